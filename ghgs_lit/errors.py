@@ -15,13 +15,13 @@ def choice(key: str, value: object, allowed: tuple) -> None:
 
 
 def require(condition: bool, key: str, expected: str, found: object) -> None:
-    """Refuse the value ``found`` of ``key`` unless ``condition`` is true; ``expected`` describes it."""
+    """Refuse the value ``found`` of ``key`` unless ``condition`` holds; ``expected`` describes it."""
     if not condition:
         raise InputError(f"{key}: expected {expected}; found {found!r}")
 
 
 def installed(package: str, extra: str, key: str) -> ModuleType:
-    """The module of a package that an ``extra`` installs. InputError: it is missing; ``key`` asks for it."""
+    """Import a package that an ``extra`` installs and ``key`` needs. InputError: it is missing."""
     try:
         return importlib.import_module(package)
     except ImportError:

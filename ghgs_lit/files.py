@@ -1,4 +1,4 @@
-"""Files that several processes share: written whole or not at all, and locks that end with their process."""
+"""Files that several processes share: atomic writes, and locks that are freed when their process ends."""
 
 import contextlib
 import errno
@@ -12,7 +12,7 @@ from typing import Any
 
 from ghgs_lit.errors import InputError, require
 
-# Lock files that this process holds: closing a second handle of a locked file would free the lock.
+# Lock files that this process holds; they are not opened again: closing a second handle would free the lock.
 _HELD: set[Path] = set()
 
 
@@ -46,8 +46,7 @@ def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
 
 @contextlib.contextmanager
 def naming(folder: Path) -> Iterator[None]:
-    """Name the ``folder`` that is written to in errors of the system that name no file, as of a full disk.
-    OSError: with ``folder`` as its ``filename``."""
+    """Add the name of ``folder`` to an OSError inside the context that names no file, such as a full disk."""
     try:
         yield
     except OSError as error:
@@ -65,7 +64,7 @@ def naming(folder: Path) -> Iterator[None]:
 
 
 def _refusal(path: Path) -> OSError | None:
-    """The system's reason not to write more to the file ``path``; None where it can be written."""
+    """The error that the system gives when more is written to the file ``path``; None: it can be written."""
     try:
         with path.open("ab") as file:
             file.write(bytes(1 << 20))
@@ -75,8 +74,8 @@ def _refusal(path: Path) -> OSError | None:
 
 
 def resolved(path: str | Path) -> Path:
-    """The absolute path without links; ``~`` is the user's folder. InputError: its links go in a loop (before
-    Python 3.13; later whatever opens it says so)."""
+    """The absolute path without links or ``~``. InputError: a loop of links (before Python 3.13; in later
+    versions opening the path fails)."""
     try:
         return Path(path).expanduser().resolve()
     except RuntimeError as error:
@@ -89,8 +88,7 @@ def write_text_atomically(path: str | Path, text: str) -> None:
 
 
 def append_line(path: Path, text: str) -> None:
-    """Append ``text`` as a line of its own, also after one whose end a killed process left out. Folders are
-    made."""
+    """Append ``text`` as a line of its own, also after an unfinished line of a killed process."""
     path.parent.mkdir(parents=True, exist_ok=True)
     is_torn = path.is_file() and path.stat().st_size > 0 and not path.read_bytes().endswith(b"\n")
     with path.open("a") as file:
@@ -129,13 +127,10 @@ def _sync(place: Path) -> None:
 
 @contextlib.contextmanager
 def lock(path: str | Path, wait: bool = False) -> Iterator[bool]:
-    """Lock the file ``path`` for this process; gives whether that succeeded.
-
-    A POSIX record lock: the system frees it however the process ends, forked children do not inherit it, and
-    NFS shares it among machines. A process that holds it already gets False. Folders are made. The file tells
-    :func:`lock_owner` who locked it last. ``wait``: whether to wait until another process frees the lock.
-    InputError: the file system has no locks.
-    """
+    """Lock the file ``path`` for this process; gives whether that succeeded (False if it holds it already). A
+    POSIX record lock: the system frees it however the process ends, forked children do not inherit it, and
+    NFS shares it among machines. The file holds the text of :func:`lock_owner`; folders are made. ``wait``:
+    wait until another process frees the lock. InputError: the file system has no locks."""
     path = Path(path).resolve()
     if path in _HELD:
         yield False

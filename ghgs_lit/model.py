@@ -1,4 +1,4 @@
-"""The whole method as one module: photographs in, Gaussians out (paper, section 3)."""
+"""The whole method as one module, from photographs to Gaussians (paper, section 3)."""
 
 import dataclasses
 from collections.abc import Collection, Mapping
@@ -25,10 +25,8 @@ from ghgs_lit.weights.reading import SHIPPED
 
 class GHGS(nn.Module):
     """``model(batch) -> Prediction``: the stages of Figure 2 (:mod:`ghgs_lit.stages`), and rounds.
-
-    ``skip`` says what is left out of the work, ``options`` what surrounds the stages; without ``rounds``,
-    which need bounds, the Gaussians of the Gaussian head are the result.
-    """
+    ``rounds``, which need bounds, correct the Gaussians of the Gaussian head. ``skip``: work to leave out.
+    ``options``: layers around the stages."""
 
     def __init__(
         self,
@@ -49,22 +47,22 @@ class GHGS(nn.Module):
         self.rounds, self.gaussian_head = rounds, gaussian_head
         self.skip, self.options = skip or SkipOptions(), options or ModelOptions()
         self.auto = self.skip.build()
-        #: The nodes that :meth:`from_config` built it of; none where stages were given.
+        #: The nodes that :meth:`from_config` built the model from; empty if the stages were given.
         self.config: dict[str, Any] = {}
-        #: Whether predictions outside of training hold the Gaussians before each round, too.
+        #: Whether predictions outside of training contain the Gaussians before each round.
         self.keeps_drafts = False
-        #: Whether photographs, depths and bodies with NaN or values out of range are refused.
+        #: Whether to refuse photographs, depths and bodies with NaN or values out of range.
         self.checks_values = True
         self.precision = "inherit"
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Refuse a precision that is none of :data:`ghgs_lit.kernels.precision.PRECISIONS`."""
+        """Refuse a ``precision`` other than :data:`ghgs_lit.kernels.precision.PRECISIONS`."""
         if name == "precision":
             choice("precision", value, PRECISIONS)
         super().__setattr__(name, value)
 
     def forward(self, batch: Batch) -> Prediction:
-        """Gaussians, depths and points, in the world of the cameras; InputError: the batch does not fit."""
+        """Gaussians, depths and points in the world of the cameras. InputError: the batch does not fit."""
         around = surroundings(self.options, self.encoder.patch_size, self.checks_values)
         for layer in around:
             batch = layer.enter(batch)
@@ -75,7 +73,7 @@ class GHGS(nn.Module):
         return dataclasses.replace(prediction, decisions=decisions)
 
     def _predict(self, batch: Batch, kept: Tensor | None) -> Prediction:
-        # Where all tokens are recalibrated, all need a depth.
+        # If all tokens are recalibrated, all need a depth.
         wanted = "all" if self.recalibration.tokens == "all" else self.skip.pixels
         bounds = bounds_of(self.bounds, batch)
         tokens = self._encode(batch, bounds, kept)
@@ -90,14 +88,14 @@ class GHGS(nn.Module):
         return prediction_of(states, self.keeps_drafts and not self.training)
 
     def _encode(self, batch: Batch, bounds: DepthBounds | None, kept: Tensor | None) -> Tokens:
-        """Tokens in the precision of the heads, whatever that of the encoder's weights."""
+        """Tokens in the precision of the heads, which may differ from that of the encoder."""
         tokens = self.encoder(batch.images, batch.masks, bounds, kept)
         heads = (parameter for name in HEADS for parameter in getattr(self, name).parameters())
         return tokens.in_precision(next(heads, tokens.semantic).dtype)
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], empty: Collection[str] = ()) -> "GHGS":
-        """The model that the nodes of a configuration describe; ``empty`` stages are on the meta device."""
+        """The model of a configuration; stages in ``empty`` are built on the meta device."""
         for name in STAGES:
             require(name in config, name, "a stage of the model", "nothing")
         skip, options = (read_node(config.get(name) or {}, name) for name in ("skip", "model"))
@@ -118,7 +116,7 @@ class GHGS(nn.Module):
     def from_checkpoint(
         cls, path: str | Path = SHIPPED, map_location: Any = "cpu", dtype: torch.dtype | None = None
     ) -> "GHGS":
-        """The model of a checkpoint on a device, in evaluation mode; arguments as of :func:`load_weights`."""
+        """The model of a checkpoint in evaluation mode; arguments as of :func:`load_weights`."""
         model = cls.from_config(read_checkpoint(path)["config"], empty=STAGES)
         load_weights(model, path, dtype, map_location)
         return model.to(map_location).eval()

@@ -1,4 +1,4 @@
-"""Files of text and arrays, read within limits: every defect is an :class:`InputError`."""
+"""Readers of text files, of limited size and depth, and of arrays; every defect is an :class:`InputError`."""
 
 import csv
 import io
@@ -16,12 +16,12 @@ from ghgs_lit.errors import InputError, require
 if TYPE_CHECKING:  # runs and --help read no arrays
     import numpy as np
 
-#: Bytes of a file of text, and levels of its mappings and lists.
+#: Largest size of a text file in bytes, and the most levels of nested mappings and lists.
 LARGEST, DEEPEST = 1 << 28, 64
 
 
 def require_file(path: str | os.PathLike, expected: str) -> None:
-    """Refuse what is no regular file: missing, a folder, a link to itself, a pipe that never ends."""
+    """Refuse a path that is no regular file: missing, a folder, a link to itself, a pipe."""
     try:
         is_file = stat.S_ISREG(os.stat(path).st_mode)
     except OSError as error:
@@ -39,8 +39,7 @@ def require_data_folder(folder: Path) -> None:
 
 
 def read_text(path: Path, expected: str = "text") -> str:
-    """The text of a file in UTF-8; a byte order mark is left out. InputError: it is missing, no file, larger
-    than 256 MB or in another encoding."""
+    """The text of a UTF-8 file without byte order mark. InputError: no file, over 256 MB, or no UTF-8."""
     require_file(path, expected)
     try:
         size = path.stat().st_size
@@ -51,25 +50,24 @@ def read_text(path: Path, expected: str = "text") -> str:
 
 
 def read_json(path: Path, expected: str = "JSON") -> Any:
-    """The content of a JSON file; arguments and errors as for :func:`read_text`. InputError: also where it is
-    no JSON, or nested deeper than 64 levels."""
+    """The content of a JSON file. InputError: as for :func:`read_text`; no JSON; more than 64 levels."""
     return read_parsed(path, expected, json.loads)
 
 
 def read_yaml(path: Path) -> Any:
-    """The plain data of a YAML file; as :func:`read_json`, and without aliases, which grow without limit."""
+    """The plain data of a YAML file, as :func:`read_json`. Aliases are refused: they grow without limit."""
     return read_parsed(path, "YAML", _plain_yaml)
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
-    """The lines of a CSV file by the names of its header; errors as for :func:`read_text`."""
+    """The rows of a CSV file, as dicts with the names of its header; errors as for :func:`read_text`."""
     return read_parsed(
         path, "CSV with a header", lambda text: list(csv.DictReader(io.StringIO(text, newline="")))
     )
 
 
 def read_lines_of_json(path: Path) -> Iterator[dict[str, Any]]:
-    """The mappings of a file with one on each line; lines that a killed process left are skipped."""
+    """The mappings of a JSON Lines file; lines that are no mapping, such as unfinished ones, are skipped."""
     require_file(path, "a mapping in JSON on each line")
     for line in path.read_bytes().splitlines():
         try:
@@ -81,13 +79,12 @@ def read_lines_of_json(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def read_npy(path: Path, expected: str = "a readable .npy file") -> "np.ndarray":
-    """The array of an ``.npy`` file without objects. InputError: it is missing, another format, or shorter
-    than its header says."""
+    """The array of an ``.npy`` file (no objects). InputError: missing, another format, or cut short."""
     import numpy as np  # here: commands that read no array start sooner
 
     require_file(path, expected)
     try:
-        # A mapping is refused where the file is too short; reading would ask for the memory first.
+        # Mapping the file fails where it is too short; reading it would allocate the memory first.
         return np.array(np.load(path, allow_pickle=False, mmap_mode="r"))
     except Exception as error:  # headers are Python, whose tokenizer has errors of its own
         raise InputError(f"{path}: expected {expected}; found a file that cannot be read: {error}") from error
@@ -99,8 +96,8 @@ def _plain_yaml(text: str) -> Any:
 
 
 def check_yaml(text: str, aliases: bool = True) -> None:
-    """Whether YAML may be loaded. ValueError: it is nested deeper than 64 levels, or has aliases, which are
-    not allowed or make it more than a million values; yaml.YAMLError: it is no YAML."""
+    """Refuse YAML that is unsafe to load. ValueError: more than 64 levels, a forbidden alias, or aliases that
+    expand to more than a million values; yaml.YAMLError: no YAML."""
     sizes: dict[str | None, int] = {}
     unfinished: list[list[Any]] = [[None, 0]]
     for event in yaml.parse(text, yaml.SafeLoader):
@@ -127,7 +124,7 @@ def check_yaml(text: str, aliases: bool = True) -> None:
 
 
 def read_parsed(path: Path, expected: str, parse: Callable[[str], Any]) -> Any:
-    """What ``parse`` makes of a file of text; other arguments and errors as for :func:`read_json`."""
+    """The result of ``parse`` for the text of a file; other arguments and errors as for :func:`read_json`."""
     try:
         value = parse(read_text(path, expected))
         if _levels(value) > DEEPEST:

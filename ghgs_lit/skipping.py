@@ -1,4 +1,4 @@
-"""What the stages see of a subject, and ``skip=auto``: the cheapest preset within a budget, by the masks."""
+"""Presets that leave out patches and pixels, and ``skip=auto``: the cheapest preset within a budget."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,20 +16,20 @@ from ghgs_lit.types import Decision, DecodedPixels
 
 
 class View(NamedTuple):
-    """What an encoder sees: its ``tokens`` and ``margin``, which is 0 with all tokens."""
+    """The ``tokens`` and ``margin`` of an encoder; the margin is 0 with all tokens."""
 
     tokens: str
     margin: int = 0
 
     @classmethod
     def of_budget(cls, budget: str | int) -> "View":
-        """What a choice of ``token_budgets`` lets the encoder see."""
+        """The view for one choice of ``token_budgets``."""
         return cls("subject", budget) if isinstance(budget, int) else cls(budget)
 
 
 @contextmanager
 def seeing(encoder: Any, view: View) -> Iterator[None]:
-    """A :class:`ghgs_lit.encoder.VGGTEncoder` that sees ``view`` while the context lasts."""
+    """Set ``tokens`` and ``margin`` of a :class:`ghgs_lit.encoder.VGGTEncoder` while the context lasts."""
     before = (encoder.tokens, encoder.margin)
     encoder.tokens, encoder.margin = view
     try:
@@ -38,7 +38,7 @@ def seeing(encoder: Any, view: View) -> Iterator[None]:
         encoder.tokens, encoder.margin = before
 
 
-#: PSNR in dB that ``skip=exact`` may lose: rounding.
+#: PSNR in dB that ``skip=exact`` may lose by rounding.
 EXACT_LOSS = 0.001
 
 
@@ -66,12 +66,12 @@ class Preset(Options):
 
     @property
     def view(self) -> View:
-        """What the encoder sees."""
+        """Which patches the encoder works on."""
         return View(self.tokens, 0 if self.tokens == "all" else self.margin)
 
     @property
     def is_exact(self) -> bool:
-        """Whether the values of ``skip=none`` are promised, so that the loss is known for any weights."""
+        """Whether the preset promises the values of ``skip=none``, for any weights."""
         return self.max_rel_diff is not None
 
 
@@ -93,7 +93,7 @@ class SkipOptions(Preset):
 
     @model_validator(mode="after")
     def _check(self) -> "SkipOptions":
-        """Refuse keys that would be ignored, and a budget in which there is no preset."""
+        """Refuse a key that would be ignored, and a budget without a preset."""
         if self.presets:
             self.require(self.tokens == "all", "tokens", "all with skip=auto, which chooses it")
             enough = self.budget_db is not None and self.budget_db >= EXACT_LOSS
@@ -102,7 +102,7 @@ class SkipOptions(Preset):
 
     @property
     def presets(self) -> dict[str, Preset]:
-        """The presets to choose from, by name, as their files in conf/skip have them; none: no choice."""
+        """The presets to choose from by name, equal to the files in conf/skip; empty without ``choices``."""
         exact = Preset(pixels=self.pixels, budget_db=EXACT_LOSS)
         seen = {"balanced": ("window", 0), "fast": ("subject", self.margin)}
         others = {}
@@ -113,7 +113,7 @@ class SkipOptions(Preset):
         return {"exact": exact, **others} if others else {}
 
     def build(self) -> "AutoSkip | None":
-        """What chooses among the presets; None where there are none."""
+        """The chooser among the presets; None without presets."""
         if not self.presets:
             return None
         ordered = dict(sorted(self.presets.items(), key=lambda item: item[1].budget_db))
@@ -124,20 +124,19 @@ class SkipOptions(Preset):
 
 @dataclass(frozen=True)
 class AutoSkip:
-    """Gives each subject the preset in which the encoder has the fewest products, among those in the budget.
+    """Gives each subject the preset of the budget in which the encoder has the fewest FLOPs.
 
-    The encoder's products decide: the heads compute windows around the subject in every preset. Presets lose
-    what ``skip.choices`` says. The machine has no say: half precision is a choice of its own for every preset
-    (``precision=auto``). ``presets``: those in the budget, the most accurate first. ``budget_db``: PSNR that
-    may be lost against ``skip=none``. ``left_out``: why the other presets are none of them, by name.
-    """
+    Only the encoder counts: the heads compute windows around the subject in every preset. The choice does not
+    depend on the machine; half precision is chosen separately (``precision=auto``). ``presets``: those within
+    the budget, the most accurate first. ``budget_db``: PSNR that may be lost against ``skip=none``.
+    ``left_out``: the other presets, with the reason."""
 
     presets: Mapping[str, Preset]
     budget_db: float
     left_out: Mapping[str, str]
 
     def trained_by(self, config: Mapping[str, Any]) -> "AutoSkip":
-        """Without the presets that the training of ``config`` never showed: nobody knows what they lose."""
+        """Only the presets that occurred in the training of ``config``: the loss of others is unknown."""
         shown = {SkipOptions.read(config.get("skip") or {}, "skip").view}
         shown |= {View.of_budget(budget) for budget in config.get("token_budgets") or []}
         known = {n: p for n, p in self.presets.items() if p.is_exact or p.view in shown}
@@ -147,9 +146,8 @@ class AutoSkip:
     def decide(
         self, encoder: Any, masks: Bool[Tensor, "B V H W"]
     ) -> tuple[tuple[Decision, ...], Bool[Tensor, "B V h w"]]:
-        """The preset of each element, which depends on its own masks alone; of equals the most accurate.
-        ``masks``: sides are divisible by the patch size. Returns: the decisions, and the patches that they
-        keep, on the CPU."""
+        """The preset of each element, by its masks alone (among equals the most accurate), and the patches
+        that it keeps, on the CPU. ``masks``: sides are divisible by the patch size."""
         choices = []
         for preset in self.presets.values():
             with seeing(encoder, preset.view):
@@ -161,7 +159,7 @@ class AutoSkip:
         return tuple(Decision(names[k], share[k]) for k, share in zip(best, shares, strict=True)), kept
 
     def report(self, decisions: Sequence[Decision]) -> str:
-        """One line: which presets the subjects got, and why."""
+        """One line that says which presets the subjects got, and why."""
         shares: dict[str, list[float]] = {name: [] for name in self.presets}
         for decision in decisions:
             shares[decision.preset].append(decision.products)
@@ -179,13 +177,10 @@ class AutoSkip:
 
 
 def encoder_products(encoder: Any, kept: Bool[Tensor, "B V h w"]) -> Float[Tensor, " B"]:
-    """FLOPs of a pair of the encoder's blocks for each element, with the patches that are kept.
-
-    Products with weights take 24 n C^2 in a block (6 for queries, keys and values, 2 for what leaves the
-    attention, 16 for the MLP of four times the width), attention among m tokens 4 m^2 C: within a view in the
-    frame block, among all views in the global block. ``encoder``: a :class:`ghgs_lit.encoder.VGGTEncoder`.
-    ``kept``: patches that take part.
-    """
+    """FLOPs of a frame block and a global block for each element, with the patches that are kept. The linear
+    layers of a block take 24 n C^2 (6 for queries, keys and values, 2 for the projection of the attention's
+    output, 16 for the MLP of four times the width), attention among m tokens 4 m^2 C: within a view in the
+    frame block, among all views in the global block. ``encoder``: a :class:`ghgs_lit.encoder.VGGTEncoder`."""
     tokens = (kept.flatten(2).sum(-1) + encoder.aggregator.special).double()
     width, both = encoder.dim_latent // 2, tokens.sum(1)
     return 48 * width**2 * both + 4 * width * (tokens.square().sum(1) + both.square())

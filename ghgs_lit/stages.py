@@ -1,8 +1,6 @@
-"""The stages of the method (paper, Figure 2): what each takes and gives, and what a replacement must offer.
-
-A class of one's own takes the place of a stage by registering its options under a new kind
-(:func:`ghgs_lit.config.register`). Stages with weights are modules (``torch.nn.Module``).
-"""
+"""Interfaces of the stages of the method (paper, Figure 2), which a replacement must offer. To replace a
+stage, register the options of a class under a new kind (:func:`ghgs_lit.config.register`). Stages with
+weights are modules (``torch.nn.Module``)."""
 
 from typing import Any, Protocol
 
@@ -23,7 +21,7 @@ from ghgs_lit.types import (
     Tokens,
 )
 
-#: The nodes of a configuration that a model is built from, in the order of the data flow.
+#: The nodes of a configuration that a model needs, in the order of the data flow.
 STAGES = ("bounds", "encoder", "depth_head", "unprojection", "recalibration", "gaussian_head")
 
 #: Stages with weights whose widths follow the encoder's.
@@ -34,23 +32,19 @@ OPTIONS = ("rounds", "skip", "model")
 
 
 class Bounds(Protocol):
-    """Near and far of each pixel's ray; options: ``build()``.
-
-    ``is_bounded`` is false for a stage that gives None, which goes with depth heads without bounds.
-    """
+    """Near and far of each pixel's ray; options: ``build()``. ``is_bounded`` is false for a stage that gives
+    None; it needs a depth head without bounds."""
 
     is_bounded: bool
 
     def __call__(self, batch: Batch) -> DepthBounds | None:
-        """Bounds of all pixels of photographs of any size."""
+        """Bounds of all pixels; photographs may have any size."""
 
 
 class Encoder(Protocol):
-    """Photographs to tokens; options: ``build(tokens, margin)``, the patches that take part (``conf/skip``).
-
-    ``dim_latent`` is the width of the tokens' layers, ``patch_size`` the side of a patch in pixels,
-    ``bounds_input`` says whether bounds are read. ``tokens`` and ``margin`` can be set: ``keeps`` follows.
-    """
+    """Photographs to tokens; options: ``build(tokens, margin)``, which choose the patches (``conf/skip``).
+    ``dim_latent`` is the width of a layer of the tokens, ``patch_size`` the side of a patch in pixels,
+    ``bounds_input``: bounds are read. ``tokens`` and ``margin`` can be set later and change ``keeps``."""
 
     dim_latent: int
     patch_size: int
@@ -65,24 +59,21 @@ class Encoder(Protocol):
         bounds: DepthBounds | None,
         kept: Bool[Tensor, "B V h w"] | None,
     ) -> Tokens:
-        """Tokens of the ``kept`` patches (None: those of ``keeps``)."""
+        """Tokens of the ``kept`` patches (None: of those that ``keeps`` gives)."""
 
     def keeps(self, masks: Bool[Tensor, "B V H W"]) -> Bool[Tensor, "B V h w"]:
-        """Patches that take part."""
+        """Patches that have tokens."""
 
 
 class DepthHead(Protocol):
-    """Tokens to depths; options: ``build(dim_latent)``.
-
-    ``is_bounded`` says whether depths lie between bounds.
-    """
+    """Tokens to depths, between bounds where ``is_bounded``; options: ``build(dim_latent)``."""
 
     is_bounded: bool
 
     def __call__(
         self, tokens: Tokens, batch: Batch, bounds: DepthBounds | None, pixels: DecodedPixels
     ) -> DepthMaps:
-        """Depths of all pixels; with ``pixels="subject"`` those of the subject are enough."""
+        """Depths of all pixels; with ``pixels="subject"`` at least of those of the subject."""
 
 
 class Unprojection(Protocol):
@@ -93,23 +84,18 @@ class Unprojection(Protocol):
 
 
 class Recalibration(Protocol):
-    """Tokens to tokens; options: ``build(dim_latent)``.
-
-    ``tokens`` is ``all`` where background tokens take part: all pixels then need a depth; else ``subject``.
-    """
+    """Tokens to tokens; options: ``build(dim_latent)``. ``tokens``: ``all`` with background tokens, for which
+    all pixels need a depth; else ``subject``."""
 
     tokens: DecodedPixels
 
     def __call__(self, tokens: Tokens, points: Points) -> Tokens:
-        """The same tokens with other layers."""
+        """The same tokens with recalibrated layers."""
 
 
 class GaussianHead(Protocol):
-    """Tokens to Gaussians in two steps; options: ``build(dim_latent)``.
-
-    What the first step gives is the head's own affair, unless rounds correct it: those need
-    :class:`ghgs_lit.heads.gaussian.RawGaussians` with descriptors of width ``channels``.
-    """
+    """Tokens to Gaussians in two steps; options: ``build(dim_latent)``. The first may give any type, but
+    rounds need :class:`ghgs_lit.heads.gaussian.RawGaussians` with descriptors of width ``channels``."""
 
     channels: int
 
@@ -119,7 +105,7 @@ class GaussianHead(Protocol):
         """Raw attributes of the valid pixels."""
 
     def activate(self, raw: Any, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
-        """The Gaussians of raw attributes, with the pixels that they belong to."""
+        """Gaussians from raw attributes, with the pixels that they belong to."""
 
 
 class Renderer(Protocol):
@@ -130,22 +116,18 @@ class Renderer(Protocol):
 
 
 class Loss(Protocol):
-    """What training makes small; options: ``build()``.
-
-    ``reads_depths`` says whether true depths are read, which need not be loaded otherwise.
-    """
+    """The training objective; options: ``build()``. ``reads_depths``: true depths must be loaded."""
 
     reads_depths: bool
 
     def __call__(
         self, prediction: Prediction, rendering: Rendering, batch: Batch
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The number that is made small, and its terms by name."""
+        """The value that training minimises, and its terms by name."""
 
 
 def require_bounds(bounds: Bounds, encoder: Encoder, depth_head: DepthHead, rounds: Any) -> None:
-    """Refuse stages that need bounds beside one that gives none, and the other way round. InputError: names
-    the stage."""
+    """Refuse stages that need bounds without them, and the reverse. InputError: names the stage."""
     head = f"a depth head {'between' if depth_head.is_bounded else 'without'} bounds"
     expected = "none with depth_head.parameterization=inverse_linear, box or hull with all others"
     fits = bounds.is_bounded == depth_head.is_bounded

@@ -1,4 +1,4 @@
-"""What surrounds the stages: a batch is checked and prepared on its way in, a prediction brought back."""
+"""Layers around the stages: they check and prepare a batch, and bring the prediction back to its world."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -19,21 +19,18 @@ from ghgs_lit.skipping import AutoSkip
 from ghgs_lit.stages import Encoder
 from ghgs_lit.types import Batch, Decision, Prediction
 
-#: How far resizing may take colours out of [0, 1].
+#: Colours may leave [0, 1] by this much, as resizing does.
 _ROUNDING = 1e-3
 
-#: A field, what was expected of it, and which elements [B] or views [B, V] are not so.
+#: A field, what was expected of it, and which elements [B] or views [B, V] violate it.
 Finding = tuple[str, str, Tensor]
 
 
 def check_batch(batch: Batch, patch_size: int, values: bool = True) -> None:
-    """Refuse a batch that the stages cannot work on; its targets are not looked at.
-
-    Values are looked at together, so that the host waits for a GPU once. ``patch_size``: must divide height
-    and width, in pixels. ``values``: look also at every value, which would spread through every view: one NaN
-    in the background leaves no Gaussian. InputError: names the field, what was expected and what was found,
-    and where.
-    """
+    """Refuse a batch that the stages cannot work on; its targets are not checked. All values are checked
+    together, so that the host waits for a GPU once. ``patch_size``: must divide height and width, in pixels.
+    ``values``: check every value, too: one NaN in the background leaves no Gaussian. InputError: names the
+    field, what was expected, what was found and where."""
     _check_shapes(batch, patch_size)
     findings = _findings_of_cameras(batch) + (_findings_of_values(batch) if values else [])
     if bool(torch.stack([bad.any() for _, _, bad in findings]).any()):
@@ -89,14 +86,14 @@ def _findings_of_values(batch: Batch) -> list[Finding]:
 
 
 def _beyond(values: Tensor, highest: float) -> Tensor:
-    """Which views of values [B, V, ...] have one outside 0 to ``highest``, up to rounding, or NaN."""
+    """Views of ``values`` [B, V, ...] with a NaN or a value outside 0 to ``highest``, up to rounding."""
     low, high = values.flatten(2).aminmax(dim=-1)
-    # Written so that NaN, which both of them repeat, is not within.
+    # Negated, because comparisons with NaN are false.
     return ~((low >= -_ROUNDING) & (high <= highest + _ROUNDING))
 
 
 class ModelOptions(Options):
-    """What happens to photographs before the stages see them, and to predictions after them."""
+    """Preparation of photographs before the stages, and of predictions after them."""
 
     group = "model"
     name: Text = "paper"
@@ -113,19 +110,19 @@ class ModelOptions(Options):
 
 
 class Surrounding:
-    """One layer around the stages, of one batch: what it knows from entering it uses when leaving."""
+    """A layer around the stages for one batch; ``leave`` may use what ``enter`` found."""
 
     def enter(self, batch: Batch) -> Batch:
-        """The batch as what lies inside sees it."""
+        """The batch for the inner layers."""
         return batch
 
     def leave(self, prediction: Prediction) -> Prediction:
-        """What lies inside predicts, as what lies outside sees it."""
+        """The prediction of the inner layers for the outer ones."""
         return prediction
 
 
 class Checks(Surrounding):
-    """Refuses what the stages cannot work on (:func:`check_batch`)."""
+    """Refuses a batch that the stages cannot work on (:func:`check_batch`)."""
 
     def __init__(self, side_multiple: int, values: bool) -> None:
         self.side_multiple, self.values = side_multiple, values
@@ -136,7 +133,7 @@ class Checks(Surrounding):
 
 
 class Mattes(Surrounding):
-    """Masks become those of soft mattes (:mod:`ghgs_lit.geometry.masks`)."""
+    """Replaces masks by thresholds of soft mattes (:mod:`ghgs_lit.geometry.masks`)."""
 
     def __init__(self, least: float | None) -> None:
         self.least = least
@@ -157,7 +154,7 @@ class SubjectFrame(Surrounding):
 
 
 class Border(Surrounding):
-    """Photographs of whole patches inside (:mod:`ghgs_lit.geometry.padding`)."""
+    """Photographs padded to whole patches inside (:mod:`ghgs_lit.geometry.padding`)."""
 
     def __init__(self, patch_size: int) -> None:
         self.patch_size = patch_size
@@ -171,12 +168,12 @@ class Border(Surrounding):
 
 
 def side_multiple(options: ModelOptions, patch_size: int) -> int:
-    """What height and width of photographs must be divisible by, in pixels."""
+    """The number of pixels that must divide height and width of photographs."""
     return 1 if options.pad == "multiple" else patch_size
 
 
 def surroundings(options: ModelOptions, patch_size: int, checks_values: bool) -> Sequence[Surrounding]:
-    """All that surrounds the stages for one batch, from the outside to the inside."""
+    """The layers around the stages for one batch, the outermost first."""
     return [
         Checks(side_multiple(options, patch_size), checks_values),
         Mattes(options.matte),
@@ -189,12 +186,9 @@ def surroundings(options: ModelOptions, patch_size: int, checks_values: bool) ->
 def computing(
     precision: str, auto: AutoSkip | None, encoder: Encoder, masks: Bool[Tensor, "B V H W"]
 ) -> Iterator[tuple[tuple[Decision, ...], Bool[Tensor, "B V h w"] | None]]:
-    """How much is computed while the context lasts: in which precision, and which patches take part.
-
-    Gives the choices, and the patches that take part, None where the encoder decides. ``precision``: one of
-    :data:`ghgs_lit.kernels.precision.PRECISIONS`. ``auto``: chooses what the encoder sees of each subject
-    (``skip=auto``); None: the encoder does itself.
-    """
+    """Set the precision while the context lasts; gives the choices of ``skip=auto`` and the patches they
+    keep. ``precision``: one of :data:`ghgs_lit.kernels.precision.PRECISIONS`. ``auto``: None: no choices, and
+    the encoder decides about the patches."""
     decisions, kept = ((), None) if auto is None else auto.decide(encoder, masks)
     with precision_of(precision, torch.device(masks.device)):
         yield decisions, kept

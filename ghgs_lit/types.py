@@ -1,6 +1,6 @@
 """The data that the stages exchange.
 
-Conventions, stated once here and used everywhere in the package:
+Conventions of the whole package:
 
 * camera axes are OpenCV's: x right, y down, z forward; ``extrinsics`` map the world to the camera;
 * ``intrinsics`` are in pixels and pixel ``(row i, column j)`` has its centre at
@@ -9,9 +9,8 @@ Conventions, stated once here and used everywhere in the package:
 * quaternions are ``(w, x, y, z)``; lengths are metres; depth is z in the camera;
 * images are float in ``[0, 1]``, RGB, on a black background outside the mask.
 
-Shapes are written with ``B`` batch, ``V`` input views, ``T`` target views, ``H W`` input size,
-``h w`` target size (of tokens: rows and columns), ``N`` packed Gaussians or tokens, ``L`` layers.
-"""
+Shapes are written with ``B`` batch, ``V`` input views, ``T`` target views, ``H W`` input size, ``h w`` target
+size (of tokens: rows and columns), ``N`` packed Gaussians or tokens, ``L`` layers."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -25,7 +24,7 @@ from torch import Tensor
 
 _T = TypeVar("_T")
 
-#: What dense heads decode: whole views, or windows around the subject.
+#: Pixels that dense heads decode: whole views, or windows around the subject.
 DecodedPixels = Literal["all", "subject"]
 
 
@@ -90,8 +89,7 @@ class Cameras(_TensorStruct):
         return dataclasses.replace(self, intrinsics=intrinsics, height=height, width=width)
 
     def cropped(self, top: int, left: int, height: int, width: int) -> "Cameras":
-        """The same cameras for a crop of the image. ``top``: row of the image at which the crop starts;
-        negative pads. ``left``: column of the image at which the crop starts."""
+        """The same cameras for a crop that starts at row ``top`` and column ``left``; negative ones pad."""
         intrinsics = self.intrinsics.clone()
         intrinsics[..., 0, 2] -= left
         intrinsics[..., 1, 2] -= top
@@ -100,11 +98,8 @@ class Cameras(_TensorStruct):
 
 @dataclass(frozen=True)
 class Targets(_TensorStruct):
-    """Photographs to predict, from cameras other than the input cameras.
-
-    ``names`` are those of the photographs of each subject, ``protocols`` the target protocol of each of the
-    ``T``, the same for all subjects.
-    """
+    """Photographs to predict, from cameras other than the input cameras. ``names``: the photographs of each
+    subject. ``protocols``: the target protocol of each of the ``T`` targets, the same for all subjects."""
 
     images: Float[Tensor, "B T 3 h w"]
     masks: Bool[Tensor, "B T h w"]
@@ -124,12 +119,10 @@ class Targets(_TensorStruct):
 class Batch(_TensorStruct):
     """Input photographs of ``B`` subjects, with everything that is known about them.
 
-    ``body_vertices`` are points of the body's surface in metres, ``depths`` true z-depths in metres (0 where
-    there is none), ``alpha`` soft mattes: the share of each pixel that shows the subject, by which its colour
-    is multiplied; None where the data set has none. ``log_gains``: logarithms of the gains of cameras, by
-    which photographs are divided already; None where they are not known. ``views`` names the photographs of
-    each subject.
-    """
+    ``body_vertices``: points of the body's surface in metres. ``depths``: true z-depths in metres, 0 where
+    unknown. ``alpha``: soft mattes, the share of each pixel that shows the subject, by which its colour is
+    multiplied. ``log_gains``: logarithms of the cameras' gains, by which photographs are already divided.
+    ``views``: names of the photographs of each subject. None: unknown."""
 
     images: Float[Tensor, "B V 3 H W"]
     masks: Bool[Tensor, "B V H W"]
@@ -143,7 +136,7 @@ class Batch(_TensorStruct):
     views: tuple[tuple[str, ...], ...] = ()
 
     def of_views(self, views: Sequence[int]) -> "Batch":
-        """The batch of some of its photographs, by number, with the same targets."""
+        """The batch with only the photographs of these numbers, and the same targets."""
         views = list(views)
         names = ("images", "masks", "cameras", "depths", "alpha", "log_gains")
         parts = {name: value[:, views] for name in names if (value := getattr(self, name)) is not None}
@@ -151,7 +144,7 @@ class Batch(_TensorStruct):
         return dataclasses.replace(self, **parts, views=said)
 
     def once(self, function: Callable[["Batch"], _T]) -> _T:
-        """``function`` of this batch, computed at its first use; several stages need the same."""
+        """``function`` of this batch, computed once and kept for other stages."""
         known = self.__dict__.setdefault("_known", {})
         if function not in known:
             known[function] = function(self)
@@ -159,7 +152,7 @@ class Batch(_TensorStruct):
 
     @cached_property
     def extents(self) -> list["Extent"]:
-        """Of the subject in each image ``b * V + v``; the host waits for a GPU when they are first read."""
+        """Extent of the subject in each image ``b * V + v``; the host waits for a GPU at the first use."""
         return extents(self.masks.flatten(0, 1))
 
     @cached_property
@@ -169,10 +162,7 @@ class Batch(_TensorStruct):
 
 
 class Extent(NamedTuple):
-    """How many pixels a mask has, and the rows and columns from the first of them to the last.
-
-    The ends are excluded. Of an empty mask only ``count`` has a meaning.
-    """
+    """Number of pixels of a mask, and its bounding box (ends excluded; no meaning for an empty mask)."""
 
     count: int
     top: int
@@ -182,7 +172,7 @@ class Extent(NamedTuple):
 
 
 def extents(masks: Bool[Tensor, "n H W"]) -> list[Extent]:
-    """Of each mask; the host waits for a GPU once."""
+    """Extent of each mask; the host waits for a GPU once."""
     found = [masks.sum((1, 2))]
     for lines in (masks.any(2).to(torch.uint8), masks.any(1).to(torch.uint8)):
         found += [lines.argmax(1), lines.shape[1] - lines.flip(1).argmax(1)]
@@ -190,12 +180,12 @@ def extents(masks: Bool[Tensor, "n H W"]) -> list[Extent]:
 
 
 def true_places(mask: Bool[Tensor, "..."], count: int) -> Int[Tensor, " count"]:
-    """Flat indices of the ``count`` True values: as ``nonzero``, for whose number the host waits."""
+    """Flat indices of the ``count`` True values, as ``nonzero`` but without waiting for a GPU."""
     flat = mask.flatten()
     if flat.device.type == "cpu":
         return flat.nonzero()[:, 0]
     index = torch.arange(len(flat), device=flat.device)
-    target = torch.where(flat, flat.cumsum(0) - 1, count)  # the last place is for all others
+    target = torch.where(flat, flat.cumsum(0) - 1, count)  # all others go to the last place
     return index.new_empty(count + 1).scatter_(0, target, index)[:count]
 
 
@@ -209,13 +199,10 @@ class DepthBounds(_TensorStruct):
 
 @dataclass(frozen=True)
 class Tokens(_TensorStruct):
-    """Tokens of the encoder: the kept ones of the whole batch, packed.
-
-    Token ``n`` is the patch at ``row[n]``, ``column[n]`` of image ``image[n]`` (``b * V + v``); tokens
-    are ordered by image, row, column. ``grid`` is ``(B, V, h, w)``. ``latent`` holds the embeddings E
-    of the encoder's read-out layers, ``semantic`` the features F (detached: they weight the attention and
-    are not trained through it).
-    """
+    """Tokens of the kept patches of the whole batch, packed. Token ``n`` is the patch at ``row[n]``,
+    ``column[n]`` of image ``image[n]`` (``b * V + v``); tokens are ordered by image, row, column. ``grid`` is
+    ``(B, V, h, w)``. ``latent``: embeddings E of the encoder's read-out layers. ``semantic``: features F,
+    detached: they weight the attention, which does not train them."""
 
     latent: tuple[Float[Tensor, "N C"], ...]
     semantic: Float[Tensor, "N S"]
@@ -237,7 +224,7 @@ class Tokens(_TensorStruct):
         return dataclasses.replace(self, latent=tuple(layer[index] for layer in self.latent), **parts)
 
     def of_images(self, images: slice) -> "Tokens":
-        """The tokens of consecutive images, as of one element; the host may wait for a GPU."""
+        """The tokens of consecutive images, as one element; the host may wait for a GPU."""
         b, v, h, w = self.grid
         if images == slice(0, b * v):
             part = self
@@ -250,7 +237,7 @@ class Tokens(_TensorStruct):
         return dataclasses.replace(part, image=part.image - images.start, grid=grid)
 
     def in_precision(self, dtype: torch.dtype) -> "Tokens":
-        """The tokens in a precision; as they are where autocast chooses it."""
+        """The tokens in a precision; unchanged under autocast, which chooses it."""
         if torch.is_autocast_enabled(self.semantic.device.type) or self.latent[0].dtype == dtype:
             return self
         latent = tuple(layer.to(dtype) for layer in self.latent)
@@ -268,7 +255,7 @@ class Tokens(_TensorStruct):
 
 @dataclass(frozen=True)
 class DepthMaps(_TensorStruct):
-    """One z-depth for each pixel, in metres, and the bounds that it lies between, if there are any."""
+    """Z-depth of each pixel in metres, and the bounds that it lies between, if any."""
 
     depth: Float[Tensor, "B V H W"]
     valid: Bool[Tensor, "B V H W"]
@@ -279,9 +266,7 @@ class DepthMaps(_TensorStruct):
 @dataclass(frozen=True)
 class Points(_TensorStruct):
     """World points of pixels and of tokens, in metres. Invalid ones are finite but meaningless.
-
-    ``token_image`` is the image (``b * V + v``) of each token.
-    """
+    ``token_image`` is the image (``b * V + v``) of each token."""
 
     pixels: Float[Tensor, "B V H W 3"]
     valid: Bool[Tensor, "B V H W"]
@@ -295,11 +280,10 @@ class Gaussians(_TensorStruct):
     """3D Gaussians of a batch, packed; ``splits[b]`` of them belong to element ``b``.
 
     ``quaternions`` need not have unit norm; ``scales`` are standard deviations in metres; ``colors`` may have
-    any number of channels. ``image`` (``b * V + v``) and ``pixel`` (row-major index) are the input pixel that
-    a Gaussian belongs to, None where there is none. ``low_pass`` (px^2) and ``antialiased`` are constants of
-    the image (:class:`ghgs_lit.rendering.RasterSettings`) that they were made for. ``metre`` is the length
-    of a metre in the unit of each element's world (:mod:`ghgs_lit.geometry.frame`); None: that is the metre.
-    """
+    any number of channels. ``image`` (``b * V + v``) and ``pixel`` (row-major index): the input pixel that a
+    Gaussian belongs to, if any. ``low_pass`` (px^2) and ``antialiased``: the settings of the renderer
+    (:class:`ghgs_lit.rendering.RasterSettings`) that they were made for. ``metre``: the length of a metre in
+    the unit of each element's world (:mod:`ghgs_lit.geometry.frame`); None: 1."""
 
     means: Float[Tensor, "N 3"]
     quaternions: Float[Tensor, "N 4"]
@@ -323,8 +307,7 @@ class Gaussians(_TensorStruct):
         return torch.stack([field.isfinite().all(1) for field in fields]).all(0)
 
     def select(self, index: Tensor | slice, splits: tuple[int, ...]) -> "Gaussians":
-        """The Gaussians at ``index`` (a slice, a mask or indices). ``index``: which Gaussians. ``splits``:
-        how many of them belong to each batch element."""
+        """The Gaussians at ``index`` (slice, mask or indices). ``splits``: their number in each element."""
         changes = {
             f.name: getattr(self, f.name)[index]
             for f in dataclasses.fields(self)
@@ -345,8 +328,8 @@ class Gaussians(_TensorStruct):
 
 @dataclass(frozen=True)
 class Decision:
-    """The preset that ``skip=auto`` gave a subject; FLOPs of the encoder's blocks, those of the most accurate
-    preset being 1."""
+    """The preset that ``skip=auto`` gave a subject, and the FLOPs of the encoder's blocks as a share of those
+    of the most accurate preset."""
 
     preset: str
     products: float
@@ -354,13 +337,9 @@ class Decision:
 
 @dataclass(frozen=True)
 class Prediction(_TensorStruct):
-    """The result of ``model(batch)``, in the world and the unit of its cameras (metres by convention);
-    ``depth`` is meaningful where ``depth_valid``.
-
-    ``decisions`` has one of each element with ``skip=auto``, none otherwise. ``rounds`` are the depths before
-    the first round and after each (the last is ``depth_maps``), ``drafts`` the Gaussians before each, where
-    the model keeps them.
-    """
+    """The result of ``model(batch)``, in the world and the unit of its cameras. ``depth`` has a meaning where
+    ``depth_valid``. ``decisions``: one for each element with ``skip=auto``. ``rounds``: depths before the
+    first round and after each (the last is ``depth_maps``). ``drafts``: Gaussians before each, if kept."""
 
     gaussians: Gaussians
     depth: Float[Tensor, "B V H W"]

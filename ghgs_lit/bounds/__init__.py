@@ -1,4 +1,4 @@
-"""The first stage: near and far of each pixel's ray, from masks and cameras alone. Not part of the paper."""
+"""The bounds stage (not in the paper): near and far of each pixel's ray, from masks and cameras."""
 
 from ghgs_lit.bounds.box import NoBounds, SubjectBox
 from ghgs_lit.bounds.hull import VisualHull

@@ -1,8 +1,6 @@
-"""Whether the masks agree about the subject: a view whose mask contradicts all others has no vote.
-
-Silhouettes of one subject explain one another: each ray of each has a point that all others show (silhouette
-coherence; Hernandez et al., PAMI 2007). Nothing here has a gradient.
-"""
+"""Agreement of the masks: a view whose mask contradicts all others does not vote. In silhouettes of one
+subject, each ray has a point that all the other silhouettes cover (silhouette coherence; Hernandez et al.,
+PAMI 2007). Nothing here has a gradient."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -19,29 +17,28 @@ from ghgs_lit.bounds.silhouettes import (
 )
 from ghgs_lit.geometry.projection import world_to_camera
 
-#: Cells along the longer side of the masks, and depths along each ray: gross errors only are looked for.
+#: Cells along the longer side of the masks, and depths along each ray: enough to find gross errors.
 RESOLUTION, _SAMPLES = 32, 24
 
-#: Masks agree where the others explain this share of each.
+#: Masks agree if the others explain at least this share of the rays of each.
 _SHARE = 0.95
 
 
 def trusted_views(
     coarse: Silhouettes, center: Float[Tensor, "B 3"], reach: Float[Tensor, " B"], tolerance: int
 ) -> Bool[Tensor, "B V"]:
-    """Views that vote about the hull: those that show the subject, but for one that contradicts the others.
+    """Views that vote about the hull: those that show the subject, except one that contradicts the others.
 
-    A mask that is cut leaves rays of the others unexplained, one with more than the subject has such rays
-    itself. Where more than :data:`_SHARE` allows is unexplained, the view without which at most half of that
-    is left has no vote. Of two views nobody can tell which one is wrong. ``coarse``: masks of at most
-    :data:`RESOLUTION` cells. ``reach``: a generous radius of the subject. ``tolerance``: how many views may
-    say "outside" of a point that is kept.
-    """
+    A mask that is cut leaves rays of the other views unexplained; a mask that is too large has unexplained
+    rays itself. If the masks do not agree (:data:`_SHARE`), the view without which less than half of the
+    unexplained share is left does not vote. With two views both vote: either could be wrong. ``coarse``:
+    masks of at most :data:`RESOLUTION` cells. ``reach``: a generous radius of the subject. ``tolerance``: how
+    many views may say "outside" of a point that is kept."""
     masks = coarse.masks
     voting = masks.flatten(2).any(-1)
     votes = _votes(coarse, voting, center, reach)
     count = votes.sum(2, keepdim=True)
-    # By all views, and by all but one of them.
+    # Votes of all views, then without each single one.
     counts = torch.cat((count, count - votes), 2)
     hit = (counts <= tolerance).any(-1) & masks[:, :, None]
     explained = hit.flatten(3).sum(-1) / masks.flatten(2).sum(-1).clamp(min=1)[..., None]
@@ -55,10 +52,10 @@ def trusted_views(
 
 
 def _votes(coarse: Silhouettes, voting: Tensor, center: Tensor, reach: Tensor) -> Tensor:
-    """1 where view ``o`` sees a point on a ray of view ``v`` outside its mask [B, v, o, h, w, S]."""
+    """Votes [B, v, o, h, w, S]: 1 where view ``o`` sees a point on a ray of view ``v`` outside its mask."""
     masks, cameras = coarse.masks, coarse.cameras
     b, v = voting.shape
-    # One cell at least: the rays of a cell's pixels run beside the ray of its centre.
+    # At least one cell: the rays of a cell's pixels run beside the ray of its centre.
     outside = votes_outside(dilate(masks, max(coarse.dilation, 1)), voting)
     matrices = projection_matrices(cameras)
     middle = world_to_camera(center[:, None].expand(b, v, 3), cameras.extrinsics)[..., 2]

@@ -1,8 +1,5 @@
-"""Near and far of each pixel from an axis-aligned box around the subject.
-
-The box is found by carving a coarse grid with the masks. Masks are dilated, because real ones are noisy.
-Nothing here has a gradient.
-"""
+"""Near and far of each pixel from an axis-aligned box around the subject. The box is found by carving a
+coarse grid with the masks, dilated because real masks are noisy. Nothing here has a gradient."""
 
 from typing import ClassVar
 
@@ -34,19 +31,17 @@ from ghgs_lit.types import Batch, Cameras, DepthBounds
 #: Cells along the longer side of the masks that are searched, and along each side of the grid that is carved.
 RESOLUTION, CELLS = 160, 32
 
-#: Metres around the box; the least near, and the least far - near.
+#: In metres: margin around the box, smallest near and smallest far - near.
 MARGIN, MIN_DEPTH, MIN_THICKNESS = 0.03, 0.1, 0.02
 
-#: The largest bound, in metres: cameras of absurd sizes overflow.
+#: The largest bound in metres, against overflow with cameras of absurd sizes.
 _FARTHEST = 1e6
 
 
 class SubjectBox(Options):
-    """``bounds(batch) -> DepthBounds``: where each ray enters and leaves the subject's box.
-
-    A ray that misses the box gets the range of depths of the whole box. Views with an empty mask do not vote,
-    nor does one whose mask contradicts all others (:func:`ghgs_lit.bounds.agreement.trusted_views`).
-    """
+    """``bounds(batch) -> DepthBounds``: where each ray enters and leaves the subject's box. A ray that misses
+    the box gets the range of depths of the whole box. Views with an empty mask do not vote, nor does one
+    whose mask contradicts all others (:func:`ghgs_lit.bounds.agreement.trusted_views`)."""
 
     group = "bounds"
     dilation: float = Field(0.01, ge=0, lt=0.5)
@@ -56,7 +51,7 @@ class SubjectBox(Options):
 
     @property
     def is_bounded(self) -> bool:
-        """Whether there are bounds: all but :class:`NoBounds` give them."""
+        """True: every stage except :class:`NoBounds` gives bounds."""
         return True
 
     @torch.no_grad()
@@ -73,7 +68,7 @@ class SubjectBox(Options):
     def _voting(self, coarse: Silhouettes) -> Bool[Tensor, "B V"]:
         few = silhouettes(coarse.masks, coarse.cameras, agreement.RESOLUTION, self.dilation)
         center = subject_center(few.masks, few.cameras)
-        # Not the largest: a mask of noise would leave no sample within the subject.
+        # The median, not the largest: with a mask of noise no sample would lie within the subject.
         reach = _reach(few.masks, few.cameras, center).nanmedian(1).values
         return agreement.trusted_views(few, center, reach, self.tolerance)
 
@@ -83,7 +78,7 @@ class SubjectBox(Options):
         return self._valid(depths_in_box(batch.cameras, lower, upper))
 
     def _valid(self, bounds: DepthBounds) -> DepthBounds:
-        """Bounds in front of the camera, widened about their middle where they are too near."""
+        """Bounds in front of the camera, moved apart where they are too close to each other."""
         near, far = (x.nan_to_num(nan=0.0).clamp(max=_FARTHEST) for x in (bounds.near, bounds.far))
         missing = (MIN_THICKNESS - (far - near)).clamp(min=0) / 2
         near = (near - missing).clamp(min=MIN_DEPTH)
@@ -93,13 +88,10 @@ class SubjectBox(Options):
 def subject_box(
     masks: Bool[Tensor, "B V h w"], cameras: Cameras, radius: int, tolerance: int = 0
 ) -> tuple[Float[Tensor, "B 3"], Float[Tensor, "B 3"]]:
-    """The axis-aligned box of the space that masks and cameras leave to the subject.
-
-    Carved twice: the second grid fills the box of the first one. Where nothing is left (masks that contradict
-    one another) the box of the previous pass stays. Returns: the corners with the smallest and with the
-    largest coordinates, in metres. ``radius``: dilation of the masks in pixels. ``tolerance``: how many views
-    may say "outside" of a point that is kept.
-    """
+    """The axis-aligned box of the visual hull: its corners with the smallest and the largest coordinates, in
+    metres. Carved twice: the second grid fills the box of the first. If nothing is left (contradicting
+    masks), the box before that pass stays. ``radius``: dilation of the masks in pixels. ``tolerance``: how
+    many views may say "outside" of a point that is kept."""
     center = subject_center(masks, cameras)
     reach = _reach(masks, cameras, center).nan_to_num().amax(1, keepdim=True).clamp(min=0.05)
     lower, upper = center - reach, center + reach
@@ -107,13 +99,13 @@ def subject_box(
     for _ in range(2):
         cell = (upper - lower) / CELLS
         depth = _project_one((lower + upper) / 2, cameras)[1]
-        # Half a cell's diagonal in pixels, for subjects that come up to 0.6 of the distance of their middle.
+        # Half a cell's diagonal in pixels, for points as near as 0.6 times the depth of the box's middle.
         pixels = focal * cell.norm(dim=-1, keepdim=True) / 2 / (0.6 * depth).clamp(min=NEAREST)
         grow = pixels.nan_to_num(nan=0.0).amax(1).clamp(max=max(masks.shape[-2:])).ceil().int()
         grown = dilate(masks, radius + grow[:, None, None, None])
         kept = _carve(votes_outside(grown, voting), cameras, lower, cell, tolerance)
         is_left = kept.flatten(1).any(-1)[:, None]
-        # Along each axis, whether any cell of the slice is kept.
+        # For each axis, the slices with a kept cell.
         slices = torch.stack([kept.any(axes) for axes in ((2, 3), (1, 3), (1, 2))], 1)
         first, last = first_and_last(slices)
         corner = lower
@@ -125,7 +117,6 @@ def subject_box(
 def _carve(
     outside: Tensor, cameras: Cameras, lower: Tensor, cell: Tensor, tolerance: int
 ) -> Bool[Tensor, "B n n n"]:
-    """Which cells of a grid at most ``tolerance`` views place outside the subject."""
     steps = torch.arange(CELLS, device=lower.device, dtype=lower.dtype) + 0.5
     position = lower[..., None] + cell[..., None] * steps
     matrices = projection_matrices(cameras)
@@ -140,26 +131,26 @@ def _carve(
 
 
 def _project_one(points: Float[Tensor, "B 3"], cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Pixel [B, V, 2] and depth [B, V] of one point of each element in all of its cameras."""
+    """Pixel [B, V, 2] and depth [B, V] of one point of each element in all its cameras."""
     points = points[:, None].expand(*cameras.shape, 3)
     return project(points, cameras.intrinsics, cameras.extrinsics)
 
 
 def _reach(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Float[Tensor, "B 3"]) -> Tensor:
-    """A generous radius [B, V] of the subject about ``center``, as each view shows it or NaN."""
+    """A generous radius [B, V] of the subject about ``center`` from each view; NaN for an empty mask."""
     pixel, depth = _project_one(center, cameras)
     extents = [
         torch.where(masks.any(-2 + dim), (line - pixel[..., dim, None]).abs() + 0.5, 0).amax(-1)
         for dim, line in enumerate(pixel_axes(cameras))
     ]
     extent = torch.stack(extents, -1) / focal_lengths(cameras)
-    # More than what is seen: what reaches away from a camera looks smaller than it is.
+    # 1.4: parts that point away from the camera look shorter than they are.
     reach = 1.4 * extent.norm(dim=-1) * depth.clamp(min=NEAREST)
     return torch.where(masks.flatten(2).any(-1), reach, torch.nan)
 
 
 class NoBounds(Options):
-    """The stage of a model whose depths are not bounded, as in the authors' release."""
+    """The stage of a model without bounds, as in the authors' release."""
 
     group = "bounds"
     is_bounded: ClassVar[bool] = False

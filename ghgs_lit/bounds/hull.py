@@ -1,8 +1,6 @@
-"""Near and far of each pixel from the visual hull of the other views.
-
-The rays of the subject's pixels are marched through the subject's box, and what the masks of the *other*
-views allow is kept: the image-based visual hull (Matusik et al. 2000). Nothing here has a gradient.
-"""
+"""Near and far of each pixel from the visual hull of the other views. The rays of the subject's pixels are
+marched through the subject's box; depths that the masks of the *other* views allow are kept: the image-based
+visual hull (Matusik et al. 2000). Nothing here has a gradient."""
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -23,15 +21,13 @@ from ghgs_lit.bounds.silhouettes import (
 from ghgs_lit.kernels.pool import even_parts, is_supported
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 
-#: Depths that are held at once (bounds memory).
+#: Depths in memory at once.
 _DEPTHS = 1 << 23
 
 
 class VisualHull(SubjectBox):
     """``bounds(batch) -> DepthBounds``: where each ray of the subject enters and leaves the visual hull.
-
-    Other pixels, and rays that miss the hull, keep their bounds in the box.
-    """
+    Other pixels, and rays that miss the hull, have the bounds of the box."""
 
     samples: int = Field(48, ge=2, le=4096)
     """Depths that are tried along each ray"""
@@ -41,7 +37,7 @@ class VisualHull(SubjectBox):
     ) -> DepthBounds:
         box = self._valid(depths_in_box(batch.cameras, lower, upper))
         start = box if coarse.stride == 1 else self._valid(depths_in_box(coarse.cameras, lower, upper))
-        # One cell at least: the rays of a cell's pixels run beside the ray of its centre.
+        # At least one cell: the rays of a cell's pixels run beside the ray of its centre.
         radius, rays = max(coarse.dilation, 1), batch.pixels if coarse.stride == 1 else None
         hull = hull_bounds(
             coarse.masks, coarse.cameras, start, radius, self.tolerance, self.samples, rays, voting
@@ -62,16 +58,14 @@ def hull_bounds(
 ) -> DepthBounds:
     """First and last depth within ``start`` that the dilated masks of the other views allow.
 
-    Computed for the subject's pixels; others, and rays that miss the hull, keep their bounds.
+    Pixels beside the subject, and rays that miss the hull, keep the bounds of ``start``.
 
     Args:
-        start: where the search begins and ends.
         radius: dilation of the masks in pixels.
         tolerance: how many other views may say "outside" of a depth that is allowed.
         samples: depths that are tried along each ray.
-        rays: indices of the masks' pixels, where they are known.
-        voting: views that may say "outside"; None: those whose mask is not empty.
-    """
+        rays: indices of the masks' pixels, if known.
+        voting: views that may say "outside"; None: those whose mask is not empty."""
     voting = masks.flatten(2).any(-1) if voting is None else voting
     outside = votes_outside(dilate(masks, radius), voting)
     near, far = (bound.clone(memory_format=torch.contiguous_format) for bound in (start.near, start.far))
@@ -97,7 +91,7 @@ def _march(
     steps: Float[Tensor, " s"],
     tolerance: int,
 ) -> None:
-    """As :func:`ghgs_lit.bounds.cpu.march`, for pixels ``rays`` of all images together."""
+    """:func:`ghgs_lit.bounds.cpu.march` in PyTorch, for the pixels ``rays`` of all images."""
     views, samples = outside.shape[1], len(steps)
     image = rays // outside[0, 0].numel()
     begin, end = (bound.view(-1)[rays] for bound in (near, far))
@@ -121,6 +115,5 @@ def _march(
 
 
 def _enlarge(values: Tensor, stride: int, size: tuple[int, int]) -> Tensor:
-    """Values of cells for each of their pixels, cut to the image's ``size``."""
     values = values.repeat_interleave(stride, -2).repeat_interleave(stride, -1)
     return values[..., : size[0], : size[1]]

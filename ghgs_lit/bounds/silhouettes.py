@@ -1,7 +1,5 @@
-"""Rays of pixels and what they hit, and masks as silhouettes: dilated, looked up at projected points.
-
-A ray is a function of z-depth: ``point(z) = center + z * direction``.
-"""
+"""Rays of pixels, and masks as silhouettes: dilated, and looked up at projected points. A ray is a function
+of z-depth: ``point(z) = center + z * direction``."""
 
 from dataclasses import dataclass
 from math import ceil
@@ -16,7 +14,7 @@ from ghgs_lit.types import Cameras, DepthBounds
 
 
 def ray_directions(cameras: Cameras) -> Float[Tensor, "*batch h w 3"]:
-    """World displacement along each pixel's ray per metre of z-depth."""
+    """Direction of each pixel's ray: displacement in the world per metre of z-depth."""
     intrinsics, extrinsics = at_least_float32(cameras.intrinsics), at_least_float32(cameras.extrinsics)
     centers = pixel_centers(cameras.height, cameras.width, intrinsics)
     centers = torch.cat((centers, torch.ones_like(centers[..., :1])), dim=-1)
@@ -25,22 +23,19 @@ def ray_directions(cameras: Cameras) -> Float[Tensor, "*batch h w 3"]:
 
 
 def projection_matrices(cameras: Cameras) -> Float[Tensor, "*batch 3 4"]:
-    """``K [R t]``: homogeneous world points to homogeneous pixels."""
+    """``K [R t]``, which maps homogeneous world points to homogeneous pixels."""
     return at_least_float32(cameras.intrinsics) @ at_least_float32(cameras.extrinsics)[..., :3, :]
 
 
 def pixel_axes(cameras: Cameras) -> tuple[Float[Tensor, " w"], Float[Tensor, " h"]]:
-    """Pixel centres along a row and along a column."""
+    """Coordinates of the pixel centres along a row and along a column."""
     centers = pixel_centers(cameras.height, cameras.width, at_least_float32(cameras.intrinsics))
     return centers[0, :, 0], centers[:, 0, 1]
 
 
 def depths_in_box(cameras: Cameras, lower: Float[Tensor, "B 3"], upper: Float[Tensor, "B 3"]) -> DepthBounds:
-    """Depths at which the ray of each pixel enters and leaves an axis-aligned box.
-
-    A ray that misses the box gets the range of depths of the whole box. ``lower``: corner of each element's
-    box with the smallest coordinates, in metres. ``upper``: corner with the largest coordinates.
-    """
+    """Depths at which the ray of each pixel enters and leaves the axis-aligned box from ``lower`` to
+    ``upper``, in metres; for a ray that misses it, the range of depths of the whole box."""
     directions = ray_directions(cameras)
     centers = cameras.centers[:, :, None, None]
     # A ray along a face: 1e-12 instead of 0 gives the right infinities without 0 / 0.
@@ -59,7 +54,7 @@ def depths_in_box(cameras: Cameras, lower: Float[Tensor, "B 3"], upper: Float[Te
     )
 
 
-#: The least depth at which masks are looked up, in metres; points behind the camera are moved there.
+#: The smallest depth in metres at which masks are looked up; points behind the camera are moved there.
 NEAREST = 1e-4
 
 
@@ -76,21 +71,21 @@ class Silhouettes:
 def silhouettes(
     masks: Bool[Tensor, "B V H W"], cameras: Cameras, resolution: int, dilation: float
 ) -> Silhouettes:
-    """Masks at a resolution that limits the cost of the search. ``resolution``: cells along the longer side
-    of the image, at most. ``dilation``: as a fraction of the image's longer side."""
+    """Masks at a lower resolution, to limit the cost of a search. ``resolution``: largest number of cells
+    along the image's longer side. ``dilation``: fraction of the image's longer side."""
     stride = ceil(max(masks.shape[-2:]) / resolution)
     if stride > 1:
         masks = F.max_pool2d(masks.float(), stride, stride, ceil_mode=True).bool()
     height, width = masks.shape[-2:]
-    # Whole cells: the last row and column of them may reach beyond the image.
+    # Whole cells: the last row and column may extend beyond the image.
     matrices = map(at_least_float32, (cameras.intrinsics, cameras.extrinsics))
     full = Cameras(*matrices, height * stride, width * stride)
     return Silhouettes(masks, full.resized(height, width), stride, ceil(dilation * max(height, width)))
 
 
 def dilate(masks: Bool[Tensor, "*batch h w"], radius: int | Tensor) -> Bool[Tensor, "*batch h w"]:
-    """Masks grown by ``radius`` pixels along both axes (at a cost that does not depend on it). ``masks``: to
-    be grown. ``radius``: one for all masks, or integers that broadcast with them."""
+    """Masks grown by ``radius`` pixels along both axes, at a cost that does not depend on the radius, which
+    is one for all masks or broadcasts with them."""
     grown = masks
     for dim in (-2, -1):
         size = masks.shape[dim]
@@ -104,19 +99,17 @@ def dilate(masks: Bool[Tensor, "*batch h w"], radius: int | Tensor) -> Bool[Tens
 
 
 def votes_outside(dilated: Bool[Tensor, "B V h w"], voting: Bool[Tensor, "B V"]) -> UInt8[Tensor, "B V h w"]:
-    """1 where a view that votes says "outside the subject"."""
+    """1 where a voting view says "outside the subject"."""
     return (~dilated & voting[..., None, None]).to(torch.uint8)
 
 
 def look_up(
     tables: Shaped[Tensor, "n h w"], image: Int[Tensor, "..."], x: Tensor, y: Tensor, w: Tensor
 ) -> Tensor:
-    """Entries of ``tables`` at homogeneous pixels; overwrites ``x``, ``y`` and ``w``.
-
-    Points outside the frame take the entry of the nearest border pixel: a mask that does not touch the border
-    has the whole subject in its frame. Points behind the camera land far outside the frame. ``image``: which
-    table; broadcasts with the pixels. ``x``, ``y``, ``w``: homogeneous pixels.
-    """
+    """Entries of ``tables`` at homogeneous pixels (``x``, ``y``, ``w``), which are overwritten. Points
+    outside the frame take the entry of the nearest border pixel: a mask that does not touch the border has
+    the whole subject in its frame. Points behind the camera land far outside the frame. ``image``: which
+    table; broadcasts with the pixels."""
     height, width = tables.shape[1:]
     inverse = w.clamp_(min=NEAREST).reciprocal_()
     # Cameras of absurd sizes overflow to NaN, which has no index.

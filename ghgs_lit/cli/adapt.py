@@ -27,12 +27,12 @@ from ghgs_lit.weights.reading import file_of
 if TYPE_CHECKING:
     from ghgs_lit.data.datamodule import PhotographsDataModule
 
-# How much more and less of a photograph than the user's subject takes people of training take.
+# Training people are as tall in a photograph as the user's subject, give or take this share.
 _SPREAD = 0.1
 
 
 def run(cfg: DictConfig) -> float | str | None:
-    """The verb; returns the mean PSNR of validation people in the rig. Interrupted: on Ctrl-C and SIGTERM."""
+    """Run the verb; return the mean PSNR of validation people in the rig. Interrupted: Ctrl-C or SIGTERM."""
     config = resolve(cfg) | model_of(cfg.checkpoint, cfg)
     if config["out"] is not None and not config["overwrite"]:
         taken = Path(config["out"]).expanduser().exists()
@@ -41,9 +41,8 @@ def run(cfg: DictConfig) -> float | str | None:
 
 
 def with_rig(config: dict[str, Any]) -> dict[str, Any]:
-    """``config`` whose people stand in the rig of ``cameras``, or of the data set that ``data`` names, and
-    are seen by all of it, where ``views.training_counts`` is not said. InputError: the calibration, a
-    photograph or the data set is missing or wrong."""
+    """Place the people of ``config`` in the rig of ``cameras`` or of the data set ``data``. All its cameras
+    are inputs unless ``views.training_counts`` is given. InputError: a file or the data is bad or missing."""
     people = config["data"]
     if people["kind"] != "people_in_rig":
         people = resolve(compose("adapt"))["data"]
@@ -68,7 +67,7 @@ def with_rig(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def _cameras_of_data(config: dict[str, Any]) -> tuple[dict[str, dict[str, Any]], list[float]]:
-    """The input cameras of the first subject that the data set is measured on, and how tall it is in them."""
+    """Input cameras of the first validation subject, and the ``fill`` that its masks suggest."""
     for name in ("images", "cameras"):
         require(config[name] is None, name, "null beside data=<data set>, which has cameras", config[name])
     data = build_data(config)
@@ -83,7 +82,6 @@ def _cameras_of_data(config: dict[str, Any]) -> tuple[dict[str, dict[str, Any]],
 
 
 def _cameras_of_file(config: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """All cameras of the calibration, which must say the size of its photographs."""
     require(config["cameras"] is not None, "cameras", "cameras=<calibration>", None)
     file = read_cameras(config["cameras"], config["calibration"]["format"])
     convention, entries = file.convention.told(config["calibration"]), {}
@@ -95,13 +93,13 @@ def _cameras_of_file(config: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def _fill_of(masks: Sequence[np.ndarray]) -> list[float]:
-    """[least, greatest] share of their photograph's height that people take, about that of the subject."""
+    """[least, greatest] share of the photograph's height that training people take."""
     tallest = max(np.ptp(np.nonzero(mask.any(1))[0]) / len(mask) for mask in masks)
     return [float(np.clip(tallest * (1 + side * _SPREAD), 0.05, 0.99)) for side in (-1, 1)]
 
 
 def adapt(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float | None:
-    """Render people, train, and write the weights; arguments as for :func:`ghgs_lit.cli.train.train`."""
+    """Render people, train and write the weights; arguments as for :func:`ghgs_lit.cli.train.train`."""
     begin = time.perf_counter()
     data = build_data(config)
     data.prepare_data()
@@ -113,7 +111,7 @@ def adapt(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
         "init_from": str(file_of(config["checkpoint"])),
         "init_strict": True,
         "allow_random_encoder": False,
-        # Nothing has to be found first, as from random weights.
+        # Stages are frozen at first only where training starts from random weights.
         "optimizer": {**config["optimizer"], "freeze_until": {}},
     }
     after = train(training, directory, stats)

@@ -1,4 +1,4 @@
-"""Each verb as a Hydra application over ``conf/<verb>.yaml``."""
+"""Run each verb as a Hydra application of ``conf/<verb>.yaml``."""
 
 import importlib
 import keyword
@@ -35,12 +35,12 @@ register_resolvers()  # on import, so that the processes of a launcher have them
 
 
 def module_of(verb: str) -> str:
-    """The module of a verb; a keyword of Python gets an underscore."""
+    """Name of a verb's module; a Python keyword (``import``) gets an underscore."""
     return f"ghgs_lit.cli.{verb}" + "_" * keyword.iskeyword(verb)
 
 
 def discard_unused(directory: Path, verb: str, since: float) -> None:
-    """Remove a run's directory that holds only how the run began, all of it written after ``since``."""
+    """Remove a run's directory that holds nothing but start-up files written after ``since``."""
     begun = {".hydra", ".lock", "config.yaml", "sessions.jsonl", f"{verb}.log"}
     paths = [] if directory == Path.cwd() else list(directory.glob("*"))
     if paths and all(path.name in begun and path.stat().st_mtime >= since for path in paths):
@@ -49,7 +49,7 @@ def discard_unused(directory: Path, verb: str, since: float) -> None:
 
 @dataclass(frozen=True)
 class Verb:
-    """The function of one verb that Hydra calls, here or in the processes of a launcher."""
+    """Task function of a verb, which Hydra calls here or in a launcher's processes."""
 
     name: str
     argv: tuple[str, ...]
@@ -57,7 +57,7 @@ class Verb:
     started: float = field(default_factory=time.time)
 
     def __call__(self, cfg: DictConfig) -> object:
-        # Lightning starts the other processes of a DDP job by running sys.argv again, which needs the verb.
+        # Lightning runs sys.argv again for the other processes of a DDP job; it must contain the verb.
         sys.argv = list(self.argv)
         from ghgs_lit.cli.photographs import require_paths  # here: --help needs no NumPy
 
@@ -70,7 +70,7 @@ class Verb:
             children_sleep()
             return module.run(cfg)
         except messages.BAD_INPUT as error:
-            # In a sweep Hydra prints the error with the number of its job; elsewhere one line is enough.
+            # In a sweep Hydra prints the error with its job's number.
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise
             discard_unused(Path(HydraConfig.get().runtime.output_dir), self.name, self.started)
@@ -81,7 +81,7 @@ class Verb:
 
 
 def read_yaml_quickly() -> None:
-    """Let OmegaConf 2.3 parse by LibYAML, where PyYAML has it: half the time of a composition."""
+    """Let OmegaConf 2.3 parse with LibYAML if PyYAML has it, which halves the time of a composition."""
     if not hasattr(omegaconf._utils, "get_yaml_loader"):
         return
     before, yaml.SafeLoader = yaml.SafeLoader, getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -92,8 +92,8 @@ def read_yaml_quickly() -> None:
 
 @contextmanager
 def composed_once(arguments: Sequence[str]) -> Iterator[None]:
-    """Spare Hydra the first of two compositions while the context lasts: it looks for ``hydra.mode`` alone.
-    Of ``conf`` sweeps alone set it. Arguments may, and so may files of the user's own, which flags name."""
+    """Skip the first of Hydra's two compositions, which only reads ``hydra.mode``. It stays where a sweep, an
+    argument or a file of the user's own (named by a flag or the search path) may set the mode."""
     says = any(key in text for text in arguments for key in ("sweep", "hydra.mode", "hydra.searchpath"))
     if says or any(text.startswith("-") and text not in ("-m", "--multirun") for text in arguments):
         yield
@@ -106,8 +106,8 @@ def composed_once(arguments: Sequence[str]) -> Iterator[None]:
 
 
 def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
-    """Arguments in Hydra's terms: where the data is that of a checkpoint, its keys are forced. A file of
-    ``sweep`` asks for a sweep, which Hydra 1.4 wants to know before it composes."""
+    """Rewrite arguments for Hydra: ``data.*`` keys are forced where the data comes from a checkpoint, and
+    ``sweep=<file>`` sets the mode, which Hydra 1.4 needs before it composes."""
     sweeps = any(re.match("sweep=(?!null)", argument) for argument in arguments)
     if sweeps and not any(argument.startswith("hydra.mode=") for argument in arguments):
         return [*arguments, "hydra.mode=MULTIRUN"]
@@ -118,7 +118,6 @@ def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
 
 
 def _help(verb: str, arguments: list[str]) -> int:
-    """``ghgs <verb> --help [group]``; of other arguments only ``--config-dir`` has a say."""
     from ghgs_lit.cli.help import print_group, print_verb
 
     words = messages.flags_first(arguments)
@@ -147,7 +146,7 @@ def run(verb: str, argv: list[str]) -> int:
             hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=verb)(task)()
         sys.stdout.flush()
     except BrokenPipeError:
-        # The reader, such as `head`, has seen enough; Python must not write the rest when it exits.
+        # The reader, such as `head`, has closed the pipe; Python must not flush the rest at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
     except messages.BadUsage as error:

@@ -1,4 +1,4 @@
-"""``ghgs benchmark``: run time against error of every preset."""
+"""``ghgs benchmark``: measure run time and error of every preset."""
 
 import itertools
 import math
@@ -27,7 +27,7 @@ from ghgs_lit.weights.checkpoint import read_checkpoint
 
 
 def run(cfg: DictConfig) -> None:
-    """The verb; prints the path of the results last. Exit code 1 where a preset breaks its budget."""
+    """Run the verb. Exit code 1 if a preset exceeds its error budget."""
     directory = output_dir()
     config = save_config(with_trained_data(cfg), directory)
     check_options(config, overrides())
@@ -48,22 +48,21 @@ def run(cfg: DictConfig) -> None:
 
 
 def check_options(config: Mapping[str, Any], given: Sequence[str]) -> None:
-    """Refuse an option, or one of the overrides that were ``given``, that has no effect beside others."""
+    """Refuse ``given`` overrides of the model beside a checkpoint, which brings its own model."""
     if config["checkpoint"] is None:
         return
-    # A checkpoint brings its own model: what is asked for beside it must not be ignored in silence.
     for key in (text.split("=", 1)[0].lstrip("+~") for text in given):
         if is_below(key, [name for name in (*KNOBS, "ablation", "compat") if name not in _APPLIED]):
             raise InputError(f"{key}: expected no option of the model beside a checkpoint (knobs={{...}})")
 
 
-#: Nodes of :data:`KNOBS` that the command line sets for checkpoints, too.
+#: Nodes of :data:`KNOBS` that may be set beside a checkpoint.
 _APPLIED = ("skip", "renderer", "precision")
 
 
 def configured_cases(config: Mapping[str, Any], device: torch.device) -> list[Case]:
-    """The model in every preset, the yardstick always among them. FileNotFoundError, InputError: as for
-    :func:`read_checkpoint` and :func:`cases_of`."""
+    """The model in every preset, always including the yardstick. Raises what :func:`read_checkpoint` and
+    :func:`cases_of` raise."""
     names = dict.fromkeys([YARDSTICK, *config["presets"]])
     presets = presets_of(list(names), config["skip"])
     path = config["checkpoint"]

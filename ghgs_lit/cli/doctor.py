@@ -1,4 +1,4 @@
-"""``ghgs doctor``: what is wrong, and what would mend it; one function for each task."""
+"""``ghgs doctor``: diagnose cameras, this machine or a device; one function for each task."""
 
 import rich
 from omegaconf import DictConfig
@@ -20,17 +20,17 @@ from ghgs_lit.prediction.capture.drawing import camera_sheet
 from ghgs_lit.prediction.capture.formats.json_and_toml import write_json
 from ghgs_lit.visualization.pictures import save_png
 
-_LISTED = 6  #: How many meanings of a calibration are listed
+_LISTED = 6  #: Number of interpretations of a calibration that are listed
 
 
 def run(cfg: DictConfig) -> None:
-    """The verb: one of the tasks below."""
+    """Run the task of the verb."""
     {"cameras": cameras, "machine": machine, "selfcheck": selfcheck_device}[cfg.task](cfg)
 
 
 def cameras(cfg: DictConfig) -> None:
-    """Whether photographs, masks and calibration fit together: print what was found; write ``cameras.png``,
-    and ``cameras.json`` of a meaning that fits. InputError: the cameras do not fit as they are."""
+    """Check whether photographs, masks and calibration fit together. Writes ``cameras.png``, and
+    ``cameras.json`` where another interpretation of the calibration fits. InputError: the cameras do not."""
     tasks = "images=<folder of photographs> cameras=<calibration>, task=machine or task=selfcheck"
     require(cfg.images is not None, "images", tasks, None)
     directory = output_dir()
@@ -53,7 +53,7 @@ def cameras(cfg: DictConfig) -> None:
         images = [folder.photograph(v.name, v.camera, v.pixels, v.mask, v.convention).image for v in views]
         save_png(camera_sheet([v.name for v in views], images, best.silhouettes(folder)), picture)
         announce(picture)
-    if diagnosis.option:  # a calibration that needs no option any more
+    if diagnosis.option:
         found = {v.name: (calibrate(v.camera, v.convention, v.camera.size), v.camera.size) for v in views}
         write_json(calibration, found)
         announce(calibration)
@@ -63,7 +63,7 @@ def cameras(cfg: DictConfig) -> None:
 
 
 def machine(cfg: DictConfig) -> None:
-    """Print what there is and what is missing; nothing is written."""
+    """Print what this machine has and which features lack a package or device."""
     console = Console(soft_wrap=True)
     for title, lines in (
         ("This machine", machine_lines(pick_device(resolve(cfg)["device"]))),
@@ -76,8 +76,8 @@ def machine(cfg: DictConfig) -> None:
 
 
 def selfcheck_device(cfg: DictConfig) -> None:
-    """Whether a device computes as the CPU does: print each outcome as soon as it is known; write all, and
-    the machine, to ``selfcheck.md``. InputError: a check failed; the exit status says so."""
+    """Check whether a device computes as the CPU does: print each outcome, and write all of them with facts
+    of the machine to ``selfcheck.md``. InputError: a check failed."""
     config = resolve(cfg)
     device = pick_device(config["device"])
     outcomes = []

@@ -22,7 +22,7 @@ from ghgs_lit.weights.checkpoint import read_checkpoint
 
 
 def trained_method(config: Mapping[str, Any], device: torch.device) -> tuple[ModelMethod, dict[str, Any]]:
-    """The model of ``config["checkpoint"]`` on a device, refined as the verb says, and facts about it."""
+    """The model of ``config["checkpoint"]`` with the configured refinement, and facts about it."""
     renderer, model = inputs.build_renderer(config, device), inputs.load_model(config, device)
     checkpoint = read_checkpoint(config["checkpoint"])
     facts: dict[str, Any] = {
@@ -41,7 +41,7 @@ def trained_method(config: Mapping[str, Any], device: torch.device) -> tuple[Mod
 def baselines_of(
     names: str | Sequence[str], config: Mapping[str, Any], device: torch.device
 ) -> dict[str, Method]:
-    """The baselines called ``names``, or ``all``; other arguments as for :func:`trained_method`."""
+    """Baselines by name; ``names`` may be one name or ``all``."""
     names = BASELINES if names == "all" else [names] if isinstance(names, str) else names
     renderer, untrained = inputs.build_renderer(config, device), lambda: GHGS.from_config(config).to(device)
     return {name: baseline(name, renderer, untrained, config["per_scene"]) for name in names}
@@ -64,7 +64,7 @@ def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], di
 
 
 def run(cfg: DictConfig) -> None:
-    """The verb; prints the path of the results last."""
+    """Run the verb."""
     directory = output_dir()
     config = inputs.with_chosen_targets(resolve(inputs.with_trained_data(cfg)))
     if config["checkpoint"] is not None:

@@ -1,4 +1,4 @@
-"""``ghgs export``: a checkpoint to the published names, or to a small one for prediction."""
+"""``ghgs export``: write a checkpoint under the published names, or a small one for prediction."""
 
 import torch
 from omegaconf import DictConfig
@@ -14,12 +14,12 @@ from ghgs_lit.weights.exporting import export_weights, write_inference
 from ghgs_lit.weights.reading import file_of
 from ghgs_lit.weights.switches import differences
 
-_PATCHES = 8  # along each side of the photographs that two models are compared on
+_PATCHES = 8  # along each side of the photographs on which two models are compared
 
 
 @torch.no_grad()
 def parity(checkpoint: str, exported: str) -> dict[str, float]:
-    """How far the prediction of one checkpoint is from another's, on photographs of noise on an ellipsoid."""
+    """Differences between the predictions of two checkpoints for photographs of a noisy ellipsoid."""
     results, batch = [], None
     for path in (exported, checkpoint):  # one model in memory at a time
         model = GHGS.from_checkpoint(path).eval()
@@ -32,7 +32,7 @@ def parity(checkpoint: str, exported: str) -> dict[str, float]:
 
 
 def run(cfg: DictConfig) -> None:
-    """The verb; prints the path of the written weights last."""
+    """Run the verb."""
     config = save_config(cfg, output_dir())
     checkpoint, vggt, release, inference = map(config.get, ("checkpoint", "vggt", "release", "inference"))
     paths = [path for path in (vggt, release, inference) if path is not None]

@@ -1,4 +1,4 @@
-"""``ghgs <verb> --help [group]``: keys with their meaning, default and range, from the options themselves."""
+"""``ghgs <verb> --help [group]``: keys with meaning, default and range, read from the options classes."""
 
 import textwrap
 from collections.abc import Iterator, Sequence
@@ -17,12 +17,12 @@ from ghgs_lit.errors import InputError
 
 _WIDTH = 100
 
-#: Groups whose options a model chooses.
+#: Groups whose options ``model=<option>`` chooses.
 _OF_MODELS = ("bounds", "depth_head", "unprojection", "recalibration", "gaussian_head")
 
 
 def defaults_of(verb: str) -> dict[str, str | None]:
-    """The config groups that a verb composes, and the option of each, None where there is none."""
+    """Default option of each config group that a verb composes; None where there is none."""
     shipped = OmegaConf.to_container(OmegaConf.load(conf_dir() / f"{verb}.yaml"))
     chosen: dict[str, str | None] = {}
     for entry in shipped["defaults"]:
@@ -38,7 +38,7 @@ def _files(group: str, folders: Sequence[Path]) -> list[Path]:
 
 
 def print_verb(verb: str, summary: str, example: str, folders: Sequence[Path] = ()) -> None:
-    """What a verb does, its groups, and its keys; ``folders`` are those of ``--config-dir``."""
+    """Print what a verb does, its groups and its keys; ``folders`` are those of ``--config-dir``."""
     print(f"ghgs {verb} [key=value ...] [group=option ...] [-m for a sweep over comma-separated values]\n")
     print(f"{summary[0].upper()}{summary[1:]}: {example}\n")
     print("== Groups (group=option; * is the default) ==")
@@ -53,7 +53,7 @@ def print_verb(verb: str, summary: str, example: str, folders: Sequence[Path] = 
 
 
 def print_group(verb: str, group: str, folders: Sequence[Path] = ()) -> None:
-    """The keys of a group: meaning, default and range of each. InputError: the verb has no such group."""
+    """Print the keys of a group with their meaning. InputError: the verb has no such group."""
     known = [*defaults_of(verb), *(name for name in compose(verb) if name in KINDS)]
     known = list(dict.fromkeys([*known, *(["rounds"] if "model" in known else [])]))
     if group not in known:
@@ -71,13 +71,11 @@ def print_group(verb: str, group: str, folders: Sequence[Path] = ()) -> None:
 
 
 def _purpose(path: Path) -> str:
-    """The comment at the top of a file of ``conf``."""
     lines = takewhile(lambda line: line.startswith("#"), path.read_text().splitlines())
     return " ".join(line.removeprefix("# ") for line in lines if "@package" not in line)
 
 
 def _fields(cls: type[BaseModel], indent: str = "") -> Iterator[str]:
-    """The fields of options and of those below them, as lines."""
     texts = meanings(cls)
     for name, field in cls.model_fields.items():
         nested = options_of(field.annotation)

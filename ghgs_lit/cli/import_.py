@@ -1,4 +1,4 @@
-"""``ghgs import``: published weights to a checkpoint of this package."""
+"""``ghgs import``: convert published weights to a checkpoint of this package."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -16,16 +16,16 @@ from ghgs_lit.weights.switches import differences
 
 
 def initial_state(config: Mapping[str, Any], release: str | None) -> dict[str, Tensor]:
-    """The tensors of a new model; stages that published weights fill are on the meta device: the encoder, and
-    the others where there is the authors' ``release``."""
+    """Tensors of a new model. Stages that published weights will fill are on the meta device: the encoder,
+    and with the authors' ``release`` all others."""
     filled = STAGES if release is not None else ("encoder",)
     return GHGS.from_config(config, empty=filled).state_dict()
 
 
 def run(cfg: DictConfig) -> None:
-    """The verb; prints the path of the checkpoint last."""
+    """Run the verb."""
     config = save_config(cfg, output_dir())
-    # New heads in the release's parameterization predict points behind the camera half of the time.
+    # New heads in the release's parameterization place half of the points behind the camera.
     safe = config["release"] is not None or config["compat"]["name"] != "release"
     require(safe, "compat", "none where there is no release=<file>", config["compat"]["name"])
     L.seed_everything(config["seed"], workers=True, verbose=False)

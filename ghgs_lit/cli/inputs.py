@@ -1,4 +1,4 @@
-"""What the verbs that measure begin with: the data, the model of a checkpoint, and the device."""
+"""Data, renderer, model of a checkpoint and device, as a verb's configuration asks for them."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -23,17 +23,17 @@ from ghgs_lit.weights.reading import SHIPPED
 if TYPE_CHECKING:  # it would import Lightning, which takes seconds
     from ghgs_lit.data.datamodule import PhotographsDataModule
 
-#: Nodes of the configuration that describe the model; a checkpoint stores these.
+#: Nodes of the configuration that describe the model.
 MODEL_NODES = (*STAGES, *OPTIONS, "compat")
 
-#: What may be changed in a model whose weights are trained: no tensor has another shape or meaning for it.
+#: Keys that may change in a trained model: they change neither shape nor meaning of any tensor.
 FREE = ("bounds", "model.pad", "rounds.count", "skip", "unprojection", "recalibration.k")
 FREE += ("recalibration.neighborhood", "recalibration.similarity", "recalibration.tokens")
 
 
 def build_data(config: Mapping[str, Any]) -> "PhotographsDataModule":
     """The configured data with its view and target protocols."""
-    # Cameras are targets that every data set could have; a verb without targets reads none.
+    # Every data set has cameras that can be targets; a verb without a target protocol reads none.
     targets = config.get("targets") or CAMERAS
     extra = {"views": config["views"], "targets": targets, "seed": config["seed"]}
     if "augmentation" in config:  # of verbs that train
@@ -50,7 +50,7 @@ def build_renderer(config: Mapping[str, Any], device: torch.device) -> Renderer:
 
 
 def load_model(config: Mapping[str, Any], device: torch.device) -> GHGS:
-    """The model of ``config["checkpoint"]`` on a device, in evaluation mode and the configured precision."""
+    """The model of ``config["checkpoint"]`` in evaluation mode and the configured precision."""
     model = GHGS.from_config(config, empty=STAGES)
     load_weights(model, config["checkpoint"], device=device)
     model.precision = config["precision"]
@@ -58,17 +58,16 @@ def load_model(config: Mapping[str, Any], device: torch.device) -> GHGS:
 
 
 def check_size(data: "PhotographsDataModule", model: GHGS) -> None:
-    """Refuse photographs that ``model`` cannot take, before any of them is made or read. InputError: their
-    sides are not divisible by the model's patch."""
+    """Check the size of photographs before any is read. InputError: a side is no multiple of the patch."""
     size, multiple = data.dataset.size, side_multiple(model.options, model.encoder.patch_size)
     expected = f"sides divisible by the patch size {multiple} (or model.pad=multiple)"
     require(not any(side % multiple for side in size), "data.size", expected, list(size))
 
 
 def with_trained_data(cfg: DictConfig) -> DictConfig:
-    """``cfg`` with the data that its checkpoint was trained on, where no ``data=<option>`` was chosen. Keys
-    that were said, such as ``data.root=...``, act on it; where this machine writes (``data.cache_dir``) is
-    the default. InputError: there is no checkpoint, or it was not trained."""
+    """Fill in the data that the checkpoint was trained on, unless ``data=<option>`` was chosen. Given keys
+    such as ``data.root=...`` change it; ``data.cache_dir`` is reset to this machine's default. InputError:
+    there is no checkpoint, or it stores no training data."""
     if "kind" in (cfg.get("data") or {}):
         return cfg
     if cfg.checkpoint is None:
@@ -85,9 +84,8 @@ def with_trained_data(cfg: DictConfig) -> DictConfig:
 
 
 def model_of(checkpoint: str, cfg: DictConfig) -> dict[str, Any]:
-    """The nodes that describe the model of a checkpoint, with what the command line changes in it. Only what
-    was said counts: the options that a verb composes by default describe another model. InputError: the
-    command line changes what the weights were trained for; names the key."""
+    """Model nodes of a checkpoint, with the changes of the command line. The options that a verb composes by
+    default do not count: they describe another model. InputError: a change that the weights do not allow."""
     trained = read_checkpoint(checkpoint)["config"]
     for stage in STAGES:
         place, found = f"{checkpoint}: config.{stage}", trained.get(stage)
@@ -108,7 +106,6 @@ def model_of(checkpoint: str, cfg: DictConfig) -> dict[str, Any]:
 
 
 def _require_same(trained: Mapping[str, Any], key: str, value: Any) -> None:
-    """Refuse another value than the one that the weights were trained with; names the first that differs."""
     plain = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
     for name, wanted in flatten(plain, key).items():
         own = lookup(trained, name)
@@ -117,15 +114,14 @@ def _require_same(trained: Mapping[str, Any], key: str, value: Any) -> None:
 
 
 def _require_ablation(trained: Mapping[str, Any]) -> None:
-    """Refuse another row of the ablation: it is said by its switches where the weights are trained."""
+    """Refuse another ``ablation`` than the trained one; its switches can be set one by one instead."""
     own, wanted = ablation_of(trained), HydraConfig.get().runtime.choices["ablation"]
     switches = "recalibration.neighborhood=... and .similarity=... act"
     require(wanted == own, "ablation", f"{own}, as the checkpoint was trained ({switches})", wanted)
 
 
 def with_chosen_targets(config: dict[str, Any]) -> dict[str, Any]:
-    """``config`` that measures the protocol of ``targets=<option>`` alone, where that was said.
-    ``evaluation.targets`` says so for several protocols, and wins."""
+    """Measure only the protocol of ``targets=<option>``, if given without ``evaluation.targets``."""
     keys = said()
     if "targets" not in keys or is_below("evaluation.targets", keys):
         return config
@@ -133,22 +129,22 @@ def with_chosen_targets(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def pick_device(name: str) -> torch.device:
-    """The device ``cpu`` or ``cuda`` (InputError: there is none); ``auto`` is CUDA, else the CPU."""
+    """The device called ``name``; ``auto`` is CUDA, else the CPU. InputError: there is no CUDA device."""
     there = torch.cuda.is_available()
     require(there or name != "cuda", "device", "auto or cpu on a machine without CUDA", name)
     return torch.device("cuda" if name != "cpu" and there else "cpu")
 
 
 def choices() -> dict[str, str]:
-    """The option of each config group in this run; empty outside of Hydra."""
+    """Chosen option of each config group in this run; empty outside of Hydra."""
     return dict(HydraConfig.get().runtime.choices) if HydraConfig.initialized() else {}
 
 
 def overrides() -> list[str]:
-    """What the command line or the sweep changed in this run; empty outside of Hydra."""
+    """Overrides of the command line or the sweep in this run; empty outside of Hydra."""
     return list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
 
 
 def said() -> list[str]:
-    """The keys and groups of :func:`overrides`, in their order."""
+    """Keys and groups of :func:`overrides`, in order."""
     return [part.key_or_group for part in OverridesParser.create().parse_overrides(overrides())]

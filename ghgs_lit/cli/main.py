@@ -1,7 +1,4 @@
-"""``ghgs <verb> [overrides]``: how a command begins and ends.
-
-:mod:`ghgs_lit.cli.application` runs a verb; it is imported where there is one.
-"""
+"""Entry point of ``ghgs <verb> [overrides]``; :mod:`ghgs_lit.cli.application` runs the verb."""
 
 import gc
 import os
@@ -13,9 +10,8 @@ from ghgs_lit.kernels.cores import spin_if_alone
 
 
 def _completion_argv(argv: list[str]) -> list[str] | None:
-    """Arguments of a shell-completion call (``ghgs -sc ...``) for the verb on the shell's line. Hydra
-    completes that line without the verb. While the verb itself is being typed, the verbs are printed and None
-    is returned."""
+    """Arguments with which Hydra completes the shell's line (``ghgs -sc ...``) without the verb. While the
+    verb itself is being typed, print the verbs and return None."""
     if "query" not in argv[2]:
         return [argv[0], "train", *argv[1:]]
     line = os.environ.get("COMP_LINE", "")
@@ -55,9 +51,9 @@ def _run(argv: list[str]) -> int:
 
 
 def main() -> int:
-    """The console script. Exit code 0, 1 for bad input, 2 for bad usage, 130 and 143 when interrupted."""
+    """The console script. Exit code 0; 1: bad input; 2: bad usage; 130, 143: interrupted."""
     argv = list(sys.argv)
-    # Schedulers and daemons may close both.
+    # Schedulers and daemons may have closed them.
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
@@ -66,7 +62,7 @@ def main() -> int:
         spin_if_alone(argv)
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     keep_freed_memory()
-    # Modules are no garbage: looking for some among them takes a third of the start.
+    # Collecting garbage among imported modules takes a third of the start-up time.
     gc.disable()
     try:
         return _command(argv)

@@ -1,4 +1,4 @@
-"""Errors as one line: ``<path or key>: expected ...; found ...``."""
+"""One-line error messages: ``<path or key>: expected ...; found ...``."""
 
 import os
 import re
@@ -20,7 +20,7 @@ from ghgs_lit.config.options import did_you_mean
 from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError
 
-#: Errors that are bad input, not bugs: files that cannot be read or written are, too.
+#: Errors that are bad input, not bugs.
 BAD_INPUT = (InputError, OSError, HydraException, OmegaConfBaseException)
 
 _EXTRAS = {"joblib": "cluster", "submitit": "cluster", "ray": "ray", "optuna": "optuna"}
@@ -33,12 +33,12 @@ _FLAGS = {
     **dict.fromkeys(("-cn", "--config-name", "-cd", "--config-dir", "--experimental-rerun"), True),
 }
 
-#: Nodes of Lightning's classes, whose keys have values of their own where none is given.
+#: Nodes of Lightning's classes, whose keys have defaults and so may be deleted.
 _LIGHTNING = ("trainer", "callbacks", "logger")
 
 
 def one_line(error: Exception, verb: str) -> str:
-    """The message of one of ``BAD_INPUT`` or of an error inside Hydra, on one line."""
+    """Message of one of ``BAD_INPUT`` or of an error inside Hydra, on one line."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         text = _missing_option(error)
     elif isinstance(error, OverrideParseException):
@@ -53,13 +53,12 @@ def one_line(error: Exception, verb: str) -> str:
         text = _yaml(error)
     elif isinstance(error, InputError):
         text = str(error)
-    else:  # of Hydra, which does not say which override it refuses
+    else:  # an error of Hydra that does not name the override
         text = f"{' '.join(sys.argv[1:])}: expected overrides that Hydra can apply; found {error}"
     return " ".join(text.split())
 
 
 def _unread_override(error: OverrideParseException) -> str:
-    """An override that Hydra cannot read; a plain value such as a path needs quotes."""
     key, _, value = str(error.override).partition("=")
     if not value or value[0] in "[{\"'":
         return f"{error.override}: expected key=value or group=option; found {error}"
@@ -70,14 +69,13 @@ def _unread_override(error: OverrideParseException) -> str:
 
 
 def _yaml(error: YAMLError) -> str:
-    """A file of ``--config-dir`` that is no YAML of plain data, with its line."""
     mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
     place = f"{mark.name}, line {mark.line + 1}" if mark else "--config-dir"
     return f"{place}: expected YAML of plain data; found {problem or error}"
 
 
 def _missing_option(error: MissingConfigException) -> str:
-    """A group without the chosen option, or no such group; Hydra lists its whole search path."""
+    """Message for an unknown group or option; Hydra's own lists the whole search path."""
     group, _, option = error.missing_cfg_file.rpartition("/")
     if not group:
         return f"--config-name: expected a configuration of the search path; found {option!r}"
@@ -89,12 +87,12 @@ def _missing_option(error: MissingConfigException) -> str:
 
 
 def _composition(error: HydraException, verb: str) -> str:
-    """A key that does not exist, with the closest one; other errors of Hydra with their cause."""
+    """Message for a key that does not exist, with the closest one, or for another error of Hydra."""
     named = re.match(r"Could not override '([^']+)'", str(error))
     if named is None:
         return f"{' '.join(sys.argv[1:])}: expected overrides that fit; found {error} {error.__cause__ or ''}"
     key, keys = named[1], list(flatten(OmegaConf.to_container(compose(verb), resolve=False)))
-    # A key without its group counts as close, too: lr for optimizer.lr.
+    # A key without its group is close, too: lr for optimizer.lr.
     whole = {known.rpartition(".")[2]: known for known in keys}.get(key)
     groups = [str(path.relative_to(conf_dir())) for path in conf_dir().rglob("*") if path.is_dir()]
     hint = f" (did you mean {whole}?)" if whole else did_you_mean(key, (*keys, *groups))
@@ -104,7 +102,7 @@ def _composition(error: HydraException, verb: str) -> str:
 
 
 def _system(error: OSError) -> str:
-    """A file that cannot be read or written. Where the system names none it is the run's directory."""
+    """Message for a file that cannot be read or written; the run's directory if the error names none."""
     if error.errno is None:  # raised by this package, with a message of its own
         return str(error)
     path = error.filename2 or error.filename
@@ -115,7 +113,7 @@ def _system(error: OSError) -> str:
 
 
 def raised_by_hydra(error: Exception) -> bool:
-    """Whether an error of any type is about the command line: raised in Hydra's own code, or of its YAML."""
+    """Whether an error concerns the command line: raised in Hydra's code, or by its YAML."""
     if isinstance(error, YAMLError):
         return True
     *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
@@ -127,13 +125,12 @@ class BadUsage(Exception):
 
 
 def takes_value(flag: str) -> bool:
-    """Whether a value follows one of Hydra's flags."""
+    """Whether one of Hydra's flags takes a value."""
     return _FLAGS.get(flag, False)
 
 
 def flags_first(arguments: Sequence[str]) -> list[str]:
-    """``arguments`` with Hydra's flags before all overrides, between which Hydra allows none. BadUsage: a
-    flag does not exist."""
+    """Put Hydra's flags before all overrides. BadUsage: a flag is unknown or lacks its value."""
     flags, overrides = [], []
     rest: Iterator[str] = iter(arguments)
     for argument in rest:
@@ -155,7 +152,7 @@ def flags_first(arguments: Sequence[str]) -> list[str]:
 
 
 def check_deletions(arguments: Sequence[str]) -> None:
-    """Refuse to delete keys and groups (``~data.size``), which the package reads. InputError: names it."""
+    """Refuse to delete a key or group that the package reads (``~data.size``)."""
     for key in (text[1:].split("=", 1)[0] for text in arguments if text.startswith("~")):
         if key in _LIGHTNING or not is_below(key, _LIGHTNING):
             raise InputError(f"{key}: expected a value (or null where it may be empty); found ~{key}")

@@ -1,4 +1,4 @@
-"""What ``predict images=...`` and ``doctor task=cameras`` share: the folder of a configuration."""
+"""Folder of photographs that a configuration names, and checks of paths and cameras before a verb runs."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,37 +9,35 @@ from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.readers import require_data_folder
 from ghgs_lit.weights.reading import require_weights
 
-_BEGUN: list[CaptureFolder] = []  #: The folder that is being read, if any
+_BEGUN: list[CaptureFolder] = []  #: The folder whose photographs are being decoded, if any
 
 _SOURCES = ("images", "cameras", "masks", "backgrounds", "segment", "calibration", "sequence")
-_CHECKED = 5  #: How many instants of a sequence the check of cameras looks at
+_CHECKED = 5  #: Number of instants of a sequence whose cameras are checked
 
 
 def sources_of(config: Mapping[str, Any]) -> dict[str, Any]:
-    """``images``, ``cameras`` and the keys beside them. InputError: one of both is missing."""
+    """``images``, ``cameras`` and the keys beside them. InputError: one of the two is missing."""
     for name, example in (("images", "images=<folder of photographs>"), ("cameras", "cameras=<calibration>")):
         require(config[name] is not None, name, example, None)
     return {name: config[name] for name in _SOURCES if name in config}
 
 
 def capture_folder(config: Mapping[str, Any]) -> CaptureFolder:
-    """The folder that ``images``, ``cameras`` and the keys beside them describe. InputError: one of both is
-    missing, or a file is missing or wrong."""
+    """The folder that :func:`sources_of` describes. InputError: a key or file is missing or wrong."""
     folder = CaptureFolder(**sources_of(config))
     return _BEGUN.pop() if [folder] == _BEGUN else folder
 
 
 def begin_to_read(config: Mapping[str, Any]) -> None:
-    """Decode the photographs of the first instant, which the next :func:`capture_folder` then has.
-    InputError: as :func:`capture_folder`."""
+    """Start decoding the first instant for the next :func:`capture_folder`; raises what that raises."""
     _BEGUN[:] = [capture_folder(config)]
     if config["segment"] is None:
         _BEGUN[0].begin(_BEGUN[0].instants[0])
 
 
 def check_cameras(folder: CaptureFolder) -> None:
-    """Print how cameras and masks agree, in a few instants of a sequence, and which contradict. InputError:
-    all contradict, or the only instant cannot be read."""
+    """Print how well cameras and masks agree in a few instants. InputError: they contradict each other in all
+    of these, or the only instant cannot be read."""
     from ghgs_lit.prediction.capture.camera_report import diagnose, in_parts
 
     names, found = folder.instants, {}
@@ -66,7 +64,7 @@ def check_cameras(folder: CaptureFolder) -> None:
         print("\n".join(diagnosis.lines), flush=True)
 
 
-#: Keys of checkpoints that these verbs open in any case.
+#: Keys of the checkpoints that a verb opens.
 _WEIGHTS = {
     "adapt": ("checkpoint",),
     "evaluate": ("checkpoint",),
@@ -74,13 +72,13 @@ _WEIGHTS = {
     "predict": ("checkpoint",),
     "train": ("resume", "init_from"),
 }
-#: Verbs that read data and make none that has a folder of its own.
+#: Verbs that read data sets without making them.
 _READERS = ("evaluate", "predict", "pretext", "train")
 
 
 def require_paths(verb: str, config: Mapping[str, Any]) -> None:
-    """Refuse what is missing, in the words of what reads it later; photographs are decoded from here on.
-    FileNotFoundError, InputError: a file or folder is missing or wrong."""
+    """Check that the files of a verb exist, with the messages of their readers, and start decoding
+    photographs. FileNotFoundError, InputError: a file or folder is missing or wrong."""
     for key in _WEIGHTS.get(verb, ()):
         if config[key] is not None:
             require_weights(config[key])

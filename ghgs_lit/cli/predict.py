@@ -1,4 +1,4 @@
-"""``ghgs predict``: photographs to a splat, and to what else ``formats`` lists."""
+"""``ghgs predict``: turn photographs into a splat and the other files that ``formats`` lists."""
 
 import contextlib
 import json
@@ -38,13 +38,13 @@ if TYPE_CHECKING:  # it would import Lightning, which takes seconds
     from ghgs_lit.data.datamodule import PhotographsDataModule
 
 
-#: PSNR in dB, in the box of the subject, below which a photograph does not come back as it should.
+#: PSNR in dB, in the subject's box, below which the render of an input counts as poor.
 LOW_PSNR = 25.0
 
 
 @torch.no_grad()
 def run(cfg: DictConfig) -> None:
-    """The verb; prints the files (not those in folders), and the directory last."""
+    """Run the verb."""
     directory = output_dir() if cfg.out is None else Path(cfg.out).expanduser().resolve()
     is_capture = cfg.images is not None or cfg.cameras is not None
     config = resolve(cfg if is_capture else inputs.with_trained_data(cfg))
@@ -56,8 +56,8 @@ def run(cfg: DictConfig) -> None:
 def subject_batch(
     data: "PhotographsDataModule", subject: str | int, split: str, targets: dict[str, Any] | None
 ) -> Batch:
-    """The photographs of one subject. InputError: there is no such subject. ``subject``: its name, or its
-    number in the split. ``targets``: a protocol whose targets are read too; None: inputs only."""
+    """Photographs of one subject, given by its name or number in the split. ``targets``: a protocol whose
+    targets are read too. InputError: there is no such subject."""
     names = list(data.subjects(split))
     if isinstance(subject, int) and 0 <= subject < len(names):
         subject = names[subject]
@@ -83,8 +83,8 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
 
 
 def predict_photographs(config: dict[str, Any], directory: Path) -> None:
-    """Predict each instant of a folder of photographs; several get a folder each, and files of all.
-    InputError: none of them can be read."""
+    """Predict each instant of a folder of photographs; several instants get a folder each and shared files.
+    InputError: no instant can be read."""
     folder, options = capture_folder(config), export.output_options(config)
     several, read = len(folder.instants) > 1, folder.input_files
     directories = {name: directory / name if several else directory for name in folder.instants}
@@ -141,13 +141,13 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
 def shared_by(
     folder: CaptureFolder, model: GHGS, size: tuple[int, int], refining: Mapping[str, Any], renderer: Renderer
 ) -> tuple[Backgrounds, Rig | None, bytes]:
-    """What the instants of a sequence share, found over some of them: backgrounds; the cameras, corrected,
-    which is said; and the content of their file. None: they stay, and have no file."""
+    """Static backgrounds and corrected cameras of a sequence, estimated from a few instants, and the content
+    of the cameras' file. None and no content: the cameras stay as they are."""
     begin, names, captures = time.perf_counter(), folder.instants, []
     rounds, masks = refining["refine_cameras"], refining["refine_masks"]
     spread = [round((len(names) - 1) * i / (INSTANTS - 1)) for i in range(INSTANTS)]
     for name in [names[place] for place in dict.fromkeys(spread)] if rounds or masks else ():
-        with contextlib.suppress(InputError):  # one that is left out
+        with contextlib.suppress(InputError):  # this instant is left out
             captures.append(Capture(name, folder.photographs(name)))
     backgrounds = Backgrounds.of(captures if masks else [])
     mended = [backgrounds.applied(capture) for capture in captures]
@@ -161,7 +161,7 @@ def shared_by(
 
 
 def mended_by(backgrounds: Backgrounds, given: Capture) -> Capture:
-    """The capture with the masks that static backgrounds mend, which is said."""
+    """The capture with masks corrected by static backgrounds; prints which ones changed."""
     capture = backgrounds.applied(given)
     both = zip(given.photographs, capture.photographs, strict=True)
     if mended := [after.name for before, after in both if after is not before]:
@@ -171,8 +171,7 @@ def mended_by(backgrounds: Backgrounds, given: Capture) -> Capture:
 
 
 def advice_of(directory: Path) -> Iterator[str]:
-    """Lines that say what of photographs is undone, why a prediction of them may be poor, and what may help,
-    by its report."""
+    """Advice from a prediction's report: gains that were undone, why it may be poor and what may help."""
     report = json.loads((directory / REPORT).read_text())
     shares = {name: geometric_mean(each) - 1 for name, each in report.get("gains", {}).items()}
     said = [
@@ -199,15 +198,15 @@ def advice_of(directory: Path) -> Iterator[str]:
 
 
 def moved_line(moved: dict[str, float]) -> str:
-    """Pixels that each photograph's subject moved by; names cameras that moved beside others that stayed."""
+    """Message: pixels by which the subject moved in each photograph, and the cameras if only some moved."""
     off = [name for name, pixels in moved.items() if pixels]
     beside = f": {', '.join(off)} beside the others" if 0 < len(off) < len(moved) else ""
     return f"refine_cameras: moved by {', '.join(f'{p:.2f}' for p in moved.values())} pixels{beside}"
 
 
 def captures_of(folder: CaptureFolder) -> Iterator[tuple[Capture, float]]:
-    """The capture of each instant and the seconds of waiting for it; the next one is decoded meanwhile. Of
-    several instants those without enough photographs are left out; it prints what is missing."""
+    """Yield the capture of each instant and the seconds of waiting for it; the next one is decoded meanwhile.
+    Of several instants, those that cannot be read are left out with a message."""
     names = folder.instants
     with ThreadPoolExecutor(1) as pool:
         following = pool.submit(folder.photographs, names[0])
@@ -238,8 +237,7 @@ def write_result(
     config: dict[str, Any],
     options: export.OutputOptions,
 ) -> dict[str, float]:
-    """Write the files of a result, and print what was done and written. Returns: the run time of each stage
-    in seconds."""
+    """Write the files of a result and print what was done; return the seconds of each stage."""
     prediction, seconds = result.prediction, dict(result.seconds)
     facts: dict[str, Any] = {"checkpoint": config["checkpoint"], "seconds": seconds, "why": result.why}
     why = {name: f"; {doubt} ({name}=0 leaves it)" for name, doubt in result.why.items()}

@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 
 
 def run(cfg: DictConfig) -> None:
-    """Run the task and print the folder of its result last."""
+    """Run the task of the verb."""
     data = build(cfg.data, key="data", views=cfg.views, targets=cfg.targets, seed=cfg.seed)
     root = Path(data.dataset.root or ".").expanduser().resolve()
     if cfg.task == "render":
@@ -38,8 +38,7 @@ def render(data: PhotographsDataModule) -> None:
 
 
 def check(data: PhotographsDataModule, folder: Path, min_iou: float, min_agreement: float) -> None:
-    """Read everything once; print tables, write ``check.json`` and a contact sheet. InputError: training
-    cannot start."""
+    """Read all data once, print tables, write ``check.json`` and a contact sheet. InputError: data is bad."""
     report = inspect(data, min_iou, min_agreement)
     show(report)
     announce(write(report, folder))

@@ -20,14 +20,13 @@ from ghgs_lit.training.pretext.module import Pretext, PretextModule
 
 
 def run(cfg: DictConfig) -> float | str | None:
-    """The verb: train the branch; returns its part accuracy on validation people. Interrupted: on Ctrl-C and
-    SIGTERM."""
+    """Train the branch; return its part accuracy on validation people. Interrupted: Ctrl-C or SIGTERM."""
     return run_job(resolve(cfg), RunDirectory(output_dir()), pretrain)
 
 
 def pretrain(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float | None:
-    """Train the branch and save it; arguments as of :func:`ghgs_lit.cli.train.train`."""
-    # A note for the tables of models that start from this checkpoint.
+    """Train the branch and save it; arguments as for :func:`ghgs_lit.cli.train.train`."""
+    # Tables of models that start from this checkpoint show this origin.
     config = {**config, "encoder": {**config["encoder"], "weights": "pretext"}}
     options, patch_size = config["encoder"]["semantic"], config["encoder"]["patch_size"]
     require(options is not None, "encoder.semantic", "the options of a branch to train", None)

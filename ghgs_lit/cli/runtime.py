@@ -1,4 +1,4 @@
-"""What all verbs share: their directory, their saved configuration, and the path that they print last."""
+"""What all verbs share: the run's directory, its saved configuration and the path printed last."""
 
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,12 @@ from ghgs_lit.files import write_text_atomically
 
 
 def output_dir() -> Path:
-    """The absolute path of this run's directory, which Hydra makes."""
+    """Absolute path of this run's directory, which Hydra makes."""
     return Path(HydraConfig.get().runtime.output_dir).resolve()
 
 
 def write_config(config: dict[str, Any], directory: Path) -> None:
-    """Write ``directory/config.yaml`` and print its path. InputError: such a file of another program is
-    there."""
+    """Write ``directory/config.yaml`` and print its path. InputError: another program's file is there."""
     path = directory / "config.yaml"
     is_free = not path.is_file() or path.read_text(errors="replace").startswith(HEADER)
     require(is_free, str(path), "no file, or the configuration of an earlier run", "another file")
@@ -29,12 +28,12 @@ def write_config(config: dict[str, Any], directory: Path) -> None:
 
 
 def save_config(cfg: DictConfig, directory: Path) -> dict[str, Any]:
-    """Write and print the configuration; returns it as plain data."""
+    """Resolve the configuration and write it; return it as plain data."""
     config = resolve(cfg)
     write_config(config, directory)
     return config
 
 
 def announce(path: Path | str) -> None:
-    """Print where the results are, as the last line of a verb."""
+    """Print the path of the results, as the last line of a verb."""
     print(f"wrote {path}", flush=True)

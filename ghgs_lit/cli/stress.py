@@ -1,4 +1,4 @@
-"""``ghgs stress``: every stage on adversarial inputs, against float64; or one saved training step again."""
+"""``ghgs stress``: compare stages with float64 on adversarial inputs, or repeat a saved training step."""
 
 import sys
 
@@ -17,7 +17,7 @@ from ghgs_lit.training.replay import replay
 
 
 def run(cfg: DictConfig) -> None:
-    """The verb; prints the path of the results last. Exit code 1 where a budget or a step is broken."""
+    """Run the verb. Exit code 1 if an error budget is exceeded or the repeated step is not finite."""
     directory = output_dir()
     config = save_config(cfg, directory)
     if config["dump"] is not None:

@@ -1,4 +1,4 @@
-"""``ghgs table``: the runs below a directory as one of the paper's tables, or as a list."""
+"""``ghgs table``: show the runs below a directory as one of the paper's tables, or as a list."""
 
 import re
 from pathlib import Path
@@ -40,7 +40,7 @@ def _options(config: dict[str, Any]) -> t.TableOptions:
 
 
 def run(cfg: DictConfig) -> None:
-    """The verb; prints the tables, and the path of the Markdown file last; with ``list`` the runs."""
+    """Print and write the tables, or with ``list`` the runs."""
     directory = output_dir()
     config = save_config(cfg, directory)
     options = _options(config)

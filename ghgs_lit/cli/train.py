@@ -36,7 +36,7 @@ from ghgs_lit.weights.checkpoint import read_checkpoint
 
 
 def quiet() -> None:
-    """Silence Lightning's own lines, which Hydra would print twice, and warnings that do not apply here."""
+    """Silence Lightning's log lines, which Hydra would print twice, and warnings that do not apply here."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
     messages = ("LeafSpec", "smaller than the logging interval", "num_workers", "dataloader is not resumable")
@@ -47,14 +47,14 @@ def quiet() -> None:
 
 @cache
 def say_which_model() -> None:
-    """Print, once in a process, that the default is not the paper's model, where nothing chose one."""
+    """Print once per process that the default model, unless one was chosen, is not the paper's."""
     chosen = {"model", "experiment", "sweep"} & set(said())
     if choices().get("model") == "hull" and not chosen:
         print("training model=hull, which learns in minutes; model=paper is the paper's method", flush=True)
 
 
 def prepare_start(config: dict[str, Any], model: GHGS, directory: Path) -> int | None:
-    """Load ``init_from``, check ``resume``; returns the step to resume at, None for a new run."""
+    """Load ``init_from`` or ``resume``; return the step to resume at, None for a new run."""
     start.check_start(config, directory)
     if config["init_from"] is not None and config["resume"] is None:
         lines = start.initialize(
@@ -68,7 +68,7 @@ def prepare_start(config: dict[str, Any], model: GHGS, directory: Path) -> int |
 
 
 def resume_step(config: dict[str, Any], model: nn.Module) -> int | None:
-    """The step that ``resume`` goes on at, None for a new run; ``model`` gets its weights."""
+    """Load the weights of ``resume``; return the step to resume at, None for a new run."""
     if config["resume"] is None:
         return None
     step, changed = start.check_resume(config["resume"], model, config)
@@ -78,8 +78,7 @@ def resume_step(config: dict[str, Any], model: nn.Module) -> int | None:
 
 
 def build_trainer(config: dict[str, Any], directory: Path, *further: Callback) -> L.Trainer:
-    """The Trainer with its loggers and callbacks, which all write below ``directory``. InputError: the
-    Trainer refuses its options."""
+    """The Trainer; loggers and callbacks write below ``directory``. InputError: it refuses its options."""
     logs = [build(node, f"logger.{name}", save_dir=str(directory)) for name, node in config["logger"].items()]
     callbacks = [*further, *(build(node, f"callbacks.{name}") for name, node in config["callbacks"].items())]
     return build(
@@ -95,15 +94,14 @@ def build_trainer(config: dict[str, Any], directory: Path, *further: Callback) -
 
 
 def _environment() -> list[LightningEnvironment]:
-    """The plugin of a job of SLURM that no ``srun`` started: its tasks are no processes."""
+    """Plugin for a SLURM job without ``srun``, whose tasks are not the processes of a training."""
     starters = ("SLURM_STEP_ID", "SRUN_DEBUG", "TORCHELASTIC_RUN_ID")
     is_alone = "SLURM_NTASKS" in os.environ and not any(name in os.environ for name in starters)
     return [LightningEnvironment()] if is_alone else []
 
 
 def run(cfg: DictConfig) -> float | str | None:
-    """The verb: train and measure, in a sweep only what its run still lacks; returns the mean PSNR.
-    Interrupted: on Ctrl-C and SIGTERM."""
+    """Train and measure (in a sweep: unless done); return the mean PSNR. Interrupted: Ctrl-C or SIGTERM."""
     config, run_directory = resolve(cfg), RunDirectory(output_dir())
     if config["dry_run"]:
         return print_single_plan(config, run_directory)
@@ -112,8 +110,7 @@ def run(cfg: DictConfig) -> float | str | None:
 
 
 def run_job(config: dict[str, Any], run_directory: RunDirectory, train: job.Train) -> float | str | None:
-    """What ``train`` returns; where it is interrupted, print how to go on. Interrupted: on Ctrl-C and
-    SIGTERM."""
+    """Return what ``train`` returns. On Ctrl-C and SIGTERM print how to go on and raise Interrupted."""
     with interruptible():
         try:
             return _run(config, run_directory, train)
@@ -124,7 +121,6 @@ def run_job(config: dict[str, Any], run_directory: RunDirectory, train: job.Trai
 
 
 def _changes_to_go_on(run_directory: RunDirectory) -> str:
-    """What to add to the command of a run that was interrupted."""
     if job.is_multirun():
         return f"hydra.sweep.dir={HydraConfig.get().sweep.dir}"
     if run_directory.checkpoint is None:
@@ -144,8 +140,8 @@ def _run(config: dict[str, Any], run_directory: RunDirectory, train: job.Train) 
 
 
 def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float | None:
-    """Train, save the last weights, measure them; returns the mean PSNR of the first protocol. ``stats`` gets
-    the ``steps`` and ``seconds`` that are trained here."""
+    """Train, save the last weights and measure them; return the mean PSNR of the first protocol. ``stats``
+    receives the ``steps`` and ``seconds`` of this training."""
     if rank_zero_only.rank == 0:
         write_config(config, directory)
         say_which_model()
@@ -163,7 +159,7 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
     quiet()
     cost = TrainingCost()
     trainer = build_trainer(config, directory, cost, StopAtStep())
-    # Last of all checks: it makes the photographs that are missing.
+    # The last check, because it makes missing photographs.
     check_evaluation(config, data)
     try:
         fit(trainer, module, data, config, step, stats)
@@ -191,7 +187,7 @@ def fit(
     step: int | None,
     stats: dict[str, Any],
 ) -> None:
-    """Train from ``step``, None for a new run; ``stats`` gets what was trained here, also of a part."""
+    """Train from ``step`` (None: a new run); ``stats`` is filled even if training is interrupted."""
     if step is not None:
         loggers.resume(trainer.loggers, step)
     loggers.log_hyperparameters(trainer.loggers, loggers.hyperparameters(config, choices(), overrides()))
@@ -213,7 +209,7 @@ def measure_last(
     directory: Path,
     training: dict[str, Any],
 ) -> float:
-    """Measure the last weights and write the results; returns the mean PSNR of the first protocol."""
+    """Measure the last weights and write the results; return the mean PSNR of the first protocol."""
     model, device = module.model, trainer.strategy.root_device
     path = measure_and_write(
         {"model": ModelMethod(model.to(device).eval(), module.renderer)},

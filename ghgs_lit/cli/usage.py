@@ -1,4 +1,4 @@
-"""The verbs, as ``ghgs --help`` lists them."""
+"""The verbs and the text of ``ghgs --help``."""
 
 _LISTED = """\
   prepare   render scans into training data, or make the built-in people
@@ -28,7 +28,7 @@ _LISTED = """\
   table     collect a sweep into the paper's table
               ghgs table runs=runs/train/sweep_..."""
 
-#: What each verb does, and an example.
+#: Summary and example of each verb.
 VERBS = {
     what.split()[0]: (what.split(maxsplit=1)[1], example.strip())
     for what, example in zip(_LISTED.splitlines()[::2], _LISTED.splitlines()[1::2], strict=True)

@@ -1,4 +1,4 @@
-"""``ghgs view``: a page in the browser with a prediction, its photographs and its cameras."""
+"""``ghgs view``: show a prediction with its photographs and cameras in the browser."""
 
 import ipaddress
 import math
@@ -30,8 +30,7 @@ from ghgs_lit.weights.reading import SHIPPED
 
 
 def run(cfg: DictConfig) -> None:
-    """The verb; shows ``path``, or predicts first where there is none, or again and again where ``live``.
-    Ctrl-C ends it."""
+    """Show ``path``; without it predict first, or with ``live`` again and again. Ctrl-C ends it."""
     has_source = cfg.live or any(cfg.get(key) is not None for key in ("path", "checkpoint", "images"))
     require(has_source, "path", "a directory of ghgs predict or a PLY, or checkpoint=<file>", None)
     is_folder = not isinstance(cfg.images, DictConfig)
@@ -45,7 +44,7 @@ def run(cfg: DictConfig) -> None:
         predict.run(cfg)
     else:
         save_config(cfg, output_dir())
-    # What was predicted is in the frame of ``up`` already: its cameras say which axis that is.
+    # A new prediction is already in the frame of ``up``, and its cameras tell which axis that is.
     viewer = _opened(cfg, read_content(cfg.path or output_dir(), cfg.up if cfg.path else None))
     end = time.monotonic() + (cfg.seconds or math.inf)
     try:
@@ -65,7 +64,7 @@ def _run_live(cfg: DictConfig) -> None:
     renderer, model = build_renderer(config, device), load_model(config, device)
     size = crop_size(config["size"], read_checkpoint(config["checkpoint"])["config"], model)
     write_config(config, output_dir())
-    # Looking for doubts at each instant would take as long as a prediction.
+    # To decide at each instant what ``auto`` should refine would take as long as a prediction.
     masks, cameras = (0 if n == "auto" else n for n in (config["refine_masks"], config["refine_cameras"]))
     forward = partial(in_frame, model)
     temporal = Temporal(forward, model.skip.every, renderer)
@@ -90,7 +89,6 @@ def _opened(cfg: DictConfig, content: Content, layers: bool = True) -> Viewer:
 
 
 def _reach(host: str) -> str:
-    """Who can open a page at this address, for the message."""
     try:
         is_own = host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:

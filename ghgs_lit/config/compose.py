@@ -1,4 +1,4 @@
-"""Finds the Hydra configuration, composes that of a verb, and turns a composed one into plain data."""
+"""Find and compose the Hydra configuration of a verb, and turn it into plain data."""
 
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -15,7 +15,7 @@ from ghgs_lit.config.registry import KINDS, check
 from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError
 
-#: How Hydra is to behave: Hydra 1.3 asks, later ones no longer do.
+#: Hydra 1.3 asks for the version to be compatible with; later versions do not.
 VERSION_BASE: dict[str, Any] = {"version_base": "1.3"} if hydra.__version__.startswith("1.3") else {}
 
 
@@ -31,13 +31,13 @@ def conf_dir() -> Path:
     )
 
 
-#: First line of the configuration that a run saves: a file without it is another program's.
+#: First line of the configuration that a run saves; a file without it belongs to another program.
 HEADER = "# The configuration of this run, by ghgs."
 
 
 def compose(verb: str, overrides: Sequence[str] = (), with_hydra: bool = False) -> DictConfig:
-    """The configuration of ``ghgs <verb> <overrides>``, with the node ``hydra`` or without."""
-    # A verb that is running has initialized Hydra already.
+    """The configuration of ``ghgs <verb> <overrides>``, with or without the node ``hydra``."""
+    # A running verb has initialized Hydra already.
     running = GlobalHydra.instance().hydra
     GlobalHydra.instance().hydra = None
     try:
@@ -48,20 +48,20 @@ def compose(verb: str, overrides: Sequence[str] = (), with_hydra: bool = False) 
 
 
 def saved_text(config: dict[str, Any]) -> str:
-    """A resolved configuration as runs save it, in YAML."""
+    """YAML text of a resolved configuration, as runs save it."""
     return f"{HEADER}\n{OmegaConf.to_yaml(OmegaConf.create(config))}"
 
 
 def resolve(cfg: DictConfig, verb: str | None = None) -> dict[str, Any]:
-    """A composed configuration as plain data; the groups are checked, and the keys of ``verb``. InputError: a
-    value is missing, or of the wrong type or range."""
+    """A composed configuration as plain data; groups and the keys of ``verb`` are checked. InputError: a
+    value is missing or has a wrong type or range."""
     data = own_keys(cfg, verb)
     check(data)
     return data
 
 
 def own_keys(cfg: DictConfig, verb: str | None) -> dict[str, Any]:
-    """:func:`resolve` without a look at the groups, whose options import PyTorch."""
+    """:func:`resolve` without the check of groups, whose options import PyTorch."""
     missing = sorted(OmegaConf.missing_keys(cfg))
     if missing:
         raise InputError(f"{missing[0]}: expected a value ({missing[0]}=...); found none")
@@ -72,11 +72,9 @@ def own_keys(cfg: DictConfig, verb: str | None) -> dict[str, Any]:
 
 
 def read_option(group: str, name: str, key: str | None = None) -> dict[str, Any]:
-    """The values of ``<group>/<name>.yaml``, its own defaults included, as plain data.
-
-    Inside a Hydra application its search path counts, which has the user's ``--config-dir`` too. InputError:
-    the group has no such option; names ``key``, or the group.
-    """
+    """The values of ``<group>/<name>.yaml``, including its own defaults, as plain data. A running Hydra
+    application also searches the user's ``--config-dir``. InputError: the group has no such option; the
+    message begins with ``key`` or the group."""
     inside = GlobalHydra.instance().is_initialized()
     with nullcontext() if inside else initialize_config_dir(str(conf_dir()), **VERSION_BASE):
         known = sorted(GlobalHydra.instance().config_loader().get_group_options(group))

@@ -1,9 +1,9 @@
-"""Configurations as dotted keys, which keys have no influence on a number, and the rows of the ablation."""
+"""Dotted keys of configurations, lists of keys that do not influence results, and names of ablations."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-#: Where a run writes, what it shows and how it shares the machine: no number depends on these.
+#: Keys that no result depends on: where a run writes, what it shows and how it shares the machine.
 WITHOUT_INFLUENCE = (
     "hydra", "allow_random_encoder", "dry_run", "overwrite", "resume", "logger", "callbacks",
     "data.cache_dir", "data.cache_images_mb", "data.render_workers", "data.workers",
@@ -11,18 +11,17 @@ WITHOUT_INFLUENCE = (
     "evaluation.pictures", "trainer.log_every_n_steps",
 )  # fmt: skip
 
-#: What may change when a run is resumed without being reported: also how far it trains (``trainer.max_*``)
-#: and what is measured after training.
+#: Keys that may change when a run is resumed without being reported: those without influence, the length of
+#: training (``trainer.max_*``) and what is measured after it.
 MAY_CHANGE_ON_RESUME = (
     *WITHOUT_INFLUENCE, "evaluation", "metrics", "sweep", "trainer.max_steps", "trainer.max_time",
 )  # fmt: skip
 
-#: What loggers do not list among the hyperparameters of a run: also the name of its sweep and what is
-#: measured after training.
+#: Keys that loggers do not list as hyperparameters: those without influence, the sweep, and the evaluation.
 NOT_HYPERPARAMETERS = (*WITHOUT_INFLUENCE, "evaluation", "sweep")
 
-#: What differs between runs in one table on purpose: also the seed, what the ablation switches, and the
-#: views, targets and metrics, which tables keep apart by themselves.
+#: Keys that may differ between the runs of a table: those without influence, the seed, the switches of the
+#: ablation, and views, targets and metrics, which tables keep apart themselves.
 EXPECTED_TO_DIFFER = (
     *WITHOUT_INFLUENCE, "evaluation", "metrics.kind", "recalibration.neighborhood",
     "recalibration.similarity", "seed", "targets", "views",
@@ -40,7 +39,7 @@ def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def lookup(config: Any, key: str) -> Any:
-    """The value at a dotted key, None where there is none."""
+    """The value at a dotted key, or None."""
     for name in key.split("."):
         if not isinstance(config, Mapping) or name not in config:
             return None
@@ -53,7 +52,7 @@ def is_below(key: str, parents: Iterable[str]) -> bool:
     return any(key == parent or key.startswith(f"{parent}.") for parent in parents)
 
 
-#: The ablation's name by its switches (3D unprojection, semantic consistency), in the tables' order.
+#: Name of the ablation by its switches (3D unprojection, semantic consistency), in the order of tables.
 ABLATIONS = {
     (False, False): "neither",
     (False, True): "no_unprojection",
@@ -65,10 +64,10 @@ ABLATIONS = {
 def switches_of(config: Mapping[str, Any]) -> tuple[bool, bool]:
     """Whether the model of ``config`` finds neighbours in 3D, and weights attention by similarity."""
     recalibration = config["recalibration"]
-    # A class of the user's own may have other keys.
+    # A plug-in may have other keys.
     return recalibration.get("neighborhood", "xyz") == "xyz", recalibration.get("similarity") != "none"
 
 
 def ablation_of(config: Mapping[str, Any]) -> str:
-    """The name of a model's row in the ablation table; arguments as for :func:`switches_of`."""
+    """Name of a model's row in the ablation table."""
     return ABLATIONS[switches_of(config)]

@@ -1,4 +1,4 @@
-"""Nodes of verbs: groups of keys that belong to no stage, such as ``turntable`` or ``calibration``."""
+"""Options of nodes that belong to no stage, such as ``turntable`` or ``calibration``."""
 
 from typing import Annotated, Literal
 
@@ -13,7 +13,7 @@ Views = Annotated[int, Field(ge=2)]
 
 
 class Calibration(Options):
-    """What the file of the cameras does not say, or says wrongly; null: as its format has it."""
+    """Corrections of what the file of cameras omits or says wrongly; null: as its format defines it."""
 
     group = "calibration"
     format: Literal["auto", "ghgs", "colmap", "nerfstudio", "opencv", "easymocap", "toml", "qualisys"] = (
@@ -39,7 +39,7 @@ class Calibration(Options):
 
 
 class Sequence(Options):
-    """Which instants count, and how the videos of cameras fit together."""
+    """Instants to use, and how the videos of cameras are synchronised."""
 
     group = "sequence"
     start: int | None = 0
@@ -70,7 +70,7 @@ class PerScene(Options):
 
 
 class Timing(Options):
-    """How times are taken."""
+    """How run times are measured."""
 
     repeats: int = Field(9, ge=1, le=1000)
     """Rounds that count, enough of them at 1000; each runs all presets, and each begins with another one."""
@@ -98,7 +98,7 @@ class PairedTest(Options):
 
 
 class EvaluationOptions(Options):
-    """Every number of views with every target protocol, after training and in ``ghgs evaluate``."""
+    """What is measured after training and by ``ghgs evaluate``: every number of views with every protocol."""
 
     group = "evaluation"
     views: Views | tuple[Views, ...] | None = None

@@ -1,8 +1,7 @@
-"""Options: what a stage can be told, defined once beside the stage as a class of typed fields.
+"""Options: classes of typed fields that configure a stage, defined once beside it.
 
-A field has its type and range, its default and, in the text below it, its unit and meaning. Values are
-checked wherever they come from (YAML, command line, checkpoint, Python), and ``ghgs <verb> --help <group>``
-shows the same fields.
+A field has a type with a range, a default and, in the text below it, a unit and meaning. Values are checked
+wherever they come from (YAML, command line, checkpoint, Python); ``ghgs <verb> --help <group>`` prints them.
 """
 
 import ast
@@ -37,18 +36,18 @@ _LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
 @dataclass(frozen=True)
 class Words:
-    """Metadata of a type: what messages call it."""
+    """Metadata of a type: its name in messages."""
 
     text: str
 
 
 def expected(field: FieldInfo) -> str:
-    """What a value of ``field`` must be, such as "an integer >= 1 or null"."""
+    """What ``field`` accepts, in words, such as "an integer >= 1 or null"."""
     return _words(field.annotation, field.metadata)
 
 
 def options_of(annotation: Any) -> type[BaseModel] | None:
-    """The class of options that an annotation allows (perhaps beside None), None where there is none."""
+    """The class of options that an annotation allows (perhaps beside None), or None."""
     for choice in (annotation, *get_args(annotation)):
         if isinstance(choice, type) and issubclass(choice, BaseModel):
             return choice
@@ -56,7 +55,7 @@ def options_of(annotation: Any) -> type[BaseModel] | None:
 
 
 def meanings(cls: type) -> dict[str, str]:
-    """The text below each field of a class and of its bases."""
+    """The text below each field of a class and its bases."""
     texts: dict[str, str] = {}
     for base in reversed(cls.__mro__):
         if not (issubclass(base, BaseModel) and inspect.get_annotations(base)):
@@ -69,7 +68,7 @@ def meanings(cls: type) -> dict[str, str]:
 
 
 def _flat(metadata: Iterable[Any]) -> list[Any]:
-    """Metadata of a type; those of pydantic's ``Field`` lie one level deeper."""
+    """Metadata of a type, with those inside pydantic's ``Field``."""
     return [part for item in metadata for part in (item.metadata if isinstance(item, FieldInfo) else [item])]
 
 
@@ -121,25 +120,25 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
 Workers = Annotated[int, Field(ge=0, le=1024)]
 Width = Annotated[int, Field(ge=1, le=65536)]
-#: Patches of a photograph: none has more than pixels along a side.
+#: Number of patches, at most that of pixels along the longest side.
 Patches = Annotated[int, Field(ge=0, le=8192)]
-# A photograph of more pixels would need gigabytes before anything could refuse it.
+# A larger photograph would need gigabytes before anything could refuse it.
 Side = Annotated[int, Field(ge=1, le=8192)]
 #: A side or [height, width] in pixels; read as (height, width).
 Size = Annotated[Side | tuple[Side, Side], AfterValidator(_pair)]
 CropSide = Annotated[int, Field(ge=1, le=2072)]
-#: The same of what a model sees.
+#: The same for crops, which the model sees.
 CropSize = Annotated[CropSide | tuple[CropSide, CropSide], AfterValidator(_pair)]
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """`` (did you mean ...?)`` with the closest of ``known``, or nothing."""
+    """`` (did you mean ...?)`` with the closest of ``known``, or an empty string."""
     close = difflib.get_close_matches(str(name), list(known), 1)
     return f" (did you mean {close[0]}?)" if close else ""
 
 
 class _Checked(type(BaseModel)):
-    """Errors of options that are made in Python are an :class:`InputError`, too."""
+    """Metaclass that raises :class:`InputError` for options that are made in Python, too."""
 
     def __call__(cls, *args: Any, **values: Any) -> Any:
         try:
@@ -149,12 +148,9 @@ class _Checked(type(BaseModel)):
 
 
 class Options(BaseModel, metaclass=_Checked):
-    """Base of all options: immutable, without unknown fields, without silent conversions.
-
-    ``replace`` makes changed options, ``build`` what they describe (the options themselves where they do the
-    work, too). ``group`` is the dotted key under which configurations have them, for messages. InputError:
-    "<key>: expected ...; found ...", for the first wrong value.
-    """
+    """Base of all options: immutable, without unknown fields and silent conversions. ``group``: dotted key of
+    the options in configurations, for messages. InputError: "<key>: expected ...; found ...", for the first
+    wrong value."""
 
     model_config = ConfigDict(
         frozen=True,
@@ -173,7 +169,7 @@ class Options(BaseModel, metaclass=_Checked):
 
     @classmethod
     def read(cls: type[_T], values: Any, key: str) -> _T:
-        """The options in ``values``, a mapping (or options already); what is missing has its default.
+        """Options from a mapping ``values`` (or options already); missing keys have their default.
         InputError: names the first wrong key below ``key``, what was expected and what was found."""
         if isinstance(values, cls):
             return values
@@ -191,12 +187,12 @@ class Options(BaseModel, metaclass=_Checked):
         return type(self)(**{**dict(self), **changes})
 
     def require(self, condition: bool, name: str, expected: str) -> None:
-        """Refuse the value of the field ``name`` unless ``condition`` is true: for ``model_validator``."""
+        """Refuse the value of field ``name`` unless ``condition``; for use in a ``model_validator``."""
         if not condition:
             raise InputError(f"{name}: expected {expected}; found {_plain(getattr(self, name))!r}")
 
     def build(self) -> Any:
-        """What the options describe; here they are it."""
+        """Build what the options describe; by default the options themselves."""
         return self
 
 
@@ -213,10 +209,7 @@ def _plain(value: Any) -> Any:
 
 
 def _input_error(cls: type[Options], key: str, values: Mapping, error: ValidationError) -> InputError:
-    """The first of pydantic's errors, in the words of this package.
-
-    Unknown keys come first: a misspelt key may be why another one is missing.
-    """
+    """The first of pydantic's errors, unknown keys first: a misspelt key may leave another one missing."""
     errors = error.errors(include_url=False)
     first = next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])
     own = first.get("ctx", {}).get("error")
@@ -235,7 +228,7 @@ def _input_error(cls: type[Options], key: str, values: Mapping, error: Validatio
         values = values.get(name)
         nested = options_of(field.annotation)
     dotted = ".".join(path)
-    if isinstance(own, InputError):  # of a validator over several fields
+    if isinstance(own, InputError):  # raised by a validator of several fields
         return InputError(f"{dotted}.{own}" if dotted else str(own))
     if first["type"] == "extra_forbidden":
         name, known = first["loc"][-1], list(cls.model_fields)

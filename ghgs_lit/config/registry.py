@@ -1,10 +1,9 @@
-"""What a configuration may build: kinds of options by group, never a path of Python code.
+"""Registry of what a configuration may build: kinds of options by group, never a path of Python code.
 
-A configuration can come from somebody else's checkpoint. A node such as ``depth_head: {kind: dpt, ...}``
-names one of the kinds below or one that is registered: by a file of the group's room, such as
-``ghgs_lit/heads``, or by the user's own code, which no configuration can name. The user does, with
-``GHGS_PLUGINS`` in the environment (Python files or names of modules, separated as in ``PATH``), or by
-installing a package that declares an entry point in the group ``ghgs_lit.plugins``.
+A configuration can come from somebody else's checkpoint, so a node such as ``depth_head: {kind: dpt, ...}``
+can only name a kind listed below or a registered one. Kinds are registered by the files of the group's
+subpackage, such as ``ghgs_lit/heads``, and by plug-ins: modules in the environment variable ``GHGS_PLUGINS``
+(Python files or module names, separated as in ``PATH``) or entry points in the group ``ghgs_lit.plugins``.
 """
 
 import gc
@@ -28,24 +27,22 @@ VARIABLE, GROUP = "GHGS_PLUGINS", "ghgs_lit.plugins"
 
 
 def load_plugins() -> None:
-    """Import the modules that the user names, so that they register their kinds. InputError: a file is
-    missing, or another module has its name. Errors inside a module keep their type."""
+    """Import the user's plug-ins, so that they register their kinds. InputError: a file is missing, or
+    another module has its name. Errors inside a module keep their type."""
     names = [_module_of(entry) for entry in os.environ.get(VARIABLE, "").split(os.pathsep) if entry.strip()]
     for name in (*names, *_installed()):
-        # The command line freezes what is imported while it is off: open files would not be flushed at exit.
+        # Files that are opened while the collector is off would be frozen, and not flushed at exit.
         gc.enable()
         importlib.import_module(name)
 
 
 @cache
 def _installed() -> tuple[str, ...]:
-    """Modules of installed packages that declare the entry point."""
     return tuple(point.value for point in importlib.metadata.entry_points(group=GROUP))
 
 
 def _module_of(entry: str) -> str:
-    """The name of the module; a file becomes importable by its stem. InputError: the file is missing, or
-    another module has its name."""
+    """Module name of an entry; a file is made importable by its stem. InputError: as :func:`load_plugins`."""
     entry = entry.strip()
     if not entry.endswith(".py"):
         return entry
@@ -56,7 +53,7 @@ def _module_of(entry: str) -> str:
         raise InputError(f"{VARIABLE}: expected a file name that Python can import; found {path.name!r}")
     folder = str(path.parent)
     if folder not in sys.path:
-        # Last in the search path: the file's neighbours must not hide installed packages.
+        # At the end of the path: the file's neighbours must not hide installed packages.
         sys.path.append(folder)
         importlib.invalidate_caches()
     spec = importlib.util.find_spec(path.stem)
@@ -68,7 +65,7 @@ def _module_of(entry: str) -> str:
 
 _C = TypeVar("_C", bound=type[Options])
 
-#: Options by group and kind; the kind None is that of groups whose nodes have no key ``kind``.
+#: Import path of the options by group and kind; kind None: nodes of the group have no key ``kind``.
 KINDS: dict[str, dict[str | None, str]] = {
     "bounds": {
         "box": "ghgs_lit.bounds.SubjectBox",
@@ -121,16 +118,15 @@ KINDS: dict[str, dict[str | None, str]] = {
     },
 }
 
-#: Groups whose nodes have names: ``callbacks.<name>: {kind: ...}``.
+#: Groups of named nodes: ``callbacks.<name>: {kind: ...}``.
 NAMED = ("callbacks", "logger")
 
-#: Kinds that are registered.
 _REGISTERED: dict[tuple[str, str], type[Options]] = {}
 
 
 def register(group: str, kind: str) -> Callable[[_C], _C]:
-    """Class decorator: configurations may say ``<group>: {kind: <kind>, ...}`` for these options. InputError:
-    there is no such group, or the kind is taken."""
+    """Class decorator that registers options as ``<group>: {kind: <kind>, ...}``. InputError: there is no
+    such group, or the kind is taken."""
     if group not in KINDS:
         raise InputError(f"register: expected one of {', '.join(KINDS)}; found {group!r}")
 
@@ -147,7 +143,7 @@ def register(group: str, kind: str) -> Callable[[_C], _C]:
 
 @cache
 def _import_room(group: str) -> None:
-    """Import the files of the group's room (its kinds lie in one), so that they register their kinds."""
+    """Import all files of the group's subpackage, so that they register their kinds."""
     room = ".".join(next(iter(KINDS[group].values())).split(".")[:2])
     for file in pkgutil.iter_modules(importlib.import_module(room).__path__, f"{room}."):
         importlib.import_module(file.name)
@@ -160,14 +156,14 @@ def _load(group: str) -> None:
 
 
 def kinds_of(group: str) -> list[str | None]:
-    """All kinds of a group, those that are registered included."""
+    """All kinds of a group, including registered ones."""
     _load(group)
     return [*KINDS[group], *(kind for of, kind in _REGISTERED if of == group)]
 
 
 def class_of(group: str, kind: Any, key: str) -> type[Options]:
-    """The options of a kind of a group (None where its nodes have none); ``key`` is the node's, for messages.
-    InputError: there is no such kind; names those that there are."""
+    """The options class of a kind (None: the group has no kinds); ``key``: that of the node, for messages.
+    InputError: there is no such kind; names the known ones."""
     known = KINDS[group]
     if isinstance(kind, str) and kind not in known:
         _load(group)
@@ -185,9 +181,9 @@ def class_of(group: str, kind: Any, key: str) -> type[Options]:
 
 
 def read_node(node: Any, key: str) -> Options:
-    """The checked options of a node. ``node``: a mapping of plain data, with ``kind`` where its group has
-    kinds. ``key``: its dotted key, such as ``bounds`` or ``callbacks.best``. InputError: names the key of the
-    first wrong value, what was expected and what was found."""
+    """The checked options of a node: a mapping of plain data, with ``kind`` where its group has kinds.
+    ``key``: its dotted key, such as ``bounds`` or ``callbacks.best``. InputError: names the first wrong key,
+    what was expected and what was found."""
     group = key.split(".")[0]
     if not isinstance(node, Mapping):
         raise InputError(f"{key}: expected a mapping of its keys; found {node!r}")
@@ -197,20 +193,19 @@ def read_node(node: Any, key: str) -> Options:
 
 
 def build(node: Any, key: str, **extra: Any) -> Any:
-    """The object that a node describes, as for :func:`read_node`; ``extra`` is what its ``build`` takes."""
+    """The object that a node (:func:`read_node`) describes; ``extra``: further arguments of its ``build``."""
     return read_node(node, key).build(**extra)
 
 
 def check(config: Mapping[str, Any]) -> None:
-    """Refuse wrong values of all groups; a node that lacks its kind is refused where it is built. InputError:
-    names the key of the first wrong value, what was expected and what was found."""
+    """Check the nodes of all groups, as :func:`read_node`; those without a kind are checked when built."""
     for group, node in config.items():
-        # A verb whose data is that of a checkpoint has no protocols and data of its own.
+        # A verb that takes its data from a checkpoint may have neither data nor targets.
         if group not in KINDS or (node is None and group in ("data", "targets")):
             continue
         if group in NAMED and isinstance(node, Mapping):
             for name, part in node.items():
                 read_node(part, f"{group}.{name}")
-        # Without a kind: keys that change the data of a checkpoint, or an optimizer that the verb lacks.
+        # Skipped without a kind: keys that change a checkpoint's data, or an optimizer that the verb lacks.
         elif not isinstance(node, Mapping) or "kind" in node or None in KINDS[group]:
             read_node(node, group)

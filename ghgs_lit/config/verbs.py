@@ -1,4 +1,4 @@
-"""The keys of each verb beside its groups: what ``conf/<verb>.yaml`` sets itself."""
+"""Options of each verb: the keys that ``conf/<verb>.yaml`` sets beside its groups."""
 
 from typing import Annotated, Literal
 
@@ -66,7 +66,7 @@ class Train(Run):
 
 
 class Photographs(Options):
-    """Photographs of one's own and their cameras."""
+    """The user's photographs and their cameras."""
 
     images: Path | None = None
     """Folder of photographs or videos named after their cameras; of such folders: one for each instant."""
@@ -92,7 +92,7 @@ class Adapt(Photographs, Run):
 
 
 class Predict(Photographs, Measured):
-    """Photographs to a splat and to what else ``formats`` lists."""
+    """Turn photographs into a splat and the other files that ``formats`` lists."""
 
     checkpoint: Path | None = "shipped"
     """The one that comes with the package, or a file of ``ghgs train`` or ``ghgs import``."""
@@ -155,7 +155,7 @@ class View(Predict):
 
 
 class Doctor(Photographs):
-    """Find out what is wrong."""
+    """Diagnose cameras and masks, this machine, or a device."""
 
     task: Literal["cameras", "machine", "selfcheck"] = "cameras"
     """cameras: whether photographs, masks and calibration fit together, and what would fit. machine: what
@@ -185,7 +185,7 @@ class Evaluate(Measured):
 
 
 class Benchmark(Measured):
-    """Run time against error."""
+    """Measure run time and error of presets."""
 
     checkpoint: Path | None = None
     """null: random weights, of which only run times and differences mean something."""
@@ -205,7 +205,7 @@ class Benchmark(Measured):
 
 
 class Export(Options):
-    """A checkpoint to published names, or to a small one for prediction."""
+    """Write a checkpoint under the published names, or a small one for prediction."""
 
     checkpoint: Path
     """A checkpoint of ``ghgs train`` or ``ghgs import``."""
@@ -220,7 +220,7 @@ class Export(Options):
 
 
 class Import(Options):
-    """Published weights to a checkpoint; the groups describe the model that takes them."""
+    """Convert published weights to a checkpoint; the groups describe the model that takes them."""
 
     vggt: Path | None = None
     """facebook/VGGT-1B, or its file (.safetensors or .pt)."""
@@ -235,7 +235,7 @@ class Import(Options):
 
 
 class Prepare(Options):
-    """Make data, or check it."""
+    """Render data, or check it."""
 
     task: Literal["render", "check"] = "render"
     """render: render what is missing. check: read every photograph and camera once, with tables and a
@@ -247,7 +247,7 @@ class Prepare(Options):
 
 
 class Stress(Options):
-    """Every stage on adversarial inputs, against float64, forward and backward."""
+    """Compare every stage with float64 on adversarial inputs, forward and backward."""
 
     quick: bool = False
     """Some thousand cases within a minute."""
@@ -262,7 +262,7 @@ class Stress(Options):
 
 
 class Table(Options):
-    """The runs below a directory as one of the paper's tables."""
+    """Show the runs below a directory as one of the paper's tables."""
 
     runs: Annotated[
         Text | Annotated[tuple[Text, ...], Field(min_length=1)], Words("a text or a list of paths")

@@ -1,1 +1,1 @@
-"""Photographs of people: read from data sets, sampled and put into batches."""
+"""Photographs of people: reading, sampling and batching of data sets."""

@@ -1,6 +1,6 @@
-"""Variation of training batches: sizes of images, and what goes wrong in captures.
+"""Augmentation of training batches: image sizes and imperfections of captures.
 
-A batch is a function of (seed, step, index) alone, as its samples are, so that runs resume exactly.
+A batch depends on (seed, step, index) alone, as its samples do, so that runs resume exactly.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ from ghgs_lit.types import Batch, Cameras
 # Streams of random numbers beside those of ghgs_lit.data.sampling.
 _SIZES, _IMPERFECTIONS, _CHANCE = 3, 4, 5
 
-#: Greatest diameter of a missing piece of a mask, as a share of the subject's height: a hand or a foot.
+#: Greatest diameter of a missing piece of a mask over the subject's height, as of a hand or foot.
 HOLE = 0.12
 
 Size = tuple[int, int]
@@ -40,12 +40,10 @@ Pixels = Annotated[float, Field(ge=0, le=64)]
 
 
 class Augmentation(Options):
-    """What varies in training; null and 0: nothing. Pixels are those of the inputs at their drawn size.
-
-    Targets keep their colours and their cameras, whose principal points alone move where subjects are cut;
-    depth maps keep the z-depths in the true cameras: the loss on depth asks for the distance of the surface,
-    not for one that makes up for the error of a camera.
-    """
+    """Variation of training batches; null and 0: none. Pixels are those of the inputs at their drawn size.
+    Targets keep their colours and cameras, except that principal points move with cut subjects. Depth maps
+    keep the z-depths in the true cameras: the depth loss asks for the distance of the surface, not for one
+    that compensates the error of a camera."""
 
     group = "augmentation"
 
@@ -88,8 +86,7 @@ class Augmentation(Options):
         return self
 
     def draw_sizes(self, size: Size, target: Size, seed: int, step: int) -> tuple[Size, Size]:
-        """Sizes of the inputs and of the targets of a step. ``size``, ``target``: where none are drawn; the
-        drawn inputs' targets keep this proportion."""
+        """Sizes of the inputs and targets of a step, from their sizes without variation."""
         rng = np.random.default_rng([seed, _SIZES, step])
         chosen, share = rng.uniform(size=2)
         drawn = size if self.sizes is None else self.sizes[int(chosen * len(self.sizes))]
@@ -103,8 +100,8 @@ class Augmentation(Options):
         return drawn, tuple(max(1, round(r * side)) for r, side in zip(ratios, drawn, strict=True))
 
     def imperfect(self, batch: Batch, seed: int, step: int, indices: Sequence[int]) -> Batch:
-        """The batch of a training step, as imperfect captures show it in a share ``chance`` of the steps.
-        ``indices``: numbers of the samples in the run."""
+        """The batch of a training step with the imperfections of captures, in a share ``chance`` of the
+        steps. ``indices``: numbers of the samples in the run."""
         is_last = self.exact_from is not None and step >= self.exact_from
         if is_last or np.random.default_rng([seed, _CHANCE, step]).uniform() >= self.chance:
             return batch
@@ -113,9 +110,8 @@ class Augmentation(Options):
         )
 
     def imperfections(self, batch: Batch, rngs: Sequence[np.random.Generator]) -> Batch:
-        """The batch as imperfect captures show it: images in [0, 1], no mask emptied. ``batch``: with at
-        least two views. ``rngs``: random numbers of each element. Whether one thing varies changes nothing
-        about another."""
+        """The batch (at least two views) with the imperfections of captures; images stay in [0, 1], and no
+        mask becomes empty. ``rngs``: for each element; each kind of variation has a stream of its own."""
         streams = [rng.spawn(6) for rng in rngs]
         if self.cut:
             batch = cut(batch, self.cut, [s[4] for s in streams])
@@ -150,14 +146,13 @@ class Augmentation(Options):
         outlines: np.random.Generator,
         behind: np.random.Generator,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Images, masks and mattes of one sample as a segmentation gives them."""
         wrong = self._masks(masks, outlines)
         has_background, is_refined = behind.uniform(size=2) < (self.background, self.refined)
         if not has_background:
-            # What a segmentation takes for the subject it takes for all of a pixel.
+            # Pixels that the segmentation adds are counted as a whole.
             return images * wrong[:, None], wrong, torch.where(wrong > masks, 1, mattes * wrong)
         patterns = torch.from_numpy(backgrounds(*masks.shape, behind)).to(images)
-        # Brightened colours may be more than their share of a pixel.
+        # Brightened colours may exceed their share of a pixel.
         photographs = (images + (1 - mattes[:, None]) * patterns).clamp(max=1)
         if not is_refined:
             return photographs * wrong[:, None], wrong, wrong.to(images)

@@ -1,4 +1,4 @@
-"""From sample specifications to batches. An item of the torch datasets here is a whole :class:`Batch`."""
+"""Batches from sample specifications; an item of the torch datasets here is a whole :class:`Batch`."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -18,8 +18,8 @@ from ghgs_lit.types import Batch, Cameras, Targets
 
 @dataclass(frozen=True)
 class BatchBuilder:
-    """Reads the photographs of samples into a :class:`Batch`. ``inputs``, ``targets``: the photographs at the
-    sizes of both. ``depths``: whether depth maps of the inputs are read, where the data has any."""
+    """Reads samples into a :class:`Batch`. ``inputs``, ``targets``: photographs at the sizes of either.
+    ``depths``: whether depth maps of the inputs are read, if there are any."""
 
     inputs: Photographs
     targets: Photographs
@@ -28,7 +28,7 @@ class BatchBuilder:
     def batch(
         self, specs: Sequence[SampleSpec], size: Size | None = None, target_size: Size | None = None
     ) -> Batch:
-        """Samples with equal numbers of inputs and equal protocols of targets, which may be none. ``size``,
+        """Batch of samples with equal numbers of inputs and equal target protocols (or none). ``size``,
         ``target_size``: (height, width) of inputs and targets (None: those of the photographs)."""
         inputs = [_views(self.inputs, s.subject, s.inputs, self.depths, size) for s in specs]
         bodies = [self.inputs.body(s.subject) for s in specs]
@@ -67,7 +67,6 @@ def _images(views: list[list[View]]) -> Tensor:
 
 
 def _stacked(views: list[list[View]], name: str) -> Tensor | None:
-    """An array of all views; None where one is not known."""
     arrays = [[getattr(view, name) for view in row] for row in views]
     if any(array is None for row in arrays for array in row):
         return None
@@ -102,7 +101,7 @@ class TrainingBatches(Dataset):
 
 
 class EvaluationBatches(Dataset):
-    """Fixed samples; an item has up to ``batch_size`` neighbours with equal protocols of targets."""
+    """Fixed samples; an item has up to ``batch_size`` consecutive ones with equal target protocols."""
 
     def __init__(self, builder: BatchBuilder, specs: Sequence[SampleSpec], batch_size: int) -> None:
         self.builder = builder
@@ -120,12 +119,9 @@ class EvaluationBatches(Dataset):
 
 
 class StepSampler(DistributedSampler):
-    """The steps of one epoch, counted from the beginning of the run.
-
-    Samples are already divided among processes by step. It is a ``DistributedSampler`` because Lightning
-    replaces any other sampler by its own when there are several processes. ``first_step``: gives the first
-    step; called when the epoch starts.
-    """
+    """Steps of one epoch, counted from the beginning of the run; ``first_step`` is called when it starts. A
+    ``DistributedSampler``, because with several processes Lightning replaces any other sampler by its own;
+    the datasets divide samples among processes themselves."""
 
     def __init__(self, dataset: Dataset, first_step: Callable[[], int]) -> None:
         super().__init__(dataset, num_replicas=1, rank=0, shuffle=False)

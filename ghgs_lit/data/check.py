@@ -1,4 +1,4 @@
-"""Reads all of a data set once and reports what is there, what is missing and what is broken."""
+"""Check of a data set: read all of it once, and report what is there, missing and broken."""
 
 import hashlib
 import json
@@ -24,20 +24,20 @@ from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError
 
 _LINE = re.compile(r"(?P<place>.*?): expected (?P<expected>.*); found (?P<found>.*)", re.DOTALL)
-# Rows of a table on the terminal; check.json lists all of them.
+# Rows of a table on the terminal; check.json has all.
 _SHOWN = 30
-# MiB of decoded files kept: a body is read once for all photographs of its subject.
+# MiB of decoded files kept, so that a body is read once for all photographs of its subject.
 _CACHE_MB = 4
 _PICTURED_SUBJECTS, _PICTURED_VIEWS = 6, 8
-# A subject of which no channel is brighter than this, of 255, is not lit at all.
+# A subject whose channels are all below this, of 255, counts as black.
 _BLACK = 8
-# Units: nobody is taller than this in metres.
+# Metres: taller subjects suggest another unit.
 _TALLEST = 10.0
 
 
 @dataclass(frozen=True)
 class _Readings(Dataset):
-    """Item ``i`` is what reading photograph ``i`` gave."""
+    """Item ``i`` is the result of reading photograph ``i``."""
 
     photographs: Photographs
     listed: Sequence[Photograph]
@@ -85,7 +85,7 @@ class _Readings(Dataset):
 
 @dataclass(frozen=True)
 class _Inspections(Dataset):
-    """Item ``i`` is the problem that inspection ``i`` found, or None."""
+    """Item ``i`` is the problem of inspection ``i``, or None."""
 
     inspections: Sequence[Callable[[], None]]
 
@@ -107,12 +107,12 @@ def _read_all(items: Dataset, workers: int, label: str) -> list:
 
 def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: float = 0.9) -> Report:
     """Read everything that training and evaluation would read, once, with the workers of ``data``.
-    ``min_iou``: least IoU of a body's silhouette and a mask; below it a camera counts as wrong. Clothed
-    people reach 0.75 to 0.95, a wrong camera 0 to 0.4. ``min_agreement``: the same for people without a body:
-    least share of a mask that the other masks allow. Right cameras reach 0.98 to 1."""
+    ``min_iou``: least IoU of a body's silhouette and a mask; clothed people reach 0.75 to 0.95, wrong cameras
+    0 to 0.4. ``min_agreement``, without a body: least share of a mask that the subject's other masks allow;
+    right cameras reach 0.98 to 1."""
     report = Report()
     dataset, workers = data.dataset, data.dataset.workers
-    # With static cameras only one protocol is possible; the configured one matters in training only.
+    # Static cameras allow only one protocol.
     targets = CAMERAS if dataset.static_cameras else data.targets
     inspections = dataset.inspections()
     report.inspections = len(inspections)
@@ -152,7 +152,7 @@ def _inspect_phase(
     phase: str, photographs: Photographs, targets: TargetProtocol, min_iou: float, workers: int
 ) -> Phase:
     reader = photographs.reader
-    # Views that the protocol may ask for are read even where no file of theirs is there to be listed.
+    # Views that the protocol may ask for are read even if no file of theirs exists.
     needed = {RING_VIEW} | targets.view_numbers
     places = [(name, position) for name, positions in reader.subjects.items() for position in positions]
     listed = [(*place, view) for place in places for view in sorted(needed | set(reader.views_at(*place)))]
@@ -203,13 +203,13 @@ def _cannot_sample(data: PhotographsDataModule, targets: TargetProtocol, trainin
 
 
 def split_line(line: str) -> tuple[str, str, str]:
-    """Place, expected and found of an error's line."""
+    """Place, expected and found of an error message."""
     match = _LINE.fullmatch(line)
     return (match["place"], match["expected"], match["found"]) if match else ("", "", line)
 
 
 def show(report: Report) -> None:
-    """Print the tables."""
+    """Print the report as tables."""
     columns = ("people", "subjects", "photos", "broken", "bodies", "mean IoU", "min IoU", "inside", "agree")
     table = Table("phase", *columns)
     for name, phase in report.phases.items():
@@ -235,7 +235,7 @@ def show(report: Report) -> None:
 
 
 def write(report: Report, folder: Path) -> Path:
-    """Write ``check.json`` and, if there are photographs, ``contact.png``; returns ``folder``."""
+    """Write ``check.json`` and, if there are photographs, ``contact.png``; return ``folder``."""
     keys = ("place", "expected", "found")
     content = {
         "problems": [dict(zip(keys, split_line(line), strict=True)) for line in report.problems],

@@ -1,4 +1,4 @@
-"""What checking a data set found, and checks that compare: masks of a subject, ``train`` with ``val``."""
+"""Report of a data check, and checks between masks of a subject and between ``train`` and ``val``."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -11,16 +11,15 @@ from ghgs_lit.data.sampling import RING_VIEW
 from ghgs_lit.data.silhouettes import SEARCH, height, twins
 from ghgs_lit.geometry.silhouettes import Silhouette
 
-#: Name of the subject, position and view.
+#: Subject, position and view.
 Photograph = tuple[str, int, int]
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What reading one photograph gave. ``iou``, ``inside``: how the body fits the mask (:class:`Overlap`),
-    where there is a body. ``agreement``: where there is none, the share of the mask that the other masks
-    allow. ``tall``: its largest side in world units, by its body or by its masks, where that is known.
-    ``silhouette``: the coarse mask, where the body does not check the camera."""
+    """Result of reading one photograph. ``iou``, ``inside``: fit of body and mask (:class:`Overlap`). Without
+    a body to compare: ``agreement``, the share of the mask that the other masks allow, and ``silhouette``,
+    the coarse mask. ``tall``: the subject's largest side in world units, by body or masks."""
 
     name: str
     position: int
@@ -38,7 +37,7 @@ class Seen:
 
 @dataclass
 class Phase:
-    """What was found in a phase."""
+    """Results of a phase."""
 
     people: int
     subjects: int
@@ -47,7 +46,7 @@ class Phase:
 
     @property
     def tall(self) -> float | None:
-        """Median largest side of the subjects in world units, where it is known."""
+        """Median largest side of the subjects in world units, if known."""
         known = [seen.tall for seen in self.seen if seen.tall is not None]
         return float(np.median(known)) if known else None
 
@@ -58,9 +57,8 @@ class Phase:
 
 @dataclass
 class Report:
-    """The result of a check. ``problems``: lines ``<place>: expected ...; found ...`` of what keeps training
-    from starting. ``notes``: the same of what does not. ``inspections``: number of files that were checked
-    beside the photographs."""
+    """Result of a check. ``problems``: lines ``<place>: expected ...; found ...`` that prevent training;
+    ``notes``: lines that do not. ``inspections``: number of files checked beside the photographs."""
 
     phases: dict[str, Phase] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
@@ -69,8 +67,8 @@ class Report:
 
 
 def agreeing(seen: list[Seen], reader: Reader, least: float) -> list[Seen]:
-    """``seen`` with the agreement of those masks that no body checked; at most one problem for each subject.
-    ``least``: share of a mask that the other masks of its subject must allow."""
+    """``seen`` with the agreement of masks without a body; at most one problem for each subject. ``least``:
+    share of a mask that the other masks of its subject must allow."""
     by_subject: dict[str, list[int]] = {}
     for i, one in enumerate(seen):
         if one.silhouette is not None:
@@ -112,7 +110,7 @@ def _compared(seen: list[Seen], reader: Reader, least: float) -> list[Seen]:
 
 
 def shared(root: str, phases: Mapping[str, Phase], readers: Mapping[str, Reader]) -> list[str]:
-    """Subjects, and photographs under different names, that are both in ``train`` and in ``val``."""
+    """Problems: subjects, or photographs under different names, in both ``train`` and ``val``."""
     if set(phases) != {"train", "val"}:
         return []
     both = set(readers["train"].subjects) & set(readers["val"].subjects)

@@ -1,4 +1,4 @@
-"""The LightningDataModule of all data sets: a data set, protocols and options turned into loaders."""
+"""LightningDataModule of all data sets."""
 
 import dataclasses
 import math
@@ -32,11 +32,8 @@ Targets = TargetProtocol | Mapping[str, Any]
 
 
 def trained_batches(trainer: Trainer | None, length: int) -> int:
-    """Batches that each process has trained on so far, also after a restart from a checkpoint.
-
-    The last step of an epoch takes the batches that are left, fewer than ``accumulate_grad_batches`` where
-    the epoch is no multiple. ``trainer``: None outside of training. ``length``: batches of an epoch.
-    """
+    """Number of batches that each process has trained on so far, also after a resume; 0 without a trainer.
+    ``length``: batches of an epoch, whose last step may have fewer than ``accumulate_grad_batches``."""
     if trainer is None:
         return 0
     length = min(length, trainer.num_training_batches)  # trainer.limit_train_batches
@@ -50,9 +47,8 @@ def _protocols(targets: Targets | Sequence[Targets]) -> list[TargetProtocol]:
 
 
 class PhotographsDataModule(LightningDataModule):
-    """Batches of a data set. InputError: an unknown key or an impossible value; when data is read, files that
-    are missing or bad. ``augmentation``: what varies in training, :class:`Augmentation` or its mapping (None:
-    nothing)."""
+    """Loaders of a data set. ``augmentation``: of training (None: no variation). InputError: an unknown key
+    or impossible value; when data is read, missing or bad files."""
 
     def __init__(
         self,
@@ -75,17 +71,17 @@ class PhotographsDataModule(LightningDataModule):
 
     @property
     def facts(self) -> dict[str, str]:
-        """What readers of results must know about how the data was read."""
+        """Provenance of the data for results."""
         return {**self.dataset.facts, "resampling": self.dataset.resampling}
 
     def prepare_data(self, splits: Sequence[str] = PHASES) -> None:
-        """Make what ``splits`` need and is missing."""
+        """Make missing data of ``splits``."""
         for split in splits:
             choice("split", split, self.dataset.split_names)
         self.dataset.prepare(splits)
 
     def builder(self, phase: str) -> BatchBuilder:
-        """Builds batches of a split; made on first use."""
+        """Batch builder of a split, made at its first use."""
         choice("split", phase, self.dataset.split_names)
         if phase not in self._builders:
             data, reader = self.dataset, self.dataset.reader(phase)
@@ -100,7 +96,7 @@ class PhotographsDataModule(LightningDataModule):
         return self.builder(phase).inputs.reader.subjects
 
     def training_sampler(self, targets: TargetProtocol | None = None) -> TrainingSampler:
-        """What training sees at each step (``targets`` None: this module's)."""
+        """Sampler of training (``targets`` None: this module's)."""
         targets = self._possible(targets or self.targets)
         return TrainingSampler(
             self.subjects("train"), self.views, targets, self.dataset.ring, self.dataset.batch_size, self.seed
@@ -117,7 +113,7 @@ class PhotographsDataModule(LightningDataModule):
         return TrainingBatches(builder, sampler, self.augmentation, length, rank, world)
 
     def train_dataloader(self) -> DataLoader:
-        """Batches of one epoch; the next epoch continues where it ended."""
+        """Batches of one epoch, which continues where the last one ended."""
         sampler = self.training_sampler()
         world = self.trainer.world_size if self.trainer else 1
         rank = self.trainer.global_rank if self.trainer else 0
@@ -135,9 +131,9 @@ class PhotographsDataModule(LightningDataModule):
         split: str = "val",
         batch_size: int | None = None,
     ) -> DataLoader:
-        """One sample for each subject, always the same ones. ``views``: number of inputs (None: the view
-        protocol's). ``targets``: a protocol or its mapping, or several, whose targets a sample has one after
-        another (None: this module's). ``batch_size``: samples of a batch (None: this module's)."""
+        """One fixed sample for each subject. ``views``: number of inputs (None: the view protocol's).
+        ``targets``: a protocol or its mapping, or several, whose targets follow one another in each sample.
+        None: this module's values."""
         protocols = _protocols(self.targets if targets is None else targets)
         specs = self._evaluation_samples(self.subjects(split), protocols, views)
         batches = EvaluationBatches(self.builder(split), specs, batch_size or self.dataset.batch_size)
@@ -150,8 +146,8 @@ class PhotographsDataModule(LightningDataModule):
         views: int | None = None,
         targets: Targets | Sequence[Targets] | None = None,
     ) -> Batch:
-        """The sample of one subject; nothing of others is read. Arguments as for :meth:`evaluation_loader`.
-        ``targets``: a protocol or its mapping, or several; None: the batch has no targets."""
+        """The sample of one subject; no other is read. Arguments as for :meth:`evaluation_loader`, except
+        that ``targets=None`` gives a batch without targets."""
         protocols = [] if targets is None else _protocols(targets)
         available = {subject: self.subjects(split)[subject]}
         return self.builder(split).batch(self._evaluation_samples(available, protocols, views))
@@ -167,7 +163,6 @@ class PhotographsDataModule(LightningDataModule):
         return self.evaluation_loader()
 
     def _possible(self, targets: TargetProtocol) -> TargetProtocol:
-        """``targets``, unless they are views between static cameras."""
         if self.dataset.static_cameras and targets.view_numbers != {RING_VIEW}:
             raise InputError(
                 f"targets: expected cameras for data={self.dataset.name}, as with targets=cameras "
@@ -177,7 +172,7 @@ class PhotographsDataModule(LightningDataModule):
 
     def _loader(self, batches: TorchDataset, **options: Any) -> DataLoader:
         with warnings.catch_warnings():
-            # More workers than cores: they were asked for, and each loader would say it.
+            # Each loader would warn of more workers than cores, which were asked for.
             warnings.filterwarnings("ignore", "This DataLoader will create")
             return DataLoader(
                 batches,

@@ -1,4 +1,4 @@
-"""Data sets as they are configured: where they lie, how they are read and how photographs become batches."""
+"""Options of data sets: location, reading and batching."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -28,15 +28,14 @@ class Limit(Options):
     """Subjects of validation that are used, the first ones; null: all."""
 
     def of(self, phase: str) -> int | None:
-        """The number of a phase; None: all."""
+        """Number of subjects of a phase; None: all."""
         return getattr(self, phase, None)
 
 
 class DataOptions(Options):
-    """Everything that data sets have in common; each has a subclass with the keys of its own. ``published``:
-    number of people of each phase in the publication, where there is one. ``static_cameras``: whether there
-    are no views between the cameras (their view number is always 0). ``ring``: number of positions on a full
-    ring of cameras; inputs are evenly spaced among them."""
+    """Base options of data sets. ``published``: number of people of each phase in the publication, if any.
+    ``static_cameras``: whether there are no views between the cameras (view numbers are 0). ``ring``: number
+    of positions on a full ring of cameras, among which inputs are evenly spaced."""
 
     group = "data"
     published: ClassVar[Mapping[str, int]] = {}
@@ -70,59 +69,56 @@ class DataOptions(Options):
         seed: int = 0,
         augmentation: Augmentation | Mapping[str, Any] | None = None,
     ) -> "PhotographsDataModule":
-        """Batches of the data set; arguments as for :class:`PhotographsDataModule`."""
+        """Data module; arguments as for :class:`PhotographsDataModule`."""
         from ghgs_lit.data.datamodule import PhotographsDataModule
 
         return PhotographsDataModule(self, views, targets, seed, augmentation)
 
     @abstractmethod
     def reader(self, phase: str, strict: bool = True) -> Reader:
-        """The photographs of ``train`` or ``val``; ``strict`` as for :class:`Reader`."""
+        """Reader of a split; ``strict`` as for :class:`Reader`."""
 
     def has(self, phase: str) -> bool:
-        """Whether there are subjects of a phase; data without ``train`` can be evaluated."""
+        """Whether a phase has subjects; data without ``train`` can be evaluated."""
         return True
 
     @property
     def split_names(self) -> tuple[str, ...]:
-        """Names of the splits that can be read: ``train``, ``val``, and further ones for evaluation."""
+        """Names of the splits: ``train``, ``val``, and further ones for evaluation."""
         return PHASES
 
     def prepare(self, splits: Sequence[str] = PHASES) -> None:
-        """Make what these splits need and is missing; called once, before any process reads."""
+        """Make missing data of these splits; called once, before any process reads."""
         return
 
     def inspections(self) -> Sequence[Callable[[], None]]:
-        """What ``task=check`` checks beside the photographs; each call raises InputError if it is bad.
-
-        They run in other processes: functions of a module, or partials of them.
-        """
+        """Further checks for ``task=check``, which raise InputError: functions of a module, or partials of
+        these, because they run in other processes."""
         return []
 
     def check_targets(self, targets: TargetProtocol) -> None:
-        """Refuse a configured target protocol whose views this data set never has."""
+        """Refuse a target protocol whose views this data set never has."""
         return
 
     @property
     def folder(self) -> Path:
-        """The folder of the data, which a subclass names as ``root``. InputError: ``data.root`` is null or no
-        folder."""
+        """Folder of the data, ``root`` of a subclass. InputError: ``data.root`` is null or not a folder."""
         folder = required_folder("data.root", "the folder of the data set", self.root)
         require_data_folder(folder)
         return folder
 
     @property
     def facts(self) -> dict[str, str]:
-        """What readers of results must know about how the files are read."""
+        """Provenance of the files for results."""
         return {"name": self.name}
 
     def split_facts(self, split: str) -> dict[str, str]:
-        """What they must know about a split."""
+        """Provenance of a split for results."""
         return {"split": split}
 
 
 class DataSet(DataOptions):
-    """A data set in a folder of the user's."""
+    """Options of a data set in the user's folder."""
 
     root: options.Path | None = None
     """Folder of the data."""
@@ -131,7 +127,7 @@ class DataSet(DataOptions):
 
 
 def required_folder(key: str, expected: str, value: str | None) -> Path:
-    """The path configured at ``key``, which need not exist. InputError: it is null."""
+    """Path configured at ``key``, which need not exist. InputError: it is null."""
     if value is None:
         raise InputError(f"{key}: expected {expected}; found null")
     return Path(value).expanduser()

@@ -1,4 +1,4 @@
-"""Files of data sets, decoded and checked: every defect is an :class:`InputError` that names the file."""
+"""Decoding and checking of files of data sets; an :class:`InputError` names the file of a defect."""
 
 import re
 from collections.abc import Sequence
@@ -12,13 +12,13 @@ from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.readers import read_npy, require_file
 
-# How far from the image's centre a principal point may lie, as a fraction of the side.
+# Largest distance of a principal point from the image's centre, as a fraction of the side.
 _OFF_CENTRE = 0.25
-# How far from a proper rotation a stored one may be: rounding, but no other unit or axis.
+# Largest entry of ``R R^T - I``: allows rounding, but no other unit or axis.
 _ROTATION_TOLERANCE = 1e-3
-# Modes of images that convert to RGB without a loss of range, and the EXIF orientation that changes nothing.
+# Modes that convert to RGB without loss of range, and the EXIF orientation of upright images.
 _EIGHT_BITS, _UPRIGHT = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr"), 1
-#: The largest coordinate of a vertex: a kilometre in millimetres.
+#: Largest coordinate of a vertex: a kilometre in millimetres.
 _FURTHEST = 1e6
 _SAFE_NAME = re.compile(r"[\w.+-]+")
 
@@ -37,8 +37,8 @@ def read_image(path: Path) -> Image.Image:
 
 
 def read_photograph(path: Path) -> np.ndarray:
-    """[h, w, 3] uint8 from an image of 8 bits a channel (grey, palette, RGB or CMYK, with or without alpha).
-    InputError: it is missing or cannot be decoded, has other values, or is to be turned when it is shown."""
+    """Read [h, w, 3] uint8 from an image of 8 bits a channel (grey, palette, RGB or CMYK, alpha ignored).
+    InputError: it is missing or cannot be decoded, has other values, or an EXIF orientation."""
     image = read_image(path)
     if image.mode not in _EIGHT_BITS:
         raise InputError(f"{path}: expected a photograph of 8 bits a channel; found mode {image.mode}")
@@ -53,8 +53,8 @@ def read_photograph(path: Path) -> np.ndarray:
 
 
 def read_map(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """Read channel 0 of a mask or depth map. ``size``: (height, width) of its photograph, which it must have
-    too. InputError: it is missing, cannot be decoded, has another size, or is no map of whole numbers."""
+    """Read channel 0 of a mask or depth map of ``size`` (height, width). InputError: it is missing, cannot be
+    decoded, has another size, or does not hold integers."""
     array = np.asarray(read_image(path))
     if array.dtype.kind not in "bui":
         raise InputError(f"{path}: expected whole numbers; found {array.dtype}")
@@ -72,8 +72,8 @@ def read_array(path: Path, shapes: Shapes) -> np.ndarray:
 
 
 def read_vertices(path: Path) -> np.ndarray:
-    """The vertices [n, 3] float32 of a body, at least one, in an ``.npy`` file. InputError: it is missing or
-    another array, or a coordinate is beyond 1e6."""
+    """Read vertices [n, 3] float32, n >= 1, from an ``.npy`` file. InputError: it is missing or another
+    array, or a coordinate is beyond 1e6."""
     vertices = read_array(path, [(None, 3)])
     require(len(vertices) > 0, str(path), "vertices", "none")
     check_extent(path, vertices)
@@ -81,14 +81,14 @@ def read_vertices(path: Path) -> np.ndarray:
 
 
 def check_extent(place: Path | str, vertices: np.ndarray) -> None:
-    """Refuse coordinates that no scan of a person has in any unit; they would make all others vanish."""
+    """Refuse coordinates that no scan of a person has in any unit and that would dwarf all others."""
     largest = float(np.abs(vertices).max(initial=0))
     require(largest < _FURTHEST, str(place), f"coordinates below {_FURTHEST:.0e}", largest)
 
 
 def check_array(place: Path | str, array: Any, shapes: Shapes) -> np.ndarray:
-    """Convert to a finite float64 array. ``shapes``: the shapes that are accepted; None is any length.
-    InputError: it is not an array of numbers, has another shape, or is not finite."""
+    """Convert to a finite float64 array of one of ``shapes``, in which None is any length. InputError: it is
+    not an array of numbers, has another shape, or is not finite."""
     try:
         array = np.asarray(array)
         if array.dtype.kind in "cmM":
@@ -113,8 +113,7 @@ def _describe(shapes: Shapes) -> str:
 
 
 def check_intrinsics(place: Path | str, intrinsics: Any) -> np.ndarray:
-    """Finite intrinsics [3, 3] with focal lengths above 0 and the last row 0 0 1, float64. InputError: they
-    are not; it names ``place``."""
+    """Intrinsics [3, 3] float64. InputError: not finite, focal lengths not above 0, or last row not 0 0 1."""
     intrinsics = check_array(place, intrinsics, [(3, 3)])
     if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
         raise InputError(
@@ -125,8 +124,7 @@ def check_intrinsics(place: Path | str, intrinsics: Any) -> np.ndarray:
 
 
 def check_extrinsics(place: Path | str, extrinsics: Any) -> np.ndarray:
-    """Extrinsics [4, 4] float64 from [3, 4] or [4, 4], world to camera: finite, with a proper rotation.
-    InputError: they are not; it names ``place``."""
+    """Extrinsics [4, 4] float64 from [3, 4] or [4, 4]. InputError: not finite, or not a proper rotation."""
     extrinsics = check_array(place, extrinsics, [(3, 4), (4, 4)])
     if len(extrinsics) == 3:
         extrinsics = np.concatenate((extrinsics, [[0, 0, 0, 1]]))
@@ -149,8 +147,7 @@ def _check_last_row(place: Path | str, matrix: np.ndarray) -> None:
 
 
 def check_view(place: Path | str, view: View) -> None:
-    """Refuse values that are not a :class:`View`'s, such as photographs of floats or masks of numbers.
-    InputError: an array has another shape or type, or the camera is bad."""
+    """Check shapes, types and camera of a :class:`View`. InputError: an array or the camera is wrong."""
     size = np.shape(view.mask)
     arrays = {"image": (view.image, (*size, 3), np.uint8), "mask": (view.mask, size, np.bool_)}
     if view.inverse_depth is not None:
@@ -169,8 +166,7 @@ def check_view(place: Path | str, view: View) -> None:
 
 
 def check_center(path: Path, intrinsics: np.ndarray, height: int, width: int) -> None:
-    """Refuse a photograph that was resized after its calibration. ``intrinsics``: [3, 3] in pixels of the
-    calibration. InputError: the principal point lies far from the photograph's centre."""
+    """Refuse a photograph resized after calibration. InputError: its principal point is far off centre."""
     if np.abs(intrinsics[:2, 2] / [width, height] - 0.5).max() > _OFF_CENTRE:
         raise InputError(
             f"{path}: expected a photograph of the calibration's size, its principal point "
@@ -179,6 +175,6 @@ def check_center(path: Path, intrinsics: np.ndarray, height: int, width: int) ->
 
 
 def check_name(name: str) -> str:
-    """Return ``name`` if it can be a part of a file name (results and pictures are named after subjects)."""
+    """Return ``name`` if it can be part of a file name, as results are named after subjects."""
     require(bool(_SAFE_NAME.fullmatch(name)), "subject", "letters, digits and . + - _ only", name)
     return name

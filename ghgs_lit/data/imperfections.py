@@ -1,6 +1,6 @@
-"""What goes wrong in captures: exposure and colour of single cameras, masks, calibration, cut subjects.
+"""Imperfections of captures: exposure and colour of single cameras, masks, calibration, cut subjects.
 
-Each function draws equally many random numbers whatever its limits are.
+The number of random numbers that a function draws does not depend on its limits.
 """
 
 import dataclasses
@@ -20,21 +20,18 @@ from ghgs_lit.types import Batch, Cameras, extents
 
 # Stored colours are light to the power 1/2.2.
 _GAMMA = 2.2
-# Side of the bumps of a ragged outline in pixels.
+# Width of the bumps of a ragged outline in pixels.
 _BUMP = 6
-# Patches of backgrounds: how many along a side, and how much their colours differ. Noise of single pixels.
+# Patches of backgrounds: number along a side and deviation of colours; noise of single pixels.
 _PATCHES, _NOISE = ((3, 0.35), (12, 0.15), (40, 0.06)), 0.02
 
 
 def color_gains(
     views: int, exposure: float, white_balance: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "V 3"]:
-    """What each camera multiplies stored colours by; the geometric mean over the cameras is 1.
-
-    Photographs do not tell which camera is right, so that only differences between cameras can be undone.
-    ``exposure``: greatest deviation of a camera in stops. ``white_balance``: greatest deviation of red and of
-    blue from green in stops.
-    """
+    """Random factors of stored colours. Their geometric mean over cameras is 1, because photographs show only
+    differences between cameras. ``exposure``, ``white_balance``: greatest deviation in stops of a camera, and
+    of red and blue from green."""
     deviation = rng.uniform(-1, 1, (views, 3))
     deviation -= deviation.mean(0)
     deviation /= np.maximum(1, np.abs(deviation).max(0))
@@ -43,8 +40,7 @@ def color_gains(
 
 
 def tone_powers(views: int, gamma: float, rng: np.random.Generator) -> Float[np.ndarray, " V"]:
-    """What each camera raises stored colours to; the geometric mean over the cameras is 1.
-    ``gamma``: greatest natural logarithm of a power."""
+    """Random powers of stored colours, geometric mean 1 over cameras; ``gamma``: greatest logarithm."""
     deviation = rng.uniform(-1, 1, views)
     deviation -= deviation.mean()
     return np.exp(gamma * deviation / max(1, np.abs(deviation).max()))
@@ -53,8 +49,7 @@ def tone_powers(views: int, gamma: float, rng: np.random.Generator) -> Float[np.
 def toned(
     images: Float[Tensor, "B V 3 h w"], alpha: Float[Tensor, "B V h w"] | None, powers: Float[Tensor, "B V"]
 ) -> Float[Tensor, "B V 3 h w"]:
-    """Photographs whose surfaces' colours are raised to a power of each view. ``alpha``: mattes by which they
-    are multiplied; None: there are none."""
+    """Raise the colours of each view to a power; multiplication by mattes ``alpha`` is undone before."""
     powers = powers[..., None, None, None]
     if alpha is None:
         return images**powers
@@ -70,15 +65,10 @@ def imperfect_mask(
     hole_chance: float,
     rng: np.random.Generator,
 ) -> Bool[np.ndarray, "h w"]:
-    """A mask as a segmentation might give it; the mask itself where nothing would be left of it.
-
-    Args:
-        mask: on the subject; an empty one stays empty.
-        offset: greatest number of pixels that it grows or shrinks by.
-        ragged: greatest number of pixels that bumps of its outline are high.
-        hole: greatest diameter of a round piece that is missing, as a share of the subject's height.
-        hole_chance: how often a piece is missing.
-    """
+    """Mask with the errors of a segmentation; unchanged if nothing would be left of it. ``offset``: greatest
+    growth or shrinkage in pixels. ``ragged``: greatest height of bumps of the outline in pixels. ``hole``:
+    greatest diameter of a missing round piece, over the subject's height. ``hole_chance``: probability of a
+    missing piece."""
     grow, height, missing, size, place = rng.uniform(size=5)
     bumps = rng.uniform(-1, 1, [side // _BUMP + 2 for side in mask.shape])
     if not mask.any():
@@ -103,7 +93,7 @@ def imperfect_mask(
 def backgrounds(
     views: int, height: int, width: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "V 3 h w"]:
-    """What is behind a subject, another for each camera: cloudy patterns of large and small patches."""
+    """Random background for each camera: cloudy patterns of large and small patches, in [0, 1]."""
     size = (views, 3, height, width)
     found = 0.5 + rng.uniform(-0.2, 0.2, (views, 3, 1, 1)) + _NOISE * rng.standard_normal(size)
     for cells, deviation in _PATCHES:
@@ -115,12 +105,12 @@ def backgrounds(
 def miscalibrated(
     cameras: Cameras, masks: Bool[Tensor, "V H W"], pixels: float, rng: np.random.Generator
 ) -> Cameras:
-    """Cameras that are off: each is turned, moved across its axis and has another focal length.
+    """Cameras with errors: each is rotated, moved across its axis, and has another focal length.
 
-    A camera's error is drawn up to ``pixels``: what the corners of its mask's box move by at the subject's
-    distance (root of the mean square). What all cameras share is taken out, as photographs do not tell where
-    a rig is: only differences between cameras can be undone. ``masks``: theirs; in place of an empty one
-    counts the whole photograph. InputError: no point is before all cameras.
+    A camera's error, drawn up to ``pixels``, is the motion of the corners of its mask's box (the photograph's
+    for an empty mask) at the subject's distance, root mean square. The common error of all cameras is
+    removed, because photographs show only differences between cameras. InputError: the point that the cameras
+    look at is not before all of them.
     """
     count = len(masks)
     directions = torch.from_numpy(rng.standard_normal((count, 6)))
@@ -132,7 +122,7 @@ def miscalibrated(
     corners = _corners(masks)
 
     def moved(errors: Tensor) -> tuple[Tensor, Tensor]:
-        """Intrinsics and extrinsics after errors [V, 6], each in pixels about."""
+        """Intrinsics and extrinsics after errors [V, 6], each about in pixels."""
         focal, half = lenses[:, 1, 1], max(cameras.height, cameras.width) / 2
         turn = errors[:, :3] / 2 / torch.stack((focal, focal, torch.full_like(focal, half)), -1)
         rotation = quaternion_to_matrix(torch.cat((torch.ones(count, 1, dtype=turn.dtype), turn), -1))
@@ -145,15 +135,14 @@ def miscalibrated(
     points = unproject(corners, distances[:, None].expand(-1, 4), _of_each(lenses), _of_each(poses))
 
     def seen(lens: Tensor, pose: Tensor) -> Tensor:
-        """Where cameras see the corners; far from the world's origin not exactly at them."""
+        """Pixels of the corners, which far from the world's origin differ from ``corners`` by rounding."""
         return project(points, _of_each(lens), _of_each(pose))[0]
 
     def size(lens: Tensor, pose: Tensor) -> Tensor:
-        """Errors in pixels."""
         return (seen(lens, pose) - seen(lenses, poses)).square().sum(-1).mean(-1).sqrt()
 
     errors = wanted[:, None] * directions / directions.norm(dim=-1, keepdim=True)
-    for _ in range(3):  # errors grow nearly in proportion
+    for _ in range(3):  # the size is nearly proportional to the errors
         errors = errors * (wanted / size(*moved(errors)))[:, None]
     lens, pose = _apart(cameras, *moved(errors))
     largest = size(lens, pose).amax()
@@ -163,7 +152,7 @@ def miscalibrated(
 
 
 def _corners(masks: Bool[Tensor, "V H W"]) -> Float[Tensor, "V 4 2"]:
-    """Corners of the boxes around masks, in pixels; those of the photograph where a mask is empty."""
+    """Corners of the boxes around masks, in pixels; those of the photograph for an empty mask."""
     masks = torch.where(masks.any((1, 2), keepdim=True), masks, True)
     lines = [mask.any(axis).nonzero()[:, 0] for mask in masks for axis in (0, 1)]
     ends = torch.stack([torch.stack((line[0], line[-1] + 1)) for line in lines]).reshape(len(masks), 2, 2)
@@ -177,7 +166,7 @@ def _of_each(matrices: Float[Tensor, "V n m"]) -> Float[Tensor, "V 4 n m"]:
 def _apart(
     cameras: Cameras, lens: Float[Tensor, "V 3 3"], pose: Float[Tensor, "V 4 4"]
 ) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"]]:
-    """Intrinsics and extrinsics without what their differences from ``cameras`` have in common."""
+    """Intrinsics and extrinsics without the common part of their differences from ``cameras``."""
     true, middle = cameras.extrinsics.double(), look_at_point(cameras).double()
     motions = without_common(motions_between(true, pose, middle), true[:, 2, :3])
     both = [0, 1]
@@ -187,17 +176,15 @@ def _apart(
     return lens, after_motions(true, motions, middle)
 
 
-#: Least and greatest share of the subject's height that a frame shows: from the waist to the ankles.
+#: Least and greatest share of a cut subject's height that remains: down to the waist or the ankles.
 _SHOWN = 0.45, 0.95
 
 
 def cut(batch: Batch, chance: float, rngs: list[np.random.Generator]) -> Batch:
-    """The batch with a share ``chance`` of its subjects cut by the frame's lower edge.
-
-    In one half of them all photographs and all targets end at about the same height, so that nobody is asked
-    for legs that no photograph shows; in the other half some of the inputs end, at heights of their own.
-    Photographs are moved down in their frames, principal points with them. ``rngs``: one for each element.
-    """
+    """Cut a share ``chance`` of the subjects by the frame's lower edge. ``rngs``: one for each element. Half
+    of them are cut in all inputs and targets at about the same height, so that no legs are asked for that no
+    photograph shows; the others in some inputs, at different heights. Photographs are moved down in their
+    frames, and principal points with them."""
     views = batch.masks.shape[1]
     shares, ends = np.ones(batch.masks.shape[:2]), np.ones(len(rngs))
     for b, rng in enumerate(rngs):
@@ -210,7 +197,7 @@ def cut(batch: Batch, chance: float, rngs: list[np.random.Generator]) -> Batch:
             shares[b] = ends[b] = low + (high - low) * height
         else:
             some = (chosen < 0.5) | (chosen == chosen.min())
-            some[chosen.argmax()] = False  # at least one is whole
+            some[chosen.argmax()] = False  # at least one stays whole
             shares[b, some] = (low + (high - low) * heights)[some]
     rows = _rows(batch.masks, shares)
     maps = {name: _lowered(getattr(batch, name), rows) for name in ("images", "masks", "depths", "alpha")}
@@ -226,7 +213,7 @@ def cut(batch: Batch, chance: float, rngs: list[np.random.Generator]) -> Batch:
 
 
 def _rows(masks: Bool[Tensor, "B V H W"], shares: Float[np.ndarray, "B V"]) -> list[list[int]]:
-    """By how many rows photographs move down so that the given share of the mask's height stays."""
+    """Rows by which photographs move down so that the given share of the mask's height remains."""
     height, views = masks.shape[2], masks.shape[1]
     found = []
     for seen, share in zip(extents(masks.flatten(0, 1)), shares.flatten(), strict=True):
@@ -236,7 +223,7 @@ def _rows(masks: Bool[Tensor, "B V H W"], shares: Float[np.ndarray, "B V"]) -> l
 
 
 def _lowered(maps: Tensor | None, rows: list[list[int]]) -> Tensor | None:
-    """``maps`` [B, V, ..., H, W], each moved down by its rows; 0 and False above."""
+    """``maps`` [B, V, ..., H, W], each moved down by its rows, with zeros above."""
     if maps is None:
         return None
     moved = torch.zeros_like(maps)

@@ -1,4 +1,4 @@
-"""The layout on disk of rendered THuman2.0 data, whoever rendered it.
+"""Layout on disk of rendered THuman2.0 data, of this and of other renderers.
 
 ``<root>/<phase>/`` with phase ``train`` or ``val`` holds, for each ring position and view number::
 
@@ -13,9 +13,9 @@
     surface/<id>/vertices.npy                      optional, of people in motion (<id> ends with the number of
                                                    an instant): the same points [n, 3] at each instant
 
-Where this package renders, ``<root>/rendering/`` has ``plan.json`` (the subjects of each phase that were
-requested) and ``done/<phase>/<subject>`` (one empty file for each complete subject, written last). A data set
-without ``rendering/`` was made elsewhere: everything in it counts as complete.
+This package's renderer writes ``<root>/rendering/`` with ``plan.json`` (the requested subjects of each phase)
+and ``done/<phase>/<subject>`` (an empty file for each complete subject, written last). Data without
+``rendering/`` was made elsewhere and counts as complete.
 """
 
 import re
@@ -39,13 +39,13 @@ from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.readers import read_json
 
-#: The renderer's notes, below the root of a data set.
+#: Folder of the renderer's notes.
 FOLDER = "rendering"
 
 
 @dataclass(frozen=True)
 class Completeness:
-    """The notes of the data set at ``root``, for reading."""
+    """The renderer's notes on which subjects of the data set at ``root`` are complete."""
 
     root: Path
 
@@ -60,7 +60,7 @@ class Completeness:
 
     @property
     def plan(self) -> dict[str, list[str]]:
-        """Subjects of each phase that were requested so far, complete or not."""
+        """Requested subjects of each phase, complete or not."""
         path = self.folder / "plan.json"
         plan = read_json(path) if path.exists() else {}
         subjects = plan.values() if isinstance(plan, dict) else [plan]
@@ -69,7 +69,7 @@ class Completeness:
         return plan
 
     def marker(self, phase: str, name: str) -> Path:
-        """The file that marks a subject as complete."""
+        """File that marks a subject as complete."""
         return self.folder / "done" / phase / name
 
     def missing(self, phase: str, names: Sequence[str]) -> list[str]:
@@ -87,19 +87,19 @@ _POSITION = re.compile(r"(.+)_(\d{3,})")
 #: Folders of bodies; the first that exists is read.
 _BODY_MODELS = ("smpl", "smplx")
 
-#: From the name of a subject to its body vertices [n, 3], None where it has none.
+#: Maps a subject's name to its body vertices [n, 3], or None.
 BodyReader = Callable[[str], np.ndarray | None]
 
 
 class Rendered(DataOptions):
-    """Data in the rendered layout. A subclass says ``root``, ``limit`` and ``pixel_centers``."""
+    """Data in the rendered layout; subclasses define ``root``, ``limit`` and ``pixel_centers``."""
 
     @property
     def facts(self) -> dict[str, str]:
         return {**super().facts, "pixel_centers": self.pixel_centers}
 
     def subject_names(self, phase: str) -> list[str] | None:
-        """Names of the subjects of a phase; None: all that are found."""
+        """Names of the subjects of a phase; None: all that exist."""
         return None
 
     def has(self, phase: str) -> bool:
@@ -109,7 +109,7 @@ class Rendered(DataOptions):
         return len(names) > 0
 
     def further_bodies(self) -> BodyReader | None:
-        """Where bodies are read from that are not among the renders."""
+        """Reader of bodies that are not among the renders."""
         return None
 
     def reader(self, phase: str, strict: bool = True) -> "Layout":
@@ -118,15 +118,13 @@ class Rendered(DataOptions):
 
 
 class Layout(Reader):
-    """Subjects of one phase of a rendered data set. InputError: the root or phase is missing, empty, not
-    completely rendered, or lacks one of ``names``.
+    """Subjects of one phase of a rendered data set.
 
-    Args:
-        names: the subjects to read (None: all that there are). Those that the folder of the phase lacks are
-            read from the other one: a split may differ from the one that the folders were made for.
-        limit: number of subjects, the first ones (None: all).
-        pixel_centers: where the renderer that made the files put pixel centres: ``half`` (+0.5, as this
-            package), ``integer`` (as the published scripts) or ``auto`` (integer unless rendered here).
+    ``names``: subjects to read (None: all); those that the phase's folder lacks are read from the other one,
+    because the split may have changed. ``limit``: number of subjects, the first ones (None: all).
+    ``pixel_centers`` of the renderer: ``half`` (+0.5, as this package), ``integer`` (as the published
+    scripts) or ``auto`` (integer unless rendered here). InputError: the root or phase is missing, empty, not
+    completely rendered, or lacks one of ``names``.
     """
 
     def __init__(
@@ -149,7 +147,7 @@ class Layout(Reader):
         self.find(phase, names, limit)
 
     def find(self, phase: str, names: Sequence[str] | None, limit: int | None = None) -> None:
-        """Fill ``subjects`` with those that are complete."""
+        """Fill ``subjects`` with complete ones."""
         if not self.root.is_dir():
             raise InputError(f"{self.root}: expected the root of a rendered data set; found no such folder")
         phases = [phase] if names is None else [phase, *(p for p in PHASES if p != phase)]
@@ -238,7 +236,7 @@ class Layout(Reader):
 
 
 def position_name(name: str, position: int) -> str:
-    """Name of the folders of a subject's ring position."""
+    """Folder name of a subject's ring position."""
     return f"{name}_{position:03d}"
 
 

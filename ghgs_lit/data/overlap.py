@@ -1,4 +1,4 @@
-"""Whether a camera sees a body where its mask says: finds wrong units, axes and centres; pictures of it."""
+"""Overlap of projected bodies and masks, which reveals wrong units, axes and centres, and pictures of it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,24 +10,23 @@ from scipy import ndimage
 
 from ghgs_lit.data.view import View, area_image, resize_view
 
-# Fewer vertices than this do not fill a silhouette.
+# Fewer vertices do not fill a silhouette.
 MIN_VERTICES = 500
-# Height of a body in cells: with more of them, cells between two vertices of SMPL's torso would stay empty.
+# Height of a body in cells; with more, cells between vertices of SMPL's torso would stay empty.
 _CELLS = 96
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """How a body fits a mask. ``iou``: intersection over union of the body's silhouette and the mask.
-    ``inside``: share of the vertices inside the photograph that lie in the mask, or in a cell beside it (a
-    hundredth of the body's height)."""
+    """Fit of body and mask. ``iou``: of the body's silhouette and the mask. ``inside``: share of the vertices
+    inside the photograph that lie in the mask or a cell beside it (a hundredth of the body's height)."""
 
     iou: float
     inside: float
 
 
 def project(vertices: np.ndarray, view: View) -> np.ndarray:
-    """Pixels [m, 2] (u, v), float64, of those vertices [n, 3] that are in front of the camera."""
+    """Pixels [m, 2] (u, v), float64, of the vertices [n, 3] in front of the camera."""
     pose, matrix = view.extrinsics.astype(np.float64), view.intrinsics.astype(np.float64)
     points = vertices.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
     points = points[points[:, 2] > 1e-6] @ matrix.T
@@ -35,12 +34,9 @@ def project(vertices: np.ndarray, view: View) -> np.ndarray:
 
 
 def overlap(vertices: np.ndarray, view: View) -> Overlap | None:
-    """Compare the silhouette of a body with a mask.
-
-    The silhouette is taken on a coarse grid, where the vertices lie densely enough to be joined without
-    knowing the faces. Parts outside the photograph do not count. ``vertices``: [n, 3] in the world, metres.
-    Returns: the overlap; None for a body with fewer than :data:`MIN_VERTICES` vertices.
-    """
+    """Compare the silhouette of a body with a mask; None with fewer than :data:`MIN_VERTICES` vertices. The
+    silhouette is taken on a grid so coarse that vertices can be joined without faces. Parts outside the
+    photograph do not count. ``vertices``: [n, 3] in the world, metres."""
     if len(vertices) < MIN_VERTICES:
         return None
     height, width = view.mask.shape
@@ -65,7 +61,7 @@ def overlap(vertices: np.ndarray, view: View) -> Overlap | None:
 
 
 def _joined(hit: np.ndarray) -> np.ndarray:
-    """The silhouette of scattered hits: gaps of up to four cells closed, holes filled."""
+    """Silhouette of scattered hits: gaps of up to four cells closed, holes filled."""
     margin = 3
     closed = ndimage.binary_closing(np.pad(hit, margin), np.ones((3, 3)), iterations=2)
     return ndimage.binary_fill_holes(closed)[margin:-margin, margin:-margin]
@@ -78,8 +74,8 @@ _DOTS = 400
 
 
 def draw_tile(view: View | None, body: np.ndarray | None) -> Tile:
-    """Draw the outline of the mask in green and some vertices of the body in red. ``view``: the photograph;
-    None draws a cross. ``body``: vertices [n, 3] in the world, or None. Returns: [176, w, 3] uint8."""
+    """Draw [176, w, 3] uint8: a photograph (None: a cross), the outline of its mask in green, and some of the
+    vertices ``body`` [n, 3] in red."""
     if view is None:
         image = Image.new("RGB", (_HEIGHT, _HEIGHT), _GREY)
         draw = ImageDraw.Draw(image)
@@ -98,8 +94,7 @@ def draw_tile(view: View | None, body: np.ndarray | None) -> Tile:
 
 
 def save_sheet(rows: Mapping[str, Sequence[tuple[str, Tile]]], path: Path) -> None:
-    """Save tiles as one picture, a row for each subject. ``rows``: (label, tile) pairs by name of the
-    subject; labels are camera and IoU."""
+    """Save (label, tile) pairs by subject as one picture, a row for each subject."""
     width = max(sum(tile.shape[1] + 2 for _, tile in tiles) for tiles in rows.values())
     step = _HEIGHT + 2 * _LINE
     sheet = Image.new("RGB", (width, step * len(rows)))

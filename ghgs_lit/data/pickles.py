@@ -1,9 +1,8 @@
-"""Reads pickles of data sets without running them.
+"""Safe reading of pickles of data sets.
 
-A pickle is a program: whoever wrote it chooses what is called while it is read. Data sets need arrays and
-containers only, so only these are admitted; every other name is refused before anything is called. Names of
-NumPy 1 (``numpy.core``) and 2 (``numpy._core``) and of Python 2 (``__builtin__``) are known, and trimesh's
-array subclass is read as a plain array, without trimesh.
+The writer of a pickle chooses what is called while it is read. Only arrays and plain containers are admitted;
+every other name is refused before anything is called. Names of NumPy 1 (``numpy.core``) and 2
+(``numpy._core``) and of Python 2 (``__builtin__``) are known; trimesh's array subclass is read as an array.
 """
 
 import codecs
@@ -22,7 +21,7 @@ from ghgs_lit.readers import read_npy
 
 
 def _bytes(text: str, encoding: str = "latin1") -> bytes:
-    """How protocols below 3 write bytes; no other codec is admitted."""
+    """Bytes as protocols below 3 write them; no other codec is admitted."""
     if encoding not in ("latin1", "latin-1"):
         raise pickle.UnpicklingError(f"codec {encoding!r}")
     return codecs.encode(text, "latin1")
@@ -78,9 +77,8 @@ def _load(path: Path, stream: io.BufferedIOBase, also: Mapping[tuple[str, str], 
 
 
 def load_pickle(path: Path, also: Mapping[tuple[str, str], Any] = _NOTHING) -> Any:
-    """Read the arrays, scalars and plain containers of a pickle. ``also``: further names that are admitted,
-    (module, name), with harmless replacements for them. InputError: it is missing, broken, or names anything
-    else, which is then not called."""
+    """Read the arrays, scalars and plain containers of a pickle. ``also``: harmless replacements for further
+    names (module, name). InputError: it is missing, broken, or names anything else, which is not called."""
     if not path.is_file():
         raise InputError(f"{path}: expected a pickle; found no such file")
     with path.open("rb") as stream:
@@ -88,11 +86,9 @@ def load_pickle(path: Path, also: Mapping[tuple[str, str], Any] = _NOTHING) -> A
 
 
 def load_npy(path: Path) -> Any:
-    """Read an ``.npy`` file; pickled objects in it are read as by :func:`load_pickle`.
-
-    A pickled object in an array without dimensions (``np.save`` of a dictionary) is returned itself.
-    InputError: it is missing, broken, or names anything but arrays and plain containers.
-    """
+    """Read an ``.npy`` file; pickled objects in it are read as by :func:`load_pickle`. The object in an array
+    without dimensions (``np.save`` of a dictionary) is returned itself. InputError: it is missing, broken, or
+    names anything but arrays and plain containers."""
     if not path.is_file():
         raise InputError(f"{path}: expected an .npy file; found no such file")
     try:
@@ -105,5 +101,5 @@ def load_npy(path: Path) -> Any:
         return read_npy(path)
     except InputError:
         raise
-    except Exception as error:  # headers are Python, whose tokenizer has errors of its own
+    except Exception as error:  # headers are Python, whose tokenizer raises errors of its own
         raise InputError(f"{path}: expected a readable .npy file; found {error}") from error

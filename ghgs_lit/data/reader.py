@@ -1,6 +1,6 @@
-"""Photographs of people by subject, position and view: what a data set has to provide.
+"""Readers of photographs by subject, position and view.
 
-A data set is a :class:`Reader`, which finds and decodes its files. Resizing and caching
+A data set provides a :class:`Reader`, which finds and decodes its files. Resizing and caching
 (:class:`Photographs`), sampling and batching are the same for all data sets.
 """
 
@@ -24,13 +24,10 @@ PHASES = ("train", "val")
 
 
 class Reader(ABC):
-    """The photographs of one phase (``train`` or ``val``) as they are stored.
-
-    ``subjects`` maps each subject that can be sampled (a person, or one frame of a person) to the positions
-    of its cameras. A photograph is identified by (position, view); ``view`` is 0 except on rings that were
-    rendered with further views between their cameras. ``strict``: raise the first problem of the data set; if
-    false, collect all of them in ``problems``.
-    """
+    """Stored photographs of one phase (``train`` or ``val``). ``subjects`` maps each subject (a person, or
+    one frame of a person) to the positions of its cameras. A photograph is identified by (position, view);
+    ``view`` is 0 except on rings that were rendered with further views between cameras. ``strict``: raise the
+    first problem of the data set, or collect all in ``problems``."""
 
     def __init__(self, strict: bool = True) -> None:
         self.strict = strict
@@ -39,13 +36,12 @@ class Reader(ABC):
 
     @abstractmethod
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
-        """Read one photograph at its stored size. InputError: a file is missing or bad. ``position``: number
-        of the camera, or position on the ring. ``view``: number of the view at that position. ``depth``:
-        whether to read the depth map too, if there is one."""
+        """Read one photograph at its stored size. ``position``: camera, or position on the ring; ``view``:
+        its number there; ``depth``: also read the depth map, if any. InputError: a file is missing or bad."""
 
     @abstractmethod
     def read_body(self, name: str) -> np.ndarray | None:
-        """Body vertices [n, 3] float32 in the world (metres), or None if the data has none."""
+        """Body vertices [n, 3] float32 in the world, metres; None if the data has none."""
 
     def read_surface(self, name: str) -> np.ndarray | None:
         """Points [n, 3] of a person in motion, the same at all instants; None if the data has none."""
@@ -61,12 +57,12 @@ class Reader(ABC):
         return [0]
 
     def place(self, name: str, position: int, view: int) -> str:
-        """How messages refer to a photograph: preferably the path of its mask."""
+        """Name of a photograph in messages, preferably the path of its mask."""
         return f"{name}, camera {position}, view {view}"
 
     @contextlib.contextmanager
     def collecting(self) -> Iterator[None]:
-        """Leave the block at an InputError; it is a problem of the data set, to be raised or collected."""
+        """Raise or collect an InputError of the block as a problem of the data set."""
         try:
             yield
         except InputError as error:
@@ -81,7 +77,7 @@ class Reader(ABC):
 
 
 class FrameReader(Reader):
-    """A reader whose subjects are frames of sequences; ``frames[subject].folder`` is the folder of one."""
+    """Reader whose subjects are frames of sequences; ``frames[subject].folder`` is the sequence's folder."""
 
     def __init__(self, strict: bool = True) -> None:
         super().__init__(strict)
@@ -97,7 +93,7 @@ class FrameReader(Reader):
         return len(self.sequences)
 
     def existing(self, folder: Path, names: Sequence[str], example: str) -> list[str]:
-        """Those of the sequences ``names`` that exist; none is a problem, whose line shows ``example``."""
+        """Existing sequences among ``names``; none is a problem, whose message shows ``example``."""
         there = [name for name in names if (folder / name).is_dir()]
         if len(there) < len(names):
             log.warning("%s: %d of %d sequences are there", folder, len(there), len(names))
@@ -107,9 +103,8 @@ class FrameReader(Reader):
 
 
 class Photographs:
-    """The photographs of a reader, resized and kept in memory. ``size``: (height, width) in pixels; None
-    keeps the stored size. ``cache_mb``: MiB of decoded views and bodies kept in each process; the least
-    recently used go first."""
+    """Photographs of a reader, resized and cached. ``size``: (height, width); None keeps the stored size.
+    ``cache_mb``: MiB of decoded views and bodies kept in each process; the least recently used go first."""
 
     def __init__(
         self,
@@ -126,9 +121,8 @@ class Photographs:
     def view(
         self, name: str, position: int, view: int = 0, depth: bool = True, size: tuple[int, int] | None = None
     ) -> View:
-        """One photograph, resized together with its intrinsics. ``size``: (height, width) in pixels; None:
-        that of all. InputError: a file is missing or bad, the reader gives something else than a
-        :class:`View` has, or the mask is empty."""
+        """One photograph, resized with its intrinsics to ``size`` (height, width; None: ``self.size``).
+        InputError: a file is missing or bad, the reader gives a wrong :class:`View`, or the mask is empty."""
         size = size or self.size
 
         def read() -> View:

@@ -1,9 +1,9 @@
-"""Which photographs make a sample: input views and targets, in training and in evaluation.
+"""Sampling of input views and targets, in training and evaluation.
 
-A photograph is identified by its ring position and the number of the view at that position: 0 is the ring
-camera itself, 1 repeats the next ring camera, 3 is the exact middle between the two, 2 and 4 are random in
-the first and the second half. Inputs are ring cameras (view 0). Every sample is a function of (seed, step,
-index in the batch) alone, so that a run resumes exactly where it stopped, whatever the number of workers.
+A photograph is identified by its ring position and the number of the view there: 0 is the ring camera, 1
+repeats the next ring camera, 3 is the exact middle between the two, 2 and 4 are random in the first and
+second half. Inputs are ring cameras (view 0). A sample depends on (seed, step, index) alone, so that a run
+resumes exactly, whatever the number of workers.
 """
 
 import hashlib
@@ -19,7 +19,7 @@ from ghgs_lit.config.options import Count, Index, Options, Text
 from ghgs_lit.errors import InputError, require
 
 RING_VIEW, MIDDLE_VIEW = 0, 3
-# Streams of random numbers that must not repeat one another.
+# Independent streams of random numbers.
 _ORDER, _COUNT, _SAMPLE = 0, 1, 2
 
 #: (ring position, view number)
@@ -29,14 +29,14 @@ Several = Annotated[int, Field(ge=2)]
 
 
 def subject_rng(seed: int, name: str) -> np.random.Generator:
-    """Random numbers of one subject, independent of which other subjects there are."""
+    """Random numbers of one subject, independent of other subjects."""
     digest = hashlib.sha256(name.encode()).digest()
     return np.random.default_rng([seed, int.from_bytes(digest[:8], "little")])
 
 
 @dataclass(frozen=True)
 class SampleSpec:
-    """Which photographs of a subject make one sample; ``protocols`` has the protocol of each target."""
+    """Photographs of a subject that make one sample, and the protocol of each target."""
 
     subject: str
     inputs: tuple[Photo, ...]
@@ -45,17 +45,17 @@ class SampleSpec:
 
 
 def photo_name(photo: Photo) -> str:
-    """``004/3`` for view 3 at position 4, as in the paths of rendered data."""
+    """Name such as ``004/3`` for view 3 at position 4, as in the paths of rendered data."""
     return f"{photo[0]:03d}/{photo[1]}"
 
 
 def ring_photos(positions: Sequence[int]) -> tuple[Photo, ...]:
-    """The photographs of the ring cameras at ``positions``."""
+    """Photographs of the ring cameras at ``positions``."""
     return tuple((position, RING_VIEW) for position in positions)
 
 
 class ViewProtocol(Options):
-    """How input views are chosen."""
+    """Choice of input views."""
 
     group = "views"
 
@@ -71,7 +71,7 @@ class ViewProtocol(Options):
         """Positions of the ``count`` inputs of a training sample."""
         if self.training != "any":
             start, positions = int(rng.integers(ring)), np.asarray(even_positions(ring, count))
-            if self.training == "uneven":  # they are at least 3 apart, so they stay different
+            if self.training == "uneven":  # positions are at least 3 apart, so they stay different
                 positions = positions + rng.integers(-1, 1, count, endpoint=True)
             return [int(position) for position in (start + positions) % ring]
         return [int(position) for position in rng.choice(np.asarray(available), count, replace=False)]
@@ -83,13 +83,13 @@ def even_positions(ring: int, count: int) -> list[int]:
 
 
 def middle(first: int, second: int, ring: int) -> Photo:
-    """The photograph half-way from position ``first`` on to ``second``: a ring camera or between two."""
+    """Photograph half-way from position ``first`` on to ``second``: at a ring camera or between two."""
     doubled = 2 * first + (second - first) % ring
     return doubled // 2 % ring, MIDDLE_VIEW if doubled % 2 else RING_VIEW
 
 
 class TargetProtocol(Options):
-    """How target views are chosen."""
+    """Choice of target views."""
 
     group = "targets"
 
@@ -126,7 +126,7 @@ class TargetProtocol(Options):
 
     @property
     def view_numbers(self) -> set[int]:
-        """Every view number that training or evaluation may ask for."""
+        """View numbers that training or evaluation may ask for."""
         evaluated = {"midway": {RING_VIEW, MIDDLE_VIEW}, "random": set()}.get(self.kind, {self.view})
         return evaluated | set(self.training_views)
 
@@ -146,7 +146,7 @@ class TargetProtocol(Options):
     def evaluation(
         self, available: Sequence[int], inputs: Sequence[int], ring: int, rng: np.random.Generator
     ) -> tuple[Photo, ...]:
-        """The targets of an evaluation sample."""
+        """Targets of an evaluation sample."""
         if self.kind == "cameras":
             return self._cameras(available, inputs)
         count = len(inputs) if self.per_subject == "all" else int(self.per_subject)
@@ -169,14 +169,13 @@ class TargetProtocol(Options):
         return tuple(photos if self.per_subject == "all" else photos[: int(self.per_subject)])
 
 
-#: Every camera that is not an input: for rigs with static cameras.
+#: All cameras that are not inputs, for rigs with static cameras.
 CAMERAS = TargetProtocol(name="cameras", view=RING_VIEW, per_subject="all", training_views=(RING_VIEW,))
 
 
 @dataclass(frozen=True)
 class TrainingSampler:
-    """The endless sequence of training samples. ``batch_size``: samples of one step in each process.
-    ``seed``: together with the step and the index in the batch, it determines a sample."""
+    """Endless sequence of training samples, ``batch_size`` of them in each step and process."""
 
     subjects: Mapping[str, tuple[int, ...]]
     views: ViewProtocol
@@ -198,17 +197,17 @@ class TrainingSampler:
                 )
 
     def batch(self, step: int, rank: int = 0, world: int = 1) -> list[SampleSpec]:
-        """Samples of process ``rank`` of ``world`` at ``step``; all have the same number of inputs."""
+        """Samples of process ``rank`` of ``world`` at ``step``, with equal numbers of inputs."""
         count = int(np.random.default_rng([self.seed, _COUNT, step]).choice(self.views.training_counts))
         return [self._sample(step, index, count) for index in self.indices(step, rank, world)]
 
     def indices(self, step: int, rank: int = 0, world: int = 1) -> range:
-        """Numbers in the run of the samples of process ``rank`` of ``world`` at ``step``."""
+        """Numbers in the run of the samples of :meth:`batch`."""
         first = (step * world + rank) * self.batch_size
         return range(first, first + self.batch_size)
 
     def _sample(self, step: int, index: int, count: int) -> SampleSpec:
-        """Sample number ``index`` of the run: all subjects once in random order, then in another."""
+        """Sample number ``index`` of the run, which takes all subjects in a new random order each epoch."""
         names = list(self.subjects)
         epoch, place = divmod(index, len(names))
         name = names[np.random.default_rng([self.seed, _ORDER, epoch]).permutation(len(names))[place]]
@@ -227,9 +226,9 @@ def evaluation_samples(
     seed: int,
     positions: Sequence[Sequence[int]] = (),
 ) -> list[SampleSpec]:
-    """One sample for each subject, always the same ones. ``protocols``: whose targets a sample has, one after
-    another; none: samples without targets. ``positions``: lists of input positions; evenly spaced where none
-    has ``count``. InputError: the input positions are not different ones, or a subject lacks one."""
+    """One fixed sample for each subject, with the targets of all ``protocols`` one after another.
+    ``positions``: lists of input positions; evenly spaced if none has ``count``. InputError: input positions
+    repeat, or a subject lacks one."""
     inputs = next((list(listed) for listed in positions if len(listed) == count), even_positions(ring, count))
     expected = f"different positions of a ring of {ring}"
     require(count > 0 and len(set(inputs)) == count, f"evaluation with {count} views", expected, inputs)

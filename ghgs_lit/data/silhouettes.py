@@ -1,4 +1,4 @@
-"""Checks of a person's masks that need no body: each by itself, and each beside the others."""
+"""Checks of a person's masks without a body: each by itself, and against the others."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -10,16 +10,16 @@ from ghgs_lit.data.view import View, area_mask
 from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, subject_sphere
 
 _T = TypeVar("_T")
-# Side of a mask in cells, at most.
+# Largest side of a coarse mask in cells.
 _CELLS = 64
-#: Of many photographs: a quarter of the other masks may be wrong.
+#: Comparison of masks, of which a quarter may be wrong.
 SEARCH = HullSearch(rays=200, depths=64, reach=1.0, others=12, wrong=0.25)
-# A person covers more of a photograph than this, and less of its border than that.
+# Least share of a photograph and greatest share of its border that a person covers.
 _LEAST_SHARE, _MOST_BORDER = 1e-3, 0.5
 
 
 def silhouette(view: View) -> Silhouette:
-    """The coarse silhouette of a photograph."""
+    """Coarse silhouette of a photograph."""
     height, width = view.mask.shape
     scale = min(_CELLS / max(height, width), 1)
     size = max(round(height * scale), 1), max(round(width * scale), 1)
@@ -29,7 +29,7 @@ def silhouette(view: View) -> Silhouette:
 
 
 def implausible(mask: np.ndarray) -> str | None:
-    """What is wrong with a mask [h, w] by itself: too small, or full or inverted; None if nothing is."""
+    """Message if a mask [h, w] is too small, full or inverted; else None."""
     border = np.concatenate((mask[0], mask[-1], mask[:, 0], mask[:, -1])).mean()
     if border > _MOST_BORDER:
         return (
@@ -43,12 +43,12 @@ def implausible(mask: np.ndarray) -> str | None:
 
 
 def height(silhouettes: Sequence[Silhouette]) -> float:
-    """Median height of the subject in world units, as the silhouettes show it."""
+    """Median height of the subject in world units, from the silhouettes."""
     focus, _ = subject_sphere(silhouettes)
     return float(np.median([s.extent(focus)[0] for s in silhouettes]))
 
 
 def twins(poses: Mapping[_T, np.ndarray]) -> tuple[_T, _T] | None:
-    """The names of the first two poses [4, 4] that are the same; None if all differ."""
+    """Names of the first two equal poses [4, 4]; None if all differ."""
     pairs = itertools.combinations(poses, 2)
     return next((p for p in pairs if np.allclose(poses[p[0]], poses[p[1]], rtol=1e-6, atol=1e-6)), None)

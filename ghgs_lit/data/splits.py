@@ -1,4 +1,4 @@
-"""Splits of named subjects into ``train`` and ``val``: from files, lists and ranges, or by a fraction."""
+"""Splits of subjects into ``train`` and ``val``: from files, lists and ranges, or by a fraction."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,10 +17,9 @@ Split = str | Path | Mapping[str, Sequence[str]]
 def split_names(
     source: Path, names: Sequence[str], split: Split | None, val_fraction: float, seed: int
 ) -> dict[str, list[str]]:
-    """Divide the scans of a folder. InputError: the split is missing or malformed, names scans that do not
-    exist, or overlaps. ``split``: as for :func:`read_split` (None: the split files in ``source``, if there
-    are any). ``val_fraction``: fraction of ``names`` that is ``val`` where nothing else decides, 0 to 1;
-    above 0 at least one of them."""
+    """Divide the scans of a folder. ``split``: as for :func:`read_split` (None: the split files in
+    ``source``, if any). ``val_fraction``: share of ``names`` for ``val`` without a split, at least one if
+    above 0. InputError: the split is missing or malformed, names scans that do not exist, or overlaps."""
     if split is None and not any((source / name).exists() for name in _SPLIT_FILES):
         order = np.random.default_rng(seed).permutation(len(names))
         count = max(round(val_fraction * len(names)), val_fraction > 0)
@@ -38,10 +37,10 @@ def split_names(
 
 
 def read_split(split: Split, names: Sequence[str]) -> dict[str, list[str]]:
-    """The ids of ``train`` and of ``val`` (which a split may call ``test``). InputError: it is missing or
-    malformed, or an id is in both. ``split``: a JSON file with these lists; a folder with ``splits.json``, or
-    with ``split_train.txt`` and ``split_val.txt`` (one id a line); or a mapping of ids and of ranges such as
-    ``0000-0425``. ``names``: the ids that a range selects from."""
+    """Ids of ``train`` and ``val`` (which a split may call ``test``). ``split``: a JSON file with these
+    lists; a folder with ``splits.json``, or with ``split_train.txt`` and ``split_val.txt`` (one id a line);
+    or a mapping to ids and ranges of ``names`` such as ``0000-0425``. InputError: it is missing or malformed,
+    or an id is in both."""
     if isinstance(split, Mapping):
         place: Path | str = "data.split"
         chosen = _lists(place, split)
@@ -61,7 +60,7 @@ def read_split(split: Split, names: Sequence[str]) -> dict[str, list[str]]:
 
 
 def _expand(entry: object, names: Sequence[str]) -> list[str]:
-    """One id, or all of ``names`` in a range of ids of equal length."""
+    """The id, or all of ``names`` in a range of ids of equal length."""
     first, dash, last = str(entry).partition("-")
     if not dash:
         return [str(entry)]

@@ -1,8 +1,7 @@
-"""One photograph with its mask, depth and camera, and how they change their size.
+"""A photograph with its mask, depth and camera, and their resizing.
 
-Pixel centres lie at +0.5, so the middle of an old image is the middle of the new one. ``release`` functions
-reproduce what the authors' code reads: OpenCV's nearest neighbour takes pixel floor(i * scale), which moves
-masks by half an old pixel less half a new one.
+Resizing keeps the middle of the image. ``release`` functions reproduce what the authors' code reads: OpenCV's
+nearest neighbour takes pixel floor(i * scale), which moves masks by half an old pixel less half a new one.
 """
 
 from dataclasses import dataclass, replace
@@ -15,12 +14,12 @@ from PIL import Image
 if TYPE_CHECKING:
     from scipy import sparse
 
-#: Depths of one surface differ by less than this share between neighbouring pixels.
+#: Largest relative difference of depths of one surface at neighbouring pixels.
 _SAME_SURFACE = 0.02
 
 
 def area_image(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """[height, width, ...] uint8: the mean over the area of each new pixel; bicubic when it grows."""
+    """Resized image [height, width, ...] uint8: mean over the area of each new pixel; bicubic if it grows."""
     h, w = image.shape[:2]
     if (h, w) == (height, width):
         return image
@@ -33,18 +32,15 @@ def area_image(image: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def area_mask(mask: np.ndarray, height: int, width: int) -> np.ndarray:
-    """[height, width] bool: where at least half of the new pixel's area is in the mask."""
+    """Resized mask [height, width] bool: at least half of the new pixel's area is in the mask."""
     if mask.shape == (height, width):
         return mask
     return _area_means(mask[..., None], height, width)[..., 0] > 0.5 - 1e-6
 
 
 def centered_depth(inverse: np.ndarray, height: int, width: int) -> np.ndarray:
-    """[height, width] uint16: inverse depth at the centre of each new pixel.
-
-    Interpolated linearly among the four old pixels around it, which is exact for planes; of those, only the
-    known ones on the nearest surface count, so that no surfaces are mixed.
-    """
+    """Inverse depth [height, width] uint16 at the centres of new pixels, by linear interpolation (exact for
+    planes) among those of the four old pixels that are known and on the nearest surface."""
     if inverse.shape == (height, width):
         return inverse
     rows, down = _neighbors(inverse.shape[0], height)
@@ -63,12 +59,12 @@ def centered_depth(inverse: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def release_image(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """[height, width, ...] uint8 by Pillow's bicubic filter."""
+    """Resized image [height, width, ...] uint8 by Pillow's bicubic filter."""
     return np.asarray(Image.fromarray(image).resize((width, height), Image.Resampling.BICUBIC))
 
 
 def release_mask(mask: np.ndarray, height: int, width: int) -> np.ndarray:
-    """[height, width] by OpenCV's nearest neighbour."""
+    """Resized mask [height, width] by OpenCV's nearest neighbour."""
     h, w = mask.shape
     rows, columns = (np.arange(n) * old // n for n, old in ((height, h), (width, w)))
     return np.ascontiguousarray(mask[rows[:, None], columns])
@@ -84,7 +80,7 @@ def _area_means(layers: np.ndarray, height: int, width: int) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def _area_weights(old: int, new: int) -> "sparse.csr_array":
-    """[new, old]: which share of each new pixel each old one covers; rows sum to 1."""
+    """Share [new, old] of each new pixel that each old one covers; rows sum to 1."""
     from scipy import sparse  # here: a wrong path is refused before it is needed
 
     edges = np.union1d(np.arange(old + 1) * new, np.arange(new + 1) * old)  # in units of 1 / (old * new)
@@ -108,17 +104,10 @@ _DEPTH_SCALE = 1 << 15
 
 @dataclass(frozen=True)
 class View:
-    """One photograph.
-
-    Attributes:
-        image: [h, w, 3] uint8, RGB.
-        mask: [h, w] bool, true on the subject.
-        inverse_depth: [h, w] uint16, 2^15 / metres, 0 where unknown; or None.
-        intrinsics: [3, 3] float32 in pixels, pixel centres at +0.5.
-        extrinsics: [4, 4] float32, world to camera, metres, OpenCV axes.
-        matte: [h, w] uint8, 255 times the share of each pixel that shows the subject, by which the image is
-            premultiplied; or None.
-    """
+    """A photograph, and its camera as float32 matrices [3, 3] and [4, 4]. ``image``: [h, w, 3] uint8, RGB.
+    ``mask``: [h, w] bool, true on the subject. ``inverse_depth``: [h, w] uint16, 2^15 / metres, 0 where
+    unknown; or None. ``matte``: [h, w] uint8, 255 times the share of each pixel that shows the subject, by
+    which the image is premultiplied; or None."""
 
     image: np.ndarray
     mask: np.ndarray
@@ -129,7 +118,7 @@ class View:
 
     @property
     def depth(self) -> np.ndarray | None:
-        """Metres [h, w] float32, 0 where unknown."""
+        """Depth [h, w] float32 in metres, 0 where unknown."""
         if self.inverse_depth is None:
             return None
         known = self.inverse_depth > 0
@@ -142,38 +131,34 @@ class View:
 
     @property
     def alpha(self) -> np.ndarray | None:
-        """The matte [h, w] float32 in [0, 1]."""
+        """Matte [h, w] float32 in [0, 1]."""
         return None if self.matte is None else self.matte.astype(np.float32) / 255
 
 
 def encode_depth(depth: np.ndarray) -> np.ndarray:
-    """Metres to uint16 inverse depth; 0 stays 0. At 2 m a step is 0.12 mm; nearer than 0.5 m saturates."""
+    """Inverse depth uint16 of metres; 0 stays 0. At 2 m a step is 0.12 mm; nearer than 0.5 m saturates."""
     known = depth > 0
     inverse = np.round(_DEPTH_SCALE / np.where(known, depth, 1))
     return np.where(known, np.clip(inverse, 1, 65535), 0).astype(np.uint16)
 
 
 def half_centers(intrinsics: np.ndarray) -> np.ndarray:
-    """Intrinsics [3, 3] of pixel centres at integers for centres at +0.5."""
+    """Convert intrinsics [3, 3] from pixel centres at integers to centres at +0.5."""
     return intrinsics + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
 
 def opencv_view(image: np.ndarray, mask: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray) -> View:
-    """A view from an OpenCV calibration: background to black, pixel centres from integers to +0.5. ``image``:
-    [h, w, 3] uint8. ``mask``: [h, w] bool. ``intrinsics``: [3, 3] in pixels, pixel centres at integers.
-    ``extrinsics``: [4, 4], world to camera, metres."""
+    """View from an OpenCV calibration, with a black background. ``image``: [h, w, 3] uint8. ``mask``: [h, w]
+    bool. ``intrinsics``: [3, 3], pixel centres at integers. ``extrinsics``: [4, 4]."""
     image = np.where(mask[..., None], image, 0)
     return View(image, mask, None, half_centers(intrinsics).astype(np.float32), extrinsics.astype(np.float32))
 
 
 def resize_view(view: View, height: int, width: int, resampling: str = "area") -> View:
-    """Resize a photograph with its mask and depth map, and scale its intrinsics.
-
-    ``resampling``: ``area`` keeps everything at its place; ``release``, as the authors' code, resizes
-    photographs by Pillow's bicubic filter and masks by OpenCV's nearest neighbour. Mattes are resized as
-    photographs, and the mask is where the subject fills half of a pixel or more. Depth is that at the centres
-    of the subject's new pixels in both.
-    """
+    """Resize a photograph with its mask and depth map, and scale its intrinsics. ``resampling``: ``area``
+    keeps everything in place; ``release``, as the authors' code, resizes photographs by Pillow's bicubic
+    filter and masks by OpenCV's nearest neighbour. Mattes are resized like photographs, and the mask is then
+    where they are at least half. Depth is taken at the centres of new pixels in both."""
     h, w = view.mask.shape
     if (h, w) == (height, width):
         return view

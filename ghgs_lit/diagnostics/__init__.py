@@ -1,1 +1,1 @@
-"""Tools that look at the framework: run time against error, numerical stability, what is wrong."""
+"""Diagnostics of the framework: run time against error, numerical stability, doctor."""

@@ -1,4 +1,4 @@
-"""The encode stage: VGGT's aggregator over patch tokens, of any size."""
+"""The encode stage: VGGT's aggregator of any size over patch tokens."""
 
 from ghgs_lit.encoder.encoder import VGGTEncoder, VGGTOptions
 

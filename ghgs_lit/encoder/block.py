@@ -1,9 +1,7 @@
-"""Pre-norm transformer block with LayerScale: the ViT's, and the aggregator's with normed, rotated q and k.
-
-The rotary position embedding (RoPE) has two dimensions: half of a head turns with the row, half with the
-column. Angles are float32 or wider for tokens of any precision: rounding an angle to bfloat16 would change
-its cosine by up to 6e-2, rounding the cosine itself only by 2e-3.
-"""
+"""Pre-norm transformer block with LayerScale, for the ViT and, with normalised and rotated q and k, for the
+aggregator. The rotary position embedding (RoPE) has two dimensions: half of a head turns with the row, half
+with the column. Angles are float32 or wider for tokens of any precision: rounding an angle to bfloat16 would
+change its cosine by up to 6e-2, rounding the cosine itself only by 2e-3."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -24,15 +22,15 @@ BASE = 100.0
 
 
 class Rotary(NamedTuple):
-    """Cosine and sine for every token and channel of a head; the sine has the sign of its term."""
+    """Cosine and signed sine for every token and channel of a head."""
 
     cosine: Float[Tensor, "t d"]
     sine: Float[Tensor, "t d"]
 
 
 def rotary_tables(positions: Int[Tensor, "t 2"], head_width: int, like: Tensor) -> Rotary:
-    """Tables of all tokens. ``positions``: row and column of each token. ``head_width``: channels of a head,
-    divisible by 4. ``like``: tokens; the tables are float32, or float64 for tokens in float64."""
+    """Rotary tables of all tokens. ``positions``: row and column of each. ``head_width``: channels of a head,
+    divisible by 4. ``like``: the tokens; tables are float64 for tokens in float64, else float32."""
     exponents = torch.arange(0, head_width, 4, device=positions.device, dtype=torch.float32) / head_width
     angles = positions.float()[..., None] * (1.0 / BASE**exponents)
     angles = angles.to(at_least_float32(like).dtype)
@@ -43,18 +41,18 @@ def rotary_tables(positions: Int[Tensor, "t 2"], head_width: int, like: Tensor) 
 
 
 def rotate(x: Float[Tensor, "*batch t d"], rotary: Rotary) -> Float[Tensor, "*batch t d"]:
-    """Rotate channel ``m`` of each half of a head with its partner ``m + d/4``; in the tables' dtype."""
+    """Rotate channels ``m`` and ``m + d/4`` of each half of a head, in the tables' dtype."""
     quarters = x.unflatten(-1, (2, 2, x.shape[-1] // 4))
     return torch.addcmul(x * rotary.cosine, quarters.flip(-2).flatten(-3), rotary.sine)
 
 
-#: Values of queries or keys that are rotated at once without a gradient (bounds memory), and on a GPU.
+#: Values of queries or keys that are rotated at once without a gradient, to save memory: on a CPU, on a GPU.
 _ROTATED, _GPU_ROTATED = 1 << 18, 1 << 25
 
 
 class Attention(nn.Module):
-    """Multi-head self-attention inside each of several packed sequences. ``qk_norm``: normalise q and k over
-    the channels of each head, before they are rotated."""
+    """Multi-head self-attention inside each of several packed sequences. ``qk_norm``: layer norm of q and k
+    over the channels of each head, before their rotation."""
 
     def __init__(self, width: int, heads: int, qk_norm: bool):
         super().__init__()
@@ -72,12 +70,11 @@ class Attention(nn.Module):
         if len(set(lengths)) == 1:
             each = (rearrange(values, "a (n t) d -> n a t d", n=len(lengths)) for values in (q, k, v))
             return self.proj(_attend(*each).flatten(0, 1))
-        # One by one: a mask of blocks would compute every product of tokens of different sequences, too.
+        # One by one: a block mask would also compute the products between different sequences.
         parts = zip(*(values[None].split(lengths, dim=2) for values in (q, k, v)), strict=True)
         return self.proj(torch.cat([_attend(*part)[0] for part in parts]))
 
     def _norm_and_rotate(self, x: Float[Tensor, "a t d"], norm: nn.Module, rotary: Rotary | None) -> Tensor:
-        """Normalise queries or keys and rotate them by their positions; in place without a gradient."""
         if rotary is None:
             return norm(x)
         if torch.is_grad_enabled():
@@ -91,22 +88,22 @@ class Attention(nn.Module):
 def _attend(
     q: Float[Tensor, "n a t d"], k: Float[Tensor, "n a t d"], v: Float[Tensor, "n a t d"]
 ) -> Float[Tensor, "n t c"]:
-    """``softmax(q k^T / sqrt(d)) v`` of every head, with the heads side by side."""
+    """``softmax(q k^T / sqrt(d)) v`` of every head, heads concatenated."""
     if cpu.is_supported(q, v):
         return cpu.attend(q, k, v).flatten(2)
     y = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
     return rearrange(y, "n a t d -> n t (a d)")
 
 
-#: Register tokens of each view, of the ViT and of the aggregator.
+#: Register tokens of each view in the ViT and in the aggregator.
 REGISTERS = 4
 
-#: Hidden values of the MLP that are held at once without a gradient (bounds memory).
+#: Hidden values of the MLP in memory at once without a gradient.
 _HIDDEN = 1 << 23
 
 
 def draw_normal_(values: Tensor, std: float) -> Tensor:
-    """Draw ``values`` in place. The meta device has none, and PyTorch would import its compiler there."""
+    """Draw normal ``values`` in place, but on the meta device, where PyTorch would import its compiler."""
     return values if values.is_meta else values.normal_(std=std)
 
 
@@ -164,10 +161,9 @@ def run_block(
     checkpointing: bool,
     rotary: Rotary | None = None,
 ) -> Float[Tensor, "t c"]:
-    """``block(x)``; no gradient is recorded where neither ``x`` nor the block needs one. ``x``: tokens of all
-    sequences, one after another. ``lengths``: tokens of each sequence; attention stays inside it.
-    ``checkpointing``: recompute the block's activations in the backward pass instead of keeping them.
-    ``rotary``: tables that rotate queries and keys; None for no rotation."""
+    """``block(x)``, without recording gradients if neither ``x`` nor the block needs one. ``x``: tokens of
+    all sequences, one after another. ``lengths``: tokens of each sequence, inside which attention stays.
+    ``checkpointing``: recompute activations in the backward pass. ``rotary``: None: no rotation."""
     needs_grad = x.requires_grad or any(p.requires_grad for p in block.parameters())
     with torch.set_grad_enabled(needs_grad and torch.is_grad_enabled()):
         if checkpointing and torch.is_grad_enabled():

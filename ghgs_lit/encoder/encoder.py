@@ -1,4 +1,4 @@
-"""The encode stage: photographs and masks to tokens, by attention inside views and across them in turn."""
+"""The encode stage: photographs and masks to tokens, by alternating attention inside and across views."""
 
 from collections.abc import Iterator
 
@@ -32,9 +32,8 @@ class Aggregator(nn.Module):
 
     Each view's sequence is [camera, registers, kept patches]. The first view has its own camera and register
     tokens, so it defines the frame of reference: another first view changes the result; any other permutation
-    of the views only permutes it. ``patch_embed``: [n, i, H, W] images and :class:`KeptPatches` to [N, width]
-    tokens of the kept patches. ``options``: of the stage.
-    """
+    of the views only permutes it. ``patch_embed``: images [n, i, H, W] and :class:`KeptPatches` to tokens
+    [N, width]."""
 
     def __init__(self, patch_embed: nn.Module, options: VGGTSettings):
         super().__init__()
@@ -58,9 +57,9 @@ class Aggregator(nn.Module):
     def forward(
         self, images: Float[Tensor, "b v i H W"], kept: KeptPatches
     ) -> tuple[list[Pair], Float[Tensor, "N c"]]:
-        """Tokens of the layers that are read out. Returns: For each layer in ``layers`` the packed tokens
-        after its frame block and after its global block, special tokens included; and the patch tokens that
-        entered. ``kept``: the patches that take part; all others are as if they did not exist."""
+        """Packed tokens, special ones included, after the frame block and after the global block of each
+        layer in ``layers``; and the patch tokens before the first block. ``kept``: the patches that take
+        part; all others are as if they did not exist."""
         b, v = images.shape[:2]
         patches = self.patch_embed(images.flatten(0, 1), kept)
         # Camera and register tokens: number 0 for the first view, number 1 for all others.
@@ -91,11 +90,10 @@ class VGGTEncoder(nn.Module):
     """VGGT of any size: ``vggt_1b`` takes the published weights, smaller ones train from scratch.
 
     Args:
-        tokens: ``all``, or patches of the background leave before the first block: ``window`` keeps those of
-            the smallest rectangle that holds the subject, ``subject`` those with a pixel of the subject. They
-            keep their place in the photograph; a view with an empty mask keeps its special tokens only.
-        margin: patches around them that stay, too.
-    """
+        tokens: ``all``; ``window``: patches of the smallest rectangle that holds the subject; ``subject``:
+            patches with a pixel of the subject. Others leave before the first block. Kept patches keep their
+            positions; a view with an empty mask has its special tokens only.
+        margin: patches around these that are kept, too."""
 
     def __init__(self, options: VGGTSettings, tokens: str = "all", margin: int = 1):
         super().__init__()
@@ -105,7 +103,7 @@ class VGGTEncoder(nn.Module):
         self.patch_size, self.dim_latent = options.patch_size, 2 * options.width
         self.mask_input, self.bounds_input = options.mask_input, options.bounds_input
         extra = [0.5] * self.mask_input
-        # No part of a checkpoint, so they need storage even in a model that is built on the meta device.
+        # Not in checkpoints, so they need storage even in a model that is built on the meta device.
         for name, values in (("mean", IMAGENET_MEAN), ("std", IMAGENET_STD)):
             constant = torch.tensor((*values, *extra), device="cpu").view(-1, 1, 1)
             self.register_buffer(name, constant, persistent=False)
@@ -131,10 +129,9 @@ class VGGTEncoder(nn.Module):
         bounds: DepthBounds | None = None,
         kept: Bool[Tensor, "b v h w"] | None = None,
     ) -> Tokens:
-        """Tokens of all views: of all patches, or of those that are kept. ``images``: [B, V, 3, H, W], RGB in
-        [0, 1], sides divisible by the patch size. ``masks``: [B, V, H, W]; read with ``mask_input``,
-        ``bounds_input`` or ``semantic``, and where ``tokens`` is not ``all``. ``bounds``: read with
-        ``bounds_input``. ``kept``: which patches take part; None: those of :meth:`keeps`."""
+        """Tokens of the kept patches of all views. ``images``: sides divisible by the patch size. ``masks``:
+        read with ``mask_input``, ``bounds_input`` or ``semantic``, and where ``tokens`` is not ``all``.
+        ``bounds``: read with ``bounds_input``. ``kept``: None: the patches of :meth:`keeps`."""
         self._check(images, masks)
         chosen = self.keeps(masks) if kept is None else kept
         kept = KeptPatches(chosen, images.device)
@@ -145,7 +142,7 @@ class VGGTEncoder(nn.Module):
         return Tokens(latent, semantic, *places, kept.grid, self.patch_size)
 
     def keeps(self, masks: Bool[Tensor, "b v H W"]) -> Bool[Tensor, "b v h w"]:
-        """Which patches ``tokens`` and ``margin`` let take part; on the CPU where the masks are not read."""
+        """Patches that ``tokens`` and ``margin`` keep; on the CPU where the masks are not read."""
         if self.tokens in KEPT:
             return KEPT[self.tokens](masks, self.patch_size, self.margin)
         b, v, height, width = masks.shape
@@ -163,7 +160,6 @@ class VGGTEncoder(nn.Module):
         require(masks.shape == (b, v, height, width), "masks", str((b, v, height, width)), tuple(masks.shape))
 
     def _normalized(self, images: Tensor, masks: Tensor, bounds: DepthBounds | None) -> Tensor:
-        """Input channels with zero mean and unit standard deviation, in the precision of the weights."""
         x = at_least_float32(images)
         if self.mask_input:
             x = torch.cat((x, masks.to(x.dtype)[:, :, None]), dim=2)
@@ -175,13 +171,12 @@ class VGGTEncoder(nn.Module):
 
 
 def _joined(pairs: list[Pair], kept: KeptPatches, special: int) -> Iterator[Float[Tensor, "N C"]]:
-    """Patch tokens of frame and global block, concatenated; empties ``pairs`` to free memory."""
+    """Patch tokens of each frame and global block, concatenated; empties ``pairs`` to free memory."""
     while pairs:
         yield torch.cat([kept.take(tokens, special) for tokens in pairs.pop(0)], dim=-1)
 
 
 def _patch_embedding(options: VGGTSettings, channels: int) -> nn.Module:
-    """What ``encoder.vit`` describes, for images of so many channels."""
     vit, width, patch_size = options.vit, options.width, options.patch_size
     if vit.kind == "conv":
         return PatchEmbed(channels, width, patch_size)

@@ -1,4 +1,4 @@
-"""What the encode stage can be told."""
+"""Options of the encode stage."""
 
 import re
 from typing import Literal
@@ -36,7 +36,7 @@ class PatchOptions(Options):
 
 
 class VGGTSettings(Options):
-    """The fields of :class:`ghgs_lit.encoder.VGGTOptions`, for the modules that it is built of."""
+    """The fields of :class:`ghgs_lit.encoder.VGGTOptions`, for the modules of the encoder."""
 
     group = "encoder"
     width: Width

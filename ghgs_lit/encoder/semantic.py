@@ -1,4 +1,4 @@
-"""Semantic features F of encoders without published weights: which parts of a body a patch shows."""
+"""Semantic features F of encoders without published weights: the parts of the body that a patch shows."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,12 +13,12 @@ from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.geometry.projection import at_least_float32
 
 NORM_EPS = 1e-5
-#: Parts of the body that ``ghgs pretext`` tells (``training.pretext.labels``): channels of a feature.
+#: Body parts that ``ghgs pretext`` distinguishes (``training.pretext.labels``): channels of a feature.
 PARTS = 16
 
 
 class SemanticOptions(Options):
-    """A branch of blocks over single views, whose features tell parts of a body."""
+    """A branch of blocks over single views, whose features distinguish body parts."""
 
     group = "encoder.semantic"
     width: Width
@@ -42,7 +42,7 @@ class SemanticOptions(Options):
 
 
 def features_of(log_shares: Float[Tensor, "N p"]) -> Float[Tensor, "N p"]:
-    """Square roots of shares, whose cosine is the overlap of two distributions."""
+    """Square roots of shares; their cosine is the overlap of two distributions."""
     return (0.5 * log_shares).exp()
 
 
@@ -53,11 +53,8 @@ class SemanticBranch(nn.Module):
     consistency (Eq. 4), is then the overlap of two distributions (Bhattacharyya's coefficient): 1 where they
     are equal, 0 where no part is shared.
 
-    Attention is inside a view, among a learned token and the patches with a pixel of the subject. All choices
-    of ``skip.tokens`` keep these, so features are those of the photograph and its mask, whatever is kept
-    beside them and whichever views there are. ``options``: of the branch. ``patch_size``: side of a patch in
-    pixels.
-    """
+    Attention is inside a view, among a learned token and the patches with a pixel of the subject. Every
+    choice of ``skip.tokens`` keeps these, so features depend on one photograph and its mask alone."""
 
     def __init__(self, options: SemanticOptions, patch_size: int):
         super().__init__()
@@ -79,8 +76,8 @@ class SemanticBranch(nn.Module):
     def log_shares(
         self, images: Float[Tensor, "b v c H W"], masks: Bool[Tensor, "b v H W"], kept: KeptPatches
     ) -> Float[Tensor, "N p"]:
-        """Logarithms of the shares of the parts in ``kept``, patches of :meth:`subject`; float32 or wider.
-        ``kept``: all patches of the subject, unless a caller wants fewer."""
+        """Logarithms, in float32 or wider, of the shares of parts in the patches ``kept`` of
+        :meth:`subject`."""
         x = torch.cat((images, masks[:, :, None].to(images.dtype)), dim=2).flatten(0, 1)
         patches = self.stem((2 * x - 1).to(self.token.dtype), kept)
         x = kept.join(self.token.to(patches.dtype).expand(masks.shape[0] * masks.shape[1], -1, -1), patches)
@@ -95,7 +92,7 @@ class SemanticBranch(nn.Module):
         masks: Bool[Tensor, "b v H W"],
         kept: Bool[Tensor, "b v h w"],
     ) -> Float[Tensor, "N p"]:
-        """Features of the patches in ``kept``; 0 (cosine 0 with all others) where there is no subject."""
+        """Features of the patches ``kept``; 0 (cosine 0 with all others) for those without the subject."""
         every = KeptPatches(kept, images.device)
         shown = KeptPatches(kept.to(masks.device) & self.subject(masks), images.device)
         features = features_of(self.log_shares(images, masks, shown))

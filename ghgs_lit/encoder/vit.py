@@ -1,7 +1,5 @@
-"""Images to patch tokens: a projection of each patch, a convolutional stem, or DINOv2 with registers.
-
-DINOv2's are the semantic features F of the paper.
-"""
+"""Images to patch tokens: a projection of each patch, a convolutional stem, or DINOv2 with registers, whose
+tokens are the semantic features F of the paper."""
 
 import math
 
@@ -16,7 +14,7 @@ from ghgs_lit.encoder.packing import KeptPatches
 
 
 class PatchEmbed(nn.Module):
-    """One convolution whose kernel and stride are the patch size (a linear projection of each patch)."""
+    """A linear projection of each patch, as one convolution."""
 
     def __init__(self, in_channels: int, width: int, patch_size: int):
         super().__init__()
@@ -37,17 +35,14 @@ class ChannelNorm(nn.LayerNorm):
         return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
-#: Patches around those that are kept, on which these depend: one is mixed in, it sees a part of the next.
+#: Patches around a kept one that it depends on: the next one is mixed in, which sees a part of its neighbour.
 _REACH = 2
 
 
 class ConvStem(nn.Module):
-    """Overlapping convolutions: with them a small encoder learns edges and the silhouette much sooner.
-
-    The image is halved while the patch size is even; one strided convolution does the odd remainder; a last
-    convolution mixes neighbouring patches. ``channels``: channels after the first convolution; doubled at
-    each halving, up to ``width``.
-    """
+    """Overlapping convolutions, with which a small encoder learns edges and the silhouette much sooner. The
+    image is halved while the patch size is even; a strided convolution does the rest; a last one mixes
+    neighbouring patches. ``channels``: after the first one; doubled at each halving, up to ``width``."""
 
     def __init__(self, in_channels: int, width: int, patch_size: int, channels: int):
         super().__init__()
@@ -74,9 +69,8 @@ NORM_EPS = 1e-6
 
 class VisionTransformer(nn.Module):
     """DINOv2 ViT; tokens of an image are in the order class, registers, kept patches. ``image_size``: side in
-    pixels of the square image whose position embedding is stored, a multiple of ``patch_size``; for other
-    sizes it is resampled. ``checkpointing``: recompute activations in the backward pass instead of keeping
-    them."""
+    pixels of the square image whose position embedding is stored, a multiple of ``patch_size``; it is
+    resampled for other sizes. ``checkpointing``: recompute activations in the backward pass."""
 
     def __init__(
         self,
@@ -96,7 +90,7 @@ class VisionTransformer(nn.Module):
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + (image_size // patch_size) ** 2, width))
         self.register_tokens = nn.Parameter(torch.zeros(1, REGISTERS, width))
-        # Replaces masked patches in DINOv2's own training; kept so that its weights load strictly.
+        # Used only in DINOv2's own training; kept so that its weights load strictly.
         self.mask_token = nn.Parameter(torch.zeros(1, width), requires_grad=False)
         self.blocks = nn.ModuleList(
             Block(width, heads, qk_norm=False, norm_eps=NORM_EPS, layer_scale=1.0) for _ in range(depth)
@@ -114,7 +108,7 @@ class VisionTransformer(nn.Module):
                 nn.init.zeros_(module.bias)
 
     def positions(self, height: int, width: int, dtype: torch.dtype) -> Float[Tensor, "1 t c"]:
-        """Position embedding of class and patches on ``height`` x ``width`` patches, resampled in float32."""
+        """Position embedding of the class token and ``height`` x ``width`` patches, resampled in float32."""
         side = math.isqrt(self.pos_embed.shape[1] - 1)
         if (height, width) == (side, side):
             return self.pos_embed.to(dtype)
@@ -124,7 +118,7 @@ class VisionTransformer(nn.Module):
         return torch.cat((table[:, :1], grid.flatten(2).mT), dim=1).to(dtype)
 
     def embed(self, images: Float[Tensor, "n i H W"], kept: KeptPatches) -> Float[Tensor, "t c"]:
-        """The packed input of the first block; position embeddings are those of the whole image."""
+        """Packed input of the first block, with the position embeddings of the whole image."""
         n, _, height, width = images.shape
         patches = self.patch_embed.dense(images)
         positions = self.positions(height // self.patch_size, width // self.patch_size, patches.dtype)

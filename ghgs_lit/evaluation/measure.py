@@ -1,4 +1,4 @@
-"""Measures a method (a model or a baseline) on the targets of an evaluation protocol."""
+"""Measurement of methods (models and baselines) on the targets of evaluation protocols."""
 
 import dataclasses
 import time
@@ -25,13 +25,13 @@ from ghgs_lit.visualization.pictures import save_png, sheet
 
 
 class Flickers:
-    """Compares each instant with the one before, if that came just before. ``builder``: of the split."""
+    """Flicker of each instant of a person against the one measured just before; ``builder``: of the split."""
 
     def __init__(self, builder: BatchBuilder) -> None:
         self._builder, self._last = builder, ("", ())
 
     def __call__(self, batch: Batch, image: Tensor) -> list[Row]:
-        """For each subject and target of ``image`` [B, T, 3, h, w]: its ``flicker``, where there is one."""
+        """Rows with the ``flicker`` of each subject and target of ``image`` [B, T, 3, h, w], else empty."""
         return [row for element in range(len(image)) for row in self._element(batch, image[element], element)]
 
     def _element(self, batch: Batch, image: Tensor, element: int) -> list[Row]:
@@ -57,16 +57,10 @@ Renderer = Callable[[Gaussians, Cameras], Rendering]
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a method predicts for a batch; None where it does not predict it.
-
-    Args:
-        image: renders of the targets [B, T, 3, h, w].
-        depth: depths of the inputs [B, V, H, W], metres.
-        depth_valid: where they are defined [B, V, H, W].
-        gaussians: number of Gaussians of each element [B].
-        not_finite: number of Gaussians and of depths of the subject of each element [B] that are not finite.
-        decisions: what ``skip=auto`` chose for each element [B].
-    """
+    """Prediction of a method for a batch; None: not predicted. ``image``: renders [B, T, 3, h, w] of the
+    targets. ``depth``: of the inputs [B, V, H, W], metres, defined where ``depth_valid``. For each element:
+    number of ``gaussians``; of Gaussians and subject depths that are ``not_finite``; ``decisions`` of
+    ``skip=auto``."""
 
     image: Tensor
     depth: Tensor | None = None
@@ -81,10 +75,8 @@ Method = Callable[[Batch], Estimate]
 
 @dataclass(frozen=True)
 class ModelMethod:
-    """A model, the renderer of its Gaussians, and what refines these and the cameras (None: nothing).
-
-    Gaussians that were refined are not at the predicted depths: these have no estimate then.
-    """
+    """A model with its renderer and optional refinement of Gaussians and cameras. Refined Gaussians leave the
+    predicted depths, so there is no depth estimate then."""
 
     model: nn.Module
     renderer: Renderer
@@ -104,7 +96,7 @@ class ModelMethod:
 
 
 def not_finite(batch: Batch, prediction: Prediction) -> tuple[int, ...]:
-    """Gaussians and depths of each subject that are not finite; a warning names subjects with any."""
+    """Number of non-finite Gaussians and depths of each subject; a warning names subjects with any."""
     splats = (~prediction.gaussians.is_finite).split(prediction.gaussians.splits)
     depths = (batch.masks & ~prediction.depth_valid).flatten(1).sum(1)
     counts = tuple((torch.stack([found.sum() for found in splats]) + depths).tolist())
@@ -123,7 +115,6 @@ def _depth_error(batch: Batch, estimate: Estimate, element: int) -> float | None
 
 
 def _rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[Row]:
-    """The metrics of each element's targets, with what each row is about."""
     targets, (b, t) = batch.targets, batch.targets.images.shape[:2]
     flat = metrics(estimate.image.flatten(0, 1), targets.images.flatten(0, 1), targets.masks.flatten(0, 1))
     values = {name: value.reshape(b, t).tolist() for name, value in flat.items()}
@@ -147,7 +138,7 @@ def _rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[Row]:
 
 
 def decisions_of(rows: Iterable[Row]) -> list[Decision]:
-    """What ``skip=auto`` chose for each subject and number of views of the rows; nothing without it."""
+    """Choice of ``skip=auto`` for each subject and number of views in the rows; empty without it."""
     chosen = {(row["method"], row["subject"], row["views"]): row for row in rows if "skip" in row}
     return [Decision(row["skip"], row["encoder_products"]) for row in chosen.values()]
 
@@ -172,13 +163,10 @@ def measure(
     picture_count: int = 0,
     flickers: Flickers | None = None,
 ) -> list[Row]:
-    """Measure one method; the targets of all protocols come from one prediction.
-
-    One row for each subject and target; ``seconds`` is the time of the prediction and all renders of a
-    subject, in a batch as the loader gives it. ``pictures``: folder for pictures of the first
-    ``picture_count`` subjects (None: none are written). ``flickers``: compares people in motion with the
-    instant before (None: nothing does). InputError: a batch has no targets.
-    """
+    """Measure a method: one row for each subject and target, with one prediction for all protocols.
+    ``seconds`` of a row: prediction and all renders of a batch, divided by its subjects. ``pictures``: folder
+    for pictures of the first ``picture_count`` subjects, or None. ``flickers``: adds flicker to the rows.
+    InputError: a batch has no targets."""
     rows: list[Row] = []
     for batch in loader:
         batch = batch.to(device)
@@ -211,9 +199,7 @@ def measure_all(
     pictures: Path | None = None,
     picture_count: int = 0,
 ) -> list[Row]:
-    """Measure all methods on the same subjects and photographs. ``data``: gives the photographs
-    (``evaluation_loader``). Returns: The rows of every number of views, protocol and method, in this
-    order."""
+    """Measure all methods on the same photographs; rows by number of views, then protocol, then method."""
     rows: list[Row] = []
     for count in views:
         loader = data.evaluation_loader(views=count, targets=list(targets.values()), split=split)

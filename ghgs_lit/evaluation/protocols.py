@@ -1,4 +1,4 @@
-"""The target protocols that an evaluation measures, and checks of all that it needs before any work."""
+"""Target protocols of an evaluation, and checks before it starts."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,11 +11,8 @@ from ghgs_lit.errors import choice, require
 
 
 def target_protocols(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """The protocols that ``evaluation.targets`` lists, by name.
-
-    Each has the values of its own file in ``conf/targets``, and the file's name; the one that ``targets=``
-    selects has the configured values, overrides included. InputError: there is no such file.
-    """
+    """Protocols that ``evaluation.targets`` lists, by name, with the values of their file in ``conf/targets``
+    or, for the one that ``targets=`` selects, the configured values. InputError: there is no such file."""
     configured = config["targets"]
     protocols = {
         name: configured if name == configured["name"] else read_option("targets", name, "evaluation.targets")
@@ -28,10 +25,9 @@ def target_protocols(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def check_evaluation(config: Mapping[str, Any], data: PhotographsDataModule) -> None:
-    """Refuse an evaluation that could not be measured; data is prepared, no photograph is read. ``config``:
-    the run's configuration (``evaluation``, ``metrics`` and ``targets`` are used). InputError: a value is
-    impossible, a metric cannot be computed, the split has no subjects, or a subject lacks an input or a
-    target."""
+    """Check that an evaluation can be measured; data is prepared, no photograph is read. ``config``: with
+    ``evaluation``, ``metrics`` and ``targets``. InputError: a value is impossible, a metric cannot be
+    computed, the split has no subjects, or a subject lacks an input or a target."""
     evaluation = config["evaluation"]
     for key in ("views", "targets"):
         found = evaluation[key]

@@ -1,4 +1,4 @@
-"""A whole evaluation as configured: measures methods, prints means, writes the results of the run."""
+"""A configured evaluation: measure methods, print means, write the results of the run."""
 
 from collections.abc import Mapping
 from functools import cache
@@ -16,12 +16,12 @@ from ghgs_lit.evaluation.protocols import target_protocols
 from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.runs.results import METHOD, Row, metric_names, summarize, write_results
 
-#: Prints a line unless this process has: what one run of a sweep lacks, all lack.
+#: Print a line once per process: all runs of a sweep lack the same.
 print_once = cache(print)
-#: Metrics that are printed, with their decimals.
+#: Printed metrics and their decimals.
 PRINTED = {"psnr": 2, "psnr_box": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1, "seconds": 2}
 PRINTED |= {"flicker": 4}
-#: What readers must know about the subjects of a split.
+#: Descriptions of splits for readers of the results.
 SPLITS = {
     "train": "the subjects that were trained on",
     "val": "unseen in training; validation shares them: it chooses best.ckpt, and never last.ckpt",
@@ -36,13 +36,9 @@ def measure_and_write(
     device: torch.device,
     **facts: Any,
 ) -> Path:
-    """Measure methods as configured; print the means and write the results. Returns: the path of
-    ``metrics.json``.
-
-    What :func:`check_evaluation` checks is not checked again. ``config``: the run's full configuration
-    (``evaluation``, ``metrics`` and ``targets`` are used, and the model's where one is measured).
-    ``directory``: gets ``metrics.json``, ``metrics.csv`` and ``pictures/``.
-    """
+    """Measure methods as configured, print the means and write ``metrics.json`` (whose path is returned),
+    ``metrics.csv`` and ``pictures/``. Call :func:`check_evaluation` before. ``config``: the run's full
+    configuration. ``facts``: further provenance."""
     evaluation = config["evaluation"]
     targets = target_protocols(config)
     metrics = build(config["metrics"], "metrics").to(device)
@@ -74,7 +70,7 @@ def measure_and_write(
 
 
 def print_summary(rows: list[Row]) -> None:
-    """Print means over subjects as a table; the files have all numbers."""
+    """Print means over subjects as a table."""
     names = [name for name in PRINTED if name in metric_names(rows)]
     about = ["method", "views", "targets"]
     lines = []

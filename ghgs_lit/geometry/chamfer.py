@@ -1,7 +1,5 @@
-"""Chamfer distance between two point sets (the paper's geometric loss L_geom).
-
-Nearest neighbours are exact and carry no gradient; the gradient runs through the matched pairs only.
-"""
+"""Chamfer distance between two point sets (the paper's geometric loss L_geom). Nearest neighbours are exact
+and carry no gradient; the gradient runs through the matched pairs only."""
 
 import torch
 from jaxtyping import Float, Int
@@ -11,16 +9,13 @@ from torch import Tensor
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.kernels.precision import exact
 
-#: Distances that an accelerator holds at a time, and candidates of each query whose distance is exact.
+#: Distances in the memory of an accelerator at once, and candidates of each query that are compared exactly.
 _DISTANCES, _CANDIDATES = 1 << 26, 4
 
 
 def nearest(queries: Float[Tensor, "n 3"], references: Float[Tensor, "m 3"]) -> Int[Tensor, " n"]:
-    """Index of the nearest reference of each query, of any one where the query is not finite.
-
-    On the CPU by a k-d tree in float64; elsewhere by matrix products, see :func:`nearest_by_products`.
-    ``references``: finite coordinates, one point at least.
-    """
+    """Index of the nearest reference of each query; of any reference if the query is not finite. On the CPU
+    by a k-d tree in float64, elsewhere by :func:`nearest_by_products`. ``references``: not empty, finite."""
     queries, references = at_least_float32(queries.detach()), at_least_float32(references.detach())
     queries = queries.nan_to_num(0.0, 0.0, 0.0)
     if queries.device.type != "cpu":
@@ -31,12 +26,10 @@ def nearest(queries: Float[Tensor, "n 3"], references: Float[Tensor, "m 3"]) -> 
 
 
 def nearest_by_products(queries: Float[Tensor, "n 3"], references: Float[Tensor, "m 3"]) -> Int[Tensor, " n"]:
-    """:func:`nearest` among the few references that are nearest by ``|r|^2 - 2 q r``.
-
-    In float32 products are off by some 1e-7 of a squared metre around the middle of the references; explicit
-    differences decide among the candidates. Explicit differences to all (``torch.cdist`` without products)
-    took 4 s of a GPU for 160 000 Gaussians and 10 475 vertices.
-    """
+    """:func:`nearest` by matrix products: ``|r|^2 - 2 q r`` finds a few candidates, differences decide. In
+    float32 the products are off by some 1e-7 of a squared metre around the middle of the references.
+    Differences to all references (``torch.cdist`` without products) took 4 s on a GPU for 160 000 Gaussians
+    and 10 475 vertices."""
     middle = references.mean(0)
     queries, references = queries - middle, references - middle
     squares, count = references.square().sum(1), min(_CANDIDATES, len(references))
@@ -62,10 +55,10 @@ def subsample(points: Float[Tensor, "n 3"], limit: int | None) -> Float[Tensor, 
 def chamfer(
     points: Float[Tensor, "n 3"], references: Float[Tensor, "m 3"], limit: int | None = None
 ) -> Float[Tensor, ""]:
-    """Mean squared distance from each point to its nearest reference, plus the mean the other way round.
-    Returns: 0 where either set is empty (with a gradient of 0); nan where a coordinate is not finite.
-    ``points``: the prediction, in metres. ``references``: the surface, in metres. ``limit``: points of each
-    set that are matched at most (to all of the other set, so that the mean stays unbiased); None: all."""
+    """Mean squared distance from each point to its nearest reference, plus the mean the other way round. 0 if
+    either set is empty (with a gradient of 0), nan if a coordinate is not finite. ``points``: the prediction,
+    in metres. ``references``: the surface, in metres. ``limit``: largest number of points of each set that
+    are matched (to all of the other set, so that the mean stays unbiased); None: all."""
     points, references = at_least_float32(points), at_least_float32(references)
     if not (torch.isfinite(points).all() and torch.isfinite(references).all()):
         return (points.sum() + references.sum()) * torch.nan

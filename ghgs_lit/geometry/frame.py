@@ -1,10 +1,9 @@
-"""A frame of the subject's own: the stages see each scene in metres, upright, around the origin.
+"""Coordinate frame of the subject: the stages see each scene in metres, upright, around the origin.
 
 Photographs come with any unit and any origin. In float32 a world 1 km away costs 0.1 mm, limits in metres
-mean nothing in millimetres, and an axis-aligned box depends on the world's axes. So a batch is moved, turned
-and scaled on its way in, and its prediction on its way out, both in float64. Nothing here has a gradient but
-what passes through :meth:`Frame.leave`.
-"""
+mean nothing in millimetres, and an axis-aligned box depends on the world's axes. So the cameras of a batch
+are moved, turned and scaled, and its prediction is moved back, both by a frame in float64. :meth:`Frame.of`
+and :meth:`Frame.enter` have no gradient."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -19,17 +18,15 @@ from ghgs_lit.geometry.rotations import matrix_to_quaternion, multiply_quaternio
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds, DepthMaps, Gaussians, Prediction
 
-#: Height (or width, if larger) of the subject in its frame, in metres.
+#: Height of the subject in its frame, or its width if larger, in metres.
 HEIGHT = 1.8
 
 
 @dataclass(frozen=True)
 class Frame:
-    """``world = origin + metre * axes^T point`` for the points of each element, in float64.
-
-    The axes are right, up and back of the first camera, with up the mean of all cameras'; the origin is the
-    subject's middle; ``metre`` is the length of a metre of the frame in the world's unit.
-    """
+    """``world = origin + metre * axes^T point`` for the points of each element, in float64. Axes: right, up
+    (the mean of all cameras) and back of the first camera. Origin: the subject's middle. ``metre``: length of
+    a metre of the frame in the world's unit."""
 
     origin: Float[Tensor, "B 3"]
     axes: Float[Tensor, "B 3 3"]
@@ -46,16 +43,14 @@ class Frame:
 
     @property
     def shared(self) -> "Frame":
-        """One frame for elements of one world: at their mean place, by their median size."""
+        """One frame for all elements, which share a world: mean origin, first axes, median size."""
         one = (self.origin.mean(0), self.axes[0], self.metre.median())
         return Frame(*(each.expand(len(self.metre), *each.shape) for each in one))
 
     @torch.no_grad()
     def enter(self, batch: Batch) -> Batch:
-        """The batch as the stages see it: its input cameras are in the frame, in the photographs' precision.
-
-        Targets, true depths and body vertices stay in the world.
-        """
+        """The batch with its input cameras in the frame, in the precision of the photographs. Targets, true
+        depths and body vertices stay in the world."""
         cameras, dtype = batch.cameras, at_least_float32(batch.images).dtype
         extrinsics = cameras.extrinsics.double()
         moved = extrinsics.clone()
@@ -66,7 +61,7 @@ class Frame:
         return dataclasses.replace(batch, cameras=inside)
 
     def leave_cameras(self, inside: Cameras, world: Cameras) -> Cameras:
-        """Cameras in the frame as cameras in the world, in the precision of ``world``, those that entered."""
+        """Cameras in the frame as cameras in the world, in the precision of ``world``, the original ones."""
         extrinsics = world.extrinsics.double().clone()
         extrinsics[..., :3, :3] = inside.extrinsics[..., :3, :3].double() @ self.axes[:, None]
         to_origin = (extrinsics[..., :3, :3] @ self.origin[:, None, :, None])[..., 0]
@@ -77,8 +72,8 @@ class Frame:
         return dataclasses.replace(world, intrinsics=intrinsics, extrinsics=extrinsics.to(world.extrinsics))
 
     def leave(self, prediction: Prediction, dtype: torch.dtype) -> Prediction:
-        """A prediction in the frame as one in the world. ``prediction``: of the stages. ``dtype``: of points
-        in the world, where they may need more digits than in the frame: that of its cameras."""
+        """The prediction in the world. ``dtype``: of points in the world (that of its cameras), which may
+        need more digits than in the frame."""
         dtype = torch.promote_types(dtype, torch.float32)
         views, points = prediction.depth.shape[1], prediction.points
         everyone = torch.arange(len(self.metre), device=points.pixels.device)[:, None, None, None]
@@ -99,7 +94,7 @@ class Frame:
         )
 
     def _maps(self, maps: DepthMaps, known: dict[Tensor, Tensor]) -> DepthMaps:
-        """Maps in the world; ``known`` holds what is there already: rounds share their bounds."""
+        """Maps in the world; ``known`` caches results, since rounds share their bounds."""
 
         def scaled(depth: Tensor) -> Tensor:
             if depth not in known:
@@ -123,7 +118,7 @@ class Frame:
     def _to_world(
         self, points: Float[Tensor, "*n 3"], element: Tensor, dtype: torch.dtype
     ) -> Float[Tensor, "*n 3"]:
-        """In ``dtype`` throughout: that of the way there is no more than the rounding of the result."""
+        """Points in the world, computed in ``dtype``; the error is that of rounding the result."""
         axes = (self.metre[:, None, None] * self.axes).to(dtype)[element].unbind(-2)
         found = self.origin.to(dtype)[element]
         for coordinate, axis in zip(points.to(dtype)[..., None].unbind(-2), axes, strict=True):
@@ -132,11 +127,8 @@ class Frame:
 
 
 def subject_center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Tensor, "B 3"]:
-    """The point nearest to the rays through the masks' centroids, by least squares.
-
-    The optical axes take part with a small weight, so that one mask, or none, is enough; a still smaller
-    pull towards the cameras keeps parallel rays solvable.
-    """
+    """The point nearest to the rays through the masks' centroids, by least squares. Optical axes have a small
+    weight, so that one mask or none is enough, and the cameras a smaller one, for parallel rays."""
     intrinsics, extrinsics = at_least_float32(cameras.intrinsics), at_least_float32(cameras.extrinsics)
     v, u = (torch.arange(side, device=masks.device, dtype=intrinsics.dtype) + 0.5 for side in masks.shape[2:])
     counts = masks.sum((-2, -1))
@@ -154,7 +146,7 @@ def subject_center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Te
     origin = cameras.centers.mean(1)
     offsets = (cameras.centers - origin[:, None])[..., None]
     matrix = across.sum(1) + 1e-4 * identity
-    # Never singular; the check of linalg.solve would wait for a GPU.
+    # Never singular; linalg.solve would check that and wait for a GPU.
     return torch.linalg.solve_ex(matrix, (across @ offsets).sum(1)).result[..., 0] + origin
 
 
@@ -163,11 +155,9 @@ def _in_cameras(points: Float[Tensor, "B 3"], extrinsics: Float[Tensor, "B V 4 4
 
 
 def _size(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Tensor) -> Float[Tensor, " B"]:
-    """Height or width of the subject, whichever is larger, in the world's unit.
-
-    The median of the views (of two the larger: masks are cut more often than grown), so that one wrong mask
-    does not count. That of a person in metres where no view shows the subject before it.
-    """
+    """Height or width of the subject, whichever is larger, in the world's unit. The median of the views, so
+    that one wrong mask does not matter; of two the larger, since masks are more often too small.
+    :data:`HEIGHT` if no view shows the subject in front of it."""
     depth = _in_cameras(center, cameras.extrinsics)[..., 2]
     sides = []
     for axis in (0, 1):
@@ -180,20 +170,20 @@ def _size(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Tensor) -> F
 
 
 def _axes(cameras: Cameras) -> Float[Tensor, "B 3 3"]:
-    """Right, up and back as rows: proper rotations, whatever the extrinsics are."""
+    """Right, up and back as rows: proper rotations for any extrinsics."""
     down, forward = cameras.extrinsics[..., 1, :3], cameras.extrinsics[:, 0, 2, :3]
     mean = -down.mean(1)
-    # Cameras without a common upright: the first one's.
+    # Without a common up direction: that of the first camera.
     up = unit(torch.where(mean.norm(dim=-1, keepdim=True) > 0.1, mean, -down[:, 0]))
 
     def level(direction: Tensor) -> Tensor:
         return direction - (direction * up).sum(-1, keepdim=True) * up
 
-    # Where the first camera looks straight up or down, its own upright is horizontal.
+    # If the first camera looks straight up or down, its own up axis is horizontal.
     back, other = level(-forward), level(-down[:, 0])
     back = unit(torch.where(back.norm(dim=-1, keepdim=True) > 0.1, back, other))
     right = unit(torch.linalg.cross(up, back))
     axes = torch.stack((right, up, back), dim=1)
-    # Rotations of rank 1 or less say nothing.
+    # Extrinsics of rank 1 or less define no axes.
     known = (right.norm(dim=-1) > 0)[:, None, None]
     return torch.where(known, axes, torch.eye(3, device=axes.device, dtype=axes.dtype))

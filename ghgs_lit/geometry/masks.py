@@ -1,8 +1,6 @@
-"""What masks say: where they begin and end, patches, distances to outlines, mattes, depths relative to them.
-
-Soft mattes show the subject in a part of a pixel's area. Photographs on black are premultiplied by that part,
-as renders of Gaussians are (Porter and Duff, SIGGRAPH 1984); a Gaussian needs the colour of the surface.
-"""
+"""Masks and soft mattes: extents, patches, distances to outlines, colours, relative depths. A matte holds the
+share of a pixel's area that shows the subject. Photographs on black are premultiplied by it, as renders of
+Gaussians are (Porter and Duff, SIGGRAPH 1984); a Gaussian needs the colour of the surface."""
 
 import dataclasses
 
@@ -26,23 +24,22 @@ def first_and_last(hits: Bool[Tensor, "*batch n"]) -> tuple[Int[Tensor, "*batch"
 def patches_around_subject(
     masks: Bool[Tensor, "b v H W"], patch_size: int, margin: int
 ) -> Bool[Tensor, "b v h w"]:
-    """Patches with a pixel of the subject, and those at most ``margin`` rows and columns from one of them.
-    ``masks``: of the photographs; sides are multiples of the patch size."""
+    """Patches with a pixel of the subject, and those at most ``margin`` rows and columns away. The sides of
+    the masks are multiples of the patch size."""
     return _grown(F.max_pool2d(masks.float(), patch_size), margin)
 
 
 def patches_in_window(
     masks: Bool[Tensor, "b v H W"], patch_size: int, margin: int
 ) -> Bool[Tensor, "b v h w"]:
-    """Patches of the smallest rectangle that holds the subject of a view, and of ``margin`` rows and columns
-    around it; arguments as of :func:`patches_around_subject`. A view with an empty mask has none."""
+    """Patches of the smallest rectangle around the subject of a view, grown by ``margin``; none if empty."""
     touched = F.max_pool2d(masks.float(), patch_size).bool()
     rows, columns = between(touched.any(-1)), between(touched.any(-2))
     return _grown((rows[..., :, None] & columns[..., None, :]).float(), margin)
 
 
 def between(hits: Bool[Tensor, "*batch n"]) -> Bool[Tensor, "*batch n"]:
-    """From the first to the last True along the last axis; none where there is none."""
+    """True from the first to the last True along the last axis."""
     first, last = first_and_last(hits)
     index = torch.arange(hits.shape[-1], device=hits.device)
     return (index >= first[..., None]) & (index <= last[..., None])
@@ -52,15 +49,13 @@ def _grown(patches: Float[Tensor, "b v h w"], margin: int) -> Bool[Tensor, "b v 
     return F.max_pool2d(patches, 2 * margin + 1, 1, margin).bool()
 
 
-#: Shares of a pixel between which an outline runs through it.
+#: An outline runs through pixels with shares between these.
 _RIM = (0.02, 0.98)
 
 
 def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Pixels to the outline, which runs between pixel centres: above 0 inside, below 0 outside.
-
-    The image's border is no outline: a mask without one is infinitely far from it.
-    """
+    """Signed distance in pixels to the outline, which runs between pixel centres; positive inside. The
+    image's border is no outline; without an outline distances are infinite."""
     from scipy.ndimage import distance_transform_edt  # here: a plain prediction does not need it
 
     if mask.all() or not mask.any():
@@ -69,7 +64,7 @@ def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 
 
 def soft_signed_distance(matte: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """:func:`signed_distance` to fractions of a pixel: its share that is inside says where outlines are."""
+    """:func:`signed_distance` with subpixel precision, from the shares of pixels that are inside."""
     from scipy.ndimage import distance_transform_edt
 
     inside = matte > 0.5
@@ -82,8 +77,7 @@ def soft_signed_distance(matte: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "
 
 
 def with_matte(batch: Batch, least: float | None) -> Batch:
-    """The batch whose masks hold all pixels that show more of the subject than ``least``. ``batch``: as it is
-    where it has no matte. ``least``: a share; None: the batch without its matte."""
+    """The batch with masks ``matte > least`` if it has a matte; None: the batch without its matte."""
     if batch.alpha is None:
         return batch
     if least is None:
@@ -92,28 +86,28 @@ def with_matte(batch: Batch, least: float | None) -> Batch:
 
 
 def coverage(batch: Batch) -> Float[Tensor, "B V H W"]:
-    """The share of each pixel that shows the subject: 0 or 1 by the mask where there is no matte."""
+    """The share of each pixel that shows the subject: the matte, or else the mask as 0 and 1."""
     shares = batch.masks if batch.alpha is None else batch.alpha
     return shares.to(at_least_float32(batch.images).dtype)
 
 
 def surface_colors(batch: Batch) -> Float[Tensor, "B V 3 H W"]:
-    """Photographs divided by the matte, at most 1: the colour of what a pixel shows of the subject."""
+    """Colours of the subject's surface: photographs divided by the matte, at most 1."""
     images = at_least_float32(batch.images)
     return images if batch.alpha is None else unmultiplied(images, batch.alpha.to(images.dtype)[:, :, None])
 
 
 def unmultiplied(images: Tensor, alpha: Tensor) -> Tensor:
-    """Colours divided by ``alpha``, at most 1; as they are where it is 0 and says nothing of them."""
+    """Colours divided by ``alpha``, at most 1; unchanged where it is 0."""
     return torch.where(alpha > 0, (images / torch.where(alpha > 0, alpha, 1)).clamp(max=1), images)
 
 
 def on_black(batch: Batch) -> Float[Tensor, "B V 3 H W"]:
-    """Photographs without what is beside the subject; with a matte they are on black already."""
+    """Photographs on black; those with a matte already are."""
     return batch.images if batch.alpha is not None else batch.images * coverage(batch)[:, :, None]
 
 
-#: Metres that become 1: about the depth of a body.
+#: Unit of relative depths in metres: about the depth of a body.
 UNIT = 0.25
 
 #: Channels of :func:`relative_bounds`.
@@ -123,15 +117,14 @@ BOUNDS_CHANNELS = 2
 def subject_mean(
     values: Float[Tensor, "B V H W"], masks: Bool[Tensor, "B V H W"]
 ) -> Float[Tensor, "B V 1 1"]:
-    """Mean over the subject's pixels of each view; 0 for a view without any."""
+    """Mean over the subject's pixels of each view; 0 for an empty mask."""
     count = masks.sum((-2, -1), keepdim=True)
     return torch.where(masks, values, 0).sum((-2, -1), keepdim=True) / count.clamp(min=1)
 
 
 def relative_bounds(bounds: DepthBounds, masks: Bool[Tensor, "B V H W"]) -> Float[Tensor, "B V 2 H W"]:
-    """The bounds as two maps: what masks and cameras say about the shape, not about the distance. ``bounds``:
-    near and far in metres. Returns: ``near`` minus the mean middle of the view's bounds, and ``far - near``,
-    in units of :data:`UNIT`; 0 outside the subject."""
+    """Two maps of the bounds that describe the shape, not the distance: ``near`` minus the mean middle of the
+    view's bounds, and ``far - near``, in units of :data:`UNIT`; 0 outside the subject."""
     middle = subject_mean((bounds.near + bounds.far) / 2, masks)
     maps = torch.stack((bounds.near - middle, bounds.far - bounds.near), dim=2) / UNIT
     return torch.where(masks[:, :, None], maps, 0)
@@ -140,7 +133,7 @@ def relative_bounds(bounds: DepthBounds, masks: Bool[Tensor, "B V H W"]) -> Floa
 def relative_depth(
     depth: Float[Tensor, "B V H W"], masks: Bool[Tensor, "B V H W"]
 ) -> Float[Tensor, "B V 1 H W"]:
-    """Depth minus its mean over the view's subject, in units of :data:`UNIT`, without a gradient. ``depth``:
-    in metres. ``masks``: of the subject; the map is 0 outside."""
+    """Depth minus its mean over the view's subject, in units of :data:`UNIT`, without a gradient; 0 outside
+    the masks. ``depth``: in metres."""
     depth = depth.detach()
     return torch.where(masks, (depth - subject_mean(depth, masks)) / UNIT, 0)[:, :, None]

@@ -1,7 +1,5 @@
-"""A black border around photographs whose sides are not multiples of the patch size.
-
-Predictions are cut back, so that results are in the photograph's own pixels.
-"""
+"""A black border around photographs whose sides are not multiples of the patch size. Predictions are cropped
+again, so that results are in the photograph's own pixels."""
 
 import dataclasses
 from collections.abc import Callable
@@ -16,10 +14,8 @@ from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Prediction,
 
 @dataclass(frozen=True)
 class Padding:
-    """Images of ``height`` x ``width`` with photographs of size ``full`` (height, width) inside.
-
-    The first pixel is pixel (``top``, ``left``) of the photograph: 0 or negative.
-    """
+    """Images of ``height`` x ``width`` with photographs of size ``full`` (height, width) inside. Their first
+    pixel is pixel (``top``, ``left``) of the photograph: 0 or negative."""
 
     top: int
     left: int
@@ -36,7 +32,7 @@ class Padding:
         return F.pad(maps, [-side for side in self._sides(maps)])
 
     def pad_batch(self, batch: Batch) -> "PaddedBatch":
-        """The batch as if every input had been photographed with the border; targets stay."""
+        """The batch with a border around every input; targets are unchanged."""
         kept = {field.name: getattr(batch, field.name) for field in dataclasses.fields(Batch)}
         return dataclasses.replace(
             PaddedBatch(**kept, photographs=batch, padding=self),
@@ -48,7 +44,7 @@ class Padding:
         )
 
     def cut_prediction(self, prediction: Prediction) -> Prediction:
-        """The prediction of a padded batch on the photographs."""
+        """The prediction of a padded batch in the pixels of the photographs."""
         whole = self._cut_maps(prediction.depth_maps)
         pixels = self.cut(prediction.points.pixels)
         return dataclasses.replace(
@@ -70,7 +66,7 @@ class Padding:
         return dataclasses.replace(gaussians, pixel=row * self.full[1] + column)
 
     def _sides(self, maps: Tensor) -> list[int]:
-        """The widths of the border in the order of ``F.pad``: last axis first, each before and after."""
+        """Widths of the border in the order of ``F.pad``: last axis first, before and after."""
         below, right = self.height - self.full[0] + self.top, self.width - self.full[1] + self.left
         return [0, 0] * (maps.dim() - 4) + [-self.left, right, -self.top, below]
 
@@ -84,19 +80,16 @@ class PaddedBatch(Batch):
 
 
 def bounds_of(stage: Callable[[Batch], DepthBounds | None], batch: Batch) -> DepthBounds | None:
-    """Bounds of all pixels, from the photographs themselves: a border invents something at their edge."""
+    """Bounds of all pixels, from the photographs without their border, which would look like background."""
     if not isinstance(batch, PaddedBatch):
         return stage(batch)
-    bounds = stage(batch.photographs)  # in the border they are depths without a meaning
+    bounds = stage(batch.photographs)  # depths in the border have no meaning
     return bounds and map_tensors(bounds, lambda depths: batch.padding.pad(depths, 1.0))
 
 
 def pad_to_patches(masks: Bool[Tensor, "B V H W"], multiple: int) -> Padding | None:
-    """The smallest border that makes both sides multiples; an odd pixel goes below and to the right.
-
-    512 becomes 518 with 3 pixels on each side, as in the authors' release. Returns: None where both sides are
-    multiples already.
-    """
+    """The smallest border that makes both sides multiples, None if they are; an odd pixel goes to the bottom
+    and the right. 512 becomes 518 with 3 pixels on each side, as in the authors' release."""
     height, width = masks.shape[2:]
     missing = (-height % multiple, -width % multiple)
     if missing == (0, 0):

@@ -1,8 +1,5 @@
-"""How well the photographs agree about depths of each pixel.
-
-A plane sweep (Collins, CVPR 1996) within each pixel's own bounds: a point on the surface has the same colour
-in the views that see it.
-"""
+"""Photo-consistency: how well the photographs agree at several depths of each pixel. A plane sweep (Collins,
+CVPR 1996) within each pixel's own bounds: a point on the surface has the same colour in all views."""
 
 import torch
 import torch.nn.functional as F
@@ -16,23 +13,22 @@ from ghgs_lit.kernels.pool import even_parts, is_supported
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 
-#: Samples that are held at once (bounds memory).
+#: Samples in memory at once.
 _SAMPLES = 1 << 22
 
 #: Mean absolute difference of two colours at which the consistency is 1 / e.
 TOLERANCE = 0.1
 
-#: Least cosine of the angle between the axes of two views that are compared (127 degrees): beyond it they
-#: hardly see a common surface.
+#: Smallest cosine between the axes of two views that are compared (127 degrees): beyond it they hardly share
+#: any surface.
 WIDEST = -0.6
 
 
 @torch.no_grad()
 def photo_consistency(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Tensor, "B V S H W"]:
-    """Agreement of each pixel of the subject with the best other view, in [0, 1], without a gradient.
-    Returns: 0 outside the subject, and where no other view has the point inside its mask. ``batch``: images,
-    masks and cameras are read. ``bounds``: near and far of each pixel, in metres. ``steps``: S, how many
-    depths are compared: the middles of S equal parts of near to far."""
+    """Agreement of each pixel of the subject with the best other view, in [0, 1], without a gradient; 0
+    outside the subject, and where no other view has the point in its mask. ``batch``: images, masks and
+    cameras are read. ``steps``: S, the number of depths: the middles of S equal parts from near to far."""
     near, far = (bound.flatten()[batch.pixels] for bound in (bounds.near, bounds.far))
     found = consistency_of(batch, batch.pixels, near, far, steps)
     result = found.new_zeros(batch.masks.numel(), steps).index_copy_(0, batch.pixels, found)
@@ -43,11 +39,11 @@ def photo_consistency(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Te
 def consistency_of(
     batch: Batch, pixels: Int[Tensor, " N"], near: Float[Tensor, " N"], far: Float[Tensor, " N"], steps: int
 ) -> Float[Tensor, "N S"]:
-    """:func:`photo_consistency` of some pixels. ``pixels``: of the subject: indices among those of all
-    images, in ascending order. ``near``, ``far``: of these, in metres."""
+    """:func:`photo_consistency` of some pixels of the subject. ``pixels``: ascending indices among those of
+    all images. ``near``, ``far``: bounds of these pixels in metres."""
     near, far = at_least_float32(near), at_least_float32(far)
     shares = (torch.arange(steps, device=near.device, dtype=near.dtype) + 0.5) / steps
-    # All of it: half a pixel in bfloat16 is a different colour.
+    # An error of half a pixel, as in bfloat16, would give another colour.
     with exact(batch.masks.device.type):
         views = [x.to(near) if x.is_floating_point() else x for x in batch.once(_pairs)]
         if is_supported(near, far):
@@ -61,7 +57,6 @@ def consistency_of(
 
 
 def _pairs(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
-    """Relations of the views, and which are compared: what depends neither on depths nor on colours."""
     turn, shift, facing = _relations(batch.cameras)
     return turn, shift, ~(facing < WIDEST)
 
@@ -78,7 +73,7 @@ def _best_match(
     shift: Float[Tensor, "B V V 3"],
     compared: Bool[Tensor, "B V V"],
 ) -> Float[Tensor, "n S"]:
-    """Agreement of pixels of all images together, at their depths, with the best other view."""
+    """Agreement of pixels of any images, at their depths, with the best other view."""
     views, _, height, width = colors.shape[1:]
     image, place = pixels // (height * width), pixels % (height * width)
     centers = F.pad(pixel_centers(height, width, depth).flatten(0, 1)[place], (0, 1), value=1.0)
@@ -93,9 +88,8 @@ def _best_match(
 
 
 def _match(images: Tensor, image: Tensor, own: Tensor, rays: Tensor, shift: Tensor, depth: Tensor) -> Tensor:
-    """Agreement [n, o, S] of colours ``own`` [n, 3] with ``images`` [m, 4, H, W]. ``image``: [n, o], the o
-    others that each pixel is compared with. ``rays``, ``shift``: [n, o, 3], of the pixels in the others.
-    ``depth``: [n, S]."""
+    """Agreement [n, o, S] of colours ``own`` [n, 3] with ``images`` [m, 4, H, W]. ``image``: [n, o], those
+    that each pixel is compared with. ``rays``, ``shift``: [n, o, 3], in these. ``depth``: [n, S]."""
     points = rays[:, :, None] * depth[:, None, :, None] + shift[:, :, None]
     z = points[..., 2]
     front = z > 0
@@ -106,21 +100,19 @@ def _match(images: Tensor, image: Tensor, own: Tensor, rays: Tensor, shift: Tens
 
 
 def _smooth(batch: Batch) -> Tensor:
-    """Colours averaged over the subject's pixels in 3 x 3, and the mask as a fourth channel.
-
-    A pixel that is not finite is none of the subject's: it would spread through sums and samples.
-    """
+    """Mean colours of the subject's pixels in 3 x 3, and the mask as a fourth channel. Pixels that are not
+    finite are left out of the mask: they would spread through sums and samples."""
     images = batch.once(surface_colors)
     inside = (batch.masks & images.sum(2).isfinite())[:, :, None]
     both = torch.cat((torch.where(inside, images, 0), inside.to(images.dtype)), 2)
-    for axis in (-2, -1):  # sums of three, several times as fast as an average pool
+    for axis in (-2, -1):  # several times as fast as an average pool
         both = _sum_of_three(both, axis)
     colors = both[:, :, :3] / torch.where(both[:, :, 3:] > 0, both[:, :, 3:], 1.0)
     return torch.cat((colors, inside.to(colors)), 2)
 
 
 def _sum_of_three(values: Tensor, axis: int) -> Tensor:
-    """Of each value and its neighbours along an axis; beyond the border lies 0."""
+    """Sum of each value and its two neighbours along an axis, with 0 beyond the border."""
     found = values.clone()
     inner = values.shape[axis] - 1
     found.narrow(axis, 1, inner).add_(values.narrow(axis, 0, inner))
@@ -129,7 +121,8 @@ def _sum_of_three(values: Tensor, axis: int) -> Tensor:
 
 
 def _relations(cameras: Cameras) -> tuple[Tensor, Tensor, Tensor]:
-    """From pixels of view j to pixels of view k, ``z_k p_k = z_j turn p_j + shift``; cosine of their axes."""
+    """``turn`` and ``shift`` [B, j, k] in ``z_k p_k = z_j turn p_j + shift`` for pixels ``p`` of views j and
+    k, and the cosine between the axes of the views."""
     intrinsics, extrinsics = at_least_float32(cameras.intrinsics), at_least_float32(cameras.extrinsics)
     rotation, translation = extrinsics[..., :3, :3], extrinsics[..., :3, 3:]
     relative = rotation[:, None] @ rotation[:, :, None].mT

@@ -1,7 +1,5 @@
-"""Between pixels and the world, and values between pixels. Conventions: see :mod:`ghgs_lit.types`.
-
-Every function takes any leading dimensions and computes in float32 or wider under any autocast.
-"""
+"""Projection, unprojection and bilinear sampling. Conventions: see :mod:`ghgs_lit.types`. Every function
+takes any leading dimensions and computes in float32 or wider under any autocast."""
 
 import torch
 import torch.nn.functional as F
@@ -17,8 +15,7 @@ def at_least_float32(tensor: Tensor) -> Tensor:
 
 
 def pixel_centers(height: int, width: int, like: Tensor) -> Float[Tensor, "h w 2"]:
-    """Centres ``(u, v)`` of the pixels of an image. ``height``, ``width``: of the image in pixels. ``like``:
-    gives device and dtype."""
+    """Centres ``(u, v)`` of the pixels of an image, with the device and dtype of ``like``."""
     rows, columns = (
         torch.arange(side, device=like.device, dtype=like.dtype) + 0.5 for side in (height, width)
     )
@@ -27,7 +24,7 @@ def pixel_centers(height: int, width: int, like: Tensor) -> Float[Tensor, "h w 2
 
 
 def inverse_intrinsics(intrinsics: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """``K^-1`` by substitution, for a K that is upper triangular (a skew is allowed) and ends with 1."""
+    """``K^-1`` by substitution, for an upper triangular K (a skew is allowed)."""
     intrinsics = at_least_float32(intrinsics)
     identity = torch.eye(3, dtype=intrinsics.dtype, device=intrinsics.device)
     return torch.linalg.solve_triangular(intrinsics, identity.expand_as(intrinsics), upper=True)
@@ -46,7 +43,7 @@ def unproject(
     x = (pixels[..., 0] - intrinsics[..., 0, 2] - intrinsics[..., 0, 1] * y) / fx
     shift = extrinsics[..., :3, 3]
     x, y, z = x * depth - shift[..., 0], y * depth - shift[..., 1], depth - shift[..., 2]
-    # A product with R^T, written out: matmul would run in half precision under autocast, and axis by axis
+    # The product with R^T is written out: matmul would run in half precision under autocast, and this way
     # there is no temporary of nine numbers for each pixel.
     rows = extrinsics[..., :3, :3].unbind(-2)
     return torch.stack(
@@ -57,7 +54,7 @@ def unproject(
 def unproject_maps(
     depth: Float[Tensor, "*batch h w"], cameras: Cameras, pixels: Float[Tensor, "*batch h w 2"] | None = None
 ) -> Float[Tensor, "*batch h w 3"]:
-    """World points of a depth map in metres at ``pixels``; None: of all pixels, at their centres."""
+    """World points of a depth map in metres at ``pixels``; None: at the centres of all pixels."""
     if pixels is None:
         centers = pixel_centers(cameras.height, cameras.width, at_least_float32(depth))
         pixels = centers.expand(*depth.shape, 2)
@@ -66,7 +63,7 @@ def unproject_maps(
 
 
 def focal_lengths(cameras: Cameras) -> Float[Tensor, "*batch 2"]:
-    """Focal lengths along rows and columns, in pixels."""
+    """Focal lengths ``(fx, fy)`` in pixels."""
     return at_least_float32(cameras.intrinsics).diagonal(dim1=-2, dim2=-1)[..., :2]
 
 
@@ -78,7 +75,7 @@ def world_to_camera(
 
 
 def _camera_axes(points: Tensor, extrinsics: Tensor) -> list[Tensor]:
-    """The three coordinates of :func:`world_to_camera`; written out as in :func:`unproject`."""
+    """Coordinates of :func:`world_to_camera`; written out as in :func:`unproject`."""
     x, y, z = at_least_float32(points).unbind(-1)
     rows = at_least_float32(extrinsics)[..., :3, :].unbind(-2)
     return [row[..., 0] * x + row[..., 1] * y + row[..., 2] * z + row[..., 3] for row in rows]
@@ -100,10 +97,8 @@ def project(
 
 
 def look_at_point(cameras: Cameras) -> Tensor:
-    """The world point [3] nearest to all optical axes of ``cameras`` [V] (least squares), float64.
-
-    Where the axes are parallel, the one of these points nearest to the mean position of the cameras.
-    """
+    """The world point [3] nearest to all optical axes of ``cameras`` [V] (least squares), float64; for
+    parallel axes, the solution nearest to the mean position of the cameras."""
     forward, centers = cameras.extrinsics[:, 2, :3].double(), cameras.centers.double()
     middle = centers.mean(0)
     away = torch.eye(3, dtype=torch.float64, device=forward.device) - forward[:, :, None] * forward[:, None]
@@ -114,14 +109,12 @@ def look_at_point(cameras: Cameras) -> Tensor:
 def sample(
     maps: Float[Tensor, "m c H W"], image: Int[Tensor, "*n"], pixels: Float[Tensor, "*n 2"]
 ) -> Float[Tensor, "*n c"]:
-    """Bilinear values of the maps ``image`` at ``pixels`` (u, v); 0 outside.
-
-    The maps must be finite: a rounding of the next map enters, too.
-    """
+    """Bilinear values of the maps ``image`` at ``pixels`` (u, v); 0 outside. All maps must be finite: by
+    rounding, the next map may enter with a tiny weight."""
     count, _, height, width = maps.shape
     u, v = pixels.unbind(-1)
-    # The maps are the layers of a volume, and all pixels lie in the middle of a layer. Far outside is brought
-    # near: large numbers are not exact.
+    # The maps are the layers of a volume, and pixels lie in the middle of a layer. Pixels far outside are
+    # clamped: large numbers are not exact.
     layer = (2 * image.to(pixels) + 1) / count - 1
     grid = torch.stack(((2 / width * u - 1).clamp(-3, 3), (2 / height * v - 1).clamp(-3, 3), layer), -1)
     grid = grid.reshape(1, 1, 1, -1, 3)

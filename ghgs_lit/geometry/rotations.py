@@ -1,8 +1,6 @@
-"""Directions, quaternions ``(w, x, y, z)``, rotation matrices, and small motions of cameras.
-
-Photographs do not tell where a rig as a whole is, nor how far its cameras are from a subject of unknown size:
-only motions of cameras beside one another can be seen in them.
-"""
+"""Directions, quaternions ``(w, x, y, z)``, rotation matrices, and small motions of cameras. Photographs show
+neither where a rig as a whole is nor how far its cameras are from a subject of unknown size: they only
+determine motions of the cameras relative to one another."""
 
 import torch
 from jaxtyping import Float
@@ -12,10 +10,8 @@ from ghgs_lit.geometry.projection import at_least_float32
 
 
 def quaternion_to_matrix(quaternions: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrices of quaternions of any non-zero norm; the zero quaternion gives identity.
-
-    Scaled by the largest component first, so that norms of 1e-30 or 1e30 neither vanish nor overflow.
-    """
+    """Rotation matrices of quaternions of any norm; the zero quaternion gives the identity. Quaternions are
+    first scaled by their largest component: norms of 1e-30 or 1e30 are valid."""
     q = at_least_float32(quaternions)
     largest = q.abs().amax(-1, keepdim=True).detach()
     is_zero = largest == 0
@@ -33,7 +29,7 @@ def quaternion_to_matrix(quaternions: Float[Tensor, "*batch 4"]) -> Float[Tensor
 
 
 def matrix_to_quaternion(matrices: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
-    """Unit quaternions of proper rotations, from the largest of four squares (Shepperd 1978)."""
+    """Unit quaternions of proper rotation matrices (Shepperd 1978)."""
     (a, ab, ac), (ba, b, bc), (ca, cb, c) = (row.unbind(-1) for row in matrices.unbind(-2))
     x, y, z = cb - bc, ac - ca, ba - ab
     xy, xz, yz = ba + ab, ac + ca, cb + bc
@@ -52,7 +48,7 @@ def matrix_to_quaternion(matrices: Float[Tensor, "*batch 3 3"]) -> Float[Tensor,
 def rotate(
     quaternions: Float[Tensor, "*batch 4"], vectors: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 3"]:
-    """Vectors turned by unit quaternions; a fifth of the time of a product with their matrices."""
+    """Vectors rotated by unit quaternions, in a fifth of the time of a product with matrices."""
     axis = quaternions[..., 1:]
     twice = 2 * torch.linalg.cross(axis, vectors)
     return vectors + quaternions[..., :1] * twice + torch.linalg.cross(axis, twice)
@@ -75,17 +71,14 @@ def multiply_quaternions(
 
 
 def unit(x: Float[Tensor, "*n c"], least: float = 0.0) -> Float[Tensor, "*n c"]:
-    """``x`` divided by its length, float32 or wider; 0 stays 0, with a zero gradient.
-
-    Scaled by its largest component first: squares of 1e-20 vanish in float32, those of 1e20 overflow. ``x``:
-    vectors of any length. ``least``: the gradient of a shorter vector, which grows as 1 / length, is that at
-    this length.
-    """
+    """``x`` divided by its length, float32 or wider; 0 stays 0, with a zero gradient. Vectors are first
+    scaled by their largest component: squares of 1e-20 vanish in float32, those of 1e20 overflow. ``least``:
+    the gradient, which grows as 1 / length, stays constant for shorter vectors."""
     x = at_least_float32(x)
     largest = x.detach().abs().amax(-1, keepdim=True)
     is_zero = largest == 0
     scaled = x / largest.masked_fill(is_zero, 1.0)
-    # The argument is chosen, not the result: a root at 0 would have an infinite gradient.
+    # The argument is replaced, not the result: a root at 0 would have an infinite gradient.
     squared = scaled.square().sum(-1, keepdim=True).masked_fill(is_zero, 1.0)
     direction = (scaled * squared.rsqrt()).masked_fill(is_zero, 0.0)
     if least == 0 or not direction.requires_grad:
@@ -94,20 +87,16 @@ def unit(x: Float[Tensor, "*n c"], least: float = 0.0) -> Float[Tensor, "*n c"]:
     return direction.detach() + share * (direction - direction.detach())
 
 
-#: Weight of a shift along an optical axis beside one across it, in what cameras share: it shows little, and
-#: as much as another focal length.
+#: Relative weight of a shift along an optical axis: it is hardly visible, much like another focal length.
 _ALONG = 0.01
 
 
 def without_common(
     motions: Float[Tensor, "*b V 6"], axes: Float[Tensor, "*b V 3"]
 ) -> Float[Tensor, "*b V 6"]:
-    """Motions without their mean, and without what they share along the optical axes.
-
-    The mean of the shifts is the one that photographs show least of once it is taken out: least squares of
-    what is across the optical axes. ``motions``: rotation vectors of points, and shifts, in the world's axes.
-    ``axes``: optical axes of the cameras.
-    """
+    """Motions without their mean, and without the mean of their shifts along the optical axes. The mean of
+    the shifts leaves the least shifts across the optical axes (least squares). ``motions``: rotation vectors
+    of points, and shifts, in the world's axes. ``axes``: optical axes of the cameras."""
     turn, shift = motions.split(3, -1)
     turn = turn - turn.mean(-2, keepdim=True)
     across = torch.eye(3).to(axes) - (1 - _ALONG) * axes[..., :, None] * axes[..., None, :]
@@ -121,7 +110,7 @@ def without_common(
 def rigid(
     motions: Float[Tensor, "*n 6"], length: float = 1.0
 ) -> tuple[Float[Tensor, "*n 3 3"], Float[Tensor, "*n 3"]]:
-    """Rotation matrices, by the vectors up to second order in their angles, and shifts times ``length``."""
+    """Rotation matrices, exact to second order in the angles of the vectors, and shifts times ``length``."""
     turn, shift = motions.split(3, -1)
     return quaternion_to_matrix(torch.cat((torch.ones_like(turn[..., :1]), turn / 2), -1)), length * shift
 
@@ -129,7 +118,7 @@ def rigid(
 def motions_between(
     before: Float[Tensor, "V 4 4"], after: Float[Tensor, "V 4 4"], middle: Float[Tensor, "3"]
 ) -> Float[Tensor, "V 6"]:
-    """Small motions of points about ``middle``: what ``before`` sees after them, ``after`` sees without."""
+    """Small motions about ``middle`` after which ``before`` sees points as ``after`` sees them unmoved."""
     back = before[:, :3, :3].mT
     turn = back @ after[:, :3, :3]
     turn = (turn - turn.mT) / 2
@@ -145,7 +134,7 @@ def after_motions(
     middle: Float[Tensor, "3"],
     length: float = 1.0,
 ) -> Float[Tensor, "*n 4 4"]:
-    """Cameras that see points as these see them after :func:`rigid` motions about ``middle``."""
+    """Cameras that see points as ``extrinsics`` sees them after :func:`rigid` motions about ``middle``."""
     rotations, shifts = rigid(motions, length)
     moved, axes = extrinsics.clone(), extrinsics[..., :3, :3]
     moved[..., :3, :3] = axes @ rotations

@@ -1,10 +1,9 @@
-"""Scene flow: how surface points move between two instants, by the photographs of all cameras.
+"""Scene flow: how surface points move between two instants, from the photographs of all cameras.
 
-A point keeps its colour in each view that shows it. How far it moved follows from the slopes of photographs
-(Lucas and Kanade, IJCAI 1981), in space and for all views at once (Vedula et al., ICCV 1999), from coarse to
-fine ones. What a single point leaves open its neighbours say: the equations of all points are summed at the
-nodes of a grid and spread to the nodes around, far where photographs are coarse.
-"""
+A point keeps its colour in each view that shows it. Its motion follows from image gradients (Lucas and
+Kanade, IJCAI 1981), in space and for all views at once (Vedula et al., ICCV 1999), from coarse to fine
+images. The equations of a single point may leave directions open, so those of all points are summed at the
+nodes of a grid and smoothed over the nodes around, further for coarser images."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,18 +19,18 @@ from ghgs_lit.types import Cameras
 
 #: Metres between the nodes of the grid.
 _CELL = 0.08
-#: Metres from the middle beyond which points are strays: the grid would have no end.
+#: Metres from the middle beyond which points are ignored, to limit the grid.
 _REACH = 3.0
-#: One point in so many has equations; all of them move.
+#: One point in this many has equations; all points move.
 _EVERY = 4
-#: Deviation of a colour at which an equation counts half.
+#: Difference of colours at which an equation has half its weight.
 _OUTLIER = 0.06
-#: Longest step in metres, and the weight of steps of 0: absolute, and as a share of the equations' own.
+#: Longest step in metres; damping of steps: absolute, and relative to the mean of the matrix's diagonal.
 _LONGEST, _STILL, _STIFF = 0.05, 1e-3, 0.01
 
 
 class _Level(NamedTuple):
-    """How much smaller photographs are, how often equations spread to the next nodes, and the steps."""
+    """A level: how much smaller images are, how often equations spread to the next nodes, number of steps."""
 
     smaller: int
     spread: int
@@ -42,7 +41,7 @@ _LEVELS = (_Level(4, 4, 2), _Level(2, 2, 2), _Level(1, 1, 1))
 
 
 class Instant(NamedTuple):
-    """Photographs on black, smoothed and made smaller (:func:`pyramid`), and their cameras, in metres."""
+    """Photographs on black as a :func:`pyramid`, and their cameras in metres."""
 
     levels: Sequence[Float[Tensor, "V 3 _h _w"]]
     cameras: Cameras
@@ -50,7 +49,7 @@ class Instant(NamedTuple):
 
 @dataclass(frozen=True)
 class _Grid:
-    """Nodes around points: ``low`` is the first one's position, ``shape`` their number along z, y and x."""
+    """Nodes around points. ``low``: position of the first. ``shape``: their number along z, y and x."""
 
     low: Float[Tensor, " 3"]
     shape: tuple[int, int, int]
@@ -62,14 +61,14 @@ class _Grid:
         return cls(low, tuple(counts.flip(0).tolist()))
 
     def summed(self, points: Float[Tensor, "n 3"], values: Float[Tensor, "n c"]) -> Float[Tensor, "c z y x"]:
-        """The sums of values at the nodes nearest to their points."""
+        """Values summed at the nodes nearest to their points."""
         x, y, z = ((points - self.low) / _CELL).round().long().unbind(-1)
         sums = values.new_zeros(self.shape[0] * self.shape[1] * self.shape[2], values.shape[1])
         sums.index_add_(0, (z * self.shape[1] + y) * self.shape[2] + x, values)
         return sums.mT.reshape(-1, *self.shape)
 
     def at(self, nodes: Float[Tensor, "c z y x"], points: Float[Tensor, "n 3"]) -> Float[Tensor, "n c"]:
-        """Values between the nodes."""
+        """Values at ``points``, interpolated between nodes."""
         last = points.new_tensor(self.shape[::-1]) - 1
         place = 2 * (points - self.low) / (_CELL * last) - 1
         found = F.grid_sample(nodes[None], place[None, None, None], padding_mode="border", align_corners=True)
@@ -77,7 +76,7 @@ class _Grid:
 
 
 def _spread(nodes: Float[Tensor, "c z y x"], times: int) -> Float[Tensor, "c z y x"]:
-    """Each node's values to the nodes around: a quarter to each side along each axis, so many times."""
+    """Smooth the nodes ``times`` times: along each axis a quarter of a value goes to either side."""
     for _ in range(times):
         for axis in (1, 2, 3):
             size = nodes.shape[axis]
@@ -89,11 +88,11 @@ def _spread(nodes: Float[Tensor, "c z y x"], times: int) -> Float[Tensor, "c z y
 
 
 def pyramid(images: Float[Tensor, "V 3 H W"]) -> list[Float[Tensor, "V 3 _h _w"]]:
-    """Photographs on black as :class:`Instant` has them, the smallest first."""
+    """Smoothed images of the sizes of :data:`_LEVELS`, the smallest first. ``images``: on black."""
     views, _, height, width = images.shape
     found = []
     for smaller, _, _ in _LEVELS:
-        # Means of windows that overlap by half, or of nine pixels.
+        # Means of windows that overlap by half; of 3 x 3 pixels at full size.
         side = 2 * smaller if smaller > 1 else 3
         mean = images.new_full((1, 1, side, side), 1 / side**2)
         rim = (side - smaller + 1) // 2
@@ -103,7 +102,7 @@ def pyramid(images: Float[Tensor, "V 3 H W"]) -> list[Float[Tensor, "V 3 _h _w"]
 
 
 def _with_slopes(images: Float[Tensor, "V 3 h w"]) -> Float[Tensor, "V 9 h w"]:
-    """Values, and their slopes to the right and down, 0 at the rim."""
+    """Values, and their gradients to the right and down, 0 at the border."""
     maps = images.new_zeros(len(images), 9, *images.shape[2:])
     maps[:, :3] = images
     torch.sub(images[..., 2:], images[..., :-2], out=maps[:, 3:6, :, 1:-1])
@@ -116,9 +115,9 @@ def _with_slopes(images: Float[Tensor, "V 3 h w"]) -> Float[Tensor, "V 9 h w"]:
 def scene_flow(
     points: Float[Tensor, "N 3"], shown: Bool[Tensor, "N V"], before: Instant, after: Instant
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
-    """How points moved, in metres, and turned: rotation vectors. ``points``: on the surface, in the first
-    instant. ``shown``: which views show them there. ``before``, ``after``: the same views in their order; a
-    camera may be cropped otherwise, but stands still."""
+    """Motion of points in metres, and their rotation vectors. ``points``: on the surface, in the first
+    instant. ``shown``: the views that show them there. ``before``, ``after``: the same views in order; a
+    camera stands still, but its crop may change."""
     near = ((points - points.nanmedian(0).values).abs() < _REACH).all(-1) if len(points) else shown.any(-1)
     if not near.any():
         return torch.zeros_like(points), torch.zeros_like(points)
@@ -143,7 +142,7 @@ def _seen(
     return project(points, cameras.intrinsics[view], cameras.extrinsics[view])
 
 
-#: Entries of a symmetric matrix [3, 3] that are kept, and where each is in it.
+#: Stored entries of a symmetric matrix [3, 3], and the stored entry of each of the nine.
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _PLACES = (0, 1, 2, 1, 3, 4, 2, 4, 5)
 
@@ -156,7 +155,7 @@ def _equations(
     cameras: Cameras,
     smaller: int,
 ) -> Float[Tensor, "n 9"]:
-    """The normal equations of a step of each point in one view: a symmetric matrix and the right side."""
+    """Normal equations of a step of each point in one view: a symmetric matrix and the right side."""
     pixels, depth = _seen(points, view, cameras)
     value, right, down = sample(maps, view, pixels / smaller).split(3, -1)
     lens, pose = cameras.intrinsics[view], cameras.extrinsics[view]
@@ -164,7 +163,7 @@ def _equations(
     right = right * (lens[:, 0, :1] / (smaller * depth[:, None]))
     down = down * (lens[:, 1, 1:2] / (smaller * depth[:, None]))
     ahead = -(right * (inside[:, :1] / depth[:, None]) + down * (inside[:, 1:2] / depth[:, None]))
-    # By the axes of the world, each [n, 3] for the colours; products of many small matrices are slow.
+    # One [n, 3] (colours) for each axis of the world; products of many small matrices are slow.
     slopes = [
         right * pose[:, 0, i, None] + down * pose[:, 1, i, None] + ahead * pose[:, 2, i, None]
         for i in range(3)
@@ -187,7 +186,7 @@ def _steps(sums: Float[Tensor, "9 z y x"]) -> Float[Tensor, "3 z y x"]:
 
 
 def _turns(moved: Float[Tensor, "3 z y x"]) -> Float[Tensor, "3 z y x"]:
-    """Half the curl."""
+    """Rotation vectors: half the curl of the motion."""
     slopes = torch.gradient(moved, spacing=_CELL, dim=(3, 2, 1))
     x, y, z = 0, 1, 2
     turns = [slopes[b][c] - slopes[c][b] for b, c in ((y, z), (z, x), (x, y))]

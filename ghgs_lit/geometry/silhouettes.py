@@ -1,9 +1,6 @@
-"""Silhouette coherence: how much of each mask lies in the visual hull of the others.
-
-Where cameras and masks are right, the ray of every mask pixel passes a point that all other masks cover
-(Boyer 2006; Hernandez, Schmitt and Cipolla 2007). In NumPy, for silhouettes of any sizes; batches of masks of
-one size vote in :mod:`ghgs_lit.bounds.agreement`.
-"""
+"""Silhouette coherence: how much of each mask lies in the visual hull of the others. With correct cameras and
+masks, the ray of every mask pixel passes a point that all other masks cover (Boyer 2006; Hernandez, Schmitt
+and Cipolla 2007). For silhouettes of any sizes, unlike :mod:`ghgs_lit.bounds.agreement`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,9 +11,8 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Silhouette:
-    """A mask with the camera of its cells. ``mask``: [h, w] bool, true where any pixel of a cell is.
-    ``intrinsics``: [3, 3] float64 in cells, cell centres at +0.5. ``extrinsics``: [4, 4] float64, world to
-    camera."""
+    """A mask of cells with its camera. ``mask``: [h, w] bool, true where any pixel of a cell is.
+    ``intrinsics``: [3, 3] float64, in cells. ``extrinsics``: [4, 4] float64."""
 
     mask: np.ndarray
     intrinsics: np.ndarray
@@ -29,28 +25,26 @@ class Silhouette:
 
     @cached_property
     def grown(self) -> np.ndarray:
-        """The mask [h, w] with the cells beside it."""
+        """The mask [h, w] dilated by one cell."""
         padded = np.pad(self.mask, 1)
         height, width = self.mask.shape
         shifts = (padded[row : row + height, column : column + width] for row, column in np.ndindex(3, 3))
         return np.logical_or.reduce(list(shifts))
 
     def rays(self, cells: np.ndarray) -> np.ndarray:
-        """World directions [n, 3] of z 1 in the camera, through ``cells`` [n, 2] (column, row)."""
+        """World directions [n, 3] per unit of z-depth, through ``cells`` [n, 2] (column, row)."""
         local = np.concatenate((cells, np.ones((len(cells), 1))), 1) @ np.linalg.inv(self.intrinsics).T
         return local @ self.extrinsics[:3, :3]
 
     def depths_around(self, point: np.ndarray, reach: float, count: int) -> np.ndarray:
-        """At most ``count`` z-depths above 0, up to ``reach`` before and behind a point [3]."""
+        """At most ``count`` positive z-depths, up to ``reach`` in front of and behind a point [3]."""
         middle = (self.extrinsics[:3, :3] @ point + self.extrinsics[:3, 3])[2]
         depths = middle + reach * np.linspace(-1, 1, count)
         return depths[depths > 0]
 
     def covers(self, points: np.ndarray) -> np.ndarray:
-        """Whether world points [..., 3] lie in the mask or in a cell beside it; false behind the camera.
-
-        Beyond the frame counts what is at its border: a mask that touches it goes on.
-        """
+        """Whether world points [..., 3] lie in the dilated mask; false behind the camera. Outside the frame
+        the nearest border cell counts: a mask that touches the border goes on."""
         local = points @ self.extrinsics[:3, :3].T + self.extrinsics[:3, 3]
         z = local[..., 2]
         pixels = local @ self.intrinsics.T
@@ -70,15 +64,14 @@ class Silhouette:
 
 @dataclass(frozen=True)
 class HullSearch:
-    """How carefully a hull is looked for.
+    """Precision of a search for the visual hull.
 
     Attributes:
-        rays: cells of a mask that are tried, at most.
+        rays: largest number of cells of a mask that are tried.
         depths: points along each ray.
         reach: range of depths around the subject's middle, in radii of the subject.
-        others: other silhouettes that a ray is looked up in, at most; None: all.
-        wrong: share of these that may say "outside".
-    """
+        others: largest number of other silhouettes that a ray is compared with; None: all.
+        wrong: share of these that may say "outside"."""
 
     rays: int = 300
     depths: int = 96
@@ -87,7 +80,7 @@ class HullSearch:
     wrong: float = 0.0
 
     def shares(self, silhouettes: Sequence[Silhouette]) -> list[float]:
-        """Shares of each silhouette's cells whose rays meet the hull of the others; 0 where it is empty."""
+        """For each silhouette, the share of its cells whose rays meet the hull of the others; 0 if empty."""
         count = len(silhouettes) if self.others is None else self.others + 1
         spread = np.unique(np.linspace(0, len(silhouettes) - 1, count).round().astype(int))
         focus, radius = subject_sphere(silhouettes)
@@ -108,9 +101,9 @@ class HullSearch:
         focus: np.ndarray,
         radius: float,
     ) -> np.ndarray:
-        """Whether the rays of a silhouette meet the hull of ``others`` [n] bool. ``cells``: [n, 2] (column,
-        row), through which the rays pass. ``others``: that a point of the hull is covered by, but for a share
-        of :attr:`wrong`. ``focus``, ``radius``: of :func:`subject_sphere`."""
+        """Whether [n] rays through ``cells`` [n, 2] (column, row) of ``one`` meet the hull of ``others``, of
+        which a share of :attr:`wrong` need not cover a point. ``focus``, ``radius``:
+        :func:`subject_sphere`."""
         depths = one.depths_around(focus, self.reach * radius, self.depths)
         points = one.center + one.rays(cells)[:, None] * depths[:, None]
         outside = np.zeros(points.shape[:2], int)
@@ -122,7 +115,7 @@ class HullSearch:
 
 
 def hull_in_view(silhouettes: Sequence[Silhouette], index: int) -> np.ndarray:
-    """Cells [h, w] bool of one silhouette in which the visual hull of the others is seen."""
+    """Cells [h, w] bool of one silhouette that show the visual hull of the others."""
     one = silhouettes[index]
     rows, columns = np.indices(one.mask.shape)
     cells = np.stack((columns.ravel(), rows.ravel()), -1) + 0.5
@@ -131,7 +124,7 @@ def hull_in_view(silhouettes: Sequence[Silhouette], index: int) -> np.ndarray:
 
 
 def subject_sphere(silhouettes: Sequence[Silhouette]) -> tuple[np.ndarray, float]:
-    """The subject's middle [3], and how far its parts may lie from there."""
+    """The subject's middle [3], and an upper limit of its radius."""
     rays, centers = [], np.stack([s.center for s in silhouettes])
     for s in silhouettes:
         rows, columns = np.nonzero(s.mask)

@@ -1,7 +1,4 @@
-"""Removes lens distortion from photographs and masks, as OpenCV's ``undistort`` and ``fisheye`` module do.
-
-OpenCV itself is not a dependency; kornia has its camera models.
-"""
+"""Undistortion of photographs, as OpenCV's ``undistort`` and ``fisheye`` do, with kornia's models."""
 
 import numpy as np
 import torch
@@ -14,11 +11,11 @@ _STEP = 8
 def undistorting_grid(
     intrinsics: np.ndarray, distortion: np.ndarray, height: int, width: int, fisheye: bool = False
 ) -> torch.Tensor:
-    """Where each pixel of the undistorted image lies in the photograph. Returns: [1, h, w, 2] float32 for
-    ``grid_sample`` with ``align_corners=False``. ``intrinsics``: [3, 3] in pixels, pixel centres at +0.5; the
-    undistorted image keeps them. ``distortion``: k1 k2 p1 p2 and up to ten more of OpenCV's model.
-    ``fisheye``: ``distortion`` is k1 to k4 of the model of Kannala and Brandt."""
-    # Here: kornia takes longer to import than photographs without distortion take to be read.
+    """Positions in the photograph of the pixels of the undistorted image: [1, h, w, 2] float32 for
+    ``grid_sample`` with ``align_corners=False``. ``intrinsics``: [3, 3], also of the undistorted image.
+    ``distortion``: k1 k2 p1 p2 and up to ten more of OpenCV's model; with ``fisheye`` Kannala-Brandt's k1 to
+    k4."""
+    # Here: importing kornia takes longer than reading photographs without distortion.
     from kornia.geometry.calibration import distort_points
     from kornia.geometry.camera.distortion_kannala_brandt import distort_points_kannala_brandt
 
@@ -42,8 +39,7 @@ def undistorting_grid(
 
 
 def undistort(image: np.ndarray, matte: np.ndarray, grid: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Resample bilinearly; black and empty outside the photograph. ``matte``: [h, w] uint8; of a mask 0 and
-    255."""
+    """Resample an image and its matte ([h, w] uint8) bilinearly; 0 outside the photograph."""
     layers = np.concatenate((image, matte[..., None]), -1)
     stacked = torch.from_numpy(layers).permute(2, 0, 1)[None].float()
     sampled = F.grid_sample(stacked, grid, mode="bilinear", padding_mode="zeros", align_corners=False)

@@ -1,4 +1,4 @@
-"""From depth maps to world points of pixels and of tokens (paper, section 3.2)."""
+"""Unprojection of depth maps to world points of pixels and of tokens (paper, section 3.2)."""
 
 from typing import Literal
 
@@ -11,19 +11,17 @@ from ghgs_lit.config.options import Options
 from ghgs_lit.geometry.projection import at_least_float32, pixel_centers, unproject_maps
 from ghgs_lit.types import Batch, DepthMaps, Points, Tokens
 
-#: Pixels on each side of the image that the token grid of the release leaves out (512 + 2 x 3 = 518).
+#: Border in pixels that the token grid of the release leaves out (512 + 2 x 3 = 518).
 RELEASE_BORDER = 3
 
 
 class Unprojection(Options):
     """``unprojection(depth_maps, tokens, batch) -> Points``, without parameters, in float32 or wider.
 
-    The mean pixel and the mean depth together keep a token's point on the surface: at a silhouette the
-    patch's centre may lie beside the subject, and the subject's depth there is a point that nothing occupies.
-    A patch without a valid pixel lies at its centre and mean depth, and is not valid. As in the authors'
-    release, tokens lie at a 2 x 2 sample of inverse depth and at the centres of a grid over the image without
-    its border; they are valid where those of the subject are.
-    """
+    With ``tokens="subject"`` the mean pixel and the mean depth keep a token's point on the surface: at a
+    silhouette the patch's centre may lie beside the subject. A patch without a valid pixel lies at its centre
+    and mean depth, and is not valid. With ``"release"`` inverse depths are sampled bilinearly (2 x 2) and
+    pixels are the centres of a grid over the image without its border; the same tokens are valid."""
 
     group = "unprojection"
     tokens: Literal["subject", "release"] = "subject"
@@ -35,7 +33,7 @@ class Unprojection(Options):
         pixels, depth, valid = locate(depth_maps, tokens.patch_size)
         cameras = batch.cameras
         points = unproject_maps(depth, cameras, pixels)
-        # Only the kept tokens; the maps hold every patch.
+        # The maps hold every patch, also those without a token.
         index = (tokens.image, tokens.row, tokens.column)
         return Points(
             pixels=unproject_maps(depth_maps.depth, cameras),

@@ -1,4 +1,4 @@
-"""A dense head run on windows around the subject."""
+"""Dense heads on windows around the subject."""
 
 import functools
 import itertools
@@ -16,13 +16,13 @@ from ghgs_lit.heads.window import Span, Window
 from ghgs_lit.kernels.pool import even_parts
 from ghgs_lit.types import Tokens
 
-#: Values of the largest map that are held at once where no gradient is kept (32 MB in float32).
+#: Values of the largest map in memory at once without a gradient (32 MB in float32).
 _LARGEST = 1 << 23
 
 
 @dataclass(frozen=True)
 class Part:
-    """Maps of some images in one window; ``images`` are consecutive."""
+    """Maps of consecutive images in one window."""
 
     images: slice
     window: Window
@@ -32,13 +32,10 @@ class Part:
 def decode(
     dpt: DPTHead, tokens: Tokens, guide: Guide | None, windows: Sequence[Window | None] | None
 ) -> Iterator[Part]:
-    """Maps of the windows of the images, in their order.
-
-    Images whose maps are small share one window. Without a gradient, larger maps are computed one after
-    another, each in a window of its own, to save memory and work. ``windows``: of each image; None: all of
-    every image. An image without a window is left out; where none has one, a single pixel is decoded: there
-    is always a part, through which gradients of 0 flow.
-    """
+    """Maps of the images in their windows, in the order of the images. Images with small maps share a window.
+    Without a gradient, larger maps are computed one after another, each in its own window, to save memory and
+    work. ``windows``: one for each image; None: whole images. An image without a window is left out; if all
+    are, one pixel is decoded, so that gradients of 0 flow."""
     b, v, rows, columns = tokens.grid
     size = (tokens.patch_size * rows, tokens.patch_size * columns)
     if windows is None:
@@ -53,7 +50,7 @@ def decode(
 
 
 def _runs(windows: Sequence[Window | None], most: int) -> Iterator[slice]:
-    """Slices of at most ``most`` consecutive images that have a window, of about equal size."""
+    """Slices of about equal size, of at most ``most`` consecutive images that have a window."""
     start = 0
     for has_window, group in itertools.groupby(windows, bool):
         count = len(list(group))

@@ -22,7 +22,7 @@ from ghgs_lit.types import Batch, DecodedPixels, DepthBounds, DepthMaps, Tokens
 
 
 def _bounded_inverse(fraction: Tensor, near: Tensor, far: Tensor) -> Tensor:
-    """Linear in ``1 / z``: equal steps have equal size in the image of another view."""
+    """Depth linear in ``1 / z``: equal steps of the fraction are equal steps in the image of another view."""
     return near * far / (far * (1 - fraction) + near * fraction)
 
 
@@ -30,7 +30,7 @@ def _linear(fraction: Tensor, near: Tensor, far: Tensor) -> Tensor:
     return near + (far - near) * fraction
 
 
-#: By name, the depth at a fraction of the way from near (0) to far (1).
+#: Functions from a fraction of the way from near (0) to far (1) to depth.
 BOUNDED = {"bounded_inverse": _bounded_inverse, "linear": _linear}
 
 
@@ -42,11 +42,8 @@ def bounded_depth(
 
 
 def inverse_linear(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """``1 / (x + 1e-8)`` as in the authors' release: of either sign and without bound.
-
-    Infinite at -1e-8, where the gradient is 0: the argument is replaced, since a result that is replaced
-    later would still have a gradient of 0 times infinity.
-    """
+    """``1 / (x + 1e-8)`` as in the authors' release: of either sign and without bound. Infinite at -1e-8,
+    where the gradient is 0. The argument is replaced, too, or the gradient would be 0 times infinity."""
     shifted = x + 1e-8
     is_pole = shifted == 0
     return torch.where(is_pole, torch.inf, 1 / torch.where(is_pole, 1.0, shifted))
@@ -106,10 +103,9 @@ class DepthHead(nn.Module):
     def forward(
         self, tokens: Tokens, batch: Batch, bounds: DepthBounds | None, pixels: DecodedPixels = "all"
     ) -> DepthMaps:
-        """Depths of all pixels; those of the subject are valid. Returns: Values that are not finite are
-        replaced by 1 m and are not valid. ``batch``: images, masks and cameras are read. ``bounds``: None
-        where :attr:`is_bounded` is false. ``pixels``: ``subject``: only windows around the subject are
-        decoded; other depths have no meaning."""
+        """Depths of all pixels; those of the subject are valid if they are finite. ``batch``: images, masks
+        and cameras are read. ``bounds``: None if :attr:`is_bounded` is false. ``pixels``: with ``subject``
+        only windows around the subject are decoded, and other depths have no meaning."""
         guide = None
         if self.dpt.guide is not None:
             maps = [] if bounds is None else [relative_bounds(bounds, batch.masks)]
@@ -134,7 +130,7 @@ class DepthHead(nn.Module):
 
 
 def finite_maps(depth: Tensor, batch: Batch, confidence: Tensor, bounds: DepthBounds | None) -> DepthMaps:
-    """Depths of which those that are not finite are 1 m and not valid."""
+    """Depth maps in which depths that are not finite become 1 m and not valid."""
     finite = depth.isfinite()
     return DepthMaps(torch.where(finite, depth, 1.0), batch.masks & finite, confidence, bounds)
 
@@ -142,10 +138,8 @@ def finite_maps(depth: Tensor, batch: Batch, confidence: Tensor, bounds: DepthBo
 def _whole(
     parts: Iterable[Part], batch: Batch, wanted: Bool[Tensor, "B V H W"] | None
 ) -> Float[Tensor, "o B V H W"]:
-    """Decoded windows in maps of whole images, float32 or wider; 0 where they are not wanted (None: nowhere).
-
-    Images share windows, so what else lies in them depends on other subjects of the batch.
-    """
+    """Decoded windows in maps of whole images, float32 or wider; 0 except in ``wanted`` (None: everywhere).
+    Images share windows, so the rest of a window depends on other subjects of the batch."""
     whole = None
     for part in parts:
         if whole is None:

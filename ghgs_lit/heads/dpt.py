@@ -1,4 +1,4 @@
-"""Dense prediction head: four layers of tokens fused from coarse to fine into one map per image."""
+"""Dense prediction head (DPT): fuses four layers of tokens from coarse to fine into one map per image."""
 
 import dataclasses
 import functools
@@ -30,7 +30,7 @@ def _axis_waves(
     channels: int, count: int, half_extent: float, dtype: torch.dtype, device: torch.device
 ) -> Float[Tensor, "c n"]:
     """Sines, then cosines along one axis times ``SCALE``, at the centres of ``count`` cells between
-    ``-half_extent`` and ``+half_extent``; computed in float64, returned in float32."""
+    ``-half_extent`` and ``+half_extent``, in float32."""
     quarter = channels // 2
     exponents = torch.arange(quarter, dtype=torch.float64, device=device) / quarter
     omega = 1.0 / BASE**exponents
@@ -42,17 +42,12 @@ def _axis_waves(
 def add_positions_(
     x: Float[Tensor, "n c h w"], aspect: float, window: Window | None = None
 ) -> Float[Tensor, "n c h w"]:
-    """Add ``0.1 E`` to ``x`` in place, in its precision: waves of x in the first half of the channels, of y
-    in the second.
+    """Add a position embedding to ``x`` in place: waves of the column in the first half of the channels, of
+    the row in the second.
 
-    The unit is half the diagonal of the image; samples are cell centres. The waves of the two axes are cached
-    (a few kilobytes each); the embedding is never held as a map.
-
-    Args:
-        x: maps whose number of channels is a multiple of 4; float64 gives float64 coordinates.
-        aspect: width / height of the image.
-        window: the part of whole maps that ``x`` is; None: all of it.
-    """
+    The unit is half the diagonal of the image; samples are cell centres. The waves of each axis are cached (a
+    few kilobytes); the embedding is never built as a map. ``x``: channels are a multiple of 4. ``aspect``:
+    width / height of the image. ``window``: the part of whole maps that ``x`` is; None: all."""
     window = window or Window.whole(tuple(x.shape[2:]))
     half = x.shape[1] // 2
     dtype = torch.float64 if x.dtype == torch.float64 else torch.float32
@@ -67,13 +62,13 @@ def add_positions_(
 
 
 LEVELS = 4
-#: Cells of the three finer levels for each patch, along an axis; the coarsest has a cell for two patches.
+#: Cells per patch along an axis in the three finer levels; the coarsest has one cell for two patches.
 CELLS = (4, 2, 1)
 NORM_EPS = 1e-5
 #: Channels before the last convolution, as published.
 HIDDEN = 32
 
-#: Values of a map at full resolution that are held at once where no gradient is kept, and least rows.
+#: Without a gradient: values of a map at full resolution in memory at once, and the smallest number of rows.
 _LARGEST, _ROWS = 1 << 21, 8
 
 
@@ -82,10 +77,8 @@ Widths = tuple[int, tuple[int, int, int, int]]
 
 def published_widths(dim_latent: int) -> Widths:
     """Channels of the fused maps, and of the four levels from fine to coarse, in the published proportions.
-
-    1/8 of the tokens' width (multiples of 8), and 1/8, 1/4, 1/2 and 1/2 (multiples of 4): 256, and 256, 512,
-    1024 and 1024 as published.
-    """
+    1/8 of the tokens' width (a multiple of 8), and 1/8, 1/4, 1/2, 1/2 (multiples of 4); as published 256, and
+    256, 512, 1024, 1024."""
     levels = tuple(_multiple(dim_latent * part, 4) for part in (1 / 8, 1 / 4, 1 / 2, 1 / 2))
     return _multiple(dim_latent / 8, 8), levels
 
@@ -99,7 +92,7 @@ def _conv3(inputs: int, outputs: int, bias: bool = True) -> nn.Conv2d:
 
 
 def _pointwise(conv: nn.Conv2d, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n o h w"]:
-    """A 1x1 convolution as a linear layer of pixels: no copy, since channels are innermost here."""
+    """A 1x1 convolution as a linear layer on pixels, without a copy, since channels are innermost."""
     return linear(x.permute(0, 2, 3, 1), conv.weight.flatten(1), conv.bias).permute(0, 3, 1, 2)
 
 
@@ -109,17 +102,15 @@ class _Halving(nn.Conv2d):
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h2 w2"]:
         if x.device.type != "cpu" or x.shape[-1] > 1:
             return super().forward(x)
-        # Of maps one cell wide in bfloat16, PyTorch 2.13 leaves parts of the weight's gradient unset.
+        # For maps one cell wide in bfloat16, PyTorch 2.13 leaves parts of the weight's gradient unset.
         with exact("cpu"):
             return super().forward(at_least_float32(x))
 
 
 class ResidualUnit(nn.Module):
     """``s + conv2(relu(conv1(relu(x))))`` with ``s = relu(x)``, or ``s = x`` without a rectified skip.
-
     Published weights expect a rectified skip. In training it can die: where all channels of a sum of levels
-    are negative, nothing from the tokens reaches the result any more, nor any gradient the tokens.
-    """
+    are negative, tokens no longer affect the result and get no gradient."""
 
     def __init__(self, features: int, rectified_skip: bool = True):
         super().__init__()
@@ -129,12 +120,12 @@ class ResidualUnit(nn.Module):
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
         rectified = F.relu(x)
-        # In place: no gradient needs the result of a convolution.
+        # In place: the backward pass does not need results of convolutions.
         return self.conv2(F.relu_(self.conv1(rectified))).add_(rectified if self.rectified_skip else x)
 
 
 class Fusion(nn.Module):
-    """Add a finer level to the coarser result, refine, resize; the coarsest block has no level to add."""
+    """Add a finer level to the coarser result and refine it; the coarsest block only refines its level."""
 
     def __init__(self, features: int, joins: bool, rectified_skip: bool):
         super().__init__()
@@ -146,12 +137,12 @@ class Fusion(nn.Module):
     def forward(
         self, x: Float[Tensor, "n c h w"] | None, level: Float[Tensor, "n c h2 w2"], place: "LevelWindows"
     ) -> Float[Tensor, "n c h w"]:
-        """The sum of ``x`` and ``level``, refined, in the window where they are joined."""
+        """The refined sum of ``x`` and ``level`` in the window ``place.joined``."""
         if x is not None:
             level = self.resConfUnit1(level)
         level = place.level.cut(level, place.joined)
         x = self.resConfUnit2(level if x is None else x.add_(level))
-        # A 1x1 convolution commutes with interpolation; before it, it costs a quarter.
+        # A 1x1 convolution commutes with interpolation; before it, it has a quarter of the cost.
         return _pointwise(self.out_conv, x)
 
 
@@ -172,7 +163,7 @@ class Scratch(nn.Module):
 
 @dataclass(frozen=True)
 class LevelWindows:
-    """Windows of one level: of tokens, of the level's map and of the sum with the coarser result."""
+    """Windows of a level: of its tokens, its map, and the sum with the coarser result."""
 
     tokens: Window
     level: Window
@@ -181,11 +172,8 @@ class LevelWindows:
 
 @dataclass(frozen=True)
 class Windows:
-    """Windows that a head computes for the window ``result`` of its result.
-
-    Convolutions pad a window with zeros as they pad a whole map, which spoils its border: each window is
-    larger than what is needed of it by the reach of its layers, as far as the map goes.
-    """
+    """Windows that a head computes for the window ``result`` of its result. Zero padding spoils the border of
+    a window, so each is larger than needed by the reach of its layers, as far as the map goes."""
 
     result: Window
     full: Window
@@ -194,10 +182,10 @@ class Windows:
 
 
 class DPTHead(nn.Module):
-    """Tokens of four layers to ``output_dim`` raw channels for each pixel. ``dim_latent``: width of a token
-    of ``Tokens.latent``. ``output_dim``: channels of the result; activations are the caller's.
-    ``guide_channels``: of a guide at full resolution (:mod:`ghgs_lit.heads.guide`), which keeps a small head
-    sharp; 0: none, as published. ``widths``: in place of :func:`published_widths`."""
+    """Tokens of four layers to ``output_dim`` raw channels for each pixel, without activation.
+    ``dim_latent``: width of a token of ``Tokens.latent``. ``guide_channels``: channels of a guide at full
+    resolution (:mod:`ghgs_lit.heads.guide`), which keeps a small head sharp; 0: none, as published.
+    ``widths``: None: :func:`published_widths`."""
 
     def __init__(
         self,
@@ -222,9 +210,8 @@ class DPTHead(nn.Module):
     def forward(
         self, tokens: Tokens, guide: Guide | None = None, window: Window | None = None
     ) -> Float[Tensor, "bv o h w"]:
-        """Raw maps of all images, float32 or wider; under float16 autocast all of it is computed in float32.
-        ``guide``: where ``guide_channels`` is not 0; of whole images. ``window``: the part of the maps that
-        is computed; None: all."""
+        """Raw maps of all images, float32 or wider; float16 autocast is turned off. ``guide``: maps of whole
+        images, if ``guide_channels`` is not 0. ``window``: the part of the maps to compute; None: all."""
         require(len(tokens.latent) == LEVELS, "tokens.latent", "four layers", len(tokens.latent))
         with without_float16(tokens.semantic.device.type):
             return self._maps(tokens, guide, window)
@@ -242,7 +229,7 @@ class DPTHead(nn.Module):
             full, half, quarter = self.guide(guide, targets)
 
         x = None
-        # The coarse levels have the large weights, the fine ones the large maps: never hold both.
+        # One level at a time: coarse levels have large weights, fine ones large maps.
         for i in reversed(range(LEVELS)):
             place = windows.levels[i]
             level = self._level(i, tokens, place)
@@ -265,20 +252,20 @@ class DPTHead(nn.Module):
         aspect: float,
         result: Window,
     ) -> Float[Tensor, "n o h3 w3"]:
-        """The part ``result`` of the result from the map before the last interpolation."""
+        """The window ``result`` of the result, from the map before the last interpolation."""
         layers = self.scratch.output_conv2
         seen = result.grown(reach(layers))
         x = add_positions_(windows.fused.resize(x, seen), aspect, seen)
         if guide is not None:
             x = x + windows.full.cut(guide, seen)
         x = layers[:-1](x)
-        # The last projection stays in float32 under autocast: depths and offsets of millimetres depend on it.
+        # In float32 also under autocast: depths and offsets of millimetres depend on this projection.
         last = layers[-1]
         with exact(x.device.type):
             return seen.cut(_pointwise(last, x.to(last.weight.dtype)), result)
 
     def _parts(self, x: Float[Tensor, "n c h w"], window: Window) -> list[Window]:
-        """Rows of a window one after another where no gradient is kept: its maps are the largest."""
+        """Parts of a window along its rows; without a gradient these largest maps are computed in turn."""
         if torch.is_grad_enabled():
             return [window]
         rows, columns = window
@@ -287,8 +274,8 @@ class DPTHead(nn.Module):
         return [Window(Span(rows.start + p.start, rows.start + p.stop, rows.full), columns) for p in parts]
 
     def windows(self, result: Window, grid: tuple[int, int]) -> Windows:
-        """Windows of each level that a window of the result depends on, from fine to coarse. ``result``: the
-        window. ``grid``: rows and columns of patches."""
+        """Windows of each level, from fine to coarse, that the window ``result`` of the result depends on.
+        ``grid``: rows and columns of patches."""
         s = self.scratch
         full = result.grown(reach(s.output_conv2))
         fused = full.sources(_times(2 * CELLS[0], grid)).grown(reach(s.output_conv1))
@@ -310,7 +297,7 @@ class DPTHead(nn.Module):
 
     def _level(self, i: int, tokens: Tokens, place: LevelWindows) -> Float[Tensor, "bv c h w"]:
         aspect = tokens.grid[3] / tokens.grid[2]
-        if tokens.is_dense:  # then the tokens outside the window can be left out without a copy
+        if tokens.is_dense:  # tokens outside the window are left out without a copy
             b, v, *grid = tokens.grid
             inside = tokens.latent[i].unflatten(0, (b * v, *grid))[:, *place.tokens.slices]
             maps = self._project(i, inside).permute(0, 3, 1, 2)
@@ -321,7 +308,7 @@ class DPTHead(nn.Module):
         return getattr(self.scratch, f"layer{i + 1}_rn")(level)
 
     def _project(self, i: int, x: Float[Tensor, "*n c"]) -> Float[Tensor, "*n o"]:
-        """Normalised and projected tokens (a 1x1 convolution is a linear layer of tokens)."""
+        """Normalised and projected tokens; the published 1x1 convolution is a linear layer on tokens."""
         project = self.projects[i]
         if not torch.is_autocast_enabled(x.device.type):
             x = x.to(project.weight.dtype)  # tokens of an encoder under float16 autocast

@@ -41,14 +41,14 @@ from ghgs_lit.types import (
 
 Attributes = tuple[Tensor, Tensor, Tensor, Tensor]
 
-#: Metres: the largest offset of a Gaussian from its pixel's point, along each axis.
+#: The largest offset of a Gaussian from its pixel's point along each axis, in metres.
 OFFSET_LIMIT = 0.05
-#: The largest scale in footprints: a splat of a whole limb hides what is wrong beneath it.
+#: The largest scale in footprints: a splat as large as a limb would hide errors beneath it.
 SCALE_CAP = 4.0
-#: Opacity at which training starts: high, since splats that become transparent do not recover.
+#: Opacity at the start of training: high, since transparent splats do not recover.
 OPACITY_START = 0.8
 
-#: The gradient of a shorter quaternion is that of this length: it would grow without bound near 0.
+#: The gradient of shorter quaternions is that of this length: it would grow without bound near 0.
 _SHORTEST = 0.1
 
 
@@ -64,24 +64,22 @@ def _mlp(sizes: Sequence[int], activation: type[nn.Module]) -> nn.Sequential:
 
 
 def float32_last(mlp: nn.Sequential, x: Tensor) -> Tensor:
-    """``mlp(x)``, its last projection in float32 under autocast: offsets of millimetres depend on it.
-
-    Under float16 autocast all of it, as the dense head before it.
-    """
+    """``mlp(x)`` with its last projection in float32 under autocast: offsets of millimetres depend on it.
+    Under float16 autocast all of it is in float32."""
     with without_float16(x.device.type):
         hidden, last = mlp[:-1](x), mlp[-1]
     with exact(x.device.type):
         return at_least_float32(last(hidden.to(last.weight.dtype)))
 
 
-#: Widths of a Gaussian's raw offset, scale, rotation, opacity and color, and their sum.
+#: Widths of the raw offset, scale, rotation, opacity and color, and their sum.
 _WIDTHS = (3, 3, 4, 1, 3)
 RAW_VALUES = sum(_WIDTHS)
 
 
 @dataclass(frozen=True)
 class RawGaussians:
-    """Attributes before their activations, and the descriptors that they come from."""
+    """Attributes before their activations, and the descriptors that they are computed from."""
 
     descriptors: Float[Tensor, "N c"]
     offset: Float[Tensor, "N 3"]
@@ -94,7 +92,7 @@ class RawGaussians:
     splits: tuple[int, ...]
 
     def changed(self, change: Float[Tensor, "N c"]) -> "RawGaussians":
-        """With :data:`RAW_VALUES` of each added to offset, scale, rotation, opacity and color."""
+        """The raw attributes plus ``change``: values of offset, scale, rotation, opacity and color."""
         offset, scale, rotation, opacity, color = change.split(_WIDTHS, -1)
         return dataclasses.replace(
             self,
@@ -107,10 +105,8 @@ class RawGaussians:
 
 
 class FootprintAttributes(Options):
-    """Raw values to attributes in units of a pixel's footprint; raw zeros give a splat on the surface.
-
-    A pixel's footprint is ``z / f`` metres. The paper gives no values.
-    """
+    """Raw values to attributes in units of a pixel's footprint, ``z / f`` metres; zeros give a splat on the
+    surface. The paper gives no values."""
 
     scale_floor: Positive = 0.15
     """Least scale in footprints; it leaves no holes when splats are rendered at a higher resolution."""
@@ -140,24 +136,23 @@ class FootprintAttributes(Options):
 
     @property
     def scale_range(self) -> float:
-        """Logarithm of the largest scale over the least."""
+        """Logarithm of the ratio of the largest to the smallest scale."""
         return log(SCALE_CAP / self.scale_floor)
 
     @property
     def scale_biases(self) -> tuple[float, float]:
-        """What is added to raw scales, of the first two axes and of the third, so that 0 is the start."""
+        """Biases of raw scales of the first two axes and of the third, so that 0 gives the start."""
         starts = self._starts.values()
         return tuple(_logit(log(start / self.scale_floor) / self.scale_range) for start in starts)
 
     @property
     def opacity_bias(self) -> float:
-        """What is added to raw opacities, so that 0 is the start."""
+        """Bias of raw opacities, so that 0 gives the start."""
         return _logit((OPACITY_START - self.opacity_floor) / (1 - self.opacity_floor))
 
     def constants(self, color_limit: float) -> tuple[float, ...]:
-        """What :func:`ghgs_lit.heads.cpu.activate` is told: limit of offsets, distance inwards, least scale,
-        logarithm of the largest over it, biases of scales, least opacity, its bias, limit of changes of
-        colours."""
+        """Constants of :func:`ghgs_lit.heads.cpu.activate`: limit of offsets, distance inwards, smallest
+        scale, log range and biases of scales, smallest opacity and its bias, limit of colour changes."""
         size = (self.scale_floor, self.scale_range, *self.scale_biases)
         return OFFSET_LIMIT, self.inward, *size, self.opacity_floor, self.opacity_bias, color_limit
 
@@ -189,7 +184,7 @@ def release_attributes(
     opacity: Float[Tensor, " N"],
     footprint: Float[Tensor, " N"],
 ) -> Attributes:
-    """As in the authors' release: offsets and scales in metres, without bound."""
+    """Attributes as in the authors' release: offsets and scales in metres, without bound."""
     return offset, F.softplus(scale, beta=100), unit(rotation), opacity.sigmoid()
 
 
@@ -235,11 +230,9 @@ class GaussianHeadOptions(Options):
 
 
 class GaussianHead(nn.Module):
-    """A dense head over the recalibrated tokens, then four small networks for each pixel of the subject.
-
-    Colours are the input pixels', unless ``color_limit`` lets them change. Published names of the networks:
-    ``offset_header``, ``scale_header``, ``rot_header``, ``opacity_header``, with linear layers 0, 2 and 4.
-    """
+    """A dense head over the recalibrated tokens, then small networks for each pixel of the subject. Colours
+    are those of the input pixels, unless ``color_limit`` lets them change. The names of the networks and
+    their linear layers 0, 2 and 4 are the published ones."""
 
     def __init__(self, options: GaussianHeadOptions, dim_latent: int):
         super().__init__()
@@ -274,9 +267,8 @@ class GaussianHead(nn.Module):
         pixels: DecodedPixels = "subject",
     ) -> RawGaussians:
         """Raw attributes of the valid pixels in the order of element, view, row, column. ``batch``: images,
-        masks and cameras are read. ``pixels``: ``subject`` decodes windows around the subject and runs the
-        networks on its pixels, ``all`` computes every pixel and selects afterwards; the result is the
-        same."""
+        masks and cameras are read. ``pixels``: ``subject`` computes windows around the subject and its
+        pixels, ``all`` computes every pixel and selects afterwards; the result is the same."""
         views, height, width = points.valid.shape[1:]
         counts = points.valid.flatten(0, 1).sum((1, 2)).tolist()
         index = true_places(points.valid, sum(counts))
@@ -290,7 +282,7 @@ class GaussianHead(nn.Module):
         return RawGaussians(*values[:5], values[5] if len(values) > 5 else None, image, pixel, splits)
 
     def activate(self, raw: RawGaussians, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
-        """The Gaussians of raw attributes at the points of their pixels; arguments as of :meth:`forward`."""
+        """Gaussians from raw attributes, at the points of their pixels."""
         numbers = (raw.offset, raw.scale, raw.rotation, raw.opacity, raw.color)
         photo, share, options = batch.once(surface_colors), batch.alpha, self.options
         inputs = (*numbers, photo, share, depth_maps.depth, points.pixels, batch.cameras.extrinsics)
@@ -309,7 +301,7 @@ class GaussianHead(nn.Module):
         image, pixel = raw.image, raw.pixel
         focal = focal_lengths(batch.cameras).prod(-1).sqrt().flatten()[image]
         depth = depth_maps.depth.flatten(0, 1).flatten(1)[image, pixel]
-        # Without a gradient: a splat that is too large must not move nearer to become smaller.
+        # No gradient: a splat that is too large must not move nearer to become smaller.
         footprint = depth.detach() / focal
         offset, scales, quaternions, opacities = self.attributes(
             raw.offset, raw.scale, raw.rotation, raw.opacity, footprint
@@ -337,7 +329,7 @@ class GaussianHead(nn.Module):
     def _of_subject(
         self, part: Part, image: Int[Tensor, " N"], pixel: Int[Tensor, " N"], counts: Sequence[int]
     ) -> Sequence[Tensor]:
-        """Descriptors and raw values (:meth:`_raw`) of a part at its pixels; each image has ``counts``."""
+        """Descriptors and raw values (:meth:`_raw`) of the pixels in a part; ``counts``: pixels per image."""
         row, column, within = _in_part(part, pixel, counts)
         chosen = part.maps.permute(0, 2, 3, 1)[image[within] - part.images.start, row, column]
         return chosen, *self._raw(chosen)
@@ -345,9 +337,9 @@ class GaussianHead(nn.Module):
     def _of_all(
         self, part: Part, image: Int[Tensor, " N"], pixel: Int[Tensor, " N"], counts: Sequence[int]
     ) -> Sequence[Tensor]:
-        """:meth:`_of_subject` by way of every pixel of the part."""
+        """:meth:`_of_subject`, but computed for every pixel of the part."""
         row, column, _ = _in_part(part, pixel, counts)
-        # One image at a time: the networks' hidden layers are wider than the maps.
+        # One image at a time, to save memory: hidden layers are wider than the maps.
         of_images = zip(*(values.split(counts[part.images]) for values in (row, column)), strict=True)
         each = [
             [values[index] for values in (maps, *self._raw(maps))]
@@ -356,7 +348,7 @@ class GaussianHead(nn.Module):
         return [torch.cat(values) for values in zip(*each, strict=True)]
 
     def _raw(self, descriptors: Float[Tensor, "*n c"]) -> tuple[Tensor, ...]:
-        """Raw offset, scale, rotation, opacity and, where there is a network for it, color."""
+        """Raw offset, scale, rotation, opacity and, with a ``color_limit``, color."""
         headers = [self.offset_header, self.scale_header, self.rot_header, self.opacity_header]
         if self.options.color_limit > 0:
             headers.append(self.color_header)
@@ -371,7 +363,7 @@ class GaussianHead(nn.Module):
 def _in_part(
     part: Part, pixel: Int[Tensor, " N"], counts: Sequence[int]
 ) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"], slice]:
-    """Rows and columns in a part's maps of the pixels that lie in it, and which pixels these are."""
+    """Rows and columns in a part's maps of the pixels that lie in it, and the slice of these pixels."""
     within = slice(sum(counts[: part.images.start]), sum(counts[: part.images.stop]))
     (top, _, _), (left, _, width) = part.window
     return pixel[within] // width - top, pixel[within] % width - left, within

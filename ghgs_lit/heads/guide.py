@@ -1,7 +1,5 @@
-"""Further input of a dense head beside its tokens: photographs, masks and depths at full resolution.
-
-A patch is one token, so a head that sees tokens alone draws soft edges. Published weights use no guide.
-"""
+"""Guides: further input of a dense head at full resolution, of photographs, masks and depths. A patch is one
+token, so a head that sees only tokens draws soft edges. Published weights use no guide."""
 
 import functools
 
@@ -19,19 +17,19 @@ from ghgs_lit.types import Batch
 PHOTO_CHANNELS = 4
 
 
-#: Maps whose channels are a guide's together; they are joined in the window that is read.
+#: Maps whose channels form a guide; they are concatenated only in the window that is read.
 Guide = tuple[Float[Tensor, "n _ H W"], ...]
 
 
 def photo_guide(batch: Batch, *maps: Float[Tensor, "B V _ H W"]) -> Guide:
-    """Photographs, masks (mattes where there are some) and further ``maps`` of all images."""
+    """Photographs, masks or mattes, and further ``maps`` of all images."""
     images = at_least_float32(batch.images)
     return tuple(part.flatten(0, 1) for part in (images, coverage(batch)[:, :, None], *maps))
 
 
 class GuidePyramid(nn.Module):
-    """A guide at full, half and quarter resolution, by three convolutions: maps of ``features / 2``,
-    ``features`` and ``features`` channels, which are added to a dense head's."""
+    """Three convolutions of a guide, at full, half and quarter resolution, to ``features / 2``, ``features``
+    and ``features`` channels, which are added to the maps of a dense head."""
 
     def __init__(self, channels: int, features: int):
         super().__init__()
@@ -40,8 +38,8 @@ class GuidePyramid(nn.Module):
         self.to_quarter = nn.Conv2d(features, features, 3, stride=2, padding=1)
 
     def forward(self, guide: Guide, targets: tuple[Window, Window, Window]) -> list[Float[Tensor, "n o h w"]]:
-        """Maps to add to the head's: at full resolution, and at half and quarter resolution, resized.
-        ``guide``: of whole images. ``targets``: windows of the head's maps."""
+        """Maps at full, half and quarter resolution of a ``guide`` of whole images, resized to
+        ``targets``."""
         whole = Window.whole(tuple(guide[0].shape[2:]))
         size = whole.full
         sizes = [whole.coarser(factor).full for factor in (1, 2, 4)]

@@ -1,11 +1,10 @@
-"""Depth by recurrent stereo between neighbouring views: a peer of the paper's method, no part of it.
+"""Depth by recurrent stereo between neighbouring views, for comparison; not part of the paper's method.
 
-After the published description of GPS-Gaussian (Zheng et al., CVPR 2024): features of the photographs by one
-small network for all views, their correlations along epipolar lines, a few updates by a GRU that looks the
-correlations up around the present estimate (RAFT-Stereo, Lipson et al., 3DV 2021), convex upsampling (RAFT,
-Teed and Deng, ECCV 2020). Other than there, photographs are not rectified: equal steps of inverse depth are
-the equal steps of disparity of a rectified pair. The two pairs that a view of a ring belongs to give one
-depth, and the loss sees the last update alone, so its gradient passes through all of them.
+After the published description of GPS-Gaussian (Zheng et al., CVPR 2024): one small network computes features
+of all views; they are correlated along epipolar lines; a GRU updates the estimate a few times from the
+correlations around it (RAFT-Stereo, Lipson et al., 3DV 2021); upsampling is convex (RAFT, Teed and Deng, ECCV
+2020). Unlike there, photographs are not rectified: equal steps of inverse depth are the equal steps of
+disparity of a rectified pair. The two pairs of a view give one depth, and the loss sees the last update only.
 """
 
 import torch
@@ -23,11 +22,11 @@ from ghgs_lit.heads.dpt import ResidualUnit
 from ghgs_lit.kernels.precision import exact, without_float16
 from ghgs_lit.types import Batch, Cameras, DecodedPixels, DepthBounds, DepthMaps, Tokens, true_places
 
-#: Pixels along the side of a cell, and channels of a cell's features and of the GRU's memory.
+#: Side of a cell in pixels, and channels of its features and of the GRU's memory.
 CELL, CHANNELS = 4, 32
-#: Other views that each view is paired with: its neighbours on either side.
+#: Number of neighbouring views that each view is paired with.
 PAIRS = 2
-#: Resolutions at which correlations are looked up, each half of the one before, and steps to either side.
+#: Resolutions of the correlations along depth, each half of the one before, and steps to either side.
 LEVELS, RADIUS = 3, 4
 
 _inverse = BOUNDED["bounded_inverse"]
@@ -70,8 +69,7 @@ class StereoHead(nn.Module):
         self, tokens: Tokens, batch: Batch, bounds: DepthBounds, pixels: DecodedPixels = "all"
     ) -> DepthMaps:
         """Depths of all pixels between the nearest and the farthest bound of their view; those of the subject
-        are valid. ``tokens``: not read. ``batch``: images, masks and cameras are read. ``bounds``: of the
-        pixels. ``pixels``: not read: the network sees whole images."""
+        are valid. ``batch``: images, masks and cameras are read. ``tokens`` and ``pixels`` are not read."""
         height, width = batch.masks.shape[2:]
         near, far = subject_range(bounds, batch)
         with without_float16(batch.masks.device.type):
@@ -80,9 +78,9 @@ class StereoHead(nn.Module):
         return finite_maps(depth, batch, torch.ones_like(depth), bounds)
 
     def _fraction(self, batch: Batch, near: Tensor, far: Tensor) -> Float[Tensor, "n h w"]:
-        """Share of the way from near to far of each pixel, with those that fill the last cells."""
+        """Depth of each pixel as a share of the way from near to far; padded to whole cells."""
         images = torch.cat((surface_colors(batch), coverage(batch)[:, :, None]), 2)
-        images = F.pad(images, (0, -images.shape[-1] % CELL, 0, -images.shape[-2] % CELL))  # whole cells
+        images = F.pad(images, (0, -images.shape[-1] % CELL, 0, -images.shape[-2] % CELL))
         maps = self.features(images.flatten(0, 1).nan_to_num().to(self.features[0].weight.dtype))
         features, memory, context = maps.chunk(3, 1)
         features = at_least_float32(features).unflatten(0, batch.masks.shape[:2])
@@ -106,7 +104,7 @@ def _two_layers(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class Update(nn.Module):
-    """One update: what is looked up around the estimate, a convolutional GRU, a change of the estimate."""
+    """One update: correlations around the estimate, a convolutional GRU, a change of the estimate."""
 
     def __init__(self, channels: int):
         super().__init__()
@@ -124,9 +122,8 @@ class Update(nn.Module):
         levels: list[Float[Tensor, "n _ h w"]],
         fraction: Float[Tensor, "n 1 h w"],
     ) -> tuple[Float[Tensor, "n c h w"], Float[Tensor, "n 1 h w"]]:
-        """The next memory, and what is added to the raw estimate. ``memory``, ``context``: of the cells.
-        ``levels``: correlations from near to far, from fine to coarse. ``fraction``: the estimate, as a share
-        of the way from near to far."""
+        """The next memory, and the change of the raw estimate. ``levels``: correlations from near to far,
+        from fine to coarse. ``fraction``: the estimate, as a share of the way from near to far."""
         seen = torch.cat([*(look_up(level, fraction) for level in levels), 2 * fraction - 1], 1)
         x = torch.cat((self.seen(seen.to(memory.dtype)).relu(), context), 1)
         forget, reset = self.gates(torch.cat((memory, x), 1)).sigmoid().chunk(2, 1)
@@ -134,7 +131,7 @@ class Update(nn.Module):
         memory = torch.lerp(memory, candidate.to(memory.dtype), forget.to(memory.dtype))
         hidden = self.change[:-1](memory)
         last = self.change[-1]
-        # The last projection stays in float32 under autocast: a step of inverse depth is centimetres.
+        # In float32 also under autocast: a step of inverse depth is centimetres.
         with exact(hidden.device.type):
             return memory, at_least_float32(last(hidden.to(last.weight.dtype)))
 
@@ -142,7 +139,7 @@ class Update(nn.Module):
 def subject_range(
     bounds: DepthBounds, batch: Batch
 ) -> tuple[Float[Tensor, "B V 1 1"], Float[Tensor, "B V 1 1"]]:
-    """The nearest and the farthest bound of the subject's pixels in each view, of all where it has none."""
+    """The nearest and the farthest bound of the subject's pixels in each view; of all pixels if none."""
     masks = batch.masks
     used = masks | ~masks.any(-1, keepdim=True).any(-2, keepdim=True)
     near = torch.where(used, at_least_float32(bounds.near), torch.inf).amin((-2, -1), keepdim=True)
@@ -151,7 +148,7 @@ def subject_range(
 
 
 def neighboring_views(cameras: Cameras) -> Int[Tensor, "n p"]:
-    """For each image ``b * V + v`` the images whose optical axes have the least angles to its own."""
+    """For each image ``b * V + v``, the images whose optical axes have the smallest angles to its own."""
     count, views = cameras.shape
     forward = at_least_float32(cameras.extrinsics)[..., 2, :3]
     facing = (forward[:, :, None] * forward[:, None]).sum(-1)
@@ -168,13 +165,12 @@ def correlations(
     far: Float[Tensor, "B V 1 1"],
     steps: int,
 ) -> Float[Tensor, "N S"]:
-    """Products of the features of cells with those at their places in neighbouring views, over ``sqrt(c)``.
+    """Products of the features of cells with those of neighbouring views at S depths, over ``sqrt(c)``.
 
-    Of the pairs that a view belongs to, the larger: a surface is often hidden from one neighbour. 0 where no
-    neighbour has the place before it and inside its image. ``cameras``: [B, V], of images whose pixels are
-    the cells. ``cells``: indices among those of all images. ``near``, ``far``: in metres. ``steps``: S, how
-    many depths, with equal steps of inverse depth from near to far.
-    """
+    The larger one of the two neighbours, as a surface is often hidden from one; 0 if the point lies behind
+    both or outside their images. ``cameras``: [B, V], of images whose pixels are the cells. ``cells``:
+    indices among those of all images. ``near``, ``far``: in metres. ``steps``: S; depths have equal steps of
+    inverse depth from near to far."""
     height, width = features.shape[-2:]
     flat = features.flatten(0, 1)
     image, place = cells // (height * width), cells % (height * width)
@@ -193,9 +189,9 @@ def correlations(
 
 
 def look_up(level: Float[Tensor, "n s h w"], fraction: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n r h w"]:
-    """Values at the estimate and at :data:`RADIUS` steps to either side of it, linear between steps.
-    ``level``: a value for each of equal parts of the way from near to far. ``fraction``: where, as a share of
-    this way; beyond its ends lie the values at the ends."""
+    """Values at the estimate and at :data:`RADIUS` steps to either side, interpolated linearly. ``level``:
+    values at equal steps from near to far; the first and the last continue beyond. ``fraction``: the
+    estimate, as a share of the way from near to far."""
     last = level.shape[1] - 1
     around = torch.arange(-RADIUS, RADIUS + 1, device=level.device).view(-1, 1, 1)
     at = (fraction * last + around).clamp(0, last)
@@ -205,7 +201,7 @@ def look_up(level: Float[Tensor, "n s h w"], fraction: Float[Tensor, "n 1 h w"])
 
 def upsampled(maps: Float[Tensor, "n 1 h w"], weights: Float[Tensor, "n _ h w"]) -> Float[Tensor, "n h2 w2"]:
     """Maps at :data:`CELL` times the resolution: each pixel is a convex combination of the 3 x 3 cells around
-    its own, with the softmax of ``weights``; the border is repeated."""
+    its own, weighted by the softmax of ``weights``; cells beyond the border repeat it."""
     n, _, height, width = maps.shape
     shares = weights.view(n, 9, CELL, CELL, height, width).softmax(1)
     around = F.unfold(F.pad(maps, (1, 1, 1, 1), mode="replicate"), 3).view(n, 9, 1, 1, height, width)

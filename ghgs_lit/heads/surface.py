@@ -1,4 +1,4 @@
-"""Local axes of the surface that a depth map describes."""
+"""Local axes of the surface of a depth map."""
 
 from math import inf
 
@@ -11,8 +11,8 @@ from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.rotations import matrix_to_quaternion, multiply_quaternions, unit
 from ghgs_lit.types import Cameras, DepthMaps
 
-#: A neighbour counts fully where its depth differs by less of a pixel's footprints than the first number, and
-#: from the second on it lies on another surface.
+#: A neighbour counts fully if its depth differs by less than the first number of pixel footprints, and not at
+#: all (another surface) from the second on.
 SAME, OTHER = 4.0, 8.0
 
 
@@ -22,24 +22,23 @@ def surface_axes(
 ) -> Float[Tensor, "N 4"]:
     """Unit quaternions from axes of the surface to the world, without a gradient.
 
-    The third axis is the normal, away from the camera; the others are the camera's right and down, turned by
-    the smallest rotation that brings its forward axis there. Normals come from differences of the depths of
-    neighbouring valid pixels on the same surface; an axis of the image along which there is none is level.
-    ``image``, ``pixel``: numbers of the images (``b * V + v``) and row-major indices of their pixels.
-    """
+    The third axis is the normal away from the camera; the others are the camera's right and down, turned by
+    the smallest rotation from its forward axis to the normal. Normals come from depth differences to
+    neighbouring valid pixels on the same surface; without any along an axis of the image, its slope is 0.
+    ``image``, ``pixel``: numbers of the images (``b * V + v``) and row-major indices of their pixels."""
     height, width = maps.depth.shape[-2:]
     depth = at_least_float32(maps.depth)
     own = depth.flatten(0, 1).flatten(1)[image, pixel]
     intrinsics = at_least_float32(cameras.intrinsics).flatten(0, 1)
     fx, skew, cx, fy, cy = (intrinsics[:, i, j][image] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
     row, column = pixel // width, pixel % width
-    # A pixel that is not valid, or beyond the border, is infinitely far away.
+    # Invalid pixels and those beyond the border are infinitely far away.
     around = F.pad(depth.masked_fill(~maps.valid, inf), (1, 1, 1, 1), value=inf).flatten()
     place = (image * (height + 2) + row + 1) * (width + 2) + column + 1
     footprint = own / fx
 
     def neighbor(step: int) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
-        """Depth of a neighbour less the pixel's (0 off its surface), and whether it is on it, 0 to 1."""
+        """Weighted difference of a neighbour's depth from the pixel's, and the weight from 0 to 1."""
         deeper = around[place + step] - own
         near = ((OTHER - deeper.abs() / footprint) / (OTHER - SAME)).clamp(0, 1)
         return near * torch.where(near > 0, deeper, 0), near

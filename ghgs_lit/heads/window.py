@@ -1,4 +1,4 @@
-"""Windows of maps, and how large a window each layer of a dense head needs for a window of its result."""
+"""Windows of maps, and the windows that the layers of a dense head need for a window of its result."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -14,7 +14,7 @@ from ghgs_lit.types import Extent
 
 
 class Span(NamedTuple):
-    """Cells ``start`` to ``stop``, which is excluded, of the ``full`` cells of a map along one axis."""
+    """Cells ``start`` to ``stop`` (excluded) of the ``full`` cells of a map along one axis."""
 
     start: int
     stop: int
@@ -24,16 +24,16 @@ class Span(NamedTuple):
         return Span(max(self.start - cells, 0), min(self.stop + cells, self.full), self.full)
 
     def sources(self, full: int) -> "Span":
-        """The cells of a map of ``full`` cells that these are interpolated from."""
+        """The cells of a map of ``full`` cells from which these are interpolated."""
         first, last = (cell * (full - 1) // max(self.full - 1, 1) for cell in (self.start, self.stop - 1))
         return Span(first, min(last + 2, full), full)
 
     def coarser(self, factor: int) -> "Span":
-        """The blocks of ``factor`` cells that hold these."""
+        """The blocks of ``factor`` cells that contain these."""
         return Span(self.start // factor, -(-self.stop // factor), -(-self.full // factor))
 
     def finer(self, factor: int, full: int) -> "Span":
-        """The cells of these blocks of ``factor`` cells; the last block may be cut."""
+        """The cells of these blocks of ``factor`` cells; the last block may be smaller."""
         return Span(self.start * factor, min(self.stop * factor, full), full)
 
     def hull(self, other: "Span") -> "Span":
@@ -79,7 +79,7 @@ class Window(NamedTuple):
         return Window(*(mine.hull(its) for mine, its in zip(self, other, strict=True)))
 
     def cut(self, maps: Float[Tensor, "n c h w"], inner: "Window") -> Float[Tensor, "n c h2 w2"]:
-        """The part ``inner`` of maps of this window."""
+        """Crop maps of this window to ``inner``."""
         if inner == self:
             return maps
         rows, columns = (
@@ -89,15 +89,13 @@ class Window(NamedTuple):
         return maps[..., rows, columns]
 
     def resize(self, maps: Float[Tensor, "n c h w"], target: "Window") -> Float[Tensor, "n c h2 w2"]:
-        """Maps of this window as those of ``target``, a window of maps of another size.
-
-        Bilinear, as ``F.interpolate`` with ``align_corners=True`` on the whole maps.
-        """
+        """Resize maps of this window to ``target``, a window of maps of another size; bilinear, as
+        ``F.interpolate`` with ``align_corners=True`` on the whole maps."""
         if self.full == target.full:
             return self.cut(maps, target)
         if self.is_whole and target.is_whole:
             return F.interpolate(maps, target.full, mode="bilinear", align_corners=True)
-        found = at_least_float32(maps).permute(0, 2, 3, 1)  # channels are innermost here
+        found = at_least_float32(maps).permute(0, 2, 3, 1)  # channels are innermost
         for axis, source, wanted in zip((1, 2), self, target, strict=True):
             found = _interpolate(found, axis, source, wanted)
         return found.permute(0, 3, 1, 2).to(maps.dtype)
@@ -112,12 +110,12 @@ def _interpolate(maps: Tensor, axis: int, source: Span, target: Span) -> Tensor:
 
 
 @lru_cache(maxsize=256)
-@torch.inference_mode(False)  # what is made here may be used with a gradient later
+@torch.inference_mode(False)  # the cached tensors may be used with a gradient later
 def _sources(
     source: Span, target: Span, dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The two cells of the source that each cell of the target lies between, and the share of the second."""
-    # One division, then one product, both rounded to the precision of the maps, as PyTorch does.
+    """For each cell of the target, the two cells of the source around it, and the weight of the second."""
+    # A division and a product, both rounded to the precision of the maps, as in PyTorch.
     step = torch.tensor((source.full - 1) / max(target.full - 1, 1), dtype=dtype, device="cpu").item()
     place = torch.arange(target.start, target.stop, dtype=dtype, device=device) * step
     low = place.long().clamp(source.start, source.stop - 1)
@@ -126,8 +124,7 @@ def _sources(
 
 
 def subject_windows(extents: Sequence[Extent], size: tuple[int, int]) -> list[Window | None]:
-    """The smallest window that holds the mask of each image; None for an empty one. ``extents``: of the
-    masks. ``size``: height and width of the images."""
+    """The bounding window of the mask of each image, None if empty. ``size``: height, width of images."""
     height, width = size
     return [
         Window(Span(top, bottom, height), Span(left, right, width)) if count else None
@@ -136,6 +133,6 @@ def subject_windows(extents: Sequence[Extent], size: tuple[int, int]) -> list[Wi
 
 
 def reach(*modules: nn.Module) -> int:
-    """Number of cells on each side that the result of these layers, one after another, depends on."""
+    """Number of cells on each side that the result of these consecutive layers depends on."""
     layers = (layer for module in modules for layer in module.modules())
     return sum(layer.kernel_size[0] // 2 for layer in layers if isinstance(layer, nn.Conv2d))

@@ -1,4 +1,4 @@
-"""How much memory this process has, how the C library gives it back, when Python looks for garbage."""
+"""Memory of this process: its size, when the C library returns it, when Python collects garbage."""
 
 import contextlib
 import ctypes
@@ -8,15 +8,15 @@ import resource
 import sys
 from pathlib import Path
 
-#: Parameters of glibc's ``mallopt``, and the largest value of one.
+#: Parameters of glibc's ``mallopt``, and their largest value.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _MOST = -1, -3, 2**31 - 1
-#: Linux's counters of this process, and what resets the peak.
+#: Linux's counters of this process, and the file that resets the peak.
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 def resident_bytes(field: str = "VmRSS") -> int:
-    """``VmRSS`` (memory now) or ``VmHWM`` (peak since :func:`forget_peak`) of this process; both are the
-    highest memory so far on other systems than Linux."""
+    """``VmRSS`` (memory now) or ``VmHWM`` (peak since :func:`forget_peak`) of this process; except on Linux
+    both are the peak since its start."""
     if _STATUS.exists():
         line = next(line for line in _STATUS.read_text().splitlines() if line.startswith(field + ":"))
         return int(line.split()[1]) * 1024
@@ -25,30 +25,27 @@ def resident_bytes(field: str = "VmRSS") -> int:
 
 
 def can_forget_peak() -> bool:
-    """Whether :func:`forget_peak` does anything: on Linux, unless a container forbids it."""
+    """Whether :func:`forget_peak` works: on Linux, unless a container forbids it."""
     return os.access(_CLEAR, os.W_OK)
 
 
 def forget_peak() -> None:
-    """Let the peak begin afresh with the memory that is held now, where the system can."""
+    """Reset the peak to the present memory, if the system can."""
     with contextlib.suppress(OSError):
         _CLEAR.write_text("5")
 
 
 def return_free_memory() -> None:
-    """Give free memory that the C library keeps back to the system, where it can: it must not count."""
+    """Return free memory of the C library to the system, if possible, so that it is not counted."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
 
 
 def keep_freed_memory() -> bool:
-    """Let this process use the memory of freed tensors again; returns whether the C library could be asked.
-
-    By default glibc gives every large block back to the system, which clears its pages when they are used the
-    next time: a small model spends a tenth of its forward pass or more on that. ``malloc_trim`` still gives
-    the memory back. Where the user's environment sets these limits, they stay.
-    """
+    """Make glibc keep freed memory for reuse; returns whether that succeeded. By default glibc returns every
+    large block to the system, which clears its pages at the next use: a small model spends a tenth of its
+    forward pass or more on that. ``malloc_trim`` still returns the memory. Limits set by the user stay."""
     if any(name.startswith("MALLOC_") or name == "GLIBC_TUNABLES" for name in os.environ):
         return False
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None
@@ -58,10 +55,8 @@ def keep_freed_memory() -> bool:
 
 
 def collect_garbage_again() -> None:
-    """Turn the collector on again after ``gc.disable()``; it leaves alone, at exit too, what was imported.
-
-    That once in a process: a later call finds objects that may become garbage.
-    """
+    """Turn the collector on again after ``gc.disable()``, and exclude the imported objects from it. They are
+    frozen once in a process: at a later call there are objects that may become garbage."""
     if not gc.isenabled():
         if not gc.get_freeze_count():
             gc.freeze()

@@ -1,4 +1,4 @@
-"""Compile kernels with Numba and keep their machine code on disk while their sources stay the same."""
+"""Compilation of kernels with Numba; machine code stays on disk until the sources change."""
 
 import contextlib
 import hashlib
@@ -12,14 +12,14 @@ import numba
 from numba.core import event, types
 from numba.core.caching import FunctionCache
 
-# Kernels are called from Python only and helpers from kernels only, so no other entry point is compiled.
+# Kernels are only called from Python and helpers only from kernels: no other entry points are needed.
 _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 #: Arguments of kernels: contiguous arrays of float32 by their number of dimensions, and whole numbers.
 FLOATS, NUMBER = [types.Array(types.float32, dimensions, "C") for dimensions in range(6)], types.int64
 
 
 class _Cache(FunctionCache):
-    """Numba's cache of one function; a file that cannot be read, or is of other sources, is made anew."""
+    """Numba's cache of one function; unreadable files and those of other sources are replaced."""
 
     def __init__(self, py_func):
         super().__init__(py_func)
@@ -39,7 +39,7 @@ class _Cache(FunctionCache):
 
 
 class FirstCompilation(event.Listener):
-    """Prints one line when a process compiles for the first time; its workers print none."""
+    """Prints one line at the first compilation of a process, but not in its workers."""
 
     is_said = multiprocessing.parent_process() is not None
 
@@ -49,7 +49,7 @@ class FirstCompilation(event.Listener):
         self.is_said = True
 
     def on_end(self, event):
-        """Nothing to say."""
+        """Does nothing; a listener must have this method."""
 
 
 event.register("numba:compile", FirstCompilation())
@@ -57,10 +57,8 @@ event.register("numba:compile", FirstCompilation())
 
 @cache
 def _digest(folder: Path) -> str:
-    """Digest of every source file that the machine code of a kernel in ``folder`` depends on.
-
-    Those of this package, and of the room that the folder is in: kernels read constants of both, no others.
-    """
+    """Digest of the sources that the machine code of a kernel in ``folder`` depends on: those of this
+    package, of ``folder`` and of its parent. Kernels read no constants of other files."""
     digest = hashlib.sha256()
     rooms = (Path(__file__).parent, folder, folder.parent)
     for path in sorted({path for room in rooms for path in room.glob("*.py")}):
@@ -69,12 +67,10 @@ def _digest(folder: Path) -> str:
 
 
 def kernel(function):
-    """Compile ``function`` on first use; it runs without the interpreter lock.
-
-    Numba's cache notices a changed file, but not changed globals or other modules whose code was
-    inlined, and installers may keep a file's time stamp. So cached code is stamped with the digest of all
-    sources that it can depend on. Where no folder for the cache is writable, each process compiles again.
-    """
+    """Compile ``function`` on first use; it runs without the interpreter lock. Numba's cache notices a
+    changed file, but not changed globals or other modules whose code was inlined, and installers may keep a
+    file's time stamp. So cached code is stamped with the digest of all sources that it can depend on. Without
+    a writable folder for the cache, each process compiles again."""
     compiled = numba.njit(**_OPTIONS)(function)
     with contextlib.suppress(RuntimeError):  # no folder for the cache
         compiled._cache = _Cache(function)
@@ -82,10 +78,9 @@ def kernel(function):
 
 
 def kernel_for(*argument_types):
-    """A decorator: calls without arguments give the :func:`kernel` for one signature, compiled at the first.
-
-    No other signature is compiled later: contiguous arrays would cause another compilation for no gain.
-    """
+    """Decorator that replaces a function by one without arguments, which returns the :func:`kernel` for one
+    signature, compiled at the first call. Other signatures are refused: other array layouts would cause
+    another compilation for no gain."""
 
     def decorate(function):
         @cache
@@ -101,17 +96,14 @@ def kernel_for(*argument_types):
 
 
 def helper(function):
-    """A function that only kernels call; it is inlined into them."""
+    """Decorator for a function that is inlined into kernels and only called there."""
     return numba.njit(forceinline=True, no_cpython_wrapper=True, **_OPTIONS)(function)
 
 
 def processor_features() -> set[str]:
-    """LLVM's names of the processor features that kernels may use, such as ``avx512bf16``.
-
-    Those of this processor, changed by Numba's setting ``NUMBA_CPU_FEATURES``: with ``-avx512f`` kernels are
-    those of a processor with AVX2. With ``NUMBA_CPU_NAME``, too, only the features that the setting lists
-    count.
-    """
+    """LLVM's names of the processor features that kernels may use, such as ``avx512bf16``. Features of this
+    processor, changed by Numba's setting ``NUMBA_CPU_FEATURES``: ``-avx512f`` gives the kernels for AVX2. If
+    ``NUMBA_CPU_NAME`` is set, too, only the features in that setting."""
     changes = numba.config.CPU_FEATURES
     is_own = numba.config.CPU_NAME is None or changes is None
     own = llvmlite.binding.get_host_cpu_features() if is_own else {}

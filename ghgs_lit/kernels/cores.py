@@ -1,4 +1,4 @@
-"""The cores that this process may use, and how its threads wait for one another."""
+"""The number of cores that this process may use, and how its threads wait for one another."""
 
 import fcntl
 import os
@@ -7,20 +7,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
 
-#: Turns of a waiting thread of libgomp before it sleeps: 0.2 ms.
+#: Spins of a waiting thread of libgomp before it sleeps: 0.2 ms.
 _TURNS = "20000"
-#: What asks for several processes, in arguments of the command line.
+#: Parts of command-line arguments that ask for several processes.
 _SEVERAL = ("launcher=", "sweep=", "ddp", "devices=")
-#: Held while this process is the one that spins.
+#: Handle of the locked file while this process is the one that spins.
 _spins: list[IO[str]] = []
 
 
 def spin_if_alone(arguments: Sequence[str], running: Path = Path("/proc/loadavg")) -> None:
-    """Let OpenMP's threads spin before they sleep, where no other process runs; before PyTorch is imported.
-
-    On an idle virtual machine a thread that sleeps wakes late: steps of ``experiment=demo`` take 0.75 s in
-    place of 0.29. Two processes that spin on the same cores take seven times as long: one of a machine may.
-    """
+    """Let OpenMP's threads spin before they sleep if no other process runs; call before importing PyTorch. On
+    an idle virtual machine a sleeping thread wakes late: steps of ``experiment=demo`` take 0.75 s instead of
+    0.29. Two spinning processes on the same cores take seven times as long, so only one per machine may."""
     try:
         alone = running.read_text().split()[3].startswith("1/")
         handle = open(Path(tempfile.gettempdir()) / f"ghgs-spins-{os.getuid()}", "a")  # noqa: SIM115
@@ -33,13 +31,13 @@ def spin_if_alone(arguments: Sequence[str], running: Path = Path("/proc/loadavg"
 
 
 def children_sleep() -> None:
-    """Processes that begin from here on do not inherit :func:`spin_if_alone`."""
+    """Let child processes that start from now on not spin; see :func:`spin_if_alone`."""
     if _spins:
         os.environ.pop("GOMP_SPINCOUNT", None)
 
 
 def allowed_cores(cgroups: Path = Path("/sys/fs/cgroup")) -> int:
-    """The number of cores by affinity and by a container's quota (control groups of version 2 or 1)."""
+    """Number of cores by affinity and by a container's quota (control groups of version 2 or 1)."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     for files in (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us")):
         try:

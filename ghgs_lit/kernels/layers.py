@@ -1,13 +1,12 @@
 """Small networks inside kernels, ``PANEL`` rows at a time, and their gradients.
 
-Products of small matrices stay in registers: a tile of the result is ``ROWS`` x ``PANEL``; its right factor
-is a panel, ``PANEL`` numbers for every step of the sum.
+Matrix products stay in registers: a tile of the result is ``ROWS`` x ``PANEL``; its right factor is a panel,
+``PANEL`` numbers for every step of the sum.
 
-Values are stored by channel: one line of ``PANEL`` floats, a lane for each row. So a layer's result is the
-next one's input as it is, and its activation needs no other layout. The gradient of a layer's values is the
-product of the transposed weights; that of its weights and biases is a sum over lanes, whose input has a line
-of ones below its channels.
-"""
+Values are stored by channel: a channel is a line of ``PANEL`` floats, one lane for each row. So the result of
+a layer is the input of the next without another layout. The gradient of a layer's input is a product with the
+transposed weights; that of its weights and biases is a sum over lanes, for which the input has a line of ones
+below its channels."""
 
 from collections.abc import Sequence
 
@@ -23,13 +22,13 @@ from ghgs_lit.kernels.compile import helper, processor_features
 from ghgs_lit.kernels.memory import pointer_to
 from ghgs_lit.kernels.simd import I64, LANES, call, constant, everywhere, floats
 
-#: Rows and columns: 24 of the 32 registers of AVX-512, or 12 of the 16 of AVX2. They divide ``QUERIES`` and
-#: ``WIDTH`` of ``layout``.
+#: Rows and columns of a tile: 24 of the 32 registers of AVX-512, or 12 of the 16 of AVX2. They divide
+#: ``QUERIES`` and ``WIDTH`` of ``encoder.cpu``.
 ROWS, PANEL = (12, 32) if "avx512f" in processor_features() else (6, 16)
 
 
 def _steps(builder, rows, row_stride: int, step_stride: int, panel, steps, totals) -> None:
-    """Add the products of each row and the panel, over ``steps`` numbers, to ``totals``."""
+    """Add the products of each row and the panel over ``steps`` numbers to ``totals``."""
     with cgutils.for_range(builder, steps, intp=I64) as loop:
         line = builder.gep(panel, [builder.mul(loop.index, ir.Constant(I64, PANEL))])
         parts = []
@@ -45,9 +44,9 @@ def _steps(builder, rows, row_stride: int, step_stride: int, panel, steps, total
 
 
 def make_product(strides: tuple[int, int], adds: bool):
-    """A product of ``ROWS`` rows and one panel. ``strides``: distances in numbers from row to row and from
-    step to step; the compiler knows them, which keeps all registers free for the tile. ``adds``: add the
-    product to ``out`` instead of overwriting it."""
+    """A function that multiplies ``ROWS`` rows with a panel. ``strides``: distances in numbers from row to
+    row and from step to step, constants for the compiler, which keep all registers free for the tile.
+    ``adds``: add the product to ``out`` instead of overwriting it."""
 
     @intrinsic
     def product(typing_context, x, x_at, panels, panel_at, steps, out, out_at, out_stride):
@@ -58,7 +57,7 @@ def make_product(strides: tuple[int, int], adds: bool):
                 )
 
             count = PANEL // LANES
-            # These become registers, since their addresses never leave this function.
+            # These become registers, since their addresses stay in this function.
             totals = [[cgutils.alloca_once(builder, floats.llvm) for _ in range(count)] for _ in range(ROWS)]
             for row in totals:
                 for total in row:
@@ -82,18 +81,18 @@ def make_product(strides: tuple[int, int], adds: bool):
     return product
 
 
-#: ``out = x y`` where the numbers of all rows for one step are neighbours.
+#: ``out = x y`` where the numbers of all rows for one step are contiguous.
 product = make_product((1, ROWS), adds=False)
 
 
 ZERO, ONE = np.float32(0), np.float32(1)
 
-#: ``out += x y^T`` over the lanes of lines of ``x``, and of ``y`` as :func:`_turn` stores them.
+#: ``out += x y^T``, summed over the lanes of the lines ``x`` and of ``y`` as :func:`_turn` stores it.
 _lane_product = make_product((PANEL, 1), adds=True)
 
 
 def room(channels: int) -> int:
-    """Lines that a layer with so many outputs writes: whole tiles."""
+    """Lines that a layer with ``channels`` outputs writes: whole tiles."""
     return -(-channels // ROWS) * ROWS
 
 
@@ -104,11 +103,9 @@ def parameters(layers: Sequence[nn.Module]) -> list[nn.Parameter]:
 
 
 def packed(numbers: Sequence[Tensor], transposed: bool = False) -> np.ndarray:
-    """Layers one after another, as one flat array.
-
-    Of each the weights in tiles of ``ROWS`` outputs, each [inputs, ROWS], then the biases. ``numbers``:
-    weight and bias of each. ``transposed``: pack the transposed weights; their biases are zeros.
-    """
+    """Layers packed into one flat array: for each the weights in tiles of ``ROWS`` outputs, each
+    [inputs, ROWS], then the biases. ``numbers``: weight and bias of each layer. ``transposed``: pack
+    transposed weights, with biases of 0."""
     found = []
     for weight, bias in _pairs(numbers):
         weight, bias = (x.detach().numpy() for x in (weight, bias))
@@ -125,9 +122,8 @@ def _pairs(numbers: Sequence) -> list[tuple]:
 
 
 class Sums:
-    """Sums of the gradients of layers, of each task of a kernel. ``places``: of each layer, where its packed
-    weights begin, its transposed ones, and its sums. ``of_task``: the sums of each task, as :func:`learn`
-    adds them up."""
+    """Sums of the gradients of layers for each task of a kernel. ``places``: for each layer, where its packed
+    weights, its transposed weights and its sums begin. ``of_task``: sums of each task, from :func:`learn`."""
 
     def __init__(self, numbers: Sequence[Tensor], tasks: int):
         self._shapes = [tuple(weight.shape) for weight, _ in _pairs(numbers)]
@@ -139,7 +135,7 @@ class Sums:
         self.of_task[:] = 0
 
     def gradients(self) -> list[Tensor]:
-        """Of weight and bias of each layer."""
+        """Gradients of weight and bias of each layer."""
         found = np.split(self.of_task.sum(0), self.places[1:-1, 2])
         both = [
             part.reshape(block).swapaxes(1, 2).reshape(-1, block[1])[: shape[0], : shape[1] + 1]
@@ -160,7 +156,7 @@ def size(outputs, inputs):
 
 @helper
 def put_rows(table, first, count, line, values):
-    """Copy ``count`` rows of a table from ``first`` on to lines from ``line`` on; the last one repeats."""
+    """Copy ``count`` rows of a table from ``first`` on to lines from ``line`` on; repeat the last row."""
     for lane in range(PANEL):
         row = first + min(lane, count - 1)
         for channel in range(table.shape[1]):
@@ -169,7 +165,7 @@ def put_rows(table, first, count, line, values):
 
 @helper
 def linear(layers, at, outputs, inputs, values, result):
-    """``result = W values`` of the packed layer at ``layers[at]``; the biases are :func:`rectify`'s."""
+    """``result = W values`` of the packed layer at ``layers[at]``, without its biases."""
     for row in range(0, outputs, ROWS):
         product(layers, at + row * inputs, values, 0, inputs, result, row * PANEL, PANEL)
 
@@ -201,7 +197,7 @@ def put_ones(line, values):
 
 @helper
 def put_slopes(table, first, count, values):
-    """Copy ``count`` rows of a table to lines; 0 in the lanes after them."""
+    """Copy ``count`` rows of a table to lines; the other lanes become 0."""
     for lane in range(PANEL):
         for channel in range(table.shape[1]):
             value = table[first + lane, channel] if lane < count else ZERO
@@ -210,7 +206,7 @@ def put_slopes(table, first, count, values):
 
 @helper
 def unrectify(values, channels, slopes):
-    """Slopes before a ReLU that gave ``values``."""
+    """Gradients before a ReLU with results ``values``, in place of ``slopes``, those after it."""
     for i in range(0, channels * PANEL, LANES):
         is_off = memory.load(values, i) <= ZERO
         memory.store(slopes, i, simd.select(is_off, ZERO, memory.load(slopes, i)))
@@ -218,7 +214,7 @@ def unrectify(values, channels, slopes):
 
 @helper
 def _turn(slopes, channels, turned):
-    """Lines as rows of ``PANEL`` channels, one for each lane."""
+    """Write lines to ``turned`` as panels of ``PANEL`` channels, with a row for each lane."""
     for channel in range(channels):
         at = channel // PANEL * PANEL * PANEL + channel % PANEL
         for lane in range(PANEL):
@@ -227,11 +223,8 @@ def _turn(slopes, channels, turned):
 
 @helper
 def learn(values, inputs, slopes, outputs, turned, at, sums):
-    """Add the gradients of a layer's weights and biases to ``sums`` from ``at`` on.
-
-    ``values`` are its inputs and a line of ones, ``slopes`` those of its outputs; ``turned`` has room for
-    whole panels of channels.
-    """
+    """Add the gradients of a layer's weights and biases to ``sums`` from ``at`` on. ``values``: inputs and a
+    line of ones. ``slopes``: gradients of outputs. ``turned``: room for whole panels."""
     _turn(slopes, outputs, turned)
     rows = lines(inputs + 1)
     for panel in range(0, outputs, PANEL):

@@ -1,9 +1,7 @@
-"""Matrix products by the faster of the two libraries that PyTorch uses on a CPU.
-
-``nn.Linear`` in float32 calls MKL, which uses only half of the vector width of AVX-512 on CPUs that Intel did
-not make: 95 to 117 GFLOP/s on a core on which oneDNN, which uses the full width, has 186 to 254. Without
-AVX-512 both are equally fast. Nothing changes on other devices, for tiny products and in other precisions.
-"""
+"""Matrix products by the faster of the two libraries that PyTorch uses on a CPU. ``nn.Linear`` in float32
+calls MKL, which uses only half the vector width of AVX-512 on CPUs by other makers than Intel: 95 to 117
+GFLOP/s per core, against 186 to 254 with oneDNN. Without AVX-512 both are equally fast. Other devices, other
+precisions and tiny products are not affected."""
 
 import torch
 import torch.nn.functional as F
@@ -11,10 +9,10 @@ from torch import Tensor, nn
 
 from ghgs_lit.kernels.pool import even_parts
 
-#: Multiplications above which oneDNN is faster in spite of its slower calls: without a gradient, and as a
-#: convolution, which has one. That needs more inputs than ``_PIXELS`` (PyTorch's own limit) and two threads.
+#: Multiplications from which oneDNN is faster in spite of its slower calls: without a gradient, and with one,
+#: as a convolution, which also needs more than ``_PIXELS`` inputs (PyTorch's own limit) and two threads.
 _SMALL, _LARGE, _PIXELS = 1 << 21, 1 << 24, 20480
-#: Weight values that oneDNN copies at once where the input has fewer rows than channels.
+#: Weight values that oneDNN copies at once if the input has fewer rows than channels.
 _COPY = 1 << 20
 
 
@@ -23,7 +21,7 @@ _WIDE_PRODUCTS = _WIDE_PRODUCTS and torch.backends.cpu.get_cpu_capability() == "
 
 
 def prefers_onednn(x: Tensor, weight: Tensor) -> bool:
-    """Whether :func:`linear` is faster by oneDNN."""
+    """Whether oneDNN computes :func:`linear` faster."""
     if not _WIDE_PRODUCTS or x.device.type != "cpu" or torch.is_autocast_enabled("cpu"):
         return False
     work = x.numel() * len(weight)
@@ -34,24 +32,23 @@ def prefers_onednn(x: Tensor, weight: Tensor) -> bool:
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """``x @ weight.T + bias``. Returns: [..., n]."""
+    """``x @ weight.T + bias``, as ``F.linear``."""
     if not prefers_onednn(x, weight):
         return F.linear(x, weight, bias)
     k, product = x.shape[-1], _convolve if torch.is_grad_enabled() else _multiply
     if x.numel() >= k * k or weight.numel() <= _COPY:
         return product(x, weight, bias)
-    # oneDNN copies the weight to its own layout; for few rows that copy would need most of the memory.
+    # oneDNN copies the weight to its own layout; with few rows that copy would take most of the memory.
     parts = even_parts(len(weight), _COPY // k)
     return torch.cat([product(x, weight[p], None if bias is None else bias[p]) for p in parts], dim=-1)
 
 
 def _multiply(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-    """The product by an operator that has no gradient."""
     return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "none", [], None)
 
 
 def _convolve(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-    """The product as a convolution: rows are pixels with the channels innermost, so nothing is copied."""
+    """The product as a convolution, with rows as pixels and channels innermost, so that nothing is copied."""
     pixels = x.reshape(1, 1, -1, x.shape[-1]).permute(0, 3, 1, 2)
     found = F.conv2d(pixels, weight[:, :, None, None], bias)
     return found.permute(0, 2, 3, 1).reshape(*x.shape[:-1], len(weight))

@@ -1,4 +1,4 @@
-"""Loading and storing whole vectors."""
+"""Loads and stores of whole vectors."""
 
 from llvmlite import ir
 from numba.core import cgutils, types

@@ -1,4 +1,4 @@
-"""Half precision where it is safe: products of networks; geometry and last projections stay in float32."""
+"""Precision: half precision for products of networks, float32 for geometry and last projections."""
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -19,11 +19,8 @@ def has_bfloat16(device: torch.device) -> bool:
 
 
 def fast_precision(stored: torch.dtype, device: torch.device) -> torch.dtype:
-    """In what weights are computed with: float32 in place of a half precision that the processor lacks.
-
-    Products and convolutions in float16 take four times as long as in float32 on a CPU, and lose digits.
-    ``stored``: of the weights in their file. ``device``: where they are used.
-    """
+    """Dtype to use for weights that are ``stored`` in one: float32 instead of a half precision that the
+    processor lacks. On a CPU float16 takes four times as long as float32, and loses digits."""
     if device.type == "cpu" and (
         stored == torch.float16 or (stored == torch.bfloat16 and not has_bfloat16(device))
     ):
@@ -32,9 +29,9 @@ def fast_precision(stored: torch.dtype, device: torch.device) -> torch.dtype:
 
 
 def precision_of(name: str, device: torch.device) -> AbstractContextManager:
-    """The autocast context of a forward pass. InputError: float16 on a CPU, or bfloat16 where the device has
-    none. ``name``: one of :data:`PRECISIONS`. ``inherit`` keeps the caller's; ``auto`` is bfloat16 where the
-    device has it, else float16 on CUDA and float32 on a CPU."""
+    """The autocast context of a forward pass. ``name``: one of :data:`PRECISIONS`; ``inherit``: the caller's;
+    ``auto``: bfloat16 if the device has it, else float16 on CUDA and float32 on a CPU. InputError: float16 on
+    a CPU, or bfloat16 on a device without it."""
     choice("precision", name, PRECISIONS)
     if name == "inherit":
         return nullcontext()
@@ -51,10 +48,8 @@ def precision_of(name: str, device: torch.device) -> AbstractContextManager:
 
 @contextmanager
 def exact(device: str) -> Iterator[None]:
-    """Float32 as it is: no autocast, and products that round their factors neither to TF32 nor to bfloat16.
-
-    ``torch.set_float32_matmul_precision`` asks for such products (TF32 on CUDA has 11 bits: 1 mm at 2 m).
-    ``device``: its type."""
+    """Full float32: no autocast, and no products with factors rounded to TF32 or bfloat16, as
+    ``torch.set_float32_matmul_precision`` allows (TF32 has 11 bits: 1 mm at 2 m). ``device``: its type."""
     backends = [b.matmul for b in (torch.backends.cuda, torch.backends.mkldnn) if hasattr(b, "matmul")]
     before = {b: getattr(b, "fp32_precision", "ieee") for b in backends}  # PyTorch 2.9 and later
     rounding = [b for b, value in before.items() if value not in ("ieee", "none")]
@@ -69,7 +64,6 @@ def exact(device: str) -> Iterator[None]:
 
 
 def without_float16(device: str) -> AbstractContextManager:
-    """No autocast where it is float16, whose largest number a dense head's maps and gradients exceed.
-    ``device``: its type."""
+    """Turn off float16 autocast on a type of device: maps and gradients of dense heads overflow in it."""
     low = torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device) == torch.float16
     return torch.autocast(device, enabled=False) if low else nullcontext()

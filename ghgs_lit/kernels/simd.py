@@ -1,13 +1,9 @@
 """Explicit vectors inside Numba kernels, compiled directly to LLVM vector instructions.
 
-LLVM cannot vectorise the masked inner loop of a rasterizer automatically, so the kernels use explicit
-vectors. A vector is 64 bytes, 16 floats or 8 doubles: one AVX-512 register; on AVX2 and NEON LLVM splits
-each operation into two or four of the machine's own, so the same kernels run everywhere. A mask is one bit
-per lane. No fast-math flag is set: NaN and infinity behave as IEEE 754 says.
-
-A number that is combined with a vector means that number in every lane. ``memory`` loads and stores
-vectors.
-"""
+LLVM cannot vectorise the masked inner loop of a rasterizer. A vector is 64 bytes, 16 floats or 8 doubles: one
+AVX-512 register; on AVX2 and NEON LLVM splits each operation into two or four. A mask is one bit per lane. No
+fast-math flag is set: NaN and infinity behave as IEEE 754 says. A number combined with a vector is put into
+every lane. ``memory`` loads and stores vectors."""
 
 import math
 import operator
@@ -26,7 +22,7 @@ I32, I64 = ir.IntType(32), ir.IntType(64)
 
 
 class _Lanes(types.Type):
-    """A Numba type that is one LLVM vector; it lives only inside kernels."""
+    """A Numba type for an LLVM vector, which exists only inside kernels."""
 
     def __init__(self, name: str, element: ir.Type, count: int):
         self.count, self.element, self.llvm = count, element, ir.VectorType(element, count)
@@ -59,7 +55,7 @@ class _LanesModel(models.PrimitiveModel):
 
 
 def everywhere(builder, number, count: int):
-    """A number in each of ``count`` lanes."""
+    """A vector with ``number`` in each of ``count`` lanes."""
     undefined = ir.Constant(ir.VectorType(number.type, count), ir.Undefined)
     one = builder.insert_element(undefined, number, ir.Constant(I32, 0))
     return builder.shuffle_vector(one, undefined, indices([0] * count))
@@ -67,21 +63,20 @@ def everywhere(builder, number, count: int):
 
 @lower_cast(types.Number, _Floats)
 def _fill(context, builder, source, kind, value):
-    """The same number in every lane."""
     return everywhere(builder, context.cast(builder, value, source, _SCALARS[kind]), kind.count)
 
 
 def _common(*args):
-    """The one kind of vector among the arguments; None where there are two kinds or none."""
+    """The only kind of vector among the arguments; None if there are two kinds or none."""
     kinds = {a for a in args if isinstance(a, _Lanes)}
     fits = len(kinds) == 1 and all(isinstance(a, (_Lanes, types.Number)) for a in args)
     return kinds.pop() if fits else None
 
 
 def _operator(function, family, result, emit):
-    """Define a Python operator for a ``family`` of vectors. ``function``: the operator, such as
-    ``operator.add``. ``family``: class of the operands, floats or masks. ``result``: maps the kind of the
-    operands to that of the value. ``emit``: writes the LLVM instruction."""
+    """Define a Python operator for vectors. ``function``: the operator, such as ``operator.add``. ``family``:
+    class of the operands. ``result``: maps the kind of the operands to that of the value. ``emit``: writes
+    the instruction."""
 
     class Template(AbstractTemplate):
         key = function
@@ -117,7 +112,7 @@ def constant(kind, value: float):
 
 
 def call(builder, name, kind, *args):
-    """Call an LLVM intrinsic whose arguments and result are all of one kind of vector."""
+    """Call an LLVM intrinsic whose arguments and result are vectors of one kind."""
     function = ir.FunctionType(kind.llvm, [kind.llvm] * len(args))
     callee = cgutils.get_or_insert_function(builder.module, function, f"llvm.{name}.{_SUFFIX[kind]}")
     return builder.call(callee, args)
@@ -129,13 +124,13 @@ def indices(values):
 
 
 def vector_of(scalar):
-    """The kind of vector whose lanes are float32 or float64."""
+    """The kind of vector with lanes of float32 or float64."""
     return _VECTORS[scalar]
 
 
 @intrinsic
 def full(typing_context, value):
-    """A float32 or float64 in every lane; other numbers become float64."""
+    """A vector with a float32 or float64 in every lane; other numbers become float64."""
     kind = floats if value == types.float32 else doubles
     return kind(kind), lambda context, builder, sig, args: args[0]
 
@@ -162,7 +157,7 @@ def floor(typing_context, a):
 def _make_extreme(sign: str):
     @intrinsic
     def extreme(typing_context, a, b):
-        """The smaller or larger number of each lane; ``b`` where either is NaN."""
+        """The smaller or larger number in each lane; ``b`` where either is NaN."""
 
         def emit(context, builder, sig, args):
             return builder.select(builder.fcmp_ordered(sign, *args), *args)
@@ -205,7 +200,7 @@ def mask(typing_context, bits):
 
 @intrinsic
 def lane_sum(typing_context, x):
-    """Sum of all lanes of floats; the upper half is added to the lower half until one lane is left."""
+    """Sum of all lanes of floats, by adding the upper half to the lower half until one lane is left."""
 
     def emit(context, builder, sig, args):
         total, width = args[0], LANES
@@ -241,7 +236,7 @@ def trailing_zeros(typing_context, value):
     return types.int64(types.int64), emit
 
 
-# Polynomial of 2^f on [-1/2, 1/2], exact at 0, least maximal relative error: 7e-8.
+# Polynomial of 2^f on [-1/2, 1/2], exact at 0, with the smallest maximal relative error: 7e-8.
 _EXP2 = (1.0, 0.69314660, 0.24022166, 0.055510474, 0.0096749520, 0.0013202982)
 #: 2^-126 is the smallest normal float32.
 EXP2_LIMIT = np.float32(126)
@@ -305,7 +300,7 @@ def log2(typing_context, x):
 
 
 def length(values):
-    """``len(values)`` of a tuple, which the compiler knows; an integer is returned as it is."""
+    """The length of a tuple, as a constant of the compiler; an integer is returned unchanged."""
 
 
 @overload(length)
@@ -317,7 +312,7 @@ def _length(values):
 
 
 def aligned_floats(count):
-    """``count`` floats, not initialised, whose memory starts on a cache line."""
+    """``count`` uninitialised floats that start on a cache line."""
     buffer = np.empty(count + LANES, np.float32)
     skip = (-(buffer.ctypes.data // 4)) % LANES
     return buffer[skip : skip + count]

@@ -1,7 +1,5 @@
-"""Watching the stages of a model from outside: when each begins and ends, what it takes and what it gives.
-
-The model knows nothing of this: stages that are modules get hooks, others are wrapped while somebody watches.
-"""
+"""Watchers of the stages of a model: when each begins and ends, its inputs and its result. The model has no
+code for this: stages that are modules get hooks, others are wrapped while they are watched."""
 
 import time
 from collections import defaultdict
@@ -13,26 +11,26 @@ from typing import Any
 import torch
 from torch import nn
 
-#: A moment: seconds on the CPU, an event on CUDA.
+#: A point in time: seconds on the CPU, an event on CUDA.
 Mark = float | torch.cuda.Event
-#: What a stage is called with: positional and named arguments.
+#: Positional and named arguments of a stage.
 Inputs = tuple[tuple, dict[str, Any]]
 
 
 class Watcher:
-    """What sees stages begin and end, one inside the other; subclasses override what they need."""
+    """Is called when stages begin and end, also nested ones; subclasses override what they need."""
 
     def begin(self, stage: str, inputs: Inputs = ((), {})) -> Inputs | None:
-        """``stage`` begins; inputs that are returned take the place of its own."""
+        """``stage`` begins; inputs that are returned replace its own."""
 
     def end(self, stage: str, result: Any = None) -> None:
-        """``stage`` ends and gives ``result``."""
+        """``stage`` ends with ``result``."""
 
 
 @contextmanager
 def watched(model: nn.Module, stages: Mapping[str, str], watcher: Watcher) -> Iterator[None]:
-    """Let ``watcher`` see the calls of stages while the context lasts. ``stages``: dotted paths of the stages
-    in ``model`` by the name that ``watcher`` is told; a stage that is None or missing is left out."""
+    """Call ``watcher`` at every call of stages while the context lasts. ``stages``: from names for the
+    watcher to dotted paths in ``model``; a stage that is None or missing is left out."""
     with ExitStack() as stack:
         for name, path in stages.items():
             parent, _, attribute = path.rpartition(".")
@@ -49,7 +47,7 @@ def watched(model: nn.Module, stages: Mapping[str, str], watcher: Watcher) -> It
 
 @contextmanager
 def inside(stage: str, watcher: Watcher) -> Iterator[None]:
-    """Let ``watcher`` see a stage that lasts as long as the context."""
+    """Call ``watcher`` for a stage that lasts as long as the context."""
     watcher.begin(stage)
     yield
     watcher.end(stage)
@@ -63,7 +61,7 @@ def _hooks(stage: nn.Module, name: str, watcher: Watcher) -> tuple:
 
 
 class _Wrapped:
-    """A stage that is no module, with a watcher of each call; all else is the stage's own."""
+    """A stage that is no module, with a watcher of its calls."""
 
     def __init__(self, stage: Any, name: str, watcher: Watcher):
         self._stage, self._name, self._watcher = stage, name, watcher
@@ -80,7 +78,7 @@ class _Wrapped:
 
 
 def time_mark(device: torch.device) -> Mark:
-    """This moment on ``device``: on CUDA, when the work that was given to it so far is done."""
+    """The present time on ``device``; on CUDA, when the work submitted so far is done."""
     if device.type != "cuda":
         return time.perf_counter()
     event = torch.cuda.Event(enable_timing=True)
@@ -89,12 +87,12 @@ def time_mark(device: torch.device) -> Mark:
 
 
 def seconds_between(begin: Mark, end: Mark) -> float:
-    """Seconds from one mark to a later one of the same device, which must have been reached."""
+    """Seconds between two marks of the same device, both of which have been reached."""
     return end - begin if isinstance(begin, float) else begin.elapsed_time(end) / 1e3
 
 
 class Stopwatch(Watcher):
-    """The time of each stage on ``device``, by events on CUDA; all calls of a stage count."""
+    """Total time of the calls of each stage on ``device``, by events on CUDA."""
 
     def __init__(self, device: torch.device):
         self.device = device
@@ -108,7 +106,7 @@ class Stopwatch(Watcher):
         self._spans.append((stage, self._open.pop(), time_mark(self.device)))
 
     def seconds(self) -> dict[str, float]:
-        """Seconds of each stage, in the order in which they ended first; waits for the device."""
+        """Seconds of each stage, in the order of their first ends; waits for the device."""
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
         total: dict[str, float] = defaultdict(float)

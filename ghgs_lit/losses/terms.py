@@ -1,7 +1,6 @@
 """The terms of the training loss.
 
-Every term takes ``(prediction, rendering, batch)`` and returns a scalar in float32 or wider.
-"""
+Every term takes ``(prediction, rendering, batch)`` and returns a scalar in float32 or wider."""
 
 import torch
 from jaxtyping import Float
@@ -26,8 +25,7 @@ def render_l1(prediction: Prediction, rendering: Rendering, batch: Batch) -> Sca
 def render_ssim(prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
     """1 - SSIM over the whole image, without padding, as the authors train (second term of L_render).
 
-    On a CPU only windows that see a difference are computed: in all others, most of them, it is 0.
-    """
+    On a CPU only windows in which the images differ are computed; in all others the term is 0."""
     image, target = rendering.image.flatten(0, 1), batch.targets.images.flatten(0, 1)
     reach, (count, channels, height, width) = SSIM_WINDOW - 1, image.shape
     if image.device.type == "cpu" and have_values(image, target):
@@ -39,9 +37,9 @@ def render_ssim(prediction: Prediction, rendering: Rendering, batch: Batch) -> S
 
 
 def chamfer(prediction: Prediction, rendering: Rendering, batch: Batch, points: int | None = None) -> Scalar:
-    """Chamfer distance of the subject's unprojected pixels to the body vertices (L_geom), batch mean.
-    InputError: the data has no body vertices. ``prediction``: its points are those before the Gaussian head's
-    offset. ``points``: how many points of each set are matched; None for all."""
+    """Chamfer distance of the subject's unprojected pixels to the body vertices (L_geom), batch mean. The
+    points are those before the Gaussian head's offset. ``points``: how many of each set are matched; None:
+    all. InputError: the data has no body vertices."""
     if batch.body_vertices is None:
         raise InputError("loss.weights.chamfer: expected 0 for data without body vertices; found more")
     used = prediction.points.valid & batch.masks
@@ -55,9 +53,8 @@ def chamfer(prediction: Prediction, rendering: Rendering, batch: Batch, points: 
 def depth(prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
     """Mean |z - true z| in metres over the subject's pixels with a true depth; 0 where there are none.
 
-    Of a model with rounds the sum over the depths before the first round and after each, as the sequence loss
-    of RAFT (Teed and Deng, ECCV 2020) without its weights. InputError: the data has no depth maps.
-    """
+    With rounds, the sum over the depths before the first round and after each, as RAFT's sequence loss (Teed
+    and Deng, ECCV 2020) without its weights. InputError: the data has no depth maps."""
     if batch.depths is None:
         raise InputError("loss.weights.depth: expected 0 for data without depth maps; found more")
     used = (coverage(batch) > 0) & prediction.depth_valid & (batch.depths > 0)

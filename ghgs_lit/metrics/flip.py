@@ -2,8 +2,7 @@
 
 P. Andersson, J. Nilsson, T. Akenine-Möller, M. Oskarsson, K. Åström, M. D. Fairchild, "FLIP: A Difference
 Evaluator for Alternating Images", HPG 2020. Section numbers below are that paper's. Images are sRGB in
-[0, 1]; the result lies in [0, 1], 0 for equal images.
-"""
+[0, 1]; the result lies in [0, 1], 0 for equal images."""
 
 import math
 
@@ -76,7 +75,6 @@ def _hyab(a: Tensor, b: Tensor) -> Float[Tensor, "n h w"]:
 
 
 def _filter(maps: Tensor, along_y: Tensor, along_x: Tensor) -> Tensor:
-    """Separable filter of [n, c, h, w]; pixels at the border are repeated outside."""
     ry, rx = len(along_y) // 2, len(along_x) // 2
     return correlate(F.pad(maps, (rx, rx, ry, ry), mode="replicate"), along_y, along_x)
 
@@ -130,8 +128,8 @@ def _features(lightness: Tensor, ppd: float) -> tuple[Tensor, Tensor]:
 
 
 def flip_map(image: Float[Tensor, "n 3 h w"], target: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n h w"]:
-    """FLIP of each pixel, in [0, 1]. ``image``, ``target``: values outside [0, 1] are clamped first."""
-    # Each image separately: rounding can depend on the position in memory, and equal images must give 0.
+    """FLIP of each pixel, in [0, 1]; input values outside [0, 1] are clamped first."""
+    # Images one by one: rounding can depend on the position in memory, and equal images must give 0.
     with exact(image.device.type):
         image, target = at_least_float32(image).clamp(0, 1), at_least_float32(target).clamp(0, 1)
         to_xyz, _ = _xyz_matrices(image)

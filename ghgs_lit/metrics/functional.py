@@ -1,14 +1,12 @@
 """Image metrics as pure functions: one value for each RGB image in [0, 1] (data range 1).
 
-A ``region`` selects the pixels that count. Where it is empty the value is nan ("undefined"), and averages
-leave it out.
+A ``region`` selects the pixels that count. Where it is empty the value is nan, and averages leave it out.
 
-Flicker is by how much the error of renders changes from one instant to the next. The field measures how
-frames change along an estimated optical flow (warping error: Lai et al. 2018, Learning Blind Video Temporal
-Consistency), or unlike the true video (tOF, tLP: Chu et al. 2020, TecoGAN). Here the motion of the surface is
-known and the truth subtracted: an error that moves with the surface does not flicker. A black render has the
-flicker of the photographs.
-"""
+Flicker is the change of a render's error from one instant to the next. The literature measures how frames
+change along an estimated optical flow (warping error: Lai et al. 2018, Learning Blind Video Temporal
+Consistency) or unlike the true video (tOF, tLP: Chu et al. 2020, TecoGAN). Here the motion of the surface is
+known and the true image subtracted: an error that moves with the surface does not flicker. A black render has
+the flicker of the photographs."""
 
 import torch
 import torch.nn.functional as F
@@ -44,7 +42,7 @@ def mean_over(values: Float[Tensor, "n h w"], region: Bool[Tensor, "n h w"] | No
 def mean_inside(
     values: Float[Tensor, "n hh ww"], region: Bool[Tensor, "n h w"] | None
 ) -> Float[Tensor, " n"]:
-    """:func:`mean_over` for maps without the border of the image; the same border of the region is cut."""
+    """:func:`mean_over` for maps without the image's border, which is cut off the region, too."""
     if region is not None:
         top, left = (
             (big - small) // 2 for big, small in zip(region.shape[1:], values.shape[1:], strict=True)
@@ -59,7 +57,7 @@ def box_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
 
 
 def crop_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
-    """A window of :data:`CROP` around the middle of each mask's box, inside the image; empty where it is."""
+    """A window of :data:`CROP` around the middle of each mask's box, in the image; empty for empty masks."""
 
     def span(hit: Bool[Tensor, "n k"], share: float) -> Bool[Tensor, "n k"]:
         count = hit.shape[1]
@@ -104,7 +102,6 @@ def psnr(
 
 
 def _gaussian_window(like: Tensor) -> Float[Tensor, " size"]:
-    """SSIM's window along one axis; its sum is 1."""
     x = torch.arange(SSIM_WINDOW, dtype=like.dtype, device=like.device) - (SSIM_WINDOW - 1) / 2
     weights = torch.exp(-x.square() / (2 * SSIM_SIGMA**2))
     return weights / weights.sum()
@@ -113,7 +110,7 @@ def _gaussian_window(like: Tensor) -> Float[Tensor, " size"]:
 def correlate(
     maps: Float[Tensor, "n c h w"], along_y: Float[Tensor, " ky"], along_x: Float[Tensor, " kx"]
 ) -> Float[Tensor, "n c hh ww"]:
-    """Separable filter of every map, at the pixels whose window lies inside the image."""
+    """Filter every map with a separable kernel, without padding."""
     n, c, h, w = maps.shape
     # All maps are channels of one depthwise convolution: ten times faster on a CPU than a batch of maps.
     flat = maps.reshape(1, n * c, h, w)
@@ -125,14 +122,13 @@ def correlate(
 def ssim_map(
     image: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"], padding: str = "valid"
 ) -> Float[Tensor, "n c hh ww"]:
-    """Structural similarity (Wang et al. 2004), K = 0.01, 0.03, moments in float32 or wider.
+    """Structural similarity (Wang et al. 2004), K = 0.01, 0.03, moments in float32 or wider. InputError:
+    images smaller than the window, unless padded with zeros.
 
     Args:
-        image, target: at least as large as the window; of any size with ``zeros``.
         padding: ``valid`` gives only the pixels whose window lies inside the image (scikit-image averages
             these); the others keep the image's size: ``reflect`` mirrors the image at its border
-            (torchmetrics), ``zeros`` surrounds it with black (the authors' evaluation).
-    """
+            (torchmetrics), ``zeros`` surrounds it with black (the authors' evaluation)."""
     choice("ssim.padding", padding, PADDINGS)
     found = tuple(image.shape[-2:])
     large = padding == "zeros" or min(found) >= SSIM_WINDOW
@@ -165,14 +161,14 @@ def ssim(
 def depth_error_mm(
     depth: Float[Tensor, "n h w"], truth: Float[Tensor, "n h w"], region: Bool[Tensor, "n h w"]
 ) -> Float[Tensor, ""]:
-    """Mean |z - true z| in millimetres over all pixels of ``region`` with a true depth; nan without any.
-    ``depth``, ``truth``: metres; a truth of 0 is unknown."""
+    """Mean |z - true z| in millimetres over the pixels of ``region`` with a true depth; nan if there are
+    none. ``depth``, ``truth``: metres; a truth of 0 is unknown."""
     region = region & (truth > 0)
     require(depth.shape == truth.shape, "depth", f"shape {tuple(truth.shape)}", tuple(depth.shape))
     return 1000 * (at_least_float32(depth)[region] - at_least_float32(truth)[region]).abs().mean()
 
 
-#: Metres that a point may lie off the depth map and be visible.
+#: Largest distance in metres of a visible point from the depth map.
 VISIBLE = 0.005
 
 
@@ -182,8 +178,8 @@ def flicker(
     depths: Float[Tensor, "2 t h w"],
     cameras: Cameras,
 ) -> Float[Tensor, " t"]:
-    """Mean absolute change of each error at the points that are visible at both instants; nan without any.
-    ``errors``: renders less photographs, of images in [0, 1]. ``points``: of the surface in the world,
+    """Mean absolute change of each camera's error at the points visible at both instants; nan if none is.
+    ``errors``: renders minus photographs, of images in [0, 1]. ``points``: of the surface, in the world,
     metres. ``depths``: true z-depths in metres, 0 where there is none. ``cameras``: [2, t]."""
     pixels, z = project(points[:, None], cameras.intrinsics[:, :, None], cameras.extrinsics[:, :, None])
     image = torch.arange(2 * z.shape[1], device=z.device).view(2, -1, 1).expand(z.shape)
@@ -198,8 +194,8 @@ def flicker(
 def flicker_in_place(
     errors: Float[Tensor, "2 t c h w"], masks: Bool[Tensor, "2 t h w"]
 ) -> Float[Tensor, " t"]:
-    """Mean absolute change of each error at the pixels of the subject's box at both instants; nan without
-    any. It needs no truth but the photographs of cameras that stand still."""
+    """Mean absolute change of each camera's error in the box around both instants' masks; nan if it is empty.
+    Cameras must stand still; no truth but the photographs is needed."""
     box = box_of(masks.any(0))
     change = torch.where(box, (errors[1] - errors[0]).abs().mean(1), 0)
     return change.sum((1, 2)) / box.sum((1, 2))

@@ -24,7 +24,7 @@ NETWORK = "vgg"
 
 
 class LPIPS:
-    """LPIPS of whole images: one value for each. ``signed``: map [0, 1] to [-1, 1], for which the network was
+    """LPIPS of whole images, one value each. ``signed``: map [0, 1] to [-1, 1], for which the network was
     calibrated; the authors' evaluation does not. InputError: torchvision or the weights are not available."""
 
     def __init__(self, signed: bool = True):
@@ -65,12 +65,12 @@ class MetricsOptions(Options):
 
     @property
     def is_release(self) -> bool:
-        """Whether numbers are those of the authors' code."""
+        """Whether the metrics are computed as in the authors' code."""
         return self.protocol == "release"
 
     @property
     def ssim_padding(self) -> str:
-        """Border of SSIM."""
+        """Padding of SSIM (:func:`ssim_map`)."""
         return {"release": "zeros", "files": "valid"}.get(self.protocol, "reflect")
 
     def build(self) -> "ImageMetrics":
@@ -80,11 +80,10 @@ class MetricsOptions(Options):
 class ImageMetrics:
     """All metrics of a protocol: ``metrics(image, target, mask)`` gives one value per image by name.
 
-    The names are ``psnr``, ``ssim``, ``flip`` and ``lpips`` for the whole image, with ``_box`` and
-    ``_subject`` added for the other regions (no FLIP for the subject's pixels alone, since it blurs).
-    ``protocol``: the name that is reported with every number. ``left_out``: why metrics are left out, by
-    name.
-    """
+    The names are ``psnr``, ``ssim``, ``flip`` and ``lpips`` for the whole image, with ``_box``, ``_subject``
+    or ``_crop`` added for the other regions (no FLIP for the subject's pixels alone, since it blurs; LPIPS
+    for the whole image only). ``protocol`` is reported with every number; ``left_out`` has the reason for
+    each missing metric."""
 
     def __init__(self, options: MetricsOptions):
         self.options, self.protocol = options, options.protocol
@@ -105,7 +104,7 @@ class ImageMetrics:
 
     @property
     def names(self) -> list[str]:
-        """The names of the values, in their order."""
+        """The names of the values, in order."""
         values = []
         for region in self.options.regions:
             metrics = ("psnr", "ssim") if region == "subject" else ("psnr", "ssim", "flip")
@@ -142,7 +141,6 @@ class ImageMetrics:
     def __call__(
         self, image: Float[Tensor, "n 3 h w"], target: Float[Tensor, "n 3 h w"], mask: Bool[Tensor, "n h w"]
     ) -> dict[str, Tensor]:
-        """One value per image for each metric; nan where a region is empty."""
         options = self.options
         image = image if options.is_release else image.clamp(0, 1)
         if options.protocol == "files":

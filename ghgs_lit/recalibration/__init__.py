@@ -1,4 +1,4 @@
-"""The recalibration stage: attention across views among tokens that are close in space."""
+"""The recalibration stage: attention across views between tokens that are close in space."""
 
 from ghgs_lit.recalibration.attention import SemanticAttention
 from ghgs_lit.recalibration.neighbors import Neighbors, nearest_neighbors

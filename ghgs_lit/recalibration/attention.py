@@ -1,4 +1,4 @@
-"""Semantic-consistency attention over given neighbours (paper, Eqs. 3 to 5)."""
+"""Semantic-consistency attention to given neighbours (paper, Eqs. 3 to 5)."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -20,12 +20,12 @@ from ghgs_lit.recalibration.neighbors import Neighbors
 #: How the similarity of two tokens changes their logit; see :class:`SemanticAttention`.
 Similarity = Literal["product", "product_clamped", "log", "none"]
 
-#: The least similarity with ``log``, whose logarithm would be infinite at 0.
+#: The smallest similarity with ``log``, as its logarithm would be infinite at 0.
 S_MIN = 0.01
 
 #: Tokens computed at once without a gradient; in half precision a smaller number is as fast on a CPU.
 _ROWS, _HALF_ROWS = 424, 256
-#: Scores of all tokens that are held on a CPU, and values of neighbours that are gathered at once.
+#: Limits of the scores of all tokens on a CPU, and of gathered values of neighbours.
 _SCORES, _GATHERED = 1 << 26, 1 << 25
 
 
@@ -35,14 +35,13 @@ class SemanticAttention(nn.Module):
     Args:
         dim: width C of the tokens; queries, keys and values have C / 4 channels.
         num_heads: number of heads, each with C / 4 / num_heads channels.
-        similarity: how the cosine s of two tokens' semantic features changes the logit:
-            ``product`` multiplies by s (Eq. 3), ``product_clamped`` multiplies by max(s, 0) (the authors'
-            release), ``log`` adds log(max(s, S_MIN)), which lowers the weight of dissimilar neighbours
-            instead of pulling their logit to 0, ``none`` ignores it (s = 1).
+        similarity: effect of the cosine s of two tokens' semantic features on the logit: ``product``
+            multiplies by s (Eq. 3), ``product_clamped`` by max(s, 0) (the authors' release), ``log`` adds
+            log(max(s, S_MIN)), which lowers the weight of dissimilar neighbours instead of pulling their
+            logit to 0, ``none`` ignores it (s = 1).
 
     Raises:
-        InputError: the heads do not divide C / 4.
-    """
+        InputError: the heads do not divide C / 4."""
 
     def __init__(self, dim: int, num_heads: int = 8, similarity: Similarity = "product"):
         super().__init__()
@@ -61,9 +60,8 @@ class SemanticAttention(nn.Module):
     def forward(
         self, x: Float[Tensor, "N C"], neighbors: Sequence[Neighbors], cosines: Sequence[Tensor] | None
     ) -> Float[Tensor, "N C"]:
-        """Recalibrated tokens. ``x``: the tokens of all batch elements, one element after the other.
-        ``neighbors``: for each element, the neighbours of its ``n_b`` tokens, as indices within the element.
-        ``cosines``: ``[n_b, k_b]`` for each element; None where ``similarity`` is ``none``."""
+        """Recalibrated tokens. ``x``: the tokens of all elements, one after the other. ``neighbors``: for
+        each element, as indices in it. ``cosines``: [n_b, k_b] for each element, if they are used."""
         counts = [len(element.index) for element in neighbors]
         elements = zip(x.split(counts), neighbors, cosines or [None] * len(counts), strict=True)
         results = [self._recalibrate_element(*element) for element in elements]
@@ -72,9 +70,8 @@ class SemanticAttention(nn.Module):
     def attention_weights(
         self, x: Float[Tensor, "n C"], rows: slice, neighbors: Neighbors, cosines: Float[Tensor, "n k"] | None
     ) -> Float[Tensor, "m k a"]:
-        """Softmax weights of each head from some tokens to their neighbours, to look at. ``x``: the tokens of
-        one batch element. ``rows``: the ``m`` tokens that attend. ``neighbors``: of all ``n`` tokens.
-        ``cosines``: None where ``similarity`` is ``none``."""
+        """Softmax weights of each head from the ``m`` tokens ``rows`` to their neighbours, for inspection.
+        ``x``: tokens of one element. ``neighbors``, ``cosines``: of all ``n``."""
         near, normed = neighbors.index[rows], self.norm1(x)
         q, k = at_least_float32(self.q_proj(normed[rows])), at_least_float32(self.k_proj(normed))
         changes = self._factor_and_bias(None if cosines is None else cosines[rows])
@@ -83,14 +80,14 @@ class SemanticAttention(nn.Module):
     def apply_similarity(
         self, logits: Float[Tensor, "a m k"], cosines: Float[Tensor, "m k"]
     ) -> Float[Tensor, "a m k"]:
-        """Logits changed by the semantic similarity of query and neighbour, as ``similarity`` says."""
+        """Logits changed by the semantic similarity of query and neighbour."""
         factor, bias = self._factor_and_bias(cosines)
         return logits * factor + bias
 
     def _recalibrate_element(
         self, x: Float[Tensor, "n C"], neighbors: Neighbors, cosines: Float[Tensor, "n k"] | None
     ) -> Float[Tensor, "n C"]:
-        """One batch element: keys and values of all tokens first, then a part of the tokens at a time."""
+        """Recalibrate one element: keys and values of all tokens first, then the tokens in parts."""
         linears = (self.q_proj, self.k_proj, self.v_proj, self.o_proj, self.mlp[0], self.mlp[2])
         q_proj, k_proj, v_proj, o_proj, mlp_in, mlp_out = map(_cast_once, linears)
 
@@ -105,7 +102,7 @@ class SemanticAttention(nn.Module):
             q = at_least_float32(q_proj(self.norm1(x[rows])))
             y = self._attend(q, k, v, near, None if cosines is None else cosines[rows])
             residual = x[rows] + o_proj(y)
-            # One expression: the input of each layer is freed before the next layer runs.
+            # One expression, so that the input of each layer is freed before the next one runs.
             return residual + mlp_out(self.mlp[1](mlp_in(self.norm2(residual))))
 
         return _in_parts(recalibrate, len(x), x.device)
@@ -133,10 +130,8 @@ class SemanticAttention(nn.Module):
         neighbors: Neighbors,
         cosines: Float[Tensor, "m k"] | None,
     ) -> Float[Tensor, "m i"]:
-        """Eq. 3 with the keys and values of neighbours: nothing is as large as the square of the tokens.
-
-        Where one part is not enough, a gradient computes each part a second time.
-        """
+        """Eq. 3 with gathered keys and values of neighbours; nothing is as large as the square of the tokens.
+        If there are several parts, the backward pass computes each again."""
         factor, bias = (x.expand(neighbors.index.shape) for x in self._factor_and_bias(cosines))
 
         def attend(q: Tensor, k: Tensor, v: Tensor, index: Tensor, *others: Tensor) -> Tensor:
@@ -161,7 +156,7 @@ class SemanticAttention(nn.Module):
         factor: Float[Tensor, "m k"],
         bias: Float[Tensor, "m k"],
     ) -> Float[Tensor, "m k a"]:
-        """Softmax weights of the neighbours of ``m`` tokens, whose keys are ``k``, in each head."""
+        """Softmax weights, in each head, of the neighbours of ``m`` tokens; ``k``: keys of the neighbours."""
         products = (q[:, None] * k).unflatten(-1, (self.num_heads, -1)).sum(-1)
         logits = products * (q.shape[1] // self.num_heads) ** -0.5 * factor[..., None] + bias[..., None]
         return logits.masked_fill(~valid[..., None], float("-inf")).softmax(1)
@@ -174,21 +169,20 @@ class SemanticAttention(nn.Module):
         neighbors: Neighbors,
         cosines: Float[Tensor, "m k"] | None,
     ) -> Float[Tensor, "a m d"]:
-        """Eq. 3 by a product of all tokens: faster than gathering, and nothing of size m x k x C is held."""
+        """Eq. 3 by a product with all tokens: faster than gathering, without a tensor of size m x k x C."""
         index = neighbors.index[None].expand(len(q), -1, -1)
         scores = q * q.shape[-1] ** -0.5 @ k.mT
         logits = scores.gather(2, index)
         if cosines is not None:
             logits = self.apply_similarity(logits, cosines)
         logits = logits.masked_fill(~neighbors.valid, float("-inf"))
-        # Without a gradient the scores are not needed any more, and the weights reuse their memory.
+        # Without a gradient the weights reuse the memory of the scores.
         weights = torch.zeros_like(scores) if torch.is_grad_enabled() else scores.zero_()
         # Invalid neighbours have weight 0 and may repeat a valid index, so weights are added, not set.
         weights = weights.scatter_add_(2, index, logits.softmax(-1))
         return weights @ v
 
     def _factor_and_bias(self, cosines: Float[Tensor, "m k"] | None) -> tuple[Tensor, Tensor]:
-        """What logits are multiplied by, and what is added to them."""
         one = torch.ones((), device=self.q_proj.weight.device)
         if cosines is None:
             return one, one * 0
@@ -198,7 +192,7 @@ class SemanticAttention(nn.Module):
 
 
 def _cast_once(linear: nn.Linear) -> Callable[[Tensor], Tensor]:
-    """``linear`` with its parameters in autocast's dtype: cast once, not for every part of the tokens."""
+    """``linear`` with its parameters cast to autocast's dtype once, not for every part of the tokens."""
     kind = linear.weight.device.type
     if not torch.is_autocast_enabled(kind):
         return linear
@@ -209,7 +203,7 @@ def _cast_once(linear: nn.Linear) -> Callable[[Tensor], Tensor]:
 def _in_parts(
     function: Callable[[slice], Tensor], count: int, device: torch.device
 ) -> Float[Tensor, "count _"]:
-    """``function`` of all rows; on a CPU without a gradient a part of them at a time, to bound memory."""
+    """``function`` of all rows; on a CPU without a gradient a part of them at a time, to save memory."""
     most = _HALF_ROWS if torch.is_autocast_enabled("cpu") else _ROWS
     if torch.is_grad_enabled() or count <= most or device.type != "cpu":
         return function(slice(None))

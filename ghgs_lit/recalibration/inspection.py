@@ -1,4 +1,4 @@
-"""Attention weights, to look at; training does not use them."""
+"""Attention weights for inspection; training does not use them."""
 
 from dataclasses import dataclass
 
@@ -13,10 +13,8 @@ from ghgs_lit.types import Points, Tokens
 
 @dataclass(frozen=True)
 class TokenAttention:
-    """Token ``query``, its neighbours (nearest first), and the weight of each in every layer and head.
-
-    ``query`` and ``neighbors`` are indices of packed tokens. ``plain``: the weights if s were 1.
-    """
+    """A token, its neighbours (nearest first), and their weights in every layer and head; ``plain``: the
+    weights for s = 1. ``query`` and ``neighbors`` are indices of packed tokens."""
 
     query: int
     neighbors: Int[Tensor, " k"]
@@ -28,8 +26,8 @@ class TokenAttention:
 def attention_of(
     recalibration: Recalibration, tokens: Tokens, points: Points, query: int
 ) -> TokenAttention | None:
-    """Attention of the packed token ``query`` (Eqs. 3 to 5); None where it takes no part. ``tokens``,
-    ``points``: as in the stage's forward."""
+    """Attention of the packed token ``query`` (Eqs. 3 to 5); None if it takes no part. ``tokens``,
+    ``points``: inputs of the stage."""
     takes_part = recalibration.takes_part(points)
     if not takes_part[query]:
         return None
@@ -48,10 +46,9 @@ def attention_of(
 def attention_on_other_parts(
     recalibration: Recalibration, tokens: Tokens, points: Points, part: Int[Tensor, " N"]
 ) -> Float[Tensor, "m L"]:
-    """Share of each token's attention, mean over heads, on tokens that show another part of the body: in each
-    layer, of the tokens that take part and whose part is known. ``tokens``, ``points``: as in the stage's
-    forward. ``part``: number of the part that a token shows; -1: unknown. Such tokens are no queries, and
-    what they get is no part of the share."""
+    """Share of each token's attention, in each layer, on tokens that show another body part; mean over heads.
+    ``tokens``, ``points``: inputs of the stage. ``part``: number of the part that a token shows; -1: unknown:
+    such tokens are no queries, and attention to them does not count."""
     takes_part, element, found = recalibration.takes_part(points), tokens.image // tokens.grid[1], []
     for number in range(tokens.grid[0]):
         chosen = (takes_part & (element == number)).nonzero()[:, 0]
@@ -70,8 +67,7 @@ def _weights(
     rows: slice,
     plain: bool = False,
 ) -> tuple[Neighbors, Float[Tensor, "L m k a"]]:
-    """Neighbours of the ``chosen`` tokens of one element, as indices among them, and the weights of rows;
-    ``plain``: if s were 1."""
+    """Neighbours of the ``chosen`` tokens of an element, as indices among them, and weights of ``rows``."""
     places, positions = recalibration.places(tokens), recalibration.positions(tokens, points)
     places = None if places is None else places[chosen]
     near = nearest_neighbors(positions[chosen], tokens.image[chosen], recalibration.k, places)

@@ -12,21 +12,20 @@ from torch import Tensor
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.kernels.pool import at_once, even_parts
 
-#: Number of distances that are held at once: bounds memory, and keeps a block in a CPU's cache. On a GPU they
-#: and their keys take 200 MB.
+#: Distances in memory at once: a block fits a CPU's cache; on a GPU it takes 200 MB with its keys.
 _BLOCK, _GPU_BLOCK = 1 << 17, 1 << 23
 
 
 @dataclass(frozen=True)
 class Neighbors:
-    """Indices of the ``k`` neighbours of each of ``n`` tokens; only ``valid`` entries count."""
+    """Indices of the ``k`` neighbours of each of ``n`` tokens; only ``valid`` ones count."""
 
     index: Int[Tensor, "n k"]
     valid: Bool[Tensor, "n k"]
 
     @classmethod
     def join(cls, elements: Sequence["Neighbors"]) -> "Neighbors":
-        """Those of all tokens of a batch, as indices among all of them; too few get invalid ones."""
+        """Neighbours of all tokens of a batch, as indices among them; shorter lists get invalid entries."""
         k = max(element.index.shape[1] for element in elements)
         starts = itertools.accumulate((len(element.index) for element in elements), initial=0)
         return cls(
@@ -41,22 +40,21 @@ def nearest_neighbors(
 ) -> Neighbors:
     """The ``min(k, n)`` nearest points of each point in any view, itself included, nearest first.
 
-    Distances are computed from differences in float32 or wider (the expansion into products would lose
-    digits far from the origin).
+    Distances are computed from differences in float32 or wider: products would lose digits far from the
+    origin.
 
     Args:
         points: positions of the tokens, of any dimension d.
         view: the view of each token; read with ``places``.
         k: number of neighbours, at least 1.
-        places: a number of each token's place, for points that have equal distances by construction. The
-            place whose number is nearest to the query's comes first, so that opposite places alternate, and
-            at each place the views take turns, the query's own first. None: ties by index.
-    """
+        places: a number of each token's place, which orders points at equal distances: nearest number first,
+            so that opposite places alternate, and at each place the query's own view, then the next views.
+            None: ties by index."""
     points = at_least_float32(points)
     n = points.shape[0]
     k = min(k, n)
     views = 0 if places is None or n == 0 else int(view.max() - view.min()) + 1
-    # Filled, not concatenated: small results between freed distances would keep that memory occupied.
+    # Filled, not concatenated: small results between freed blocks of distances would fragment the memory.
     index = torch.empty(n, k, dtype=torch.int64, device=points.device)
     for rows in even_parts(n, at_once(points.device, _BLOCK, _GPU_BLOCK) // max(n, 1)):
         distance = torch.cdist(points[rows], points, compute_mode="donot_use_mm_for_euclid_dist")
@@ -66,22 +64,20 @@ def nearest_neighbors(
 
 
 def widened(table: Tensor, k: int) -> Tensor:
-    """A table of neighbours [n, _] with ``k`` columns; the new ones are 0."""
+    """A table of neighbours [n, _], filled up with zeros to ``k`` columns."""
     return table if table.shape[1] == k else F.pad(table, (0, k - table.shape[1]))
 
 
 def _turns(places: Tensor, view: Tensor, views: int, block: slice) -> Int[Tensor, "m n"]:
-    """Ranks of tokens at equal distances from the queries of a block; see ``places``."""
+    """Ranks of tokens at equal distances from the queries ``block``; see ``places``."""
     apart = places - places[block, None]
     return (2 * apart.abs() + (apart < 0)) * views + (view - view[block, None]) % views
 
 
 def _smallest(distance: Float[Tensor, "m n"], ranks: Int[Tensor, "m n"] | None, k: int) -> Int[Tensor, "m k"]:
     """Columns of the ``k`` smallest values of each row, ascending, ties by rank or column; NaN is largest.
-
-    ``topk`` does not define the order of equal values, so the rank is part of the key: the bits of a
-    non-negative float32 sort like its value, and the rank fills the lower half.
-    """
+    ``topk`` does not define the order of equal values, so the rank is the lower half of the key; the upper
+    half is the bits of the distance, since those of non-negative floats sort like their values."""
     if distance.dtype == torch.float64:
         if ranks is None:
             return distance.sort(dim=1, stable=True).indices[:, :k]

@@ -17,7 +17,7 @@ from ghgs_lit.recalibration.attention import SemanticAttention, Similarity
 from ghgs_lit.recalibration.neighbors import Neighbors, nearest_neighbors, widened
 from ghgs_lit.types import DecodedPixels, Points, Tokens, true_places
 
-#: Number of cosines that are held at once (bounds memory).
+#: Cosines in memory at once, on a CPU and on a GPU.
 _COSINES, _GPU_COSINES = 1 << 21, 1 << 25
 
 
@@ -39,7 +39,7 @@ class RecalibrationOptions(Options):
     """Tokens that take part: subject, those with a point on the subject | all (the release)"""
 
     def build(self, dim_latent: int) -> "Recalibration":
-        """The stage for tokens of width ``dim_latent``."""
+        """The stage for tokens of width ``dim_latent``. InputError: as :class:`SemanticAttention`."""
         return Recalibration(self, dim_latent)
 
 
@@ -52,8 +52,7 @@ class Recalibration(nn.Module):
         self.block = SemanticAttention(dim_latent, options.num_heads, options.similarity)
 
     def forward(self, tokens: Tokens, points: Points) -> Tokens:
-        """Tokens with recalibrated layers; the semantic features and the order stay. ``tokens``: from the
-        encoder. ``points``: of the same tokens."""
+        """Tokens with recalibrated layers; semantic features and order are unchanged."""
         batch_size, views = tokens.grid[:2]
         takes_part = self.takes_part(points)
         elements = torch.arange(batch_size, device=takes_part.device)[:, None]
@@ -83,34 +82,30 @@ class Recalibration(nn.Module):
         return dataclasses.replace(tokens, latent=tuple(layers))
 
     def takes_part(self, points: Points) -> Bool[Tensor, " N"]:
-        """Which tokens are recalibrated and can be neighbours."""
+        """Tokens that are recalibrated and can be neighbours."""
         return points.tokens_valid | (self.tokens == "all")
 
     def positions(self, tokens: Tokens, points: Points) -> Float[Tensor, "N d"]:
         """Position of each token in the space where neighbours are searched; see ``neighborhood``."""
         if self.neighborhood == "xyz":
             return points.tokens.detach()
-        # Half pixels are exact in float32, so that equal distances are equal numbers.
+        # Half pixels are exact in float32, so equal distances are equal numbers.
         return (torch.stack((tokens.row, tokens.column), dim=-1) + 0.5) * tokens.patch_size
 
     def places(self, tokens: Tokens) -> Int[Tensor, " N"] | None:
-        """The ``places`` of :func:`nearest_neighbors`; None where equal distances are an accident."""
+        """``places`` for :func:`nearest_neighbors`; None for 3D points, which have no systematic ties."""
         if self.neighborhood != "image_plane":
             return None
-        # Twice the columns: no two places at equal distances from a third have equal numbers apart from it.
+        # Twice the columns, so that places at equal distances from a query differ in their numbers.
         return tokens.row * 2 * tokens.grid[3] + tokens.column
 
 
 @torch.no_grad()
 def neighbor_cosines(semantic: Float[Tensor, "n s"], neighbors: Neighbors) -> Float[Tensor, "n k"]:
-    """Cosines of the semantic features of tokens and their neighbours (Eq. 4), float32 or wider.
-
-    Features are normalised once, before the neighbours are gathered. A feature of length 0 has cosine 0 with
-    every other.
-    """
+    """Cosines of the semantic features of tokens and neighbours (Eq. 4), float32 or wider; 0 for zeros."""
     with exact(semantic.device.type):
         semantic = at_least_float32(semantic)
-        # Allocated first: after the features it would keep their memory occupied once they are freed.
+        # Allocated before temporary tensors, so that their memory can be freed.
         cosines = semantic.new_empty(neighbors.index.shape)
         directions = unit(semantic)
         most = at_once(semantic.device, _COSINES, _GPU_COSINES)
@@ -120,7 +115,7 @@ def neighbor_cosines(semantic: Float[Tensor, "n s"], neighbors: Neighbors) -> Fl
 
 
 class NoRecalibrationOptions(Options):
-    """Tokens stay as they are: for methods without attention across views behind the encoder."""
+    """No recalibration, for methods without attention across views after the encoder."""
 
     group = "recalibration"
 
@@ -129,7 +124,7 @@ class NoRecalibrationOptions(Options):
 
 
 class NoRecalibration(nn.Module):
-    """Gives the tokens back."""
+    """Returns the tokens unchanged."""
 
     tokens: DecodedPixels = "subject"
 

@@ -1,4 +1,4 @@
-"""Gaussian splatting: ``render`` and ``Renderer``; ``settings`` defines the image."""
+"""Rendering of Gaussians: ``render`` and ``Renderer``; ``settings`` defines the image."""
 
 from ghgs_lit.rendering.api import Renderer, render
 from ghgs_lit.rendering.gsplat_backend import BackendUnavailable

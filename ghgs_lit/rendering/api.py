@@ -1,4 +1,4 @@
-"""Gaussians to images: one function, one definition of the image, three backends."""
+"""Rendering of Gaussians by one function with three backends."""
 
 import dataclasses
 import importlib
@@ -20,7 +20,7 @@ from ghgs_lit.rendering.settings import RasterSettings
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 BACKENDS = ("auto", "gsplat", "cpu", "reference")
-#: Metres; practically no limit.
+#: Farthest depth in metres: practically no limit.
 FAR = 1e10
 _MODULES = {"gsplat": "gsplat_backend", "cpu": "cpu", "reference": "reference"}
 
@@ -39,7 +39,9 @@ def render(
     """Render ``B`` sets of Gaussians from cameras [B, T].
 
     Differentiable in means, quaternions, scales, opacities, colours and background. Any number ``C`` of
-    colour channels, any image size and any number of Gaussians per element, including none.
+    colour channels, any image size and any number of Gaussians per element, including none. Depth is 0 where
+    no Gaussian is seen. InputError: inputs that do not fit together. BackendUnavailable: gsplat cannot run on
+    this machine.
 
     Args:
         gaussians: a zero quaternion is the identity; a Gaussian with NaN in its geometry or opacity is not
@@ -49,16 +51,7 @@ def render(
         background: one number, one per channel, or a tensor that broadcasts with [B, T, C, h, w].
         near, far: metres (see ``gaussians.metre``); only Gaussians whose centre has ``near <= z <= far`` are
             drawn.
-        settings: constants of the image; None for the defaults, or what the Gaussians were made for.
-
-    Returns:
-        Image [B, T, C, h, w], alpha and depth [B, T, 1, h, w]; depth is the expectation
-        ``sum(w z) / max(sum(w), 1e-10)``, 0 where no Gaussian is seen.
-
-    Raises:
-        InputError: inputs that do not fit together.
-        BackendUnavailable: gsplat cannot run on this machine.
-    """
+        settings: constants of the image; None: those that the Gaussians were made for."""
     settings = settings or made_for(gaussians)
     require(0 < near < math.inf, "near", "a number of metres > 0", near)
     require(near < far < math.inf, "far", f"more than near = {near}", far)
@@ -80,13 +73,13 @@ def render(
 
 
 def made_for(gaussians: Gaussians, **settings) -> RasterSettings:
-    """The constants that Gaussians were made for, beside those that are given."""
+    """The settings that Gaussians were made for, with further ``settings``."""
     return RasterSettings(low_pass=gaussians.low_pass, antialiased=gaussians.antialiased, **settings)
 
 
 def resolve_backend(backend: str, device: torch.device) -> str:
-    """The backend for tensors on ``device``, with ``auto`` resolved. InputError: a backend that does not run
-    on ``device``. BackendUnavailable: gsplat cannot run on this machine."""
+    """The backend for tensors on ``device``, with ``auto`` resolved. InputError: it does not run on
+    ``device``. BackendUnavailable: gsplat cannot run on this machine."""
     choice("renderer.backend", backend, BACKENDS)
     is_cuda = device.type == "cuda"
     if backend == "auto":
@@ -121,7 +114,7 @@ class Renderer(Options):
     def __call__(
         self, gaussians: Gaussians, cameras: Cameras, background: Background | None = None
     ) -> Rendering:
-        """See :func:`render`; a ``background`` that is given here replaces the configured one."""
+        """:func:`render` with these options; ``background`` replaces the configured one if given."""
         background = self.background if background is None else background
         settings = made_for(gaussians, alpha_max=self.alpha_max)
         return render(gaussians, cameras, self.backend, background, self.near, FAR, settings)
@@ -146,7 +139,6 @@ def _check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
 
 
 def _in_one_dtype(gaussians: Gaussians) -> Gaussians:
-    """All fields in float64 if one of them is, else in float32."""
     fields = ("means", "quaternions", "scales", "opacities", "colors")
     tensors = {name: at_least_float32(getattr(gaussians, name)) for name in fields}
     is_double = any(tensor.dtype == torch.float64 for tensor in tensors.values())
@@ -156,13 +148,13 @@ def _in_one_dtype(gaussians: Gaussians) -> Gaussians:
 
 
 def _of_each(values: Tensor, gaussians: Gaussians) -> Tensor:
-    """``values`` of the elements [B, ...] for each of their Gaussians."""
+    """``values`` of the elements [B, ...], repeated for each of their Gaussians."""
     counts = torch.tensor(gaussians.splits, device=values.device)
     return values.repeat_interleave(counts, dim=0, output_size=len(gaussians))
 
 
 def _around_cameras(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
-    """Means in float64 relative to each element's first camera: the backends compute in float32."""
+    """Move float64 scenes to each element's first camera, since backends compute in float32."""
     if gaussians.means.dtype != torch.float64 or 0 in cameras.shape:
         return gaussians, cameras
     origin = cameras[:, 0].to(torch.float64).centers.detach()
@@ -175,7 +167,6 @@ def _around_cameras(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, 
 
 
 def _in_metres(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
-    """A scene in metres, in which near and far are."""
     if gaussians.metre is None:
         return gaussians, cameras
     lengths = _of_each(gaussians.metre.to(gaussians.means), gaussians)[:, None]

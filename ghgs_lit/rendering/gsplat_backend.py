@@ -1,4 +1,4 @@
-"""The gsplat backend (CUDA). gsplat is imported on first use; most constants are compiled into it."""
+"""The gsplat backend (CUDA), imported on first use; most constants are compiled into gsplat."""
 
 import importlib
 
@@ -11,8 +11,8 @@ from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 #: The limit of alpha that is compiled into gsplat.
 _ALPHA_MAX = RasterSettings().alpha_max
-#: In a batch, gsplat 1.5.3 adds up a warp's gradients by the number of a Gaussian in its element alone: those
-#: of elements with fewer Gaussians than a warp has threads would be mixed.
+#: Threads of a warp. In a batch, gsplat 1.5.3 sums the gradients of a warp by the index of a Gaussian in its
+#: element alone, and would mix those of elements with fewer Gaussians than this.
 _WARP = 32
 _FIXED = ("alpha_min", "stop", "extent", "frustum_margin")
 
@@ -22,8 +22,7 @@ class BackendUnavailable(InputError):
 
 
 def load():
-    """gsplat's function ``rasterization``. BackendUnavailable: no CUDA device, or gsplat cannot be
-    imported."""
+    """gsplat's function ``rasterization``. BackendUnavailable: no CUDA device, or the import fails."""
     if not torch.cuda.is_available():
         raise BackendUnavailable(
             "renderer.backend=gsplat: needs a CUDA device, but torch.cuda.is_available() is false "
@@ -45,11 +44,9 @@ def load():
 def rasterize(
     gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Rendering:
-    """Gaussians on black, in float32; see :func:`ghgs_lit.rendering.render`.
-
-    A limit of alpha below :data:`_ALPHA_MAX` applies to opacities: alphas differ by at most ``1 - alpha_max``
-    from those of the other backends, where an opacity is above it.
-    """
+    """Render on black in float32; see :func:`ghgs_lit.rendering.render`. A limit of alpha below
+    :data:`_ALPHA_MAX` is applied to opacities: for opacities above it, alphas differ by at most
+    ``1 - alpha_max`` from those of other backends."""
     default, expected = RasterSettings(), f"at most {_ALPHA_MAX}, which is compiled into gsplat"
     allowed = settings.alpha_max <= _ALPHA_MAX
     require(allowed, "renderer.settings.alpha_max", expected, settings.alpha_max)
@@ -59,7 +56,7 @@ def rasterize(
     rasterization = load()
     channels = gaussians.colors.shape[1]
     if len(gaussians) == 0 or 0 in cameras.shape:
-        # Stays part of the graph, so that a batch of empty elements can be differentiated.
+        # Part of the graph, so that a batch of empty elements can be differentiated.
         nothing = (gaussians.means.sum() + gaussians.colors.sum()).float()
         drawn = nothing * nothing.new_zeros(*cameras.shape, channels + 2, cameras.height, cameras.width)
     else:
@@ -69,10 +66,10 @@ def rasterize(
 
 
 def _drawn(rasterization, gaussians: Gaussians, cameras: Cameras, settings, near, far) -> Tensor:
-    """All views of all elements, [B, T, C + 2, h, w]: colours, expected depth, alpha. One call of gsplat."""
+    """Colours, expected depth and alpha of all views, [B, T, C + 2, h, w], by one call of gsplat."""
     means, quaternions, scales, opacities, colors = _sanitized(*_side_by_side(gaussians))
     if settings.alpha_max < _ALPHA_MAX:
-        # Opacities above the limit keep their gradient, as they do beside the middle of a splat elsewhere.
+        # Opacities above the limit keep their gradient, as away from the centre of a splat in other backends.
         opacities = opacities - (opacities - settings.alpha_max).clamp(min=0).detach()
     values, alpha, _ = rasterization(
         means=means,
@@ -95,11 +92,8 @@ def _drawn(rasterization, gaussians: Gaussians, cameras: Cameras, settings, near
 
 
 def _side_by_side(gaussians: Gaussians) -> tuple[Tensor, ...]:
-    """Means, quaternions, scales, opacities and colors of each element, [B, N, ...], in float32.
-
-    Elements with fewer Gaussians than others, or than :data:`_WARP`, get some of zeros: their
-    opacity of 0 is not drawn.
-    """
+    """Means, quaternions, scales, opacities and colors of each element, [B, N, ...], in float32; padded to
+    one number, at least :data:`_WARP` with several elements, by Gaussians with opacity 0."""
     names = ("means", "quaternions", "scales", "opacities", "colors")
     fields = [getattr(gaussians, name).float() for name in names]
     if len(gaussians.splits) == 1:
@@ -115,12 +109,9 @@ def _side_by_side(gaussians: Gaussians) -> tuple[Tensor, ...]:
 def _sanitized(
     means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor
 ) -> tuple[Tensor, ...]:
-    """The same that gsplat draws as this project defines them.
-
-    gsplat's kernels square quaternions in float32 and do not expect NaN or infinity. So quaternions are
-    normalised, the zero quaternion becomes the identity, and a Gaussian whose geometry or opacity is not
-    finite becomes invisible.
-    """
+    """Gaussians that gsplat draws as the other backends do. gsplat squares quaternions in float32 and does
+    not expect NaN or infinity. So quaternions are normalised, the zero quaternion becomes the identity, and a
+    Gaussian whose geometry or opacity is not finite becomes invisible."""
     geometry = torch.cat((means, quaternions, scales, opacities[..., None]), dim=-1)
     is_finite = geometry.isfinite().all(-1)
     identity = torch.nn.functional.pad(means.new_ones(1), (0, 3))

@@ -1,8 +1,6 @@
-"""The image in plain PyTorch, in the dtype of its input: the truth for tests.
-
-Every Gaussian is evaluated in every pixel, so it is slow and needs much memory; gradients come from autograd.
-:class:`ghgs_lit.rendering.settings.RasterSettings` defines the image.
-"""
+"""The reference renderer for tests, in plain PyTorch and the dtype of its input. It evaluates every Gaussian
+in every pixel, so it is slow and needs much memory; gradients are by autograd.
+:class:`ghgs_lit.rendering.settings.RasterSettings` defines the image."""
 
 import math
 from dataclasses import dataclass
@@ -16,13 +14,13 @@ from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.rendering.settings import RasterSettings
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
-# Gaussians times pixels that are held at once (bounds memory).
+# Gaussians times pixels in memory at once.
 _CHUNK = 1 << 19
 
 
 @dataclass(frozen=True)
 class Splats:
-    """Gaussians projected into one camera: pixels, and covariances as (xx, xy, yy) in px^2."""
+    """Gaussians projected into one camera: centres in pixels, covariances as (xx, xy, yy) in px^2."""
 
     centers: Float[Tensor, "n 2"]
     covariances: Float[Tensor, "n 3"]
@@ -35,7 +33,7 @@ class Splats:
 def rasterize(
     gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Rendering:
-    """Gaussians on black; see :func:`ghgs_lit.rendering.render`."""
+    """Render on black; see :func:`ghgs_lit.rendering.render`."""
     channels = gaussians.colors.shape[1]
     sums = _sums(gaussians, cameras, settings, near, far)
     image, depth, alpha = sums.split((channels, 1, 1), dim=2)
@@ -45,7 +43,7 @@ def rasterize(
 def _sums(
     gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Float[Tensor, "B T channels h w"]:
-    """Sums over the Gaussians that a pixel sees: ``w colour`` (C channels), ``w z`` and ``w``."""
+    """Sums over the Gaussians that a pixel sees of ``w colour`` (C channels), ``w z`` and ``w``."""
     images = []
     for element in range(len(gaussians.splits)):
         images += [
@@ -73,11 +71,8 @@ def _view(
 def visible(
     gaussians: Gaussians, camera: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Int[Tensor, " n"]:
-    """Indices of the Gaussians to draw, sorted by float32 depth, ties by index.
-
-    They lie between near and far, their determinant is positive and finite, and their opacity is at least
-    ``alpha_min``. NaN fails each of these conditions.
-    """
+    """Indices of the Gaussians to draw, sorted by float32 depth, ties by index: between near and far, with
+    finite centres, a positive, finite determinant and an opacity of at least ``alpha_min``."""
     splats = project(gaussians, camera, settings)
     depths, determinants = splats.depths, splats.determinants
     keep = (depths >= near) & (depths <= far) & (determinants > 0) & determinants.isfinite()
@@ -87,7 +82,7 @@ def visible(
 
 
 def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> Splats:
-    """All Gaussians as splats of one camera, whether it sees them or not."""
+    """All Gaussians as splats of one camera, also those that it does not see."""
     rotation, translation = camera.extrinsics[:3, :3], camera.extrinsics[:3, 3]
     points = gaussians.means @ rotation.mT + translation
     x, y, z = points.unbind(-1)
@@ -118,7 +113,7 @@ def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> 
 
 
 def _blend(splats: Splats, pixels: Float[Tensor, "P 2"], settings: RasterSettings) -> Float[Tensor, "P c"]:
-    """Composite all splats over ``P`` pixels: sums of ``w colour``, ``w z`` and ``w``."""
+    """Composite all splats over ``P`` pixels; see :func:`_sums`."""
     dx, dy = (pixels[None] - splats.centers[:, None]).unbind(-1)
     xx, xy, _ = splats.covariances[:, None].unbind(-1)
     sigma = 0.5 * (dx * dx / xx + (dy - xy / xx * dx).square() * xx / splats.determinants[:, None])
@@ -128,12 +123,12 @@ def _blend(splats: Splats, pixels: Float[Tensor, "P 2"], settings: RasterSetting
     alpha = torch.where(raw < settings.alpha_max, raw, settings.alpha_max)
     hit = near_enough & (alpha >= settings.alpha_min)
     behind = torch.log1p(-torch.where(hit, alpha, 0)).cumsum(0)
-    # Transmittance only falls, so every splat after the first one that is left out is left out too.
+    # Transmittance only falls: all splats after the first one that is left out are left out, too.
     seen = hit & (behind > (math.log(settings.stop) if settings.stop > 0 else -math.inf))
     alpha = torch.where(seen, alpha, 0)
     step = torch.log1p(-alpha)
     weights = alpha * torch.exp(step.cumsum(0) - step)
     ones = torch.ones_like(splats.depths)
     values = torch.cat((splats.colors, splats.depths[:, None], ones[:, None]), dim=-1)
-    # Not a matrix product: a colour that is not finite must not reach pixels that do not see its splat.
+    # Not a matrix product: colours that are not finite must not reach pixels that do not see their splat.
     return (weights[..., None] * torch.where(seen[..., None], values[:, None], 0)).sum(0)

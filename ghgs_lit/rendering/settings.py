@@ -1,4 +1,4 @@
-"""The constants that define the image; the defaults are gsplat's."""
+"""Constants that define the image; the defaults are gsplat's."""
 
 from pydantic import Field, model_validator
 
@@ -6,13 +6,12 @@ from ghgs_lit.config.options import Amount, Options, Positive
 
 
 class RasterSettings(Options):
-    """The constants of the image, the same in all backends.
+    """Constants of the image, the same in all backends.
 
     Each pixel composites Gaussians in the order of their float32 depth, ties by index. A Gaussian has
-    ``alpha = min(alpha_max, opacity exp(-sigma))`` with ``sigma`` half its squared Mahalanobis distance
-    from the pixel's centre; it is skipped where ``alpha < alpha_min`` or ``sigma > extent^2 / 2``. Where the
-    transmittance behind a Gaussian would not exceed ``stop``, the pixel ends before that Gaussian.
-    """
+    ``alpha = min(alpha_max, opacity exp(-sigma))`` with ``sigma`` half its squared Mahalanobis distance from
+    the pixel's centre; it is skipped where ``alpha < alpha_min`` or ``sigma > extent^2 / 2``. A pixel ends
+    before the first Gaussian behind which its transmittance would not exceed ``stop``."""
 
     group = "renderer.settings"
     low_pass: Amount = 0.3

@@ -1,4 +1,4 @@
-"""Rounds that look again: Gaussians are compared with the photographs and corrected."""
+"""Rounds of refinement: Gaussians are compared with the photographs and corrected."""
 
 from ghgs_lit.rounds.rounds import Rounds, RoundsOptions, State, prediction_of, replaced
 

@@ -1,8 +1,5 @@
-"""Photographs of cameras whose exposure or white balance differ, made alike.
-
-A point on the surface has the same colour in all views that see it, up to a gain of each camera and channel
-(Brown and Lowe, IJCV 2007, solve the same for panoramas).
-"""
+"""Gains of cameras whose exposure or white balance differ. A point on the surface has the same colour in all
+views that see it, up to a gain of each camera and channel (as for panoramas: Brown and Lowe, IJCV 2007)."""
 
 import dataclasses
 import itertools
@@ -20,41 +17,38 @@ from ghgs_lit.types import Batch, Gaussians
 
 #: Distance in metres from a view's rendered surface at which a Gaussian's weight in that view is 1 / e.
 _NEAR = 0.02
-#: Colours closer than this to black or white, which say little of a gain, count less.
+#: Colours closer than this to black or white have less weight: they say little about a gain.
 _DARK = 0.05
-#: Deviation of a logarithm of colours from the gains at which a Gaussian counts half: wrong depths, shadows.
+#: Deviation of log colours from the gains at which a Gaussian has half its weight: wrong depths, shadows.
 _OUTLIER = 0.15
-#: Logarithms of gains well below this are taken for errors of the estimate, and shrunk to 0.
+#: Log gains well below this are probably errors of the estimate, and shrunk towards 0.
 _LEAST = 0.02
-#: Weight of gains of 1, in Gaussians: views that share nothing get these.
+#: Weight of the prior, gains of 1, in Gaussians; views that share nothing get these.
 _PRIOR = 1.0
-#: One Gaussian in so many is compared: a third of them is enough, and takes a third of the time.
+#: One Gaussian in this many is compared: a third is enough and takes a third of the time.
 _EVERY = 3
 #: Steps of reweighting.
 _STEPS = 5
 
 
 def equalized(gaussians: Gaussians, batch: Batch) -> tuple[Gaussians, Batch]:
-    """Gaussians and the photographs that they come from, divided by their cameras' gains."""
+    """Gaussians and their photographs, divided by the gains of their cameras."""
     logs = log_gains(gaussians, batch)
     colors = gaussians.colors * torch.exp(-logs).flatten(0, 1)[gaussians.image]
     return dataclasses.replace(gaussians, colors=colors), divided(batch, logs)
 
 
 def divided(batch: Batch, logs: Float[Tensor, "B V 3"]) -> Batch:
-    """The photographs divided by gains, given by their logarithms."""
+    """The batch with photographs divided by the gains whose logarithms are given."""
     images = (at_least_float32(batch.images) * torch.exp(-logs)[..., None, None]).clamp(0, 1)
     return dataclasses.replace(batch, images=images, log_gains=logs)
 
 
 @torch.no_grad()
 def log_gains(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
-    """Natural logarithms of each camera's gains.
-
-    Their mean is about 0, as photographs do not tell which camera is right. Pairs of views vote with the
-    Gaussians that both see; each counts the less the more it deviates (Cauchy weights), so that wrong depths
-    do not decide. 0 where views share nothing.
-    """
+    """Natural logarithms of each camera's gains; 0 if views share nothing. Their mean is about 0, as
+    photographs do not tell which camera is right. Pairs of views are compared at the Gaussians that both see,
+    with Cauchy weights, so that wrong depths matter little."""
     with exact(gaussians.means.device.type):
         depth = render(gaussians, batch.cameras).depth
         some = _thinned(gaussians)
@@ -82,7 +76,7 @@ def _thinned(gaussians: Gaussians) -> Gaussians:
 def _compared(
     gaussians: Gaussians, batch: Batch, depth: Float[Tensor, "B V 1 H W"]
 ) -> tuple[Float[Tensor, "N V 3"], Float[Tensor, "N V 3"]]:
-    """Logarithms of a Gaussian's colours in each view over that in its own photograph, and their weights."""
+    """Log ratios of a Gaussian's colour in each view to that in its own photograph, and their weights."""
     views = batch.masks.shape[1]
     shares = coverage(batch)[:, :, None]
     maps = torch.cat((batch.once(surface_colors) * shares, shares, depth), 2)
@@ -100,7 +94,7 @@ def _compared(
 def _solved(
     counts: Float[Tensor, "B V V 3"], differences: Float[Tensor, "B V V 3"]
 ) -> Float[Tensor, "B V 3"]:
-    """Logarithms of gains that best fit the sums of differences, of the last V to the first."""
+    """Log gains that best fit the sums of differences of views (last V) from own views (first V)."""
     counts, differences = counts.movedim(-1, 1), differences.movedim(-1, 1)
     both = counts + counts.mT
     identity = torch.eye(both.shape[-1], dtype=both.dtype, device=both.device)

@@ -1,4 +1,4 @@
-"""Values of the photographs and the render at each Gaussian's present position, without a gradient."""
+"""Values of photographs and renders at the positions of Gaussians, without a gradient."""
 
 import dataclasses
 
@@ -16,15 +16,15 @@ from ghgs_lit.rendering import render
 from ghgs_lit.rounds import cpu
 from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering, map_tensors
 
-#: Metres behind the rendered surface at which a Gaussian counts as hidden (tanh of the ratio).
+#: Scale in metres of a Gaussian's distance behind the rendered surface (tanh of the ratio).
 _BEHIND = 0.05
 
 #: Values of a Gaussian in a view: photograph minus its own colour (3), photograph minus render (3), mask,
-#: alpha, how far it lies behind the rendered surface, whether the view can see it, whether it is from there.
+#: alpha, distance behind the rendered surface, whether the view can see it, whether the view is its own.
 CHANNELS = 11
-#: Values of :func:`slopes`: of a mean along its ray and along its own axes, of scales, opacity and color.
+#: Values of :func:`slopes`: of the mean along its ray and its own axes, of scales, opacity and color.
 SLOPES = 1 + 3 + 3 + 1 + 3
-# Slopes are bounded from about a quarter on: of most Gaussians they are less than a tenth.
+# Slopes saturate from about 1/4 on; most are less than a tenth.
 _STEEP = 4.0
 
 
@@ -32,13 +32,10 @@ _STEEP = 4.0
 def slopes(
     gaussians: Gaussians, batch: Batch, directions: Float[Tensor, "N 3"], footprints: Float[Tensor, "N 1"]
 ) -> tuple[Rendering, Float[Tensor, "N s"]]:
-    """The inputs as rendered, and the gradient of their squared error with respect to each Gaussian.
-
-    Colours and mattes count alike. Means move by pixels, scales and opacities by logarithms and logits. The
-    values are bounded; no gradient flows through them. ``directions``: of the Gaussians' rays.
-    ``footprints``: the size of a pixel where a Gaussian is.
-    """
-    # Copies, as what was made in inference mode can never have a gradient.
+    """The rendered inputs, and the bounded gradient of their squared error with respect to each Gaussian. The
+    error is of colours and mattes. Units are pixels for means, logarithms for scales, logits for opacities.
+    No gradient flows through the values. ``directions``: of the rays. ``footprints``: size of a pixel."""
+    # Copies: tensors of inference mode can never have a gradient.
     means, scales, opacities, colors = leaves = [
         getattr(gaussians, name).detach().clone().requires_grad_()
         for name in ("means", "scales", "opacities", "colors")
@@ -65,8 +62,7 @@ def slopes(
 
 @torch.no_grad()
 def observe(gaussians: Gaussians, batch: Batch, rendering: Rendering | None = None) -> Float[Tensor, "N V c"]:
-    """:data:`CHANNELS` values of each input view at each Gaussian of its element. The first view is that of
-    the Gaussian's own image; the others follow in their order, from the last to the first again."""
+    """:data:`CHANNELS` values of each Gaussian in each view: its own, then the others in cyclic order."""
     with exact(gaussians.means.device.type):
         return _compare(gaussians, batch, rendering or render(gaussians, batch.cameras))
 
@@ -93,7 +89,7 @@ def _compare(gaussians: Gaussians, batch: Batch, rendering: Rendering) -> Float[
 def looked_up(
     gaussians: Gaussians, cameras: Cameras, maps: Float[Tensor, "B V c H W"]
 ) -> tuple[Float[Tensor, "N V c"], Float[Tensor, "N V 1"], Bool[Tensor, "N V 1"]]:
-    """Values of maps where means appear in each view, their z-depths, and whether they lie in the image."""
+    """Values of maps at projected means in each view, z-depths, and whether the view can see the means."""
     means = gaussians.means.split(gaussians.splits)
     each = [_in_element(own, cameras[b], maps[b]) for b, own in enumerate(means)]
     return tuple(torch.cat(values) for values in zip(*each, strict=True))
@@ -106,7 +102,7 @@ def _in_element(
     pixels, z = project(
         means.expand(len(maps), -1, -1), cameras.intrinsics[:, None], cameras.extrinsics[:, None]
     )
-    # Far outside is brought near: large numbers are not exact.
+    # Pixels far outside are clamped: large numbers are not exact.
     grid = (2 / size * pixels - 1).clamp(-3, 3)
     found = F.grid_sample(maps, grid[:, None], align_corners=False)[:, :, 0]
     can_see = (z > 0) & ((pixels >= 0) & (pixels <= size)).all(-1)

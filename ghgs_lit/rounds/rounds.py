@@ -1,11 +1,10 @@
-"""Rounds that look again: the inputs are rendered, compared with the photographs, the Gaussians corrected.
+"""Rounds: render the inputs, compare them with the photographs, correct the Gaussians.
 
-One forward pass guesses depths and attributes and never checks them, although checking is cheap: the
-rasterizer draws the inputs in milliseconds. Each round shows every Gaussian what the photographs say about it
-where it is now (:mod:`ghgs_lit.rounds.observation`), and a small network, the same in all rounds, moves it
-along its ray and changes its raw attributes. Feeding errors of re-rendered inputs back is the idea of learned
-optimizers of splats (G3R, Chen et al., ECCV 2024; ReSplat, Xu et al., 2025).
-"""
+A single forward pass never checks its depths and attributes, although the rasterizer draws the inputs in
+milliseconds. In each round every Gaussian is compared with the photographs at its present position
+(:mod:`ghgs_lit.rounds.observation`), and a small network, the same in all rounds, moves it along its ray and
+changes its raw attributes. Learned optimizers of splats also use the errors of re-rendered inputs (G3R, Chen
+et al., ECCV 2024; ReSplat, Xu et al., 2025)."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -32,22 +31,20 @@ from ghgs_lit.rounds.gains import equalized
 from ghgs_lit.rounds.observation import CHANNELS, SLOPES, observe, slopes
 from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Prediction
 
-#: Pixels: side of the square around a Gaussian's pixel from which it hears.
+#: Side in pixels of the square around a Gaussian's pixel whose Gaussians it exchanges features with.
 SIDE = 5
 
 
 class Windows(NamedTuple):
-    """Positions of Gaussians in maps cropped to the subject of each image.
-
-    ``place`` counts through the pixels of all maps, whose number, height and width are ``shape``.
-    """
+    """Positions of Gaussians in maps cropped to the subject of each image. ``place``: index among the pixels
+    of all maps. ``shape``: number, height and width of the maps."""
 
     place: Int[Tensor, " N"]
     shape: tuple[int, int, int]
 
     @classmethod
     def of(cls, raw: RawGaussians, batch: Batch) -> "Windows":
-        """Maps of the size of the largest subject; each begins at its subject's first row and column."""
+        """Positions in maps of the size of the largest subject, each of which begins at its own subject."""
         filled = [extent for extent in batch.extents if extent.count]
         height = max((extent.bottom - extent.top for extent in filled), default=1)
         width = max((extent.right - extent.left for extent in filled), default=1)
@@ -60,17 +57,15 @@ class Windows(NamedTuple):
 
 
 class Exchange(nn.Module):
-    """Adds to what each Gaussian knows what those of the pixels around it tell; untrained, nothing.
-
-    Where several depths explain a colour, neighbours decide, as in recurrent networks of optical flow (RAFT,
-    Teed and Deng, ECCV 2020). Few channels and one convolution keep it cheap. ``width``: of what a Gaussian
-    knows. ``channels``: of what it tells.
-    """
+    """Adds features of neighbouring pixels' Gaussians to the features of each; untrained, it adds nothing. If
+    several depths explain a colour, neighbours decide, as in recurrent networks of optical flow (RAFT, Teed
+    and Deng, ECCV 2020). Few channels and one convolution keep it cheap. ``width``: of the features.
+    ``channels``: of the features that are exchanged."""
 
     def __init__(self, width: int, channels: int):
         super().__init__()
         self.tell = nn.Linear(width, channels)
-        # Channels last is several times as fast on a CPU, and the order that rows of Gaussians have already.
+        # Channels last is several times as fast on a CPU, and the layout of rows of Gaussians.
         self.across = nn.Conv2d(channels, channels, SIDE, padding=SIDE // 2).to(
             memory_format=torch.channels_last
         )
@@ -79,32 +74,30 @@ class Exchange(nn.Module):
         nn.init.zeros_(self.hear.bias)
 
     def forward(self, known: Float[Tensor, "N w"], windows: Windows) -> Float[Tensor, "N w"]:
-        """``known`` with what the neighbours add."""
+        """``known`` with features of the neighbours added."""
         return known + self.hear(F.relu(self.heard(known, windows)))
 
     def heard(self, known: Float[Tensor, "N w"], windows: Windows) -> Float[Tensor, "N c"]:
-        """What the neighbours tell; pixels without a Gaussian tell zeros."""
+        """Features of the neighbours; 0 for pixels without a Gaussian."""
         told, (count, height, width) = self.tell(known), windows.shape
         maps = told.new_zeros(count * height * width, told.shape[1]).index_copy(0, windows.place, told)
         maps = self.across(maps.view(count, height, width, told.shape[1]).permute(0, 3, 1, 2))
         return maps.permute(0, 2, 3, 1).flatten(0, 2).index_select(0, windows.place)
 
 
-#: Gaussians whose views go through the network at once.
+#: Gaussians that go through the network at once on a CPU.
 _AT_ONCE = 2048
-#: How far the depths that a round compares lie from the current one, in the first round: a share of the
-#: distance from near to far.
+#: Largest distance of the depths that the first round compares from the current one, as a share of the way
+#: from near to far.
 REACH = 0.25
-#: Of :class:`Search`: how far from near to far a Gaussian is, and the distance between them.
+#: Channels of ``Search.place``: position between near and far (0 to 1), and far - near.
 _PLACE = 2
 
 
 @dataclass(frozen=True)
 class Search:
-    """Depths around the current one, of each Gaussian.
-
-    ``matches`` is the photo-consistency at depths from ``down`` metres before to ``up`` metres behind it.
-    """
+    """Depths around the current one of each Gaussian. ``matches``: photo-consistency at depths from ``down``
+    metres in front of it to ``up`` metres behind it."""
 
     matches: Float[Tensor, "N s"]
     place: Float[Tensor, "N 2"]
@@ -113,7 +106,7 @@ class Search:
 
 
 class Rays(NamedTuple):
-    """Places of the Gaussians' pixels among those of all images, and a metre of depth along their rays."""
+    """Indices of the Gaussians' pixels among all images', and displacements per metre of depth."""
 
     place: Int[Tensor, " N"]
     direction: Float[Tensor, "N 3"]
@@ -127,7 +120,7 @@ class Rays(NamedTuple):
 
 @dataclass(frozen=True)
 class State:
-    """Input and output of a round; the first state is the prediction of the stages before."""
+    """Input and output of a round; the first state is the prediction of the stages."""
 
     raw: RawGaussians
     gaussians: Gaussians
@@ -136,8 +129,8 @@ class State:
 
 
 def prediction_of(states: Sequence[State], keeps_drafts: bool) -> Prediction:
-    """What the last of several states predicts. ``states``: before the first round and after each.
-    ``keeps_drafts``: whether the prediction has the Gaussians before each round."""
+    """The prediction of the last state. ``states``: before the first round and after each. ``keeps_drafts``:
+    include the Gaussians before each round."""
     last, maps = states[-1], tuple(state.depth_maps for state in states)
     drafts = tuple(state.gaussians for state in states[:-1]) if keeps_drafts else ()
     depth, valid = maps[-1].depth, maps[-1].valid
@@ -149,11 +142,11 @@ Activate = Callable[[RawGaussians, Batch, Points, DepthMaps], Gaussians]
 
 
 def replaced(activate: Activate, training: bool) -> Activate:
-    """``activate`` for Gaussians that the next round replaces: in training no loss sees them."""
+    """``activate`` for Gaussians that the next round replaces: in training without a gradient."""
     return torch.no_grad()(activate) if training else activate
 
 
-#: Of rounds.
+#: A number of rounds.
 Number = Annotated[int, Field(ge=1, le=32)]
 
 
@@ -190,11 +183,10 @@ def _two_layers(inputs: int, wide: int, outputs: int) -> nn.Sequential:
 class Rounds(nn.Module):
     """Corrects Gaussians several times with the same weights; untrained, it changes nothing.
 
-    Each round can change half as much as the one before, depths stay between near and far and attributes
-    within the bounds of their activations: more rounds than were trained do not diverge. ``channels``: width
-    of the Gaussian head's descriptors. ``count``: number of rounds outside of training; it may be changed at
-    any time.
-    """
+    Each round can change half as much as the one before, depths stay between near and far, attributes within
+    the bounds of their activations: more rounds than in training do not diverge. ``channels``: width of the
+    Gaussian head's descriptors. The attribute ``count``, the number of rounds outside of training, may be
+    changed at any time."""
 
     def __init__(self, options: RoundsOptions, channels: int):
         super().__init__()
@@ -211,8 +203,8 @@ class Rounds(nn.Module):
         nn.init.zeros_(self.change[-1].bias)
 
     def forward(self, state: State, activate: Activate, batch: Batch) -> tuple[State, ...]:
-        """The state before the first round and after each. ``state``: the prediction of the stages before;
-        its depths have bounds. ``batch``: photographs, masks and cameras are read."""
+        """The states before the first round and after each. ``state``: the prediction of the stages, with
+        bounds of depths. ``batch``: photographs, masks and cameras are read."""
         if self.options.gains and batch.log_gains is None:
             gaussians, batch = equalized(state.gaussians, batch)
             state = dataclasses.replace(state, gaussians=gaussians)
@@ -233,7 +225,7 @@ class Rounds(nn.Module):
     def _round(
         self, state: State, batch: Batch, rays: Rays, memory: Tensor, windows: Windows | None, size: float
     ) -> tuple[tuple[Tensor, Tensor], Tensor]:
-        """New depths and changes of raw attributes, and what the next round remembers."""
+        """Changes of depths and of raw attributes, and the memory for the next round."""
         gaussians = state.gaussians.detach()
         drawn, steep = None, []
         if self.options.slopes:
@@ -253,7 +245,7 @@ class Rounds(nn.Module):
         memory: Float[Tensor, "N h"],
         windows: Windows | None,
     ) -> tuple[Float[Tensor, "N h"], Float[Tensor, "N c"]]:
-        """The memory after a look and an exchange, and the change that follows from it."""
+        """The memory after observation and exchange, and the change computed from it."""
         fused = multiplies(each, known, memory, self.memory.weight)
         if fused:
             memory = cpu.remembered(self.view, self.update, self.memory, each, known, memory)
@@ -266,7 +258,7 @@ class Rounds(nn.Module):
         return memory, float32_last(self.change, memory)
 
     def _remembered_in_parts(self, *rows: Tensor) -> Float[Tensor, "N h"]:
-        """:meth:`_remembered` in parts that fit a CPU's cache: half the time. All at once with a gradient."""
+        """:meth:`_remembered` in parts that fit a CPU's cache, in half the time; at once with a gradient."""
         count, device = len(rows[0]), rows[0].device
         parts = even_parts(count, count if torch.is_grad_enabled() else at_once(device, _AT_ONCE, count))
         return torch.cat([self._remembered(*(row[part] for row in rows)) for part in parts])
@@ -274,7 +266,7 @@ class Rounds(nn.Module):
     def _remembered(
         self, each: Float[Tensor, "n V c"], known: Float[Tensor, "n k"], memory: Float[Tensor, "n h"]
     ) -> Float[Tensor, "n h"]:
-        """The memory after a look at what each view shows, the own one first, and what is known beside it."""
+        """The new memory from the observations of each view (``each``, the own one first) and ``known``."""
         own, *others = self.view(each).unbind(1)
         seen = (own, sum(others) / len(others), reduce(torch.maximum, others))
         return torch.tanh(memory + self.memory(self.update(torch.cat((*seen, known, memory), -1))))
@@ -288,7 +280,7 @@ class Rounds(nn.Module):
         )
         thickness = far - near
         half, share = reach * thickness, (depth - near) / torch.where(thickness > 0, thickness, 1)
-        # Rounding may have put a depth a little outside its bounds.
+        # By rounding a depth may lie slightly outside its bounds.
         low, high = torch.minimum(torch.maximum(depth - half, near), depth), torch.minimum(depth + half, far)
         high = torch.maximum(high, depth)
         matches = consistency_of(batch, rays.place, low, high, self.options.depths)
@@ -297,7 +289,7 @@ class Rounds(nn.Module):
 
 @torch.no_grad()
 def _footprints(state: State, batch: Batch, rays: Rays) -> Tensor:
-    """Sizes [N, 1] of the pixels where the Gaussians are, in the unit of the world."""
+    """Sizes [N, 1] of a pixel at the Gaussians' depths, in the unit of depth."""
     focal = focal_lengths(batch.cameras).prod(-1).sqrt().flatten()
     depth = at_least_float32(state.depth_maps.depth).flatten()[rays.place]
     return (depth / focal[state.raw.image])[:, None]

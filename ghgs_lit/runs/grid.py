@@ -1,4 +1,4 @@
-"""The sweeper of ``conf/hydra/sweeper/grid.yaml``: launches the runs of a grid that are not done."""
+"""Grid sweeper of ``conf/hydra/sweeper/grid.yaml``: launches those runs of a grid that are not done."""
 
 import datetime
 import itertools
@@ -33,7 +33,7 @@ OUTPUTS = "config.yaml, checkpoints/, metrics.json, metrics.csv, sessions.jsonl,
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A run of a sweep: the hash of its configuration, all of its overrides, and those to print."""
+    """A run of a sweep. ``name``: hash of its configuration; ``shown``: the overrides to print."""
 
     name: str
     overrides: tuple[str, ...]
@@ -54,7 +54,7 @@ def time_budget(config: Mapping[str, Any]) -> float | None:
 
 
 def step_seconds(directory: Path) -> tuple[float, int] | None:
-    """Mean seconds of a training step in the runs below ``directory`` that are done, and their number."""
+    """Mean seconds of a training step over the finished runs in ``directory``, and their number."""
     steps = seconds = count = 0
     for path in sorted(directory.glob("*/metrics.json")):
         sessions = [s for s in RunDirectory(path.parent).sessions() if s.get("steps")]
@@ -65,7 +65,7 @@ def step_seconds(directory: Path) -> tuple[float, int] | None:
 
 
 def expected_seconds(config: Mapping[str, Any], step: float | None) -> float | None:
-    """How long a run trains, from its budgets and the measured seconds of a ``step``; None if unknown."""
+    """Training time of a run by its budgets and the measured seconds of a ``step``; None if unknown."""
     steps = config["trainer"].get("max_steps", -1)
     known = [time_budget(config), steps * step if steps > 0 and step is not None else None]
     return min((seconds for seconds in known if seconds is not None), default=None)
@@ -76,7 +76,6 @@ def _budget(config: Mapping[str, Any], seconds: float | None) -> str:
 
 
 def _print_table(planned: Sequence[PlannedRun], columns: Mapping[str, Sequence[str]]) -> None:
-    """Print one line for each run; overrides that all runs share are left out."""
     shared = set.intersection(*(set(item.shown) for item in planned)) if len(planned) > 1 else set()
     overrides = [" ".join(o for o in item.shown if o not in shared) for item in planned]
     table = {"run": [item.name for item in planned], **columns, "overrides": overrides}
@@ -86,7 +85,6 @@ def _print_table(planned: Sequence[PlannedRun], columns: Mapping[str, Sequence[s
 def _print_states(
     planned: Sequence[PlannedRun], columns: Mapping[str, Sequence[str]], end: str
 ) -> list[State]:
-    """Print the runs with their states, and how many there are in each state."""
     states = [item.run.state for item in planned]
     _print_table(planned, {"state": [s.value for s in states], **columns})
     counts = ", ".join(f"{states.count(state)} {state.value}" for state in State if state in states)
@@ -95,7 +93,7 @@ def _print_states(
 
 
 def print_plan(planned: Sequence[PlannedRun], directory: Path) -> None:
-    """Print the runs with their states, how long the remaining ones train, and where results go."""
+    """Print the runs with their states, the training time of the remaining ones and the output paths."""
     measured = step_seconds(directory)
     times = [expected_seconds(item.config, measured and measured[0]) for item in planned]
     budgets = [_budget(item.config, seconds) for item, seconds in zip(planned, times, strict=True)]
@@ -112,7 +110,7 @@ def print_plan(planned: Sequence[PlannedRun], directory: Path) -> None:
 
 
 def print_refusals(configs: Sequence[Mapping[str, Any]]) -> None:
-    """Print why runs would be refused as they are configured, each reason once."""
+    """Print why configured runs would be refused, each reason once."""
     reasons = {}
     for config in configs:
         try:
@@ -124,7 +122,7 @@ def print_refusals(configs: Sequence[Mapping[str, Any]]) -> None:
 
 
 def print_results(planned: Sequence[PlannedRun], directory: Path) -> None:
-    """Print the runs with their states and results, and last the path of the sweep."""
+    """Print the runs with their states and results, then the path of the sweep."""
     shown = ["" if (m := item.run.metric) is None else f"{m:.2f}" for item in planned]
     sessions = [str(len(item.run.sessions())) for item in planned]
     _print_states(planned, {"PSNR": shown, "sessions": sessions}, "")
@@ -145,15 +143,15 @@ def print_single_plan(config: Mapping[str, Any], run: RunDirectory) -> None:
 
 
 log = logging.getLogger(__name__)
-_POLL = 2.0  # seconds between two looks at runs that other processes work on
+_POLL = 2.0  # seconds between checks of runs that other processes work on
 _MOST_RUNS = 10_000  # of a sweep
 
 Launch = Callable[[Sequence[Sequence[str]], int], Sequence[JobReturn]]
 
 
 def sweep(sweeper: BasicSweeper, arguments: Sequence[str]) -> list[Sequence[JobReturn]]:
-    """Run, or with ``dry_run`` only print, the grid of ``arguments`` and the sweeper's parameters.
-    Interrupted: on Ctrl-C and SIGTERM; no further run is started."""
+    """Run the grid of ``arguments`` and the sweeper's parameters, or print it with ``dry_run``. Interrupted:
+    Ctrl-C or SIGTERM; no further run is started."""
     directory = Path(str(sweeper.config.hydra.sweep.dir)).resolve()
     with interruptible():
         try:
@@ -189,8 +187,8 @@ def _sweep(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> 
 def combinations(
     params: Mapping[str, Any] | None, arguments: Sequence[str], loader: ConfigLoader | None = None
 ) -> list[list[str]]:
-    """The overrides of each job; the command line's values of a key replace the sweep's own. ``loader`` knows
-    the options of groups, which ``glob(*)`` stands for."""
+    """Overrides of each job; values of the command line replace the sweep's own. ``loader`` resolves
+    ``glob(*)`` to the options of a group."""
     parser = OverridesParser.create(config_loader=loader)
     given = parser.parse_overrides(list(arguments))
     keys = {override.get_key_element() for override in given}
@@ -201,19 +199,19 @@ def combinations(
 
 
 def _require_few(overrides: Sequence[Override]) -> None:
-    """Refuse a grid that would take all memory before any of its runs starts."""
+    """Refuse a grid so large that listing its runs would exhaust the memory."""
     count = 1
     for override in overrides:
         if override.is_sweep_override() and override.is_discrete_sweep():
-            # Not the iterator of a range, which would list it to shuffle it.
+            # The sweep iterator of a range would list all of it.
             values = override.value().range() if override.is_range_sweep() else override.sweep_iterator()
             count *= sum(1 for _ in itertools.islice(values, _MOST_RUNS + 1))
             require(count <= _MOST_RUNS, override.key_or_group, f"at most {_MOST_RUNS} runs", "more")
 
 
 def plan(combos: Sequence[Sequence[str]], compose: Callable[[list[str]], DictConfig]) -> list[PlannedRun]:
-    """The different runs among the jobs, in order; ``compose`` makes a configuration of a job's overrides.
-    InputError: a job's configuration is bad or lacks a value."""
+    """Distinct runs of the jobs, in order; ``compose`` makes the configuration of a job's overrides.
+    InputError: a configuration is bad or lacks a value."""
     planned: dict[str, PlannedRun] = {}
     for overrides in combos:
         cfg = compose(list(overrides))
@@ -229,7 +227,7 @@ def plan(combos: Sequence[Sequence[str]], compose: Callable[[list[str]], DictCon
 
 
 def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Path) -> None:
-    """Write each run's configuration, by which tables know that it is planned."""
+    """Write each run's configuration, by which tables recognise planned runs."""
     for item in planned:
         path = item.run.path / "config.yaml"
         if not path.exists():
@@ -238,9 +236,9 @@ def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Pat
 
 
 def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = None) -> list[JobReturn]:
-    """Launch runs until each one is done, here or elsewhere, or has failed. A job whose run another process
-    works on returns ``BUSY``: it is launched again once that process has finished or died. ``launch`` starts
-    jobs, given their overrides and the number of the first; ``batch`` of them at once, None: all."""
+    """Launch runs until each one has finished, here or elsewhere, or failed. A job that returns ``BUSY``
+    (another process works on its run) is launched again once that process has ended. ``launch`` starts jobs,
+    given their overrides and the number of the first; ``batch``: jobs at once, None: all."""
     todo = [item for item in planned if not item.run.done]
     print(f"{len(planned)} runs: {len(planned) - len(todo)} done before, {len(todo)} to do", flush=True)
     returns: list[JobReturn] = []

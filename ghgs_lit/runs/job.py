@@ -1,4 +1,4 @@
-"""What a job of a sweep does: lock its run if that is free and not done, and train or resume it."""
+"""Jobs that train: lock a run that is free and not done, then train or resume it."""
 
 import os
 import shutil
@@ -20,9 +20,9 @@ from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.runs.signals import STOP, Interrupted
 
-BUSY = "busy"  #: The return value of a job whose run another process works on
+BUSY = "busy"  #: Return value of a job whose run another process works on
 SWEEPER = "hydra_plugins.ghgs_lit_sweeper.GridSweeper"
-# Set in the environment of a job's own process: whether to "skip" a locked run or to "wait" for it.
+# Environment variable of a job's own process: "skip" a locked run, or "wait" for it.
 _VARIABLE = "GHGS_SWEEP_JOB"
 
 Train = Callable[[dict[str, Any], Path, dict[str, Any]], float | None]
@@ -40,16 +40,15 @@ def in_sweep() -> bool:
 
 
 def _waits() -> bool:
-    """Whether to wait for a locked run: the grid returns to it later, other sweepers need its result now."""
+    """Whether to wait for a locked run: the grid sweeper returns to it later, others need its result now."""
     if is_multirun():
         return HydraConfig.get().sweeper.get("_target_") != SWEEPER
     return os.environ.get(_VARIABLE) == "wait"
 
 
 def register_resolvers() -> None:
-    """Register what configurations may ask for. ``${config_hash:}`` is a run's directory, ``${sqlite:path}``
-    a database's URL, ``${folder:first,second}`` the first of two folders, or the second where that is null.
-    """
+    """Register resolvers of configurations: ``${config_hash:}``, the name of a run's directory;
+    ``${sqlite:path}``, a database's URL; ``${folder:first,second}``, the second if the first is null."""
 
     def hash_of_run(*, _root_: DictConfig) -> str:
         keys = [key for key in _root_ if key != "hydra"]
@@ -70,14 +69,15 @@ def register_resolvers() -> None:
 
 
 def with_resume(config: dict[str, Any], run: RunDirectory) -> dict[str, Any]:
-    """``config`` that, in a sweep, resumes from the run's own last checkpoint."""
+    """``config``, which in a sweep resumes from the run's last checkpoint."""
     if not in_sweep() or config["resume"] is not None or run.checkpoint is None:
         return config
     return {**config, "resume": str(run.checkpoint)}
 
 
 def train_once(run: RunDirectory, config: dict[str, Any], train: Train) -> float | str | None:
-    """Train ``run`` unless it is done; returns its metric, or ``BUSY`` if another process works on it."""
+    """Train ``run``; in a sweep, return ``BUSY`` if another process works on it, its metric if it is done.
+    InputError: outside of a sweep, another process works on it or its directory holds a run."""
     with run.claim(wait=_waits()) as claimed:
         if not claimed and in_sweep():
             print(f"skipped: {run.owner} works on {run.path}", flush=True)
@@ -95,8 +95,8 @@ def train_once(run: RunDirectory, config: dict[str, Any], train: Train) -> float
 
 
 def train_in_own_process(run: RunDirectory) -> float | str | None:
-    """Run this job as a ``ghgs`` of its own: training in several processes cannot share its process. The new
-    process locks the run, so that the lock stays when this process dies."""
+    """Run this job as a separate ``ghgs``, because training in several processes cannot share this one. The
+    new process locks the run, so that the lock outlives this process."""
     hydra = HydraConfig.get()
     command = [sys.executable, "-m", "ghgs_lit", hydra.job.name, *hydra.overrides.task]
     command += [f"hydra.run.dir='{run.path}'", "hydra.mode=RUN"]
@@ -110,7 +110,7 @@ def train_in_own_process(run: RunDirectory) -> float | str | None:
 
 
 def _run_process(command: list[str], environment: Mapping[str, str]) -> int:
-    """The exit code of ``command``; a signal that stops this process is handed on, and awaited."""
+    """Exit code of ``command``; a signal that stops this process is passed on to it."""
     with subprocess.Popen(command, env=environment) as process:
         try:
             return process.wait()
@@ -121,7 +121,7 @@ def _run_process(command: list[str], environment: Mapping[str, str]) -> int:
 
 
 def trains_in_several_processes(config: Mapping[str, Any], launcher: str) -> bool:
-    """Whether a job of a sweep trains in several processes; InputError: Hydra's launcher runs all in one."""
+    """Whether a job trains in several processes. InputError: ``launcher`` runs all jobs in one process."""
     devices = config["trainer"].get("devices", 1)
     if devices in (1, "1", [0]):
         return False
@@ -142,21 +142,19 @@ def needs_own_process(config: Mapping[str, Any]) -> bool:
     return trains_in_several_processes(config, launcher) and "slurm" not in launcher
 
 
-#: What training writes below a run's directory, beside the logs of Hydra.
+#: What training writes into a run's directory, beside the logs of Hydra.
 WRITTEN = ("checkpoints", "csv", "init_from.txt", "metrics.csv", "metrics.json", "pictures")
 WRITTEN += ("sessions.jsonl", "tensorboard")
 
 
 def check_config(config: Mapping[str, Any]) -> None:
-    """Refuse a run that cannot give what it is started for. InputError: ``skip=auto``, or a frozen
-    encoder without weights."""
+    """Check that a run can train. InputError: ``skip=auto``, or a frozen encoder without weights."""
     one_preset = not lookup(config, "skip.choices")
     require(one_preset, "skip", "the preset to train with, or one and token_budgets=[...]", "auto")
     _require_weights(config)
 
 
 def _require_weights(config: Mapping[str, Any]) -> None:
-    """A part of an encoder that does not learn must have learned before."""
     trainable = lookup(config, "encoder.trainable")
     starts = config.get("init_from") is not None or config.get("resume") is not None
     if starts or config.get("allow_random_encoder"):
@@ -176,8 +174,8 @@ def _require_weights(config: Mapping[str, Any]) -> None:
 
 
 def check_directory(directory: Path, config: Mapping[str, Any]) -> None:
-    """Refuse to train where an earlier run would be lost; with ``overwrite`` remove it. InputError: there is
-    a run, and this one does not go on from it."""
+    """Check that no earlier run would be lost; with ``overwrite`` delete it. InputError: there is a run that
+    this one does not resume."""
     kept = [*(directory / "checkpoints").glob("*.ckpt"), directory / "csv" / "metrics.csv"]
     earlier = next((path for path in [*kept, directory / "metrics.json"] if path.exists()), None)
     resume = config.get("resume")

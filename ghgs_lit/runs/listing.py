@@ -1,4 +1,4 @@
-"""All runs below folders: what they were started with, how far they are, and their best figure."""
+"""List of the runs below folders: their overrides, state and best result."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,8 +11,7 @@ from ghgs_lit.runs.run import RunDirectory, State
 
 
 def files_below(folders: Sequence[Path], name: str) -> list[Path]:
-    """The files of a name below folders, sorted in each; without those of Hydra. FileNotFoundError: a folder
-    is missing."""
+    """Files called ``name`` below folders, except in ``.hydra``. FileNotFoundError: a folder is missing."""
     for folder in folders:
         if not folder.is_dir():
             raise FileNotFoundError(f"{folder}: expected a directory of runs; found none")
@@ -21,12 +20,9 @@ def files_below(folders: Sequence[Path], name: str) -> list[Path]:
 
 
 def list_runs(folders: Sequence[Path]) -> pd.DataFrame:
-    """A line for each training and each evaluation: ``run``, ``state``, ``best`` and ``overrides``.
-
-    ``best`` is the highest mean PSNR of a method, number of views and kind of targets; of a run without
-    results, of a validation so far. FileNotFoundError: a folder is missing. InputError: there is no run below
-    the folders.
-    """
+    """A line for each training and each evaluation: ``run``, ``state``, ``best`` and ``overrides``. ``best``:
+    highest mean PSNR over methods, numbers of views and target protocols, or over validations of a run
+    without results. FileNotFoundError: a folder is missing. InputError: there is no run below them."""
     runs = []
     for path in files_below(folders, "config.yaml"):
         run, file = RunDirectory(path.parent), path.parent / ".hydra" / "overrides.yaml"
@@ -40,7 +36,6 @@ def list_runs(folders: Sequence[Path]) -> pd.DataFrame:
 
 
 def _trains(path: Path) -> bool:
-    """Whether a ``config.yaml`` is that of a training, which may not have begun."""
     try:
         return "trainer" in read_yaml(path)
     except (InputError, TypeError):

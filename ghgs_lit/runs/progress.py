@@ -1,4 +1,4 @@
-"""How far a long task is: a bar on a terminal, a line a minute where there is none, as in a batch job."""
+"""Progress of long tasks: a bar on a terminal, else a line every minute."""
 
 import datetime
 import time
@@ -15,19 +15,19 @@ EVERY = 60.0  #: Seconds between two lines
 
 
 def on_terminal() -> bool:
-    """Whether somebody watches: a bar moves instead of lines."""
+    """Whether the output is a terminal."""
     return Console().is_terminal
 
 
 class Lines:
-    """Prints a line every so many seconds, unless not ``printed``, and appends it to the file ``log``."""
+    """Progress lines, printed if ``printed`` and appended to the file ``log``, if any."""
 
     def __init__(self, log: Path | None = None, printed: bool = True, every: float = EVERY) -> None:
         self.log, self.printed, self.every = log, printed, every
         self._next = time.monotonic()
 
     def due(self) -> bool:
-        """Whether it is time for a line; the first is due at once, and then one each ``every`` seconds."""
+        """Whether a line is due: at the first call, then after ``every`` seconds each."""
         now = time.monotonic()
         if now < self._next:
             return False
@@ -35,7 +35,7 @@ class Lines:
         return True
 
     def say(self, text: str) -> None:
-        """One line, with the time of the day."""
+        """Write one line with the time of day."""
         line = f"{datetime.datetime.now():%H:%M:%S} {text}"
         if self.printed:
             print(line, flush=True)
@@ -45,12 +45,12 @@ class Lines:
 
 
 def clock(seconds: float) -> str:
-    """``1:02:03``."""
+    """Seconds as ``1:02:03``."""
     return str(datetime.timedelta(seconds=round(seconds)))
 
 
 def track(items: Iterable[T], text: str, every: float = EVERY) -> Iterator[T]:
-    """``items``, with a bar or, each ``every`` seconds, with a line that says how many of them are done."""
+    """Yield ``items`` with a bar, or with a line every ``every`` seconds that counts those done."""
     if on_terminal():
         yield from bar(items, text, transient=True)
         return

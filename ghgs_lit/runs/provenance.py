@@ -1,4 +1,4 @@
-"""Where a number comes from: configuration, code, versions, machine."""
+"""Provenance of results: configuration, code, versions, machine."""
 
 import datetime
 import hashlib
@@ -16,15 +16,14 @@ PACKAGES = ("ghgs-lit", "torch", "lightning", "torchmetrics", "kornia", "numpy",
 
 
 def config_hash(config: Mapping[str, Any]) -> str:
-    """Twelve hexadecimal digits that identify a resolved configuration. The order of keys does not matter,
-    nor do keys without influence on a number (``WITHOUT_INFLUENCE``)."""
+    """Twelve hexadecimal digits of a configuration, without ``WITHOUT_INFLUENCE`` and the order of keys."""
     hashed = {key: value for key, value in flatten(config).items() if not is_below(key, WITHOUT_INFLUENCE)}
     text = json.dumps(hashed, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the installed packages that numbers depend on."""
+    """Versions of Python and of the installed packages that results depend on."""
     found = {"python": platform.python_version()}
     for name in PACKAGES:
         try:
@@ -35,7 +34,7 @@ def versions() -> dict[str, str]:
 
 
 def git_state() -> dict[str, Any] | None:
-    """Commit of the checkout that the package runs from, and whether files were changed; None elsewhere."""
+    """Commit of the checkout and whether tracked files were changed; None outside of a checkout."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None
@@ -54,7 +53,7 @@ def git_state() -> dict[str, Any] | None:
 
 
 def provenance(config: Mapping[str, Any], **facts: Any) -> dict[str, Any]:
-    """Everything above as plain data, with ``facts`` that the verb knows (seed, protocol, seconds, ...)."""
+    """Provenance as plain data, with ``facts`` of the verb (seed, protocol, seconds, ...)."""
     return {
         **facts,
         "config_hash": config_hash(config),

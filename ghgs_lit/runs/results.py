@@ -17,7 +17,7 @@ from ghgs_lit.readers import read_json
 from ghgs_lit.runs.provenance import config_hash
 
 FORMAT_VERSION = 3  #: The version that is written, and the only one that is read
-METHOD = "model"  #: The method of the rows of a trained model; others are baselines
+METHOD = "model"  #: Method of a trained model's rows; others are baselines
 KEYS = ("method", "subject", "views", "targets", "target", "inputs", "skip")
 """What a row describes; all other entries of a row are metrics."""
 
@@ -26,13 +26,13 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def mean(values: Iterable[float | None]) -> float | None:
-    """Mean of the defined values (neither None nor nan); None without any."""
+    """Mean of the values that are neither None nor nan; None without any."""
     known = [v for v in values if v is not None and not math.isnan(v)]
     return sum(known) / len(known) if known else None
 
 
 def metric_names(rows: Sequence[Row]) -> list[str]:
-    """Names of the numbers in the rows, in order of appearance."""
+    """Names of the metrics in the rows, in order of appearance."""
     return list(dict.fromkeys(name for row in rows for name in row if name not in KEYS))
 
 
@@ -46,7 +46,7 @@ def by_protocol(rows: Sequence[Row]) -> dict[tuple, dict[str, list[Row]]]:
 
 
 def summarize(rows: Sequence[Row]) -> list[Row]:
-    """Means over subjects for each method, number of views and kind of target. A subject's targets are
+    """Means over subjects for each method, number of views and target protocol. A subject's targets are
     averaged first, so that each subject counts once."""
     names = metric_names(rows)
     return [
@@ -60,7 +60,7 @@ def summarize(rows: Sequence[Row]) -> list[Row]:
 
 
 def plain(value: Any) -> Any:
-    """``value`` for JSON, in which infinite numbers and nan become null."""
+    """``value`` as plain data for JSON; infinite numbers and nan become None."""
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, Mapping):
@@ -71,10 +71,10 @@ def plain(value: Any) -> Any:
 
 
 def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str, Any]) -> Path:
-    """Write ``metrics.csv`` and then ``metrics.json``, whose presence marks the run as complete."""
+    """Write ``metrics.csv``, then ``metrics.json``, which marks the run as complete. InputError: no rows."""
     if not rows:
         raise InputError("evaluation: expected at least one subject and target; found none")
-    # Rows of several runs can be concatenated and still be distinguished.
+    # Columns that distinguish the rows of concatenated tables.
     origin = {
         "data": provenance.get("data", {}).get("name"),
         "split": provenance.get("data", {}).get("split"),
@@ -100,7 +100,7 @@ def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str,
 
 
 class _Mean(BaseModel):
-    """What others rely on in an entry of ``summary``: all that is not named is a number."""
+    """An entry of ``summary``; all further keys are metrics."""
 
     model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
     __pydantic_extra__: dict[str, float | None]
@@ -124,7 +124,7 @@ class _Results(BaseModel):
 
 
 def validated(model: type[Model], content: Any, where: str) -> Model:
-    """``content`` as a pydantic model; an InputError names ``where`` and the first key that is wrong."""
+    """``content`` as a pydantic model. InputError: names ``where`` and the first wrong key."""
     try:
         return model.model_validate(content)
     except ValidationError as error:
@@ -137,8 +137,8 @@ def validated(model: type[Model], content: Any, where: str) -> Model:
 
 
 def read_results(path: Path) -> dict[str, Any]:
-    """Read a ``metrics.json``. InputError: the file is not a whole ``metrics.json`` of today's format, or its
-    configuration is not the one that was measured; the message names it."""
+    """Read a ``metrics.json``. InputError: it is not complete or of another format version, or its
+    configuration does not fit its ``config_hash``."""
     content = read_json(path, "a metrics.json")
     found = content.get("format_version") if isinstance(content, dict) else type(content).__name__
     if found != FORMAT_VERSION:

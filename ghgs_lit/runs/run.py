@@ -1,8 +1,8 @@
-"""One run on disk: its state, the process that works on it, and when it was worked on.
+"""A run on disk: its state, the process that works on it, and its sessions.
 
-``metrics.json`` is written last: a run that has it is done. The process that works on the run locks
-``.lock``. ``sessions.jsonl`` gets one line when a process starts to work on the run and one when it ends; a
-killed process leaves only the first.
+A run is done when it has ``metrics.json``, which is written last. The process that works on it locks
+``.lock``. ``sessions.jsonl`` has a line for the start of each process and one for its end, which a killed
+process lacks.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ from ghgs_lit.runs.results import read_results
 
 
 class State(StrEnum):
-    """How far a run is."""
+    """State of a run."""
 
     DONE = "done"
     RUNNING = "running"
@@ -32,7 +32,7 @@ class State(StrEnum):
 
 
 class RunDirectory:
-    """The directory of one run, which need not exist yet."""
+    """Directory of a run; it need not exist."""
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path).resolve()
@@ -40,7 +40,7 @@ class RunDirectory:
 
     @property
     def results(self) -> dict[str, Any] | None:
-        """The content of ``metrics.json``; None if it is missing or not whole."""
+        """Content of ``metrics.json``; None if it is missing or unreadable."""
         path = self.path / "metrics.json"
         try:
             return read_results(path) if path.is_file() else None
@@ -59,7 +59,7 @@ class RunDirectory:
 
     @property
     def checkpoint(self) -> Path | None:
-        """The checkpoint that an interrupted run resumes from."""
+        """Checkpoint that an interrupted run resumes from."""
         path = self.path / "checkpoints" / "last.ckpt"
         return path if path.is_file() else None
 
@@ -76,15 +76,15 @@ class RunDirectory:
 
     @property
     def owner(self) -> str:
-        """The process that worked on the run last, for messages."""
+        """Process that worked on the run last, for messages."""
         return lock_owner(self._lock)
 
     def claim(self, wait: bool = False) -> contextlib.AbstractContextManager[bool]:
-        """Lock the run for this process; gives whether that succeeded (:func:`ghgs_lit.files.lock`)."""
+        """Lock the run for this process; yields whether that succeeded (:func:`ghgs_lit.files.lock`)."""
         return lock(self._lock, wait)
 
     def sessions(self) -> list[dict[str, Any]]:
-        """One entry for each process that worked on the run; a killed one has no ``outcome``."""
+        """An entry for each process that worked on the run; a killed one has no ``outcome``."""
         path = self.path / "sessions.jsonl"
         found: list[dict[str, Any]] = []
         for entry in read_lines_of_json(path) if path.exists() else ():
@@ -96,8 +96,8 @@ class RunDirectory:
 
     @contextlib.contextmanager
     def session(self, **facts: Any) -> Iterator[dict[str, Any]]:
-        """Log that this process works on the run, with ``facts``, and how it ends. Gives a dict for numbers
-        such as steps and seconds, which are logged at the end."""
+        """Log start and end of this process in ``sessions.jsonl``. Yields a dict for numbers such as steps
+        and seconds, which are logged at the end."""
         self._log({"started": _now(), "host": socket.gethostname(), "pid": os.getpid(), **facts})
         stats: dict[str, Any] = {}
         try:

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: who is asked to stop ends with exit code 130 or 143, and nothing follows."""
+"""Handling of Ctrl-C and SIGTERM, which end a process with exit code 130 or 143."""
 
 import contextlib
 import os
@@ -13,9 +13,9 @@ STOP = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupted(SystemExit):
-    """This process was asked to stop; the exit code is 128 and the signal's number. A ``SystemExit``, because
-    Hydra takes any ``Exception`` for one failed job and starts the next one. ``number``: of the signal.
-    ``explained``: whether a line that says how to go on is printed already."""
+    """This process was asked to stop by signal ``number``; the exit code is 128 + ``number``. A
+    ``SystemExit``, because Hydra takes any ``Exception`` for one failed job and starts the next one.
+    ``explained``: whether the line that says how to go on was printed."""
 
     def __init__(self, number: int) -> None:
         super().__init__(128 + number)
@@ -24,7 +24,7 @@ class Interrupted(SystemExit):
 
 
 class _Handler:
-    """Calls ``act(number)`` in the process that made it, and not in workers that are forked later."""
+    """Signal handler that calls ``act(number)`` only in the process that made it, not in forked workers."""
 
     def __init__(self, act: Callable[[int], Any]) -> None:
         self.act, self.process = act, os.getpid()
@@ -32,26 +32,25 @@ class _Handler:
     def __call__(self, number: int, frame: FrameType | None) -> None:
         if os.getpid() == self.process:
             self.act(number)
-        elif number == signal.SIGTERM:  # that is how a parent ends its workers
+        elif number == signal.SIGTERM:  # sent by a parent to end its workers
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
 
 
 def interrupt(number: int) -> None:
-    """Stop here."""
+    """Raise :class:`Interrupted`."""
     raise Interrupted(number)
 
 
 def handlers() -> dict[int, Any]:
-    """The present handlers of both signals; those that Python cannot know are left out, and alone."""
+    """Present handlers of both signals, without those that were not set from Python."""
     found = {number: signal.getsignal(number) for number in STOP}
     return {number: handler for number, handler in found.items() if handler is not None}
 
 
 def handle(act: Callable[[int], Any], before: Mapping[int, Any]) -> None:
-    """Let ``act(number)`` handle the signals that nobody else handles. submitit and ``nohup`` have handlers
-    of their own, which stay: under submitit SIGTERM does not end a job. ``act``: called with the signal's
-    number. ``before``: the handlers to judge by, and to return to where they are somebody else's."""
+    """Let ``act(number)`` handle signals, except those that others handle by ``before``. Handlers of submitit
+    and ``nohup`` stay: under submitit SIGTERM does not end a job."""
     if threading.current_thread() is not threading.main_thread():
         return  # signals belong to the main thread
     for number, handler in before.items():
@@ -61,7 +60,7 @@ def handle(act: Callable[[int], Any], before: Mapping[int, Any]) -> None:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise :class:`Interrupted` on Ctrl-C and SIGTERM, where nobody else handles them."""
+    """Raise :class:`Interrupted` on Ctrl-C and SIGTERM unless others handle them."""
     before = handlers()
     handle(interrupt, before)
     try:
@@ -73,7 +72,7 @@ def interruptible() -> Iterator[None]:
 
 
 def print_how_to_go_on(stop: Interrupted, what: str, change: str) -> None:
-    """One line on stderr: what was stopped, and what to add to the same command to go on with it."""
+    """Print to stderr what was stopped, and how to change the command to go on with it."""
     stop.explained = True
     name = signal.Signals(stop.number).name
     print(f"ghgs: {what} was interrupted ({name}); to go on, the same command with {change}", file=sys.stderr)

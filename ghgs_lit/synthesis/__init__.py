@@ -1,1 +1,1 @@
-"""Making data: people, rigs of cameras, photographs, scans."""
+"""Synthesis of data: people, rigs of cameras, photographs, scans."""

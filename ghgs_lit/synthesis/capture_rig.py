@@ -1,8 +1,6 @@
-"""A user's own cameras as a rig: built-in people stand where they look, in crops as captures have them.
-
+"""A user's own cameras as a rig around built-in people, photographed in crops like those of captures.
 Positions are the cameras in the order of their azimuth about the subject. Views at a position are numbered as
-those of :mod:`ghgs_lit.synthesis.rig`; those between two cameras turn about the subject from one to the next.
-"""
+in :mod:`ghgs_lit.synthesis.rig`; those between two cameras turn about the subject from one to the next."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,11 +17,11 @@ from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.rig import STILL, Poses, Rig, Variation
 from ghgs_lit.types import Cameras
 
-#: How much of a crop's height or width the subject takes, as in crops of photographs.
+#: Share of a crop's height or width that the subject takes, as in crops of photographs.
 SHARE = 0.8
-# Subjects stand up to this share of their height beside the place that the cameras look at.
+# Largest distance of subjects from the point that the cameras look at, as a share of their height.
 _ASIDE = 0.1
-# Cosine between the optical axes of cameras that look in one direction.
+# Smallest cosine between the optical axes of cameras that look in one direction.
 _PARALLEL = 0.999
 
 Row3 = tuple[float, float, float]
@@ -47,10 +45,9 @@ class RigCamera(Options):
 
 @dataclass(frozen=True)
 class CaptureRig:
-    """Cameras around a subject whose size in their unit is not known. ``intrinsics``: [3, 3] of each camera.
-    ``extrinsics``: [4, 4] of each camera. ``heights``: of the photographs in pixels. ``fill``: [least,
-    greatest] share of its photograph's height that a subject takes in the camera that sees it tallest:
-    decides how far the cameras stand."""
+    """Cameras in an unknown unit. ``intrinsics``: [3, 3] of each. ``extrinsics``: [4, 4] of each.
+    ``heights``: of the photographs in pixels. ``fill``: [least, greatest] share of the photograph's height
+    that a subject takes in the camera that sees it tallest; decides how far the cameras stand."""
 
     intrinsics: tuple
     extrinsics: tuple
@@ -62,7 +59,7 @@ class CaptureRig:
     @classmethod
     def of(cls, cameras: Sequence[RigCamera], fill: tuple[float, float]) -> "CaptureRig":
         """The rig of two or more cameras. InputError: there are fewer, they look in one direction, or the
-        place that they look at is behind one of them."""
+        point that they look at is behind one of them."""
         require(len(cameras) > 1, "data.cameras", "two or more cameras", len(cameras))
         columns = ([getattr(c, n) for c in cameras] for n in ("intrinsics", "extrinsics", "height"))
         rig = cls(*map(tuple, columns), fill)
@@ -97,16 +94,13 @@ class CaptureRig:
 
     @cached_property
     def _distances(self) -> np.ndarray:
-        """Depths [n] of the middle in the cameras, in their unit."""
+        """Depths [n] of :attr:`_middle` in the cameras, in their unit."""
         return self._poses[:, 2, :3] @ self._middle + self._poses[:, 2, 3]
 
     @cached_property
     def _upright(self) -> np.ndarray:
-        """Rotation [3, 3] from the world to one whose y points up.
-
-        Cameras are held level: up is at right angles to their image rows. Where all rows are parallel, the
-        mean of what is up in the images decides.
-        """
+        """Rotation [3, 3] from the world to one whose y points up. Cameras are assumed level: up is
+        orthogonal to all image rows. If all rows are parallel, it is the mean up direction of the images."""
         rows, mean = self._poses[:, 0, :3], -self._poses[:, 1, :3].mean(0)
         _, strengths, axes = np.linalg.svd(rows)
         up = axes[2] * np.sign(axes[2] @ mean) if strengths[1] > 0.1 * strengths[0] else mean
@@ -117,7 +111,7 @@ class CaptureRig:
 
     @cached_property
     def _around(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rotations [n, 3, 3] and translations [n, 3] for a world with its origin in the middle, y up."""
+        """Rotations [n, 3, 3] and translations [n, 3] for a world with origin :attr:`_middle` and y up."""
         shifts = self._poses[:, :3, :3] @ self._middle + self._poses[:, :3, 3]
         return self._poses[:, :3, :3] @ self._upright.T, shifts
 
@@ -128,13 +122,13 @@ class CaptureRig:
         return np.arctan2(centers[:, 0], centers[:, 2])
 
     def yaws(self, rng: np.random.Generator) -> np.ndarray:
-        """Places [positions, 5] of all views of one subject: 1.5 is half-way from camera 1 to camera 2."""
+        """Places [positions, 5] of all views of a subject: 1.5 is half-way from camera 1 to camera 2."""
         first, second = rng.uniform(0, 0.5, (2, self.positions))
         offsets = np.stack((0 * first, 0 * first + 1, first, 0 * first + 0.5, 0.5 + second), -1)
         return np.arange(self.positions)[:, None] + offsets
 
     def place(self, person: Person, rng: np.random.Generator) -> Person:
-        """A person of its own height that faces anywhere, the feet on y = 0."""
+        """The person at its own height, turned by a random angle about y, the feet on y = 0."""
         angle = rng.uniform(0, 2 * np.pi)
         turn = Rotation.from_euler("y", angle).as_matrix()
         return Rig(height=None).place(person, rng).mapped(lambda vertices: vertices @ turn.T)
@@ -142,7 +136,7 @@ class CaptureRig:
     def drawn(
         self, person: Person, yaws: np.ndarray, aspect: float, rng: np.random.Generator
     ) -> tuple["PlacedRig", Poses]:
-        """The cameras around one subject; the second value is that of a rig without deviations."""
+        """The cameras around one subject; the deviations (second value) are 0."""
         vertices = np.concatenate([part.vertices for part in person.parts])
         low, high = vertices.min(0), vertices.max(0)
         tall = high[1] - low[1]
@@ -156,8 +150,8 @@ class CaptureRig:
 
 @dataclass(frozen=True)
 class PlacedRig:
-    """A rig around one subject. ``scale``: metres of their unit. ``middle``: the point [3] that the cameras
-    look at, in the subject's world. ``vertices``: [n, 3] of the subject."""
+    """A rig around one subject. ``scale``: metres per unit of the cameras. ``middle``: the point [3] that the
+    cameras look at, in the subject's world. ``vertices``: [n, 3] of the subject."""
 
     rig: CaptureRig
     scale: float
@@ -165,7 +159,7 @@ class PlacedRig:
     vertices: np.ndarray
 
     def cameras(self, yaws: np.ndarray, height: int, width: int, poses: Poses | None = None) -> Cameras:
-        """Cameras [k] of crops around the subject, float32; arguments as for :meth:`Rig.cameras`."""
+        """Cameras [k] of crops around the subject, float32. ``yaws``: of :meth:`CaptureRig.yaws`."""
         rotations, shifts = self._poses(np.asarray(yaws))
         shifts = self.scale * shifts - rotations @ self.middle
         first, then, share = _neighbours(np.asarray(yaws), self.rig.positions)
@@ -184,7 +178,7 @@ class PlacedRig:
         round_about = np.stack(
             (self.rig._azimuths, np.hypot(centers[:, 0], centers[:, 2]), centers[:, 1]), -1
         )
-        # How each camera is turned against one that looks at the middle.
+        # Rotation of each camera relative to one that looks at the middle.
         turns = Rotation.from_matrix(rotations @ _looking_inwards(centers).mT).as_rotvec()
         first, then, share = _neighbours(yaws, self.rig.positions)
         step = round_about[then] - round_about[first]
@@ -196,7 +190,7 @@ class PlacedRig:
         return rotation, -(rotation @ between[..., None])[..., 0]
 
     def _crop(self, matrix: np.ndarray, pose: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """The intrinsics of a crop of ``size`` (width, height) in whose middle the subject lies."""
+        """Intrinsics of a crop of ``size`` (width, height) with the subject in its middle."""
         points = self.vertices @ pose[:3, :3].T + pose[:3, 3]
         near = "cameras farther from the subject than it is wide (data.fill is less)"
         require(points[:, 2].min() > 1e-3, "data.cameras", near, f"a depth of {points[:, 2].min():.3g} m")
@@ -211,7 +205,7 @@ class PlacedRig:
 
 
 def _neighbours(yaws: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The cameras [k] before and after places, and the share [k] of the way between them."""
+    """Cameras [k] before and after each place, and the share [k] of the way between them."""
     first = np.floor(yaws).astype(int)
     return first % count, (first + 1) % count, yaws - first
 

@@ -1,4 +1,4 @@
-"""Data sets of rendered people as they are configured: generated people and scans."""
+"""Configurable data sets of rendered people: generated people and scans."""
 
 import functools
 import hashlib
@@ -38,13 +38,13 @@ from ghgs_lit.synthesis.progress import Progress
 from ghgs_lit.synthesis.rig import Fill, Rig, RigOptions
 from ghgs_lit.synthesis.scans import ScanSource
 
-# Training loses nothing to a process of this priority: it takes what its threads leave idle.
+# A process of this priority only takes time that training leaves idle.
 _NICE = 19
 _running: dict[Path, multiprocessing.process.BaseProcess] = {}
 
 
 class Joining(dict[str, tuple[int, ...]]):
-    """``subjects`` of a layout of training: each look finds those who became whole since the last."""
+    """``subjects`` of a training layout; iterating adds those that have become complete."""
 
     def __init__(self, layout: Layout, made: Completeness, names: Sequence[str]) -> None:
         super().__init__(layout.subjects)
@@ -62,7 +62,7 @@ class Joining(dict[str, tuple[int, ...]]):
 def render_beside(
     root: Path, names: Sequence[str], source: PersonSource, rig: object, settings: RenderOptions, seed: int
 ) -> None:
-    """Begin to render training people below ``root`` in a process that ends with this one; arguments as for
+    """Start to render training people below ``root`` in a process that ends with this one; arguments as of
     :func:`ghgs_lit.synthesis.jobs.render_people`."""
     if not Progress(root).complete.missing("train", names) or (
         root in _running and _running[root].is_alive()
@@ -82,16 +82,16 @@ def _render(*arguments: object) -> None:
         print(f"training goes on with the people rendered so far: {error}", file=sys.stderr, flush=True)
 
 
-# Of built-in people: one population, whose numbers tell its people apart.
+# Seed of built-in people: they are one population, numbered.
 _PEOPLE_SEED = 0
-# Of heights, yaws, lights and of the split by fraction of scans.
+# Seed of heights, yaws, lights and of the split by fraction of scans.
 _SEED = 0
-# People in a rig that training begins with.
+# People in a rig that are rendered before training begins.
 _FIRST_TRAIN = 8
 
 
 class _Renderable(Rendered):
-    """A data set that this package can render."""
+    """A data set that this package renders."""
 
     render: RenderOptions = RenderOptions()
     """What is rendered of each person."""
@@ -105,12 +105,12 @@ class _Renderable(Rendered):
     def render_into(
         self, root: Path, names: Mapping[str, Sequence[str]], source: PersonSource, seed: int
     ) -> int:
-        """Render the people of each phase that ``root`` lacks; returns their number."""
+        """Render the people of each phase that are missing in ``root``; returns their number."""
         return render_people(root, names, source, self.camera_rig(), self.render, seed, self.render_workers)
 
 
 class _OnRing(_Renderable):
-    """Its cameras are the ring of the rig."""
+    """A data set whose cameras are a ring."""
 
     ring: ClassVar[int] = Rig.positions
 
@@ -121,7 +121,7 @@ class _OnRing(_Renderable):
         return self.rig.build()
 
 
-#: Index of the first validation person: training people never reach it.
+#: Index of the first validation person, above those of all training people.
 FIRST_VAL = 1_000_000
 
 
@@ -164,14 +164,14 @@ class _Generated(_Renderable):
 
     @property
     def root(self) -> str:
-        """The cache's folder, which is named after everything that the photographs depend on."""
+        """The cache's folder, named after everything that the photographs depend on."""
         made_with = identity(self.camera_rig(), self.render, _PEOPLE_SEED, self.source_of_people.instants)
         made_with["people"] = people_version()
         key = hashlib.sha256(json.dumps(made_with, sort_keys=True).encode()).hexdigest()[:16]
         cache = self.cache_dir or os.environ.get("GHGS_CACHE") or "~/.cache/ghgs_lit"
         try:
             return str(Path(cache).expanduser() / f"synthetic-{key}")
-        except RuntimeError:  # of users of a container whom it does not know
+        except RuntimeError:  # a user that the container does not know
             expected = "a folder, or one in GHGS_CACHE, where there is no home directory"
             raise InputError(f"data.cache_dir: expected {expected}; found {cache}") from None
 
@@ -194,8 +194,8 @@ class _Generated(_Renderable):
         return [f"{kind}{first + i:07d}" for kind, count in numbers for i in range(count)]
 
     def prepare(self, splits: Sequence[str] = PHASES) -> None:
-        """Render the people of ``splits`` that the cache lacks. InputError: frozen people are not those
-        of their definition (:mod:`.bench`)."""
+        """Render the people of ``splits`` that are missing in the cache. InputError: frozen people differ
+        from their definition (:mod:`.bench`)."""
         frozen = [split for split in splits if split in bench.SPLITS]
         for split in frozen:
             made_with = everything(self.camera_rig(), self.render)
@@ -239,11 +239,8 @@ class Synthetic(_Generated, _OnRing):
 
 
 class PeopleInRig(_Generated):
-    """Generated people in the rig of a capture, as crops around them: what ``ghgs adapt`` trains on.
-
-    Training waits for the first of its people only (for all where ``render_workers`` is 0): the others are
-    rendered beside it.
-    """
+    """Generated people in the rig of a capture, as crops around them: what ``ghgs adapt`` trains on. Training
+    waits for the first people only (for all with ``render_workers=0``); the others are rendered meanwhile."""
 
     name: Text = "people_in_rig"
     cameras: Annotated[dict, Words("a mapping of cameras")] = Field({})
@@ -257,11 +254,11 @@ class PeopleInRig(_Generated):
         return len(self.cameras)
 
     def subject_names(self, phase: str) -> list[str]:
-        """Both kinds of people in turn, so that the first ones are of both."""
+        """Names sorted by number, so that the first ones are of both kinds."""
         return sorted(super().subject_names(phase), key=lambda name: name[1:])
 
     def render_first(self, names: Mapping[str, Sequence[str]]) -> None:
-        """Render these people, of training the first; begin to render the others."""
+        """Render these people, but of training only the first; start to render the others."""
         if self.render_workers == 0:
             return super().render_first(names)
         trained, root, source = list(names.get("train", [])), Path(self.root), SyntheticSource(_PEOPLE_SEED)
@@ -282,7 +279,7 @@ class PeopleInRig(_Generated):
 
 
 class Scans(DataSet, _OnRing):
-    """Scans in the rendered layout at ``root``; :meth:`render_missing` renders them from ``source``."""
+    """Scans rendered to ``root``; :meth:`render_missing` renders them from ``source``."""
 
     name: Text = "scans"
     size: Size = (140, 140)
@@ -311,7 +308,7 @@ class Scans(DataSet, _OnRing):
         return required_folder("data.source", "a folder of scans", self.source)
 
     def scans(self) -> PersonSource:
-        """Where the scans come from."""
+        """The source of the scans."""
         return ScanSource(self.source_folder)
 
     def render_missing(self) -> int:
@@ -324,7 +321,7 @@ class Scans(DataSet, _OnRing):
 
 @functools.cache
 def people_version() -> str:
-    """A hash of the code and assets that make people: another generator needs another cache."""
+    """A hash of the code and assets that generate people, for the names of caches."""
     digest = hashlib.sha256()
     folder = Path(people.__file__).parent
     for path in sorted(folder.rglob("*")):

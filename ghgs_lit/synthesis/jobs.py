@@ -1,9 +1,7 @@
-"""Renders many people into the layout: in several processes, resumable, the same files for the same seed.
-
-Workers are spawned (a fork of a process that runs threads may hang): each imports the script that called
-:func:`render_people`, which therefore needs ``if __name__ == "__main__":``. Workers write into workspaces
-only; the process that holds the lock moves finished subjects to their place.
-"""
+"""Rendering of many people in several processes: resumable, with the same files for the same seed. Workers
+are spawned (a fork of a process that runs threads may hang): each imports the script that called
+:func:`render_people`, which therefore needs ``if __name__ == "__main__":``. Workers write to workspaces; the
+process that holds the lock moves finished subjects to their place."""
 
 import contextlib
 import multiprocessing
@@ -40,21 +38,21 @@ from ghgs_lit.synthesis.progress import Progress
 from ghgs_lit.synthesis.rig import STILL, Poses, Rig
 
 _GUARD = 'if __name__ == "__main__":'
-# Part of every cache key: increase it when photographs of the same settings would change.
+# Part of every cache key: to be increased when photographs of the same settings change.
 RENDER_VERSION = 2
-# Vertices of a person in motion that are noted at each instant.
+# Vertices of a person in motion that are stored at each instant.
 _FOLLOWED = 4000
-#: Of all people.
+#: Lights of all people.
 LIGHTS = Lights()
 
 
 class PersonSource(Protocol):
-    """Where people come from; must survive pickling."""
+    """A source of people; it can be pickled."""
 
     def load(self, name: str) -> Person: ...
 
     def facing(self, name: str) -> float:
-        """Degrees about y that the first camera is turned by, to look at the front."""
+        """Degrees by which the first camera is turned about y to face the person."""
 
 
 #: First letter of the names of generated people in poses of sport and dance.
@@ -63,8 +61,8 @@ ACTIVE = "a"
 
 @dataclass(frozen=True)
 class SyntheticSource:
-    """Generated people, named ``p<index>``, and those in poses of sport and dance, ``a<index>``; all
-    ``instants`` of one in motion (0: none) are one person."""
+    """Generated people, named ``p<index>``, and those in poses of sport and dance, ``a<index>``. With
+    ``instants`` above 0 they move, and a :class:`Person` has all instants."""
 
     seed: int
     instants: int = 0
@@ -114,17 +112,17 @@ class _Job:
 
 
 def everything(rig: Rig, settings: RenderOptions) -> dict:
-    """All that photographs of a given person depend on beside the seed, as plain data."""
+    """All settings besides the seed that photographs of a person depend on, as plain data."""
     cameras = {**asdict(rig), "variation": rig.variation.model_dump()}
     return {"rig": cameras, "render": {**settings.model_dump(), "lights": asdict(LIGHTS)}}
 
 
 def identity(rig: Rig, settings: RenderOptions, seed: int, instants: int = 0) -> dict:
-    """The same with seed and instants, as it names caches and is noted in data sets."""
+    """:func:`everything` with seed and instants, in the form of cache keys and stored settings."""
     cameras, render = everything(rig, settings).values()
     render["vids"] = render.pop("views")  # the name in stored data sets and in the keys of caches
     still = STILL.model_dump()
-    # The name of a cache does not depend on what does not vary.
+    # Names of caches do not depend on variations that are off.
     varied = {name: value for name, value in cameras.pop("variation").items() if value != still[name]}
     if varied:
         cameras["variation"] = varied
@@ -133,12 +131,12 @@ def identity(rig: Rig, settings: RenderOptions, seed: int, instants: int = 0) ->
 
 
 def render_subject(job: _Job) -> _Job:
-    """Render one subject into its workspace."""
+    """Render one person into its workspace."""
     rng = subject_rng(job.seed, job.name)
     person = job.rig.place(job.source.load(job.name), rng)
     yaws, lights = job.rig.yaws(rng) + job.source.facing(job.name), LIGHTS.draw(rng)
     height, width = job.settings.size
-    # Random numbers of their own: heights, yaws and lights do not depend on what is varied.
+    # A separate generator: heights, yaws and lights do not depend on what is varied.
     rig, poses = job.rig.drawn(person, yaws, width / height, rng.spawn(1)[0])
     count = len(job.subjects)
     for i, name in enumerate(job.subjects):
@@ -156,7 +154,7 @@ def render_subject(job: _Job) -> _Job:
 
 def _photograph(job: _Job, name: str, studio: Studio, rig: Rig, yaws: np.ndarray, poses: Poses) -> None:
     numbers, (height, width) = job.settings.views, job.settings.size
-    # Losses of compression would count as flicker.
+    # Errors of compression would be measured as flicker.
     quality = None if job.instants else job.settings.quality
     positions = range(job.rig.positions) if job.settings.positions is None else job.settings.positions
     for position in positions:
@@ -185,14 +183,12 @@ def render_people(
     workers: int | None = None,
     shown: bool = True,
 ) -> int:
-    """Render people below ``root``; those that are already there are kept. Returns: how many were rendered
-    now.
+    """Render people below ``root``; existing ones are kept. Returns the number of people rendered now.
 
     It is safe to kill, to repeat, and to start twice at once: a second process waits for the first.
-    ``names``: of the subjects of each phase: of people, or of their instants if they are in motion.
-    ``workers``: number of processes (None: one for each core; 0: this one). InputError: ``root`` holds
-    something else, a person is bad, or the script has no main guard.
-    """
+    ``names``: subjects of each phase: people, or their instants if they move. ``workers``: number of
+    processes (None: one for each core; 0: only this one). InputError: ``root`` holds something else, a person
+    is bad, or the script has no main guard."""
     _check_main_guard()
     positions = settings.positions
     fits = positions is None or set(positions) <= set(range(rig.positions))
@@ -204,13 +200,13 @@ def render_people(
     if not any(missing(phase, listed) for phase, listed in names.items()):
         return 0
     with progress.lock(), naming(progress.root):
-        progress.check_settings(made_with)  # another process may have been faster
+        progress.check_settings(made_with)  # another process may have written others meanwhile
         progress.clear_workspaces()
         progress.plan(names)
         todo = [
             _Job(source, rig, settings, seed, phase, name, progress.workspace(phase, name), instants)
             for phase, listed in names.items()
-            # Without the instant's _t000.
+            # The name of the person is the instant's without _t000.
             for name in dict.fromkeys(name[:-5] if instants else name for name in missing(phase, listed))
         ]
         with _bar(shown) as bar:
@@ -231,7 +227,7 @@ def _run(jobs: list[_Job], workers: int | None) -> Iterator[_Job]:
         yield from map(render_subject, jobs)
         return
     if multiprocessing.get_start_method() not in multiprocessing.get_all_start_methods():
-        # A worker of joblib: its start method is inherited by name, and a fresh process does not know it.
+        # A worker of joblib inherits the name of a start method that a fresh process does not know.
         multiprocessing.set_start_method("spawn", force=True)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, context, initializer=start_worker) as pool:
@@ -248,7 +244,7 @@ def _run(jobs: list[_Job], workers: int | None) -> Iterator[_Job]:
 
 
 def _check_main_guard() -> None:
-    """End a worker that runs the calling script again: it would wait for its parent, and that for it."""
+    """Refuse to run in a worker that imports the calling script, which would wait for its parent forever."""
     # Set by multiprocessing while a spawned process imports the main module of its parent.
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         raise InputError(
@@ -258,14 +254,14 @@ def _check_main_guard() -> None:
 
 
 def start_worker() -> None:
-    """One thread for each process; Ctrl-C is left to the parent; a worker ends with its parent."""
+    """Prepare a worker: one thread, Ctrl-C only in the parent, and an end with the parent."""
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """Nothing else ends a worker whose parent is killed (``kill``, ``kill -9``, the batch system)."""
+    """End this worker when its parent is killed (``kill``, ``kill -9``, the batch system)."""
     multiprocessing.parent_process().join()
     os._exit(1)
 
@@ -276,12 +272,9 @@ def _bar(shown: bool) -> Bar:
 
 
 def write_view(phase: Path, folder: str, number: int, view: View, quality: int | None = 98) -> None:
-    """Write one view; the JPEG keeps the full resolution of colours.
-
-    The mask has three equal channels: the authors' loader takes channel 0 of an image that has several.
-    ``folder``: name of the subject's position, ``<id>_<position>``. ``quality``: of the JPEG, 1 to 100; None:
-    a PNG, without loss.
-    """
+    """Write one view; the JPEG keeps the full resolution of colours. The mask has three equal channels, as
+    the authors' loader reads channel 0. ``folder``: name of the subject's position, ``<id>_<position>``.
+    ``quality``: of the JPEG, 1 to 100; None: a PNG."""
     folders = {kind: phase / kind / folder for kind in ("img", "mask", "alpha", "depth", "parm")}
     for path in folders.values():
         path.mkdir(parents=True, exist_ok=True)
@@ -298,7 +291,7 @@ def write_view(phase: Path, folder: str, number: int, view: View, quality: int |
 
 
 def write_body(phase: Path, name: str, vertices: np.ndarray, kind: str = "smpl") -> None:
-    """Write the vertices [n, 3] of a subject's body, or of another ``kind``: ``surface``."""
+    """Write the vertices [n, 3] of a subject's body, or of its surface with ``kind="surface"``."""
     folder = phase / kind / name
     folder.mkdir(parents=True, exist_ok=True)
     np.save(folder / "vertices.npy", vertices.astype(np.float32))

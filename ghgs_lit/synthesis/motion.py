@@ -1,8 +1,6 @@
-"""Built-in people in motion: from one pose to another and back, at instants of 1/30 s.
-
-A person in motion is the still one of the same number, in its pose at the first instant. Only vertices move:
-faces, texture coordinates and textures (with the shadows of the first instant) are those of all instants.
-"""
+"""Built-in people in motion: from one pose to another and back, at instants of 1/30 s. At the first instant a
+person in motion equals the still one of the same number. Only vertices move: faces, texture coordinates and
+textures (with the shadows of the first instant) are the same at all instants."""
 
 from dataclasses import dataclass, replace
 
@@ -15,20 +13,20 @@ from ghgs_lit.synthesis.people.garments import Figure
 from ghgs_lit.synthesis.people.generate import MAX_POSES, Character, arm_depth, pose_figure
 from ghgs_lit.synthesis.people.mesh import Person
 
-#: Part of the keys of caches: increase it when people of the same number would move differently.
+#: Part of the keys of caches: to be increased when people of the same number move differently.
 VERSION = 1
-#: Instants from one pose to the other: a second.
+#: Instants from one pose to the other: one second.
 PASSAGE = 30
 
 
 def instant_names(person: str, instants: int) -> tuple[str, ...]:
-    """The subjects that a person is in the data: one an instant; 0 instants: one of the person's name."""
+    """Names of a person's subjects, one for each instant; with 0 instants the person's name."""
     return tuple(f"{person}_t{i:03d}" for i in range(instants)) or (person,)
 
 
 def shares(instants: int) -> np.ndarray:
-    """How far [instants] a person is from the first pose (0) to the second (1): evenly but at the poses."""
-    even = 0.95  # at 1 a person would turn back at once
+    """Positions [instants] between the two poses (0 and 1), at an even speed except near them."""
+    even = 0.95  # at 1 a person would turn back abruptly
     return 0.5 - np.arcsin(even * np.cos(np.pi * np.arange(instants) / PASSAGE)) / (2 * np.arcsin(even))
 
 
@@ -41,8 +39,8 @@ class Motion:
     second: Figure
 
     def at(self, share: float) -> Figure:
-        """The figure at a share of the way. Each bone turns about one axis of its parent's; the foot that is
-        lower in both poses stays where it is, and the lower foot of each instant on the ground."""
+        """The figure at a share of the way. Each bone turns about a fixed axis of its parent; the foot that
+        is lower in both poses stays in its place, the lowest vertex on the ground."""
         body, first = self.body, self.first
         start, end = (self._local(figure.transforms[:, :, :3]) for figure in (first, self.second))
         rotations = (start * Rotation.from_rotvec(share * (start.inv() * end).as_rotvec())).as_matrix()
@@ -58,7 +56,7 @@ class Motion:
         return replace(first, transforms=transforms, posed=posed + shift)
 
     def _local(self, rotations: np.ndarray) -> Rotation:
-        """Rotations [b] relative to those of the parents, of world-axis ones [b, 3, 3]."""
+        """Rotations [b] relative to the parents, from rotations [b, 3, 3] relative to the world."""
         parents = self.body.bone_parents
         above = np.where(parents[:, None, None] >= 0, rotations[parents], np.eye(3))
         return Rotation.from_matrix(above.transpose(0, 2, 1) @ rotations)
@@ -70,11 +68,11 @@ class Motion:
 
 
 def generate_moving(seed: int, index: int, instants: int, active: bool = False) -> Person:
-    """Person ``index`` of the family ``seed`` at all instants: parts and bodies one instant after another.
-    Arguments and frame as for :func:`.people.generate`; the frame is that of the first instant."""
+    """Person ``index`` of the family ``seed`` at all instants: parts and bodies of one instant after another.
+    Arguments as of :func:`.people.generate`; the frame is that of the first instant."""
     person = Character(seed, index, active)
     first = person.first
-    for _ in range(MAX_POSES):  # until the arms are clear of the trunk on the way
+    for _ in range(MAX_POSES):  # until the arms do not cut the trunk on the way
         second = pose_figure(person.body, person.coefficients, person.motion_rng, active)
         motion = Motion(person.body, first, second)
         if max(arm_depth(motion.at(share).posed, first.faces) for share in (0.25, 0.5, 0.75)) < 0.012:

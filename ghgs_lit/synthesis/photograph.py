@@ -1,15 +1,13 @@
 """Photographs of textured meshes: image, matte, mask and metric depth from pinhole cameras.
 
-Embree casts ``samples`` x ``samples`` rays on a regular grid through each pixel of the window in which the
-subject lies. Conventions: see :mod:`ghgs_lit.types`.
+Embree casts ``samples`` x ``samples`` rays on a regular grid through each pixel of the subject's window.
 
 * image: the mean colour of the samples; samples that miss are black, so silhouettes are antialiased and
   premultiplied by their coverage (like an alpha-blended splat on black);
 * matte: the share of a pixel's samples that hit the subject;
-* mask: at least half of them do;
+* mask: true where the matte is at least 0.5;
 * depth: z of the hit nearest to the pixel's centre (at the centre itself when ``samples`` is odd), 0 where
-  there is none. Samples are never averaged, so that no depth lies between two surfaces.
-"""
+  there is none. It is no mean of samples, so that no depth lies between two surfaces."""
 
 from dataclasses import dataclass
 
@@ -23,28 +21,27 @@ from ghgs_lit.synthesis.people.mesh import Person, sample_texture
 from ghgs_lit.synthesis.people.meshing import smooth_normals
 from ghgs_lit.types import Cameras
 
-# Rays traced at once: as many as fit the processor's cache, three times as fast as a whole photograph.
+# Rays traced at once: they fit the processor's cache, which is three times as fast as a whole photograph.
 _CHUNK = 1 << 14
-# Cut-away layers (strands of hair) that a ray may pass; after more it counts as a miss.
+# Transparent layers (strands of hair) that a ray may pass; after more it counts as a miss.
 _MAX_LAYERS = 64
-# Where a ray continues behind a cut-away hit, metres: more than float32 error, less than any real gap.
+# Step of a ray behind a transparent hit, in metres: more than float32 error, less than any real gap.
 _STEP = 2e-5
 
 
 @dataclass(frozen=True)
 class Lights:
-    """White lights around a person; the same for every camera, so that views agree.
+    """White lights around a person, the same for every camera, so that views agree.
 
     Shading is Lambertian with soft terminators, ``ambient + sum_l w_l max((n.l + s) / (1 + s), 0)``, and
     multiplies texture values as stored.
 
     Attributes:
-        ambient: share of the light that comes from everywhere, 0 to 1.
+        ambient: share of ambient light, 0 to 1.
         softness: s of the formula, 0 (Lambertian) to 1.
-        exposure: mean brightness over all directions of the normal, about.
+        exposure: approximate mean brightness over all directions of the normal.
         elevation: largest elevation of a light in degrees.
-        jitter: how much the strengths of the lights differ, 0 to below 1.
-    """
+        jitter: relative variation of the strengths of the lights, 0 to below 1."""
 
     count: int = 6
     ambient: float = 0.5
@@ -70,7 +67,7 @@ class Lights:
 @dataclass(frozen=True)
 class LightRig:
     """The lights of one person. ``directions``: [l, 3] unit vectors towards the lights. ``strengths``: [l].
-    ``ambient``: brightness without any light."""
+    ``ambient``: brightness without them."""
 
     directions: np.ndarray
     strengths: np.ndarray
@@ -100,19 +97,17 @@ class Photographs:
 
 
 class Studio:
-    """A person under fixed lights, photographed from any number of cameras.
-
-    Surfaces are double-sided: normals are flipped towards the camera. Rays pass through a surface where the
-    alpha of its texture is below the part's ``alpha_cutoff``. ``samples``: ``samples`` x ``samples`` rays per
-    pixel, 1 to 16. InputError: no faces, values that are not finite, or a texture that is not uint8.
-    """
+    """A person under fixed lights, photographed from any number of cameras. Surfaces are double-sided:
+    normals are flipped towards the camera. Rays pass through a surface where the alpha of its texture is
+    below the part's ``alpha_cutoff``. ``samples``: 1 to 16. InputError: no faces, values that are not finite,
+    or a texture that is not uint8."""
 
     def __init__(self, person: Person, lights: LightRig, samples: int = 3) -> None:
         require(1 <= samples <= 16, "samples", "between 1 and 16", samples)
         parts = [part for part in person.parts if len(part.faces)]
         if not parts:
             raise InputError(f"{person.name}: expected a mesh with faces; found none")
-        for part in parts:  # what TexturedMesh does not check and Embree would render wrongly
+        for part in parts:  # TexturedMesh does not check this, and Embree would render it wrongly
             if part.texture.dtype != np.uint8:
                 raise InputError(f"{person.name}: expected a texture of uint8; found {part.texture.dtype}")
             if not np.isfinite(part.vertices).all() or not np.isfinite(part.uv).all():
@@ -137,8 +132,7 @@ class Studio:
         TriangleMesh(self._scene, self._vertices, self._faces)
 
     def shoot(self, cameras: Cameras) -> Photographs:
-        """Take a photograph with each of ``cameras`` (one leading dimension). InputError: a camera is not
-        finite or has no focal length."""
+        """Photographs from ``cameras`` [n]. InputError: a camera is not finite or has a focal length <= 0."""
         intrinsics = cameras.intrinsics.double().numpy()
         extrinsics = cameras.extrinsics.double().numpy()
         size = (len(intrinsics), cameras.height, cameras.width)
@@ -161,7 +155,7 @@ class Studio:
     ) -> tuple[int, int, int, int]:
         """The window (top, bottom, left, right) in pixels that all vertices project into."""
         points = self._vertices @ pose[:3, :3].T + pose[:3, 3]
-        if points[:, 2].min() <= 1e-3:  # partly behind the camera: its projection has no bounds
+        if points[:, 2].min() <= 1e-3:  # partly behind the camera: the projection has no bounds
             return 0, height, 0, width
         pixels = points @ matrix.T
         low = np.floor((pixels[:, :2] / pixels[:, 2:]).min(0)).astype(int)
@@ -179,7 +173,7 @@ class Studio:
         u = columns.start + (np.arange(w * n) + 0.5) / n - matrix[0, 2]
         x = (u - matrix[0, 1] * y[:, None]) / matrix[0, 0]
         rays = np.stack((x, np.broadcast_to(y[:, None], x.shape), np.ones_like(x)), -1)
-        # [h, n, w, n] -> one row of n * n samples per pixel. Rays have z = 1: their length is the depth.
+        # [h, n, w, n] -> one row of n * n samples per pixel. Rays have z = 1, so distances are depths.
         rays = rays.reshape(h, n, w, n, 3).transpose(0, 2, 1, 3, 4).reshape(-1, 3)
         directions = (rays @ pose[:3, :3]).astype(np.float32)
         origin = (-pose[:3, :3].T @ pose[:3, 3]).astype(np.float32)
@@ -199,7 +193,7 @@ class Studio:
         return np.clip(image, 0, 1), alpha, np.where(alpha > 0, center, 0)
 
     def _trace(self, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Distance [n], face [n] (-1: none) and barycentric weights [n, 3] of the first hit not cut away."""
+        """Distance [n], face [n] (-1: none) and barycentric weights [n, 3] of the first opaque hit."""
         distance = np.zeros(len(directions), np.float32)
         face = np.full(len(directions), -1, np.int64)
         weights = np.zeros((len(directions), 3), np.float32)
@@ -244,7 +238,7 @@ class Studio:
         smooth = trimesh.unitize(np.einsum("nk,nkc->nc", weights, self._normals[self._faces[face]]))
         cancelled = np.square(smooth).sum(-1, keepdims=True) < 0.5
         normals = np.where(cancelled, flat, smooth)
-        # The side of the face that is seen decides, so that smooth normals flip together with flat ones.
+        # The flat normal decides, so that all smooth normals of a face flip together.
         behind = np.einsum("nc,nc->n", flat, directions) > 0
         normals = np.where(behind[:, None], -normals, normals)
         return colors * self.lights.shade(normals)[:, None]

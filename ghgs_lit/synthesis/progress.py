@@ -1,8 +1,6 @@
-"""Bookkeeping of rendering, so that a killed run can resume; :mod:`ghgs_lit.data.layout` reads it.
-
-Beside what is described there, ``<root>/rendering/`` holds ``settings.json`` (what the files were made
-with), ``lock`` and ``tmp/`` (workspaces: what is being written).
-"""
+"""Progress of rendering on disk, so that a killed run can resume; :mod:`ghgs_lit.data.layout` reads it.
+Besides the files described there, ``<root>/rendering/`` has ``settings.json`` (the settings of the files),
+``lock`` and ``tmp/`` (workspaces)."""
 
 import contextlib
 import json
@@ -24,14 +22,14 @@ _KINDS = ("mask", "alpha", "depth", "parm", "img", "smpl", "surface")
 
 
 class Progress:
-    """The state of the data set at ``root`` while it is rendered."""
+    """The progress of rendering the data set at ``root``."""
 
     def __init__(self, root: Path) -> None:
         self.root, self.complete = root, Completeness(root)
         self.folder = self.complete.folder
 
     def check_settings(self, settings: dict) -> None:
-        """Note ``settings`` in an empty data set; refuse a data set that was made with other settings."""
+        """Store ``settings`` in an empty data set; refuse a data set with other settings or foreign files."""
         path = self.folder / "settings.json"
         foreign = self.root.is_dir() and any(p != self.folder for p in self.root.iterdir())
         if not path.exists():
@@ -50,7 +48,7 @@ class Progress:
                 )
 
     def plan(self, names: Mapping[str, Sequence[str]]) -> None:
-        """Note that these subjects were requested; only under the lock."""
+        """Store that these subjects were requested; call under the lock."""
         known = self.complete.plan
         phases = known.keys() | names.keys()
         plan = {p: sorted({*known.get(p, []), *names.get(p, [])}) for p in phases}
@@ -58,7 +56,7 @@ class Progress:
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Let one process at a time write; the system frees the lock when a process dies."""
+        """Hold the lock for writing; the system frees it when a process dies."""
         path = self.folder / "lock"
         if is_locked(path):
             log.info("waiting for %s, which renders into %s", lock_owner(path), self.root)
@@ -67,14 +65,14 @@ class Progress:
             yield
 
     def workspace(self, phase: str, name: str) -> Path:
-        """An empty folder to write a subject into."""
+        """A new, empty folder for the files of a subject."""
         path = self.folder / "tmp" / f"{phase}-{name}"
         shutil.rmtree(path, ignore_errors=True)
         path.mkdir(parents=True)
         return path
 
     def publish(self, workspace: Path, phase: str, names: Sequence[str]) -> None:
-        """Move the complete subjects of a workspace to their place, then mark them."""
+        """Move the subjects of a workspace to their place, then mark them as complete."""
         for kind in _KINDS:
             for source in sorted((workspace / kind).glob("*")):
                 target = self.root / phase / kind / source.name
@@ -89,7 +87,7 @@ class Progress:
         shutil.rmtree(workspace, ignore_errors=True)
 
     def clear_workspaces(self) -> None:
-        """Remove what killed runs left; only under the lock."""
+        """Remove workspaces of killed runs; call under the lock."""
         shutil.rmtree(self.folder / "tmp", ignore_errors=True)
 
 

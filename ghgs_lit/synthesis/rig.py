@@ -1,10 +1,9 @@
-"""The ring of cameras that THuman2.0 is rendered with, and how a subject is placed in it.
+"""The ring of cameras that THuman2.0 is rendered with, and the placement of a subject in it.
 
-``positions`` cameras stand evenly around the subject. The views at each position are numbered: 0 is the
-ring camera itself, 1 the next ring camera, 3 the exact middle between the two, 2 and 4 are random in the
-first and the second half of the step. Yaw 0 looks at a subject that faces +z from the front.
-A :class:`Variation` gives each subject a ring of its own and moves single cameras.
-"""
+``positions`` cameras stand evenly around the subject. The views at each position are numbered: 0 is the ring
+camera itself, 1 the next ring camera, 3 the exact middle between the two, 2 and 4 are random in the first and
+the second half of the step. Yaw 0 sees the front of a subject that faces +z. A :class:`Variation` gives each
+subject its own ring and moves single cameras."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +18,7 @@ from ghgs_lit.errors import require
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.types import Cameras
 
-# Share of the image's sides that a varied rig leaves free around a subject.
+# Margin around a subject with a varied ``fill``, as a share of the image's height.
 _MARGIN = 0.01
 
 Pitch = Annotated[float, Field(gt=-89, lt=89)]
@@ -28,7 +27,7 @@ Fill = Annotated[float, Field(gt=0, lt=1)]
 
 
 class Variation(Options):
-    """How rigs differ between subjects and single cameras from their ring; null and 0: not at all."""
+    """Differences of rigs between subjects, and of single cameras from their ring; null and 0: none."""
 
     group = "data.rig.variation"
 
@@ -57,12 +56,12 @@ class Variation(Options):
         return self
 
 
-#: A rig that is the same for all.
+#: No variation.
 STILL = Variation()
 
 
 class RigOptions(Options):
-    """What can be changed of the ring of cameras that THuman2.0 is rendered with by the published scripts."""
+    """Options of the ring of cameras with which the published scripts render THuman2.0."""
 
     group = "data.rig"
 
@@ -77,8 +76,7 @@ class RigOptions(Options):
 
 @dataclass(frozen=True)
 class Poses:
-    """How cameras [...] deviate from their ring. ``pitch``, ``roll``: degrees [...]. ``shift``: metres [...,
-    3]."""
+    """Deviations of cameras [...] from their ring: degrees of pitch and roll, metres of shift [..., 3]."""
 
     pitch: np.ndarray | float = 0.0
     roll: np.ndarray | float = 0.0
@@ -90,7 +88,7 @@ class Poses:
 
 @dataclass(frozen=True)
 class Rig:
-    """A ring of cameras; the numbers are those of the published scripts.
+    """A ring of cameras; defaults are those of the published scripts.
 
     Attributes:
         radius: distance of the cameras from ``look_at``, metres.
@@ -98,10 +96,9 @@ class Rig:
         pitch: degrees; below 0 the cameras look down.
         focal: focal length as a fraction of the image's height.
         shift_y: offset of the principal point below the centre, as a fraction of the image's height.
-        yaw_jitter: the ring of each subject is turned by up to this angle, degrees.
-        height: height that subjects are scaled to, metres (null: they keep their own).
-        height_jitter: greatest deviation from ``height``, metres.
-    """
+        yaw_jitter: largest rotation of the ring of a subject, degrees.
+        height: height that subjects are scaled to, metres (None: they keep their own).
+        height_jitter: largest deviation from ``height``, metres."""
 
     positions: int = 16
     radius: float = 2.0
@@ -151,14 +148,14 @@ class Rig:
     def drawn(
         self, person: Person, yaws: np.ndarray, aspect: float, rng: np.random.Generator
     ) -> tuple["Rig", Poses]:
-        """The rig of one subject by ``variation``, and how its cameras deviate from it. ``yaws``: degrees
-        [positions, 5] of all its views (:meth:`yaws`). ``aspect``: width of the images over their height.
-        ``rng``: random numbers of the rig alone; all are drawn whatever varies."""
+        """The rig of one subject by ``variation``, and the deviations of its cameras. ``yaws``: of all its
+        views (:meth:`yaws`). ``aspect``: width / height of the images. ``rng``: for the rig alone; the same
+        numbers are drawn whatever varies."""
         v, share = self.variation, rng.uniform(size=3)
         deviations = rng.uniform(-1, 1, (*yaws.shape, 5))
         deviations[:, 1] = np.roll(deviations[:, 0], -1, 0)  # view 1 is the next ring camera
         pitch, roll, shift = deviations[..., 0], deviations[..., 1], deviations[..., 2:]
-        higher = rng.uniform(-1, 1, yaws.shape)  # drawn last: what came before depends on no newer draw
+        higher = rng.uniform(-1, 1, yaws.shape)  # drawn last, so that the numbers above do not change
         higher[:, :2] = 0
         pitch = v.camera_pitch * pitch + v.between_pitch * higher
         poses = Poses(pitch, v.camera_roll * roll, v.camera_look_at * shift)
@@ -168,12 +165,12 @@ class Rig:
             return rig, poses
         low, high = rig._extents(person, yaws, poses)
         room, middle = np.array([aspect, 1]) / 2 - _MARGIN, np.array([0, self.shift_y])
-        reach = np.maximum(-low / (room + middle), high / (room - middle)).max()  # 1: to the image's margin
+        reach = np.maximum(-low / (room + middle), high / (room - middle)).max()
         tallest = (high - low)[:, 1].max()
         return replace(rig, focal=float(min(_within(v.fill, share[2], 0.0) / tallest, 1 / reach))), poses
 
     def _extents(self, person: Person, yaws: np.ndarray, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
-        """Least and greatest (x/z, y/z) [n, 2] of a subject in each camera."""
+        """Smallest and largest (x/z, y/z) [n, 2] of a subject in each camera."""
         vertices = np.concatenate([part.vertices for part in person.parts])
         low, high = [], []
         for pose in self.cameras(yaws, 1, 1, poses).extrinsics.flatten(0, 1).numpy():
@@ -186,7 +183,7 @@ class Rig:
         return np.stack(low), np.stack(high)
 
     def place(self, person: Person, rng: np.random.Generator) -> Person:
-        """Scale a person, put the feet on y = 0 and centre it; the body vertices move along."""
+        """Scale and centre a person, with the feet on y = 0; the body vertices are moved, too."""
         jitter = self.height_jitter * rng.uniform(-1, 1)
         low = np.min([part.vertices.min(0) for part in person.parts if len(part.vertices)], 0)
         high = np.max([part.vertices.max(0) for part in person.parts if len(part.vertices)], 0)
@@ -198,5 +195,4 @@ class Rig:
 
 
 def _within(limits: Sequence[float] | None, share: float, default: float) -> float:
-    """The value at ``share`` of the way between two limits; ``default`` where there are none."""
     return default if limits is None else float(limits[0] + share * (limits[1] - limits[0]))

@@ -1,4 +1,4 @@
-"""Scans: textured meshes, either as THuman2.0 stores them (``.obj``) or ``.glb`` files with several parts."""
+"""Scans: textured meshes, as ``.obj`` like those of THuman2.0, or as ``.glb`` with several parts."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
 
 _MESH_SUFFIXES = (".glb", ".gltf", ".obj")
-# Of glTF, which trimesh does not unpack.
+# A compression of glTF that trimesh does not support.
 _COMPRESSION = b"EXT_meshopt_compression"
 _IMAGE_SUFFIXES = (".jpeg", ".jpg", ".png")
 
@@ -33,7 +33,7 @@ class ScanSource:
         return names
 
     def load(self, name: str) -> Person:
-        """One scan as stored, with its ``body_vertices.npy`` if it has one. InputError: the mesh is missing
+        """A scan as stored, with its ``body_vertices.npy`` if there is one. InputError: the mesh is missing
         or unreadable, or a part has no texture."""
         folder = self.folder / name
         path = _mesh_file(folder) if folder.is_dir() else None
@@ -44,7 +44,7 @@ class ScanSource:
         return Person(name=name, parts=load_parts(path), body_vertices=body)
 
     def facing(self, name: str) -> float:
-        """Degrees about y that the first camera is turned by: where these scans face is not known."""
+        """0 degrees: it is not known where these scans face."""
         return 0.0
 
 
@@ -88,9 +88,9 @@ def _part(path: Path, name: str, mesh: trimesh.Trimesh, transform: np.ndarray) -
 
 
 def _texture(path: Path, material: object) -> tuple[np.ndarray | None, float | None]:
-    """Texture [h, w, 3 or 4] uint8 and alpha cutoff of a material; None if it has no colour."""
+    """Texture [h, w, 3 or 4] uint8 and alpha cutoff of a material; None if it has no texture or no cutoff."""
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    if image is not None and image.format is None:  # not from a file: trimesh replaced a lost material
+    if image is not None and image.format is None:  # not from a file: trimesh replaced a missing material
         image = None
     factor = getattr(material, "baseColorFactor", None)
     if image is None and factor is not None:  # one plain colour, as buttons and eyes often have
@@ -100,7 +100,7 @@ def _texture(path: Path, material: object) -> tuple[np.ndarray | None, float | N
     if image is None:
         return None, None
     mode = str(getattr(material, "alphaMode", None) or "OPAQUE").upper()
-    # Blended hair is cut at one half: each ray of a photograph sees one surface.
+    # Blended hair is cut off at 0.5, as each ray of a photograph sees one surface.
     cutoff = None if mode == "OPAQUE" else float(getattr(material, "alphaCutoff", None) or 0.5)
     has_alpha = "A" in image.getbands() or "transparency" in image.info
     cutoff = cutoff if has_alpha else None
@@ -112,7 +112,7 @@ def _texture(path: Path, material: object) -> tuple[np.ndarray | None, float | N
 
 
 def _image_beside(path: Path) -> Image.Image | None:
-    """The texture of a scan whose ``.mtl`` was lost: ``material0.*``, or the only image."""
+    """The texture of a scan without its ``.mtl``: ``material0.*``, or the only image."""
     images = sorted(p for p in path.parent.iterdir() if p.suffix.lower() in _IMAGE_SUFFIXES)
     named = [p for p in images if p.stem == "material0"]
     chosen = named[:1] or (images if len(images) == 1 else [])

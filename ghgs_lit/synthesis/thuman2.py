@@ -1,13 +1,12 @@
-"""THuman2.0: raw scans with SMPL-X fits as released, and renders of them.
+"""THuman2.0: raw scans with SMPL-X fits as released, and renders.
 
 ::
 
     <source>/<id>/<id>.obj, material0.jpeg, material0.mtl     526 scans 0000 ... 0525, y up, no metric units
     <fits>/<id>/smplx_param.pkl, mesh_smplx.obj               the fit, in the frame of its scan
 
-The renders lie as :mod:`ghgs_lit.data.layout` describes; what GPS-Gaussian, GHG, RoGSplat and the authors'
-release render is read as it is. GHG keeps its bodies beside the scans (``<source>/<id>/<id>_transform.npy``).
-"""
+Renders have the layout of :mod:`ghgs_lit.data.layout`; those of GPS-Gaussian, GHG, RoGSplat and the authors'
+release can be read unchanged. GHG stores how it moved bodies in ``<source>/<id>/<id>_transform.npy``."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -29,7 +28,7 @@ from ghgs_lit.synthesis.jobs import RenderOptions
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.scans import ScanSource
 
-# Names of the folder of the fits in published archives and scripts.
+# Names of the folder of fits in published archives and scripts.
 FIT_FOLDERS = ("THuman2.0_smplx", "THuman2.0_Smpl_X_Paras", "THuman2.0_SMPLX_Paras", "smplx_2", "smplx")
 _NEEDED = ("betas", "global_orient", "body_pose")
 _MORE = ("left_hand_pose", "right_hand_pose", "jaw_pose", "leye_pose", "reye_pose", "expression")
@@ -39,8 +38,7 @@ _FIT_SIZES = {"global_orient": (3,), "scale": (1,), "translation": (3,), "transl
 @dataclass(frozen=True)
 class SmplxFit:
     """The content of ``smplx_param.pkl``. ``parameters``: of the male SMPL-X model, by name, [1, n].
-    ``scale``, ``translation``: from the model's frame to the scan's: ``v * scale + translation``, scale
-    first."""
+    ``scale``, ``translation``: from the model's frame to the scan's, ``v * scale + translation``."""
 
     parameters: Mapping[str, np.ndarray]
     scale: float
@@ -52,14 +50,14 @@ class SmplxFit:
 
     @property
     def facing(self) -> float:
-        """Degrees about y from +z to where the body faces."""
+        """Angle about y from +z to the direction that the body faces, in degrees."""
         forward = Rotation.from_rotvec(self.parameters["global_orient"][0]).as_matrix()[:, 2]
         return float(np.degrees(np.arctan2(forward[0], forward[2])))
 
 
 def read_fit(path: Path) -> SmplxFit:
-    """The fit at ``path``; its pickle is read without running it. InputError: it is missing, no plain pickle,
-    lacks a key, or a value is of another shape or not finite."""
+    """The fit at ``path``; its pickle is read without executing it. InputError: it is missing, no plain
+    pickle, lacks a key, or a value has another shape or is not finite."""
     content = load_pickle(path)
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected a dictionary; found {type(content).__name__}")
@@ -79,9 +77,8 @@ def read_fit(path: Path) -> SmplxFit:
 
 
 def find_fits(source: Path, fits: str | None) -> Path | None:
-    """The folder of the fits, None if there is none; each scan's own folder is looked into as well. ``fits``:
-    the configured folder (None: one of :data:`FIT_FOLDERS` in or beside ``source``). InputError: the
-    configured folder does not exist."""
+    """The folder of the fits; None if there is none. ``fits``: the configured folder (None: one of
+    :data:`FIT_FOLDERS` in or beside ``source``). InputError: the configured folder does not exist."""
     if fits is not None:
         folder = Path(fits).expanduser()
         if not folder.is_dir():
@@ -95,7 +92,7 @@ def find_fits(source: Path, fits: str | None) -> Path | None:
 class THuman2Source:
     """Raw scans with their bodies. ``fits``: folder of the fits (None: each scan's own folder).
     ``body_model``: folder of the licensed SMPL-X model files (package ``smplx``), to compute bodies from
-    ``smplx_param.pkl`` (None: read ``mesh_smplx.obj``, a part of the fits)."""
+    ``smplx_param.pkl`` (None: read the fits' ``mesh_smplx.obj``)."""
 
     folder: Path
     fits: Path | None
@@ -105,8 +102,7 @@ class THuman2Source:
         return ScanSource(self.folder).names()
 
     def fit(self, name: str) -> Path | None:
-        """The folder of one scan's fit; None if there are no fits at all. InputError: there are fits, but not
-        of this scan."""
+        """The folder of a scan's fit; None without :attr:`fits`. InputError: they have none of this scan."""
         if (self.folder / name / "smplx_param.pkl").exists():
             return self.folder / name
         if self.fits is None:
@@ -117,7 +113,7 @@ class THuman2Source:
 
     def body(self, name: str) -> np.ndarray | None:
         """Body vertices [n, 3] float64 in the scan's frame; None without fits. InputError: the fit is bad, or
-        its vertices are neither stored nor computable."""
+        its vertices are not stored and cannot be computed."""
         folder = self.fit(name)
         if folder is None:
             return None
@@ -133,8 +129,7 @@ class THuman2Source:
         return _obj_vertices(mesh)
 
     def load(self, name: str) -> Person:
-        """One scan with its body, both as stored. InputError: the scan or its fit is bad, or the body does
-        not lie in the scan."""
+        """A scan with its body, as stored. InputError: the scan or fit is bad, or the body lies outside."""
         scan, body = ScanSource(self.folder).load(name), self.body(name)
         if body is None:
             return scan
@@ -142,12 +137,12 @@ class THuman2Source:
         return Person(name, scan.parts, body.astype(np.float32))
 
     def check(self, name: str) -> None:
-        """Read everything that rendering a scan reads. InputError: a part of it is bad."""
+        """Read all files that rendering a scan needs. InputError: one of them is bad."""
         self.load(name)
         self.facing(name)
 
     def facing(self, name: str) -> float:
-        """Degrees about y that the first camera is turned by, to face the person; 0 without a fit."""
+        """Degrees by which the first camera is turned about y to face the person; 0 without a fit."""
         folder = self.fit(name)
         path = None if folder is None else folder / "smplx_param.pkl"
         return 0.0 if path is None or not path.exists() else read_fit(path).facing
@@ -165,7 +160,7 @@ def _obj_vertices(path: Path) -> np.ndarray:
 
 
 def _check_body(folder: Path, scan: Person, body: np.ndarray) -> None:
-    """Refuse a body that does not lie in its scan: its scale or translation was not applied."""
+    """Refuse a body outside its scan, as when scale or translation were not applied."""
     points = np.concatenate([part.vertices for part in scan.parts])
     low, high = points.min(0), points.max(0)
     tall = high[1] - low[1]
@@ -201,8 +196,7 @@ def smplx_vertices(folder: Path, parameters: Mapping[str, np.ndarray]) -> np.nda
 
 
 def ghg_body(path: Path, vertices: np.ndarray) -> np.ndarray:
-    """Move the body of a scan as GHG's renderer moved the scan. ``vertices``: [n, 3] in the scan's frame.
-    InputError: the file is missing, or lacks a number."""
+    """Move body ``vertices`` [n, 3] as GHG's renderer moved the scan. InputError: no file, or no number."""
     content = load_npy(path)
     names = ("vy_max", "vy_min", "human_height", "offset", "move_delta_axis_0", "move_delta_axis_2")
     for name in names:
@@ -237,7 +231,7 @@ class THuman2(Scans):
         return None if self.source is None else partial(_body_beside_scan, self.scans())
 
     def inspections(self) -> list[Callable[[], None]]:
-        """Every raw scan with its fit, if ``source`` is given."""
+        """Checks of every raw scan with its fit, if ``source`` is given."""
         if self.source is None:
             return []
         source = self.scans()
@@ -245,7 +239,7 @@ class THuman2(Scans):
 
 
 def _body_beside_scan(source: THuman2Source, name: str) -> np.ndarray | None:
-    """The body [n, 3] of a scan that GHG rendered, in the world of its renders; None for other scans."""
+    """The body [n, 3] of a scan rendered by GHG, in the world of its renders; None for other scans."""
     transform = source.folder / name / f"{name}_transform.npy"
     fit = source.body(name) if transform.exists() else None
     return None if fit is None else ghg_body(transform, fit).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Training: the LightningModule, its optimization and its callbacks."""
+"""Training: the LightningModule, optimization and callbacks."""
 
 from ghgs_lit.training.guard import DivergedError
 from ghgs_lit.training.module import GHGSModule

@@ -1,4 +1,4 @@
-"""What every LightningModule of this package shares: schedule over the run's budget, plain checkpoints."""
+"""Base of the LightningModules of this package: a schedule over the run's budget, plain checkpoints."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -18,22 +18,21 @@ from ghgs_lit.weights.checkpoint import FORMAT_VERSION
 
 
 def image_mean() -> MeanMetric:
-    """A mean over the images of a validation, in float64; undefined values (nan) are left out."""
+    """A mean over the images of a validation, in float64; nan is left out."""
     return MeanMetric(nan_strategy="ignore").set_dtype(torch.float64)
 
 
 class BudgetedModule(L.LightningModule):
-    """A module whose learning rate follows the share of the run's budget that is used.
+    """A module whose learning rate follows the used share of the run's budget.
 
     Args:
-        model: whose parameters learn; checkpoints hold its tensors.
-        config: the run's full configuration as plain data, of which ``seed`` is read; every checkpoint has
-            it, beside the nodes of a model that was built of them. None: these alone.
+        model: trained; checkpoints hold its tensors.
+        config: the run's full configuration as plain data, of which ``seed`` is read; checkpoints contain it
+            together with the model's own. None: only that of the model.
 
     Attributes:
-        clock: marks where the parts of a step end; it runs where the callback ``Costs`` starts it.
-        used_budget: share of the run's budget in [0, 1] that is used, as of the last step.
-    """
+        clock: measures the parts of a step; the callback ``Costs`` starts it.
+        used_budget: used share of the run's budget in [0, 1], as of the last step."""
 
     def __init__(self, model: nn.Module, optimization: Optimization, config: Mapping[str, Any] | None):
         super().__init__()
@@ -44,35 +43,35 @@ class BudgetedModule(L.LightningModule):
         self.clock = StepClock()
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
-        # Lightning copies structures that it does not know one tensor after the other, and waits for each.
+        # Lightning copies unknown structures one tensor at a time, and waits for each.
         return batch.to(device, non_blocking=device.type != "cpu")
 
     def on_train_start(self) -> None:
-        # After a restart the scheduler asks for the first time when a step has been taken.
+        # After a restart the scheduler updates it only after a step.
         self.used_budget = self.progress()
-        # This run's options of the optimizer take the place of those of the checkpoint that it resumes.
+        # This run's options of the optimizer replace those of a resumed checkpoint.
         optimizer, schedule = self.optimizers(), self.lr_schedulers()
         for number, (group, option) in enumerate(zip(optimizer.param_groups, self._options, strict=True)):
-            # The rate itself has the schedule's factor of the step that comes next.
+            # The rate itself includes the schedule's factor of the next step.
             rate = group["lr"] * option["lr"] / schedule.base_lrs[number]
             group.update(option, lr=rate, initial_lr=option["lr"])
             schedule.base_lrs[number] = option["lr"]
 
     def step_seed(self, batch_idx: int) -> int:
-        """Seed of the random numbers of this step; it does not depend on interruptions of the run."""
+        """Seed of this step's random numbers, which does not depend on interruptions of the run."""
         part = batch_idx % self.trainer.accumulate_grad_batches
         numbers = [self.config.get("seed", 0), self.global_step, part, self.global_rank]
         return int(np.random.SeedSequence(numbers).generate_state(1)[0])
 
     def progress(self) -> float:
-        """Share of the budget in [0, 1] that is used: of steps or of time, whichever is larger."""
+        """Used share of the budget in [0, 1]: of steps or of time, whichever is larger."""
         trainer = self.trainer
         shares = [self.global_step / trainer.max_steps] if trainer.max_steps > 0 else []
         for timer in (c for c in trainer.callbacks if isinstance(c, Timer)):
             used, left = timer.time_elapsed(), timer.time_remaining()
             if left is not None:
                 share = torch.tensor(used / max(used + left, 1e-9), device=self.device)
-                # Clocks differ between processes; learning rates must not.
+                # Clocks of processes differ, but learning rates must not.
                 together = trainer.world_size > 1 and used > 0
                 shares.append(float(trainer.strategy.reduce(share, reduce_op="max") if together else share))
         if not shares:
@@ -81,7 +80,6 @@ class BudgetedModule(L.LightningModule):
 
     @property
     def _scaler(self) -> torch.amp.GradScaler | None:
-        """What scales the loss, so that gradients of half precision (``16-mixed``) do not vanish."""
         return getattr(self.trainer.precision_plugin, "scaler", None)
 
     def configure_optimizers(self) -> dict[str, Any]:
@@ -97,7 +95,7 @@ class BudgetedModule(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_train_batch_end(self, *args: Any) -> None:
-        # Called after all callbacks: what they did since the step ended is not counted.
+        # Called after all callbacks, so that their time is not counted.
         self.clock.restart()
 
     def on_validation_end(self) -> None:

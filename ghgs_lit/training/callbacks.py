@@ -1,4 +1,4 @@
-"""What runs beside the training step: a progress bar, times and memory."""
+"""Callbacks: a progress bar, times and memory."""
 
 import time
 from contextlib import ExitStack
@@ -26,10 +26,8 @@ class ProgressOptions(Options):
 
 
 class RunProgress(ProgressBar):
-    """How far the run is, over its budget of steps or of time, not of epochs.
-
-    On a terminal a bar; elsewhere a line a minute. ``<run>/train.log`` gets the lines in both cases.
-    """
+    """Progress of the run over its budget of steps or time. On a terminal a bar; elsewhere a line a minute.
+    ``<run>/train.log`` gets the lines in both cases."""
 
     def __init__(self):
         super().__init__()
@@ -37,7 +35,7 @@ class RunProgress(ProgressBar):
         self._lines: Lines | None = None
 
     def disable(self) -> None:
-        """Called by Lightning in all processes but the first."""
+        """Called by Lightning in all processes except the first."""
         self._is_enabled = False
 
     def enable(self) -> None:
@@ -63,7 +61,7 @@ class RunProgress(ProgressBar):
         if self._bar is not None:
             text = f"step {trainer.global_step}  {self._numbers(trainer, pl_module)}"
             self._bar.update(self._task, completed=pl_module.used_budget, text=text)
-        # Between two parts of an accumulated step there is nothing new.
+        # Nothing is new between two parts of an accumulated step.
         if self._lines is not None and trainer.global_step > self._last[1] and self._lines.due():
             self._say(trainer, pl_module)
 
@@ -75,7 +73,7 @@ class RunProgress(ProgressBar):
         now = (time.monotonic(), trainer.global_step, pl_module.used_budget)
         total = f" of {trainer.max_steps}" if trainer.max_steps > 0 else ""
         parts = [f"step {now[1]}{total}", self._numbers(trainer, pl_module)]
-        if self._first is None:  # the first step compiles and fills caches: its time says nothing
+        if self._first is None:  # the first step compiles and fills caches: its time is not typical
             self._first = now
         else:
             parts.append(f"{(now[0] - self._last[0]) / (now[1] - self._last[1]):.3g} s a step")
@@ -107,14 +105,11 @@ class CostsOptions(Options):
 
 
 class Costs(Callback, Watcher):
-    """Logs milliseconds of a step and of its parts, and memory in MiB, each since the last log.
+    """Logs milliseconds of a step and of its parts, and memory in MiB, each since the last log. Times are
+    means; memory on CUDA is the peak of all tensors. ``time_ms/01_data`` is the wait for data,
+    ``time_ms/step`` the sum of all parts. Validation and writing of checkpoints and logs do not count."""
 
-    Times are means, memory on CUDA is the peak of all tensors. ``time_ms/01_data`` is the wait for data,
-    ``time_ms/step`` the sum of all parts. Validation and the writing of checkpoints and logs are not counted;
-    parts that a model does not have are left out.
-    """
-
-    #: Stages of the model: the part that ends where the stage begins, the part that the stage is.
+    #: For each stage of the model: the part that ends where it begins, and the part that it is.
     STAGES: ClassVar = {
         "encoder": ("interval", "encode"),
         "depth_head": (None, "depth"),

@@ -1,4 +1,4 @@
-"""Checkpoints on disk: complete or not there at all, whenever the run is killed or asked to stop."""
+"""Checkpoints, written atomically, also when a run is killed or asked to stop."""
 
 import os
 import shutil
@@ -24,7 +24,7 @@ _PATHS = ("best_model_path", "kth_best_model_path", "last_model_path")
 
 
 def check_training_state(path: str | Path, checkpoint: Mapping[str, Any]) -> None:
-    """Refuse a checkpoint whose state of the training has another form than Lightning's."""
+    """Refuse a checkpoint whose training state does not have Lightning's form."""
     kinds = {"epoch": int, "global_step": int, "loops": Mapping, "callbacks": Mapping}
     kinds |= {"optimizer_states": list, "lr_schedulers": list}
     for key in kinds.keys() & checkpoint.keys():
@@ -36,12 +36,10 @@ def check_training_state(path: str | Path, checkpoint: Mapping[str, Any]) -> Non
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes checkpoints by :func:`ghgs_lit.files.write_atomically`.
-
-    Lightning's own class writes into the system's temporary folder and *moves* the file: between file
-    systems that copies over the previous checkpoint, and a run that is killed meanwhile has lost both.
-    Weights that do not train are written once, beside them (:mod:`ghgs_lit.weights.frozen`).
-    """
+    """Writes checkpoints by :func:`ghgs_lit.files.write_atomically`. Lightning's own class writes to the
+    system's temporary folder and *moves* the file: between file systems that copies over the previous
+    checkpoint, and a run killed meanwhile has lost both. Weights that are not trained are written once, to
+    another file (:mod:`ghgs_lit.weights.frozen`)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -50,21 +48,21 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike, storage_options: Any | None = None
     ) -> None:
-        """Replace the file at ``path`` as a whole; ``storage_options`` are not used."""
+        """Replace the file at ``path`` atomically; ``storage_options`` are not used."""
         content = self._frozen.stored(checkpoint, Path(path).absolute().parent)
         write_atomically(path, lambda temporary: torch.save(content, temporary))
 
     def load_checkpoint(
         self, path: str | os.PathLike, map_location: Any = "cpu", weights_only: bool | None = True
     ) -> dict[str, Any]:
-        """Tensors and plain data only, whatever the default of the installed PyTorch is."""
+        """Load tensors and plain data only; ``weights_only`` is not used."""
         content = frozen.joined(path, torch.load(path, map_location=map_location, weights_only=True))
         content.setdefault("pytorch-lightning_version", L.__version__)
         return content
 
 
 def validates_now(trainer: L.Trainer) -> bool:
-    """Whether validation follows this step, where validations are counted in steps."""
+    """Whether a validation follows this step, if validations are counted in steps."""
     every, by_steps = trainer.val_check_batch, trainer.check_val_every_n_epoch is None
     if not (by_steps and trainer.enable_validation and isinstance(every, int)):
         return False
@@ -72,11 +70,8 @@ def validates_now(trainer: L.Trainer) -> bool:
 
 
 class CheckpointOptions(Options):
-    """A checkpoint in ``<run>/checkpoints`` after every so many steps or minutes, or of the best validation.
-
-    Where a validation is due, the best checkpoint is chosen first: list callbacks that monitor a value
-    before those that do not.
-    """
+    """A checkpoint in ``<run>/checkpoints`` at intervals of steps or minutes, or of the best validation. List
+    callbacks with a monitor before those without, so that the best checkpoint is chosen first."""
 
     group = "callbacks.checkpoints"
     filename: Text
@@ -93,7 +88,7 @@ class CheckpointOptions(Options):
 
 
 class Checkpoints(ModelCheckpoint):
-    """Lightning's ModelCheckpoint in ``<run>/checkpoints``; each file replaces the previous of its name."""
+    """Lightning's ModelCheckpoint in ``<run>/checkpoints``; a file replaces the previous one of its name."""
 
     def __init__(self, options: CheckpointOptions):
         arguments = dict(options)
@@ -106,16 +101,16 @@ class Checkpoints(ModelCheckpoint):
             save_on_train_epoch_end=False,
             **arguments,
         )
-        if minutes is not None:  # Lightning's arguments allow steps or time alone, its hook follows both
+        if minutes is not None:  # Lightning's arguments allow steps or time, its hook handles both
             self._train_time_interval = timedelta(minutes=minutes)
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        """Use ``<run>/checkpoints`` unless a folder is configured."""
+        """Set the folder to ``<run>/checkpoints``, unless there is one."""
         self.dirpath = self.dirpath or str(Path(trainer.default_root_dir) / "checkpoints")
         super().setup(trainer, pl_module, stage)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Remember the step that the run starts at."""
+        """Store the step at which the run starts."""
         super().on_train_start(trainer, pl_module)
         self._step = trainer.global_step
 
@@ -125,19 +120,19 @@ class Checkpoints(ModelCheckpoint):
         if trainer.global_step == self._step:
             return
         self._step = trainer.global_step
-        # A restart does not repeat a validation that was due when the checkpoint was written.
+        # After the validation if one is due: a restart would not repeat it.
         if self.monitor is not None or not validates_now(trainer):
             super().on_train_batch_end(trainer, pl_module, *args)
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Save the best, or what was due at the step of this validation."""
+        """Save the best checkpoint, or one that was due at the step of this validation."""
         if self.monitor is not None:
             super().on_validation_end(trainer, pl_module)
         elif not trainer.sanity_checking:
             super().on_train_batch_end(trainer, pl_module, None, None, 0)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Continue with the best checkpoint so far, also where the run resumes in another folder."""
+        """Continue with the best checkpoint so far, also if the run resumes in another folder."""
         state = dict(state_dict)
         if state.get("dirpath") not in (None, self.dirpath):
             state = self._moved(state)
@@ -145,14 +140,14 @@ class Checkpoints(ModelCheckpoint):
             super().load_state_dict(state)
 
     def _moved(self, state: Mapping[str, Any]) -> dict[str, Any]:
-        """``state`` with the paths of this folder; the best files are copied into it."""
+        """``state`` with paths in this folder, into which the best files are copied."""
         folder = Path(self.dirpath)
 
         def here(path: str) -> str:
             return str(folder / Path(path).name) if path else path
 
         best = [Path(path) for path in state["best_k_models"]]
-        # Frozen weights before the checkpoints that refer to them.
+        # Frozen weights first, since checkpoints refer to them.
         shared = {file for path in best for file in path.parent.glob(frozen.PATTERN)}
         for path in [*shared, *best]:
             target = folder / path.name
@@ -163,18 +158,15 @@ class Checkpoints(ModelCheckpoint):
         return {**state, **moved, "best_k_models": scores, "dirpath": self.dirpath}
 
 
-#: Seconds within which a second signal is the same one: a terminal sends it to all processes, and these
-#: hand it on.
+#: Seconds within which a second signal counts as the same one: a terminal sends it to all processes, which
+#: forward it.
 _SAME = 1.0
 
 
 class StopAtStep(Checkpoint):
-    """On Ctrl-C or SIGTERM: finishes the step, and its validation, writes ``last.ckpt`` and stops.
-
-    A second signal stops at once. Several processes stop after the same step. Lightning calls it after all
-    other callbacks, because it is a ``Checkpoint`` and the last one: the checkpoint has their state.
-    ``received``: number of the signal; 0 without one.
-    """
+    """On Ctrl-C or SIGTERM: finishes the step and its validation, writes ``last.ckpt`` and stops. A second
+    signal stops at once. Several processes stop after the same step. As the last ``Checkpoint``, Lightning
+    calls it after all other callbacks, whose state is saved. ``received``: the signal or 0."""
 
     def __init__(self) -> None:
         self.received = 0
@@ -184,7 +176,7 @@ class StopAtStep(Checkpoint):
         self._before = handlers()
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Replace Lightning's handlers, which stop without a checkpoint; at the end it restores all."""
+        """Replace Lightning's signal handlers, which save no checkpoint; it restores all at the end."""
         self._step = trainer.global_step
         handle(self._note, self._before)
 
@@ -196,7 +188,7 @@ class StopAtStep(Checkpoint):
             print("stopping after this step; again: at once", flush=True)
 
     def on_train_batch_end(self, trainer: L.Trainer, *args: Any) -> None:
-        """Save here, unless the step is not complete or a validation is due first."""
+        """Save after a complete step, unless a validation is due first."""
         # Between two parts of an accumulated step the gradients so far would be lost.
         if trainer.global_step == self._step:
             return
@@ -219,10 +211,10 @@ class StopAtStep(Checkpoint):
             self._saved = number
 
     def on_train_batch_start(self, *args: Any) -> None:
-        """End once the numbers of the step are logged, which comes after all other hooks of the step."""
+        """Stop here, since the values of a step are logged after all its other hooks."""
         if self._saved:
             raise Interrupted(self._saved)
 
     def on_train_epoch_end(self, *args: Any) -> None:
-        """As above, where no batch follows."""
+        """Stop here if no batch follows."""
         self.on_train_batch_start()

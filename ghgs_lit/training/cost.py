@@ -1,4 +1,4 @@
-"""What training costs: the parts of a step, and seconds and memory over all sessions of a run."""
+"""Cost of training: time of the parts of a step, and time and memory over all sessions of a run."""
 
 import time
 from collections.abc import Sequence
@@ -20,23 +20,21 @@ PARTS = (
 
 
 class StepClock:
-    """Measures the parts of a step: the time between two marks belongs to the part of the second.
-
-    It does nothing before :meth:`start` and after :meth:`stop`. On CUDA the marks are events that are read
-    when the next step ends, so that nothing waits for the device.
-    """
+    """Measures the parts of a step: the time between two marks belongs to the part of the second. It does
+    nothing before :meth:`start` and after :meth:`stop`. On CUDA marks are events, read at the end of the next
+    step, so that nothing waits for the device."""
 
     def __init__(self) -> None:
         self.device = torch.device("cpu")
         self.stop()
 
     def start(self, device: torch.device) -> None:
-        """Begin to measure on ``device``, with the wait for the data of a step."""
+        """Begin to measure on ``device``; the first part is the wait for data."""
         self.device, self.running = device, True
         self.restart()
 
     def stop(self) -> None:
-        """Measure nothing from now on and forget everything."""
+        """Stop measuring, and discard all measurements."""
         self.running = False
         self._totals: dict[str, float] = {}
         self._steps = 0
@@ -44,7 +42,7 @@ class StepClock:
         self._pending: list[tuple[str | None, Mark]] = []
 
     def restart(self) -> None:
-        """Begin a step again here; marks since the last :meth:`end_step` are forgotten."""
+        """Begin the step here; marks since the last :meth:`end_step` are discarded."""
         if self.running:
             self._marks = [(None, self._now())]
 
@@ -54,7 +52,7 @@ class StepClock:
             self._marks.append((part, self._now()))
 
     def end_step(self) -> None:
-        """The step ends here, with its last part, the optimizer; the next one begins."""
+        """The step ends here with its last part, the optimizer; the next one begins."""
         self.mark("optimizer")
         if self.device.type == "cuda":
             self._pending, self._marks = self._marks, self._pending
@@ -62,7 +60,7 @@ class StepClock:
         self.restart()
 
     def means(self) -> dict[str, float]:
-        """Milliseconds of each part in a step since the last call, in order, and of the whole ``step``."""
+        """Mean milliseconds of each part of a step since the last call, in order, and of the ``step``."""
         found = {part: 1e3 * self._totals[part] / self._steps for part in PARTS if part in self._totals}
         if found:
             found["step"] = sum(found.values())
@@ -79,13 +77,9 @@ class StepClock:
 
 
 class TrainingCost(Callback):
-    """Seconds and peak memory of the training that the weights have seen.
-
-    Every checkpoint contains both, so that a resumed run goes on counting. What a killed process did after
-    its last checkpoint is done again and counted once. Validation and the writing of checkpoints count.
-
-    List it before callbacks that reset the peak of the GPU's memory.
-    """
+    """Seconds and peak memory of the training of the weights. Checkpoints contain both, so that a resumed run
+    continues to count; work after the last checkpoint of a killed process is repeated and counts once.
+    Validation and writing of checkpoints count. List it before callbacks that reset the GPU's peak."""
 
     def __init__(self) -> None:
         self._earlier = 0.0  # seconds of earlier sessions
@@ -96,7 +90,7 @@ class TrainingCost(Callback):
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self._started, self._device = time.perf_counter(), pl_module.device
         if self._device.type != "cuda":
-            forget_peak()  # the runs of a sweep share a process
+            forget_peak()  # runs of a sweep share a process
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
         if self._device.type == "cuda":  # its peak may be reset at any step
@@ -107,12 +101,12 @@ class TrainingCost(Callback):
 
     @property
     def seconds(self) -> float:
-        """Of all sessions so far."""
+        """Seconds of all sessions so far."""
         return self._earlier + (0.0 if self._started is None else time.perf_counter() - self._started)
 
     @property
     def peak_bytes(self) -> int:
-        """The highest memory of a session's first process: of all tensors on a GPU, else of the process."""
+        """Peak memory of the first process over all sessions: of tensors on a GPU, else of the process."""
         if self._started is None:
             return self._peak
         on_gpu = self._device.type == "cuda"

@@ -1,4 +1,4 @@
-"""A training step whose loss or gradient is not finite: its first fault is named and saved, it is skipped."""
+"""Guard against training steps that are not finite: they are explained, saved and skipped."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping
@@ -21,16 +21,14 @@ from ghgs_lit.types import Batch, map_tensors
 if TYPE_CHECKING:  # it imports this module
     from ghgs_lit.training.module import GHGSModule
 
-#: What faults are told apart by; other modules belong to the model.
+#: Stages that faults are assigned to; other modules count as ``model``.
 _STAGES = (*STAGES, "renderer", "losses")
 
 
 @dataclass(frozen=True)
 class Step:
-    """A forward and a backward pass, with all that it depends on beside the weights.
-
-    ``budget`` is that of :func:`~ghgs_lit.training.module.drawn_budget`, ``scale`` the factor of the loss.
-    """
+    """All inputs of a forward and a backward pass except the weights. ``budget``: see
+    :func:`~ghgs_lit.training.module.drawn_budget`. ``scale``: factor of the loss."""
 
     batch: Batch
     seed: int
@@ -41,7 +39,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Fault:
-    """A value that is not finite; ``place`` is its tensor, ``sample`` the subject that is at fault alone."""
+    """Values that are not finite. ``place``: their tensor. ``sample``: the subject that causes them."""
 
     values: str
     where: str
@@ -55,10 +53,10 @@ class Fault:
 
 
 class _Faults(list[Fault], Watcher):
-    """Faults in the order in which they are seen, in results of stages and in gradients of their inputs."""
+    """Faults in results of stages and in gradients of their inputs, in the order in which they occur."""
 
     def begin(self, stage: str, inputs: Inputs = ((), {})) -> Inputs:
-        """Views of the inputs, whose gradients are those from this stage alone."""
+        """Views of the inputs, whose gradients come from this stage alone."""
 
         def view(value: Tensor) -> Tensor:
             if not value.requires_grad:
@@ -73,7 +71,7 @@ class _Faults(list[Fault], Watcher):
         self.see("result of", stage, result)
 
     def see(self, where: str, place: str, value: Any, stage: str | None = None) -> None:
-        """Look at all tensors in ``value``; ``stage`` is the beginning of ``place`` unless it is given."""
+        """Check all tensors in ``value``. ``stage``: None: the stage at the beginning of ``place``."""
         for name, tensor in _tensors(value, place):
             if broken := int((~tensor.isfinite()).sum()):
                 values = f"{broken} of {tensor.numel()} values are not finite"
@@ -100,11 +98,9 @@ def _tensors(value: Any, name: str) -> Iterator[tuple[str, Tensor]]:
 
 
 def first_fault(module: "GHGSModule", step: Step) -> Fault | None:
-    """Run ``step`` again and look at weights, batch, results of all modules and gradients, in this order.
-
-    A batch that is at fault is run again subject by subject, to name the one that is at fault alone. Weights
-    and their gradients are not changed. None: all values are finite.
-    """
+    """The first fault when ``step`` is run again, in weights, batch, results of modules, and gradients. A
+    faulty batch is run again subject by subject, to find the first one that is faulty alone. Weights and
+    their gradients are not changed. None: all values are finite."""
     fault = _search(module, step)
     if fault is None or fault.where == "weights of":
         return fault
@@ -129,13 +125,13 @@ def _search(module: "GHGSModule", step: Step) -> Fault | None:
         try:
             with torch.autocast(device, step.autocast, enabled=step.autocast is not None):
                 _, total, _ = module.forward_losses(step)
-        except Exception:  # a later stage may refuse what is not finite
+        except Exception:  # a later stage may refuse values that are not finite
             if not faults:
                 raise
         if not faults:
             slopes = torch.autograd.grad(total * step.scale, list(trained.values()), allow_unused=True)
             norms = {n: slope.norm() for n, slope in zip(trained, slopes, strict=True) if slope is not None}
-            if norms:  # of finite values the largest is named
+            if norms:  # if all are finite, the largest is named
                 name = max(norms, key=lambda name: float(norms[name]))
                 norm = torch.stack(list(norms.values())).norm()
                 faults.see("gradient from", f"norm, largest of {name}", norm, _stage_of(name))
@@ -143,7 +139,7 @@ def _search(module: "GHGSModule", step: Step) -> Fault | None:
 
 
 def _watch(module: "GHGSModule", faults: _Faults, stack: ExitStack) -> None:
-    """Until ``stack`` closes, ``faults`` sees the results and the gradients of every stage of ``module``."""
+    """Let ``faults`` check results of all modules and gradients of all parameters until ``stack`` closes."""
     model = module.model
     for name, part in model.named_modules():
         hook = part.register_forward_hook(
@@ -171,16 +167,14 @@ def _one_subject(batch: Batch, element: int) -> Batch:
 
 
 class DivergedError(InputError):
-    """A loss or a gradient stopped being a number."""
+    """A loss or a gradient is not finite."""
 
 
 class Guard:
-    """Looks at each step of the optimizer once, and runs the step again only where it is not finite.
-
-    All processes decide alike. A fault is saved as ``<run>/faults/step_<n>.pt`` (once for each stage), which
-    :mod:`ghgs_lit.training.replay` runs again. ``limit`` steps in a row are skipped before the run stops;
-    ``skipped`` counts those of all sessions of the run.
-    """
+    """Checks each step of the optimizer, and runs the step again only if it is not finite. All processes
+    decide alike. A fault is saved to ``<run>/faults/step_<n>.pt`` (once for each stage), which
+    :mod:`ghgs_lit.training.replay` can run again. ``limit``: steps in a row that are skipped before the run
+    stops. ``skipped``: steps skipped in all sessions of the run."""
 
     def __init__(self, limit: int):
         self.limit, self.skipped = limit, 0
@@ -189,14 +183,12 @@ class Guard:
         self._saved: set[str] = set()
 
     def note(self, step: Step, loss: Tensor) -> None:
-        """A forward pass of the optimizer's next step, and its loss; it does not wait for the device."""
+        """Store a forward pass of the optimizer's next step, and its loss; does not wait for the device."""
         self._steps.append((step, loss.detach()))
 
     def is_finite(self, trainer: L.Trainer, norm: Tensor) -> tuple[bool, bool]:
-        """Whether all losses since the last step, and the gradient's ``norm``, are finite in all processes.
-
-        The only place at which a training step waits for the device.
-        """
+        """Whether all losses since the last step, and whether the gradient's ``norm``, are finite in all
+        processes. A training step waits for the device only here."""
         losses = torch.stack([loss for _, loss in self._steps]) if self._steps else norm.new_zeros(1)
         flags = torch.stack([losses.isfinite().all(), norm.isfinite()]).float()
         if trainer.world_size > 1:
@@ -204,12 +196,12 @@ class Guard:
         return tuple(bool(flag) for flag in flags.tolist())
 
     def accept(self) -> None:
-        """The step was finite, or a scaler of the loss skips it."""
+        """Note that the step was finite, or that a scaler of the loss skips it."""
         self._steps.clear()
         self._in_a_row = 0
 
     def refuse(self, module: L.LightningModule, scale: float) -> None:
-        """Name and save the fault, and drop the gradients, so that the optimizer changes nothing.
+        """Explain and save the fault, and drop the gradients, so that the optimizer changes nothing.
         DivergedError: more than ``limit`` steps in a row were not finite."""
         trainer, line = module.trainer, self._explain(module, scale)
         self._steps.clear()
@@ -229,7 +221,7 @@ class Guard:
             print(f"{said}; the step is skipped", flush=True)
 
     def _explain(self, module: L.LightningModule, scale: float) -> str:
-        """The first fault of this process, and the file of its step, once for each stage; "" without one."""
+        """The first fault of this process, "" if none, and, for the first fault of a stage, its file."""
         for step, _ in self._steps:
             step = dataclasses.replace(step, scale=scale)
             if (fault := first_fault(module, step)) is None:

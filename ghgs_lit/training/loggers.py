@@ -1,4 +1,4 @@
-"""Loggers that continue after a restart, and the values that a sweep compares its runs by."""
+"""Loggers that continue after a restart, and the values by which runs are compared."""
 
 import os
 import warnings
@@ -14,14 +14,14 @@ from ghgs_lit.config.options import Options
 from ghgs_lit.errors import installed
 from ghgs_lit.readers import read_rows
 
-#: The final numbers that runs are compared by: TensorBoard's HParams tab shows the first five of them
-#: at once. ``metrics.json`` has all.
+#: Final values by which runs are compared: TensorBoard's HParams tab shows the first five of them at once.
+#: ``metrics.json`` has all.
 COMPARED = ("depth_error_mm", "flip", "lpips", "psnr", "psnr_box", "ssim")
 Value = str | int | float | bool
 
 
 class _StepsTaken:
-    """Counts steps as checkpoints and pictures do: those taken. Lightning's number of the first one is 0."""
+    """Counts steps taken, as checkpoints and pictures do; for Lightning the first step is 0."""
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         super().log_metrics(metrics, None if step is None else step + 1)
@@ -31,14 +31,14 @@ class CsvLog(_StepsTaken, CSVLogger):
     """Lightning's ``metrics.csv``, continued by a run that resumes in the same folder."""
 
     def resume(self, step: int) -> None:
-        """Keep the rows up to ``step``; later steps are trained and written again."""
+        """Keep the rows up to ``step``, as later steps are trained again."""
         path = Path(self.log_dir) / "metrics.csv"
         rows = read_rows(path) if path.is_file() else []
         # A killed run may have left an incomplete last line.
         rows = [row for row in rows if (row.get("step") or "").isdecimal() and int(row["step"]) <= step]
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", ".*will be deleted")  # what is kept is written again
-            writer = self.experiment  # begins with an empty file
+            warnings.filterwarnings("ignore", ".*will be deleted")  # the rows are written again below
+            writer = self.experiment  # starts with an empty file
         writer.metrics = [{name: value for name, value in row.items() if value} for row in rows]
         writer.save()
 
@@ -47,19 +47,19 @@ class TensorBoardLog(_StepsTaken, TensorBoardLogger):
     """TensorBoard's event files, with the run's row in the HParams tab."""
 
     def resume(self, step: int) -> None:
-        """Tell TensorBoard to drop what was logged after ``step``."""
+        """Make TensorBoard drop values logged after ``step``."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
         start = SessionLog(status=SessionLog.START)
         self.experiment.file_writer.add_event(Event(session_log=start), step + 1)
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Log without the epoch that Lightning adds: runs are counted in steps."""
+        """Log without the epoch that Lightning adds."""
         super().log_metrics({name: value for name, value in metrics.items() if name != "epoch"}, step)
 
     @rank_zero_only
     def log_hyperparams(self, params: Mapping[str, Value], *args: Any, **kwargs: Any) -> None:
-        """Begin a session without a list of metrics: TensorBoard then compares runs by all metrics."""
+        """Begin a session without a list of metrics, so that TensorBoard compares runs by all of them."""
         from torch.utils.tensorboard.summary import hparams
 
         _, session, _ = hparams(dict(params), {})
@@ -67,7 +67,7 @@ class TensorBoardLog(_StepsTaken, TensorBoardLogger):
 
     @rank_zero_only
     def log_results(self, results: Mapping[str, float], step: int) -> None:
-        """Log the final numbers and end the session with success."""
+        """Log the final values and end the session with success."""
         from torch.utils.tensorboard.summary import hparams
 
         self.log_metrics(dict(results), step - 1)
@@ -77,7 +77,7 @@ class TensorBoardLog(_StepsTaken, TensorBoardLogger):
 
 
 class CsvOptions(Options):
-    """The logged numbers as ``<run>/csv/metrics.csv``."""
+    """Logged values in ``<run>/csv/metrics.csv``."""
 
     def build(self, save_dir: str) -> CsvLog:
         return CsvLog(save_dir, name="csv", version="")
@@ -104,7 +104,7 @@ class WandbOptions(Options):
 
 @rank_zero_only
 def resume(loggers: Sequence[Logger], step: int) -> None:
-    """Continue the logs of a run that resumes at ``step``, where they are in the same folder."""
+    """Continue the logs of a run that resumes at ``step`` in the same folder."""
     for logger in loggers:
         if isinstance(logger, (CsvLog, TensorBoardLog)):
             logger.resume(step)
@@ -112,7 +112,7 @@ def resume(loggers: Sequence[Logger], step: int) -> None:
 
 @rank_zero_only
 def log_hyperparameters(loggers: Sequence[Logger], values: Mapping[str, Value]) -> None:
-    """Log the values of :func:`hyperparameters`, except to CSV: ``config.yaml`` has them."""
+    """Log the values of :func:`hyperparameters`, but not to CSV, since ``config.yaml`` has them."""
     for logger in loggers:
         if not isinstance(logger, CSVLogger):
             logger.log_hyperparams(dict(values))
@@ -120,7 +120,7 @@ def log_hyperparameters(loggers: Sequence[Logger], values: Mapping[str, Value]) 
 
 @rank_zero_only
 def log_results(loggers: Sequence[Logger], summary: Sequence[Mapping[str, Any]], step: int) -> None:
-    """Log :func:`final_numbers` of the weights after ``step``; ``summary`` is that of ``metrics.json``."""
+    """Log :func:`final_numbers` of the weights after ``step``. ``summary``: of ``metrics.json``."""
     results = final_numbers(summary)
     for logger in loggers:
         if isinstance(logger, TensorBoardLog):
@@ -131,9 +131,9 @@ def log_results(loggers: Sequence[Logger], summary: Sequence[Mapping[str, Any]],
 
 
 def close(loggers: Sequence[Logger]) -> None:
-    """Write what is left and end the loggers' threads: the runs of a sweep share a process."""
+    """Write remaining values and end the loggers' threads, since runs of a sweep share a process."""
     for logger in loggers:
-        # One that was never used must not begin now.
+        # Unused loggers must not start now.
         if isinstance(logger, TensorBoardLogger) and logger._experiment is not None:
             logger._experiment.close()
         elif isinstance(logger, WandbLogger) and logger._experiment is not None:
@@ -153,10 +153,8 @@ def final_numbers(summary: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 def hyperparameters(
     config: Mapping[str, Any], choices: Mapping[str, str], overrides: Sequence[str]
 ) -> dict[str, Value]:
-    """What runs are compared by: options of config groups, the seed, and every changed value.
-
-    Keys that no number depends on are left out. ``choices`` has the option of each config group.
-    """
+    """Settings by which runs are compared: options of config groups, the seed, and every changed value. Keys
+    that do not affect results are left out. ``choices``: the option of each config group."""
     found: dict[str, Value] = {
         group: name for group, name in choices.items() if name is not None and _matters(group)
     }

@@ -1,4 +1,4 @@
-"""The LightningModule of training: steps and logging calls around the model."""
+"""The LightningModule of training: steps and logging around the model."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -24,34 +24,31 @@ from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpo
 
 
 def drawn_budget(budgets: Sequence[str | int], numbers: Sequence[int]) -> str | int:
-    """How much of the background the encoder sees in a training step.
+    """Draw which patches the encoder sees in a training step.
 
     Args:
         budgets: ``all``: all patches (``skip=none``, ``exact``); ``window``: those of the smallest rectangle
             that holds the subject (``balanced``); a number: the subject's patches and those at most this many
-            patches away (``fast``). What is listed twice is drawn twice as often.
-        numbers: that the step stands for; equal numbers give the same budget.
-    """
-    # A key of its own: the same numbers seed the other draws of the step.
+            patches away (``fast``). Budgets that are listed twice are drawn twice as often.
+        numbers: seed; equal numbers give the same budget."""
+    # A separate key: the same numbers seed the other draws of the step.
     generator = np.random.default_rng(np.random.SeedSequence(numbers, spawn_key=(1,)))
     return budgets[int(generator.integers(len(budgets)))]
 
 
 def token_budget(model: GHGS, budget: str | int | None) -> AbstractContextManager[None]:
-    """``model`` with one of the budgets of :func:`drawn_budget` while the context lasts; None: as it is."""
+    """Set a budget of :func:`drawn_budget` while the context lasts; None: leave the model unchanged."""
     return nullcontext() if budget is None else seeing(model.encoder, View.of_budget(budget))
 
 
 def _depth_error(batch: Batch, maps: DepthMaps) -> Tensor:
-    """Millimetres over the subject's pixels that are valid and have a true depth."""
     valid = batch.masks & maps.valid
     return depth_error_mm(maps.depth.flatten(0, 1), batch.depths.flatten(0, 1), valid.flatten(0, 1))
 
 
 class GHGSModule(BudgetedModule):
-    """Trains a model through a renderer. ``guard``: looks for steps whose loss or gradient is not finite.
-    ``optimization``, ``config``: as of :class:`BudgetedModule`. ``token_budgets``: drawn from in each
-    training step; None: the model stays as it is configured."""
+    """Trains a model through a renderer. ``optimization``, ``config``: as of :class:`BudgetedModule`.
+    ``token_budgets``: budgets for :func:`drawn_budget` in each training step; None: as configured."""
 
     def __init__(
         self,
@@ -68,16 +65,15 @@ class GHGSModule(BudgetedModule):
         self.token_budgets = token_budgets
         self.guard = Guard(optimization.skip_nonfinite)
         self.val_psnr, self.val_psnr_box = image_mean(), image_mean()
-        model.keeps_drafts = True  # validation shows what each round is worth
+        model.keeps_drafts = True  # validation measures each round
 
     @classmethod
     def load_from_checkpoint(
         cls, checkpoint_path: str | Path, map_location: Any = None, **parts: Any
     ) -> "GHGSModule":
-        """The module of a checkpoint. ``checkpoint_path``: of a run of ``ghgs train``, or of a Trainer of
-        one's own. ``parts``: ``renderer``, ``losses`` and ``optimization`` in place of those of the
-        configuration. InputError: the checkpoint cannot be used, or a part is neither configured nor
-        given."""
+        """The module of a checkpoint of ``ghgs train`` or of any Trainer. ``parts``: ``renderer``, ``losses``
+        and ``optimization`` in place of those of the configuration. InputError: the checkpoint cannot be
+        used, or a part is neither configured nor given."""
         checkpoint = read_checkpoint(checkpoint_path)
         config = checkpoint["config"]
         for name, group in {"losses": "loss", "optimization": "optimizer", "renderer": "renderer"}.items():
@@ -92,7 +88,7 @@ class GHGSModule(BudgetedModule):
         return cls(model.train(), config=config, **parts)
 
     def forward(self, batch: Batch) -> tuple[Prediction, Rendering]:
-        """The prediction for a batch, and its Gaussians as the batch's target cameras see them."""
+        """The prediction for a batch, and its Gaussians rendered from the batch's target cameras."""
         prediction = self.model(batch)
         self.clock.mark("gaussians")
         rendering = self.renderer(prediction.gaussians, batch.targets.cameras)
@@ -100,7 +96,7 @@ class GHGSModule(BudgetedModule):
         return prediction, rendering
 
     def forward_losses(self, step: Step) -> tuple[Prediction, Tensor, dict[str, Tensor]]:
-        """The prediction of a step, its loss and the terms of it; random numbers are those of its seed."""
+        """The prediction of a step, its loss and the loss's terms, with the random numbers of its seed."""
         torch.manual_seed(step.seed)
         with token_budget(self.model, step.budget):
             prediction, rendering = self(step.batch)
@@ -112,7 +108,7 @@ class GHGSModule(BudgetedModule):
         device = self.device.type
         autocast = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else None
         budget = None
-        if self.token_budgets is not None:  # the same in all processes, so that none waits for a larger one
+        if self.token_budgets is not None:  # the same in all processes, so that none waits for another
             part = batch_idx % self.trainer.accumulate_grad_batches
             numbers = [self.config.get("seed", 0), self.global_step, part]
             budget = drawn_budget(self.token_budgets, numbers)
@@ -158,12 +154,10 @@ class GHGSModule(BudgetedModule):
         return found
 
     def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
-        """Clip to ``optimizer.clip`` and log the norm before it; the arguments are not used.
-
-        A scaler of the loss is undone before. Where it overflowed it skips the step and halves its factor;
-        only a gradient that overflows without any factor is the guard's. DivergedError: a loss or the norm is
-        not finite, and the guard does not skip the step.
-        """
+        """Clip to ``optimizer.clip`` and log the norm before; the arguments are not used. Gradients are
+        already unscaled. After an overflow, a scaler of the loss skips the step and halves its factor; the
+        guard handles losses that are not finite, and gradients that overflow without a factor. DivergedError:
+        the guard does not skip the step."""
         self.optimization.drop_frozen_gradients(self.model, self.used_budget)
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.optimization.clip, foreach=True)
         loss_holds, norm_holds = self.guard.is_finite(self.trainer, norm)

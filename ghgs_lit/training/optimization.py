@@ -1,10 +1,9 @@
-"""How the weights are trained: AdamW or Muon, a linear schedule over the run's budget, gradient clipping.
+"""Optimization: AdamW or Muon, a linear schedule over the run's budget, gradient clipping.
 
-Muon's steps for matrices are orthogonal (K. Jordan et al., 2024, github.com/KellerJordan/Muon): they move all
-directions of a matrix equally far, not only the few that the gradient is full of. Step lengths are those of
-J. Liu et al., "Muon is Scalable for LLM Training", 2025. PyTorch's ``torch.optim.Muon`` takes matrices only;
-here weights of convolutions are matrices of their output channels, too.
-"""
+Muon's steps for matrices are orthogonal (K. Jordan et al., 2024, github.com/KellerJordan/Muon): they change
+all directions of a matrix equally, not only the few that dominate the gradient. Step lengths are those of J.
+Liu et al., "Muon is Scalable for LLM Training", 2025. Unlike in ``torch.optim.Muon``, weights of convolutions
+also count as matrices, with a row for each output channel."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated, Any
@@ -20,9 +19,9 @@ from ghgs_lit.errors import require
 COEFFICIENTS = (3.4445, -4.7750, 2.0315)
 ITERATIONS = 5
 MOMENTUM = 0.95
-# AdamW's steps have about this root mean square (Liu et al., section 2.2).
+# Approximate root mean square of AdamW's steps (Liu et al., section 2.2).
 ROOT_MEAN_SQUARE = 0.2
-# What has fewer rows or columns (tokens, biases, heads of one or two channels) is left to AdamW.
+# Parameters with fewer rows or columns (tokens, biases, heads of one or two channels) are left to AdamW.
 SMALLEST_SIDE = 3
 
 
@@ -35,12 +34,9 @@ def is_matrix(parameter: nn.Parameter) -> bool:
 
 
 def orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
-    """The matrices with singular values of about 1 (0.7 to 1.2) in place of their own.
-
-    The polynomials are found from the smaller Gram matrices, for all of one size at once. ``matrices``: of
-    any sizes, float32 or wider. Singular values below 1e-3 of the largest end below 1; a matrix of zeros
-    stays one.
-    """
+    """The matrices with their singular values replaced by values of about 1 (0.7 to 1.2). The polynomials are
+    computed from the smaller Gram matrices, for all of one size at once. ``matrices``: of any sizes, float32
+    or wider. Singular values below 1e-3 of the largest become less than 1; zeros stay 0."""
     wide = [m.mT if m.shape[0] > m.shape[1] else m for m in matrices]
     largest = torch._foreach_norm(wide, torch.inf)
     wide = torch._foreach_div(wide, [x + (x == 0) for x in largest])  # so that no square underflows
@@ -57,9 +53,9 @@ def orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
 
 
 def _polynomials(gram: Tensor) -> Tensor:
-    """What matrices [n, R, C] are multiplied by, from their Gram matrices [n, R, R]."""
+    """Factors [n, R, R] of matrices [n, R, C], from their Gram matrices [n, R, R]."""
     a, b, c = COEFFICIENTS
-    square = gram.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]  # of the Frobenius norm
+    square = gram.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]  # squared Frobenius norms
     square = square + (square == 0)
     gram, found = (
         gram / square,
@@ -75,8 +71,8 @@ def _polynomials(gram: Tensor) -> Tensor:
 
 class Muon(torch.optim.AdamW):
     """Muon for the matrices among ``parameters``, AdamW for all others. ``matrix_lr``: learning rate of
-    matrices, in units of AdamW's: steps are as long as AdamW's of this rate. ``**options``: of AdamW, for the
-    other parameters; weight decay is for both."""
+    matrices; steps are as long as AdamW's with this rate. ``**options``: of AdamW; weight decay is for
+    both."""
 
     def __init__(self, parameters: Iterable[nn.Parameter], matrix_lr: float, **options: Any):
         parameters = list(parameters)
@@ -88,7 +84,7 @@ class Muon(torch.optim.AdamW):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Tensor] | None = None) -> Tensor | None:
-        """One step; the gradients of matrices are used up."""
+        """Take a step; the gradients of matrices are removed."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -100,18 +96,18 @@ class Muon(torch.optim.AdamW):
         return loss
 
     def _step_matrices(self, group: dict[str, Any]) -> None:
-        """Move the matrices, and take their gradients away, so that AdamW leaves them alone."""
+        """Take a step of the matrices, and remove their gradients, so that AdamW skips them."""
         moved = [parameter for parameter in group["params"] if parameter.grad is not None]
         if not moved:
             return
         for parameter in moved:
             state = self.state[parameter]
-            if not state:  # AdamW's loading of a state asks for a step
+            if not state:  # AdamW expects a step when it loads a state
                 state.update(step=torch.zeros(()), momentum=torch.zeros_like(parameter))
             state["step"] += 1
         gradients, averages = [p.grad for p in moved], [self.state[p]["momentum"] for p in moved]
         torch._foreach_lerp_(averages, gradients, 1 - MOMENTUM)
-        directions = torch._foreach_lerp(gradients, averages, MOMENTUM)  # Nesterov's
+        directions = torch._foreach_lerp(gradients, averages, MOMENTUM)  # Nesterov momentum
         steps = orthogonalized([direction.flatten(1) for direction in directions])
         lengths = [-group["lr"] * ROOT_MEAN_SQUARE * max(step.shape) ** 0.5 for step in steps]
         torch._foreach_mul_(steps, lengths)
@@ -129,11 +125,8 @@ START_FACTOR = 0.04
 
 
 class Optimization(Options):
-    """AdamW or Muon, whose learning rate rises linearly to ``lr`` and then falls linearly.
-
-    The schedule depends on the share of the run's budget that is used: of steps or of time, whichever is
-    larger.
-    """
+    """AdamW or Muon, with a learning rate that rises linearly to ``lr`` and then falls linearly, over the
+    used share of the run's budget of steps or of time, whichever is larger."""
 
     group = "optimizer"
     lr: Positive = 1e-4
@@ -156,11 +149,9 @@ class Optimization(Options):
     """Steps in a row that are not finite and are skipped before the run stops; 0: it stops at the first."""
 
     def optimizer(self, model: nn.Module, fused: bool = True) -> torch.optim.AdamW:
-        """The optimizer of the parameters of ``model`` that are trained.
-
-        ``fused`` is PyTorch's fastest AdamW. It undoes the scaling of a loss (``16-mixed``) inside its step,
-        where gradients cannot be clipped any more. InputError: ``freeze_until`` names no parameter.
-        """
+        """The optimizer of the trained parameters of ``model``. ``fused``: PyTorch's fastest AdamW. It undoes
+        the scaling of a loss (``16-mixed``) inside its step, too late for clipping gradients. InputError:
+        ``freeze_until`` names no parameter."""
         names = [name for name, _ in model.named_parameters()]
         for prefix in self.freeze_until:
             known = any(name.startswith(prefix) for name in names)
@@ -173,10 +164,8 @@ class Optimization(Options):
         return Muon(parameters, matrix_lr=self.matrix_scale * self.lr, **options)
 
     def drop_frozen_gradients(self, model: nn.Module, progress: float) -> None:
-        """Remove the gradients of the parameters that are frozen at the share ``progress`` of the run.
-
-        The optimizer then leaves these parameters unchanged, without weight decay.
-        """
+        """Remove the gradients of parameters that are frozen at the share ``progress`` of the run, so that
+        the optimizer leaves them unchanged, also by weight decay."""
         frozen = tuple(prefix for prefix, share in self.freeze_until.items() if progress < share)
         if not frozen:
             return
@@ -185,7 +174,7 @@ class Optimization(Options):
                 parameter.grad = None
 
     def factor(self, progress: float) -> float:
-        """Learning rate as a fraction of ``lr`` when the share ``progress`` of the budget is used."""
+        """Learning rate as a fraction of ``lr`` at the share ``progress`` of the budget."""
         if progress < self.warmup:
             return START_FACTOR + (1 - START_FACTOR) * progress / self.warmup
         fall = (progress - self.warmup) / (1 - self.warmup)

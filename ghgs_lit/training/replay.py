@@ -1,4 +1,4 @@
-"""Running a step again that :class:`ghgs_lit.training.guard.Guard` has saved, on any machine."""
+"""Replay of a step that :class:`ghgs_lit.training.guard.Guard` saved, on any machine."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,15 +19,14 @@ _KEYS = ("fault", "global_step", "step", "state_dict", "config")
 
 
 def replay(path: str | Path) -> tuple[int, str, Fault | None]:
-    """Run a saved step again, on the CPU. Returns: its number, what was wrong when it was saved, and what is
-    wrong now (None: nothing). FileNotFoundError: there is no such file. InputError: the file is not one of a
-    step."""
+    """Run a saved step again on the CPU. Returns its number, its fault when it was saved, and its fault now
+    (None: none). FileNotFoundError: no such file. InputError: the file is not a saved step."""
     content = open_file(path)
     if not isinstance(content, Mapping) or any(key not in content for key in _KEYS):
         raise InputError(f"{path}: expected a step that a training saved; found {describe(content)}")
     config = content["config"]
     model = GHGS.from_config(config)
-    # Not checked for fit to be finite: the weights may be what is at fault.
+    # Not by a loader that refuses weights that are not finite: they may be the fault.
     model.load_state_dict(content["state_dict"], assign=True)
     parts = (build(config[group], group) for group in ("renderer", "loss", "optimizer"))
     module = GHGSModule(model, *parts, config).train()

@@ -1,4 +1,4 @@
-"""What training starts from: nothing, the weights of another run, or an interrupted run."""
+"""Start of training: from nothing, from the weights of another run, or from an interrupted run."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,10 +15,8 @@ from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpo
 
 
 def check_start(config: Mapping[str, Any], directory: Path) -> None:
-    """Refuse ``init_from`` beside ``resume``, unless the run resumes in its own ``directory``.
-
-    Such a run began with its ``init_from``, and its configuration still says so.
-    """
+    """Refuse ``init_from`` together with ``resume``, unless the run resumes in its own ``directory``: then
+    its configuration still has the ``init_from`` that it began with."""
     if config["resume"] is None or config["init_from"] is None:
         return
     own = resolved(config["resume"]).is_relative_to(directory.resolve())
@@ -26,9 +24,9 @@ def check_start(config: Mapping[str, Any], directory: Path) -> None:
 
 
 def check_resume(path: str | Path, model: nn.Module, config: Mapping[str, Any]) -> tuple[int, list[str]]:
-    """Check that a run can resume from a checkpoint, whose weights ``model`` gets. Returns: the step of the
-    checkpoint, and one line for each setting that ``config`` changes. InputError: not a checkpoint of a
-    training run, of another model (names the tensor), or changed since it was written."""
+    """Check that a run can resume from a checkpoint, and load its weights into ``model``. Returns the step of
+    the checkpoint, and one line for each setting that ``config`` changes. InputError: not a checkpoint of a
+    training run, of another model (names the tensor) or optimizer, or damaged."""
     checkpoint = read_checkpoint(path, whole=True)
     for key in ("global_step", "optimizer_states"):
         if key not in checkpoint:
@@ -45,7 +43,7 @@ def check_resume(path: str | Path, model: nn.Module, config: Mapping[str, Any]) 
 def _check_optimizer(
     path: str | Path, checkpoint: Mapping[str, Any], model: nn.Module, config: Mapping[str, Any]
 ) -> None:
-    """Refuse to go on with Muon from the averages of AdamW, the other way round, or from other groups."""
+    """Refuse to resume with Muon from AdamW's state, the reverse, or with other parameter groups."""
     states = checkpoint["optimizer_states"]
     by_muon = any("orthogonal" in group for state in states for group in state["param_groups"])
     key = "optimizer.matrix_scale"
@@ -60,7 +58,7 @@ def _check_optimizer(
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """``key: old value -> new value`` of everything that the weights depend on."""
+    """Lines ``key: old value -> new value`` of changed settings that the weights depend on."""
     old, new = flatten(before), flatten(now)
     keys = (key for key in sorted(old.keys() | new.keys()) if not is_below(key, MAY_CHANGE_ON_RESUME))
     return [f"{key}: {old.get(key)} -> {new.get(key)}" for key in keys if old.get(key) != new.get(key)]
@@ -69,13 +67,12 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
 def initialize(
     model: nn.Module, path: str | Path, strict: bool = False, random_frozen: bool = False
 ) -> list[str]:
-    """Load the weights at ``path`` that fit into ``model``.
+    """Load the weights at ``path`` that fit into ``model``; returns one line for each tensor.
 
-    One line for each tensor: ``loaded``, ``wrong shape`` and ``missing`` (both stay as initialised) or
-    ``ignored`` (the model has no such tensor). ``strict``: every tensor must fit. ``random_frozen``:
-    parameters that do not learn may stay as initialised. InputError: not a checkpoint of this project;
-    nothing fits; a parameter that does not learn stays as initialised; with ``strict``, a tensor that does
-    not fit or is missing on either side (names it).
+    A line says ``loaded``, ``wrong shape`` or ``missing`` (both stay as initialised) or ``ignored`` (not in
+    the model). ``strict``: every tensor must fit. ``random_frozen``: parameters that are not trained may stay
+    as initialised. InputError: not a checkpoint of this project; nothing fits; a parameter that is not
+    trained would stay as initialised; with ``strict``, a tensor that does not fit or is missing (names it).
     """
     state, own = model_state(read_checkpoint(path, whole=True)), model.state_dict()
     if strict:
@@ -104,10 +101,8 @@ def initialize(
 
 
 def with_origin(config: Mapping[str, Any], model: nn.Module) -> Mapping[str, Any]:
-    """``config`` with the origin of the encoder's semantic features, where the start has one and all fit.
-
-    Tables read ``encoder.weights`` to know whether the features carry semantics.
-    """
+    """``config`` with ``encoder.weights``, the origin of the semantic features, from the checkpoint that the
+    run starts from, if it has one and all these weights fit; tables read it."""
     path = config["resume"] or config["init_from"]
     if path is None:
         return config
@@ -123,7 +118,8 @@ def with_origin(config: Mapping[str, Any], model: nn.Module) -> Mapping[str, Any
 
 
 def report(lines: list[str], path: str | Path, written: Path) -> str:
-    """At most 22 of the ``lines`` of :func:`initialize`, those of loaded tensors counted; a file gets all."""
+    """At most 22 lines on the ``lines`` of :func:`initialize`, of which loaded tensors are only counted; all
+    are written to the file ``written``."""
     written.write_text("\n".join(lines) + "\n")
     others = [line for line in lines if not line.startswith("loaded")]
     loaded = len(lines) - len(others)

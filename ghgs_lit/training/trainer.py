@@ -1,4 +1,4 @@
-"""Lightning's Trainer, and what of it can be told."""
+"""Lightning's Trainer and its options."""
 
 from typing import Annotated, Any, Literal
 
@@ -10,7 +10,7 @@ from pydantic import Field
 from ghgs_lit.config.options import Count, Index, Options, Share, Text, Words
 from ghgs_lit.errors import InputError
 
-#: Numbers of which no sum of days is too large for Python.
+#: Limits that keep every duration in Python's range.
 Duration = Annotated[
     Annotated[str, Field(pattern=r"^\d{1,8}(:\d{1,9}){3}$")]
     | dict[str, Annotated[float, Field(ge=0, le=1e8)]],
@@ -19,7 +19,7 @@ Duration = Annotated[
 
 
 class TrainerOptions(Options):
-    """How long a run trains, on what, and how often it validates and logs."""
+    """Duration and devices of a training, and intervals of validation and logging."""
 
     group = "trainer"
     accelerator: Text = "gpu"
@@ -45,7 +45,7 @@ class TrainerOptions(Options):
     """true: only deterministic operations, where PyTorch has them."""
 
     def build(self, **arguments: Any) -> L.Trainer:
-        """The Trainer, with further ``arguments`` of it; InputError: it refuses its options."""
+        """The Trainer with further ``arguments``. InputError: it refuses its options."""
         precision = self.precision
         if precision == "tf32":
             precision = "32-true"
@@ -60,7 +60,7 @@ class TrainerOptions(Options):
                 check_val_every_n_epoch=None,  # validations are counted in steps
                 num_sanity_val_steps=0,
                 enable_model_summary=False,
-                use_distributed_sampler=False,  # the data divides its samples among processes itself
+                use_distributed_sampler=False,  # the data module divides samples among processes
                 **arguments,
             )
         except (MisconfigurationException, RuntimeError, TypeError, ValueError) as error:

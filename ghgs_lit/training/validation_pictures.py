@@ -1,4 +1,4 @@
-"""Pictures, attention and point clouds of the first validation subjects, while a run trains."""
+"""Pictures, attention and point clouds of the first validation subjects."""
 
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from ghgs_lit.visualization.attention import attention_sheet, chosen_token
 from ghgs_lit.visualization.clouds import clouds
 from ghgs_lit.visualization.pictures import save_png, sheet
 
-#: How TensorBoard shows clouds: points of two centimetres through a perspective camera.
+#: TensorBoard's view of clouds: points of two centimetres through a perspective camera.
 CLOUD_VIEW = {
     "camera": {"cls": "PerspectiveCamera", "fov": 40},
     "material": {"cls": "PointsMaterial", "size": 0.02},
@@ -41,11 +41,9 @@ class PicturesOptions(Options):
 
 
 class Pictures(Callback):
-    """``sheet/<subject>``, ``attention/<subject>`` and, in TensorBoard's mesh tab, ``<subject>/points``.
-
-    A sheet has inputs, depths, targets, renders and errors. Attention is that of one token of the
-    recalibration. Clouds are the predicted points and the body's vertices.
-    """
+    """Logs ``sheet/<subject>``, ``attention/<subject>`` and, in TensorBoard's mesh tab, ``<subject>/points``.
+    A sheet has inputs, depths, targets, renders and errors. Attention is of one token of the recalibration.
+    Clouds are the predicted points and the body's vertices."""
 
     def __init__(self, options: PicturesOptions):
         self.options = options
@@ -103,7 +101,7 @@ class Pictures(Callback):
             _publish(trainer, f"attention/{name}", picture, f"{name}_attention")
 
     def _log_other_parts(self, pl_module: L.LightningModule, batch: Batch) -> None:
-        """Log the share of attention on other parts of the body, of built-in people with true depths."""
+        """Log the share of attention on other body parts, for built-in people with true depths."""
         if self._seen is None or batch.depths is None or not has_parts(batch):
             return
         stage, tokens, points = self._seen
@@ -115,7 +113,7 @@ class Pictures(Callback):
 
 
 def _publish(trainer: L.Trainer, tag: str, picture: np.ndarray, file: str) -> None:
-    """Write ``<run>/pictures/step_<step>/<file>.png`` and log it as ``tag`` where loggers take pictures."""
+    """Write ``<run>/pictures/step_<step>/<file>.png`` and log it as ``tag`` to loggers of pictures."""
     step = trainer.global_step
     save_png(picture, Path(trainer.default_root_dir) / "pictures" / f"step_{step:06d}" / f"{file}.png")
     for logger in trainer.loggers:

@@ -17,9 +17,9 @@ _QUERY = (255, 60, 220)
 def chosen_token(
     tokens: Tokens, points: Points, element: int, at: tuple[int, int, int] | None = None
 ) -> int | None:
-    """Index of a packed token that has a point. ``at``: ``(view, row, column)`` on the grid of tokens (None:
-    the middle of the subject in its first view). Returns: The token of that view that is nearest to the
-    place; None where no token of the view has a point. InputError: ``at`` is outside the grid."""
+    """Index of the token with a valid point that is nearest to a place; None where its view has none. ``at``:
+    ``(view, row, column)`` on the grid of tokens; None: the middle of the subject in its first view.
+    InputError: ``at`` is outside the grid."""
     views, height, width = tokens.grid[1:]
     if at is not None:
         expected = f"view, row, column below {(views, height, width)}"
@@ -35,12 +35,11 @@ def chosen_token(
 
 
 def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> np.ndarray:
-    """Draw the query (outlined) and its neighbours on the views of its subject.
+    """Picture of a subject's views with the query token (outlined) and its neighbours.
 
-    The first row shows the neighbours, the nearest brightest; captions give their number in each view. One
-    row for each layer follows with the weights, averaged over heads, the largest brightest, and beside them
-    those for s = 1, where they differ; captions give the share of each view. ``batch``: gives the
-    photographs, padded to whole patches.
+    The first row shows the neighbours, the nearest brightest; captions count them in each view. Then one row
+    for each layer shows the weights, averaged over heads, the largest brightest, and beside them those with
+    ``s = 1`` where they differ; captions give shares of views. ``batch``: with photographs of whole patches.
     """
     views = tokens.grid[1]
     element = int(tokens.image[attention.query]) // views

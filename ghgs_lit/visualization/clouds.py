@@ -12,10 +12,11 @@ Cloud = tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]
 
 
 def clouds(batch: Batch, prediction: Prediction, element: int, limit: int = 6000) -> dict[str, Cloud]:
-    """Point clouds of one subject. ``limit``: maximum number of points and of vertices. Returns: Positions in
-    metres and colours in [0, 1] by name: ``points``, unprojected pixels in their colours; ``body``, vertices
-    of the body where the data has them; ``points_and_body``, both, whose distance the Chamfer term measures.
-    Clouds without points are left out."""
+    """Point clouds of one subject by name: positions in metres and colours in [0, 1].
+
+    ``points``: unprojected pixels in their colours; ``body``: body vertices, where the data has them;
+    ``points_and_body``: both, whose distance the Chamfer term measures. Empty clouds are left out. ``limit``:
+    largest number of points and of vertices."""
     valid = prediction.points.valid[element] & batch.masks[element]
     colors = batch.images[element].movedim(1, -1)
     found = {"points": (prediction.points.pixels[element][valid], colors[valid])}
@@ -30,7 +31,6 @@ def clouds(batch: Batch, prediction: Prediction, element: int, limit: int = 6000
 
 
 def _thinned(cloud: Cloud, limit: int) -> Cloud:
-    """At most ``limit`` of the finite points, evenly spaced in memory."""
     positions, colors = (part.detach().float().cpu() for part in cloud)
     finite = positions.isfinite().all(-1)
     positions, colors = positions[finite], colors[finite].nan_to_num(0).clamp(0, 1)

@@ -13,7 +13,7 @@ from ghgs_lit.types import Batch
 
 _CAPTION = 14  # height of a caption in pixels
 _GAP = 2
-ERROR_GAIN = 4.0  #: Factor of the mean absolute error of the colours before it is shown
+ERROR_GAIN = 4.0  #: Factor of errors before they are shown
 
 
 @cache
@@ -31,13 +31,7 @@ def to_uint8(image: Tensor) -> np.ndarray:
 
 
 def colorize(values: Tensor, low: float, high: float, name: str, valid: Tensor | None = None) -> np.ndarray:
-    """A picture of values [h, w] in the colours of a palette.
-
-    Args:
-        values: what is shown [h, w].
-        low, high: values of the first and the last colour.
-        valid: pixels [h, w] that are not black (None: all).
-    """
+    """Values [h, w] in colours of a palette from ``low`` to ``high``; black where not ``valid`` [h, w]."""
     values = values.detach().float().cpu()
     scaled = ((values - low) / max(high - low, 1e-9)).nan_to_num(0).clamp(0, 1)
     picture = palette(name)[(scaled * 255).round().long().numpy()]
@@ -47,7 +41,7 @@ def colorize(values: Tensor, low: float, high: float, name: str, valid: Tensor |
 
 
 def error_map(image: Tensor, target: Tensor) -> np.ndarray:
-    """Mean absolute error over the channels of images [3, h, w], times ``ERROR_GAIN``."""
+    """A picture of the mean absolute error over the channels of images [3, h, w], times ``ERROR_GAIN``."""
     return colorize((image - target).abs().mean(0) * ERROR_GAIN, 0, 1, "inferno")
 
 
@@ -81,7 +75,7 @@ def _depth_rows(
         maps["true depth"] = (batch.depths[element], masks & (batch.depths[element] > 0))
     if not maps:
         return []
-    ends = []  # 1st and 99th percentile of each view's depths, of the true ones where they are known
+    ends = []  # 1st and 99th percentile of each view's (true, if known) depths
     for depths, valid in zip(*list(maps.values())[-1], strict=True):
         known = depths[valid].detach().float().cpu().numpy()
         ends.append(np.quantile(known, [0.01, 0.99]).tolist() if known.size else (0.0, 1.0))
@@ -100,15 +94,13 @@ def sheet(
     depth: Tensor | None = None,
     depth_valid: Tensor | None = None,
 ) -> np.ndarray:
-    """Pictures of one subject: inputs, their depths, then target, render and error of each target.
+    """A picture of one subject: inputs, their depths, then target, render and error of each target.
 
     Args:
-        batch: inputs, and targets where there are renders of them.
-        image: renders of the targets [B, T, 3, h, w], or of the inputs where there are none, which then stand
-            below the inputs with their errors (None: no renders).
-        depth: predicted depths [B, V, H, W], metres (None: no row of them).
-        depth_valid: where they are defined [B, V, H, W] (None: in the masks).
-    """
+        image: renders of the targets [B, T, 3, h, w]; without targets, renders of the inputs, which then
+            stand below them with their errors; None: no renders.
+        depth: predicted depths [B, V, H, W], metres; None: no row of them.
+        depth_valid: where they are defined [B, V, H, W]; None: in the masks."""
     views = batch.views[element] if batch.views else tuple(map(str, range(batch.images.shape[1])))
     rows = [row([to_uint8(i) for i in batch.images[element]], [f"input {name}" for name in views])]
     if image is not None and batch.targets is None:

@@ -1,4 +1,4 @@
-"""Cameras on a circle around the subject of given cameras, and where that subject is."""
+"""Cameras on a circle around the subject, and where the subject of given cameras is."""
 
 import math
 
@@ -8,14 +8,13 @@ from torch import Tensor
 from ghgs_lit.geometry.projection import look_at_point, project
 from ghgs_lit.types import Cameras, Gaussians
 
-_OPAQUE = 0.5  #: Opacity of Gaussians that make up the subject
-_OUTSIDE = 1e-3  #: Part of them beyond each face of the subject's box: floaters
-_SHARE = 0.95  #: Part of a picture's height and width that the subject takes at most
+_OPAQUE = 0.5  #: Least opacity of Gaussians that make up the subject
+_OUTSIDE = 1e-3  #: Share of them cut off at each face of the subject's box: floaters
+_SHARE = 0.95  #: Largest share of a picture's height and width that the subject takes
 
 
 def subject_points(gaussians: Gaussians) -> Tensor:
-    """Centres [n, 3] of the opaque Gaussians of one subject without the outermost; float64. Of all Gaussians
-    where none is opaque."""
+    """Centres [n, 3] (float64) of one subject's opaque Gaussians (all, if none is), without outliers."""
     opaque = gaussians.opacities >= _OPAQUE
     points = (gaussians.means[opaque] if bool(opaque.any()) else gaussians.means).detach().double()
     if not len(points):
@@ -26,23 +25,22 @@ def subject_points(gaussians: Gaussians) -> Tensor:
 
 
 def center_of(points: Tensor, cameras: Cameras) -> Tensor:
-    """The middle [3] of the box around points [n, 3], float64; of no points where the optical axes meet."""
+    """The middle [3] (float64) of the box around points [n, 3]; without any, where the optical axes meet."""
     return (points.amin(0) + points.amax(0)) / 2 if len(points) else look_at_point(cameras)
 
 
 def pixel_size(cameras: Cameras, center: Tensor) -> float:
-    """The side of a photograph's pixel at ``center`` [3], mean of ``cameras`` [V]."""
+    """The side of a photograph's pixel at ``center`` [3] in the world's unit, mean over ``cameras`` [V]."""
     depths = ((center - cameras.centers) * cameras.extrinsics[:, 2, :3].double()).sum(-1)
     return float((depths / cameras.intrinsics[:, 0, 0]).mean())
 
 
 def up_direction(cameras: Cameras) -> Tensor:
-    """The world's unit vector [3] that is up in the photographs of ``cameras`` [V], float64.
+    """The world's unit vector [3] (float64) that is up in the photographs of ``cameras`` [V].
 
-    Cameras that are held upright may look up or down, but the rows of their images are level: up is at right
-    angles to all of them, and nearest to the mean upward column. An axis of the world within 3 degrees is
-    taken as it is, so that small tilts of the cameras do not tilt a world that is upright.
-    """
+    Upright cameras may look up or down, but the rows of their images are level: up is perpendicular to all
+    rows, and nearest to the mean upward column. A world axis within 3 degrees of it is returned instead, so
+    that small tilts of the cameras do not tilt an upright world."""
     rows, columns = cameras.extrinsics[:, 0, :3].double(), cameras.extrinsics[:, 1, :3].double()
     mean = -columns.mean(0)
     # Least squares; the small weight of the mean decides where all rows of images are parallel.
@@ -58,16 +56,15 @@ def up_direction(cameras: Cameras) -> Tensor:
 def turntable(cameras: Cameras, frames: int, points: Tensor | None = None) -> Cameras:
     """Cameras on one turn around the subject, at the mean distance and height of the given ones.
 
-    They begin at the side of the first camera and have its lens. With ``points`` they turn about the middle
-    of their box, look straight at it, and have a wider lens where the first camera's would cut them off.
-    ``points``: of the subject [n, 3], n may be 0; None: they turn about where the optical axes meet.
-    """
+    They start at the side of the first camera and have its lens. With ``points`` [n, 3] of the subject (n may
+    be 0) they turn about the middle of the points' box, look straight at it, and have a wider lens where that
+    of the first camera would cut points off. Without, they turn about where the optical axes meet."""
     angles = torch.arange(frames, dtype=torch.float64) * (2 * math.pi / max(frames, 1))
     return orbit(cameras, angles, points)
 
 
 def orbit(cameras: Cameras, angles: Tensor, points: Tensor | None = None) -> Cameras:
-    """Such cameras [n] at ``angles`` [n] (float64, radians) from the side of the first given camera."""
+    """Cameras [n] as of :func:`turntable`, at ``angles`` [n] (float64, radians) from the first one's side."""
     center = look_at_point(cameras) if points is None else center_of(points, cameras)
     frames, angles = len(angles), angles.to(center.device)
     up = up_direction(cameras)
@@ -92,7 +89,7 @@ def orbit(cameras: Cameras, angles: Tensor, points: Tensor | None = None) -> Cam
 
 
 def _fitted(intrinsics: Tensor, extrinsics: Tensor, points: Tensor, height: int, width: int) -> Tensor:
-    """Intrinsics [n, 3, 3] with the principal point in the middle that show points [m, 3] in all views."""
+    """Intrinsics [n, 3, 3] with the principal point in the middle and a lens that shows all points [m, 3]."""
     middle = intrinsics.new_tensor([width / 2, height / 2])
     intrinsics = intrinsics.clone()
     intrinsics[:, :2, 2] = middle

@@ -18,7 +18,7 @@ from ghgs_lit.weights.frozen import SHARING, joined
 from ghgs_lit.weights.names import RELEASE_ENTRY, VGGT
 from ghgs_lit.weights.reading import cast, file_of, open_file
 
-FORMAT_VERSION = 2  #: Version of checkpoints that are whole by themselves; earlier ones are read too
+FORMAT_VERSION = 2  #: Version of self-contained checkpoints; version 1 is read too
 
 STATE_PREFIX = "model."  #: Prefix of the model's tensors in the state of a LightningModule
 
@@ -27,11 +27,10 @@ _FLOATS = (torch.float64, torch.float32, torch.float16, torch.bfloat16)  #: Prec
 
 
 def read_checkpoint(path: str | Path, whole: bool = False) -> dict[str, Any]:
-    """Read a checkpoint of this package, with frozen weights that it shares with others (:mod:`.frozen`).
-    ``path``: the file; its tensors are mapped from the disk, not read. ``whole``: read every byte once and
-    refuse a file that was damaged since it was written (2 s for 1 GB). FileNotFoundError: there is no such
-    file. InputError: the file is not a checkpoint of this package, or its frozen weights are missing; names
-    what was expected and found."""
+    """Read a checkpoint of this package, including frozen weights that it shares (:mod:`.frozen`). Tensors
+    are mapped from the disk, not read. ``whole``: read every byte once and refuse a damaged file (2 s for 1
+    GB). FileNotFoundError: there is no such file. InputError: it is not a checkpoint of this package, or its
+    frozen weights are missing."""
     _check_sums(path, whole)
     checkpoint = open_file(path)
     for key, kind in (("state_dict", Mapping), ("config", Mapping), ("format_version", int)):
@@ -53,12 +52,12 @@ def read_checkpoint(path: str | Path, whole: bool = False) -> dict[str, Any]:
 
 
 def _check_content(path: str | Path, checkpoint: Mapping[str, Any]) -> None:
-    """Refuse nodes and tensors of kinds that no checkpoint has; what a node says is checked where it acts."""
+    """Refuse nodes and tensors of impossible types; values of nodes are checked where they are used."""
     for name, node in checkpoint["config"].items():
         require(isinstance(name, str), f"{path}: config", "keys of text", name)
         fits = name not in KINDS or node is None or isinstance(node, Mapping)
         require(fits, f"{path}: config.{name}", "a mapping of its keys", node)
-    # Verbs merge parts of it into a configuration of their own, where OmegaConf would evaluate resolvers.
+    # Verbs merge parts of the configuration into their own, where OmegaConf would evaluate resolvers.
     for key, value in flatten(checkpoint["config"]).items():
         require("${" not in repr(value), f"{path}: config.{key}", "a value, no interpolation", value)
     for name, value in checkpoint["state_dict"].items():
@@ -71,8 +70,7 @@ def _check_content(path: str | Path, checkpoint: Mapping[str, Any]) -> None:
 
 
 def _check_sums(path: str | Path, whole: bool) -> None:
-    """Refuse a PyTorch file whose bytes, those of tensors where it is read as a ``whole``, do not fit its
-    checksums."""
+    """Refuse a PyTorch file that does not fit its checksums; tensors are checked only if ``whole``."""
     if not zipfile.is_zipfile(file := file_of(path)):
         return  # reading it says what is wrong
     try:
@@ -87,7 +85,7 @@ def _check_sums(path: str | Path, whole: bool) -> None:
 
 
 def describe(content: Any) -> str:
-    """The content of an unexpected file in a few words, for messages."""
+    """Content of an unexpected file in a few words, for messages."""
     if not isinstance(content, Mapping):
         return f"a {type(content).__name__}"
     names = [repr(name) for name in content]
@@ -96,7 +94,7 @@ def describe(content: Any) -> str:
 
 
 def model_state(checkpoint: Mapping[str, Any], prefix: str = STATE_PREFIX) -> dict[str, Tensor]:
-    """The tensors of the model alone; a LightningModule's checkpoint holds those of losses too."""
+    """Tensors of the model; a LightningModule's checkpoint also holds those of losses."""
     return {
         key.removeprefix(prefix): value
         for key, value in checkpoint["state_dict"].items()
@@ -105,8 +103,8 @@ def model_state(checkpoint: Mapping[str, Any], prefix: str = STATE_PREFIX) -> di
 
 
 def require_fit(module: nn.Module, state: Mapping[str, Any], source: str | Path) -> None:
-    """Refuse tensors that are not exactly those of ``module``. InputError: a key is missing, unknown or has
-    another shape; names source, key and both shapes. ``module``: its tensors may be on the meta device."""
+    """Check that keys and shapes are exactly those of ``module``, whose tensors may be on the meta device.
+    InputError: a key is missing, unknown or has another shape; names source, key and both shapes."""
     own = module.state_dict()
     for key in own:
         require(key in state, f"{source}: {key}", f"a tensor of shape {tuple(own[key].shape)}", "nothing")
@@ -116,10 +114,9 @@ def require_fit(module: nn.Module, state: Mapping[str, Any], source: str | Path)
 
 
 def require_finite(state: Mapping[str, Tensor], source: str | Path) -> None:
-    """Refuse weights with NaN or infinity, of which every prediction would be empty; names the first tensor.
-    ``state``: tensors by name. ``source``: where they come from, for messages."""
+    """Refuse weights with NaN or infinity, which make every prediction empty. ``source``: for messages."""
     for key, value in state.items():
-        # A sum is not finite where a term is not, and needs no second tensor. Half precision would overflow.
+        # The sum is not finite if any term is not, and needs no second tensor. Half precision would overflow.
         total = value.sum(dtype=torch.promote_types(value.dtype, torch.float32))
         require(bool(total.isfinite()), f"{source}: {key}", "finite numbers", "NaN or infinity")
 
@@ -132,7 +129,7 @@ def load_strictly(module: nn.Module, state: Mapping[str, Any], source: str | Pat
 
 
 def require_shape(key: str, own: Tensor, found: Any) -> None:
-    """Refuse a value that does not fit the configured model's tensor ``own``."""
+    """Refuse a value that differs in shape from the model's tensor ``own`` or holds no floats."""
     expected = f"shape {tuple(own.shape)} of the configured model"
     require(shape_of(found) == tuple(own.shape), key, expected, shape_of(found))
     require(found.is_floating_point(), key, "floating point numbers", found.dtype)
@@ -146,7 +143,7 @@ def shape_of(value: Any) -> tuple[int, ...] | str:
 def write_checkpoint(
     path: str | Path, state: Mapping[str, Tensor], config: Mapping[str, Any], **facts: Any
 ) -> None:
-    """Write a checkpoint."""
+    """Write a checkpoint with the model's tensors, its configuration and further ``facts``."""
     content = {
         "state_dict": {f"{STATE_PREFIX}{key}": value for key, value in state.items()},
         "config": dict(config),
@@ -159,15 +156,12 @@ def write_checkpoint(
 def load_weights(
     model: nn.Module, path: str | Path, dtype: torch.dtype | None = None, device: Any = "cpu"
 ) -> None:
-    """Give a model the weights of a checkpoint, mapped from the file, not copied. FileNotFoundError: there is
-    no such file. InputError: the file is not a checkpoint of this package, or its weights are not finite or
-    do not fit the model.
+    """Give a :class:`ghgs_lit.model.GHGS` the weights of a checkpoint, mapped from the file, not copied.
 
-    Args:
-        model: a :class:`ghgs_lit.model.GHGS`; its own weights may be on the meta device.
-        dtype: of the encoder (None: as in the file, on a CPU float32 in place of a half precision that it
-            lacks); the heads are float32 or wider.
-        device: where the weights will be moved to.
+    The model's own weights may be on the meta device. ``dtype``: precision of the encoder (None: as in the
+    file, but float32 on a CPU without that half precision); the heads are float32 or wider. ``device``: where
+    the weights will be moved to. FileNotFoundError: there is no such file. InputError: it is not a checkpoint
+    of this package, or its weights are not finite or do not fit the model.
     """
     checkpoint = read_checkpoint(path, whole=True)
     require_fit(model, model_state(checkpoint), path)
@@ -184,9 +178,8 @@ def load_weights(
 
 
 def check_preset(model: nn.Module, checkpoint: Mapping[str, Any], path: str | Path) -> None:
-    """Compare the tokens that take part in a model with those that a checkpoint's training has shown.
-    ``skip=auto`` leaves out presets that it did not show. The authors' training showed all tokens: fewer give
-    a warning."""
+    """Compare the model's token preset with those that the checkpoint was trained with. ``skip=auto`` drops
+    presets that were not trained; fewer than all tokens with the authors' weights give a warning."""
     is_release = "release" in (checkpoint.get("imported") or {})
     if model.auto is not None:
         model.auto = model.auto.trained_by({} if is_release else checkpoint["config"])

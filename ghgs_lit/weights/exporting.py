@@ -1,4 +1,4 @@
-"""Writes a checkpoint for others: its tensors under their published names, or a small one for prediction."""
+"""Export of checkpoints: tensors under their published names, or a small checkpoint for prediction."""
 
 from pathlib import Path
 
@@ -15,10 +15,9 @@ from ghgs_lit.weights.switches import differences
 
 
 def export_weights(checkpoint: str | Path, vggt: str | Path | None, release: str | Path | None) -> list[str]:
-    """Write the tensors of ``checkpoint``, bit for bit, under their published names; returns a report.
-    InputError: both files are None, or a tensor has no published name; then nothing is written. ``vggt``: the
-    file for the encoder (safetensors or PyTorch, by its suffix); None to leave it out. ``release``: the
-    PyTorch file for everything else; None to leave it out."""
+    """Write the tensors of ``checkpoint``, bit for bit, under their published names; return a report.
+    ``vggt``: file for the encoder (safetensors or PyTorch, by its suffix). ``release``: PyTorch file for all
+    other stages. InputError: both are None, or a tensor has no published name; then nothing is written."""
     require(vggt is not None or release is not None, "vggt", "vggt=<file>, release=<file> or both", None)
     content = read_checkpoint(checkpoint, whole=True)
     state = model_state(content)
@@ -44,9 +43,8 @@ def export_weights(checkpoint: str | Path, vggt: str | Path | None, release: str
 
 
 def write_tensors(path: str | Path, tensors: dict[str, Tensor], entry: str | None = None) -> None:
-    """Write tensors by name as safetensors or a PyTorch file, by the suffix of ``path``. InputError:
-    ``entry`` is given for safetensors, which have no levels. ``entry``: the key of the PyTorch file under
-    which they are stored; None for no such level."""
+    """Write tensors as safetensors or a PyTorch file, by the suffix of ``path``. ``entry``: key of the
+    PyTorch file that holds them, if any. InputError: it is given for safetensors, which are not nested."""
     if Path(path).suffix == ".safetensors":
         require(entry is None, "release", f"a PyTorch file (.pth), which holds {entry!r}", ".safetensors")
         write_atomically(path, lambda temporary: save_file(tensors, temporary, metadata={"format": "pt"}))
@@ -56,15 +54,14 @@ def write_tensors(path: str | Path, tensors: dict[str, Tensor], entry: str | Non
 
 
 def write_inference(checkpoint: str | Path, path: str | Path, dtype: str) -> None:
-    """Write the model of ``checkpoint`` without optimizer, losses and progress. InputError: a weight is too
-    large for ``dtype``, or both are one file. ``dtype``: of all weights: ``float16``, ``bfloat16`` or
-    ``float32``."""
+    """Write the model of ``checkpoint`` without optimizer, losses and progress. ``dtype`` of all weights:
+    ``float16``, ``bfloat16`` or ``float32``. InputError: a weight overflows it, or both are one file."""
     if Path(checkpoint).resolve() == Path(path).resolve():
         raise InputError(f"inference={path}: expected another file than the checkpoint; found the same")
     content = read_checkpoint(checkpoint, whole=True)
     state = cast(lambda: model_state(read_checkpoint(checkpoint)), lambda *_: getattr(torch, dtype))
     require_finite(state, f"{checkpoint} as {dtype}")
-    # Without paths of the machine that trained it, with what loading reads beside weights and configuration.
+    # Paths of the machine that trained it are dropped; loading reads ``imported``.
     config = {**content["config"], "resume": None, "init_from": None}
     facts = {"imported": content["imported"]} if "imported" in content else {}
     write_checkpoint(path, state, config, **facts)

@@ -1,4 +1,4 @@
-"""Weights that do not train: the checkpoints of a run share one file of them, which lies beside them."""
+"""Frozen weights, which all checkpoints of a run share in one file beside them."""
 
 import contextlib
 import hashlib
@@ -15,15 +15,15 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically
 from ghgs_lit.weights.reading import file_of, open_file
 
-#: Bytes of frozen weights up to which each checkpoint holds its own, and so is whole by itself.
+#: Bytes of frozen weights up to which each checkpoint holds its own.
 OWN = 1 << 26
-#: Version of checkpoints that share a file: what reads version 2 alone would miss their tensors.
+#: Version of checkpoints that share a file; readers of version 2 would miss its tensors.
 SHARING = 3
 PATTERN = "frozen-*.pt"  #: Names of the files
 
 
 def digest_of(tensors: Mapping[str, Tensor]) -> str:
-    """SHA-256 of names, kinds and bytes."""
+    """SHA-256 of names, dtypes, shapes and bytes."""
     digest = hashlib.sha256()
     for name in sorted(tensors):
         tensor = tensors[name].detach().cpu().contiguous()
@@ -33,21 +33,21 @@ def digest_of(tensors: Mapping[str, Tensor]) -> str:
 
 
 class Frozen:
-    """Takes frozen tensors out of the checkpoints of a run, whose key ``frozen`` has their names."""
+    """Moves the tensors that a checkpoint names under ``frozen`` into a shared file."""
 
     def __init__(self) -> None:
         self._known: list[tuple[str, int, int]] = []
         self._digest = ""
 
     def stored(self, checkpoint: dict[str, Any], folder: Path) -> dict[str, Any]:
-        """``checkpoint`` with a reference in place of these tensors, which are then in a file in ``folder``;
-        as it is where they are few."""
+        """``checkpoint`` with a reference to the shared file in ``folder`` in place of frozen tensors, or
+        unchanged if they are small."""
         state = checkpoint.get("state_dict", {})
         tensors = {name: state[name] for name in checkpoint.get("frozen", ())}
         if sum(tensor.nbytes for tensor in tensors.values()) <= OWN:
             return checkpoint
         known = [(name, tensor.data_ptr(), tensor._version) for name, tensor in tensors.items()]
-        if known != self._known:  # they are digested again only where something wrote to them
+        if known != self._known:  # hashed again only if something wrote to them
             self._known, self._digest = known, digest_of(tensors)
         path = folder / PATTERN.replace("*", self._digest[:16])
         if not path.exists():
@@ -61,7 +61,7 @@ class Frozen:
 
 
 def _write(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Write the file, or link that of another run beside this one, as of a sweep."""
+    """Write the file, or link the same file of a neighbouring run of a sweep."""
     for twin in path.parent.parent.parent.glob(f"*/{path.parent.name}/{path.name}"):
         with contextlib.suppress(OSError):  # some file systems have no links
             return write_atomically(path, partial(os.link, twin))
@@ -69,9 +69,8 @@ def _write(path: Path, tensors: Mapping[str, Tensor]) -> None:
 
 
 def joined(path: str | Path, checkpoint: Mapping[str, Any], whole: bool = False) -> dict[str, Any]:
-    """``checkpoint``, which was read at ``path``, with the tensors of the file that it refers to, if any.
-    ``whole``: read every byte of these and refuse others than those that were written. InputError: there is
-    no such file beside the checkpoint, or it holds something else."""
+    """``checkpoint``, read from ``path``, with the tensors of its shared file, if any. ``whole``: check their
+    SHA-256. InputError: there is no such file beside the checkpoint, or it holds something else."""
     if "frozen_file" not in checkpoint:
         return dict(checkpoint)
     place, linked = f"{path}: frozen_file", checkpoint["frozen_file"]

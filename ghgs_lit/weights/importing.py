@@ -1,4 +1,4 @@
-"""Published weights to a checkpoint of this package: every tensor is used, or is listed as ignored."""
+"""Import of published weights to a checkpoint: every tensor is used, or listed as ignored."""
 
 import hashlib
 import re
@@ -29,12 +29,8 @@ def is_repository(name: str) -> bool:
 
 
 def fetch(repository: str) -> tuple[Path, str]:
-    """The path of a repository's file and its SHA-256, from the local cache or the hub.
-
-    Shows progress, resumes an earlier download, and compares the checksum with the published one.
-    ``repository``: ``owner/repository``. InputError: the package, the network or the repository is missing,
-    or the checksum differs.
-    """
+    """Path and SHA-256 of the weights of ``owner/repository``, from the local cache or the hub. InputError:
+    the package, the network or the repository is missing, or the checksum is not the published one."""
     try:
         import huggingface_hub
     except ImportError:
@@ -59,7 +55,7 @@ def fetch(repository: str) -> tuple[Path, str]:
 
 
 def sha256(path: Path) -> str:
-    """The checksum of a file in hexadecimal digits."""
+    """SHA-256 of a file in hexadecimal digits."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while block := file.read(1 << 20):
@@ -68,7 +64,7 @@ def sha256(path: Path) -> str:
 
 
 def _checked(path: Path) -> str:
-    """The checksum of a cached file, which the cache names by the published one."""
+    """SHA-256 of a cached file, whose name in the cache is the published one."""
     found, published = sha256(path), path.resolve().name
     if re.fullmatch(r"[0-9a-f]{64}", published) and found != published:
         raise InputError(
@@ -77,7 +73,7 @@ def _checked(path: Path) -> str:
     return found
 
 
-KINDS = {"vggt": "VGGT-1B", "release": "the authors' release"}  #: The files' names in messages
+KINDS = {"vggt": "VGGT-1B", "release": "the authors' release"}  #: Names in messages
 
 
 @dataclass(frozen=True)
@@ -85,13 +81,13 @@ class Source:
     """A file of published weights."""
 
     key: str  #: ``vggt`` or ``release``
-    label: str  #: the repository or the file's name, for reports
+    label: str  #: the repository's or file's name, for the checkpoint
     path: Path
     checksum: str  #: SHA-256
-    table: Mapping[str, str]  #: prefixes of published names: our prefixes
+    table: Mapping[str, str]  #: our prefixes by published ones
     ignored: Sequence[str] = ()  #: prefixes of tensors that are not used
-    entry: str | None = None  #: the key of the file under which its tensors are; None for none
-    used: dict[str, str] = field(default_factory=dict)  #: our name: published name, of used tensors
+    entry: str | None = None  #: the key of the file that holds its tensors, if any
+    used: dict[str, str] = field(default_factory=dict)  #: published names of used tensors by ours
     skipped: Counter = field(default_factory=Counter)  #: ignored tensors by the first part of their name
 
     def tensors(self) -> dict[str, Tensor]:
@@ -107,7 +103,7 @@ class Source:
         return dict(content)
 
     def used_tensors(self) -> dict[str, Tensor]:
-        """The tensors that are used, by our names."""
+        """The used tensors by our names."""
         tensors = self.tensors()
         return {own: tensors[published] for own, published in self.used.items()}
 
@@ -126,7 +122,7 @@ class Source:
             self.used[own] = name
 
     def report(self) -> str:
-        """How many tensors are used and ignored, as one line."""
+        """Numbers of used and ignored tensors, as one line."""
         ignored = ", ".join(f"{part} {count}" for part, count in sorted(self.skipped.items()))
         return f"{self.key}: {self.path}: {len(self.used)} tensors used, {self.skipped.total()} ignored" + (
             f" ({ignored})" if ignored else ""
@@ -134,7 +130,7 @@ class Source:
 
 
 def sources(vggt: str | None, release: str | None) -> Iterator[Source]:
-    """The files to read; a repository of the hub is downloaded first."""
+    """Yield the files to read; a repository of the hub is downloaded first."""
     require(vggt is not None, "vggt", "a file or facebook/VGGT-1B (heads need their encoder)", None)
     if is_repository(vggt):
         label, (path, checksum) = vggt, fetch(vggt)
@@ -157,16 +153,12 @@ def import_weights(
     release: str | None = None,
     dtype: str = "float32",
 ) -> list[str]:
-    """Write a checkpoint with published weights; returns a report.
+    """Write a checkpoint with published weights; return a report.
 
-    The published tensors are mapped from their files and written from there. FileNotFoundError: a file is
-    missing. InputError: a tensor does not fit; names the file, the tensor and both shapes.
-
-    Args:
-        state: the model's tensors. Those on the meta device must come from the files, others may keep
-            their values.
-        vggt: a file of VGGT-1B's weights, or a repository of the Hugging Face hub.
-        dtype: precision of the encoder in the checkpoint, such as ``bfloat16``; the heads are always float32.
+    ``state``: the model's tensors; those on the meta device must come from the files, others may keep their
+    values. ``vggt``: a file of VGGT-1B's weights, or a repository of the Hugging Face hub. ``dtype``:
+    precision of the encoder, such as ``bfloat16``; heads are float32. FileNotFoundError: a file is missing.
+    InputError: a tensor does not fit; names the file, the tensor and both shapes.
     """
     files = list(sources(vggt, release))
     for source in files:
@@ -176,7 +168,7 @@ def import_weights(
     tensors = dict(state)
 
     def precision(name: str, stored: torch.dtype) -> torch.dtype:
-        # Depths and offsets of millimetres depend on the digits of the heads.
+        # Depths and offsets of millimetres need the precision of the heads.
         return getattr(torch, dtype) if name.startswith("encoder.") else torch.float32
 
     for source in files:
@@ -194,9 +186,8 @@ def import_weights(
 
 
 def match_files(state: Mapping[str, Tensor], files: Sequence[Source]) -> list[str]:
-    """Find the file of each tensor of ``state`` (``Source.used``), by names and shapes alone. Returns: the
-    names of tensors that are in no file and keep their values. InputError: a tensor on the meta device is in
-    no file, or a file does not fit."""
+    """Fill ``Source.used`` by names and shapes; return the names of tensors that are in no file and keep
+    their values. InputError: a tensor on the meta device is in no file, or a file does not fit."""
     for source in files:
         source.match(state)
     missing = [name for name in state if not any(name in source.used for source in files)]

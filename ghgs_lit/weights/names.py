@@ -1,4 +1,4 @@
-"""Published names of tensors and ours, as tables of prefixes; the rest of a name is the same."""
+"""Tables of published prefixes of tensor names and ours; the rest of a name is the same."""
 
 from collections.abc import Mapping
 
@@ -27,7 +27,7 @@ RELEASE = {
 }
 RELEASE_ENTRY = "network"
 
-UNPUBLISHED = ".guide."  #: Part of the names of tensors that only our own variants have
+UNPUBLISHED = ".guide."  #: Part of the names of tensors that only our variants of the model have
 
 
 def to_ours(name: str, table: Mapping[str, str]) -> str | None:

@@ -1,7 +1,6 @@
-"""Opens weight files of either format, and explains in one line what is wrong with any other file.
+"""Reading of safetensors and PyTorch files, with one-line errors for any other file.
 
-Tensors are mapped from the disk, not read: only the pages that are used take memory, and the system can free
-them again.
+Tensors are mapped from the disk: only the pages that are used take memory, and the system can free them.
 """
 
 import pickle
@@ -20,18 +19,18 @@ if TYPE_CHECKING:  # a missing file is refused before PyTorch is imported
     from torch import Tensor
 
 _WEB_PAGE = "a web page; the address asked for a login or redirected"
-#: Results of failed downloads: the first bytes, and what they mean.
+#: First bytes of what failed downloads leave, and their meaning.
 FAILED_DOWNLOADS = (
     (b"version https://git-lfs", "a git-lfs pointer; `git lfs pull` downloads the file itself"),
     (b"<!doctype html", _WEB_PAGE),
     (b"<html", _WEB_PAGE),
     (b"<?xml", "an XML document, as servers send it for an error"),
 )
-#: The name of the checkpoint that comes with the package (docs/model_card.md), and its file.
+#: Name and file of the checkpoint that comes with the package (docs/model_card.md).
 SHIPPED, SHIPPED_FILE = "shipped", Path(__file__).with_name("shipped.ckpt")
 ZIP, PICKLE = b"PK", b"\x80"
 
-_CHUNK = 1 << 28  #: Bytes of tensors to convert before the file is mapped again
+_CHUNK = 1 << 28  #: Bytes of tensors that are converted before the file is mapped again
 
 
 def file_of(path: str | Path) -> Path:
@@ -40,9 +39,9 @@ def file_of(path: str | Path) -> Path:
 
 
 def open_file(path: str | Path) -> Any:
-    """The content of a safetensors or PyTorch file; its format is read from its first bytes. Nothing in the
-    file is ever executed (``weights_only=True``). ``path``: the file, or :data:`SHIPPED`. FileNotFoundError:
-    there is no such file. InputError: it has another format, is truncated, or holds code."""
+    """Content of a safetensors or PyTorch file, or :data:`SHIPPED`; the first bytes tell the format. No code
+    in it is executed (``weights_only=True``). FileNotFoundError: there is no such file. InputError: it has
+    another format, is truncated, or holds code."""
     path = file_of(path)
     start = require_weights(path)
     if start.startswith(ZIP):
@@ -61,12 +60,12 @@ def _unfit(path: Path, found: str) -> InputError:
 
 
 def require_weights(path: str | Path) -> bytes:
-    """The first bytes of a file that may hold weights; raises as :func:`open_file` does."""
+    """First bytes of a file that may hold weights; raises as :func:`open_file` does."""
     path = file_of(path)
     if path.is_dir():
         raise _unfit(path, "a directory")
     if not path.is_file():
-        resolved(path)  # says so where its links go in a loop
+        resolved(path)  # refuses links that form a loop
         raise FileNotFoundError(f"{path}: expected a file of weights; found none")
     with path.open("rb") as file:
         start = file.read(64)
@@ -83,7 +82,7 @@ def _open_torch(path: Path, mmap: bool) -> Any:
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about foreign pickles, which are refused below
+            warnings.simplefilter("ignore")  # foreign pickles are refused below
             return torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
     except Exception as error:
         text = str(error)
@@ -114,13 +113,9 @@ def _open_safetensors(path: Path) -> "dict[str, Tensor]":
 def cast(
     open_tensors: "Callable[[], Mapping[str, Tensor]]", dtype_of: "Callable[[str, torch.dtype], torch.dtype]"
 ) -> "dict[str, Tensor]":
-    """The tensors of a mapped file, converted to the precision that ``dtype_of`` chooses.
-
-    Tensors that have it already stay mapped. Pages of a mapping count as memory once they were read, so the
-    file is closed and opened again after every 256 MB: never more than the result and one chunk is held.
-    ``open_tensors``: opens the file; gives its tensors by name. ``dtype_of``: the precision of a tensor,
-    given its name and its stored precision.
-    """
+    """Tensors of a mapped file, each converted to ``dtype_of(name, stored precision)`` unless it has it.
+    ``open_tensors`` maps the file and returns its tensors by name. Pages that were read count as memory, so
+    the file is mapped again after every 256 MB: only the result and one chunk are held."""
     tensors = open_tensors()
     names = list(tensors)
     target = {name: dtype_of(name, tensor.dtype) for name, tensor in tensors.items()}

@@ -1,4 +1,4 @@
-"""Where the authors' code differs from the paper: the switches of ``compat=release``."""
+"""Switches of ``compat=release``, with which the authors' code differs from the paper."""
 
 from collections.abc import Mapping
 from functools import cache
@@ -12,7 +12,7 @@ from ghgs_lit.config.options import Options
 
 
 class CompatOptions(Options):
-    """Name of the code that a configuration reproduces; ``conf/compat`` sets the switches themselves."""
+    """Name of the code that a configuration reproduces; ``conf/compat`` sets the switches."""
 
     group = "compat"
     name: Literal["none", "release"] = "none"
@@ -25,7 +25,7 @@ def release_switches() -> dict[tuple[str, ...], Any]:
     node = OmegaConf.to_container(OmegaConf.load(conf_dir() / "compat" / "release.yaml"))
     for choice in node["defaults"]:
         ((group, option),) = ((key.removeprefix("override /"), value) for key, value in choice.items())
-        if group not in ("metrics", "renderer"):  # no parts of the model
+        if group not in ("metrics", "renderer"):  # not parts of the model
             node[group] = OmegaConf.to_container(OmegaConf.load(conf_dir() / group / f"{option}.yaml"))
     return {
         (group, key): value
@@ -37,9 +37,8 @@ def release_switches() -> dict[tuple[str, ...], Any]:
 
 
 def differences(config: Mapping[str, Any], other: Mapping[str, Any] | None = None) -> list[str]:
-    """The switches in which two models differ, as ``<key>=<value> for <other value>``. ``other``: that of
-    another model; None for the release. What it has no stage of (a checkpoint of ``ghgs pretext`` is an
-    encoder alone) does not differ."""
+    """Switches in which ``config`` differs from ``other`` (None: the release), as ``<key>=<value> for <other
+    value>``. Stages that ``other`` lacks, as a checkpoint of ``ghgs pretext`` does, are not compared."""
     found = []
     for (group, key), value in release_switches().items():
         if other is not None and group not in other:

@@ -1,4 +1,4 @@
-"""The two searches of the bounds for CPUs: a cell or a ray is left as soon as its answer is known."""
+"""The two searches of the bounds for CPUs; each cell and each ray ends as soon as its result is known."""
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -6,7 +6,7 @@ from torch import Tensor
 
 from ghgs_lit.kernels import pool
 
-#: Slices of a grid, or rows of an image, of one task.
+#: Slices of a grid, and rows of an image, in one task.
 _SLICES, _ROWS = 8, 16
 
 
@@ -16,8 +16,8 @@ def carve(
     position: Float[Tensor, "B 3 n"],
     tolerance: int,
 ) -> Bool[Tensor, "B n n n"]:
-    """Which cells of a grid at most ``tolerance`` views place outside; see :func:`subject_box`. ``outside``:
-    1 where a view says "outside". ``tolerance``: votes that a kept cell may have."""
+    """Cells of a grid that at most ``tolerance`` views place outside; see :func:`subject_box`. ``outside``: 1
+    where a view says "outside". ``position``: centres of the cells along each axis."""
     from ghgs_lit.bounds.cpu.kernel import carve_slices  # here: it loads a compiler
 
     elements, cells = position.shape[0], position.shape[2]
@@ -39,10 +39,10 @@ def march(
     steps: Float[Tensor, " s"],
     tolerance: int,
 ) -> None:
-    """Change ``near`` and ``far`` to the first and the last depth that the other views allow. ``outside``: 1
-    where a view says "outside". ``near``, ``far``: contiguous; rays that miss the hull keep theirs.
-    ``steps``: shares of the way from near to far that are tried. ``tolerance``: votes that an allowed depth
-    may have."""
+    """Replace ``near`` and ``far`` by the first and the last depth that the other views allow. ``outside``: 1
+    where a view says "outside". ``near``, ``far``: contiguous; unchanged for rays that miss the hull.
+    ``steps``: fractions of the way from near to far that are tried. ``tolerance``: votes that an allowed
+    depth may have."""
     from ghgs_lit.bounds.cpu.kernel import march_rows
 
     elements, views, height, _ = masks.shape

@@ -1,4 +1,4 @@
-"""Votes of the views about cells and about depths along rays, one at a time."""
+"""Kernels that count the votes of the views about cells and about depths along rays."""
 
 import numpy as np
 from numba.core import types
@@ -19,10 +19,10 @@ def _vote(table, x, y, w):
     inverse = ONE / (LEAST if w < LEAST else w)
     column, row = x * inverse, y * inverse
     right, bottom = np.float32(table.shape[1] - 1), np.float32(table.shape[0] - 1)
-    # Comparisons with NaN are false: it becomes 0.
+    # Comparisons with NaN are false, so it becomes 0.
     column = (right if column > right else column) if column > ZERO else ZERO
     row = (bottom if row > bottom else row) if row > ZERO else ZERO
-    # Unsigned: a signed index is compared with 0.
+    # Unsigned: Numba checks the sign of a signed index.
     return table[np.uint64(np.int64(row)), np.uint64(np.int64(column))]
 
 
@@ -52,7 +52,7 @@ def carve_slices(outside, matrices, position, kept, tolerance, element, first, l
 
 @helper
 def _allowed(outside, element, view, origin, along, depth, tolerance):
-    """Whether at most ``tolerance`` other views place a depth of a ray outside."""
+    """Whether at most ``tolerance`` other views place the point at ``depth`` outside."""
     votes = 0
     for u in range(len(origin)):
         if u != view:
@@ -74,7 +74,7 @@ def _product(row, vector):
 def march_rows(
     outside, masks, matrices, directions, centers, near, far, steps, tolerance, element, view, first, last
 ):
-    """Change the bounds of rows ``first`` to ``last`` of a view; see :func:`ghgs_lit.bounds.cpu.march`."""
+    """Narrow the bounds of rows ``first`` to ``last`` of a view; see :func:`ghgs_lit.bounds.cpu.march`."""
     views, width, samples = masks.shape[1], masks.shape[3], len(steps)
     origin, along = np.empty((views, 3), np.float32), np.empty((views, 3), np.float32)
     for u in range(views):

@@ -1,1 +1,1 @@
-"""HuMMan-Recon v1.0: one performer among ten Kinects, read as it is downloaded."""
+"""Reader of HuMMan-Recon v1.0 as downloaded: one performer among ten Kinects."""

@@ -1,6 +1,6 @@
-"""The cameras of a HuMMan sequence (``cameras.json``): ten of colour, and ten of depth with their points.
+"""Cameras of a HuMMan sequence (``cameras.json``), ten of colour and ten of depth, and points of the latter.
 
-Each has ``K`` (3, 3), ``R`` (3, 3) and ``T`` (3), OpenCV's, world to camera in metres, without lens
+Each has ``K`` (3, 3), ``R`` (3, 3) and ``T`` (3) as in OpenCV, world to camera in metres, without lens
 distortion. The world is the frame of ``kinect_color_000``: y points down.
 """
 
@@ -21,16 +21,15 @@ _NEAREST, _FURTHEST = 0.1, 100.0
 
 @dataclass(frozen=True)
 class Calibration:
-    """Ten cameras. ``intrinsics``: [10, 3, 3] in pixels, pixel centres at integers. ``extrinsics``: [10, 4,
-    4], world to camera, metres."""
+    """Ten cameras: ``intrinsics`` [10, 3, 3] with pixel centres at integers, ``extrinsics`` [10, 4, 4]."""
 
     intrinsics: np.ndarray
     extrinsics: np.ndarray
 
 
 def read_calibration(path: Path, kind: str) -> Calibration:
-    """Read the cameras of a sequence. ``kind``: ``color`` or ``depth``. InputError: it is missing or broken,
-    a camera is missing or bad, or translations are not in metres."""
+    """Read the cameras of a sequence. ``kind``: ``color`` or ``depth``. InputError: the file or a camera is
+    missing or bad, or translations are not in metres."""
     content = read_json(path, "the cameras of a sequence in JSON")
     cameras = [_camera(path, content, f"kinect_{kind}_{k:03d}") for k in KINECTS]
     intrinsics, extrinsics = (np.stack(matrices) for matrices in zip(*cameras, strict=True))
@@ -56,17 +55,16 @@ def _camera(path: Path, content: Any, key: str) -> tuple[np.ndarray, np.ndarray]
 
 
 MILLIMETRES = 1000.0
-_DEEPEST = 5.0  # metres: the limit of the data set's own toolbox, too
-# Number of points that are kept, evenly over the cameras: a multiple of what a loss uses.
+_DEEPEST = 5.0  # metres, as in the data set's own toolbox
+# Greatest number of points that are kept, evenly over the cameras.
 _KEPT = 20000
 
 
 def surface_points(
     sequence: Path, frame: int, depth_cameras: Calibration, cameras: Calibration, masks: dict[int, np.ndarray]
 ) -> np.ndarray:
-    """What the depth cameras see inside all masks. ``masks``: [h, w] bool by number of the colour camera.
-    Returns: [n, 3] float32 in the world, metres. InputError: a depth map is missing or bad, or no point lies
-    inside the masks."""
+    """World points [n, 3] float32 of the depth cameras that lie inside all masks. ``masks``: [h, w] bool by
+    number of the colour camera. InputError: a depth map is missing or bad, or no point lies inside."""
     points = [_points(_path(sequence, k, frame), depth_cameras, k) for k in KINECTS]
     inside = [_inside(world, k, cameras, masks) for k, world in zip(KINECTS, points, strict=True)]
     found = np.concatenate(inside)
@@ -98,7 +96,7 @@ def _points(path: Path, cameras: Calibration, kinect: int) -> np.ndarray:
 def _inside(
     points: np.ndarray, kinect: int, cameras: Calibration, masks: dict[int, np.ndarray]
 ) -> np.ndarray:
-    """Points that no mask excludes and one includes; the own camera comes first: it excludes the most."""
+    """Points that some mask includes and none excludes; the own camera, which excludes most, comes first."""
     seen = np.zeros(len(points), bool)
     for k in sorted(masks, key=lambda k: k != kinect):
         pose, (height, width) = cameras.extrinsics[k], masks[k].shape

@@ -1,10 +1,9 @@
-"""HuMMan-Recon v1.0 as it is configured and read.
+"""Options and reader of HuMMan-Recon v1.0.
 
-``<root>/p<subject>_a<action>/`` holds, for the Kinects 000 to 009 and frames that are multiples of 6,
-``kinect_color/kinect_<k>/<frame>.png`` (1920 x 1080), ``kinect_mask/`` with the same names (matting: any
-value but 0 is the performer), for the test sequences ``kinect_mask_manual/``, ``kinect_depth/`` (640 x 576,
-millimetres, frame of the depth camera), ``smpl_params/<frame>.npz`` and ``cameras.json``. Some frames are
-missing.
+``<root>/p<subject>_a<action>/`` holds, for the Kinects 000 to 009 and frames that are multiples of 6 (some
+are missing), ``kinect_color/kinect_<k>/<frame>.png`` (1920 x 1080), ``kinect_mask/`` with the same names
+(matting: any value but 0 is the performer), for the test sequences ``kinect_mask_manual/``, ``kinect_depth/``
+(640 x 576, millimetres, frame of the depth camera), ``smpl_params/<frame>.npz`` and ``cameras.json``.
 """
 
 import logging
@@ -40,8 +39,8 @@ class _Frame:
 
 class HuMManReader(FrameReader):
     """Frames of the sequences of a phase, each a subject ``<sequence>_<frame>``; positions are the colour
-    cameras. Sequences and frames that are missing are left out, and cameras of a frame. InputError: all
-    sequences are missing, cameras are bad, or the body model cannot be loaded."""
+    cameras. Missing sequences, frames and cameras of a frame are left out. InputError: all sequences are
+    missing, cameras are bad, or the body model cannot be loaded."""
 
     def __init__(self, data: "HuMMan", phase: str, strict: bool = True) -> None:
         super().__init__(strict)
@@ -58,7 +57,7 @@ class HuMManReader(FrameReader):
     def _add(self, path: Path, frames: Sequence[int]) -> None:
         cameras = read_calibration(path / "cameras.json", "color")
         there = {k: _frames_of(path / "kinect_color" / f"kinect_{k:03d}") for k in KINECTS}
-        # Not one by one: any number of frames may be asked for.
+        # Existing frames are listed, because any number may be asked for.
         numbers = [number for number in sorted(set().union(*there.values())) if number in frames]
         found = {number: tuple(k for k in KINECTS if number in there[k]) for number in numbers}
         if not found:
@@ -128,12 +127,12 @@ def _frames_of(folder: Path) -> set[int]:
 
 
 _SEQUENCE = re.compile(r"p\d{6}_a\d{6}")
-# How far the first camera's pose may differ from the identity.
+# Largest difference of the first camera's pose from the identity.
 _POSE_TOLERANCE = 1e-2
 
 
 class SequenceNames(Options):
-    """Which sequences are train and val."""
+    """Sequences of each phase."""
 
     train: tuple[Text, ...] | None = None
     """Names of sequences; null: all that exist but those of val."""
@@ -146,12 +145,12 @@ class SequenceNames(Options):
         return self
 
     def of(self, phase: str) -> tuple[str, ...] | None:
-        """The names of a phase."""
+        """Names of a phase."""
         return getattr(self, phase)
 
 
 class HuMMan(DataSet):
-    """Downloaded HuMMan-Recon sequences below ``root``; a sample is one frame of one sequence."""
+    """Downloaded HuMMan-Recon sequences below ``root``; a subject is one frame of one sequence."""
 
     published: ClassVar[Mapping[str, int]] = {"train": 317, "val": 22}
     static_cameras: ClassVar[bool] = True
@@ -178,7 +177,7 @@ class HuMMan(DataSet):
         return self
 
     def sequences(self, phase: str) -> list[str]:
-        """Names of the sequences of a phase, whether they exist or not."""
+        """Names of the sequences of a phase; listed ones need not exist."""
         if (names := self.split.of(phase)) is not None:
             return list(names)
         names = (p.name for p in self.folder.iterdir() if p.is_dir() and _SEQUENCE.fullmatch(p.name))
@@ -197,8 +196,7 @@ class HuMMan(DataSet):
 
 
 def check_world(path: Path) -> None:
-    """Check that the world of a ``cameras.json`` is the frame of its first colour camera. InputError: it is
-    not, or the file is bad."""
+    """Check a ``cameras.json``. InputError: it is bad, or its world is not the first colour camera's."""
     first = read_calibration(path, "color").extrinsics[0]
     if np.abs(first - np.eye(4)).max() > _POSE_TOLERANCE:
         raise InputError(

@@ -1,8 +1,7 @@
-"""Bodies from SMPL parameters, for those who have the licensed model.
+"""Bodies from HuMMan's SMPL parameters, with the licensed SMPL_NEUTRAL and the package ``smplx``.
 
-HuMMan stores parameters, not vertices: vertices need SMPL_NEUTRAL and the package ``smplx``. The model file
-is read without running it: pickles of the official release name chumpy and SciPy classes, which are replaced
-by harmless classes that keep the arrays.
+No code of the model file is run: the chumpy and SciPy classes that pickles of the official release name are
+replaced by harmless ones that keep the arrays.
 """
 
 import contextlib
@@ -22,7 +21,7 @@ from ghgs_lit.data.pickles import load_pickle
 from ghgs_lit.errors import InputError, installed
 
 VERTICES = 6890
-#: What a sequence's ``smpl_params/<frame>.npz`` holds.
+#: Length of each vector in ``smpl_params/<frame>.npz``.
 PARAMETERS = {"betas": 10, "body_pose": 69, "global_orient": 3, "transl": 3}
 _SHAPES = {
     "v_template": (VERTICES, 3), "shapedirs": (VERTICES, 3, None), "posedirs": (VERTICES, 3, 207),
@@ -32,14 +31,14 @@ _FILES = ("smpl/SMPL_NEUTRAL.pkl", "smpl/SMPL_NEUTRAL.npz", "SMPL_NEUTRAL.pkl", 
 
 
 class _Chumpy:
-    """Replaces ``chumpy.ch.Ch``: an array under ``x``."""
+    """Replacement of ``chumpy.ch.Ch``, whose array is ``x``."""
 
     def __setstate__(self, state: dict) -> None:
         self.array = np.asarray(state["x"])
 
 
 class _Sparse:
-    """Replaces SciPy's compressed column matrices."""
+    """Replacement of SciPy's compressed column matrices."""
 
     def __setstate__(self, state: dict) -> None:
         parts = (state["data"], state["indices"], state["indptr"])
@@ -47,7 +46,7 @@ class _Sparse:
 
 
 def _reconstruct(kind: type, base: type, state: Any) -> object:
-    """How protocols below 2 make objects; only the replacements above are made."""
+    """Object construction of protocols below 2, for the replacements above only."""
     if kind not in (_Chumpy, _Sparse):
         raise pickle.UnpicklingError(f"an object of {kind!r}")
     return kind.__new__(kind)
@@ -62,8 +61,7 @@ _REPLACEMENTS = {
 
 
 def model_file(path: Path) -> Path:
-    """The model's file: ``path`` itself, or one of the usual names in the folder ``path``. InputError: there
-    is none."""
+    """Model file at ``path``, or under a usual name in the folder ``path``. InputError: there is none."""
     files = [path, *(path / name for name in _FILES)]
     found = next((file for file in files if file.is_file()), None)
     if found is None:
@@ -72,8 +70,7 @@ def model_file(path: Path) -> Path:
 
 
 def read_model(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an SMPL model file. InputError: it is missing, names anything that could run, or an array
-    is missing or has another shape."""
+    """Arrays of an SMPL model file. InputError: the file or an array is missing or bad, or it names code."""
     if path.suffix == ".npz":
         with _opened(path) as archive:
             content = {key: archive[key] for key in _SHAPES if key in archive}
@@ -86,8 +83,8 @@ def read_model(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_parameters(path: Path) -> dict[str, np.ndarray]:
-    """Parameters of one frame, each a vector of float64. InputError: the file is missing or broken; a vector
-    is missing, has another length or is not finite."""
+    """Parameters of one frame as float64 vectors. InputError: the file is missing or broken, or a vector is
+    missing, has another length or is not finite."""
     if not path.is_file():
         raise InputError(f"{path}: expected SMPL parameters; found no such file")
     with _opened(path) as archive:
@@ -100,7 +97,7 @@ def read_parameters(path: Path) -> dict[str, np.ndarray]:
 
 @contextlib.contextmanager
 def _opened(path: Path):
-    """Open an ``.npz``; every error, also one inside the block, becomes an InputError."""
+    """Open an ``.npz``; every error, also inside the block, becomes an InputError."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             yield archive
@@ -109,8 +106,7 @@ def _opened(path: Path):
 
 
 class Body:
-    """SMPL_NEUTRAL from the file or folder ``path``. InputError: there is no model at ``path``, it is broken,
-    or ``smplx`` is not installed."""
+    """SMPL_NEUTRAL from a file or folder. InputError: it is missing or bad, or ``smplx`` is missing."""
 
     def __init__(self, path: Path) -> None:
         self.model = _model(model_file(path))

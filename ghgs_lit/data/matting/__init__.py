@@ -1,10 +1,10 @@
 """Mattes of photographs whose masks are a few pixels off, ragged or have holes.
 
-A mask that is off by a pixel paints the background's colours on the subject's outline, other ones in every
-view. The photograph itself says where the subject ends. A network tells it that learned from generated people
-before backgrounds of many kinds (``scripts/bake_matting.py``): a U-Net (Ronneberger et al., MICCAI 2015) with
-a rough mask beside the colours, as in Deep Image Matting (Xu et al., CVPR 2017). It also sees how
-far each colour is from those of the subject and of the background nearby.
+A mask that is off by a pixel paints colours of the background, different in each view, on the subject's
+outline. A network estimates the matte from photograph and mask: a U-Net (Ronneberger et al., MICCAI 2015)
+with a rough mask beside the colours, as in Deep Image Matting (Xu et al., CVPR 2017), and the differences of
+each colour from those of subject and background nearby. It was trained on generated people before many kinds
+of backgrounds (``scripts/bake_matting.py``).
 """
 
 import functools
@@ -23,16 +23,16 @@ from ghgs_lit.kernels.precision import exact
 
 #: Channels at the full size of the image and at each half of it.
 _WIDTHS = (16, 32, 48, 64)
-#: Distances in pixels from the mask's outline that the network tells apart.
+#: Pixels at which the distance from the mask's outline is clipped.
 FARTHEST = 8.0
 #: Colours nearby are averaged in images smaller by this factor, over squares of these sides, twice.
 _COARSER, _SIDES = 4, (3, 7)
-#: Colours, mask, distance from its outline, and colours less those of two sides in two neighbourhoods.
+#: Channels: colours, mask, distance from its outline; differences from colours inside and outside nearby.
 _FEATURES = 5 + 3 * 2 * len(_SIDES)
 
 
 class MattingNetwork(nn.Module):
-    """Mattes, and colours of the subject alone."""
+    """U-Net for mattes and colours of the subject."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -45,9 +45,8 @@ class MattingNetwork(nn.Module):
     def forward(
         self, images: Float[Tensor, "B 3 h w"], mattes: Float[Tensor, "B h w"]
     ) -> tuple[Float[Tensor, "B h w"], Float[Tensor, "B 3 h w"]]:
-        """The mattes, in [0, 1] in evaluation alone, and the subject's colours multiplied by them.
-        ``images``: photographs with what is behind the subject, in [0, 1]. ``mattes``: what is known of it,
-        such as masks of 0 and 1."""
+        """Mattes (in [0, 1] in evaluation only) and the subject's colours multiplied by them, from ``images``
+        with background in [0, 1] and rough ``mattes`` such as masks of 0 and 1."""
         height, width = images.shape[2:]
         whole = 2 ** (len(_WIDTHS) - 1)
         x = F.pad(_features(images, mattes), (0, -width % whole, 0, -height % whole), mode="replicate")
@@ -59,11 +58,10 @@ class MattingNetwork(nn.Module):
         for block in reversed(self.up):
             x = block(torch.cat((finer.pop(), F.interpolate(x, scale_factor=2.0, mode="nearest")), 1))
         out = self.out(x)[..., :height, :width].float()
-        # A mask of 0 or 1 can be turned around, and a matte that is right is the easiest answer.
+        # A correction of up to 1.1 can invert a mask; the initial one is 0.
         found = mattes + 1.1 * torch.tanh(out[:, 0])
         share = found.clamp(0, 1)
-        # A pixel shows its share of the subject's colour and the rest of the background's; the network
-        # gives the difference of the two colours.
+        # A pixel mixes the colours of subject and background; the network predicts their difference.
         colors = images + (1 - share.detach())[:, None] * out[:, 1:]
         if not self.training:
             found, colors = share, colors.clamp(0, 1)
@@ -92,41 +90,36 @@ def _features(
 
 
 def _insideness(mask: np.ndarray) -> np.ndarray:
-    """Distance from the outline over :data:`FARTHEST`, from -1 outside to 1 inside; float32."""
+    """Signed distance from the outline over :data:`FARTHEST`, in [-1, 1], positive inside; float32."""
     return (signed_distance(mask) / FARTHEST).clip(-1, 1).astype(np.float32)
 
 
 def _near(sums: Float[Tensor, "B 4 m n"], side: int, size: torch.Size) -> Float[Tensor, "B 3 h w"]:
-    """Means of colours in squares, from sums of weighted colours and weights; black where none weighs."""
+    """Weighted means of colours in squares; black if all weights are 0."""
     for _ in range(2):
         sums = F.avg_pool2d(sums, side, 1, side // 2)
     means = sums[:, :3] / (sums[:, 3:] + 1e-4)
     return F.interpolate(means, size, mode="bilinear", align_corners=False)
 
 
-#: The tensors of the network that comes with the package, in half precision.
+#: The network's weights in half precision.
 WEIGHTS = Path(__file__).with_name("weights.safetensors")
-#: Pixels of the background around what may change, which the network sees too.
+#: Pixels of context around those that may change.
 _AROUND = 16
 
 
 def refined_matte(
     image: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray, "h w"], pixels: float
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
-    """The subject on black (premultiplied), and its matte.
-
-    Args:
-        image: the photograph, with its background; best where the subject is 170 to 330 pixels tall, as in
-            training.
-        matte: 255 times the share of each pixel that shows the subject, a mask's 0 and 255 for instance.
-        pixels: by how much the outline may be wrong, above 0 (8 in training); holes of twice that width are
-            filled, too, where the photograph does not speak against it.
-    """
+    """Subject on black (premultiplied), and its refined matte. ``image``: photograph with its background;
+    best if the subject is 170 to 330 pixels tall, as in training. ``matte``: 255 times the share of each
+    pixel that shows the subject, such as 0 and 255 of a mask. ``pixels``: greatest error of the outline,
+    above 0 (8 in training); holes of twice that width may be filled."""
     window = _window(matte > 127, int(pixels) + _AROUND)
     colors, given = (torch.from_numpy(part[window] / np.float32(255)) for part in (image, matte))
     with torch.inference_mode():
         found, subject = _network()(colors.permute(2, 0, 1)[None], given[None])
-    # Pixels whose nearest one on the other side of the outline is so near.
+    # Pixels near enough to the outline to change.
     is_open = np.abs(signed_distance(matte[window] > 127)) + 0.5 <= pixels
     result = np.zeros_like(image), np.zeros_like(matte)
     kept = given.numpy(), (given[..., None] * colors).numpy()
@@ -145,6 +138,5 @@ def _network() -> MattingNetwork:
 
 
 def _window(inside: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice]:
-    """The part of an image around its mask; all of it where the mask is empty."""
     lines = (np.nonzero(inside.any(axis))[0] for axis in (1, 0))
     return tuple(slice(max(n[0] - margin, 0), n[-1] + margin + 1) if len(n) else slice(None) for n in lines)

@@ -1,1 +1,1 @@
-"""ZJU-MoCap: one performer among 21 or 23 cameras, read as it is downloaded."""
+"""Reader of ZJU-MoCap as downloaded: one performer among 21 or 23 cameras."""

@@ -1,8 +1,8 @@
-"""``annots.npy`` of a ZJU-MoCap sequence: its cameras and the names of its photographs.
+"""Reading of ``annots.npy`` of a ZJU-MoCap sequence: its cameras and the names of its photographs.
 
 A pickled dictionary in an array without dimensions: ``cams`` with lists ``K`` (3, 3), ``D`` (4 or 5
 coefficients in any shape), ``R`` (3, 3), ``T`` (3, 1) in **millimetres**, world to camera; ``ims`` with a
-dictionary for each frame, whose ``ims`` are the paths of its photographs in the order of the cameras. In the
+dictionary for each frame, whose ``ims`` are the paths of its photographs in the order of the cameras. In
 sequences 313 and 315 these are the original long names, whose fifth field is the frame number from 1.
 """
 
@@ -18,16 +18,15 @@ from ghgs_lit.data.pickles import load_npy
 from ghgs_lit.errors import InputError
 
 MILLIMETRES = 1000.0
-# Metres: cameras that are all closer together than this were not given in millimetres.
+# Metres: cameras that are closer together were not given in millimetres.
 _NEAREST = 0.1
 
 
 @dataclass(frozen=True)
 class Annotations:
-    """Cameras of one sequence and the photographs of its frames. ``intrinsics``: [n, 3, 3] in pixels as
-    calibrated, pixel centres at integers. ``distortions``: for each camera the coefficients k1 k2 p1 p2 (k3).
-    ``extrinsics``: [n, 4, 4], world to camera, metres. ``frames``: ``frames[f][k]`` is the path of camera k
-    at frame f."""
+    """Cameras of a sequence and its photographs: ``intrinsics`` [n, 3, 3] with pixel centres at integers,
+    ``distortions`` k1 k2 p1 p2 (k3) of each camera, ``extrinsics`` [n, 4, 4] in metres; ``frames[f][k]`` is
+    the path of camera k at frame f."""
 
     intrinsics: np.ndarray
     distortions: tuple[np.ndarray, ...]
@@ -36,8 +35,7 @@ class Annotations:
 
 
 def read_annotations(path: Path) -> Annotations:
-    """Read and check an ``annots.npy``. InputError: it is missing, unsafe or broken; a camera or a name is
-    bad."""
+    """Read and check an ``annots.npy``. InputError: it is missing, unsafe or broken, or an entry is bad."""
     content = load_npy(path)
     cams, ims = (_entry(path, content, key) for key in ("cams", "ims"))
     lists = {key: _entry(f"{path}: cams", cams, key) for key in ("K", "D", "R", "T")}
@@ -63,8 +61,7 @@ def read_annotations(path: Path) -> Annotations:
 
 
 def frame_number(name: PurePath) -> int:
-    """The frame number in the name of a photograph; the files of bodies are named after it. InputError: the
-    name has neither of the two known forms."""
+    """Frame number in a photograph's name; files of bodies are named after it. InputError: there is none."""
     field = frame_field(name)
     if not field.isdecimal():
         raise InputError(
@@ -74,7 +71,7 @@ def frame_number(name: PurePath) -> int:
 
 
 def frame_field(name: PurePath) -> str:
-    """The frame number as it is in a name: ``000012``, or ``0001`` of ``…_Camera_(1)_0001_2019-…``."""
+    """Frame number as written in a name: ``000012``, or ``0001`` of ``…_Camera_(1)_0001_2019-…``."""
     fields = name.stem.split("_")
     return fields[4] if len(fields) > 4 else name.stem
 

@@ -1,4 +1,4 @@
-"""ZJU-MoCap as it is configured and read.
+"""Options and reader of ZJU-MoCap.
 
 ``<root>/CoreView_<id>/`` holds ``annots.npy`` (see :mod:`.annotations`), the photographs of each camera,
 ``mask_cihp/`` and sometimes ``mask/`` (label maps: any value but 0 is the subject), ``new_vertices/`` and
@@ -27,12 +27,12 @@ from ghgs_lit.geometry.undistortion import undistort, undistorting_grid
 log = logging.getLogger(__name__)
 
 BODY_VERTICES = 6890
-#: Folders of vertices; the first that a sequence has is read.
+#: Folders of vertices, of which the first existing one is read.
 _BODIES = ("new_vertices", "vertices")
 
 
 class Frames(Options):
-    """Some frames of some sequences."""
+    """Frames of several sequences."""
 
     sequences: tuple[Annotated[Text | Index, AfterValidator(str)], ...]
     """Ids, such as 377."""
@@ -59,11 +59,8 @@ class _Frame:
 
 
 class ZJUMoCapReader(FrameReader):
-    """Chosen frames, each a subject ``CoreView_<id>_<frame number>``; positions are the cameras.
-
-    Missing sequences are left out (``ghgs prepare task=check`` counts them). InputError: all sequences are
-    missing, or annotations are bad.
-    """
+    """Chosen frames, each a subject ``CoreView_<id>_<frame number>``; positions are the cameras. Missing
+    sequences are left out. InputError: all sequences are missing, or annotations are bad."""
 
     def __init__(self, data: "ZJUMoCap", phase: str, strict: bool = True) -> None:
         super().__init__(strict)
@@ -136,18 +133,18 @@ class ZJUMoCapReader(FrameReader):
 
 
 def _find(folder: Path, photograph: PurePosixPath, suffix: str) -> Path:
-    """A photograph's file: under its own name, or under its frame field alone (313 and 315, renamed)."""
+    """File of a photograph, under its name or its frame field alone (renamed files of 313 and 315)."""
     path = folder / photograph.with_suffix(suffix)
     renamed = path.with_name(frame_field(photograph) + suffix)
     return renamed if not path.exists() and renamed.exists() else path
 
 
-# Cameras of a sequence where all are used and nothing else is known; some have 23.
+# Assumed number of cameras if all are used; some sequences have 23.
 _ALL = 21
 
 
 class FramesByPhase(Options):
-    """Which frames are train and val."""
+    """Frames of each phase."""
 
     train: tuple[Frames, ...]
     """Sequences and their frames."""
@@ -161,12 +158,12 @@ class FramesByPhase(Options):
         return self
 
     def of(self, phase: str) -> tuple[Frames, ...]:
-        """The frames of a phase."""
+        """Frames of a phase."""
         return getattr(self, phase)
 
 
 class ZJUMoCap(DataSet):
-    """Downloaded ZJU-MoCap sequences below ``root``; a sample is one frame of one sequence."""
+    """Downloaded ZJU-MoCap sequences below ``root``; a subject is one frame of one sequence."""
 
     published: ClassVar[Mapping[str, int]] = {"train": 6, "val": 3}
     static_cameras: ClassVar[bool] = True

@@ -1,1 +1,1 @@
-"""Measuring run time against error: presets and knobs."""
+"""Benchmark of run time against error, for presets and knobs."""

@@ -10,7 +10,7 @@ from ghgs_lit.kernels.cores import allowed_cores
 
 
 def processor_name() -> str:
-    """The processor's model name; what Python knows of it on other systems than Linux."""
+    """Model name of the processor; on other systems than Linux what Python knows of it."""
     path = Path("/proc/cpuinfo")
     lines = path.read_text().splitlines() if path.exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
@@ -31,7 +31,7 @@ def machine_facts(device: torch.device) -> dict[str, Any]:
 
 
 def in_words(machine: dict[str, Any]) -> str:
-    """The facts on one line, for titles."""
+    """:func:`machine_facts` on one line."""
     device = "" if machine["device"] == "cpu" else f"{machine['device']}, "
     cores = f"{machine['threads']} of {machine['cores']} cores"
     return f"{device}{machine['processor']} ({machine['vectors']}, {cores}), torch {machine['torch']}"

@@ -1,4 +1,4 @@
-"""The measurement: what a case computes, how far it is from the yardstick, how long each stage takes."""
+"""Measurement of cases: work, differences from the yardstick, and seconds of each stage."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -25,9 +25,8 @@ ATTRIBUTES = ("means", "quaternions", "scales", "opacities", "colors")
 
 
 def relative_difference(found: Tensor, expected: Tensor, norm: float = math.inf) -> float:
-    """``|found - expected| / max|expected|``; infinite where a value is not finite or all of ``expected`` is
-    0 and ``found`` is not; 0 where there are no values. ``norm``: of the difference: the largest of all
-    values, or 2 for their root mean square."""
+    """``|found - expected| / max|expected|``; infinite if a value is not finite or only ``expected`` is 0
+    everywhere, 0 without values. ``norm`` of the difference: the largest value, or 2 for root mean square."""
     if found.numel() == 0:
         return 0.0
     difference = (found - expected).double().abs()
@@ -39,8 +38,7 @@ def relative_difference(found: Tensor, expected: Tensor, norm: float = math.inf)
 
 
 def partners(found: Gaussians, expected: Gaussians) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
-    """Indices of the Gaussians that belong to the same input pixel in both. A preset may drop or merge
-    Gaussians: those without a partner are left out."""
+    """Indices of Gaussians of the same input pixel in both; those without a partner are left out."""
     if found.image is None or expected.image is None:
         n = min(len(found), len(expected))
         return torch.arange(n), torch.arange(n)
@@ -54,16 +52,18 @@ def partners(found: Gaussians, expected: Gaussians) -> tuple[Int[Tensor, " n"], 
 def differences(
     found: tuple[Prediction, Rendering], expected: tuple[Prediction, Rendering], masks: Bool[Tensor, "..."]
 ) -> dict[str, float]:
-    """What a preset changes. ``masks``: of the inputs [B, V, H, W]. Returns: :func:`relative_difference` of
-    each attribute of the Gaussians, of the ``render`` (root mean square) and of the ``depth`` of the
-    subject's pixels; their largest, ``max_rel_diff``; ``psnr_to_none`` in dB of the renders; and
-    ``unmatched``, the part of the yardstick's Gaussians that have no partner, or more than the preset's own
-    that have none."""
+    """Differences of a preset from the yardstick. ``masks``: of the inputs [B, V, H, W].
+
+    Returns :func:`relative_difference` of each attribute of the Gaussians, of the ``render`` (root mean
+    square) and of the subject's ``depth``; their largest, ``max_rel_diff``; ``psnr_to_none`` of the renders
+    in dB; and ``unmatched``, the Gaussians without a partner (of the preset or the yardstick, whichever has
+    more) over the number of the yardstick's.
+    """
     (prediction, rendering), (yardstick, reference) = found, expected
     ours, theirs = prediction.gaussians, yardstick.gaussians
     a, b = partners(ours, theirs)
     result = {n: relative_difference(getattr(ours, n)[a], getattr(theirs, n)[b]) for n in ATTRIBUTES}
-    # Not the largest: a Gaussian that covers 1/255 of a pixel up to rounding is drawn there or not.
+    # Not the largest: rounding decides whether a Gaussian that covers 1/255 of a pixel is drawn.
     result["render"] = relative_difference(rendering.image, reference.image, norm=2)
     valid = prediction.depth_valid & yardstick.depth_valid & masks
     result["depth"] = relative_difference(prediction.depth[valid], yardstick.depth[valid])
@@ -77,7 +77,7 @@ def differences(
     }
 
 
-WARMUP = 1  #: Rounds that do not count: the first compiles and fills caches
+WARMUP = 1  #: Rounds that do not count; the first compiles and fills caches
 
 
 @dataclass(frozen=True)
@@ -96,8 +96,7 @@ class Times:
 
 @dataclass
 class Work:
-    """What a forward pass of a batch needs: FLOPs and peak bytes by stage, and numbers
-    of tokens, points, Gaussians and bytes of the PLY."""
+    """Cost of a forward pass: FLOPs and peak bytes by stage; tokens, points, Gaussians and PLY bytes."""
 
     flops: dict[str, float]
     peaks: dict[str, int]
@@ -105,7 +104,7 @@ class Work:
 
     @classmethod
     def of(cls, works: Sequence["Work"]) -> "Work":
-        """Of several batches: the mean, and the largest peak."""
+        """Mean over batches, with the largest peaks."""
         flops, peaks, counts = (
             pd.DataFrame([getattr(work, name) for work in works]) for name in ("flops", "peaks", "counts")
         )
@@ -114,7 +113,7 @@ class Work:
 
 @dataclass
 class Record:
-    """All that is known about a case; ``differences`` are the largest of all batches."""
+    """Measurements of a case; ``differences`` are the worst over batches."""
 
     case: Case
     work: Work
@@ -124,16 +123,15 @@ class Record:
 
 
 def order(turn: int, count: int) -> list[int]:
-    """The order of ``count`` cases in a round: each round begins one case later, so that every case has every
-    neighbour and drift of the machine hits all alike."""
+    """Order of the cases in a round; each begins one case later, so that drift affects all cases alike."""
     return [(turn + number) % count for number in range(count)]
 
 
 def time_cases(
     cases: Sequence[Case], batches: Sequence[Batch], warmup: int, repeats: int, device: torch.device
 ) -> list[dict[str, Times]]:
-    """The seconds of each stage of each case, means over the batches, in interleaved rounds. ``warmup``:
-    rounds that do not count. ``repeats``: rounds that count, at least 1."""
+    """Seconds of each stage of each case, means over batches, in interleaved rounds: ``warmup`` rounds that
+    do not count, then ``repeats``, at least 1."""
     seconds: list[dict[str, list[float]]] = [{} for _ in cases]
     for turn in track(range(-warmup, repeats), "rounds"):
         for number in order(turn, len(cases)):
@@ -147,7 +145,7 @@ def time_cases(
 
 @contextmanager
 def threads(count: int | None) -> Iterator[None]:
-    """PyTorch with ``count`` threads; None changes nothing."""
+    """Run PyTorch with ``count`` threads; None changes nothing."""
     before = torch.get_num_threads()
     torch.set_num_threads(count or before)
     try:
@@ -157,7 +155,7 @@ def threads(count: int | None) -> Iterator[None]:
 
 
 def inspect(case: Case, batch: Batch, device: torch.device) -> tuple[Work, Prediction, Rendering]:
-    """Predict a batch once for its FLOPs and once for its memory."""
+    """Predict a batch once to count FLOPs and once to measure memory."""
     with FlopsProbe() as counted:
         forward(case.model, case.renderer, batch, counted)
     memory = PeakProbe(device)
@@ -178,8 +176,7 @@ def _counts(prediction: Prediction) -> dict[str, float]:
 def record_cases(
     cases: Sequence[Case], batches: Sequence[Batch], metrics: ImageMetrics, device: torch.device, repeats: int
 ) -> list[Record]:
-    """Measure work and error of cases on batches, then their times. ``cases``: the yardstick first.
-    ``batches``: on the device, with targets."""
+    """Measure work and error of cases, the yardstick first, then their times; ``batches`` need targets."""
     works: list[list[Work]] = [[] for _ in cases]
     records = [Record(case, Work({}, {}, {})) for case in cases]
     for batch in track(batches, "errors"):
@@ -191,7 +188,7 @@ def record_cases(
             for name, value in differences(result, yardstick, batch.masks).items():
                 worst = min if name == "psnr_to_none" else max
                 record.differences[name] = worst(record.differences.get(name, value), value)
-            # The error against the truth, by the measurement of `ghgs evaluate`; its time does not count.
+            # The error against the truth, as `ghgs evaluate` measures it; its time does not count.
             found, rendering = result
             estimate = Estimate(rendering.image, found.depth, found.depth_valid, decisions=found.decisions)
             measured = measure(lambda _, known=estimate: known, record.case.label, [batch], metrics, device)

@@ -1,4 +1,4 @@
-"""What is compared: one model in every preset of ``conf/skip`` and with every value of the knobs."""
+"""Cases of a benchmark: one model in every preset of ``conf/skip`` and with every value of the knobs."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -18,19 +18,19 @@ from ghgs_lit.evaluation.measure import Renderer
 from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.weights.checkpoint import check_preset, load_weights, read_checkpoint, require_fit
 
-YARDSTICK = "none"  #: The preset that all others are compared with
+YARDSTICK = "none"  #: Preset that all others are compared with
 #: Nodes of a configuration that a model is built from, beside ``skip``.
 MODEL_NODES = (*STAGES, "rounds", "model")
-KNOBS = (*STAGES, "rounds", "skip", "model", "renderer", "precision")  #: What knobs can change
-#: Rounds take normals from differences of depths and look photographs up where Gaussians are: one rounding of
-#: the photographs changes single attributes by 1e-3 of the largest one (trained weights, 1 to 3 rounds).
+KNOBS = (*STAGES, "rounds", "skip", "model", "renderer", "precision")  #: Nodes that knobs can change
+#: Factor on the allowed differences of models with rounds, which take normals from differences of depths and
+#: sample photographs at Gaussians: rounding the photographs once changes single attributes by 1e-3 of the
+#: largest one (trained weights, 1 to 3 rounds).
 ROUNDS_AMPLIFY = 1000
 
 
 @dataclass(frozen=True)
 class Source:
-    """Weights and the configuration that fits them. ``config``: with :data:`MODEL_NODES`. ``checkpoint``:
-    path of the weights; None: random ones."""
+    """Weights (path of a checkpoint; None: random) and the configuration, with :data:`MODEL_NODES`."""
 
     config: Mapping[str, Any]
     checkpoint: str | None
@@ -38,19 +38,19 @@ class Source:
 
 @dataclass(frozen=True)
 class Case:
-    """A model that is measured."""
+    """A model to measure."""
 
     preset: str
-    knobs: Mapping[str, Any]  #: values that were changed, by key
+    knobs: Mapping[str, Any]  #: changed values by key
     model: GHGS  #: in evaluation mode, on its device
     renderer: Renderer
-    budget_db: float | None  #: PSNR that the preset may lose against the yardstick; None: nothing is promised
-    max_rel_diff: float | None  #: the same of differences of attributes (:data:`ROUNDS_AMPLIFY`)
+    budget_db: float | None  #: PSNR that the preset may lose against the yardstick; None: no budget
+    max_rel_diff: float | None  #: allowed difference, times :data:`ROUNDS_AMPLIFY` with rounds; None: any
     is_trained: bool
 
     @property
     def label(self) -> str:
-        """A name that no other case has."""
+        """Unique name of the case."""
         changes = [f"{key}={value}" for key, value in self.knobs.items()]
         return " ".join([self.preset, *changes])
 
@@ -60,8 +60,8 @@ class Case:
 
 
 def presets_of(names: Sequence[str], configured: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """The values of presets by name. ``names``: files of ``conf/skip``. ``configured``: the node ``skip`` of
-    the run, whose values its own preset has, overrides included. InputError: there is no such file."""
+    """Values of presets by name (files of ``conf/skip``); the preset of the run's own node ``skip`` has the
+    ``configured`` values. InputError: there is no such file."""
     return {
         name: dict(configured) if name == configured["name"] else read_option("skip", name, "presets")
         for name in names
@@ -69,8 +69,7 @@ def presets_of(names: Sequence[str], configured: Mapping[str, Any]) -> dict[str,
 
 
 def combinations(knobs: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
-    """Every choice of one value for each knob. InputError: a knob that does not exist, or has no list of
-    values."""
+    """All combinations of values of the knobs. InputError: a knob does not exist or has no list of values."""
     for key, values in knobs.items():
         require(is_below(key, KNOBS), f"knobs.{key}", f"a key of {', '.join(KNOBS)}", key)
         is_list = isinstance(values, Sequence) and not isinstance(values, str)
@@ -81,8 +80,7 @@ def combinations(knobs: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
 def case_config(
     source: Source, skip: Mapping[str, Any], knobs: Mapping[str, Any], shared: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The configuration of a case as plain data. ``shared``: nodes that all cases have (``renderer``,
-    ``precision``). InputError: a knob that the configuration does not have."""
+    """Configuration of a case; ``shared``: nodes that all cases have. InputError: it lacks a knob."""
     own = {name: source.config[name] for name in MODEL_NODES if name in source.config}
     node = OmegaConf.create({**own, **shared, "skip": dict(skip)})
     for key, value in knobs.items():
@@ -100,10 +98,9 @@ def cases_of(
     device: torch.device,
     seed: int = 0,
 ) -> list[Case]:
-    """The cases of a model; they share one copy of the weights. InputError: a preset or knob that the model
-    refuses, or to which the weights do not fit. ``presets``: of :func:`presets_of`; the yardstick comes
-    first, without knobs, where it is among them. ``knobs``: values of each knob, by key; every preset is
-    measured with every combination."""
+    """Cases of a model, every preset (:func:`presets_of`) with every combination of knobs; they share one
+    copy of the weights. The yardstick, if among the presets, comes first, without knobs. InputError: the
+    model refuses a preset or knob, or the weights do not fit it."""
     choices = [(name, change) for name in presets for change in combinations(knobs)]
     if YARDSTICK in presets:
         choices = [(YARDSTICK, {}), *(choice for choice in choices if choice != (YARDSTICK, {}))]
@@ -115,7 +112,7 @@ def cases_of(
         model = _model(source, config, state, seed, device).to(device).eval()
         state = state or model.state_dict()
         model.precision = config["precision"]
-        # A preset's promise is about the preset alone.
+        # Budgets hold for presets without knobs.
         budget_db, max_rel_diff = (None if change else skip.get(key) for key in ("budget_db", "max_rel_diff"))
         renderer = build(config["renderer"], "renderer")
         if max_rel_diff is not None and model.rounds is not None:
@@ -128,7 +125,7 @@ def cases_of(
 def _model(
     source: Source, config: dict[str, Any], state: dict[str, Tensor], seed: int, device: torch.device
 ) -> GHGS:
-    """A model with the tensors of ``state``; the first one, where there are none yet, gets its own."""
+    """A model with the tensors of ``state``, or, if that is empty, with the source's own."""
     if not state and source.checkpoint is None:
         return random_model(config, seed)
     model = GHGS.from_config(config, empty=STAGES)

@@ -1,4 +1,4 @@
-"""The rows of a benchmark, what its budgets say, and its tables."""
+"""Rows, budgets and tables of a benchmark."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -14,10 +14,10 @@ from ghgs_lit.diagnostics.output import Tables, document, pivoted, texts
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.results import Row, plain, summarize
 
-#: Means of a case that its row ``total`` has beside PSNR, where they are known.
+#: Metrics beside PSNR in the row ``total`` of a case, if known.
 ERRORS = ("psnr_box", "ssim", "ssim_box", "flip", "flip_box", "lpips", "depth_error_mm")
 
-#: Headings of the table of cases, with columns and formats.
+#: Columns and formats of the table of cases, by heading.
 _COLUMNS = {
     "preset": ("preset", "{}"),
     "s (quartiles)": ("quartiles", "{}"),
@@ -41,8 +41,7 @@ _COLUMNS = {
 
 
 def rows_of(records: Sequence[Record]) -> list[Row]:
-    """One row for each case and stage; the row ``total`` has the errors and the budgets, too. The first of
-    ``records`` is the yardstick's."""
+    """One row for each case (yardstick first) and stage; row ``total`` also has errors and budgets."""
     rows: list[Row] = []
     for record in records:
         (means,) = summarize(record.metrics)
@@ -77,8 +76,7 @@ def rows_of(records: Sequence[Record]) -> list[Row]:
 
 
 def broken_budgets(rows: Sequence[Row]) -> list[str]:
-    """What presets promise and do not keep, in one line each. A loss of PSNR says nothing about weights that
-    nobody trained; a difference does."""
+    """Broken budgets, one line each. PSNR counts for trained weights only; differences count for all."""
     return [f"{row['preset']}: {said}" for row in totals(rows) for said in _broken(row)]
 
 
@@ -97,12 +95,12 @@ def _broken(row: Row) -> list[str]:
 
 
 def totals(rows: Sequence[Row]) -> list[Row]:
-    """The rows of whole cases."""
+    """Rows of whole cases."""
     return [row for row in rows if row["stage"] == TOTAL]
 
 
 def tables_of(rows: Sequence[Row]) -> Tables:
-    """Cases with their cost and error, then the seconds of their stages."""
+    """Tables of cost and error of cases, and of the seconds of their stages."""
 
     def promises(row: Row) -> bool:
         return row["max_rel_diff_budget"] is not None or (row["trained"] and row["budget_db"] is not None)
@@ -122,7 +120,7 @@ def tables_of(rows: Sequence[Row]) -> Tables:
 
 
 def notes_of(content: Mapping[str, Any]) -> list[str]:
-    """What a reader of the numbers must know."""
+    """Notes above the tables."""
     notes = [f"Machine: {in_words(content['machine'])}.", content["about"]]
     if content["random_weights"]:
         notes.append("The weights are random: PSNR says nothing, only run times and differences do.")
@@ -130,7 +128,7 @@ def notes_of(content: Mapping[str, Any]) -> list[str]:
 
 
 def write_numbers(directory: Path, content: Mapping[str, Any], tables: Tables) -> Path:
-    """Write ``benchmark.md`` and ``benchmark.json``; returns the path of the last."""
+    """Write ``benchmark.md`` and ``benchmark.json``; return the latter's path."""
     write_text_atomically(directory / "benchmark.md", document("Benchmark", notes_of(content), tables))
     path = directory / "benchmark.json"
     write_text_atomically(path, json.dumps(plain(content), indent=1, allow_nan=False) + "\n")

@@ -1,4 +1,4 @@
-"""What is measured without training or data: random weights, and a subject of a given size in the frame."""
+"""Measurement without training or data: random weights, and a subject of a given size in the frame."""
 
 import math
 from collections.abc import Mapping
@@ -13,13 +13,12 @@ from ghgs_lit.model import GHGS
 from ghgs_lit.synthesis.rig import Rig
 from ghgs_lit.types import Batch, Targets
 
-#: Width to height of the silhouette while it fits, as of a standing person; and its largest height as a part
-#: of the frame's.
+#: Width over height of the silhouette, as of a standing person, and its largest height over the frame's.
 _ASPECT, _TALLEST = 0.4, 0.9
 
 
 def ellipse(share: float, size: tuple[int, int]) -> torch.Tensor:
-    """A mask of ``size`` (height, width): an upright ellipse in the middle, ``share`` of the frame."""
+    """Mask of ``size`` (height, width): an upright ellipse in the middle, ``share`` of the frame's area."""
     # share = pi / 4 * width * height, both as parts of the frame
     height = min(math.sqrt(4 * share * size[1] / (math.pi * _ASPECT * size[0])), _TALLEST)
     width = 4 * share / (math.pi * height)
@@ -29,9 +28,9 @@ def ellipse(share: float, size: tuple[int, int]) -> torch.Tensor:
 
 
 def ellipsoid_batch(share: float, views: int, size: int | tuple[int, int], batch: int) -> Batch:
-    """Photographs of noise on an ellipsoid of revolution, which looks the same in every view. Returns: The
-    batch; its target is the first input view. ``share``: part of the frame that the subject covers. ``size``:
-    side, or height and width, of the photographs in pixels."""
+    """Batch of photographs of noise on an ellipsoid of revolution, whose mask is the same in every view; the
+    target is the first input view. ``share``: part of the frame that the subject covers. ``size``: side, or
+    height and width, in pixels."""
     size = (size, size) if isinstance(size, int) else size
     rig = Rig(look_at=(0.0, 0.0, 0.0), pitch=0.0, focal=1.0, shift_y=0.0)
     yaws = np.tile(np.arange(views) * 360.0 / views, (batch, 1))
@@ -44,8 +43,8 @@ def ellipsoid_batch(share: float, views: int, size: int | tuple[int, int], batch
 
 @torch.no_grad()
 def random_model(config: Mapping[str, Any], seed: int = 0) -> GHGS:
-    """A model with random weights, without the time of the usual initialisation. No last layer is 0, as it is
-    at the start of training: every output depends on the photographs."""
+    """A model with random weights, faster than the usual initialisation. No last layer is 0, unlike at the
+    start of training, so that every output depends on the photographs."""
     generator = torch.Generator().manual_seed(seed)
     with torch.device("meta"):
         model = GHGS.from_config(config)

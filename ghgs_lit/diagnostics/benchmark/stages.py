@@ -1,4 +1,4 @@
-"""The stages of a forward pass as they are measured: their names, and a pass that is watched."""
+"""Probes of the stages of a forward pass: seconds, peak memory and FLOPs."""
 
 from collections.abc import Iterable
 from contextlib import AbstractContextManager, ExitStack
@@ -19,36 +19,36 @@ from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.types import Batch, Prediction, Rendering
 
 ROUNDS, RENDER, TOTAL = "rounds", "render", "total"
-OTHER = "other"  #: What lies in no stage: checks, padding
-#: Parts of stages: a name ``<stage>.<part>``, and where the part is in the model.
+OTHER = "other"  #: Work outside of stages: checks, padding
+#: Modules of parts of stages, by ``<stage>.<part>``.
 PARTS = {"encoder.patch_tokens": "encoder.aggregator.patch_embed"}
-#: All that is timed, in the order of the data flow. The stages without a dot add up to ``total``.
+#: All timed names in the order of the data flow; those without a dot add up to ``total``.
 NAMES = (*STAGES[:1], *PARTS, *STAGES[1:], ROUNDS, RENDER, OTHER, TOTAL)
 
 
 class SecondsProbe(Stopwatch):
-    """The time of each stage and of what lies in none."""
+    """Times of the stages and of the rest."""
 
     def seconds(self) -> dict[str, float]:
-        """Seconds of each stage, and of ``other``, in the order of :data:`NAMES`."""
+        """Seconds by name, in the order of :data:`NAMES`."""
         known = super().seconds()
         known[OTHER] = known[TOTAL] - sum(known[name] for name in top_level(known))
         return {name: known[name] for name in NAMES if name in known}
 
 
 def top_level(names: Iterable[str]) -> list[str]:
-    """The names of stages that lie in no other and are not their sum."""
+    """Names of whole stages, without parts, ``other`` and ``total``."""
     return [name for name in names if "." not in name and name not in (OTHER, TOTAL)]
 
 
 def watched(model: GHGS, probe: Watcher) -> AbstractContextManager[None]:
-    """Let ``probe`` see the stages of ``model`` and their parts."""
+    """Context in which ``probe`` watches the stages of ``model`` and their parts."""
     return stages_watched(model, {name: name for name in (*STAGES, ROUNDS)} | PARTS, probe)
 
 
 @torch.inference_mode()
 def forward(model: GHGS, renderer: Renderer, batch: Batch, probe: Watcher) -> tuple[Prediction, Rendering]:
-    """Predict the Gaussians of a batch and render its targets, while ``probe`` watches."""
+    """Predict the Gaussians of a batch and render its targets under ``probe``."""
     with watched(model, probe), inside(TOTAL, probe):
         prediction = model(replace(batch, targets=None))
         with inside(RENDER, probe):
@@ -57,9 +57,9 @@ def forward(model: GHGS, renderer: Renderer, batch: Batch, probe: Watcher) -> tu
 
 
 class PeakProbe(Watcher):
-    """The peak memory of each stage, of the process on a CPU, of all tensors on CUDA. ``peaks`` are bytes in
-    addition to what was held when the first stage began: weights and photographs do not count. On systems
-    without Linux's counters there are no peaks."""
+    """Peak memory of each stage: of the process on a CPU, of all tensors on CUDA. ``peaks`` are bytes beyond
+    those held when the first stage began, such as weights and photographs. Systems without Linux's counters
+    have none."""
 
     def __init__(self, device: torch.device):
         self.device = device
@@ -93,7 +93,7 @@ class PeakProbe(Watcher):
         return self.device.type == "cuda" or can_forget_peak()
 
     def held(self) -> int:
-        """Bytes now."""
+        """Bytes held now."""
         if self.device.type == "cuda":
             return torch.cuda.memory_allocated(self.device)
         return_free_memory()
@@ -109,11 +109,11 @@ class PeakProbe(Watcher):
         if self.device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(self.device)
         else:
-            return_free_memory()  # what an earlier stage freed is not this one's
+            return_free_memory()  # what an earlier stage freed does not count
             forget_peak()
 
 
-#: PyTorch's attention on a CPU, which its own counter does not know.
+#: FLOPs of PyTorch's attention on a CPU, which its own counter does not know.
 _CPU_ATTENTION = {
     torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: (
         lambda q, k, v, *_, **__: sdpa_flop_count(q, k, v)
@@ -125,8 +125,8 @@ _CPU_ATTENTION = {
 
 
 class FlopsProbe(Watcher):
-    """A watcher that counts while it is open as a context; ``flops`` has the multiplications and additions of
-    products by stage, with those of the encoder's compiled kernel. The rasterizer's are not counted."""
+    """Context that counts ``flops`` by stage: multiplications and additions of products, including the
+    encoder's compiled kernel, without the rasterizer."""
 
     def __init__(self) -> None:
         self.flops: dict[str, int] = {}

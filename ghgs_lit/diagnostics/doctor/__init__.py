@@ -1,1 +1,1 @@
-"""What a machine has, and what a configuration needs."""
+"""Diagnosis of a machine and its devices."""

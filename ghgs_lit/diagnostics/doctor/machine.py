@@ -1,4 +1,4 @@
-"""Facts of this machine, and what is missing for which optional feature."""
+"""Facts about this machine, and optional extras that are missing."""
 
 import importlib.metadata
 import os
@@ -17,7 +17,7 @@ Line = tuple[str, str]
 
 
 def machine_lines(device: torch.device) -> list[Line]:
-    """What there is, as pairs of a name and its value."""
+    """Facts about the machine, as pairs of name and value."""
     facts = machine_facts(device)
     versions = (DISTRIBUTION, "torch", "lightning", "numpy", "numba", "gsplat")
     return [
@@ -33,11 +33,11 @@ def machine_lines(device: torch.device) -> list[Line]:
 
 
 def missing_extras() -> Iterator[Line]:
-    """Each extra of the package that is not there as a whole, and the command that installs it."""
+    """Yield each incomplete extra of the package with the command that installs it."""
     wanted: dict[str, list[str]] = {}
     for requirement in importlib.metadata.requires(DISTRIBUTION) or []:
         extra = re.search(r"extra == ['\"]([\w-]+)['\"]", requirement)
-        if extra and extra[1] != "dev":  # which no feature of a user needs
+        if extra and extra[1] != "dev":
             wanted.setdefault(extra[1], []).append(re.match(r"[\w.-]+", requirement)[0])
     for extra, names in wanted.items():
         absent = [name for name in names if _version(name) is None]

@@ -1,4 +1,4 @@
-"""Whether a device computes as the CPU does in float64: renderer, stages, gradient of all weights."""
+"""Comparison of a device with the CPU in float64: renderer, stages, gradient of all weights."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,23 +19,24 @@ from ghgs_lit.rendering.api import resolve_backend
 from ghgs_lit.types import Batch, Cameras, Gaussians
 
 PASSED, FAILED, SKIPPED = "pass", "fail", "skip"
-#: Largest errors of images and of their gradients. Rounding to float32 gives 1e-6 and 1e-5 on a CPU; a splat
-#: that one of both cuts off at 1/255, at its border of a tile or in another order gives more than 1e-3.
+#: Largest errors of images and their gradients. Rounding to float32 gives 1e-6 and 1e-5 on a CPU; a splat
+#: that is cut off at 1/255 or at a tile's border, or drawn in another order, gives more than 1e-3.
 IMAGE_LIMIT, IMAGE_GRADIENT_LIMIT = 1e-4, 1e-3
-#: Largest error of a stage, by precision. In float32 it is 1e-6 on a CPU; a device that sums in another order
-#: may choose another neighbour at equal distances, which moves one token. The others round every product: 8
-#: times the rounding of one (2^-8 in bfloat16, 2^-11 in float16 and TF32); in bfloat16 a CPU has 1.6 times.
+#: Largest error of a stage, by precision. In float32 it is 1e-6 on a CPU; with another order of summation
+#: another of two equally distant neighbours may be chosen, which moves one token. The other precisions round
+#: every product: 8 times one rounding (2^-8 in bfloat16, 2^-11 in float16 and TF32); 1.6 times in bfloat16 on
+#: a CPU.
 LIMITS = {"float32": 1e-4, "tf32": 2.0**-8, "bfloat16": 2.0**-5, "float16": 2.0**-8}
-#: Of the gradient of all weights in float32. It jumps where rounding takes a unit across 0 or a token to
-#: another neighbour: 2e-6 to 4e-2 on a CPU. Of three models one at least is spared; a wrong kernel spares
-#: none.
+#: Largest error of the gradient of all weights in float32, and number of models that are tried. It jumps if
+#: rounding moves a unit across 0 or a token to another neighbour: 2e-6 to 4e-2 on a CPU. At least one of
+#: three models has no such jump; a wrong kernel affects all.
 GRADIENT_LIMIT, _MODELS = 1e-2, 3
-_SIZE, _LONGEST = 48, 300  #: Side of the photographs of splats, and characters of an error that are shown
+_SIZE, _LONGEST = 48, 300  #: Side of the images of splats; number of characters of an error that are shown
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One row: what was checked, one of the three statuses, and what was found or why it was skipped."""
+    """Outcome of a check; ``found``: the error, or why the check was skipped."""
 
     check: str
     status: str
@@ -43,9 +44,8 @@ class Outcome:
 
 
 def selfcheck(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]:
-    """All checks, each outcome as soon as it is known; an error ends its check alone, and is an outcome.
-    ``config``: of a run of ``ghgs train``; its model gets random weights. ``device``: what is compared with
-    the CPU."""
+    """Compare ``device`` with the CPU; yield the outcomes of all checks. An error is an outcome and ends only
+    its check. ``config``: as for ``ghgs train``; its model gets random weights."""
     for check in CHECKS:
         try:
             yield from check(config, device)
@@ -55,25 +55,25 @@ def selfcheck(config: Mapping[str, Any], device: torch.device) -> Iterator[Outco
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
-    """The outcomes as Markdown."""
+    """Outcomes as Markdown."""
     rows = [f"| {o.check} | {o.status} | {o.found.replace('|', '/')} |" for o in outcomes]
     return "\n".join(["| check | status | found |", "|---|---|---|", *rows])
 
 
 def compared(check: str, found: Tensor, expected: Tensor, limit: float) -> Outcome:
-    """Passes where the norm of the difference is at most ``limit`` of that of ``expected``, in one shape."""
+    """Outcome that passes if shapes agree and ``|found - expected| <= limit * |expected|`` (2-norms)."""
     error = float("nan")
     if found.shape == expected.shape:
         found, expected = found.detach().cpu().double(), expected.detach().cpu().double()
         norm = expected.norm()
         error = float((found - expected).norm() / torch.where(norm > 0, norm, 1.0))
-    # Written so that NaN fails.
+    # This comparison fails for NaN.
     return Outcome(check, PASSED if error <= limit else FAILED, f"error {error:.1e}, limit {limit:.0e}")
 
 
 def renderer(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]:
-    """Of random splats with and without antialiasing, and of splats around each threshold: the reference's
-    images and gradients."""
+    """Check images and gradients of random splats with and without antialiasing, and of splats around the
+    renderer's thresholds."""
     backend = config["renderer"]["backend"]
     try:
         backend = resolve_backend(backend, device)
@@ -94,7 +94,6 @@ def renderer(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcom
 
 
 def _random_splats() -> Gaussians:
-    """Of two elements with different numbers of splats, about as large as a person."""
     n, g = 240, torch.Generator().manual_seed(0)
     return Gaussians(
         means=torch.randn(n, 3, generator=g) * torch.tensor([0.2, 0.5, 0.2]),
@@ -107,8 +106,8 @@ def _random_splats() -> Gaussians:
 
 
 def _splats_at_thresholds(cameras: Cameras) -> Gaussians:
-    """Before the first camera of each element: opacities just below and above 1/255; ten opaque splats behind
-    one another, whose light ends before the last; a bright one nearer than ``near``, one behind."""
+    """Splats before the first camera of each element: opacities just below and above 1/255; ten opaque ones
+    behind one another, which saturate before the last; one nearer than ``near``; one behind the camera."""
     depths = [2.0, 2.0, *(2.2 + 0.05 * i for i in range(10)), 0.005, -1.0]
     opacities = [0.9 / 255, 1.2 / 255, *[0.9, 1.0] * 5, 1.0, 1.0]
     right = [-0.4, 0.4, *[0.02 * i for i in range(10)], 0.0, 0.0]
@@ -118,7 +117,7 @@ def _splats_at_thresholds(cameras: Cameras) -> Gaussians:
     return Gaussians(
         means=torch.cat(means),
         quaternions=torch.tensor([[0.9, 0.1, -0.3, 0.2]]).repeat(2 * n, 1),
-        # Of three lengths: the direction of a ball has no gradient.
+        # Three lengths: the rotation of a ball has no gradient.
         scales=torch.tensor([[0.06, 0.1, 0.14]]).repeat(2 * n, 1),
         opacities=torch.tensor(opacities * 2),
         colors=torch.rand(2 * n, 3, generator=torch.Generator().manual_seed(0)),
@@ -142,7 +141,7 @@ def _rendered(
 
 
 def stages(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]:
-    """Each stage in each precision that the device has: the first one that fails is the one to look at."""
+    """Check each stage in each precision that the device has; the first that fails is the one to examine."""
     batch = _small_batch(config)
     expected = _results(random_model(config).double(), _in_float64(batch))
     for precision, limit in LIMITS.items():
@@ -155,13 +154,13 @@ def stages(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]
         with _products(tf32=precision == "tf32"):
             found = _results(model, batch.to(device))
         for stage, value in expected.items():
-            # Geometry is float32 in every precision.
+            # Geometry is always float32.
             allowed = LIMITS["float32"] if stage == "bounds" else limit
             yield compared(f"model, {precision}: {stage}", found[stage], value, allowed)
 
 
 def gradient(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]:
-    """Of all weights, in float32: the nearest of a few random models."""
+    """Check the gradient of all weights in float32; one of :data:`_MODELS` random models must pass."""
     batch, outcomes = _small_batch(config), []
     for seed in range(_MODELS):
         expected = _gradients(random_model(config, seed).double(), _in_float64(batch))
@@ -177,7 +176,6 @@ CHECKS = (renderer, stages, gradient)
 
 
 def _small_batch(config: Mapping[str, Any]) -> Batch:
-    """Two elements of three views of four by four patches, without targets."""
     batch = ellipsoid_batch(0.15, 3, 4 * config["encoder"]["patch_size"], 2)
     return replace(batch, targets=None)
 
@@ -196,7 +194,7 @@ def _unsupported(precision: str, device: torch.device) -> str | None:
 
 @contextmanager
 def _products(tf32: bool) -> Iterator[None]:
-    """Products of float32 numbers on CUDA rounded to TF32, or not; convolutions are by PyTorch's default."""
+    """Switch TF32 on or off for products and convolutions of float32 numbers on CUDA."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high" if tf32 else "highest")
     try:
@@ -208,7 +206,6 @@ def _products(tf32: bool) -> Iterator[None]:
 
 @torch.no_grad()
 def _results(model: GHGS, batch: Batch) -> dict[str, Tensor]:
-    """What each stage gives for the subject, in the order of the data flow, on the CPU."""
     seen = Results()
     with watched(model, {name: name for name in ("encoder", "recalibration")}, seen):
         prediction = model(batch).to("cpu")
@@ -226,7 +223,7 @@ def _results(model: GHGS, batch: Batch) -> dict[str, Tensor]:
 
 
 def _gradients(model: GHGS, batch: Batch) -> Tensor:
-    """Of a number that depends on all attributes, of all weights in one row in float64 on the CPU."""
+    """Gradient of a number that depends on all attributes by all weights [n], in float64 on the CPU."""
     gaussians = model.requires_grad_(True)(batch).gaussians
     sum(_waves(getattr(gaussians, name)).mean() for name in ATTRIBUTES).backward()
     rows = [torch.zeros_like(p) if p.grad is None else p.grad for p in model.parameters()]
@@ -234,6 +231,6 @@ def _gradients(model: GHGS, batch: Batch) -> Tensor:
 
 
 def _waves(values: Tensor) -> Tensor:
-    """Values with different signs and weights: the sum of squares of a unit quaternion says nothing."""
+    """Values times weights of both signs; the sum of squares of a unit quaternion has no gradient."""
     weights = torch.arange(values.numel(), device=values.device, dtype=torch.float32).cos()
     return values * weights.view_as(values).to(values.dtype)

@@ -1,1 +1,1 @@
-"""Numerical stability: every stage on adversarial inputs, against float64, forward and backward."""
+"""Stress test: every stage on adversarial inputs against float64, forward and backward."""

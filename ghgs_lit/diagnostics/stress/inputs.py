@@ -1,4 +1,4 @@
-"""Random inputs of one case, in float64; a family changes its own ingredient, the others stay ordinary."""
+"""Random inputs of one case in float64. A family changes its own ingredient; the others stay ordinary."""
 
 import math
 
@@ -9,13 +9,13 @@ from torch.nn import functional
 F64 = torch.float64
 
 UNITS = {"large": 1e3, "small": 1e-3}  #: Size of the scene by family
-#: What the values of an ingredient are multiplied with, by family.
+#: Factors on the values of an ingredient, by family.
 FACTORS = {
     "depths": {"zero_depth": 0.0, "negative_depth": -1.0, "near_zero_depth": 1e-12, "huge_depth": 1e12},
     "quaternions": {"zero_quaternion": 0.0, "tiny_quaternion": 1e-20, "huge_quaternion": 1e20},
     "features": {"zero_features": 0.0, "tiny_features": 1e-20, "huge_features": 1e18},
 }
-#: Families that change nothing in points without a camera, with the reason.
+#: Families that do not apply to points without a camera, with the reason.
 NO_CAMERA = {
     "wide long skewed mirrored degenerate": "takes points, no camera",
     "behind on_camera beside": "relative to a camera",
@@ -36,13 +36,13 @@ def directions(g: Generator, *shape: int) -> Tensor:
 
 
 def place(family: str, g: Generator) -> Tensor:
-    """The middle of the scene in the world [3]."""
+    """Middle of the scene in the world [3]."""
     away = 1e4 if family == "shifted" else 0.1
     return directions(g, 3) * away * UNITS.get(family, 1.0)
 
 
 def cameras(family: str, g: Generator, views: int, size: int, middle: Tensor) -> tuple[Tensor, Tensor]:
-    """Lenses [v, 4] (focal lengths, principal point), poses [v, 3, 4], two units from ``middle``."""
+    """Lenses [v, 4] (focal lengths, principal point) and poses [v, 3, 4], two units from ``middle``."""
     unit = UNITS.get(family, 1.0)
     focal = {"wide": 0.1 * size, "long": 1e5}.get(family, float(uniform(g, 0.8, 1.2)) * size)
     distance = 2.0 * unit * (focal / size if family == "long" else 1.0)
@@ -64,7 +64,7 @@ def cameras(family: str, g: Generator, views: int, size: int, middle: Tensor) ->
 
 
 def _towards_middle(angle: float) -> Tensor:
-    """The rotation [3, 3] of a camera at an angle around the scene, a little above it."""
+    """Rotation [3, 3] of a camera at an angle around the scene, a little above it."""
     back = torch.tensor([math.sin(angle), 0.2, math.cos(angle)], dtype=F64)
     forward = -back / back.norm()
     right = torch.linalg.cross(forward, torch.tensor([0.0, 1.0, 0.0], dtype=F64))
@@ -73,20 +73,20 @@ def _towards_middle(angle: float) -> Tensor:
 
 
 def intrinsics(lenses: Tensor) -> Tensor:
-    """Intrinsics [..., 3, 3]."""
+    """Intrinsics [..., 3, 3] from lenses."""
     fx, fy, cx, cy = lenses.unbind(-1)
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
     return torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
 
 
 def matrices(lenses: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
-    """Intrinsics [..., 3, 3] and extrinsics [..., 4, 4]."""
+    """Intrinsics [..., 3, 3] and extrinsics [..., 4, 4] from lenses and poses."""
     last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=poses.dtype).expand(*poses.shape[:-2], 1, 4)
     return intrinsics(lenses), torch.cat((poses, last), -2)
 
 
 def points(family: str, g: Generator, count: int, middle: Tensor, poses: Tensor | None = None) -> Tensor:
-    """World points [count, 3] of a subject at ``middle``; those relative to a camera need its pose."""
+    """World points [count, 3] around ``middle``; families relative to a camera need ``poses``."""
     around = middle + 0.3 * UNITS.get(family, 1.0) * normal(g, count, 3)
     if family == "duplicates":
         return around[torch.arange(count) // 2]
@@ -144,7 +144,7 @@ def features(family: str, g: Generator, count: int, width: int) -> Tensor:
 
 
 def raw(family: str, g: Generator, *shape: int) -> Tensor:
-    """Raw values of a head; adverse ones of both signs."""
+    """Raw values of a head."""
     values, factor = normal(g, *shape), {"saturated": 100.0, "extreme": 1e4}.get(family)
     return values if factor is None else values.sign() * factor * uniform(g, 0.5, 1.5, *shape)
 
@@ -157,13 +157,13 @@ def images(family: str, g: Generator, *shape: int) -> Tensor:
 
 
 def disc(size: int) -> Tensor:
-    """A mask of a disc in the middle [size, size]."""
+    """Mask of a disc in the middle [size, size]."""
     offset = torch.arange(size, dtype=F64) + 0.5 - size / 2
     return offset[:, None].square() + offset.square() < (0.3 * size) ** 2
 
 
 def spoiled(family: str, g: Generator, masks: Tensor) -> Tensor:
-    """Masks [v, h, w] of a subject; in the families of masks, the last view's is spoiled."""
+    """Masks [v, h, w] of a subject; families of masks spoil that of the last view."""
     masks = masks.clone()
     if family == "empty_mask":
         masks[-1] = False

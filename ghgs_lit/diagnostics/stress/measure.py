@@ -1,4 +1,4 @@
-"""Errors of one stage and family in all dtypes, in units of the problem's own sensitivity."""
+"""Errors of a stage and family in all dtypes, in units of eps times the condition number."""
 
 import math
 import time
@@ -15,30 +15,30 @@ from ghgs_lit.diagnostics.stress.stage import FAMILIES, PLANTED, Stage, Values, 
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.results import plain
 
-#: Size of the random roundings of the inputs that estimate the condition number, in relative terms.
+#: Relative size of the random roundings of inputs that estimate the condition number.
 _STEP = torch.finfo(torch.float32).eps
 
-#: A cell of the matrix: ``stage``, ``family``, ``dtype``, numbers of ``cases`` and ``failures``; ``error``
-#: and ``median`` in units of eps times the condition number (None: without a bound), ``budget``, the allowed
-#: factor; ``nonfinite``, the share of cases with a value that is not finite; ``gradient``, the median of the
-#: largest gradient; ``worst``, which output and seed; ``seconds``.
+#: A cell of the matrix: ``stage``, ``family``, ``dtype``; numbers of ``cases`` and ``failures``; largest
+#: ``error`` and ``median`` in units of eps times the condition number (None: unbounded); ``budget``, the
+#: allowed factor; ``nonfinite``, the share of cases with a value that is not finite; ``gradient``, the median
+#: of the largest gradient; ``worst``, the output and seed of the largest error; ``seconds``.
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What was found for n cases."""
+    """Errors of n cases."""
 
-    errors: Tensor  #: over eps times the condition number [n]; infinite where there is no bound
+    errors: Tensor  #: in units of eps times the condition number [n]; infinite if unbounded
     lost: Tensor  #: whether a value is not finite [n]
-    said: Sequence[str]  #: what has the error, of each case
+    said: Sequence[str]  #: name of what has the error, for each case
     gradient: float = 0.0  #: median of the largest gradient
 
 
 def measure(
     stage: Stage, family: str, seeds: Sequence[int], dtypes: Sequence[str] | None = None
 ) -> list[Row]:
-    """The cells of a family: one for each dtype of the stage (or for those of ``dtypes`` among them)."""
+    """Cells of a family, one for each dtype of the stage (among ``dtypes``, if given)."""
     started = time.perf_counter()
     chosen = [dtype for dtype in stage.dtypes if dtypes is None or dtype in dtypes]
     # A case depends on stage, family and seed only.
@@ -78,7 +78,7 @@ def _row(
 
 
 def evaluate(run: Callable[[Values], Values], inputs: Values, gradients: Sequence[str], dtype: str) -> Values:
-    """Outputs, and gradients of their weighted sum, in float64; ``dtype`` names an autocast, or none."""
+    """Outputs and gradients of their weighted sum as float64; half precisions run in autocast."""
     leaves = {
         name: value.detach().requires_grad_(name in gradients) if value.is_floating_point() else value
         for name, value in inputs.items()
@@ -99,13 +99,13 @@ def evaluate(run: Callable[[Values], Values], inputs: Values, gradients: Sequenc
 
 
 def _weights(name: str, value: Tensor) -> Tensor:
-    """Weights of an output's entries, the same for all cases and dtypes: a sum hides no sign."""
+    """Random weights of an output's entries, the same for all cases and dtypes."""
     g = torch.Generator().manual_seed(zlib.crc32(name.encode()))
     return torch.randn(value.shape[1:], generator=g, dtype=torch.float64)
 
 
 def _comparison(stage: Stage, family: str, cases: Values) -> Callable[[str], Outcome]:
-    # What all dtypes can represent: the rounding of the inputs is not the stage's error.
+    # Inputs that all dtypes represent exactly: their rounding is not the stage's error.
     exact = _inputs(_inputs(cases, "float32"), "float64")
     run = partial(evaluate, stage.reference or stage.run, gradients=stage.gradients, dtype="float64")
     truth = run(exact)
@@ -118,9 +118,9 @@ def _inputs(cases: Values, dtype: str) -> Values:
 
 
 def _spread(run: Callable[[Values], Values], exact: Values, truth: Values, stage: Stage) -> Values:
-    """How far each output of the reference moves where the inputs are rounded at random, over the rounding.
-    Two roundings are of one step. The other two are opposite and as large as the budget: a decision that
-    falls within it (a ray that grazes a box) jumps for one of them."""
+    """Largest change of each output of the reference under random roundings of the inputs, over their size.
+    Two roundings have size eps. Two more are opposite and as large as the budget, so that one of them flips
+    any decision within it (a ray that grazes a box)."""
     spread = {name: torch.zeros(len(value), dtype=torch.float64) for name, value in truth.items()}
     for seed, size in ((0, 1), (1, 1), (2, stage.factor), (2, -stage.factor)):
         g, step, moved = torch.Generator().manual_seed(seed), size * _STEP, dict(exact)
@@ -142,7 +142,7 @@ def _largest(values: Tensor) -> Tensor:
 
 
 def _compared(stage: Stage, family: str, exact: Values, truth: Values, spread: Values, dtype: str) -> Outcome:
-    """The error of each output and gradient over what the problem itself allows."""
+    """Errors of outputs and gradients in units of eps times the condition number."""
     working = torch.float64 if dtype == "float64" else torch.float32
     found = evaluate(stage.run, _inputs(exact, dtype), stage.gradients, dtype)
     eps = torch.finfo(getattr(torch, dtype) if stage.network else working).eps
@@ -163,7 +163,7 @@ def _compared(stage: Stage, family: str, exact: Values, truth: Values, spread: V
     largest = torch.stack([_largest(found[name]) for name in names])
     lost = ~largest.isfinite().all(0)
     if dtype == "float16" and FAMILIES[family].ingredient == "weights":
-        # Weights may take products beyond 65 504, float16's largest number: then the result must say so.
+        # Products may exceed 65 504, float16's largest number; the result must then not be finite.
         table = torch.where(lost, 0.0, table)
     errors, row = table.max(0)
     slopes = largest[[name.startswith("d ") for name in names]]
@@ -184,8 +184,8 @@ def _refused(stage: Stage, cases: Values, dtype: str) -> Outcome:
 
 
 def _planted(stage: Stage, value: float, cases: Values, seeds: Sequence[int], dtype: str) -> Outcome:
-    """``value``, which is not finite, in one input: it is refused, or seen in the outputs, and reaches no
-    other case. The error is 0 where that holds, else infinite."""
+    """Plant ``value``, which is not finite, in one input. The error is 0 if it is refused, or shows in the
+    outputs and reaches no other case; else infinite."""
     inputs = _inputs(cases, dtype)
     names = [name for name, x in inputs.items() if x.is_floating_point() and name not in stage.steady]
     errors, lost, said = torch.zeros(len(seeds)), torch.zeros(len(seeds)), []

@@ -1,4 +1,4 @@
-"""The matrix as JSON, as tables and as a picture."""
+"""Report of the stress test as JSON, tables and a picture."""
 
 import json
 from collections.abc import Sequence
@@ -20,30 +20,30 @@ _WORST = ("stage", "family", "dtype", "error", "budget")  #: Columns of the wors
 
 
 def frame_of(rows: Sequence[Row]) -> pd.DataFrame:
-    """The rows with ``ratio``, the error over the budget, infinite where the error has no bound."""
+    """Rows with ``ratio``, the error over the budget; infinite for unbounded errors."""
     frame = pd.DataFrame(rows)
     return frame.assign(ratio=(frame.error.astype(float) / frame.budget).fillna(np.inf))
 
 
 def worst_of(rows: Sequence[Row]) -> list[Row]:
-    """The worst cell of each stage and dtype."""
+    """Worst cell of each stage and dtype."""
     index = frame_of(rows).groupby(["stage", "dtype"], sort=False).ratio.idxmax()
     return [{name: rows[i][name] for name in _WORST} for i in index]
 
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
-    """The numbers of cases and failures, the worst of each stage and dtype, and every cell."""
+    """Numbers of cases and failures, the worst cell of each stage and dtype, and all cells."""
     totals = {name: sum(row[name] for row in rows) for name in ("cases", "failures")}
     return {**totals, "worst": worst_of(rows), "cells": list(rows)}
 
 
 def bounded(error: float | None) -> str:
-    """An error with three digits."""
+    """Text of an error, with three digits."""
     return "no bound" if error is None else f"{error:.3g}"
 
 
 def to_markdown(rows: Sequence[Row]) -> str:
-    """The worst errors, the numbers of cases, budgets with their reasons, and what families are."""
+    """Worst errors, numbers of cases, budgets with reasons, and descriptions of families."""
     found, cases = summary(rows), _matrix(pd.DataFrame(rows), "cases", "sum")
     families, stages = list(cases.columns), [STAGES[name] for name in cases.index]
     worst = pd.DataFrame(found["worst"]).assign(error=[bounded(row["error"]) for row in found["worst"]])
@@ -64,7 +64,6 @@ def to_markdown(rows: Sequence[Row]) -> str:
 
 
 def _matrix(frame: pd.DataFrame, values: str, how: str) -> pd.DataFrame:
-    """Values by stage and family, in their order."""
     table = frame.pivot_table(index="stage", columns="family", values=values, aggfunc=how)
     stages, families = (
         [name for name in known if name in set(frame[key])]
@@ -74,7 +73,7 @@ def _matrix(frame: pd.DataFrame, values: str, how: str) -> pd.DataFrame:
 
 
 def draw(rows: Sequence[Row]) -> Figure:
-    """The largest error over budget of each stage and family, over all dtypes."""
+    """Picture of the largest error over budget of each stage and family."""
     ratios = _matrix(frame_of(rows), "ratio", "max")
     values = np.log10(ratios.clip(1e-6, 1e3)).to_numpy()
     height, width = values.shape
@@ -100,7 +99,7 @@ def draw(rows: Sequence[Row]) -> Figure:
 
 
 def write(directory: Path, rows: Sequence[Row], source: dict[str, Any]) -> Path:
-    """Write ``stress.md``, ``stress.png`` and ``stress.json``; returns the path of the last."""
+    """Write ``stress.md``, ``stress.png`` and ``stress.json``; return the last one's path."""
     write_text_atomically(directory / "stress.md", to_markdown(rows))
     save_figure(draw(rows), directory / "stress.png")
     path = directory / "stress.json"

@@ -1,4 +1,4 @@
-"""All cases of a run: divided among processes, written as they end, and not computed twice."""
+"""Run of a stress test: tasks in several processes, with a journal so that none is computed twice."""
 
 import json
 import zlib
@@ -24,7 +24,7 @@ from ghgs_lit.runs.progress import track
 
 @cache
 def code_digest() -> str:
-    """Of the sources of the package: rows of other code are not taken over."""
+    """Checksum of the package's sources; rows of other code are not reused."""
     digest = 0
     for path in sorted(Path(ghgs_lit.__file__).parent.rglob("*.py")):
         digest = zlib.crc32(path.read_bytes(), digest)
@@ -32,7 +32,7 @@ def code_digest() -> str:
 
 
 class Journal(dict[str, list[Row]]):
-    """Rows of finished pieces by key; those that an earlier run with the same code wrote are there."""
+    """Rows of finished tasks by key, including those of earlier runs with the same code."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -40,14 +40,14 @@ class Journal(dict[str, list[Row]]):
         super().__init__((e["key"], e["rows"]) for e in entries if e.get("code") == code_digest())
 
     def add(self, key: str, rows: list[Row]) -> None:
-        """Note a finished piece; its line is on its way to the disk when this returns."""
+        """Add a finished task and append it to the file."""
         append_line(self.path, json.dumps({"key": key, "code": code_digest(), "rows": rows}))
         self[key] = rows
 
 
 @dataclass(frozen=True)
 class Task:
-    """The cells of one stage and family."""
+    """Cells of one stage and family."""
 
     stage: str
     family: str
@@ -55,7 +55,7 @@ class Task:
 
     @property
     def key(self) -> str:
-        """A name that no other task has."""
+        """Unique name of the task."""
         return "/".join((self.stage, self.family, str(self.seeds)))
 
     def run(self) -> list[Row]:
@@ -67,7 +67,7 @@ class Task:
 def tasks_of(
     stages: Sequence[str] | None = None, families: Sequence[str] | None = None, quick: bool = False
 ) -> list[Task]:
-    """Everything to run; None: all stages or families. InputError: a name that is not known."""
+    """Tasks of the chosen stages and families (None: all). InputError: an unknown name."""
     stages = _chosen("stages", stages, tuple(STAGES))
     families = _chosen("families", families, tuple(FAMILIES))
     return [
@@ -85,8 +85,8 @@ def _chosen(key: str, names: Sequence[str] | None, known: tuple[str, ...]) -> tu
 
 
 def run_tasks(tasks: Sequence[Task], journal: Path, workers: int) -> list[Row]:
-    """The rows of all tasks; those that ``journal`` has already are read from it. ``journal``: a file of one
-    line for each task, which is written as the tasks end. ``workers``: processes; 0: this one."""
+    """Rows of all tasks. ``journal``: file with a line for each finished task, which is not run again.
+    ``workers``: number of processes; 0: this one."""
     done = Journal(journal)
     left = [task for task in tasks if task.key not in done]
     if count := len(tasks) - len(left):
@@ -99,11 +99,10 @@ def run_tasks(tasks: Sequence[Task], journal: Path, workers: int) -> list[Row]:
 
 @contextmanager
 def _mapping(workers: int) -> Iterator[Callable[..., Iterator]]:
-    """``map`` in this process, or divided among others."""
     if workers == 0:
         yield map
         return
-    # Not forked: a child would inherit locks of threads that it does not have.
+    # Spawned: a forked child would inherit locks of threads that it does not have.
     pool = ProcessPoolExecutor(
         workers, get_context("spawn"), initializer=torch.set_num_threads, initargs=(1,)
     )

@@ -1,4 +1,4 @@
-"""A stage of the stress test: its inputs and what is adverse about them, function, reference and budget."""
+"""Families of adversarial inputs, and stages of the stress test: inputs, function, reference and budget."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ from torch import Generator, Tensor
 
 @dataclass(frozen=True)
 class Family:
-    """Inputs of one kind: which ingredient they change (None: any stage has them), and how."""
+    """A kind of inputs. ``ingredient``: what it changes (None: it applies to every stage)."""
 
     ingredient: str | None
     says: str
@@ -69,17 +69,17 @@ FAMILIES = {
     "kicked": Family("weights", "after a step of a learning rate of 10"),
 }
 
-#: Families whose values are not finite: they are reported or contained, not compared.
+#: Families with a value that is not finite, which must be refused or show in the outputs.
 PLANTED = {"nan": float("nan"), "inf": float("inf")}
 
 
 Values = dict[str, Tensor]
 
-#: Names of the dtypes: the last two are those of autocast, with inputs in float32.
+#: Names of dtypes; the last two run in autocast, with inputs in float32.
 DTYPES = ("float64", "float32", "bfloat16", "float16")
-FLOAT32_ONLY = DTYPES[1:]  #: Those of kernels and of photographs, which are never in float64
+FLOAT32_ONLY = DTYPES[1:]  #: Dtypes of kernels and photographs, which are never in float64
 
-#: The largest factor of a budget: more than this many roundings of its inputs no stage may lose.
+#: Largest factor of a budget.
 LARGEST = 100.0
 
 
@@ -88,26 +88,26 @@ class Stage:
     """A row of the matrix.
 
     The budget of a case is ``factor * eps * kappa`` of each output and gradient (its largest entry).
-    ``kappa`` is the condition number of the reference at the case's inputs: how far it moves when each input
-    is rounded at random, in units of eps.
+    ``kappa`` is the condition number of the reference at the case's inputs: its change under random roundings
+    of the inputs, in units of eps.
 
     Args:
-        ingredients: what the inputs contain; families of others do not apply.
-        make: the inputs of one case in float64, from a family and a generator.
-        run: outputs [n, ...] of n cases, whose inputs are stacked; in the dtype of the inputs.
+        ingredients: what the inputs contain; families of other ingredients do not apply.
+        make: makes the inputs of one case in float64, from a family and a generator.
+        run: computes outputs [n, ...] of n stacked cases in the dtype of the inputs.
         factor: at most :data:`LARGEST`.
-        reference: the same in float64 by other means; None: ``run`` itself in float64.
+        reference: computes the same in float64 by other means; None: ``run`` in float64.
         gradients: inputs whose gradients are compared, too.
         steady: inputs that are not rounded for kappa.
-        seeds: cases of each family and dtype in the full run.
-        quick: the same in a quick run, which says nothing of rare failures.
-        network: computes in autocast's dtype; all others stay in float32 or wider.
-        kappa: a least condition number, where the stage's definition subtracts large numbers.
+        seeds: number of cases of each family and dtype in the full run.
+        quick: the same in a quick run, which misses rare failures.
+        network: whether the stage computes in autocast's dtype, not in float32 or wider.
+        kappa: lower bound of the condition number, where the stage's definition subtracts large numbers.
         excluded: families that do not apply although their ingredient does, with the reason.
-        sizes: size of the numbers [n] whose differences gradients are, where those cancel by definition.
-        ties: families in which gradients are not unique; they must be finite only.
+        sizes: magnitude [n] of terms that cancel in the gradients by definition.
+        ties: families whose gradients are not unique and must only be finite.
         refused: families that must be refused with an :class:`~ghgs_lit.errors.InputError`.
-        silent: why a value that is not finite need not be seen in the outputs; empty: it must be.
+        silent: why a value that is not finite need not show in the outputs; empty: it must.
     """
 
     name: str
@@ -135,7 +135,7 @@ class Stage:
             raise ValueError(f"{self.name}: a budget needs a factor up to {LARGEST} and a reason")
 
     def missing(self, family: str) -> str | None:
-        """Why there are no cases of a family; None where there are."""
+        """Why a family has no cases; None if it has."""
         ingredient = FAMILIES[family].ingredient
         if ingredient is not None and ingredient not in self.ingredients:
             return f"takes no {ingredient}"
@@ -143,12 +143,12 @@ class Stage:
 
 
 def except_for(reasons: Mapping[str, str]) -> dict[str, str]:
-    """The families of ``excluded``: reasons by names that are separated by spaces."""
+    """``excluded`` of a stage, from reasons by several names that are separated by spaces."""
     return {name: reason for names, reason in reasons.items() for name in names.split()}
 
 
 def case_by_case(run: Callable[[Values], Values]) -> Callable[[Values], Values]:
-    """A function of one case as one of stacked cases."""
+    """Turn a function of one case into one of stacked cases."""
 
     def stacked(values: Values) -> Values:
         count = len(next(iter(values.values())))
@@ -158,5 +158,5 @@ def case_by_case(run: Callable[[Values], Values]) -> Callable[[Values], Values]:
 
 
 def stack(cases: list[Values]) -> Values:
-    """Values of cases, stacked along a first axis."""
+    """Stack the values of cases along a new first axis."""
     return {name: torch.stack([case[name] for case in cases]) for name in cases[0]}

@@ -1,4 +1,4 @@
-"""Attention for CPUs with AVX2 or AVX-512: one pass, without a matrix of all scores in memory."""
+"""Attention for CPUs with AVX2 or AVX-512, in one pass without the matrix of all scores in memory."""
 
 from functools import partial
 from itertools import pairwise
@@ -9,24 +9,23 @@ from torch import Tensor
 
 from ghgs_lit.kernels import pool
 
-#: Head widths that the kernel can compute are multiples of this.
+#: Head widths must be multiples of this.
 WIDTH = 32
-#: Keys whose scores and weights are held at once, for some queries.
+#: Keys whose scores are in memory at once.
 KEYS = 256
 #: Queries that are compared with those keys before the next keys are read.
 QUERIES = 96
 
 
-# Multiplications from which the kernel is faster, on one thread and on several, on which PyTorch's own
-# operator divides small products better: 360 and 1450 tokens in two heads of 32 channels.
+# Multiplications from which the kernel is faster, on one thread and on several, where PyTorch's operator
+# divides small products better: 360 and 1450 tokens in two heads of 32 channels.
 _SMALL, _LARGE = 1 << 23, 1 << 27
 # Processor features that the kernel needs.
 _FEATURES = {"avx2", "fma"}
 
 
 def is_supported(q: Tensor, v: Tensor) -> bool:
-    """Whether :func:`attend` can compute this attention, and faster than PyTorch. ``q``: queries [n, a, t,
-    d]. ``v``: values [n, a, s, d]."""
+    """Whether :func:`attend` is faster than PyTorch for ``q`` [n, a, t, d] and ``v`` [n, a, s, d]."""
     if torch.is_grad_enabled() or v.device.type != "cpu" or v.dtype not in (torch.float32, torch.bfloat16):
         return False
     n, a, t, d = q.shape
@@ -37,18 +36,15 @@ def is_supported(q: Tensor, v: Tensor) -> bool:
 def attend(
     q: Float[Tensor, "n a t d"], k: Float[Tensor, "n a s d"], v: Float[Tensor, "n a s d"]
 ) -> Float[Tensor, "n t a d"]:
-    """``softmax(q k^T / sqrt(d)) v`` of every head, in the dtype of ``v``; see :func:`is_supported`.
-
-    All of it is float32, to which bfloat16 is widened before. The result has the same bits with any number of
-    threads.
-    """
+    """``softmax(q k^T / sqrt(d)) v`` of every head, computed in float32, in the dtype of ``v``; see
+    :func:`is_supported`. The result has the same bits with any number of threads."""
     from ghgs_lit.encoder.cpu.kernel import attend_head
 
     out = torch.empty(q.transpose(1, 2).shape)
     arrays = [_rows(x.float()).numpy() for x in (q, k, v, out.transpose(1, 2))]
     n, a, t, d = q.shape
     heads = [(i, j) for i in range(n) for j in range(a)]
-    # Every task packs its own keys and values, so a head is split only where there are few heads.
+    # Every task packs keys and values again, so a head is split only if there are few heads.
     parts = max(1, min(-(-2 * torch.get_num_threads() // len(heads)), t // QUERIES))
     edges = [t * p // (parts * QUERIES) * QUERIES for p in range(parts)] + [t]
     compiled = attend_head()
@@ -62,5 +58,4 @@ def attend(
 
 
 def _rows(x: Tensor) -> Tensor:
-    """The same numbers, those of a row beside one another."""
     return x if x.stride(-1) == 1 else x.contiguous()

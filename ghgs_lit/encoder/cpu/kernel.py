@@ -1,7 +1,5 @@
 """Attention of one head, ``KEYS`` keys at a time with a running maximum (Dao et al., FlashAttention, 2022).
-
-Powers of 2 replace the exponential: ``exp(x) = 2^(x log2 e)``.
-"""
+Powers of 2 replace the exponential: ``exp(x) = 2^(x log2 e)``."""
 
 import math
 
@@ -16,16 +14,14 @@ from ghgs_lit.kernels.simd import EXP2_LIMIT
 
 LANES = simd.LANES
 LOWEST = np.float32(-np.inf)
-#: ``out += x y`` where the numbers of one row are neighbours: ``KEYS`` of them.
+#: ``out += x y`` for rows ``x`` of ``KEYS`` contiguous numbers.
 add_values = make_product((KEYS, 1), adds=True)
 
 
 @kernel_for(*[types.Array(types.float32, 2, "A")] * 4, NUMBER, NUMBER)
 def attend_head(q, k, v, out, first, last):
-    """Write ``softmax(q k^T / sqrt(d)) v`` of queries ``first`` to ``last`` to ``out``.
-
-    Every matrix is [tokens, d] with any strides, ``d`` a multiple of 32.
-    """
+    """Write ``softmax(q k^T / sqrt(d)) v`` of queries ``first`` to ``last`` to ``out``; all matrices are
+    [tokens, d] with any strides, ``d`` a multiple of 32."""
     tokens, width = k.shape
     scale = np.float32(math.log2(math.e) / math.sqrt(width))
     keys, values = _packed_keys(k), _packed_values(v)
@@ -60,7 +56,7 @@ def _padded(count):
 
 @helper
 def _packed_keys(k):
-    """Panels of ``PANEL`` keys, each [channels, PANEL]; missing keys of the last panel are zero."""
+    """Panels of ``PANEL`` keys, each [channels, PANEL]; the last one is filled with zeros."""
     tokens, steps = k.shape
     packed = simd.aligned(_padded(tokens) * steps)
     for panel in range(0, tokens, PANEL):
@@ -76,7 +72,7 @@ def _packed_keys(k):
 
 @helper
 def _packed_values(v):
-    """Panels of ``PANEL`` channels, each [tokens, PANEL]; missing tokens are zero."""
+    """Panels of ``PANEL`` channels, each [tokens, PANEL]; tokens are filled up with zeros."""
     tokens, width = v.shape
     lines = _padded(tokens)
     packed = simd.aligned(lines * width)
@@ -90,7 +86,7 @@ def _packed_values(v):
 
 @helper
 def _pack_queries(q, start, count, packed):
-    """Tiles of ``ROWS`` queries, each [channels, ROWS]; the last query fills the last tile."""
+    """Write tiles of ``ROWS`` queries, each [channels, ROWS]; the last query fills the last tile."""
     steps = q.shape[1]
     for row in range(0, count, ROWS):
         for r in range(ROWS):
@@ -101,7 +97,7 @@ def _pack_queries(q, start, count, packed):
 
 @helper
 def _score(queries, row, keys, key, seen, steps, scores):
-    """Products of ``ROWS`` queries and ``seen`` keys [ROWS, KEYS]; the padding after them is -inf."""
+    """Write the products [ROWS, KEYS] of queries and ``seen`` keys, with -inf in the padding after them."""
     for panel in range(0, seen, PANEL):
         product(queries, row * steps, keys, (key + panel) * steps, steps, scores, panel, KEYS)
     for r in range(ROWS):
@@ -111,7 +107,7 @@ def _score(queries, row, keys, key, seen, steps, scores):
 
 @helper
 def _highest(scores, r, seen):
-    """The highest score of a row; NaN is ignored here and reaches the result through the weights."""
+    """The highest score of a row. NaN is ignored here; it reaches the result through the weights."""
     found = simd.full(LOWEST)
     for i in range(0, seen, LANES):
         found = simd.maximum(memory.load(scores, r * KEYS + i), found)
@@ -128,7 +124,7 @@ def _scale_down(exponent, sums, totals, r, width):
 
 @helper
 def _weigh(scores, r, seen, scale, top, weights, sums, query):
-    """Weights ``2^(scale s - top)`` of a row of scores, and their sum in each lane."""
+    """Write the weights ``2^(scale s - top)`` of a row of scores, and add them to the sum of each lane."""
     total, minus, limit = memory.load(sums, query * LANES), simd.full(-scale), simd.full(EXP2_LIMIT)
     for i in range(0, _padded(seen), LANES):
         depth = simd.fma(memory.load(scores, r * KEYS + i), minus, top)

@@ -1,4 +1,4 @@
-"""Methods that a user would pick instead of a model, and simple ones that it must beat."""
+"""Baselines: methods that a user might pick instead of a model, and simple ones that it must beat."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -22,7 +22,7 @@ from ghgs_lit.types import Batch
 
 __all__ = ["BASELINES", "baseline", "black", "nearest_view", "splats_at", "splatted"]
 
-#: By name, what gives the depth of a baseline's discs.
+#: Depth of the discs of a baseline, by name.
 DEPTHS = {"body_depth": body_depth, "hull": hull_depth, "photo_depth": photo_depth, "true_depth": true_depth}
 BASELINES = ("black", "nearest_view", *DEPTHS, "per_scene", "untrained")
 
@@ -30,8 +30,7 @@ BASELINES = ("black", "nearest_view", *DEPTHS, "per_scene", "untrained")
 def baseline(
     name: str, renderer: Renderer, untrained: Callable[[], torch.nn.Module], per_scene: Mapping[str, Any]
 ) -> Method:
-    """The baseline called ``name``, one of ``BASELINES``. ``untrained``: builds a model with random weights,
-    for the baseline ``untrained``."""
+    """The baseline ``name`` of ``BASELINES``; ``untrained`` builds a model with random weights."""
     choice("baselines", name, BASELINES)
     if name in DEPTHS:
         return partial(splatted, depth_of=DEPTHS[name], renderer=renderer)
@@ -43,7 +42,7 @@ def baseline(
 
 
 def black(batch: Batch) -> Estimate:
-    """A black image: the score of the background alone."""
+    """A black image, which scores the background alone."""
     return Estimate(torch.zeros_like(batch.targets.images))
 
 

@@ -1,4 +1,4 @@
-"""Baselines that are splats: at a depth (of a hull, a plane sweep, bodies, the truth) or fitted per scene."""
+"""Baselines of splats: at the depth of a hull, plane sweep, body or the truth, or fitted per scene."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,35 +18,30 @@ from ghgs_lit.heads.surface import surface_axes
 from ghgs_lit.prediction.refinement import Change, Refinement
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians
 
-#: Finer and closer to the masks than the bounds of a model, which must hold the subject whatever the masks.
+#: Finer and closer to the masks than a model's bounds, which must contain the subject despite bad masks.
 HULL = VisualHull(dilation=0.005, samples=192)
 
 
 def hull_bounds(batch: Batch) -> DepthBounds:
-    """Where the ray of each pixel enters and leaves the visual hull."""
+    """Depths at which each pixel's ray enters and leaves the visual hull."""
     return HULL(batch)
 
 
 def hull_depth(batch: Batch) -> Tensor:
-    """The hull's first surface along the ray of each pixel of the subject [B, V, H, W], metres; 0 elsewhere.
-
-    The photographs coloured by it are the image-based visual hull (Matusik et al. 2000).
-    """
+    """Depth of the visual hull's surface [B, V, H, W], metres; 0 outside the subject. Its splats resemble the
+    image-based visual hull (Matusik et al. 2000)."""
     return batch.once(hull_bounds).near * batch.masks
 
 
-#: Tuned on four people, with 3 to 5 views: depths that are compared; half the side of the window in which
-#: pixels share their evidence, as a part of the longer side of the image; and the difference of consistency
-#: at which a depth counts 1 / e of the best one.
+#: Number of compared depths; half the side of the window over which consistency is averaged, over the longer
+#: side of the image; temperature of the softmax over depths. Tuned on four people, with 3 to 5 views.
 DEPTHS, WINDOW, SOFTNESS = 32, 0.02, 0.03
 
 
 def photo_depth(batch: Batch) -> Tensor:
-    """Depths at which pixels and their neighbours agree best with another view [B, V, H, W], metres.
-
-    The mean of the depths of a plane sweep, weighted by their consistency (the soft argmin of Kendall et al.,
-    ICCV 2017); the middle of the hull where all are alike. 0 outside the subject.
-    """
+    """Depths of a plane sweep between the hull's surfaces [B, V, H, W], metres; 0 outside the subject. Mean
+    of the depths, weighted by their photo-consistency in a window (soft argmin of Kendall et al., ICCV 2017);
+    the middle of the hull where all depths are equally consistent."""
     bounds = batch.once(hull_bounds)
     consistency = photo_consistency(batch, bounds, DEPTHS)
     radius = max(round(WINDOW * max(batch.masks.shape[-2:])), 1)
@@ -65,25 +60,24 @@ def _shared(values: Tensor, masks: Tensor, radius: int) -> Tensor:
 
 
 def _window_mean(maps: Tensor, radius: int) -> Tensor:
-    """Means over a square window [B, n, H, W], beyond the border 0; rows, then columns."""
+    """Means over a square window [B, n, H, W], zero beyond the border."""
     side = 2 * radius + 1
     maps = F.avg_pool2d(maps, (side, 1), 1, (radius, 0))
     return F.avg_pool2d(maps, (1, side), 1, (0, radius))
 
 
-#: Of :func:`discs_at`, as ``model=recurrent`` starts: standard deviations along the surface and across it and
-#: distance behind it in footprints of a pixel, opacity, and the rendering's low-pass filter.
+#: Discs, as ``model=recurrent`` starts: standard deviations along and across the surface and distance behind
+#: it in pixel footprints; opacity; low-pass filter in px^2.
 _ALONG, _ACROSS, _INWARD, _OPACITY, _LOW_PASS = 0.5, 0.1, 0.4, 0.8, 0.1
-#: Share of the subject above which a pixel gets a disc.
+#: Matte above which a pixel gets a disc.
 _MATTE = 0.125
 
 
 def splats_at(
     batch: Batch, depth: Tensor, valid: Tensor, sigma: float = 0.3, opacity: float = 0.9
 ) -> Gaussians:
-    """Round splats for pixels of the inputs, in the order of the pixels. ``depth``: where the splats are [B,
-    V, H, W], metres. ``valid``: pixels that get a splat [B, V, H, W]. ``sigma``: standard deviation in pixels
-    of the input. ``opacity``: in (0, 1)."""
+    """Round splats at ``depth`` [B, V, H, W] in metres for the ``valid`` pixels [B, V, H, W], in their order.
+    ``sigma``: standard deviation in input pixels. ``opacity``: in (0, 1)."""
     points = unproject_maps(depth, batch.cameras)[valid]
     focal = batch.cameras.intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2].mean(-1)
     scale = (sigma * depth / focal[..., None, None])[valid]
@@ -99,7 +93,7 @@ def splats_at(
 
 
 def discs_at(batch: Batch, depth: Tensor, valid: Tensor) -> Gaussians:
-    """Discs on the surface that depth maps describe, as Gaussian heads with ``axes=surface`` start."""
+    """Discs on the surface of depth maps, like the initial Gaussians of heads with ``axes=surface``."""
     places = valid.flatten(0, 1).flatten(1).nonzero()
     image, pixel = places.unbind(1)
     focal = focal_lengths(batch.cameras).prod(-1).sqrt()
@@ -121,7 +115,7 @@ def discs_at(batch: Batch, depth: Tensor, valid: Tensor) -> Gaussians:
 
 
 def body_depth(batch: Batch) -> Tensor:
-    """Mean depth of the body's vertices in each view, as maps [B, V, H, W] in metres."""
+    """Mean depth of the body's vertices in each view [B, V, H, W], metres. InputError: no bodies."""
     if batch.body_vertices is None:
         raise InputError("baselines: body_depth expects body vertices in the data; found none")
     means = [
@@ -132,15 +126,14 @@ def body_depth(batch: Batch) -> Tensor:
 
 
 def true_depth(batch: Batch) -> Tensor:
-    """Depth maps [B, V, H, W] of the data, metres."""
+    """Depth maps [B, V, H, W] of the data, metres. InputError: there are none."""
     if batch.depths is None:
         raise InputError("baselines: true_depth expects depth maps in the data; found none")
     return batch.depths
 
 
 def splatted(batch: Batch, depth_of: Callable[[Batch], Tensor], renderer: Renderer) -> Estimate:
-    """Discs at a depth that is not learned, of pixels at the rim, too, where the data have mattes.
-    ``depth_of``: gives depths of the inputs [B, V, H, W], metres."""
+    """Estimate by discs at ``depth_of(batch)`` [B, V, H, W], metres; with mattes also at the rim."""
     batch = with_matte(batch, _MATTE)
     depth = depth_of(batch)
     valid = batch.masks & (depth > 0)
@@ -149,8 +142,8 @@ def splatted(batch: Batch, depth_of: Callable[[Batch], Tensor], renderer: Render
     return Estimate(image, depth, valid, gaussians.splits)
 
 
-#: How far a Gaussian may go and how fast, tuned on four people with 3 to 5 views for what other cameras see.
-#: Colours stay near the photograph: freed to 0.1 and beyond they cost 0.2 to 1 dB there.
+#: Limits and rates of the fitted attributes, tuned for novel views on four people with 3 to 5 views. A limit
+#: of 0.1 or more for colours costs 0.2 to 1 dB in novel views.
 CHANGES = {
     "means": Change(limit=30.0, rate=0.5),
     "quaternions": Change(limit=1.0, rate=0.05),
@@ -158,28 +151,26 @@ CHANGES = {
     "opacities": Change(limit=7.0, rate=0.1),
     "colors": Change(limit=0.05, rate=0.001),
 }
-#: Standard deviation in pixels and opacity of Gaussians that are not fitted yet.
+#: Standard deviation in pixels and opacity of the initial Gaussians.
 SIGMA, OPACITY = 0.5, 0.5
 
 
 @dataclass(frozen=True)
 class PerScene:
     """``method(batch)``: 3D Gaussian splatting (Kerbl et al. 2023) on the inputs, a Gaussian for each pixel.
-
-    They begin where photographs agree. None is added or pruned: a Gaussian for each pixel of each photograph
-    is more than they can tell apart. ``steps``: of the optimiser, 1 or more.
-    """
+    Gaussians start at :func:`photo_depth`. None is added or pruned: one for each pixel of each photograph is
+    more than the photographs determine. ``steps``: of the optimiser, at least 1."""
 
     renderer: Renderer
     steps: int
 
     @property
     def fitting(self) -> Refinement:
-        """What fits the Gaussians."""
+        """Optimisation that fits the Gaussians."""
         return Refinement(self.steps, self.renderer, CHANGES)
 
     def begin(self, batch: Batch) -> Gaussians:
-        """The Gaussians that are fitted."""
+        """Initial Gaussians."""
         depth = photo_depth(batch)
         return splats_at(batch, depth, depth > 0, SIGMA, OPACITY)
 

@@ -1,4 +1,4 @@
-"""From measurements to tables: which run fills which cell, what is best."""
+"""Assembly of tables from measurements: their rows, columns and cells."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -33,14 +33,14 @@ BASELINES = {
     "true_depth": "Discs at the true depth",
     "untrained": "Untrained model",
 }
-#: Models that are built after other methods, by name.
+#: Titles of models that follow other methods.
 PEERS = {"gps": "After GPS-Gaussian", "pixel": "Pixel-aligned"}
 
 
 def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOptions) -> list[Table]:
-    """One table for each setting that occurs (and each model, where rows are ablations). ``others``: results
-    of other methods, of each file. InputError: nothing was measured on these targets; two runs claim one
-    cell; the results of other methods fit no table."""
+    """One table for each setting (and each model, if rows are ablations). ``others``: results of other
+    methods, one frame for each file. InputError: nothing was measured on these targets, two runs claim one
+    cell, or results of other methods fit no table."""
     layout = options.layout
     if others and layout.rows == "ablation":
         raise InputError(f"others: expected layout=table1, table2 or table3; found {layout.name}")
@@ -117,7 +117,7 @@ def _groups(rows: pd.DataFrame, planned: list[Planned], options: TableOptions) -
 
 
 def _reported(layout: Layout, reported: str, groups: list[Group]) -> tuple[list[Line], list[dict]]:
-    """The paper's rows, and its figures with the numbers of their line and group."""
+    """The paper's rows, and its figures with their line and group."""
     lines, cells = [], []
     switches = {name: pair for pair, name in ABLATIONS.items()}
     for method, figures in reported_table(reported)[1].items():
@@ -137,7 +137,7 @@ def _signs(switches: tuple[bool, bool]) -> tuple[str, str]:
 
 
 def _measured_lines(variants: list[Variant], planned: list[Planned], layout: Layout) -> list[Line]:
-    """All four combinations; or baselines, other methods and ours, in this order."""
+    """Rows of all four ablations; or of baselines, other methods and ours, in this order."""
     if layout.rows == "ablation":
         first, lines = variants[0], []
         for pair in ABLATIONS:
@@ -155,7 +155,7 @@ def _measured_lines(variants: list[Variant], planned: list[Planned], layout: Lay
 
 
 def _label(variant: Variant, models: list[Variant]) -> str:
-    """``Ours`` or a peer's name, with the differences between variants where there are several."""
+    """Title of a row: ``Ours`` or another method's, with what distinguishes several models."""
     if variant.kind == "baseline":
         return BASELINES.get(variant.name, variant.name)
     if variant.kind != "model":

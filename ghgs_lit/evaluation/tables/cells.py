@@ -1,9 +1,8 @@
-"""The cells of a table from measurements: means, deviations, what is best, what differs beyond chance.
+"""Cells of a table: means, deviations, the best value, and significant differences.
 
-A row is some of many possible trainings, measured on some of many subjects: both are drawn by chance. The
-squared standard errors over seeds and over subjects are added (min F', Clark 1973), and the degrees of
-freedom are those of the fewer of the two (Mickey and Brown 1966), so that the level holds whichever varies
-more.
+Seeds and subjects of a row are both random samples. The squared standard errors over seeds and over subjects
+are added (min F', Clark 1973), and the degrees of freedom are those of the smaller sample (Mickey and Brown
+1966), so that the level holds whichever of the two varies more.
 """
 
 import math
@@ -25,16 +24,10 @@ from ghgs_lit.evaluation.tables.records import TRAINING, differing, differing_te
 
 @dataclass(frozen=True)
 class Comparison:
-    """A row compared with the reference row of its column, on the seeds and subjects that both have.
-
-    Args:
-        seeds, subjects: their numbers.
-        difference: mean of row minus reference; None without pairs.
-        low, high: the interval in which the difference lies with probability 1 - alpha, not corrected; None,
-            as ``p``, with fewer than two seeds or subjects.
-        p: two-sided p-value.
-        corrected: ``p`` after Holm's correction.
-    """
+    """Comparison of a row with the reference row of its column, on the seeds and subjects that both have.
+    ``difference``: mean of row minus reference; None without pairs. ``low``, ``high``: its interval at level
+    1 - alpha, not corrected. ``p``: two-sided p-value, ``corrected`` by Holm. Interval and p-values are None
+    with fewer than two seeds or subjects."""
 
     seeds: int
     subjects: int
@@ -46,8 +39,7 @@ class Comparison:
 
 
 def compare(row: pd.DataFrame, reference: pd.DataFrame, alpha: float = 0.05) -> Comparison:
-    """Compare two rows; equal ones have p = 1. ``row``, ``reference``: values by seed (index) and subject
-    (columns). ``alpha``: one minus the probability of the interval."""
+    """Compare two rows of values by seed (index) and subject (columns); ``alpha``: level of the interval."""
     row, reference = row.align(reference, join="inner")
     differences = (row - reference).dropna(axis="columns")
     seeds, subjects = differences.shape
@@ -66,14 +58,13 @@ def compare(row: pd.DataFrame, reference: pd.DataFrame, alpha: float = 0.05) -> 
 
 
 def needed_errors(alpha: float, count: int, comparisons: int = 1) -> float:
-    """Standard errors by which rows must differ to be marked first among ``comparisons``. ``alpha``: level of
-    significance of all comparisons together. ``count``: number of seeds, or of subjects where they are fewer;
-    2 or more."""
+    """Standard errors by which rows must differ so that the smallest p of ``comparisons`` is significant at
+    level ``alpha`` of all together. ``count``: number of seeds or subjects, the smaller one, at least 2."""
     return float(stats.t.isf(alpha / 2 / comparisons, count - 1))
 
 
 def holm(values: Sequence[float]) -> list[float]:
-    """Holm's correction of p-values of one table, in their order."""
+    """Holm's correction of the p-values of a table."""
     order = np.argsort(values, kind="stable")
     scaled = np.asarray(values, dtype=np.float64)[order] * np.arange(len(values), 0, -1)
     corrected = np.empty(len(values))
@@ -82,11 +73,10 @@ def holm(values: Sequence[float]) -> list[float]:
 
 
 def fill(table: Table, figures: Sequence[Mapping[str, Any]]) -> None:
-    """Fill ``table.cells``. ``figures``: the reported ones, as entries of it. InputError: two runs claim one
-    cell with different numbers."""
+    """Fill ``table.cells``; ``figures``: reported cells. InputError: runs with other numbers claim one."""
     values, options = _values(table), table.options
     _refuse_rivals(table, values)
-    # The same numbers, measured or copied twice, are one run.
+    # Runs with the same numbers count once.
     cell_and_seed = [*CELL, "seed"]
     values = values[values["source"] == values.groupby(cell_and_seed)["source"].transform("first")]
     seeds = values.groupby(cell_and_seed, sort=False)
@@ -111,7 +101,7 @@ def _columns(table: Table) -> tuple[range, list[str]]:
 
 
 def _values(table: Table) -> pd.DataFrame:
-    """A line for each value: ``CELL``, ``seed``, ``source``, ``run``, ``subject``, ``count``, ``value``."""
+    """One row for each value: ``CELL``, ``seed``, ``source``, ``run``, ``subject``, ``count``, ``value``."""
     lines = {line.variant: i for i, line in enumerate(table.lines) if not line.is_reported}
     numbers = {(g.views, g.data): i for i, g in enumerate(table.groups)}
     rows, facts = table.rows, ["line", "group", "seed", "source", "run", "subject"]
@@ -126,7 +116,7 @@ def _values(table: Table) -> pd.DataFrame:
 
 
 def _refuse_rivals(table: Table, values: pd.DataFrame) -> None:
-    """Refuse several runs for one cell; names them all, and the keys that tell them apart."""
+    """Refuse several runs for one cell; names them and the keys in which they differ."""
     means = values.groupby([*CELL, "seed", "source"], sort=False)["value"].mean().reset_index("source")
     rivals: dict[tuple[str, ...], str] = {}
     for (line, group, _, seed), part in means.groupby(level=[*CELL, "seed"], sort=False):
@@ -149,7 +139,7 @@ def _refuse_rivals(table: Table, values: pd.DataFrame) -> None:
 
 
 def _lacking(table: Table, cell: Any) -> tuple[int, ...]:
-    """Seeds of planned runs of our row of a cell that has some seeds and not these."""
+    """Seeds of planned runs that a cell of ours, which has other seeds, still lacks."""
     line, group, _ = cell.Index
     line, group = table.lines[line], table.groups[group]
     if not line.is_ours or not isinstance(cell.seeds, tuple):
@@ -165,35 +155,29 @@ def _competing(table: Table, column: tuple) -> pd.Series:
 
 
 def _mark_best(table: Table, column: tuple) -> None:
-    """Mark the best means of a column, as printed.
-
-    None where all are equal, no direction is better, or the best is ahead of the next by no more than the
-    deviation over seeds of one of both.
-    """
+    """Mark the best means of a column, as printed. None is marked if all are equal, no direction is better,
+    or the best leads by no more than the larger deviation over seeds of the best two."""
     means = _competing(table, column).round(decimals(column[1]))
     if means.nunique() < 2 or not arrow(column[1]):
         return
     means = means.sort_values(ascending=arrow(column[1]) == "↓")
     deviations = table.cells["deviation"].xs(column, level=CELL[1:])[means.index[:2]]
-    if abs(means.iloc[0] - means.iloc[1]) <= deviations.max():  # false where there is none
+    if abs(means.iloc[0] - means.iloc[1]) <= deviations.max():  # false if there is no deviation
         return
     for line in means.index[means == means.iloc[0]]:
         table.cells.loc[(line, *column), "best"] = True
 
 
 def _by_person(values: pd.DataFrame, unit: re.Pattern[str] | None) -> pd.DataFrame:
-    """Values by cell and seed (index) and by person (columns); those of persons alone can be tested."""
+    """Values that can be tested, by cell and seed (index) and by person (columns)."""
     values = values[values["subject"].notna() & ~values["metric"].isin(TRAINING)]
     values = values.assign(person=[person_of(subject, unit) for subject in values["subject"]])
     return values.groupby([*CELL, "seed", "person"])["value"].mean().unstack("person")
 
 
 def _test(table: Table, people: pd.DataFrame, test: PairedTest) -> None:
-    """Test each row against the reference of its column, corrected over all comparisons of the table.
-
-    Where the reference is the best of what was measured, every pair of rows of the column counts as a
-    comparison: chance chose among them.
-    """
+    """Test each row against the reference of its column, corrected over all comparisons of the table. If the
+    reference was chosen by its figures, every pair of rows of the column counts as a comparison."""
     tested: list[tuple[tuple | None, Comparison]] = []
     for column in product(*_columns(table)):
         means = _competing(table, column)
@@ -219,7 +203,7 @@ def _test(table: Table, people: pd.DataFrame, test: PairedTest) -> None:
 
 
 def _reference(table: Table, means: pd.Series, metric: str, against: str) -> tuple[int | None, bool]:
-    """The row that the others of a column are tested against, and whether it was chosen by its figures."""
+    """Reference row of a column, and whether it was chosen by its figures."""
     full = [i for i in means.index if table.lines[i].is_ours and table.lines[i].variant.ablation == "full"]
     if against == "full" and len(full) == 1:
         return full[0], False

@@ -1,4 +1,4 @@
-"""Layouts of tables (the paper's four, the ablation at all numbers of views), and their parts."""
+"""Layouts of tables (the paper's four, the ablation at several numbers of views) and their parts."""
 
 import re
 from collections.abc import Mapping
@@ -29,10 +29,9 @@ TITLES = {
 
 @dataclass(frozen=True)
 class Layout:
-    """Rows (``ablation``: all four combinations, or ``methods``) and groups of columns. ``rows``:
-    ``ablation`` or ``methods``. ``columns``: ``views`` or ``data``, one group for each. ``heading``: above
-    each group of columns: its ``views``, its ``data`` or ``none``. ``reported``: the paper's table whose
-    figures are shown beside the measured ones."""
+    """Rows and groups of columns of a table. ``rows``: ``ablation`` (all four combinations) or ``methods``.
+    ``columns``: one group for each of ``views`` or ``data``. ``heading`` of each group: ``views``, ``data``
+    or ``none``. ``reported``: the paper's table whose figures are shown beside the measured ones."""
 
     name: str
     rows: str
@@ -53,9 +52,9 @@ LAYOUTS = {
 
 @dataclass(frozen=True)
 class TableOptions:
-    """What is shown. ``views``, ``targets``, ``metrics``: a selection; None: those of the layout and of the
-    runs. ``unit``: a regular expression whose first group is the person, where subjects are frames of people.
-    ``illustration``: whether a note says that the numbers are no result, of which none is bold."""
+    """What a table shows. ``views``, ``targets``, ``metrics``: a selection; None: those of the layout and the
+    runs. ``unit``: regular expression whose first group is the person, if subjects are frames of people.
+    ``illustration``: note that the numbers are not a result, and mark none as best."""
 
     layout: Layout
     views: tuple[int, ...] | None = None
@@ -68,23 +67,23 @@ class TableOptions:
 
 
 def _stem(metric: str) -> str:
-    """The metric without its region: ``psnr`` of ``psnr_box``."""
+    """Metric without its region: ``psnr`` for ``psnr_box``."""
     return metric if metric in DECIMALS else metric.split("_")[0]
 
 
 def decimals(metric: str) -> int:
-    """Digits after the decimal point, as in the paper."""
+    """Decimals of a metric, as in the paper."""
     return DECIMALS.get(_stem(metric), 4)
 
 
 def arrow(metric: str) -> str:
-    """Whether higher (↑) or lower (↓) is better; empty where neither is, or nothing says."""
+    """Whether higher (↑) or lower (↓) is better; empty if neither or unknown."""
     stem = _stem(metric)
     return "↑" if stem in HIGHER_IS_BETTER else "↓" if stem in LOWER_IS_BETTER else ""
 
 
 def title(metric: str) -> str:
-    """``psnr_box`` as ``PSNR box``."""
+    """Title of a metric, such as ``PSNR box`` for ``psnr_box``."""
     stem, _, region = metric.partition("_")
     return TITLES.get(metric) or f"{stem.upper()} {region}".strip()
 
@@ -108,17 +107,17 @@ class Line:
 
     @property
     def is_ours(self) -> bool:
-        """Whether it is a trained model of ours."""
+        """Whether this is a trained model of ours."""
         return self.variant.kind == "model"
 
     @property
     def is_reported(self) -> bool:
-        """Whether its figures are those that the paper prints."""
+        """Whether the figures are the paper's."""
         return self.variant.kind == "reported"
 
     @property
     def competes(self) -> bool:
-        """Whether it can be best and is tested: no baseline, some of which know the truth."""
+        """Whether the row can be best and is tested; baselines, some of which know the truth, do not."""
         return self.variant.kind in ("model", "other")
 
 
@@ -128,17 +127,14 @@ CELL = ["line", "group", "metric"]
 
 @dataclass
 class Table:
-    """One table: everything that a writer of a format needs.
+    """A table, with everything that a writer of a format needs.
 
-    Args:
-        rows: what was measured, as in :class:`Sweep`.
-        planned: the training runs of the sweep, finished or not, that belong to it.
-        configs: the configuration of our model by ``source``.
-        cells: by ``CELL``, every line and column in order: ``mean`` over subjects and seeds (nan: no number),
-            ``deviation`` over seeds, ``seeds`` and ``lacking`` (seeds of planned runs without results) as
-            tuples, ``count`` of subjects, ``runs`` (hashes or files), ``best``: whether it is the best of its
-            column as printed, ``test`` (a :class:`Comparison` or None), and ``marked``.
-        reported_on: data of the reported figures, where it has any.
+    ``rows``: measurements, as in :class:`Sweep`. ``planned``: training runs of the table, finished or not.
+    ``configs``: configuration of our model by ``source``. ``cells``, by ``CELL``: ``mean`` over subjects and
+    seeds (nan: no number), ``deviation`` over seeds, ``seeds`` and ``lacking`` (seeds of planned runs without
+    results) as tuples, ``count`` of subjects, ``runs`` (hashes or files), ``best`` (of its column, as
+    printed), ``test`` (a :class:`Comparison` or None), ``marked`` (significant). ``reported_on``: data of the
+    reported figures, if any.
     """
 
     options: TableOptions
@@ -161,19 +157,19 @@ class Table:
 
     @property
     def ours(self) -> list[Line]:
-        """The rows of our models."""
+        """Rows of our models."""
         return [line for line in self.lines if line.is_ours]
 
     @property
     def measured(self) -> pd.DataFrame:
-        """The cells with a number that was measured, not reported."""
+        """Cells with a measured, not reported, number."""
         known = self.cells[self.cells["mean"].notna()]
         reported = [self.lines[i].is_reported for i in known.index.get_level_values("line")]
         return known.loc[[not is_reported for is_reported in reported]]
 
     @property
     def blocks(self) -> list[list[int]]:
-        """Numbers of the reported rows, then of the measured rows; a block without rows is left out."""
+        """Indices of reported rows, then of measured rows; empty blocks are left out."""
         parts = [
             [i for i, line in enumerate(self.lines) if line.is_reported == reported]
             for reported in (True, False)
@@ -181,7 +177,7 @@ class Table:
         return [part for part in parts if part]
 
     def block_title(self, block: list[int]) -> str:
-        """What stands above a block where a table has reported rows."""
+        """Title of a block, for tables with reported rows."""
         reported = f"as reported on {self.reported_on}, not measured here"
         return reported if self.lines[block[0]].is_reported else "measured here"
 
@@ -192,17 +188,17 @@ def _content() -> dict[str, Any]:
 
 
 def data_title(name: str) -> str:
-    """The paper's name of a data set, whatever its spelling (``zju_mocap``); ``name`` where it has none."""
+    """The paper's name of a data set in any spelling (``zju_mocap``), else ``name``."""
     return _content()["data"].get(re.sub(r"[^a-z0-9]", "", name.lower()), name)
 
 
 def reported_source() -> str:
-    """The reference of the paper."""
+    """Reference of the paper."""
     return _content()["source"]
 
 
 def reported_table(name: str) -> tuple[str, dict[str, dict[int | str, dict[str, float]]]]:
-    """The data of one of the paper's tables, and its rows: method -> views or data -> metric -> figure."""
+    """Data set of one of the paper's tables, and its rows: method -> views or data -> metric -> figure."""
     table, metrics = _content()["tables"][name], _content()["metrics"]
     rows = {
         method: {group: dict(zip(metrics, figures, strict=True)) for group, figures in groups.items()}
@@ -212,5 +208,5 @@ def reported_table(name: str) -> tuple[str, dict[str, dict[int | str, dict[str, 
 
 
 def reported_data(name: str) -> list[str]:
-    """The data sets that are columns of a reported table."""
+    """Groups of columns of a reported table: data sets or numbers of views."""
     return list(dict.fromkeys(group for row in reported_table(name)[1].values() for group in row))

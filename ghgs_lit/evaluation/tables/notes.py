@@ -20,7 +20,7 @@ MARK = "*"
 
 
 def write_caption(table: Table) -> str:
-    """Data, protocol, model and number of runs, in one line."""
+    """Caption in one line: data, protocol, model and number of seeds."""
     first, names = table.rows.iloc[0], dict.fromkeys(table.rows["data"])
     measured = table.measured
     counts = sorted({int(count) for count in measured["count"].dropna()})
@@ -44,7 +44,7 @@ def write_caption(table: Table) -> str:
 
 
 def write_notes(table: Table) -> list[str]:
-    """The notes below the table."""
+    """Notes below the table."""
     said = [f"**{ILLUSTRATION}**"] if table.options.illustration else []
     if table.layout.rows == "ablation":
         said.append(FOOTNOTE)

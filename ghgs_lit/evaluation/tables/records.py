@@ -1,15 +1,15 @@
-"""What runs measured, and other methods, as a DataFrame: method, setting, the values of each subject.
+"""Measurements of runs and of other methods as DataFrames: method, setting, values of each subject.
 
 A run is identified by its configuration, never by the name of its directory. The file of another method
-(``docs/tables.md`` describes it, ``docs/example_others.json`` is one) is::
+(described in ``docs/tables.md``; ``docs/example_others.json`` is an example) is::
 
     {"format": "ghgs_lit.others", "format_version": 1, "method": "RoGSplat",
      "source": "their code at commit 8a196b6, run by us", "rows": [
        {"data": "thuman2", "split": "val", "targets": "release", "protocol": "release", "views": 4,
         "subject": "0501", "seed": 1, "metrics": {"psnr": 28.9, "ssim": 0.96}}]}
 
-A row with ``subject`` has the values of one subject and can be tested; a row without has means over
-``subjects`` subjects (optional). ``seed`` is optional.
+A row with ``subject`` has the values of one subject and can be tested; others have means over ``subjects``
+subjects (optional). ``seed`` is optional.
 """
 
 import re
@@ -33,7 +33,7 @@ SETTING = ["data", "split", "targets", "protocol"]
 """What numbers in one column must have in common."""
 TRAINING = ("steps", "seconds", "peak_gb")
 """Metrics of the training, which no subject has."""
-#: Keys of `ghgs evaluate` that change its numbers beside the model, the data and the metrics.
+#: Keys of `ghgs evaluate` that change its results, beside model, data and metrics.
 _OF_EVALUATION = ("checkpoint", "refine", "refine_cameras")
 _ROW = ["method", "views", "targets", "subject"]
 # Keys that identify an encoder of conf/encoder; models change its other keys.
@@ -42,14 +42,12 @@ _ENCODER_KEYS = ("width", "heads", "depth", "layers", "vit")
 
 @dataclass(frozen=True)
 class Variant:
-    """What a row of a table shows.
+    """Identity of a row of a table.
 
-    Args:
-        kind: ``model`` (ours), ``baseline``, ``other`` (another method) or ``reported`` (by the paper).
-        switches: whether 3D unprojection and semantic consistency are on.
-        has_semantics: whether the semantic features have learned parts: from published weights or in `ghgs
-            pretext`. It is not known before training starts, so rows are not told apart by it.
-        extra: further configuration keys and their values that tell rows apart.
+    ``kind``: ``model`` (ours), ``baseline``, ``other`` (another method) or ``reported`` (by the paper).
+    ``switches``: whether 3D unprojection and semantic consistency are on. ``has_semantics``: whether the
+    semantic features were trained (published weights or `ghgs pretext`); unknown before training starts, so
+    it does not distinguish rows. ``extra``: further configuration keys and values that do.
     """
 
     kind: str
@@ -62,18 +60,18 @@ class Variant:
 
     @property
     def ablation(self) -> str:
-        """The ablation's name by its switches; empty without switches."""
+        """Name of the ablation; empty without switches."""
         return ABLATIONS[self.switches] if self.switches else ""
 
     @property
     def trained(self) -> tuple:
-        """What was trained, without its ablation."""
+        """Identity of the model without its ablation."""
         return (self.model, self.encoder, self.extra)
 
 
 @dataclass(frozen=True)
 class Planned:
-    """A training run, finished or not: which cells it fills, and whether it is done."""
+    """A training run, finished or not, with the cells that it fills."""
 
     variant: Variant
     data: str
@@ -83,10 +81,10 @@ class Planned:
 
 @dataclass
 class Sweep:
-    """Everything below the directories of a sweep. ``rows``: a line for each subject of each method of a run,
-    number of views and kind of targets: ``variant``, ``SETTING``, ``views``, ``seed``, ``source`` (the file),
-    ``run`` (the configuration's hash), ``git`` (in words), ``subject``, and the metrics, averaged over the
-    subject's targets. ``configs``: the configuration of our model by ``source``."""
+    """All runs below the directories of a sweep. ``rows``: one for each run, method, number of views, target
+    protocol and subject, with ``variant``, ``SETTING``, ``views``, ``seed``, ``source`` (the file), ``run``
+    (the configuration's hash), ``git`` (in words), ``subject``, and the metrics, averaged over the subject's
+    targets. ``configs``: configuration of our model by ``source``."""
 
     rows: pd.DataFrame = field(default_factory=pd.DataFrame)
     planned: list[Planned] = field(default_factory=list)
@@ -99,8 +97,7 @@ def _shipped_encoders() -> dict[str, dict]:
 
 
 def encoder_name(config: Mapping[str, Any]) -> str:
-    """The option of conf/encoder that a configuration has, and whether it has a semantic branch; ``unnamed``
-    where it is another."""
+    """Option of conf/encoder in a configuration, or ``unnamed``, and whether it has a semantic branch."""
     encoder = config.get("encoder")
     encoder = encoder if isinstance(encoder, Mapping) else {}
     branch = ", semantic branch" * (encoder.get("semantic") is not None)
@@ -111,14 +108,14 @@ def encoder_name(config: Mapping[str, Any]) -> str:
 
 
 def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()) -> Variant:
-    """The row of a model. ``by``: keys that tell rows apart beside model, encoder and ablation. InputError:
-    the configuration has no recalibration, by which the ablation is told."""
+    """Variant of a model. ``by``: keys that distinguish rows beside model, encoder and ablation. InputError:
+    the configuration has no recalibration, which defines the ablation."""
     recalibration = config.get("recalibration")
     require(isinstance(recalibration, Mapping), f"{source}: recalibration", "a mapping", recalibration)
     compat = lookup(config, "compat.name")
     model = [str(lookup(config, "model.name") or "unnamed")]
     model += [f"compat {compat}"] * (compat not in (None, "none"))
-    # No row of the ablation, which has 3D points or the image plane.
+    # Not an ablation, whose neighbours are in 3D or on the image plane.
     model += ["neighbours by feature"] * (recalibration.get("neighborhood") == "feature")
     return Variant(
         kind="model",
@@ -126,7 +123,7 @@ def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()
         model=", ".join(model),
         encoder=encoder_name(config),
         switches=switches_of(config),
-        # Without such weights an encoder has learned from the loss of the rendering only.
+        # Without such weights the encoder has learned from the rendering loss only.
         has_semantics=bool(lookup(config, "encoder.weights")),
         extra=tuple((key, str(lookup(config, key))) for key in by),
     )
@@ -159,8 +156,7 @@ class _Training(_Strict):
 class _Provenance(_Strict):
     config: dict[str, Any]
     config_hash: str | None = None
-    # The configuration of `ghgs evaluate` does not say how the model was trained; that of its checkpoint
-    # does, but for what the command line changed.
+    # Of `ghgs evaluate`: how the model was trained, and what the command line changed in it.
     checkpoint_config: dict[str, Any] | None = None
     changed_model: dict[str, Any] | None = Field(None, alias="model_config")
     seed: int | None = None
@@ -171,7 +167,7 @@ class _Provenance(_Strict):
 
 
 def _read_run(path: Path, by: Sequence[str]) -> tuple[pd.DataFrame, dict[str, Any]]:
-    """The lines of a ``metrics.json``, and the configuration of its model as it was trained and measured."""
+    """Rows of a ``metrics.json``, and the configuration of its model as trained and measured."""
     content = read_results(path)
     source = validated(_Provenance, content["provenance"], f"{path}: provenance")
     trained = (source.checkpoint_config or source.config) | (source.changed_model or {})
@@ -181,7 +177,7 @@ def _read_run(path: Path, by: Sequence[str]) -> tuple[pd.DataFrame, dict[str, An
     require(isinstance(seed, int), f"{path}: provenance.seed", "a whole number", seed)
     rows = pd.DataFrame(content["rows"])
     rows = rows.drop(columns=[key for key in KEYS if key in rows and key not in _ROW])
-    # In tables ``seconds`` are those of the training.
+    # In tables, ``seconds`` is the training time.
     rows = rows.rename(columns={"seconds": "prediction_seconds"})
     rows = rows.astype({name: float for name in rows if name not in _ROW})
     rows = rows.groupby(_ROW, sort=False).mean().dropna(axis="columns", how="all").reset_index()
@@ -207,7 +203,7 @@ def _read_run(path: Path, by: Sequence[str]) -> tuple[pd.DataFrame, dict[str, An
 
 
 def _planned(path: Path, by: Sequence[str]) -> Planned | None:
-    """The training run of a ``config.yaml``; None where it is that of another verb or incomplete."""
+    """The training run of a ``config.yaml``; None if it is another verb's or incomplete."""
     try:
         config = read_yaml(path)
     except InputError:
@@ -222,9 +218,9 @@ def _planned(path: Path, by: Sequence[str]) -> Planned | None:
 
 
 def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
-    """All runs below some folders, finished or not. ``by``: configuration keys that tell rows apart beside
-    model, encoder and ablation. FileNotFoundError: a folder is missing. InputError: there is no finished run,
-    a ``metrics.json`` is damaged, or no run has a key of ``by``."""
+    """All runs below folders, finished or not. ``by``: configuration keys that distinguish rows beside model,
+    encoder and ablation. FileNotFoundError: a folder is missing. InputError: there is no finished run, a
+    ``metrics.json`` is damaged, or no run has a key of ``by``."""
     runs = {str(path): _read_run(path, by) for path in files_below(folders, "metrics.json")}
     planned = [p for path in files_below(folders, "config.yaml") if (p := _planned(path, by)) is not None]
     if not runs:
@@ -241,13 +237,13 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
 
 
 def person_of(subject: str, unit: re.Pattern[str] | None) -> str:
-    """The person of a subject: the first group of ``unit`` where it matches, else the subject itself."""
+    """Person of a subject: the first group of ``unit`` if it matches, else the subject."""
     match = unit.fullmatch(subject) if unit else None
     return match[1] if match else subject
 
 
 def differing(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
-    """Keys whose values differ among ``configs`` with these values, without those expected to differ."""
+    """Keys in which ``configs`` differ, with their values, except :data:`EXPECTED_TO_DIFFER`."""
     flat = [flatten(config) for config in configs]
     keys = dict.fromkeys(key for values in flat for key in values)
     found = {key: list(dict.fromkeys(str(values.get(key, "absent")) for values in flat)) for key in keys}
@@ -256,14 +252,14 @@ def differing(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
 
 
 def differing_text(keys: Mapping[str, Sequence[str]], limit: int = 6) -> str:
-    """``optimizer.lr (0.001, 0.0001)`` and so on, the first ``limit`` keys."""
+    """Text such as ``optimizer.lr (0.001, 0.0001)`` of the first ``limit`` keys."""
     shown = [f"`{key}` ({', '.join(values[:4])})" for key, values in list(keys.items())[:limit]]
     more = len(keys) - len(shown)
     return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
 
 
 def telling_apart(configs: Sequence[Mapping[str, Any]], keys: Mapping[str, Sequence[str]]) -> Iterable[str]:
-    """One of the ``keys`` in which ``configs`` differ if it tells all of them apart, else all."""
+    """The first of ``keys`` that distinguishes all ``configs``, else all keys."""
     return next(([key] for key, values in keys.items() if len(values) == len(configs)), list(keys))
 
 
@@ -296,12 +292,9 @@ class _Others(_Exact):
 
 
 def read_others(path: Path) -> pd.DataFrame:
-    """The lines of another method's results file, as :class:`Sweep` has them of ours.
-
-    ``said`` is the file's ``source``; lines that are means have no ``subject`` and may have a ``count``.
-    FileNotFoundError: there is no such file. InputError: it is not as the head of this module describes; the
-    message names the key.
-    """
+    """Rows of another method's results file, like those of :class:`Sweep`. ``said`` is the file's ``source``;
+    means have no ``subject`` and may have a ``count``. FileNotFoundError: there is no such file. InputError:
+    it does not have the format above; the message names the key."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected another method's results; found no such file")
     others = validated(_Others, read_json(path), path.name)

@@ -1,7 +1,6 @@
-r"""Tables as Markdown, on a terminal, as CSV and as LaTeX in the paper's layout.
+r"""Writers of tables: Markdown, terminal, CSV, and LaTeX in the paper's layout.
 
-LaTeX's are booktabs with one bar before each group of columns; they need
-``\usepackage{booktabs,multirow,adjustbox,pifont}``.
+LaTeX needs ``\usepackage{booktabs,multirow,adjustbox,pifont}``.
 """
 
 import re
@@ -15,7 +14,7 @@ from tabulate import tabulate
 from ghgs_lit.evaluation.tables.layouts import Line, Table, arrow, data_title, decimals, title
 from ghgs_lit.evaluation.tables.notes import MARK
 
-#: What a terminal shows bold and green.
+#: Bold and green on a terminal.
 _BEST = "\033[1;32m{}\033[0m"
 COLUMNS = (
     "table", "kind", "method", "model", "encoder", "ablation", "unprojection", "semantic", "extra", "data",
@@ -28,7 +27,7 @@ Write = Callable[[str, str, bool], str]
 
 
 def _cell(cell: Any, line: Line, write: Write) -> str:
-    """A cell as printed: the number, the deviation over seeds, a mark with its interval, missing seeds."""
+    """A cell as printed: number, deviation over seeds, mark with its interval, missing seeds."""
     if pd.isna(cell.mean):
         return write(line.absent, "", False)
     digits, tail = decimals(cell.Index[2]), ""
@@ -42,13 +41,13 @@ def _cell(cell: Any, line: Line, write: Write) -> str:
 
 
 def texts(table: Table, write: Write) -> pd.DataFrame:
-    """The numbers as printed: a row for each line, and columns by group and metric."""
+    """Cells as printed: a row for each line, columns by group and metric."""
     cells = [_cell(cell, table.lines[cell.Index[0]], write) for cell in table.cells.itertuples()]
     return pd.Series(cells, table.cells.index).unstack(["group", "metric"])
 
 
 def heading(table: Table, group: int, metric: str, between: str) -> str:
-    """The name of a column after that of its group, where the layout has one."""
+    """Title of a column after that of its group, if the layout has one."""
     named = f"{table.groups[group].title}{between}" if table.layout.heading != "none" else ""
     return named + f"{title(metric)} {arrow(metric)}".strip()
 
@@ -75,10 +74,10 @@ def to_markdown(table: Table) -> str:
 
 
 def to_terminal(table: Table, width: int) -> str:
-    """The numbers for a terminal; groups stand below one another where the table is wider than ``width``."""
+    """Cells for a terminal; groups stand below one another if the table is wider than ``width``."""
 
     def write(number: str, tail: str, best: bool) -> str:
-        # What is in brackets stands below its number: beside it few tables would fit.
+        # Brackets stand below their number; beside it few tables would fit.
         lines = re.sub(r" (?=[\[(])", "\n", number + tail).split("\n")
         return "\n".join(_BEST.format(line) if best else line for line in lines)
 
@@ -102,7 +101,7 @@ def _terminal(table: Table, numbers: pd.DataFrame) -> str:
 
 
 def to_csv(tables: Sequence[Table]) -> str:
-    """All cells with all digits, one for each line; the mean is empty where a run is missing."""
+    """All cells with all digits, one on each line; the mean is empty if a run is missing."""
     pairs = [(n, table, cell) for n, table in enumerate(tables, 1) for cell in table.cells.itertuples()]
     lines = [_line(*each) for each in pairs]
     frame = pd.DataFrame(lines, columns=COLUMNS)
@@ -120,7 +119,7 @@ def _line(number: int, table: Table, cell: Any) -> dict[str, Any]:
         **dict(zip(("unprojection", "semantic"), variant.switches or (), strict=False)),
         "extra": " ".join(f"{key}={value}" for key, value in variant.extra),
         "data": group.data or (table.reported_on if reported else data_title(setting["data"])),
-        # Our names of splits, targets and protocols do not apply to the paper's figures.
+        # Our splits, targets and protocols do not apply to the paper's figures.
         **({} if reported else {name: setting[name] for name in ("split", "targets", "protocol")}),
         "views": group.views,
         "metric": cell.Index[2],
@@ -158,7 +157,7 @@ def escape(text: str) -> str:
 
 
 def prose(text: str) -> str:
-    """A sentence of Markdown as LaTeX: ``**bold**`` and names in backticks."""
+    """Markdown (``**bold**`` and names in backticks) as LaTeX."""
     parts = re.split(r"(`[^`]*`|\*\*[^*]+\*\*)", text)
     marks = {"`": (r"\texttt{", 1), "*": (r"\textbf{", 2)}
     return "".join(
@@ -175,7 +174,7 @@ def _number(number: str, tail: str, best: bool) -> str:
 
 
 def _column_spec(table: Table) -> str:
-    """``ccccc`` for the ablation, ``l | c c c | c c c`` for methods, without the first bar for data sets."""
+    """Columns such as ``ccccc`` (ablation) or ``l | c c c | c c c`` (methods; no first bar for data sets)."""
     if table.layout.rows == "ablation" and len(table.groups) == 1:
         return "c" * (len(table.stub) + len(table.metrics))
     stub = "c c" if len(table.stub) == 2 else "l"
@@ -204,7 +203,7 @@ def _frame(table: Table) -> pd.DataFrame:
 
 
 def _tabular(table: Table) -> str:
-    """The ``tabular`` environment alone: that of pandas, with rules below groups and above blocks."""
+    """The ``tabular`` environment of pandas, with rules below groups and above blocks."""
     frame = _frame(table)
     text = frame.style.hide(axis="index").to_latex(
         column_format=_column_spec(table), hrules=True, multicol_align="c"
@@ -226,7 +225,7 @@ def _tabular(table: Table) -> str:
 
 
 def to_latex(table: Table, label: str) -> str:
-    """A float with the table, its caption, its notes in small print and its label."""
+    """A float with the table, its caption, notes in small print and label."""
     name = "table*" if len(table.groups) * len(table.metrics) >= _WIDE else "table"
     notes = [r"\par\smallskip", r"\parbox{\linewidth}{\footnotesize"]
     notes += [rf"{prose(note)}\par" for note in table.notes] + ["}"]
@@ -235,7 +234,7 @@ def to_latex(table: Table, label: str) -> str:
             rf"\begin{{{name}}}[t]",
             r"\centering",
             r"\small",
-            # Deviations, marks and long names make rows wide; the paper scales its tables to the line, too.
+            # Rows can be wide; the paper scales its tables to the line, too.
             r"\begin{adjustbox}{max width=\linewidth}",
             _tabular(table),
             r"\end{adjustbox}",

@@ -1,4 +1,4 @@
-"""Photo-consistency for CPUs: all depths of a pixel at once."""
+"""Photo-consistency for CPUs (:mod:`ghgs_lit.geometry.photo_consistency`)."""
 
 import math
 from itertools import pairwise
@@ -10,16 +10,14 @@ from torch import Tensor
 
 from ghgs_lit.kernels import pool
 
-#: Pixels, and rows of an image, of one task.
+#: Pixels, and rows of an image, in one task.
 _PIXELS, _ROWS = 1024, 64
 
 
 def padded(photo: Float[Tensor, "B V 3 H W"], masks: Bool[Tensor, "B V H W"]) -> Tensor:
-    """Smoothed photographs, and their masks as a fourth channel, as the kernel reads them: flat, with a rim.
-
-    The rim of zeros is what lies outside a photograph; one pixel's channels lie side by side. Whole
-    vectors are read, of the last pixels beyond the end.
-    """
+    """Smoothed photographs with their masks as a fourth channel, as one flat array for the kernel. Channels
+    are innermost. A rim of zeros surrounds each photograph, and the end is padded for reads of whole
+    vectors."""
     from ghgs_lit.geometry.cpu.kernel import smooth_rows  # here: it loads a compiler
     from ghgs_lit.kernels.simd import LANES
 
@@ -43,10 +41,9 @@ def sweep(
     shares: Float[Tensor, " S"],
     tolerance: float,
 ) -> Float[Tensor, "N S"]:
-    """Agreement of pixels with the best other view; arguments as in
-    :mod:`ghgs_lit.geometry.photo_consistency`. ``colors``: of all views, :func:`padded`. ``pixels``: in
-    ascending order. ``turn``, ``shift``: from pixels of a view (second axis) to those of another (third
-    axis). ``shares``: of the way from near to far."""
+    """Agreement of pixels with the best other view, as :mod:`ghgs_lit.geometry.photo_consistency`.
+    ``colors``: all views, :func:`padded`. ``pixels``: ascending. ``turn``, ``shift``: map pixels of a view
+    (second axis) to another (third axis). ``shares``: fractions of the way from near to far."""
     from ghgs_lit.geometry.cpu.kernel import sweep_pixels  # here: it loads a compiler
 
     result = np.empty((len(pixels), len(shares)), np.float32)

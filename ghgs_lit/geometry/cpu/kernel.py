@@ -1,4 +1,4 @@
-"""The plane sweep of 16 pixels of four channels at once (see :mod:`ghgs_lit.geometry.photo_consistency`)."""
+"""Plane sweep of 16 pixels of four channels at once (see :mod:`ghgs_lit.geometry.photo_consistency`)."""
 
 import math
 
@@ -12,7 +12,7 @@ from ghgs_lit.kernels.compile import FLOATS, NUMBER, helper, kernel_for
 from ghgs_lit.kernels.memory import pointer_to
 from ghgs_lit.kernels.simd import EXP2_LIMIT, I32, LANES, everywhere, floats, indices
 
-#: Of a pixel.
+#: Channels of a pixel.
 CHANNELS = 4
 
 
@@ -21,7 +21,7 @@ def _vector(count: int) -> ir.VectorType:
 
 
 def _between(builder, low, high, share):
-    """``low + share (high - low)`` of two vectors of any length."""
+    """``low + share (high - low)`` for vectors of any length."""
     kind, share = low.type, everywhere(builder, share, low.type.count)
     function = ir.FunctionType(kind, [kind] * 3)
     callee = cgutils.get_or_insert_function(builder.module, function, f"llvm.fmuladd.v{kind.count}f32")
@@ -30,11 +30,9 @@ def _between(builder, low, high, share):
 
 @intrinsic
 def interpolate(typing_context, pixels, at, line, right, down, out, place):
-    """Write to ``out[place:]`` what lies between four pixels.
-
-    The first is at ``pixels[at]``, that below it ``line`` numbers later; ``right`` and ``down`` are shares of
-    the ways to the next ones. The two pixels of a line are loaded at once.
-    """
+    """Write the bilinear interpolation of four pixels to ``out[place:]``. The first is at ``pixels[at]``, the
+    one below it ``line`` numbers later; ``right`` and ``down`` are the weights of the next ones. The two
+    pixels of a line are loaded at once."""
 
     def emit(context, builder, sig, args):
         pair, array = _vector(2 * CHANNELS), sig.args[0]
@@ -57,7 +55,7 @@ def interpolate(typing_context, pixels, at, line, right, down, out, place):
 
 @intrinsic
 def channels_of(typing_context, pixels, at):
-    """The channels of 16 pixels from ``pixels[at]`` on, one vector for each."""
+    """The channels of 16 pixels from ``pixels[at]`` on, one vector per channel."""
 
     def emit(context, builder, sig, args):
         address = pointer_to(context, builder, pixels, *args, at, _vector(LANES * CHANNELS))
@@ -73,7 +71,7 @@ def channels_of(typing_context, pixels, at):
 
 @intrinsic
 def store_places(typing_context, places, at, row, column, line):
-    """Write to ``places[at:]`` (int32) where pixels lie, of vectors of whole rows and columns."""
+    """Write the indices of pixels, from vectors of whole rows and columns, to ``places[at:]`` (int32)."""
 
     def emit(context, builder, sig, args):
         integers = ir.VectorType(I32, LANES)
@@ -128,10 +126,8 @@ def _rays(turn, u, v):
 
 @helper
 def _project(rays, shift, depth, height, width, places, rights, downs):
-    """Where points of rays lie in an image: places of its pixels, and the way to the next pixels.
-
-    What lies outside the image, behind it or nowhere (NaN) is put into its rim, where nothing is seen.
-    """
+    """Project points of rays into an image: indices of pixels, and the weights of the next pixels. Points
+    outside the image or behind the camera, and NaN, are put into the rim, where the mask is 0."""
     z = simd.fma(rays[2], depth, shift[2])
     inverse = ONE / z
     x = simd.fma(rays[0], depth, shift[0]) * inverse - HALF
@@ -151,7 +147,7 @@ def _difference(first, second):
 
 @helper
 def _load_pixels(colors, pixels, near, far, start, last, height, width, begin, values, own):
-    """Fill ``values`` with the pixels' centres, near and far - near; ``own`` with their colours."""
+    """Fill ``values`` with the pixels' centres, near and far - near, ``own`` with their colours."""
     for lane in range(LANES):
         i = min(start + lane, last - 1)
         place = pixels[i] % (height * width)
@@ -168,7 +164,7 @@ def sweep_pixels(
     colors, pixels, near, far, turn, shift, compared, shares, tolerance, out, height, width, image, first,
     last,
 ):  # fmt: skip
-    """Write rows ``first`` to ``last``, pixels of ``image``; see :func:`ghgs_lit.geometry.cpu`."""
+    """Write rows ``first`` to ``last``, pixels of ``image``; see :func:`ghgs_lit.geometry.cpu.sweep`."""
     views = turn.shape[1]
     element, view = image // views, image % views
     line = (width + 2) * CHANNELS

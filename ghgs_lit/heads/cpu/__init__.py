@@ -1,4 +1,4 @@
-"""The Gaussian head for CPUs: all that is done with a few Gaussians, then with the next."""
+"""The Gaussian head for CPUs: all steps for a few Gaussians at a time."""
 
 from itertools import pairwise
 
@@ -11,12 +11,12 @@ from ghgs_lit.geometry.rotations import matrix_to_quaternion
 from ghgs_lit.kernels import pool
 from ghgs_lit.types import Cameras, DepthMaps, Points
 
-#: Gaussians of one task.
+#: Gaussians in one task.
 _TASK = 1024
 
 
 def is_supported(*tensors: Tensor | None) -> bool:
-    """Whether the kernel can compute with these: without a gradient, in float32."""
+    """Whether the kernel can compute with these tensors: float32 on a CPU, without a gradient."""
     given = [x for x in tensors if x is not None]
     return not torch.is_grad_enabled() and pool.is_supported(*given) and pool.have_values(*given)
 
@@ -34,10 +34,9 @@ def activate(
     on_surface: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Means, quaternions, scales, opacities and colours of Gaussians; see :func:`is_supported`. ``raw``:
-    offsets, scales, rotations, opacities and, where there are some, colours before activations. ``image``,
-    ``pixel``: that they belong to, in ascending order. ``photo``, ``share``: colours of pixels, and what
-    opacities are multiplied by. ``constants``: of ``FootprintAttributes``. ``on_surface``: axes are those of
-    the surface."""
+    offsets, scales, rotations, opacities and colours (or None) before activations. ``image``, ``pixel``:
+    where they belong, ascending. ``photo``: colours of pixels. ``share``: factors of opacities.
+    ``constants``: of ``FootprintAttributes``. ``on_surface``: ``raw`` is in axes of the surface."""
     from ghgs_lit.heads.cpu.kernel import activate as compiled  # here: it loads a compiler
 
     *raw, color = raw
@@ -59,16 +58,15 @@ def activate(
     return tuple(out)
 
 
-#: Rows of one task, and how many of the pool's pieces of work one of them is.
+#: Rows in one task, and the work of a row as the pool counts it.
 _ROWS, _WORK = 1024, 2
 
 
 def attributes(
     networks: list[nn.Sequential], descriptors: Float[Tensor, "*n c"]
 ) -> tuple[Float[Tensor, "*n _"], ...]:
-    """What each of the networks makes of the descriptors; see :func:`ghgs_lit.kernels.pool.multiplies`.
-    ``networks``: of three layers, of equal widths but for the last, with ``nn.Tanh`` or ``nn.ReLU`` between.
-    ``descriptors``: of pixels."""
+    """Results of the networks for descriptors of pixels; see :func:`ghgs_lit.kernels.pool.multiplies`.
+    ``networks``: three linear layers, of equal widths except the last, and ``nn.Tanh`` or ``nn.ReLU``."""
     from ghgs_lit.heads.cpu.kernel import attributes as compiled  # here: it loads a compiler
     from ghgs_lit.kernels.layers import packed, parameters
 

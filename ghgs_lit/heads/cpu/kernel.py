@@ -1,8 +1,7 @@
-"""Raw attributes to Gaussians, 16 of one image at once; each line of ``values`` is a number of the 16.
-
-The same as :meth:`ghgs_lit.heads.gaussian.GaussianHead.activate` in plain PyTorch, without a gradient. And
-networks of three layers, of ``PANEL`` rows at once (see :mod:`ghgs_lit.kernels.layers`).
-"""
+"""Kernels of the Gaussian head, without a gradient. :func:`activate` is
+:meth:`ghgs_lit.heads.gaussian.GaussianHead.activate` for 16 Gaussians of one image at once; a line of
+``values`` holds one number of each. :func:`attributes` computes networks of three layers for ``PANEL`` rows
+at once (see :mod:`ghgs_lit.kernels.layers`)."""
 
 import math
 
@@ -21,7 +20,7 @@ LOG2_E = np.float32(math.log2(math.e))
 SIGMOID, TANH = np.float32(SIGMOID_LIMIT), np.float32(TANH_LIMIT)
 FAR, RANGE = np.float32(OTHER), np.float32(OTHER - SAME)
 
-# Lines: raw values, then what is read at the pixel, then the depths right, left, below and above of it.
+# Lines: raw values, values at the pixel, and depths to the right, to the left, below and above it.
 OFFSET, SCALE, ROTATION, OPACITY, COLOR = 0, 3, 6, 10, 11
 DEPTH, POINT, PHOTO, SHARE, AROUND, LINES = 14, 15, 18, 21, 22, 26
 
@@ -50,7 +49,7 @@ def _tanh(x):
 
 @helper
 def _exp(x):
-    """The exponential of numbers that are not negative."""
+    """The exponential of non-negative numbers."""
     return ONE / simd.exp2_minus(simd.minimum(simd.full(EXP2_LIMIT), x * LOG2_E))
 
 
@@ -92,7 +91,7 @@ def _rotate(q, v):
 
 @helper
 def _slope(values, line, own, footprint):
-    """Relative change of depth along an axis, of the pixels after and before; see ``surface_axes``."""
+    """Relative change of depth along an axis, from the pixels before and after; see ``surface_axes``."""
     after, before = _line(values, line) - own, _line(values, line + 1) - own
     near_after = simd.minimum(ONE, (FAR - simd.maximum(after, ZERO - after) / footprint) / RANGE)
     near_before = simd.minimum(ONE, (FAR - simd.maximum(before, ZERO - before) / footprint) / RANGE)
@@ -119,7 +118,7 @@ def _read(
     offset, scale, rotation, opacity, color, pixel, depth, valid, points, photo, share, image, start, last,
     values,
 ):  # fmt: skip
-    """Fill ``values`` with Gaussians from ``start`` on; the last one repeats."""
+    """Fill ``values`` with Gaussians from ``start`` on; the last one is repeated."""
     height, width = depth.shape[1], depth.shape[2]
     for lane in range(LANES):
         i = min(start + lane, last - 1)
@@ -146,7 +145,7 @@ def activate(
     offset, scale, rotation, opacity, color, pixel, depth, valid, points, photo, share, intrinsics, turns,
     constants, on_surface, means, quaternions, scales, opacities, colors, image, first, last,
 ):  # fmt: skip
-    """Write Gaussians ``first`` to ``last``, of ``image``; see :func:`ghgs_lit.heads.cpu.activate`."""
+    """Write Gaussians ``first`` to ``last`` of ``image``; see :func:`ghgs_lit.heads.cpu.activate`."""
     limit, inward, floor, span, across, thickness, least, bias, change = constants
     camera, width, values = intrinsics[image], depth.shape[2], simd.aligned(LINES * LANES)
     rows, columns = simd.aligned(LANES), simd.aligned(LANES)

@@ -1,9 +1,8 @@
-"""What stands behind the subject of a sequence, and masks that it contradicts.
+"""Backgrounds of cameras that stand still, and masks corrected by them.
 
-Cameras that stand still show the same background in every instant, and at each pixel some instants show it
-without the subject. Large parts of a mask that show the background are not the subject, and large parts
-beside it that do not, are. Outlines stay as they are: to say where they run is what mattes are for.
-"""
+Such a camera shows the same background in every instant, and at each pixel some instants show it without the
+subject. Large parts of a mask that show the background are removed, large parts beside it that do not are
+added. Outlines stay as they are: finding them is the work of mattes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,27 +15,27 @@ from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.crops import Photograph
 
-_ENOUGH = 6  #: Photographs of a camera that a background takes, at least
-#: Levels of 255 by which the photographs of a background differ at most, and by which the subject does.
+_ENOUGH = 6  #: Least number of photographs for a background
+#: Levels of 255 by which photographs of a background differ at most, and the subject at least.
 _STEADY, _DIFFERENT = 20.0, 12.0
 _DEVIATIONS = 4.0  #: Deviations of the noise beyond which a pixel differs
-#: Parts of a mask's area: what is large, and what is a speck beside the largest part.
+#: Shares of area: of the mask, for a large part; of the largest part, below which one is a speck.
 _LARGE, _SPECK = 0.03, 0.05
-_DARK = 0.3  #: Share of the light that a shadow leaves, at least
-#: Correlation of brightness from which a part shows the background: a grey shirt is no grey wall.
+_DARK = 0.3  #: Least share of the light that a shadow leaves
+#: Correlation of brightness above which a part shows the background: a grey shirt is no grey wall.
 _ALIKE = 0.9
 
 
 @dataclass(frozen=True)
 class _Background:
-    """Of one camera: ``image`` [h, w, 3] float32 where it is ``known`` [h, w]."""
+    """The background of one camera: ``image`` [h, w, 3] float32 where it is ``known`` [h, w]."""
 
     image: np.ndarray
     known: np.ndarray
 
     @classmethod
     def of(cls, photographs: Sequence[Photograph]) -> "_Background":
-        """From the photographs of one size that agree best at each pixel."""
+        """The mean of those photographs (of one size) that agree best at each pixel."""
         images = np.stack([photograph.image for photograph in photographs]).astype(np.float32)
         count, reach = max(3, len(images) // 4), _reach(images.shape[1:3])
         light = images.sum(-1)
@@ -53,7 +52,7 @@ class _Background:
         return cls(images.mean(0), steady & np.isfinite(width.min(0)))
 
     def mended(self, photograph: Photograph) -> Photograph:
-        """The photograph with a mask that the background does not contradict; itself where it does not."""
+        """The photograph with a corrected mask; itself where the background does not contradict it."""
         reach = _reach(self.known.shape)
         lines = (np.nonzero(photograph.mask.any(axis))[0] for axis in (1, 0))
         box = tuple(slice(max(n[0] - 24 * reach, 0), n[-1] + 24 * reach + 1) for n in lines)
@@ -69,7 +68,7 @@ class _Background:
 def _mended(
     image: np.ndarray, matte: np.ndarray, behind: np.ndarray, known: np.ndarray, reach: int
 ) -> np.ndarray | None:
-    """Another matte [h, w] of a photograph in front of a background; None: it stays."""
+    """The corrected matte [h, w] of a photograph in front of a background; None: it stays."""
     mask = matte > 127
     off = ndimage.uniform_filter(np.abs(image - behind).max(-1) * known, 3)
     beside = off[known & ~mask]
@@ -82,7 +81,7 @@ def _mended(
     if not gone.any() and not come.any():
         return None
     matte = np.where(come, np.uint8(255), np.where(gone, np.uint8(0), matte))
-    if come.any():  # its rim is nearer to the mask than what differs clearly
+    if come.any():  # fills the rim, which differs less clearly
         matte = np.maximum(matte, ndimage.binary_closing(matte > 127, iterations=3) * np.uint8(255))
     labels, count = ndimage.label(matte > 127)
     areas = np.bincount(labels.ravel(), minlength=count + 1)
@@ -105,7 +104,6 @@ def _is_alike(image: np.ndarray, behind: np.ndarray) -> bool:
 
 
 def _parts(parts: np.ndarray, keep: Callable[[np.ndarray], bool]) -> np.ndarray:
-    """The connected parts that are kept."""
     labels, count = ndimage.label(parts)
     return np.isin(labels, [number for number in range(1, count + 1) if keep(labels == number)])
 
@@ -116,7 +114,7 @@ def _reach(size: tuple[int, int]) -> int:
 
 
 def _large(parts: np.ndarray, mask: np.ndarray, reach: int) -> np.ndarray:
-    """The parts that are thick and take a share of a mask's area."""
+    """The parts that are thick and have ``_LARGE`` of the mask's area."""
     labels, count = ndimage.label(ndimage.binary_opening(parts, iterations=reach))
     areas = np.bincount(labels.ravel(), minlength=count + 1)
     areas[0] = 0
@@ -125,13 +123,13 @@ def _large(parts: np.ndarray, mask: np.ndarray, reach: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Backgrounds:
-    """Of a rig that stands still, by camera."""
+    """The backgrounds of a rig that stands still, by camera."""
 
     cameras: Mapping[str, _Background]
 
     @classmethod
     def of(cls, captures: Sequence[Capture]) -> "Backgrounds":
-        """From instants spread over a sequence; of cameras that several of them show in one size."""
+        """From instants spread over a sequence, of cameras with enough photographs of one size."""
         photographs: dict[str, list[Photograph]] = {}
         for photograph in (photograph for capture in captures for photograph in capture.photographs):
             photographs.setdefault(photograph.name, []).append(photograph)
@@ -142,7 +140,7 @@ class Backgrounds:
         return cls(cameras)
 
     def applied(self, capture: Capture) -> Capture:
-        """The capture with masks that are mended where large parts contradict the background."""
+        """The capture with masks corrected where large parts contradict the background."""
         with ThreadPoolExecutor(allowed_cores()) as pool:
             return replace(capture, photographs=tuple(pool.map(self._mended, capture.photographs)))
 

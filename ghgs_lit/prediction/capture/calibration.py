@@ -1,7 +1,6 @@
 """Calibrations as files store them, and their meaning in the conventions of :mod:`ghgs_lit.types`.
 
-Most files do not say whether poses map the world to the camera, or with which axes: the format tells it, or
-the user.
+Few files say whether poses map the world to the camera, and with which axes: the format tells, or the user.
 """
 
 from collections.abc import Mapping
@@ -19,7 +18,7 @@ EXTRINSICS = ("world_to_camera", "camera_to_world")
 AXES = ("opencv", "opengl")
 INTRINSICS = ("pixels", "normalized", "normalized_principal")
 
-#: A camera multiplies colours by at most this beside the mean of all, and at least by one over it.
+#: Largest gain of a camera's colours relative to the mean of all; the least is its inverse.
 MOST_GAIN = 2.0
 #: Between the camera axes of OpenGL (y up, z backward) and OpenCV (y down, z forward).
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -27,7 +26,7 @@ _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _CODED, _SHOWN = 1088, 1080
 # Distance from the origin beyond which a rotation's seventh digit moves a centre by more than 0.1 mm.
 _FAR = 1e3
-# Sides of a photograph and of its calibration have one ratio up to the rounding of a resize, in pixels.
+# Pixels by which a side may differ from the calibration's ratio of sides: rounding of a resize.
 _ROUNDING = 1.5
 
 
@@ -38,12 +37,11 @@ class Convention:
     Attributes:
         extrinsics: what the poses map: ``world_to_camera`` | ``camera_to_world``.
         axes: of the camera: ``opencv`` (y down, z forward) | ``opengl`` (y up, z backward).
-        intrinsics: ``pixels``, or shares of the width and of the height: ``normalized`` (all of them) |
-            ``normalized_principal`` (the principal point alone).
+        intrinsics: ``pixels``, or shares of width and height: ``normalized`` (all) | ``normalized_principal``
+            (the principal point alone).
         pixel_centers: the first pixel's centre lies at 0.5 (``half``) or at 0 (``integer``, as OpenCV's).
-        resized: by what photographs were resized after the calibration, beyond the sizes that the file says.
-        unit: metres of one unit of length.
-    """
+        resized: factor of a resize after the calibration, beyond the sizes that the file says.
+        unit: metres of one unit of length."""
 
     extrinsics: str = "world_to_camera"
     axes: str = "opencv"
@@ -58,7 +56,7 @@ class Convention:
             require(1e-9 <= value <= 1e9, f"calibration.{name}", expected, value)
 
     def told(self, said: Mapping[str, Any]) -> "Convention":
-        """The convention with what the user says; None and keys of other things say nothing."""
+        """The convention with what the user says; None and other keys are ignored."""
         named = {f.name: said.get(f.name) for f in fields(self)}
         return replace(self, **{name: value for name, value in named.items() if value is not None})
 
@@ -71,13 +69,11 @@ class StoredCamera:
         origin: file and key, for messages.
         intrinsics: [3, 3] float64.
         pose: [4, 4] float64, a rotation and a translation.
-        size: (height, width) in pixels of the images that were calibrated, where the file says it.
-        distortion: of OpenCV's model, 0 to 14 numbers: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty; with
-            ``fisheye`` k1 to k4 of Kannala and Brandt's.
-        fisheye: which of these models.
+        size: (height, width) in pixels of the calibrated images, where the file says it.
+        distortion: 0 to 14 numbers: OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty; with ``fisheye`` k1
+            to k4 of Kannala and Brandt's model.
         mask: the photograph's mask, where the file names it.
-        gains: [3], by what it multiplies red, green and blue beside other cameras, where the file says it.
-    """
+        gains: [3], of red, green and blue relative to other cameras, where the file says them."""
 
     name: str
     origin: str
@@ -124,9 +120,8 @@ class Calibration:
 
 
 def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[int, int]) -> Calibration:
-    """The camera of a photograph that a stored camera means. ``photograph``: (height, width) in pixels;
-    intrinsics of another size with the same ratio of the sides are scaled. InputError: the ratio of the sides
-    differs."""
+    """The camera of a photograph in this package's conventions. ``photograph``: (height, width) in pixels;
+    intrinsics for another size of the same aspect ratio are scaled. InputError: the aspect ratio differs."""
     size = camera.size or photograph
     if not same_ratio(size, photograph):
         shown = tuple(_SHOWN if side == _CODED else side for side in size)
@@ -151,7 +146,7 @@ def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[in
 
 
 def extrinsics_of(pose: np.ndarray, convention: Convention) -> np.ndarray:
-    """World to camera [4, 4] with OpenCV axes, of a stored pose."""
+    """A stored pose as world to camera [4, 4] with OpenCV axes."""
     if convention.extrinsics == "camera_to_world":
         pose = np.linalg.inv(pose)
     extrinsics = _FLIP @ pose if convention.axes == "opengl" else pose.copy()
@@ -160,8 +155,8 @@ def extrinsics_of(pose: np.ndarray, convention: Convention) -> np.ndarray:
 
 
 def _rigid(pose: np.ndarray) -> np.ndarray:
-    """World to camera with the nearest rotation about the camera's centre: of a rotation of seven digits the
-    transpose is no inverse, and 100 km from the origin the centre that follows is a centimetre off."""
+    """The pose with the nearest rotation and the same camera centre: a rotation of seven digits is not
+    orthogonal enough, and 100 km from the origin the transpose puts the centre a centimetre off."""
     u, _, v = np.linalg.svd(pose[:3, :3])
     rigid = pose.copy()
     rigid[:3, :3] = u @ v
@@ -176,7 +171,7 @@ def same_ratio(one: tuple[int, int], other: tuple[int, int]) -> bool:
 
 def quarter_turned(calibration: Calibration, turns: int, size: tuple[int, int]) -> Calibration:
     """The camera of an image after quarter ``turns`` counterclockwise, as of ``numpy.rot90``. ``calibration``
-    (without distortion) and ``size`` (height, width): of the image before."""
+    (without distortion) and ``size`` (height, width) are those before."""
     for _ in range(turns % 4):
         k = calibration.intrinsics
         height, width = size  # new x is the old y, new y is the width less the old x

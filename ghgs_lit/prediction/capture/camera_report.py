@@ -1,8 +1,5 @@
-"""Report on the cameras of a capture: other meanings of their numbers, tried one after another.
-
-Each :class:`Hypothesis` is another meaning; they are ranked by how well masks and cameras agree
-(:mod:`ghgs_lit.geometry.silhouettes`).
-"""
+"""Report on the cameras of a capture: other meanings of their numbers (:class:`Hypothesis`), ranked by how
+well masks and cameras agree (:mod:`ghgs_lit.geometry.silhouettes`)."""
 
 import itertools
 from collections.abc import Iterator, Sequence
@@ -22,8 +19,8 @@ from ghgs_lit.prediction.capture.photographs import Pixels
 AGREES, BETTER = 0.9, 0.05
 _SIDE = 320  # Longer side of the photographs that are compared, in pixels
 _MIDDLE = (0.3, 0.7)  # Shares of a photograph between which a principal point is plausible
-PERSON = (0.5, 2.5)  #: Largest extents that are taken for a person in metres
-# What photographs are resized by after a calibration.
+PERSON = (0.5, 2.5)  #: A person's largest extent in metres
+# Usual factors of a resize after the calibration.
 _RESIZES = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 1.0, 4 / 3, 1.5, 2.0, 3.0, 4.0)
 # A part of a mask is another person where it has this share of the largest part's area, or more.
 _PART = 1 / 3
@@ -46,10 +43,10 @@ class Hypothesis:
     """A meaning of a calibration, and how well masks and cameras agree with it."""
 
     says: str
-    option: str  #: of the command line, which makes it so; empty: as it is, or nothing does
+    option: str  #: of the command line, for this meaning; empty: none
     views: tuple[StoredView, ...]
-    blames: tuple[str, ...] = ()  #: the cameras that it says are wrong; empty: all, or none
-    shares: dict[str, float] = field(default_factory=dict)  #: of each mask in the hull of the others
+    blames: tuple[str, ...] = ()  #: the cameras that are wrong by it; empty: all, or none
+    shares: dict[str, float] = field(default_factory=dict)  #: of each mask, in the hull of the others
 
     @property
     def score(self) -> float:
@@ -57,8 +54,7 @@ class Hypothesis:
         return min(self.shares.values())
 
     def silhouettes(self, folder: CaptureFolder) -> list[Silhouette]:
-        """Masks with cameras, as this meaning has them. InputError: it has the photographs in another ratio
-        of height and width."""
+        """Masks with their cameras in this meaning. InputError: a photograph has another aspect ratio."""
         white = np.uint8(255)
         upright = [
             folder.photograph(v.name, v.camera, v.pixels, v.mask * white, v.convention) for v in self.views
@@ -89,15 +85,14 @@ class Diagnosis:
 
     consistent: bool
     lines: tuple[str, ...]
-    option: str  #: of the command line, which mends it; empty where none does
+    option: str  #: of the command line, for the best meaning; empty: none
     ranking: tuple[Hypothesis, ...]  #: all meanings that were tried, the best first
-    size: float  #: the subject's largest extent, in the user's unit, of the best meaning
+    size: float  #: the subject's largest extent in the user's unit, by the best meaning
     suspects: tuple[str, ...] = ()  #: cameras that disagree with the others
 
 
 def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
-    """Examine the cameras of one instant (None: the first). InputError: photographs or masks cannot be
-    read."""
+    """Examine the cameras of one instant (None: the first). InputError: a file cannot be read."""
     views = small_views(folder, folder.instants[0] if instant is None else instant)
     given = Hypothesis("the calibration is right as it is", "", views).ranked(folder)
     same = twins({view.name: view.camera.pose for view in views})
@@ -113,7 +108,7 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
     tried = [given, *(hypothesis.ranked(folder) for hypothesis in _for_all(views))]
     best = max(tried, key=lambda hypothesis: hypothesis.score)
     if best.score < AGREES:
-        # One camera among right ones: with the best meaning for all.
+        # A single wrong camera is sought with the best meaning for all.
         base = best if best.score > given.score + BETTER else given
         tried += [hypothesis.ranked(folder) for hypothesis in _for_some(base.views)]
         best = max(tried, key=lambda hypothesis: hypothesis.score)
@@ -127,7 +122,7 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
 
 
 def small_views(folder: CaptureFolder, instant: str) -> tuple[StoredView, ...]:
-    """The photographs of an instant at a size at which many meanings can be tried."""
+    """The photographs of an instant, so small that many meanings can be tried."""
     views = []
     for name, (camera, pixels, matte) in folder.decode(instant).items():
         height, width = pixels.size
@@ -236,7 +231,7 @@ def _mistakes(view: StoredView) -> Iterator[tuple[str, StoredView]]:
 
 
 def _contrast(view: StoredView, mask: np.ndarray) -> float:
-    """Mean gradient of the photograph on the outline of a mask, which is largest for its right mask."""
+    """Mean gradient of the photograph on the outline of a mask, largest for the right mask."""
     grey = view.pixels.image.astype(np.float64).mean(-1)
     gradient = np.hypot(*np.gradient(grey))
     outline = np.hypot(*np.gradient(mask.astype(np.float64))) > 0
@@ -244,7 +239,6 @@ def _contrast(view: StoredView, mask: np.ndarray) -> float:
 
 
 def _size_line(size: float) -> str:
-    """A line about the subject's size, with the unit in which it is a person's."""
     if PERSON[0] <= size <= PERSON[1]:
         return f"the subject is {size:.3g} units tall: a person in metres"
     unit = next((n for n, u in _UNITS.items() if PERSON[0] <= size * u <= PERSON[1]), None)

@@ -16,7 +16,7 @@ from ghgs_lit.types import Batch, Cameras
 
 @dataclass(frozen=True)
 class Capture:
-    """Photographs of one instant. :meth:`read` makes it from files. ``photographs``: two or more."""
+    """Photographs of one instant, two or more."""
 
     name: str
     photographs: tuple[Photograph, ...]
@@ -37,9 +37,8 @@ class Capture:
 
         Cameras are in the user's world, in float64, which a world far from its origin needs. Photographs are
         divided by the gains of their cameras where those of all are known. ``size``: (height, width) of the
-        crops in pixels. ``refine_masks``: by how many pixels of a crop the outlines of masks may be wrong;
-        mattes are then searched in the photographs (:func:`refined_matte`). 0: masks are right.
-        """
+        crops in pixels. ``refine_masks``: pixels of a crop by which outlines of masks may be wrong; mattes
+        are then searched in the photographs (:func:`refined_matte`). 0: masks are right."""
         crops = [crop_to_subject(photograph, size, refine_masks) for photograph in self.photographs]
         images, mattes, intrinsics, extrinsics = (
             torch.from_numpy(np.stack([getattr(crop, name) for crop in crops]))[None]

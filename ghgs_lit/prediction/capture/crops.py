@@ -7,9 +7,9 @@ import numpy as np
 
 from ghgs_lit.data.view import area_image
 
-#: How much of a crop's height or width the subject takes, as in the photographs of training data.
+#: Share of a crop's height or width that the subject takes, as in training photographs.
 SHARE = 0.8
-_FINER = 2  #: Mattes are searched in photographs of at most this times the size of their crops
+_FINER = 2  #: Largest size of photographs for refined mattes, relative to crops
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Photograph:
     matte: np.ndarray  #: [h, w] uint8, 255 times the share of each pixel that shows the subject
     intrinsics: np.ndarray  #: [3, 3] float64 in pixels, pixel centres at +0.5
     extrinsics: np.ndarray  #: [4, 4] float64, world to camera, OpenCV axes, in the user's unit
-    gains: np.ndarray | None = None  #: [3], by what it multiplies colours beside others; None: not known
+    gains: np.ndarray | None = None  #: [3], relative to other cameras; None: not known
 
     @property
     def mask(self) -> np.ndarray:
@@ -30,12 +30,11 @@ class Photograph:
 
 
 def crop_to_subject(photograph: Photograph, size: tuple[int, int], refine_masks: int = 0) -> Photograph:
-    """The subject in the middle of an image of ``size`` (height, width); its camera is that of the crop.
+    """A crop of ``size`` (height, width) with the subject in its middle, and its camera.
 
-    Beyond the photograph and beside the subject the crop is black. A large photograph's sharp mask becomes a
-    soft matte. Where the subject is cut by the photograph's border the crop ends there, too: black beside it
-    would say that the subject ends. ``refine_masks`` is that of ``Capture.batch``.
-    """
+    Beyond the photograph and beside the subject it is black. A large photograph's sharp mask becomes a soft
+    matte. Where the photograph's border cuts the subject the crop ends, too: black beside it would look like
+    the subject's end. ``refine_masks``: as for ``Capture.batch``."""
     rows, columns = (np.nonzero(photograph.mask.any(axis))[0] for axis in (1, 0))
     extents = [(int(lines[0]), int(lines[-1]) + 1) for lines in (rows, columns)]
     scale = max((end - first) / (SHARE * side) for (first, end), side in zip(extents, size, strict=True))
@@ -49,7 +48,7 @@ def crop_to_subject(photograph: Photograph, size: tuple[int, int], refine_masks:
     intrinsics[:2, 2] -= [left, top]
     intrinsics[:2] *= factors[:, None]
     image, matte = _cut(photograph.image, spans), _cut(photograph.matte, spans)
-    # Before it is made smaller: the background has no part in the pixels of the rim.
+    # Before resizing, so that the rim has nothing of the background.
     if refine_masks:
         image, matte = _refined(photograph.name, image, matte, size, refine_masks)
     else:
@@ -62,7 +61,7 @@ def crop_to_subject(photograph: Photograph, size: tuple[int, int], refine_masks:
 def _refined(
     name: str, image: np.ndarray, matte: np.ndarray, size: tuple[int, int], pixels: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """:func:`refined_matte` of a cut, which is made smaller first where it is much larger than the crop."""
+    """:func:`refined_matte` of a cut, which is resized first where it is much larger than the crop."""
     from ghgs_lit.data.matting import refined_matte  # here: photographs are read while PyTorch is imported
 
     sides = [min(_FINER * side, whole) for side, whole in zip(size, matte.shape, strict=True)]
@@ -96,7 +95,6 @@ def _span(first: int, end: int, length: int, whole: int) -> tuple[int, int]:
 
 
 def _cut(image: np.ndarray, spans: list[tuple[int, int]]) -> np.ndarray:
-    """The pixels of ``spans``, 0 beyond the image."""
     inside = tuple(slice(max(a, 0), min(b, side)) for (a, b), side in zip(spans, image.shape, strict=False))
     pads = [(max(-a, 0), max(b - side, 0)) for (a, b), side in zip(spans, image.shape, strict=False)]
     return np.pad(image[inside], pads + [(0, 0)] * (image.ndim - 2))

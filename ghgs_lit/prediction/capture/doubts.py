@@ -1,7 +1,4 @@
-"""What a capture contradicts: photographs the outlines of its masks, silhouettes its cameras.
-
-Both are quick looks. A capture of which they find nothing is predicted as it is.
-"""
+"""Quick checks of a capture: do photographs contradict masks, or silhouettes cameras?"""
 
 import numpy as np
 
@@ -12,11 +9,11 @@ from ghgs_lit.prediction.capture.crops import SHARE, Photograph
 from ghgs_lit.prediction.refinement.coherence import contradiction
 from ghgs_lit.types import Batch
 
-ENOUGH = 4  #: Pixels of masks, and rounds of cameras, that mend what is found
-_REACH = 6  #: Pixels beside an outline at which photographs are looked at
-#: Pixels of crops by which outlines lie beside the masks', on average, above which masks are off.
+ENOUGH = 4  #: Pixels of masks, and rounds of cameras, for correcting what is found
+_REACH = 6  #: Pixels beside an outline in which contrast is measured
+#: Mean pixels of crops from masks' outlines to the photographs', above which masks are off.
 _OFF = 0.35
-#: Pixels that rays near outlines miss other silhouettes by, on average, above which cameras are off.
+#: Mean pixels by which rays near outlines miss other silhouettes, above which cameras are off.
 _MISSED = 4e-3
 
 
@@ -32,18 +29,18 @@ def doubt_of_cameras(capture: Capture, batch: Batch) -> str:
     """By how much silhouettes of its crops miss one another, if cameras are off; else ""."""
     missed = float(contradiction(Frame.of(batch).enter(batch)))
     focal = [photograph.intrinsics[0, 0] for photograph in capture.photographs]
-    # Pixels of a photograph that is smaller than its crop are larger, and so are steps of outlines.
+    # An enlarged photograph has larger pixels, and larger steps of outlines.
     larger = max(1.0, *(batch.cameras.intrinsics[0, :, 0, 0].numpy() / focal))
     return f"silhouettes miss one another by {missed:.4f} pixels" if missed > larger**2 * _MISSED else ""
 
 
 def _outline(photograph: Photograph, size: tuple[int, int]) -> float:
-    """How many pixels of its crop inside the mask's outline the photograph has the most contrast."""
+    """Pixels of the crop inside the mask's outline at which the photograph has the most contrast."""
     extents = [np.nonzero(photograph.mask.any(axis))[0][[0, -1]] for axis in (1, 0)]
     steps = [(end - start + 1) / (SHARE * side) for (start, end), side in zip(extents, size, strict=True)]
     step = max(*steps, 1)
     reach = (_REACH + 2) * step
-    # One pixel of the photograph for each of a crop: as fast for a large one, and edges stay where they are.
+    # One pixel of the photograph for each of the crop: fast, and edges stay where they are.
     lines = [
         np.arange(max(start - reach, 0), min(end + reach, whole - 1) + 0.5, step).astype(int)
         for (start, end), whole in zip(extents, photograph.mask.shape, strict=True)
@@ -59,7 +56,7 @@ def _outline(photograph: Photograph, size: tuple[int, int]) -> float:
     lines = np.floor(distance[near]).astype(int) + _REACH
     count = np.maximum(np.bincount(lines, minlength=2 * _REACH), 1)
     contrast = np.bincount(lines, np.abs(across).sum(-1), 2 * _REACH) / count
-    # An edge has a line of pixels on either side; those beside them say to fractions of a pixel where it is.
+    # The lines of pixels on either side of an edge, and those beside them, give fractions of a pixel.
     first = int((contrast[1:-2] + contrast[2:-1]).argmax())
     around = contrast[first : first + 4]
     middle = (around * np.arange(4)).sum() / max(around.sum(), 1e-6)

@@ -18,13 +18,11 @@ _COLORS = ((255, 220, 0), (0, 200, 255), (255, 120, 255), (255, 160, 60), (160, 
 def camera_sheet(
     names: Sequence[str], images: Sequence[np.ndarray], views: Sequence[Silhouette]
 ) -> np.ndarray:
-    """A row with masks (green) and the hulls of the others (red), and a row of epipolar lines for each view.
+    """Picture [H, W, 3] uint8: a row with masks (green) and hulls of the others (red), then epipolar lines.
 
-    The first picture of a row of lines has points of the mask, the others the lines on which each must be,
-    where it is as far away as the subject: a line passes the same part of the body in every photograph.
-    Returns: [H, W, 3] uint8. ``images``: photographs [h, w, 3] uint8. ``views``: masks of the photographs'
-    sizes with their cameras.
-    """
+    Each row of lines begins with points of one mask; the other pictures show the line on which each point
+    must be, near the subject's depth: it passes the same part of the body in every photograph. ``images``:
+    [h, w, 3] uint8. ``views``: masks of the photographs' sizes with their cameras."""
     focus, radius = subject_sphere(views)
     small, tiles = [_smaller(view) for view in views], []
     for i, (image, view) in enumerate(zip(images, views, strict=True)):
@@ -44,7 +42,6 @@ def camera_sheet(
 
 
 def _smaller(view: Silhouette) -> Silhouette:
-    """At most ``_CELLS`` along the longer side, by taking every nth pixel."""
     step = max(-(-max(view.mask.shape) // _CELLS), 1)
     intrinsics = view.intrinsics.copy()
     intrinsics[:2] /= step
@@ -70,7 +67,6 @@ def _dots(image: np.ndarray, points: np.ndarray) -> np.ndarray:
 def _lines(
     image: np.ndarray, view: Silhouette, other: Silhouette, points: np.ndarray, depths: np.ndarray
 ) -> np.ndarray:
-    """The lines of a view's ``points`` at ``depths`` on the photograph of another."""
     picture = Image.fromarray(image)
     draw = ImageDraw.Draw(picture)
     for ray, color in zip(view.rays(points), _COLORS, strict=True):

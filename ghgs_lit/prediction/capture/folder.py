@@ -41,16 +41,16 @@ class CaptureFolder:
 
     Args:
         images: folder of photographs named after their cameras; of such folders, one for each instant; or of
-            videos named after their cameras. Or the frames of one instant by camera, as decoded.
-        cameras: the calibration, in one of :data:`ghgs_lit.prediction.capture.formats.FORMATS`, or read.
-        masks: folder of masks, laid out and named as the photographs; None: ``backgrounds``, ``segment``,
-            masks beside the photographs (``<name>_mask.png``) or named by the calibration, alpha channels.
+            videos named after their cameras. Or the decoded frames of one instant, by camera.
+        cameras: the calibration, in one of :data:`ghgs_lit.prediction.capture.formats.FORMATS`, or already
+            read.
+        masks: folder of masks, laid out and named as the photographs; None: the first there is of
+            ``backgrounds``, ``segment``, masks beside the photographs (``<name>_mask.png``) or named by the
+            calibration, alpha.
         backgrounds: folder of photographs without the subject, named after the cameras.
         segment: a segmenter of :data:`ghgs_lit.prediction.capture.masks.SEGMENTERS`.
-        calibration: what the file does not say, or says wrongly: the fields of
-            :class:`ghgs_lit.config.nodes.Calibration`.
-        sequence: which instants count, and how videos fit together: the fields of
-            :class:`ghgs_lit.config.nodes.Sequence`.
+        calibration: what the file does not say, or says wrongly (:class:`ghgs_lit.config.nodes.Calibration`).
+        sequence: which instants count, and how videos fit together (:class:`ghgs_lit.config.nodes.Sequence`).
     """
 
     images: str | Path | Mapping[str, Frame]
@@ -93,7 +93,6 @@ class CaptureFolder:
 
     @functools.cached_property
     def _found(self) -> tuple[dict[str, dict[str, Source]], str]:
-        """The photographs of all instants, and a line about what is left over."""
         folder, cameras, part = self.images, self.file.cameras, self._part
         if isinstance(folder, Mapping):
             return {"": dict(folder)}, ""
@@ -134,7 +133,7 @@ class CaptureFolder:
 
     @property
     def input_files(self) -> list[Path]:
-        """The files that may be read, such as photographs with what lies beside them, and the calibration."""
+        """All files that may be read: photographs and what lies beside them, the calibration, masks."""
         sources = (path for paths in self.paths.values() for path in paths.values())
         folders = {path.parent if isinstance(path, Path) else self.images for path in sources}
         given = [path for path in (self.cameras, self.masks, self.backgrounds) if isinstance(path, Path)]
@@ -142,7 +141,7 @@ class CaptureFolder:
         return files + [file for path in given for file in (path.rglob("*") if path.is_dir() else [path])]
 
     def photographs(self, instant: str) -> tuple[Photograph, ...]:
-        """The photographs of one instant, two or more. InputError: as of :meth:`decode`."""
+        """The photographs of one instant, two or more. InputError: as for :meth:`decode`."""
         views = self.decode(instant)
         self._begun.clear()  # they take much memory
         upright = {n: partial(self.photograph, n, *view, self.convention) for n, view in views.items()}
@@ -151,15 +150,14 @@ class CaptureFolder:
     def decode(self, instant: str) -> dict[str, tuple[StoredCamera, Pixels, np.ndarray]]:
         """Camera, photograph and matte as shown of each view, before the calibration is applied.
 
-        They are kept until :meth:`photographs` has them, or those of another instant are decoded. InputError:
-        a photograph or mask is missing or wrong; of several instants one may lack photographs
-        (:attr:`missing`) where three or more remain.
-        """
+        They are kept until :meth:`photographs` has them, or another instant is decoded. InputError: a
+        photograph or mask is missing or wrong; of several instants one may lack photographs (:attr:`missing`)
+        where three or more remain."""
         self.begin(instant)
         return self._complete(instant, {name: view.result for name, view in self._begun[instant].items()})
 
     def _complete(self, instant: str, views: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
-        """The values of all views, without those that cannot be had if the others are enough."""
+        """The values of all views; in a sequence, without those that fail where the others are enough."""
         found = {}
         for name, view in views.items():
             try:
@@ -198,7 +196,7 @@ class CaptureFolder:
     def photograph(
         self, name: str, camera: StoredCamera, pixels: Pixels, matte: np.ndarray, convention: Convention
     ) -> Photograph:
-        """One view without distortion and upright, as a convention has it."""
+        """One view, undistorted and upright, with the camera that a convention gives it."""
         image, turns = pixels.image, 0
         if fits_stored(pixels, camera, self._said.exif):
             turns = pixels.turns
@@ -208,7 +206,7 @@ class CaptureFolder:
         if calibration.distortion.any():
             from ghgs_lit.geometry.undistortion import undistort
 
-            # Everything that undistortion depends on, as a key of a cache: many instants share it.
+            # All that undistortion depends on, as the key of a cache that instants share.
             lens = (
                 *map(tuple, (calibration.intrinsics.ravel(), calibration.distortion)),
                 calibration.fisheye,
@@ -221,7 +219,7 @@ class CaptureFolder:
         return Photograph(name, image, matte, found.intrinsics, found.extrinsics, found.gains)
 
     def _matte(self, name: str, camera: StoredCamera, path: Source, pixels: Pixels) -> np.ndarray:
-        """The matte [h, w] uint8 as the photograph is shown, of the first source that there is."""
+        """The matte [h, w] uint8 of the photograph as shown, from the first source that there is."""
         masks = self.images if self.masks is None else self.masks
         mask = mask_path(path, self.images, masks) if isinstance(path, Path) else path.mask
         if self.masks is not None:

@@ -29,7 +29,7 @@ _DIGITS = 6
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A photograph [h, w, 3] uint8 RGB that is decoded already, and what took it; ``mask``: as below."""
+    """A decoded photograph [h, w, 3] uint8 RGB, and its source; ``mask`` as for :class:`VideoFrame`."""
 
     origin: str
     image: np.ndarray
@@ -69,7 +69,7 @@ Source = Path | Frame | VideoFrame  #: Where a photograph comes from
 
 
 def has_videos(folder: Path, cameras: Mapping[str, StoredCamera], names: Mapping[str, str]) -> bool:
-    """Whether a folder is one of videos: it holds one of a camera, or nothing else."""
+    """Whether a folder without photographs has a camera's video, or videos and no folders."""
     if not folder.is_dir() or images_in(folder):
         return False
     videos = images_in(folder, SUFFIXES)
@@ -87,16 +87,15 @@ def find_frames(
     step: int,
 ) -> tuple[dict[str, dict[str, VideoFrame]], str]:
     """The frames of each instant that all videos show. Returns: ``{instant: {camera: frame}}``, instants
-    named by the frame of the first camera; and a line about frames that are left over. InputError: videos and
-    cameras, or videos and one another, do not fit together.
+    named by the first camera's frame; and a line about frames that are left over. InputError: videos do not
+    fit the cameras or one another.
 
     Args:
-        masks: folder of masks: a video of the same name for each, or a folder of numbered images; None:
-            videos beside the others that end with ``_mask``, where there are any.
+        masks: folder of masks: for each video one of the same name, or a folder of numbered images; None:
+            videos beside the others that end with ``_mask``, if any.
         sync: frames by which a camera began before the others; or a CSV of ``camera,frame,seconds``, by which
             each frame of the first camera gets the nearest one of every other; None: all began together.
-        step: of the instants that will be read.
-    """
+        step: of the instants that will be read."""
     paths = by_camera(folder, images_in(folder, SUFFIXES), cameras, names)
     with ThreadPoolExecutor(allowed_cores()) as pool:
         videos = dict(zip(paths, pool.map(read_video, paths.values()), strict=True))
@@ -121,7 +120,7 @@ def find_frames(
 
 
 def _by_number(videos: Mapping[str, Video], offsets: Mapping[str, Any]) -> dict[int, dict[str, int]]:
-    """The frame of each camera, by that of the first."""
+    """The frame of each camera by the first camera's."""
     unknown = sorted(set(offsets) - set(videos))
     require(not unknown, "sequence.sync", f"cameras among {', '.join(videos)}", unknown)
     wrong = {name: value for name, value in offsets.items() if type(value) is not int}
@@ -140,7 +139,7 @@ def _by_number(videos: Mapping[str, Video], offsets: Mapping[str, Any]) -> dict[
 
 
 def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) -> dict[int, dict[str, int]]:
-    """The frame of each camera that is nearest to one of the first, within half of the time between its."""
+    """The frame of each camera nearest to each of the first camera's, within half of its frame time."""
     import pandas as pd  # here: it takes time to import
 
     columns, rows = {"camera": str, "frame": int, "seconds": float}, read_rows(path)
@@ -169,7 +168,7 @@ def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) 
 
 
 def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict[int, VideoFrame | Path]:
-    """The masks of a video by the numbers of its frames; none where there are none beside it."""
+    """The masks of a video by frame number; empty if there are none beside it."""
     name, place = composed(video.path.stem), folder if masks is None else masks
     marked = f"{name}{MASK_ENDING}"
     names = (marked,) if place.resolve() == folder.resolve() else (name, marked)
@@ -177,7 +176,7 @@ def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict
     if path is not None:
         drawn = read_video(path)
         reader, numbers = Reader(drawn, "gray", step), drawn.numbers.tolist()
-        # Masks that were drawn of frame after frame know of none that the camera dropped.
+        # Masks made frame by frame lack those that the camera dropped.
         known = video.numbers.tolist() if len(numbers) == len(video.numbers) else numbers
         return {n: VideoFrame(reader, its) for n, its in zip(known, numbers, strict=True)}
     if masks is None:

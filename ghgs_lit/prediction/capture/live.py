@@ -1,4 +1,4 @@
-"""Captures of what goes on: instants of a folder that is being written, videos at their rate, or cameras."""
+"""Live captures: instants of a folder that is being written, videos at their own rate, or cameras."""
 
 import threading
 import time
@@ -18,12 +18,12 @@ from ghgs_lit.prediction.capture.frames import Frame
 from ghgs_lit.prediction.capture.photographs import by_camera, composed, counted, images_in
 from ghgs_lit.prediction.capture.videos import SUFFIXES
 
-#: Seconds after which a frame, and a folder, is looked for again, and that closing waits for a camera.
+#: Seconds between looks for a frame and for a folder, and of waiting for a camera at the end.
 _FRAME_POLL, _FOLDER_POLL, _PATIENCE = 0.002, 0.02, 2.0
 
 
 def opened(devices: Mapping[str, int | str]) -> dict[str, Any]:
-    """OpenCV's captures by camera, of its number, the address of a stream or the path of a video. InputError:
+    """OpenCV's captures by camera. ``devices``: number, address of a stream or path of a video. InputError:
     one cannot be opened, or OpenCV is not installed."""
     try:
         import cv2
@@ -39,18 +39,18 @@ def opened(devices: Mapping[str, int | str]) -> dict[str, Any]:
 def newest_frames(
     captures: Mapping[str, Any], least: int, clock: Callable[[], float], sleep: Callable[[float], None]
 ) -> Iterator[tuple[dict[str, Frame], int, float]]:
-    """The newest frame of each camera that has one whenever they are asked for, how many times frames were
-    taken and not asked for before, and when these were. It ends where fewer than ``least`` cameras go on, and
-    releases them. A thread takes frames as they come, so that none waits in a camera's buffer; it decodes
-    those alone that somebody asks for."""
+    """The newest frames by camera whenever they are asked for, how many were taken before and not asked for,
+    and when the newest were taken. A thread takes frames as they come, so that none waits in a camera's
+    buffer, and decodes only those that are asked for. Ends, and releases the cameras, where fewer than
+    ``least`` give frames."""
     wanted, stopped, ready = threading.Event(), threading.Event(), SimpleQueue()
-    wanted.set()  # the first frames that there are
+    wanted.set()  # the first frames
 
     def take() -> None:
         passed = 0
         try:
             while not stopped.is_set():
-                # All are taken before the first is decoded, which takes longer.
+                # All are grabbed before decoding, which takes longer.
                 shown = {name: capture for name, capture in captures.items() if capture.grab()}
                 taken = clock()
                 if len(shown) < least:
@@ -90,7 +90,7 @@ def newest_frames(
 
 
 class Arrived(NamedTuple):
-    """A capture, how many were dropped since the one before, and when it came, as the clock says."""
+    """A capture, how many were dropped since the one before, and its time of arrival by the clock."""
 
     capture: Capture
     dropped: int
@@ -106,21 +106,18 @@ def live_frames(
     sleep: Callable[[float], None] = time.sleep,
     **options: Any,
 ) -> Iterator[Arrived]:
-    """The newest capture whenever one is asked for.
-
-    Dropped is what comes while the one before is in use, and what cannot be read. InputError: the
-    calibration, a video, a camera or the folder is missing or wrong.
+    """The newest capture whenever one is asked for; those that come meanwhile or cannot be read are dropped.
+    InputError: the calibration, a video, a camera or the folder is missing or wrong.
 
     Args:
-        images: a folder of videos, which are shown at their own rate; or of instants, each a folder that
-            counts once it has a photograph of every camera and none of its files grows any more. Or what
-            OpenCV opens by camera: numbers of devices, addresses of streams; ``options`` then says where
-            masks come from, and ``ENOUGH`` cameras go on without the others.
+        images: a folder of videos, played at their own rate; or of instants, each a folder that counts once
+            it has a photograph of every camera and none of its files grows any more. Or what OpenCV opens, by
+            camera: numbers of devices, addresses of streams; ``options`` then says where masks come from, and
+            at least ``ENOUGH`` cameras must go on.
         masks: a folder laid out as ``images``.
         idle: seconds without a new instant after which a folder of instants ends; None: never.
-        clock, sleep: tells seconds, and lets some pass.
-        options: as for :class:`CaptureFolder`.
-    """
+        clock, sleep: tells seconds, and waits.
+        options: as for :class:`CaptureFolder`."""
     said, part = options.get("calibration", {}), options.get("sequence", {})
     if is_folder := not isinstance(images, Mapping):
         folder = Path(images).expanduser()
@@ -221,7 +218,7 @@ def _arriving(
 
 
 def _sizes(folder: Path) -> dict[str, int]:
-    """Bytes of each file; a file that is renamed meanwhile counts next time."""
+    """Bytes of each file; -1 for one that vanishes meanwhile."""
     found = {}
     for path in folder.iterdir() if folder.is_dir() else ():
         try:

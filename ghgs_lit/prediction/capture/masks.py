@@ -1,6 +1,6 @@
 """The subject's matte in a photograph: from a file, alpha, a photograph of the background, or rembg.
 
-A matte [h, w] uint8 is 255 times the share of each pixel that shows the subject; of a mask 0 and 255.
+A matte [h, w] uint8 is 255 times the share of each pixel that shows the subject; a mask has only 0 and 255.
 """
 
 from collections.abc import Callable
@@ -23,9 +23,8 @@ _SPECK = 0.05  # Regions below this share of the largest one's area are not of t
 def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
     """The matte of the photograph as shown, from alpha, labels, or grey of 8 or 16 bits.
 
-    An alpha channel counts unless it is the same everywhere. Of labels any but 0 is the subject, and the
-    largest number beside them, void, is not. InputError: it cannot be decoded, or fits the photograph neither
-    as shown nor as stored.
+    An alpha channel counts unless it is constant. All labels but 0 are the subject; a single larger number
+    beside them is void. InputError: it cannot be decoded, or fits the photograph neither as shown nor stored.
     """
     image = read_image(path)
     values = np.asarray(image)
@@ -40,7 +39,7 @@ def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
         values = np.rot90(values, pixels.turns)
     most = int(values.max(initial=0))
     labelled = (values > 0) & (values < _LABELS)
-    # Void is a rim of few pixels without a number between it and the labels, which a soft matte has.
+    # Void is a thin rim, and a soft matte has numbers between it and the labels.
     is_void = (values == most).sum() < labelled.sum() and not ((values >= _LABELS) & (values < most)).any()
     if most < _LABELS or is_void:
         return labelled * np.uint8(255)
@@ -48,15 +47,14 @@ def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
 
 
 def matte_of_background(pixels: Pixels, path: Path) -> np.ndarray:
-    """A mask: where a photograph differs from one without the subject, without specks and holes. InputError:
-    the background's photograph has another size, or nothing differs."""
+    """A mask of what differs from a background. InputError: it has another size, or nothing differs."""
     from scipy import ndimage  # here: masks of files do not need it
 
     background = read_pixels(path)
     fits = background.size == pixels.size
     require(fits, str(path), f"the size of the photograph, {pixels.size} (height, width)", background.size)
     difference = np.abs(pixels.image.astype(np.float32) - background.image).max(-1)
-    # Most pixels show the background, so that the median is of the noise: 1.48 times it is one deviation.
+    # Most pixels show the background: 1.48 times the median is a deviation of the noise.
     threshold = max(_DEVIATIONS * 1.4826 * float(np.median(difference)), _LEAST_DIFFERENCE)
     radius = max(max(pixels.size) // 400, 1)
     regions, count = ndimage.label(ndimage.binary_opening(difference > threshold, iterations=radius))
@@ -70,8 +68,7 @@ def matte_of_background(pixels: Pixels, path: Path) -> np.ndarray:
 
 
 def segmenter(name: str) -> Callable[[Pixels], np.ndarray]:
-    """A function from a photograph to its matte. ``name``: one of :data:`SEGMENTERS`. InputError: its package
-    is not installed."""
+    """A function from photographs to mattes. ``name``: of :data:`SEGMENTERS`. InputError: not installed."""
     choice("segment", name, SEGMENTERS)
     rembg = installed("rembg", "segment", "segment")
     session = rembg.new_session()
@@ -85,10 +82,10 @@ def segmenter(name: str) -> Callable[[Pixels], np.ndarray]:
 
 def mask_path(photograph: Path, images: Path, masks: Path) -> Path | None:
     """The mask's file: in the same place below ``masks`` as the photograph below ``images``; None: none."""
-    # The folder's own path: photographs may be links to files elsewhere.
+    # Not resolved: photographs may be links to files elsewhere.
     folder = masks / photograph.parent.relative_to(images)
     marked = f"{photograph.stem}{MASK_ENDING}"
-    # Beside a photograph the image of its name is the photograph itself.
+    # Beside the photograph, the image of its name is the photograph itself.
     beside = folder.resolve() == photograph.parent.resolve()
     # COLMAP's masks keep the suffix of the photograph: front.jpg.png.
     return image_named(folder, *([marked] if beside else [photograph.stem, photograph.name, marked]))

@@ -17,7 +17,7 @@ from ghgs_lit.prediction.capture.calibration import StoredCamera, same_ratio
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 MASK_ENDING = "_mask"  #: A mask beside its photograph ends with this
-#: How EXIF says to show a photograph: orientation to quarter turns as of ``numpy.rot90``.
+#: Quarter turns as of ``numpy.rot90`` by EXIF orientation.
 _TURNS = {1: 0, 3: 2, 6: 3, 8: 1}
 _EIGHT_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr")
 
@@ -57,9 +57,9 @@ def read_pixels(path: Path) -> Pixels:
 
 
 def fits_stored(pixels: Pixels, camera: StoredCamera, exif: str) -> bool:
-    """Whether a camera was calibrated with the photograph as it is stored, not as it is shown. The size of
-    the calibration tells it for quarter turns. Elsewhere it is as shown: OpenCV turns photographs when it
-    reads them. ``exif``: ``auto`` | ``stored`` | ``shown``: what the user says."""
+    """Whether a camera was calibrated with the photograph as stored, not as shown. With ``exif`` ``auto`` the
+    size of the calibration tells for quarter turns; otherwise it is as shown, since OpenCV turns photographs
+    on reading. ``exif``: ``auto`` | ``stored`` | ``shown``, by the user."""
     if exif != "auto" or not pixels.turns:
         return exif == "stored"
     size = camera.size
@@ -67,13 +67,12 @@ def fits_stored(pixels: Pixels, camera: StoredCamera, exif: str) -> bool:
 
 
 def composed(name: str) -> str:
-    """A name whose letters have one spelling: macOS writes an umlaut as two characters."""
+    """A name in its composed spelling (NFC): macOS writes an umlaut as two characters."""
     return unicodedata.normalize("NFC", name)
 
 
 def images_in(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[str, Path]:
-    """Photographs of a folder by name without suffix, sorted; masks beside them are left out. InputError: two
-    of them have one name."""
+    """Photographs of a folder by name without suffix, sorted, no masks. InputError: two have one name."""
     paths: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         is_image = path.suffix.lower() in suffixes and not path.name.startswith(".") and not path.is_dir()
@@ -94,21 +93,18 @@ def image_named(folder: Path, *names: str, suffixes: tuple[str, ...] = SUFFIXES)
 
 @functools.lru_cache(maxsize=64)
 def _listed(folder: Path, changed: int) -> dict[tuple[str, str], Path]:
-    """Files by name and suffix, whose letters are spelled in one way; once for each change of the folder."""
+    """Files by composed name and suffix, cached until the folder changes."""
     return {(composed(path.stem), path.suffix.lower()): path for path in sorted(folder.iterdir())}
 
 
 def find_instants(
     folder: Path, cameras: Mapping[str, StoredCamera], names: Mapping[str, str]
 ) -> dict[str, dict[str, Path]]:
-    """The photographs of each instant: those of the folder itself, or of its folders.
+    """``{instant: {camera: path}}``, of photographs in the folder itself or in its folders.
 
-    Folders are instants, each with a photograph of every camera; folders with the names of cameras hold one
-    photograph for each instant. Of several instants one may lack photographs. Returns: Paths by camera, by
-    instant: ``{instant: {camera: path}}``. ``names``: the camera of a photograph (or of a camera's folder)
-    whose name differs from the camera's. InputError: there are none, or photographs and cameras do not fit
-    together.
-    """
+    A folder is an instant with a photograph of every camera, or, if named after a camera, has one photograph
+    for each instant. Of several instants one may lack photographs. ``names``: the camera of a photograph (or
+    camera's folder) of another name. InputError: there are none, or photographs do not fit the cameras."""
     problem = "a file" if folder.exists() else "no such folder"
     require(folder.is_dir(), str(folder), "a folder of photographs", problem)
     if photographs := images_in(folder):
@@ -127,12 +123,12 @@ def find_instants(
 
 
 def counted(name: str) -> list[str | int]:
-    """What names are sorted by so that their numbers follow one another: 2 before 10."""
+    """Sort key of names by which numbers follow one another: 2 before 10."""
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
 def _by_instant(folder: Path, by_camera: Mapping[str, dict[str, Path]]) -> dict[str, dict[str, Path]]:
-    """``{camera: {instant: path}}`` the other way around."""
+    """Turn ``{camera: {instant: path}}`` into ``{instant: {camera: path}}``."""
     first, *others = by_camera
     for other in others:
         shared = by_camera[first].keys() & by_camera[other].keys()
@@ -152,7 +148,7 @@ def by_camera(
     names: Mapping[str, str],
     least: int = 2,
 ) -> dict[str, Any]:
-    """Values by camera, given by the name of a photograph, of a video or of a camera's folder. InputError: a
+    """Values by camera instead of by name of a photograph, of a video or of a camera's folder. InputError: a
     name is that of no camera, two are of one, or there are fewer than ``least``."""
     unknown = [name for name in values if names.get(name, name) not in cameras]
     if unknown:

@@ -1,4 +1,4 @@
-"""Gaussians of a capture in the user's world, and of any batch after its cameras are corrected."""
+"""Gaussians of a capture in the user's world, and of any batch, with corrected cameras."""
 
 import functools
 import time
@@ -62,16 +62,14 @@ def predict(
             one that comes with the package.
         size: side or (height, width) of the crops that the model sees, in pixels; None: as it was trained
             (checkpoints only).
-        refine_cameras: rounds, at most, that correct the cameras until the photographs agree
+        refine_cameras: most rounds that correct the cameras until the photographs agree
             (:class:`CameraRefinement`); 0: none; ``auto``: 4 where silhouettes contradict one another.
         refine_masks: pixels of a crop by which masks may be wrong; mattes are then searched in the
             photographs (:func:`ghgs_lit.data.matting.refined_matte`). 0: masks are right; ``auto``: 4 where
             photographs show other outlines.
         refine: steps that bring the Gaussians nearer to the photographs, such as 15; 0: none.
         renderer: what refining draws with; None: that of the device.
-        temporal: what predicted the instants before, in their order; None: this one has nothing to do with
-            them.
-    """
+        temporal: the predictor of the instants before, in their order; None: no sequence."""
     if not isinstance(model, GHGS):
         path = file_of(model)
         model = _model(path, path.stat().st_mtime_ns)
@@ -93,8 +91,8 @@ def predict(
 
 
 def in_frame(model: GHGS, batch: Batch) -> Prediction:
-    """A prediction in metres around the subject whatever the weights: no unit is wrong for a capture."""
-    # Weights that see the world as it is (compat=release) have no such frame of their own.
+    """A prediction in the subject's frame, whatever the weights, so that a capture may have any unit."""
+    # Weights with compat=release do not enter a frame of their own.
     frame = Frame.of(batch)
     return frame.leave(model(frame.enter(batch)), batch.cameras.extrinsics.dtype)
 
@@ -112,11 +110,10 @@ def predict_batch(
 
     Args:
         renderer: draws what :class:`CameraRefinement` and :class:`Refinement` compare.
-        refine_cameras: rounds of the one, at most; 0: none.
-        refine: steps of the other; 0: none.
-        forward: the prediction of a batch without targets; None: the model's.
-        temporal: the same where instants before are known.
-    """
+        refine_cameras: most rounds of :class:`CameraRefinement`; 0: none.
+        refine: steps of :class:`Refinement`; 0: none.
+        forward: predicts a batch without targets; None: the model.
+        temporal: takes the place of ``forward`` where instants before are known."""
     forward, moved, seconds, start = forward or model, (), {}, time.perf_counter()
     if refine_cameras:
         given, batch = batch, CameraRefinement(refine_cameras, model, renderer)(batch)
@@ -140,7 +137,7 @@ def predict_batch(
 def _crops(
     capture: Capture, size: tuple[int, int], refine_masks: int, seconds: dict[str, float]
 ) -> tuple[Batch, tuple[float, ...]]:
-    """The batch that the model sees, and by how much refining changed each matte; notes the run times."""
+    """The batch that the model sees, and the share by which refining changed each matte; adds run times."""
     start = time.perf_counter()
     given = capture.batch(size)
     seconds["crop"] = time.perf_counter() - start
@@ -154,14 +151,14 @@ def _crops(
 
 
 def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:
-    """Side or (height, width) of the photographs that a checkpoint's model was trained with. Imported weights
-    were trained elsewhere: it is the size of the encoder's position embedding."""
+    """Side or (height, width) of the photographs that a checkpoint's model was trained with; of imported
+    weights the size of the encoder's position embedding."""
     return lookup(config, "data.size") or lookup(config, "encoder.image_size") or 518
 
 
 def crop_size(size: int | tuple[int, int] | None, config: Mapping[str, Any], model: GHGS) -> tuple[int, int]:
-    """(height, width) of the crops that a checkpoint's model sees; None: as it was trained. Larger ones give
-    a warning: they make results worse, not sharper. InputError: the model cannot take this size."""
+    """(height, width) of the crops that a checkpoint's model sees; None: as it was trained. Warns of larger
+    ones, which make results worse, not sharper. InputError: the model cannot take this size."""
     trained, patch = image_size("size", trained_size(config)), model.encoder.patch_size
     height, width = trained if size is None else image_size("size", size)
     multiple = side_multiple(model.options, patch)

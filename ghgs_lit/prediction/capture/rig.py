@@ -1,8 +1,7 @@
 """Cameras of a rig that stands still, corrected once over several instants, and their colour gains.
 
-One instant shows one pose, often with a mask that is wrong somewhere; several together say more of the
-cameras, and cameras that are the same in all of them do not flicker.
-"""
+One instant shows one pose, often with a mask that is wrong somewhere; several say more about the cameras, and
+cameras that are the same in all instants do not flicker."""
 
 import math
 from collections import Counter
@@ -25,17 +24,17 @@ from ghgs_lit.rendering import Renderer
 from ghgs_lit.rounds.gains import log_gains
 from ghgs_lit.types import Batch, Cameras
 
-INSTANTS = 8  #: Instants, spread over a sequence, that its cameras are corrected with
-#: Median deviation of the logarithms of gains from which a camera changes its exposure between instants.
+INSTANTS = 8  #: Instants, spread over a sequence, for correcting its cameras
+#: Median deviation of log gains above which exposures change between instants.
 _CHANGING = 0.05
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Corrected cameras, and what else photographs of all instants share, by name; gains where found."""
+    """Corrected cameras, and colour gains where found, by name."""
 
     extrinsics: Mapping[str, np.ndarray]  #: [4, 4] float64, world to camera
-    zoom: Mapping[str, float]  #: by how much their focal lengths grow
+    zoom: Mapping[str, float]  #: factor of their focal lengths
     moved: Mapping[str, float]  #: pixels of a crop that the correction moved the subject by
     why: str = ""  #: what the given cameras contradicted, where ``auto`` decided
     gains: Mapping[str, np.ndarray] = field(default_factory=dict)  #: [3], with a geometric mean of 1
@@ -58,13 +57,13 @@ class Rig:
         self, folder: CaptureFolder, captures: Sequence[Capture]
     ) -> dict[str, tuple[Calibration, tuple[int, int]]]:
         """The corrected cameras of a folder's photographs as they are stored, and their (height, width).
-        ``captures``: of the folder, with the cameras as they were given."""
+        ``captures``: of the folder, with the cameras as given."""
         found = {}
         for name, photograph in {p.name: p for c in captures for p in c.photographs}.items():
             stored = folder.file.cameras[name]
             size = stored.size or photograph.mask.shape
             given = calibrate(stored, folder.convention, size)
-            # A photograph may be turned upright: what moved is the same before.
+            # The motion is the same before the photograph is turned upright.
             corrected = self._corrected(photograph)
             moved = np.linalg.inv(photograph.extrinsics) @ corrected.extrinsics
             lens, pose = given.intrinsics * self._zoom_of(name), given.extrinsics @ moved
@@ -86,10 +85,9 @@ def corrected_rig(
     Args:
         captures: of one rig; those that lack a camera take no part.
         size: (height, width) of the crops in pixels.
-        rounds: of :class:`CameraRefinement`, at most; ``auto``: 4 where the silhouettes of half of the
+        rounds: most rounds of :class:`CameraRefinement`; ``auto``: 4 where the silhouettes of half of the
             instants contradict the cameras.
-        refine_masks: as of :func:`ghgs_lit.prediction.capture.predict.predict`.
-    """
+        refine_masks: as for :func:`ghgs_lit.prediction.capture.predict.predict`."""
     names = Counter(_names(capture) for capture in captures).most_common(1)[0][0]
     captures = [capture for capture in captures if _names(capture) == names]
     batches, doubts = [], []
@@ -120,9 +118,9 @@ def corrected_rig(
 
 @torch.no_grad()
 def shared_gains(batch: Batch, model: GHGS) -> np.ndarray | None:
-    """By what the cameras [V, 3] of several instants multiply colours: the median, and 1 in the mean of all.
-    None: exposures change from instant to instant, photographs are divided by gains already, or the model
-    does not ask for any. ``batch``: an element for each instant, in the world."""
+    """Colour gains [V, 3] of the cameras: the median over instants, with a geometric mean of 1 over cameras.
+    None: exposures change between instants, photographs are divided by gains already, or the model uses none.
+    ``batch``: an element for each instant, in the world."""
     if model.rounds is None or not model.rounds.options.gains or batch.log_gains is not None:
         return None
     batch = Frame.of(batch).enter(batch)
@@ -140,7 +138,6 @@ def _names(capture: Capture) -> tuple[str, ...]:
 
 
 def _together(batches: Sequence[Batch]) -> Batch:
-    """The instants as the elements of one batch."""
     names = ("images", "masks", "alpha", "log_gains")
     known = [name for name in names if getattr(batches[0], name) is not None]
     parts = {name: torch.cat([getattr(batch, name) for batch in batches]) for name in known}

@@ -1,4 +1,4 @@
-"""Videos of cameras: when each frame was taken, and frames that ffmpeg decodes as they are asked for."""
+"""Videos of cameras: when each frame was taken, and frames that ffmpeg decodes when asked for."""
 
 import functools
 import io
@@ -22,11 +22,11 @@ SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 # ffmpeg says on stderr when each frame is shown, before it writes the frame.
 _TELL = r"metadata=add:key=k:value=v,metadata=print:file='pipe\:2':direct=1"
 _TIME = re.compile(rb"pts_time:(\S+)")
-# Colours as they were before they were coded: without it green is a level too dark.
+# Exact colours: without it green is a level too dark.
 _EXACT = "bicubic+accurate_rnd+full_chroma_int"
 # How framecrc lists a packet that says no time, and one that is not shown.
 _UNTIMED, _HIDDEN = -(2**63), re.compile("F=0x[4-7]")
-_PATIENCE = 10.0  #: Seconds of a video that are decoded for nothing before it is sought in
+_PATIENCE = 10.0  #: Seconds of a video that are decoded to reach a frame; beyond, it is sought
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,11 @@ class Video:
     path: Path
     size: tuple[int, int]  #: (height, width) in pixels as shown
     seconds: np.ndarray  #: [n] float64, when each frame is shown, ascending
-    numbers: np.ndarray  #: [n] int64, the number of each; one that the camera dropped has a number, too
+    numbers: np.ndarray  #: [n] int64, the number of each; dropped frames have numbers, too
 
     @property
     def count(self) -> int:
-        """Number of frames, those included that the camera dropped."""
+        """Number of frames, with those that the camera dropped."""
         return int(self.numbers[-1]) + 1
 
     @property
@@ -57,8 +57,8 @@ class Video:
 
 
 def read_video(path: Path) -> Video:
-    """What a video's file says of its frames; no frame but the first is decoded. InputError: it is missing,
-    ffmpeg cannot read it or is not installed, or there is no frame."""
+    """List the frames of a video; only the first is decoded. InputError: the file is missing, ffmpeg cannot
+    read it or is not installed, or there is no frame."""
     require_file(path, "a video")
     return _read_video(path, path.stat().st_mtime_ns)
 
@@ -98,8 +98,8 @@ def _command(path: Path, pixels: str, *output: str, select: str = "1", **source:
 
 
 class Reader:
-    """Frames of one video, decoded in order as they are asked for; elsewhere it is sought. ``pixels``:
-    ``rgb24`` | ``gray``. ``step``: frames between those that will be asked for: others never reach Python."""
+    """Frames of one video, decoded in order; elsewhere it is sought. ``pixels``: ``rgb24`` | ``gray``.
+    ``step``: distance of the frames that will be asked for; ffmpeg drops the others."""
 
     def __init__(self, video: Video, pixels: str, step: int = 1) -> None:
         self.video, self.pixels, self.step = video, pixels, step
@@ -109,7 +109,7 @@ class Reader:
         self._frame = np.zeros(0, np.uint8)
 
     def frame(self, number: int) -> np.ndarray:
-        """[h, w, 3] or [h, w] uint8. InputError: there is none of this number that can be decoded."""
+        """A frame, [h, w, 3] or [h, w] uint8. InputError: none of this number can be decoded."""
         far = _PATIENCE * self.video.rate + self.step
         with self._lock:
             if self._process is None or number <= self._before or number > self._at + far:
@@ -136,7 +136,6 @@ class Reader:
         self._at = self._before = number - 1
 
     def _advance(self) -> bool:
-        """Read the next frame; False: there is none."""
         shape = (*self.video.size, 3) if self.pixels == "rgb24" else self.video.size
         time = next(filter(None, map(_TIME.search, self._process.stderr)), None)
         content = self._process.stdout.read(math.prod(shape))

@@ -1,7 +1,4 @@
-"""Gaussians in the compact formats of 3DGS viewers.
-
-They store few bits: ``docs/evidence/outputs.md`` has their sizes and what is lost.
-"""
+"""Gaussians in the compact formats of 3DGS viewers; ``docs/evidence/outputs.md`` has sizes and losses."""
 
 from collections.abc import Mapping
 
@@ -21,8 +18,7 @@ the rotation (w, x, y, z), of which 128 is zero."""
 
 
 def converted(name: str, gaussians: Gaussians) -> bytes:
-    """The content of a file of another format. ``name``: one of ``CONVERTED``. RuntimeError: gaussforge
-    refuses."""
+    """The content of a file in format ``name`` of ``CONVERTED``. RuntimeError: gaussforge refuses."""
     from gaussforge import GaussForge
 
     answer = GaussForge().convert(ply_bytes(gaussians), "ply", CONVERTED[name])
@@ -32,8 +28,8 @@ def converted(name: str, gaussians: Gaussians) -> bytes:
 
 
 def to_records(gaussians: Gaussians) -> np.ndarray:
-    """The records [N] of dtype ``RECORD`` of the Gaussians of one subject with RGB colours. Large and opaque
-    ones come first, so that a part of a ``.splat`` file is a picture, too."""
+    """The Gaussians of one subject (RGB colours) as records [N] of dtype ``RECORD``, large and opaque ones
+    first, so that a part of a ``.splat`` file is a picture, too."""
     values = {name: value[visible_first(gaussians).cpu()] for name, value in stored_values(gaussians).items()}
     records = np.empty(len(gaussians), RECORD)
     records["mean"], records["scale"] = values["means"].numpy(), values["scales"].numpy()

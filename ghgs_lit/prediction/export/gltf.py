@@ -1,8 +1,7 @@
 """Gaussians as binary glTF with the Khronos extension ``KHR_gaussian_splatting``.
 
-The vertices are in the world of the files; glTF's up is +y, so a node turns the world upright. Programs
-without the extension show coloured points.
-"""
+The vertices are in the world of the other files; a node turns it so that +y is up, as in glTF. Programs
+without the extension show coloured points."""
 
 import numpy as np
 import torch
@@ -23,8 +22,8 @@ _KERNEL = {
 
 
 def glb_bytes(gaussians: Gaussians, up: torch.Tensor) -> bytes:
-    """The content of a file of the Gaussians of one subject (RGB colours). ``up``: the unit vector [3] of
-    that world that points up. InputError: there are none: glTF has no empty lists."""
+    """The content of a file with the Gaussians of one subject (RGB colours). ``up``: the world's upward unit
+    vector [3]. InputError: there are no Gaussians (glTF has no empty lists)."""
     import pygltflib as gltf
 
     require(len(gaussians) > 0, "formats=glb", "at least one Gaussian", 0)

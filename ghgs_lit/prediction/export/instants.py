@@ -1,4 +1,4 @@
-"""What several instants become together: a page that plays them, numbered PLYs and a video."""
+"""Files of several instants together: a page that plays them, numbered PLYs and a video."""
 
 import math
 import os
@@ -22,17 +22,17 @@ from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.pictures import to_uint8
 from ghgs_lit.visualization.turntable import orbit
 
-#: How far the video's camera swings to each side of the first photograph, in radians.
+#: Swing of the video's camera to each side of the first photograph, in radians.
 _SWING = math.radians(20)
-_VIDEO_SIDE = 720  #: The longer side of its pictures in pixels, at least
+_VIDEO_SIDE = 720  #: Least length of its pictures' longer side in pixels
 
 
 class Instants:
-    """Files beside the folders of several instants: for ``html`` ``viewer.html``; for ``ply``
+    """Files of all instants together, beside their folders: for ``html`` ``viewer.html``; for ``ply``
     ``sequence/0000.ply`` and so on, which other programs import as a sequence; for ``mp4`` ``instants.mp4``.
 
-    The cameras of page and video follow the mean of the subject, smoothed over a second. ``count``: how many
-    instants there may be. ``others``: names and, once they are known, contents of further files.
+    The cameras of page and video follow the subject's mean, smoothed over a second. ``count``: largest number
+    of instants. ``others``: names of further files, whose contents are set in the attribute before writing.
     """
 
     def __init__(self, count: int, options: OutputOptions, others: Iterable[str] = ()):
@@ -46,15 +46,14 @@ class Instants:
 
     @property
     def files(self) -> list[str]:
-        """The names below the directory of all instants that there may be."""
+        """Names of the files that may be written, below the directory of all instants."""
         numbered = [f"sequence/{number:04d}.ply" for number in range(self.count)]
         names = {"html": ["viewer.html"], "ply": numbered, "mp4": ["instants.mp4"]}
         made = [name for format in names if format in self.options.formats for name in names[format]]
         return [*made, *self.others]
 
     def add(self, folder: Path, batch: Batch, prediction: Prediction, renderer: Renderer) -> None:
-        """Keep of the next instant what the files need: a few bytes for each Gaussian. ``folder``: of its own
-        files; ``renderer``: draws the video."""
+        """Keep what the files need of the next instant. ``folder``: that of the instant's own files."""
         self.folders.append(folder)
         if not {"html", "mp4"} & {*self.options.formats}:
             return
@@ -68,15 +67,15 @@ class Instants:
         self._seconds += time.perf_counter() - begin
 
     def write(self, directory: Path) -> list[Path]:
-        """Write the files after all instants are added and their own files are written. Returns: What was
-        written, the report of these files last; nothing where ``formats`` has none of them. InputError: a
-        file of another origin is in the way."""
+        """Write the files, after all instants are added and their own files written. Returns: the paths, the
+        report last; none if ``formats`` has no such file. InputError: a file of other origin is in the way.
+        """
         self.count, self.others = len(self.folders), {n: made for n, made in self.others.items() if made}
         names = self.files
         if not names:
             return []
         for name in begin_files(directory, names):
-            if name.startswith("sequence/"):  # of a longer sequence: other programs would play these, too
+            if name.startswith("sequence/"):  # of an earlier, longer sequence: programs would play these, too
                 (directory / name).unlink()
         contents = {name: partial(self.others.get, name) for name in self.others}
         contents |= {"viewer.html": self._page, "instants.mp4": self._video}
@@ -90,9 +89,8 @@ class Instants:
         return end_files(directory, names, report)
 
     def _path(self) -> np.ndarray:
-        """How far the subject's smoothed mean is from that of the first instant [n, 3]."""
         reach = self.options.fps // 2
-        # Turned about the ends, so that a steady walk stays what it is.
+        # Odd reflection at the ends: a steady walk stays steady.
         padded = np.pad(np.stack(self._means), ((reach, reach), (0, 0)), "reflect", reflect_type="odd")
         weights = np.hanning(2 * reach + 3)[1:-1]
         windows = np.lib.stride_tricks.sliding_window_view(padded, len(weights), axis=0)
@@ -104,7 +102,6 @@ class Instants:
         return page(self._first, name, self._packed, path, self.options.fps).encode()
 
     def _video(self) -> bytes:
-        """From a camera that swings about the subject and shows all of it."""
         first, cameras, path = self._first, self._first.cameras, self._path()
         low, high = (np.stack(self._boxes) - path[:, None]).swapaxes(0, 1)
         sides = torch.from_numpy(np.stack((low.min(0), high.max(0)), 1)).to(cameras.extrinsics.device)
@@ -117,7 +114,7 @@ class Instants:
 
         def picture(frame: int) -> np.ndarray:
             gaussians = unpack(self._packed[frame], first.pixel, first.center, COARSE, first.gaussians)
-            # Large pictures would show gaps.
+            # Else large pictures would show gaps.
             gaussians = smoothed(gaussians, first.pixel).to(seen.extrinsics.device)
             return to_uint8(first.renderer(gaussians, seen[frame : frame + 1][None]).image[0, 0])
 
@@ -125,14 +122,13 @@ class Instants:
 
 
 def _link(source: Path, target: Path) -> None:
-    """The same file under another name; a copy where the file system has no links."""
     try:
         os.link(source, target)
     except OSError:
         shutil.copyfile(source, target)
 
 
-# RGB is told apart from video levels by these: a player that guesses the matrix shows other colours.
+# Without these, a player guesses matrix and range, and may show other colours.
 _COLORS = (
     "-vf scale=out_color_matrix=bt709:out_range=tv -colorspace bt709 -color_primaries bt709 -color_trc bt709"
 )
@@ -140,7 +136,7 @@ _COLORS = (
 
 def mp4_bytes(pictures: Iterable[np.ndarray], fps: int) -> bytes:
     """The content of a video of pictures [h, w, 3] uint8 of one size; odd sides get one more row or column.
-    ``pictures``: at least one; they are taken one after another, so that a long video fits in memory."""
+    ``pictures``: at least one; taken one by one, so that a long video fits in memory."""
     import imageio_ffmpeg
 
     pictures = iter(pictures)

@@ -1,4 +1,4 @@
-"""Depth maps, photographs, cameras and point clouds as the contents of files of common formats."""
+"""Contents of files in common formats: depth maps, photographs, cameras and point clouds."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping
@@ -26,8 +26,8 @@ def png(picture: np.ndarray, text: PngInfo | None = None) -> bytes:
 
 
 def depth_unit(largest: float) -> float:
-    """The length of one grey level of a depth picture: 0.001, and other powers of ten where these fit better.
-    So that ``largest`` fits into 16 bits and has at least 1000 levels."""
+    """The length of one grey level of a depth picture: 0.001, or another power of ten if ``largest`` needs it
+    to fit into 16 bits and have at least 1000 levels."""
     exponent = -3
     while largest > _LEVELS * 10.0**exponent:
         exponent += 1
@@ -37,8 +37,8 @@ def depth_unit(largest: float) -> float:
 
 
 def depth_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
-    """Makers of a PNG of 16 bits for each view (0: none; the unit stands in the file), then an exact NPZ. The
-    NPZ has ``depth`` [V, H, W] (nan: none), ``intrinsics``, ``extrinsics`` and ``views``."""
+    """Functions that make a 16-bit PNG of each view (0: no depth; the unit stands in the file), then an exact
+    NPZ with ``depth`` [V, H, W] (nan: none), ``intrinsics``, ``extrinsics`` and ``views``."""
     valid = subject.depth_valid.cpu().numpy()
     depth = np.where(valid, subject.depth.float().cpu().numpy(), np.float32(np.nan))
     unit = depth_unit(float(np.max(depth, where=valid, initial=0)))
@@ -57,7 +57,7 @@ def depth_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
 
 
 def points_ply(subject: ExportedSubject) -> bytes:
-    """The unprojected pixels of the subject with their colours."""
+    """A PLY of the unprojected pixels of the subject with their colours."""
     positions = subject.points.float().cpu().numpy()
     colors = (subject.colors.float().clamp(0, 1) * 255).round().byte().cpu().numpy()
     columns = dict(zip("xyz", positions.T, strict=True))
@@ -65,10 +65,10 @@ def points_ply(subject: ExportedSubject) -> bytes:
 
 
 def input_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
-    """Makers of PNGs of the views as the model saw them, with matte or mask as alpha, then the cameras. Both
-    are what ``ghgs predict images=inputs cameras=cameras.json`` reads."""
+    """Functions that make a PNG of each view as the model saw it, with matte or mask as alpha, then the
+    cameras: what ``ghgs predict images=inputs cameras=cameras.json`` reads."""
     for image, matte in zip(subject.images, subject.mattes, strict=True):
-        colors = to_uint8(unmultiplied(image, matte))  # Colours of a PNG are not premultiplied
+        colors = to_uint8(unmultiplied(image, matte))  # PNG's colours are not premultiplied
         alpha = (matte * 255).round().byte().cpu().numpy()[..., None]
         yield partial(png, np.concatenate([colors, alpha], -1))
     cameras = subject.cameras
@@ -79,8 +79,7 @@ def input_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
 
 
 def camera_entry(intrinsics: Any, extrinsics: Any, size: tuple[int, int]) -> dict[str, Any]:
-    """A camera of this package's JSON. ``intrinsics``, ``extrinsics``: arrays [3, 3] and [4, 4]. ``size``:
-    (height, width) of its photograph in pixels."""
+    """A camera of this package's JSON. ``size``: (height, width) of its photograph in pixels."""
     matrices = {"intrinsics": intrinsics.tolist(), "extrinsics": extrinsics.tolist()}
     return {**matrices, "width": size[1], "height": size[0]}
 

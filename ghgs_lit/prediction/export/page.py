@@ -17,23 +17,22 @@ from ghgs_lit.prediction.export.ply import stored_values
 from ghgs_lit.prediction.export.subject import ExportedSubject
 from ghgs_lit.types import Gaussians
 
-#: Steps of a centre in a photograph's pixel, of a standard deviation in a factor of e, of an opacity, and of
-#: each number of a rotation to each side of 0: of one instant, and of each of several that are played.
+#: Quantisation steps in a pixel of a photograph (centre), a factor of e (standard deviation) and 1 (opacity;
+#: rotation, to each side of 0): ``FINE`` for one instant, ``COARSE`` for each of several.
 FINE = {"center": 64, "scale": 24, "opacity": 255, "rotation": 127}
 COARSE = {"center": 12, "scale": 12, "opacity": 127, "rotation": 31}
-#: Numbers of a Gaussian that take four bytes (its centre) and one (the others).
+#: A Gaussian's numbers of four bytes (its centre) and of one (the others).
 _WIDE, _NARROW = 3, 10
 _LARGEST = 1 << 29
 
 
 def pack(gaussians: Gaussians, pixel: float, center: Tensor, steps: Mapping[str, int]) -> bytes:
-    """Gaussians of one subject (RGB colours) as few bytes, which ``page.html`` unpacks: planes [22, N].
+    """Gaussians of one subject (RGB colours) in few bytes, which ``page.html`` unpacks: planes [22, N].
 
-    A Gaussian is whole numbers: its centre from ``center`` [3] in parts of ``pixel``, the side of a
-    photograph's pixel at the subject; the logarithms of its standard deviations, colour and opacity; and its
-    rotation as ``v / (1 + w)`` of the unit quaternion ``(w, v)`` with ``w >= 0``. Each is stored as its
-    change from the Gaussian before, mostly that of the pixel beside. ``steps``: ``FINE`` or ``COARSE``.
-    """
+    A Gaussian becomes whole numbers: its centre relative to ``center`` [3] in parts of ``pixel``, the side of
+    a photograph's pixel at the subject; the logarithms of its standard deviations; colour and opacity; and
+    its rotation as ``v / (1 + w)`` of the unit quaternion ``(w, v)`` with ``w >= 0``. Each is stored as the
+    difference from the Gaussian before, mostly its neighbour's. ``steps``: ``FINE`` or ``COARSE``."""
     values = stored_values(gaussians, torch.float64)
     w, v = values["quaternions"].split((1, 3), dim=1)
     parts = (
@@ -44,16 +43,16 @@ def pack(gaussians: Gaussians, pixel: float, center: Tensor, steps: Mapping[str,
         v * torch.where(w < 0, -1, 1) / (1 + w.abs()) * steps["rotation"],
     )
     numbers = torch.cat([part.round().long() for part in parts], dim=1).numpy()
-    numbers[:, [6, 8]] -= numbers[:, [7]]  # red and blue go with green
+    numbers[:, [6, 8]] -= numbers[:, [7]]  # red and blue are like green
     wide, narrow = np.split(np.diff(numbers, axis=0, prepend=0), [_WIDE], axis=1)
-    wide = ((wide << 1) ^ (wide >> 63)).astype("<u4")  # the sign is the last bit: high bytes are mostly 0
+    wide = ((wide << 1) ^ (wide >> 63)).astype("<u4")  # with the sign as last bit, high bytes are mostly 0
     planes = wide.view(np.uint8).T.tobytes() + narrow.astype(np.uint8).T.tobytes()
     packer = zlib.compressobj(9, strategy=zlib.Z_FILTERED)
     return packer.compress(planes) + packer.flush()
 
 
 def unpack(data: bytes, pixel: float, center: Tensor, steps: Mapping[str, int], like: Gaussians) -> Gaussians:
-    """The Gaussians of :func:`pack`, on the CPU. ``like``: has their constants."""
+    """The Gaussians of :func:`pack`, on the CPU, with the image constants of ``like``."""
     planes = np.frombuffer(zlib.decompress(data), np.uint8).reshape(4 * _WIDE + _NARROW, -1)
     wide = np.ascontiguousarray(planes[: 4 * _WIDE].T).view("<u4").astype(np.int64)
     centers = torch.from_numpy((wide >> 1 ^ -(wide & 1)).cumsum(0))
@@ -74,7 +73,7 @@ def unpack(data: bytes, pixel: float, center: Tensor, steps: Mapping[str, int], 
 
 
 def _signed(numbers: Tensor) -> Tensor:
-    """Whole numbers modulo 256 as those from -128 to 127."""
+    """Numbers modulo 256, from -128 to 127."""
     return (numbers + 128 & 255) - 128
 
 
@@ -85,14 +84,13 @@ def page(
     path: Sequence[Sequence[float]] = ((0.0, 0.0, 0.0),),
     fps: float = 1.0,
 ) -> str:
-    """The text of the page of an instant, or of several that it plays; it has a button for each camera.
+    """The text of a page that shows one instant or plays several, with a button for each camera.
 
     Args:
-        subject: of several instants the first; the page begins at its first camera.
-        packed: of each of several instants what :func:`pack` gives with ``COARSE``.
-        path: how far from the first instant the page's camera moves along with the subject [instants, 3].
-        fps: instants a second.
-    """
+        subject: the first instant; the page begins at its first camera.
+        packed: :func:`pack` of each of several instants, with ``COARSE``.
+        path: shift of the page's camera at each instant [instants, 3].
+        fps: instants a second."""
     gaussians, cameras, center, pixel = subject.gaussians, subject.cameras, subject.center, subject.pixel
     steps = COARSE if packed else FINE
     packed = packed or [pack(gaussians, pixel, center, steps)]

@@ -1,9 +1,8 @@
 """Gaussians as the PLY file that viewers of 3D Gaussian Splatting read.
 
 Positions in metres in the world frame, opacity as logit, standard deviations as logarithm, unit quaternions
-``(w, x, y, z)``, colour as the constant term of spherical harmonics. A comment of the header has the
-constants of the image that the Gaussians were made for; other programs ignore it.
-"""
+``(w, x, y, z)``, colour as the constant term of spherical harmonics. A comment in the header has the image
+constants that the Gaussians were made for; other programs ignore it."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -42,7 +41,7 @@ def write_ply(gaussians: Gaussians, path: str | Path) -> None:
 
 
 def ply_bytes(gaussians: Gaussians) -> bytes:
-    """The content of the file; see :func:`write_ply`."""
+    """The content of the file that :func:`write_ply` writes."""
     require(len(gaussians.splits) == 1, "write_ply", "the Gaussians of one subject", len(gaussians.splits))
     channels = gaussians.colors.shape[1]
     require(channels == 3, "write_ply", "colours of 3 channels", channels)
@@ -64,7 +63,7 @@ def ply_bytes(gaussians: Gaussians) -> bytes:
 
 
 def stored_values(gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
-    """Means, scales, unit quaternions, opacities and colours on the CPU, by the names of their fields."""
+    """Means, scales, unit quaternions, opacities and colours on the CPU, by field name."""
     names = ("means", "scales", "quaternions", "opacities", "colors")
     values = {name: getattr(gaussians, name).detach().to("cpu", dtype) for name in names}
     return values | {"quaternions": torch.nn.functional.normalize(values["quaternions"], dim=-1)}
@@ -80,7 +79,7 @@ def vertices_ply(columns: Mapping[str, np.ndarray], comments: Sequence[str] = ()
 
 
 def _read(path: Path) -> PlyData:
-    """A PLY, also one whose comments are not ASCII, as some programs write them."""
+    """Read a PLY whose comments need not be ASCII, as some programs write them."""
     try:
         return PlyData.read(path)
     except UnicodeDecodeError:
@@ -89,9 +88,9 @@ def _read(path: Path) -> PlyData:
 
 
 def read_ply(path: Path) -> Gaussians:
-    """Read such a file as the Gaussians of one subject, without colours that depend on the direction. A file
-    without this package's comment is taken for one that was made for 3D Gaussian Splatting's own renderer: a
-    low-pass of 0.3 px^2, not antialiased. InputError: not such a file."""
+    """Read a 3DGS PLY as the Gaussians of one subject, without view-dependent colours. A file without this
+    package's comment is taken to be made for 3D Gaussian Splatting's own renderer: a low-pass of 0.3 px^2,
+    not antialiased. InputError: it is no such file."""
     try:
         content = _read(path)
         vertices = content["vertex"]

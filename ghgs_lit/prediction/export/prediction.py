@@ -1,4 +1,4 @@
-"""Everything that is written of a prediction: one entry of ``FORMATS`` for each format."""
+"""The files of a prediction: one entry of ``FORMATS`` for each format."""
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -34,12 +34,12 @@ SHEET = "sheet.png"  #: The picture to look at
 
 @dataclass(frozen=True)
 class Format:
-    """One format. ``contents`` makes functions that make each of the files, in their order and in threads."""
+    """One format. ``contents`` gives a function for each file, in order; threads call it for the content."""
 
-    files: tuple[str, ...]  #: their names; ``{view}`` and ``{frame}``: one of each view, of the turntable
+    files: tuple[str, ...]  #: names; one for each ``{view}``, or ``{frame}`` of the turntable
     contents: Callable[[ExportedSubject], Iterable[Callable[[], bytes]]]
-    package: str | None = None  #: that it needs
-    extra: str = "formats"  #: of this package, which installs it
+    package: str | None = None  #: package that it needs
+    extra: str = "formats"  #: extra of this package that installs it
 
     def names(self, views: Sequence[str], frames: int) -> list[str]:
         """The names of all files."""
@@ -55,12 +55,11 @@ class Format:
 
 
 def _one(content: Callable[[ExportedSubject], bytes]) -> Callable[[ExportedSubject], list]:
-    """The contents of a format with one file."""
     return lambda subject: [partial(content, subject)]
 
 
 def _of_viewers(content: Callable[[Gaussians], bytes]) -> Callable[[ExportedSubject], list]:
-    """The same of the Gaussians for other viewers, which are made once, before any thread begins."""
+    """Contents of one file from the Gaussians for other viewers, which are made before threads begin."""
     return lambda subject: [partial(content, subject.for_other_renderers)]
 
 
@@ -90,8 +89,8 @@ FORMATS: dict[str, Format] = {
 
 def output_options(config: Mapping[str, Any]) -> OutputOptions:
     """The options of a verb's configuration, checked before any work. ``config``: plain data with ``formats``
-    (``all`` stands for all of them), ``up``, ``smooth`` and ``turntable``. InputError: an unknown format, a
-    value out of range, or a package that is not installed."""
+    (``all``: all of them), ``up``, ``smooth`` and ``turntable``. InputError: an unknown format, a value out
+    of range, or a package that is not installed."""
     formats = config["formats"]
     formats = [formats] if isinstance(formats, str) else formats
     formats = tuple(FORMATS) if "all" in formats else tuple(dict.fromkeys(formats))
@@ -105,8 +104,7 @@ def output_options(config: Mapping[str, Any]) -> OutputOptions:
 
 
 def output_files(options: OutputOptions, views: Sequence[str]) -> list[str]:
-    """The names below the directory of the files that :func:`write_prediction` writes of these views beside
-    the report."""
+    """Names of the files, except the report, that :func:`write_prediction` writes into its directory."""
     names = [name for format in options.formats for name in FORMATS[format].names(views, options.frames)]
     return [*names, SHEET]
 
@@ -122,21 +120,20 @@ def write_prediction(
 ) -> list[Path]:
     """Write the prediction of one subject, ``sheet.png`` to look at and ``report.json`` about it.
 
-    Lengths in the files are in the unit of the batch's cameras. Returns: What was written, ``report.json``
+    Lengths in the files are in the unit of the batch's cameras. Returns: the paths, that of ``report.json``
     last. InputError: several subjects, or a file of another origin is in the way.
 
     Args:
-        directory: files that an earlier prediction wrote are replaced, others stay.
-        batch: photographs, masks and cameras of the subject; the sheet compares renders with its targets,
-            or with the photographs where it has none.
+        directory: files of an earlier prediction are replaced, others stay.
+        batch: photographs, masks and cameras of the subject; the sheet compares renders with its targets, or
+            with the photographs where it has none.
         renderer: draws the turntable, and the input views for the report.
-        facts: further plain data for the report, such as the seconds of each stage.
-    """
+        facts: further plain data for the report, such as the seconds of each stage."""
     subject = exported_subject(batch, prediction, renderer, options)
     names, seconds = output_files(options, subject.views), {}
     begin_files(directory, names)
     with ThreadPoolExecutor(allowed_cores()) as pool:
-        pool.submit(palette, "turbo")  # the sheet needs it: matplotlib is imported meanwhile
+        pool.submit(palette, "turbo")  # imports matplotlib, which the sheet needs, meanwhile
         tasks = {}
         for name in options.formats:
             begin = time.perf_counter()
@@ -157,7 +154,6 @@ def write_prediction(
 
 
 def _report(subject: ExportedSubject) -> dict[str, Any]:
-    """Counts and checks of a subject; PSNR in dB in the box of the subject says how the inputs are met."""
     gaussians, valid = subject.gaussians, subject.depth_valid
     lost = subject.masks & ~valid
     drawn = subject.renderer(gaussians, subject.cameras[None])

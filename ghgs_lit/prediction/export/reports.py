@@ -1,4 +1,4 @@
-"""``report.json`` of a directory: it says which files are ours, which alone are replaced."""
+"""``report.json`` of a directory lists the files of predictions; only those are replaced later."""
 
 import json
 import time
@@ -15,8 +15,7 @@ REPORT = "report.json"  #: The file that lists the others
 
 
 def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] = ()) -> None:
-    """Refuse to replace an input, or a file of ``names`` or a report that no earlier prediction wrote.
-    InputError: names the first such file."""
+    """Refuse to replace inputs, or ``names`` and a report of other origin. InputError: names the first."""
     read = {path.resolve() for path in inputs}
     written = _written_before(directory)
     for name in (*names, REPORT):
@@ -28,8 +27,8 @@ def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] =
 
 
 def begin_files(directory: Path, names: Sequence[str]) -> list[str]:
-    """Note files that are about to be written; those of a run that is cut off are known as ours, too.
-    Returns: Files of earlier predictions beside these. InputError: a file of another origin is in the way."""
+    """List files in the report before they are written, so that those of an interrupted run are known, too.
+    Returns: other files of earlier predictions. InputError: a file of another origin is in the way."""
     require_free(directory, names)
     earlier = _beside(directory, names)
     known = {"files": dict.fromkeys(names), "earlier_files": earlier}
@@ -57,13 +56,11 @@ def write_file(path: Path, content: Callable[[], bytes]) -> float:
 
 
 def _beside(directory: Path, names: Sequence[str]) -> list[str]:
-    """Files of earlier predictions that are there beside ``names`` and the report."""
     written = _written_before(directory)
     return [name for name in written if name not in (REPORT, *names) and (directory / name).exists()]
 
 
 def _written_before(directory: Path) -> list[str]:
-    """The report of an earlier prediction and the files that it lists; nothing where there is none."""
     try:
         report = read_json(directory / REPORT)
     except InputError:

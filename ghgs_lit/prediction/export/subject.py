@@ -36,8 +36,7 @@ def turn(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Float[Tensor, "4
 def rotate_world(
     quaternion: Float[Tensor, "4"], gaussians: Gaussians, cameras: Cameras
 ) -> tuple[Gaussians, Cameras]:
-    """The same scene in a world rotated by the unit ``quaternion``: every image stays as it is. Colours must
-    not depend on the direction."""
+    """The same scene in a world rotated by the unit ``quaternion``. Colours must not depend on direction."""
     quaternion = quaternion.double()
     rotation = quaternion_to_matrix(quaternion)
     means = gaussians.means.double() @ rotation.to(gaussians.means.device).mT
@@ -49,14 +48,14 @@ def rotate_world(
     return replace(gaussians, **values), moved
 
 
-#: Square pixels that the renderers of other viewers add to each Gaussian; those are not antialiased.
+#: Low-pass, in px^2, of other viewers' renderers, which are not antialiased.
 VIEWER_LOW_PASS = 0.3
-_SMALLEST = 1e-3  #: The least standard deviation of a Gaussian in pixels
-#: How Gaussians for other viewers are brought nearer to ours: what may change, steps, and cameras around the
-#: subject beside the inputs, of which two take part in a step.
+_SMALLEST = 1e-3  #: Least standard deviation in pixels
+#: The fit of Gaussians for other viewers: changes, steps, cameras around the subject (beside the inputs), and
+#: views in each step.
 _FIT = {"scales": Change(3.0, 0.15), "opacities": Change(5.0, 0.3), "colors": Change(0.1, 0.006)}
 _FIT_STEPS, _AROUND, _AT_ONCE = 32, 8, 2
-_WEIGHTS = (1.0, 0.0, 0.1)  #: Of L1, 1 - SSIM, which would take half of the time, and the silhouette
+_WEIGHTS = (1.0, 0.0, 0.1)  #: Of L1, 1 - SSIM (it would take half of the time) and silhouette
 
 
 @dataclass(frozen=True)
@@ -64,10 +63,10 @@ class OutputOptions:
     """Choices for the files of a prediction."""
 
     formats: tuple[str, ...] = ("ply",)  #: names of :data:`ghgs_lit.prediction.export.prediction.FORMATS`
-    up: str | None = None  #: axis (``y``, ``-y``, ``z``) that points up in files; None: as of the cameras
-    smooth: bool = False  #: the files of Gaussians hold what a renderer adds in pixels of the photographs
+    up: str | None = None  #: axis (``y``, ``-y``, ``z``) that points up in files; None: the cameras' world
+    smooth: bool = False  #: files hold the :func:`smoothed` Gaussians
     frames: int = 24  #: pictures of the turntable
-    fps: int = 12  #: of these, per second of the video
+    fps: int = 12  #: pictures per second of the video
 
     def __post_init__(self):
         choice("up", self.up, (None, *AXES))
@@ -75,9 +74,9 @@ class OutputOptions:
 
 
 def smoothed(gaussians: Gaussians, pixel: float) -> Gaussians:
-    """Gaussians that hold what a renderer adds in pixels of the photographs, ``pixel`` metres wide. These are
-    ``low_pass`` square pixels, and with ``antialiased`` the opacity that they take: exact for round
-    Gaussians, for others the geometric mean of their axes."""
+    """Gaussians widened by what a renderer adds in photographs with pixels of side ``pixel``: ``low_pass``
+    square pixels and, with ``antialiased``, the loss of opacity (exact for round Gaussians; for others the
+    geometric mean of their axes)."""
     variances = gaussians.scales.square()
     wider = variances + gaussians.low_pass * pixel**2
     opacities = gaussians.opacities
@@ -90,10 +89,8 @@ def smoothed(gaussians: Gaussians, pixel: float) -> Gaussians:
 def for_other_renderers(gaussians: Gaussians, pixel: float) -> Gaussians:
     """Gaussians that 3D Gaussian Splatting's own renderer draws as ours draws the given ones.
 
-    It adds 0.3 px^2 whatever Gaussians were made for, and takes no opacity for it. Variances lose what it
-    adds too much at the photographs' size, whose pixels are ``pixel`` metres wide; Gaussians that ours draws
-    smaller than 0.3 px^2 become points.
-    """
+    It always adds 0.3 px^2 and does not reduce opacity. Variances are reduced by what it adds too much at the
+    photographs' size, with pixels of side ``pixel``; those that ours draws below 0.3 px^2 become points."""
     if gaussians.low_pass == VIEWER_LOW_PASS and not gaussians.antialiased:
         return gaussians
     drawn = smoothed(gaussians, pixel)
@@ -103,15 +100,14 @@ def for_other_renderers(gaussians: Gaussians, pixel: float) -> Gaussians:
 
 
 def fitted(theirs: Gaussians, ours: Gaussians, cameras: Sequence[Cameras], renderer: Renderer) -> Gaussians:
-    """``theirs`` with scales, opacities and colours with which they are drawn more as ``ours`` are.
-    ``cameras``: sets of cameras [n], which take part in turn."""
+    """``theirs`` optimised to render more like ``ours``. ``cameras``: sets of cameras [n], used in turn."""
     drawn = [renderer(ours, some[None], background=0.0) for some in cameras]
     search = Descent(theirs, None, _FIT)
     for step in range(_FIT_STEPS):
         lap, among = divmod(step, len(cameras))
         seen, wanted = cameras[among], drawn[among]
         count = seen.extrinsics.shape[0]
-        # Far apart, so that the two see different sides.
+        # Far apart, to see different sides.
         views = [(lap + part * max(count // _AT_ONCE, 1)) % count for part in range(_AT_ONCE)]
         part = (wanted.image[:, views], wanted.alpha[:, views], seen[views][None])
         search.step(renderer, part, _WEIGHTS)
@@ -120,12 +116,11 @@ def fitted(theirs: Gaussians, ours: Gaussians, cameras: Sequence[Cameras], rende
 
 @dataclass(frozen=True)
 class ExportedSubject:
-    """One subject. Lengths are in the unit of the cameras; ``up`` is the unit vector that points up.
+    """One subject. Lengths are in the unit of the cameras; ``up`` is the upward unit vector.
 
-    ``images`` are premultiplied by ``mattes``, which are the masks where there are none.
-    ``points`` are the unprojected pixels of the subject with their ``colors``; ``dropped`` counts Gaussians
-    that are not finite, which no renderer draws and no file holds.
-    """
+    ``images`` are premultiplied by ``mattes`` (the masks, where there are none). ``points`` are the subject's
+    unprojected pixels with their ``colors``; ``dropped`` counts Gaussians that are not finite, which no
+    renderer draws and no file holds."""
 
     name: str
     views: tuple[str, ...]
@@ -145,19 +140,18 @@ class ExportedSubject:
 
     @property
     def file_names(self) -> list[str]:
-        """The names of the views as parts of the names of files."""
+        """:func:`file_names` of the views."""
         return file_names(self.views)
 
     @cached_property
     def stored(self) -> Gaussians:
-        """The Gaussians as the PLY holds them, which says what image they were made for; with ``smooth`` they
-        hold what a renderer adds (as of Mip-Splatting, Yu et al. 2024): a larger screen shows no gaps."""
+        """The Gaussians of the PLY, which stores their image constants; with ``smooth`` they are
+        :func:`smoothed` (as in Mip-Splatting, Yu et al. 2024), so that a larger screen shows no gaps."""
         return smoothed(self.gaussians, self.pixel) if self.options.smooth else self.gaussians
 
     @cached_property
     def for_other_renderers(self) -> Gaussians:
-        """The Gaussians as files hold them that cannot say what image they were made for: brought nearer to
-        what ours draws from the inputs and from all around."""
+        """The Gaussians of files without image constants, fitted to our renders of inputs and all around."""
         if self.options.smooth:
             return self.stored
         converted = for_other_renderers(self.gaussians, self.pixel)
@@ -168,7 +162,7 @@ class ExportedSubject:
 
     @cached_property
     def body(self) -> Float[Tensor, "n 3"]:
-        """The points that pictures of the whole subject show (:func:`subject_points`)."""
+        """The points that pictures of the whole subject must show."""
         return subject_points(self.gaussians)
 
     @property
@@ -227,7 +221,7 @@ def exported_subject(
 
 
 def file_names(views: Sequence[str]) -> list[str]:
-    """The names of photographs as parts of the names of files, all different also without case."""
+    """Names of photographs made fit for file names, all different even without case."""
     names: dict[str, str] = {}
     for view in views:
         name = "".join(c if c.isalnum() or c in "-_." else "_" for c in view)

@@ -1,4 +1,4 @@
-"""What of a subject photographs do not show: who is cut by a frame, and where depth is a guess."""
+"""What photographs do not show of a subject: what a frame cuts off, and where depth is a guess."""
 
 import dataclasses
 from typing import Any
@@ -10,23 +10,22 @@ from torch import Tensor
 from ghgs_lit.prediction.export.subject import ExportedSubject
 from ghgs_lit.rounds.observation import looked_up
 
-#: Metres behind the rendered surface from which on a photograph does not show a Gaussian.
+#: Metres behind the rendered surface up to which a photograph shows a Gaussian.
 _BEHIND = 0.03
-#: Parts of the subject's height that are looked at, and Gaussians beyond its ends that are not: floaters.
+#: Parts of the subject's height, and share of Gaussians beyond either end of it (floaters).
 _PARTS, _OUTSIDE = 4, 1e-3
-#: Share of a part that one photograph alone shows, from which on it is said: of whole people three even views
-#: show a half by itself, two opposite ones all.
+#: Share of ``seen_once`` above which a part is reported: three even views of whole people have a half, two
+#: opposite ones all.
 GUESSED = 0.75
 
 
 def unseen(subject: ExportedSubject, depth: Float[Tensor, "1 V 1 H W"]) -> dict[str, Any]:
-    """Plain data for the report. ``depth``: of the inputs, as rendered.
+    """Plain data for the report. ``depth``: of the rendered inputs.
 
     Returns:
         ``cut``: by edge of the frame, the photographs whose mask reaches it. ``seen_once``: by part of the
-        subject's height, the share of its Gaussians that one photograph alone shows, whose depth no second
-        one tells; empty without Gaussians.
-    """
+        subject's height, the share of its Gaussians that at most one photograph shows, so that no second one
+        confirms their depth; empty without Gaussians."""
     masks = subject.masks
     lines = {"top": masks[:, 0], "bottom": masks[:, -1], "left": masks[..., 0], "right": masks[..., -1]}
     touched = {edge: line.any(-1).tolist() for edge, line in lines.items()}

@@ -1,4 +1,4 @@
-"""Seconds of optimisation through the rasterizer, from a prediction."""
+"""Refinement of a prediction by seconds of optimisation through the rasterizer."""
 
 from ghgs_lit.prediction.refinement.cameras import CameraRefinement, pixels_moved
 from ghgs_lit.prediction.refinement.refinement import Change, Descent, Refinement, Report

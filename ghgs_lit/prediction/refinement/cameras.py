@@ -1,11 +1,11 @@
-"""Cameras of a capture, corrected until the photographs agree with one another.
+"""Correction of a capture's cameras until its photographs agree.
 
-First cameras move and zoom until silhouettes explain one another
-(:mod:`ghgs_lit.prediction.refinement.coherence`); where a prediction does not agree that this is better, as
-with wrong masks, they stay. Then what the other views say of a view is drawn with that view's camera, which
-moves until it fits the photograph (bundle adjustment as of BARF, Lin et al., ICCV 2021). Photographs do not
-tell where the whole rig is, so cameras only move beside one another (:mod:`ghgs_lit.geometry.rotations`).
-"""
+First, cameras move and zoom until silhouettes are consistent
+(:mod:`ghgs_lit.prediction.refinement.coherence`); they stay where a prediction does not confirm the gain, as
+with wrong masks. Then the Gaussians of the other views are rendered with each view's camera, which moves
+until the render fits the photograph (bundle adjustment as in BARF, Lin et al., ICCV 2021). Photographs do not
+tell where the whole rig is: only relative motions of cameras are estimated
+(:mod:`ghgs_lit.geometry.rotations`)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -24,26 +24,27 @@ from ghgs_lit.prediction.refinement.coherence import coherent_cameras
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
 
 Renderer = Callable[..., Rendering]
-#: Of the elements of a batch: numbers, and which of its cameras.
+#: Numbers of the elements of a batch, and a choice of their cameras.
 Numbers, Which = Float[Tensor, " B"], Bool[Tensor, "B V"]
 
-#: Steps of the optimiser in each round, and its first step: radians, and half heights of the subject.
+#: Steps of the optimiser in a round, and their size at first: radians, and half heights of the subject.
 _STEPS, _RATE = 15, 0.006
-_OUTLINE = 0.5  #: Weight of the silhouettes beside that of colours
-_SAME = 0.05  #: Metres between depths of one surface
+_OUTLINE = 0.5  #: Weight of silhouettes; that of colours is 1
+_SAME = 0.05  #: Largest difference in metres of depths of one surface
 _STAY = 4.0  #: Weight of the squared motion
-#: Part of the disagreement that the first round and any later one must take away for its cameras to be kept.
-#: With exact cameras it is up to 0.01, 0.02 from above; with cameras that are off by a pixel 0.02 to 0.2.
-#: The first also holds for cameras that silhouettes propose.
+#: Relative decrease of the loss for which the cameras of the first and of a later round are kept: with exact
+#: cameras it is up to 0.01 (0.02 from above), with cameras off by a pixel 0.02 to 0.2. ``_FIRST`` also holds
+#: for cameras that silhouettes propose.
 _FIRST, _LATER = 0.02, 0.01
-#: From so many cameras on, those whose rays pass beside silhouettes by less than so many pixels are exact, or
-#: off by half a pixel (fewer silhouettes tell less), and must agree better by another part to be moved.
+#: With ``_TELLING`` cameras or more (fewer silhouettes tell less), a silhouette distance below ``_EXACT``
+#: pixels means that they are off by half a pixel at most: the first round must gain ``_DOUBTED``.
 _TELLING, _EXACT, _DOUBTED = 4, 1.5e-4, 0.05
 
 
 @dataclass(frozen=True)
 class _Views:
-    """The ``n`` views of a batch, each with its photograph and the Gaussians whose ``owner`` it is."""
+    """The ``n`` views of a batch with the Gaussians that the element's other views predict; ``owner``: the
+    view that each of these Gaussians is drawn in."""
 
     gaussians: Gaussians
     owner: Int[Tensor, " N"]
@@ -57,12 +58,11 @@ class CameraRefinement:
     """``refinement(batch)``: the batch with cameras that agree better.
 
     Args:
-        rounds: how often the batch is predicted and its cameras are corrected at most, 1 or more. An element
-            keeps its cameras from the first round on that does not make its photographs agree better.
-        predict: gives the Gaussians of a batch, as a model does.
-        renderer: draws them, with gradients.
-        shared: the elements of a batch are instants of one rig, whose cameras move alike in all of them.
-    """
+        rounds: most rounds of prediction and correction, 1 or more. An element keeps its cameras from the
+            first round on that does not make its photographs agree better.
+        predict: gives the prediction of a batch, as a model does.
+        renderer: draws Gaussians, with gradients.
+        shared: the elements of a batch are instants of one rig, whose cameras move alike in all of them."""
 
     def __init__(
         self, rounds: int, predict: Callable[[Batch], Prediction], renderer: Renderer, shared: bool = False
@@ -71,8 +71,7 @@ class CameraRefinement:
         self.rounds, self.predict, self.renderer, self.shared = rounds, predict, renderer, shared
 
     def __call__(self, batch: Batch) -> Batch:
-        """The batch with corrected cameras; targets stay as they are. ``batch``: photographs, masks and
-        cameras, of two views or more."""
+        """The batch with corrected cameras; targets stay as they are. ``batch``: two views or more."""
         frame = Frame.of(batch).shared if self.shared else Frame.of(batch)
         inside, moved, free, first = self._coherent(frame.enter(batch))
         for _ in range(self.rounds):
@@ -88,8 +87,9 @@ class CameraRefinement:
 
     @torch.no_grad()
     def _coherent(self, batch: Batch) -> tuple[Batch, Bool[Tensor, " B"], Which, Numbers]:
-        """Elements with coherent silhouettes; which agree better for it; which cameras may be wrong (all, but
-        where silhouettes and prediction agree on a few); and what a first round must gain."""
+        """The batch with cameras of consistent silhouettes; which elements these improve; which cameras may
+        be wrong (all, unless silhouettes and prediction agree on a few); and what the first round must gain.
+        """
         cameras, free, distance = coherent_cameras(batch, self.shared)
         are_right = (distance < _EXACT) & (batch.masks.shape[1] >= _TELLING)
         first = torch.where(are_right, _DOUBTED, _FIRST)
@@ -104,14 +104,13 @@ class CameraRefinement:
         return replace(batch, cameras=cameras), is_better, free, first
 
     def _disagreement(self, batch: Batch) -> Numbers:
-        """The loss of the rounds with the cameras as they are."""
         views = _views(self.predict(batch), batch)
         return self._loss(self.renderer(views.gaussians, views.cameras, background=0.0), views, batch)
 
     def _loss(self, drawn: Rendering, views: _Views, batch: Batch) -> Numbers:
-        """L1 of colours and silhouettes for each pixel of an element's subject, or its mean over instants."""
+        """L1 of colours and silhouettes per pixel of an element's subject, or with ``shared`` its mean."""
         image, alpha = drawn.image[:, 0], drawn.alpha[:, 0, 0]
-        # Where no other view shows the surface of the photograph, one sees through to what lies behind it.
+        # Where the other views lack the surface of the photograph, what lies behind it is drawn.
         same = (drawn.depth.detach()[:, 0, 0] - views.depths).abs() < _SAME
         errors = same * (image - views.photographs).abs().mean(1)
         errors = errors + _OUTLINE * (alpha - views.silhouettes).abs()
@@ -123,7 +122,7 @@ class CameraRefinement:
     def _corrected(
         self, prediction: Prediction, batch: Batch, free: Which, worth: Numbers
     ) -> tuple[Cameras, Bool[Tensor, " B"]]:
-        """Cameras after one round, and which elements agree better by ``worth``; those of the others stay."""
+        """Cameras after one round, and which elements gain ``worth``; the cameras of the others stay."""
         cameras, losses = batch.cameras, []
         views = _views(prediction, batch)
         axes = cameras.extrinsics[..., 2, :3]
@@ -150,13 +149,12 @@ class CameraRefinement:
 
 
 def _of_free(motions: Float[Tensor, "B V 6"], axes: Float[Tensor, "B V 3"], free: Which) -> Tensor:
-    """Motions of the free cameras: beside one another where all are, and beside the others where some are."""
+    """Motions of the free cameras: without their common motion if all are free; 0 for fixed cameras."""
     all_are = free.all(1)[:, None, None]
     return torch.where(all_are, without_common(motions, axes), motions * free[..., None])
 
 
 def _chosen(which: Which, first: Cameras, second: Cameras) -> Cameras:
-    """The first cameras of some views, the second of the others."""
     which = which[..., None, None]
     lenses = torch.where(which, first.intrinsics, second.intrinsics)
     poses = torch.where(which, first.extrinsics, second.extrinsics)
@@ -164,7 +162,7 @@ def _chosen(which: Which, first: Cameras, second: Cameras) -> Cameras:
 
 
 def pixels_moved(before: Batch, after: Batch) -> list[list[float]]:
-    """Pixels that the subject moved by in each photograph [B][V], root mean square over a box around it."""
+    """Root mean square motion in pixels of a box around the subject in each photograph [B][V]."""
     frame = Frame.of(before)
     corners = HEIGHT / 2 * torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], device=before.masks.device)] * 3)
     seen = []
@@ -197,7 +195,7 @@ def _views(prediction: Prediction, batch: Batch) -> _Views:
 
 
 def _moved(views: _Views, motion: Float[Tensor, "B V 6"]) -> Gaussians:
-    """The Gaussians of each view, moved as if its camera had moved the other way; their axes stay."""
+    """The Gaussians of each view, moved in place of its camera; their orientations stay."""
     rotations, shifts = (value.flatten(0, 1)[views.owner] for value in rigid(motion, HEIGHT / 2))
     means = (rotations @ views.gaussians.means[..., None])[..., 0] + shifts
     return replace(views.gaussians, means=means)

@@ -1,10 +1,9 @@
-"""Cameras of a capture, moved and zoomed until its silhouettes explain one another.
+"""Correction of a capture's cameras by motions and zooms that make its silhouettes consistent.
 
-Where cameras are right the ray of every pixel of a silhouette has a point that all other silhouettes show
-(silhouette coherence: Boyer, ACCV 2006; Hernandez, Schmitt and Cipolla, PAMI 2007). Where they are off, rays
-near the outlines have none: how far their best points lie beside the other silhouettes is what Gauss-Newton
-steps make small. This needs no model and no surface that two photographs share.
-"""
+With right cameras, the ray of every silhouette pixel has a point inside all other silhouettes (silhouette
+coherence: Boyer, ACCV 2006; Hernandez, Schmitt and Cipolla, PAMI 2007). With wrong ones, rays near the
+outlines have none: Gauss-Newton steps minimise how far outside the other silhouettes their best points lie.
+This needs no model and no surface that two photographs share."""
 
 import math
 from collections.abc import Iterator
@@ -27,32 +26,32 @@ from ghgs_lit.prediction.refinement.outlines import QUICK, TO, Outlines
 from ghgs_lit.types import Batch, Cameras
 
 Lens, Pose = Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"]
-#: Of ``K`` instants, whose crops have lenses of their own.
+#: Those of ``K`` instants, whose crops differ in intrinsics.
 Lenses, Middles = Float[Tensor, "K V 3 3"], Float[Tensor, "K 3"]
-#: One of each camera, and one of each ray.
+#: One for each camera, and one for each ray.
 Which, Numbers, Points = Bool[Tensor, " V"], Int[Tensor, " R"], Float[Tensor, "R 3"]
 
-_DEPTHS = 48  #: Depths along a ray
-#: Mean distance in pixels of rays near outlines below which silhouettes explain one another.
+_DEPTHS = 48  #: Depths tried along a ray
+#: Mean distance of rays in pixels below which silhouettes are consistent.
 _COHERENT = 5e-4
-#: Weight of the squared steps, in pixels, beside the mean of the squared distances of the rays; and of those
-#: of the logarithms of focal lengths over it: lenses are known better than where cameras stand.
+#: Weight of the squared steps, in pixels, relative to the mean squared distance; and the factor of it for
+#: zooms: lenses are known better than poses.
 _STAY, _KNOWN = 1e-3, 5.0
-#: Few cameras explain silhouettes as well as all where rays pass by less than so many times the distance, or
-#: by less than ``_COHERENT``; of fewer silhouettes than so many, which tell less, by a tenth of it. None is
-#: looked for where the distance with the given cameras is below the third: that of one off by 2.5. One
-#: alone may leave the last part of that distance, as of rough masks: the camera across from it leaves 0.04.
+#: Moving a few cameras is enough if it leaves less than ``_AS_WELL`` times the distance that moving all
+#: leaves, or less than ``_COHERENT`` (a tenth of it with fewer than ``_TELLING`` silhouettes, which tell
+#: less). It is tried where the given distance is above ``_BUMPED``, that of one camera off by 2.5 pixels. One
+#: camera alone may leave ``_REST`` of the given distance, as with rough masks; moving the opposite camera
+#: leaves 0.04.
 _AS_WELL, _TELLING, _BUMPED, _REST = 1.5, 4, 2e-3, 0.02
 
 
 @dataclass(frozen=True)
 class _Phase:
-    """Some steps, what they make small, and the weight of a ray whose distance is ``r`` pixels.
+    """Gauss-Newton steps with one kind of distance, for rays from pixels up to ``to`` inside their outline.
 
-    First, rays must meet the other silhouettes: the weight of those that miss them by more than ``scale``
-    falls with 1 / r. Then, they must lie as deep in the others as in their own, as outlines from the front
-    and from behind do; those that differ by more than ``scale`` lose their weight (Geman and McClure).
-    """
+    First, rays must meet the other silhouettes; the weight of those that miss them by r > ``scale`` pixels
+    falls with 1 / r. Then (``is_exact``) they must lie as deep in the others as in their own, as outlines
+    from the front and from behind do; beyond ``scale`` the weight vanishes (Geman and McClure)."""
 
     steps: int
     to: float
@@ -73,7 +72,7 @@ _MEET, _LIE = _Phase(12, TO, 1.0, is_exact=False), _Phase(6, 3.0, 0.3, is_exact=
 
 @dataclass(frozen=True)
 class _Alignment:
-    """Cameras after some steps of those that are ``free``, and the mean distance of rays before each step."""
+    """Cameras after steps of the ``free`` ones, and the mean distance of rays before each step."""
 
     lens: Lenses
     pose: Pose
@@ -81,7 +80,6 @@ class _Alignment:
     distances: tuple[float, ...] = ()
 
     def after(self, phase: _Phase, silhouettes: "_Silhouettes") -> "_Alignment":
-        """The same after the steps of a phase."""
         found = self
         for _ in range(phase.steps):
             equations = silhouettes.equations(found.lens, found.pose, phase)
@@ -91,8 +89,8 @@ class _Alignment:
         return found
 
     def shows_motions_from(self, start: "_Alignment") -> bool:
-        """Whether the subject moves by more than it grows in the image of each free camera: focal lengths are
-        known only beside one another."""
+        """Whether the subject moves more than it grows in each free camera's image: growth alone may be a
+        zoom of the other cameras, since only relative focal lengths can be known."""
         scale, before = (each.lens[0, :, 0, 0] / each.pose[:, 2, 3] for each in (self, start))
         seen, was = (s[:, None] * each.pose[:, :2, 3] for s, each in ((scale, self), (before, start)))
         growth = HEIGHT / 2 * before * (scale / before).log().abs()
@@ -101,9 +99,10 @@ class _Alignment:
 
 @torch.no_grad()
 def contradiction(batch: Batch) -> Float[Tensor, " B"]:
-    """How far rays near outlines pass beside other silhouettes, in pixels on average: a quick look at a batch
-    as of :func:`coherent_cameras`. With exact cameras it is up to 0.0025, with ones off by 1.5 0.007 to 0.09.
-    """
+    """Mean distance in pixels by which rays near outlines miss other silhouettes; a quick check.
+
+    With exact cameras it is up to 0.0025, with ones off by 1.5 pixels 0.007 to 0.09. ``batch``: as for
+    :func:`coherent_cameras`."""
     found = []
     for mattes, lens, pose in zip(*_on_cpu(batch), strict=True):
         outlines = Outlines.of(mattes, QUICK)
@@ -121,20 +120,18 @@ def _on_cpu(batch: Batch) -> list[Tensor]:
 def coherent_cameras(
     batch: Batch, shared: bool = False
 ) -> tuple[Cameras, Bool[Tensor, "B V"], Float[Tensor, " B"]]:
-    """Cameras whose silhouettes explain one another; those of an element whose silhouettes do already stay.
+    """Cameras with consistent silhouettes; those of an element whose silhouettes are consistent stay.
 
-    Where moving a minority of the cameras explains the silhouettes as well as moving all, the others stay.
-    Silhouettes do not tell this from all cameras moving, less and apart from what they share.
+    Where moving a minority of the cameras is as good as moving all, the others stay. Silhouettes do not tell
+    this from all cameras moving by less, relative to one another.
 
-    Also returned is which cameras were free to move, and how far rays near outlines pass beside other
-    silhouettes, in pixels on average, with the given cameras: 0 to 0.00014 with exact cameras and mattes,
-    0.0001 to 0.0004 with four cameras that are off by up to half a pixel, 0.002 by one, 0.04 to 0.08 by
-    three; infinite where no silhouette has an outline. ``batch``: in the subject's frame
-    (:class:`ghgs_lit.geometry.frame.Frame`). ``shared``: the elements are instants of one rig, in one frame;
-    its cameras move and zoom alike in all.
-    """
+    Also returned is which cameras were free to move, and by how many pixels rays near outlines miss other
+    silhouettes with the given cameras, on average: 0 to 0.00014 with exact cameras and mattes; with four
+    cameras 0.0001 to 0.0004 if off by up to half a pixel, 0.002 by one, 0.04 to 0.08 by three; infinite where
+    no silhouette has an outline. ``batch``: in the subject's frame (:class:`ghgs_lit.geometry.frame.Frame`).
+    ``shared``: the elements are instants of one rig, in one frame; its cameras move and zoom alike in all."""
     cameras = batch.cameras
-    # A small problem of many short steps, and distances to outlines are computed on a CPU.
+    # On a CPU: many short steps, and distances to outlines are computed there anyway.
     mattes, lens, pose = _on_cpu(batch)
     middle = subject_center(batch.masks, cameras).float().cpu() if shared else pose.new_zeros(len(pose), 3)
     each = [slice(None)] if shared else [slice(b, b + 1) for b in range(len(pose))]
@@ -151,7 +148,7 @@ def coherent_cameras(
 def _coherent(
     mattes: Float[Tensor, "K V H W"], lens: Lenses, pose: Pose, middle: Middles
 ) -> tuple[Lenses, Pose, Which, float]:
-    """Of one rig: intrinsics, extrinsics, which were free, and the mean distance with the given ones."""
+    """Intrinsics and extrinsics of one rig, which were free, and the mean distance with the given ones."""
     silhouettes = _Silhouettes(tuple(Outlines.of(each) for each in mattes), middle)
     every = torch.ones(len(pose), dtype=torch.bool)
     if not any(len(outlines.depth) for outlines in silhouettes.outlines):
@@ -174,7 +171,7 @@ def _coherent(
 
 
 def _minorities(equations: "_Equations", count: int) -> Iterator[Which]:
-    """Of ``count`` cameras the one that explains most when it alone moves, the two, and so on to half."""
+    """The camera that alone explains most when it moves, the best two, and so on below half of ``count``."""
     for size in range(1, (count + 1) // 2):
         sets = [
             torch.zeros(count, dtype=torch.bool).index_fill(0, torch.tensor(views), True)
@@ -185,7 +182,7 @@ def _minorities(equations: "_Equations", count: int) -> Iterator[Which]:
 
 @dataclass(frozen=True)
 class _Equations:
-    """The normal equations of a step of Gauss-Newton, and the mean distance of the rays before it."""
+    """Normal equations of a Gauss-Newton step, and the number and total distance of rays before it."""
 
     normal: Float[Tensor, "n n"]
     right: Float[Tensor, " n"]
@@ -201,19 +198,19 @@ class _Equations:
         return _Equations(*sums)
 
     def solved(self, free: Which) -> Float[Tensor, "V 7"]:
-        """The step of the free cameras; that of the others is 0."""
+        """The step of the free cameras; 0 for the others."""
         index = free.repeat_interleave(7).nonzero()[:, 0]
         steps = torch.linalg.solve(self.normal[index][:, index], self.right[index])
         return torch.zeros_like(self.right).index_copy(0, index, steps).view(-1, 7)
 
     def gain(self, free: Which) -> float:
-        """What the step of the free cameras takes from the squared distances, to first order."""
+        """First-order decrease of the squared distances by the free cameras' step."""
         return float((self.solved(free).flatten() * self.right).sum())
 
 
 @dataclass(frozen=True)
 class _Silhouettes:
-    """Those of each instant, and where its subject is in the frame."""
+    """The silhouettes of each instant, and where its subject is in the frame."""
 
     outlines: tuple[Outlines, ...]
     middle: Middles
@@ -227,7 +224,7 @@ class _Silhouettes:
 def _equations(
     outlines: Outlines, lens: Lens, middle: Float[Tensor, " 3"], pose: Pose, phase: _Phase, pixel: Tensor
 ) -> _Equations:
-    """The unknowns are motions about the frame's origin and zooms of all cameras, each in about a pixel."""
+    """Unknowns: motions about the frame's origin and zooms of all cameras, in about a pixel."""
     count = len(pose)
     # Rays are searched around the subject's middle.
     pose = after_motions(pose, F.pad(middle, (3, 0)).expand(count, 6), pose.new_zeros(3))
@@ -249,12 +246,12 @@ def _equations(
 
 
 def _pixel(lens: Lenses, pose: Pose) -> Float[Tensor, ""]:
-    """Pixels of half a height of the subject."""
+    """Half the height of the subject, in pixels."""
     return HEIGHT / 2 * (lens[..., 0, 0] / pose[:, 2, 3]).mean()
 
 
 def _stepped(steps: Float[Tensor, "V 7"], lens: Lenses, pose: Pose, are_all: bool) -> tuple[Lenses, Pose]:
-    """Intrinsics and extrinsics after a step; where all cameras are free they move beside one another."""
+    """Intrinsics and extrinsics after a step, without what is common to all cameras if ``are_all`` free."""
     motions, zooms = (steps / _pixel(lens, pose)).split((6, 1), -1)
     if are_all:
         motions, zooms = without_common(motions, pose[:, 2, :3]), zooms - zooms.mean(0)
@@ -266,8 +263,8 @@ def _stepped(steps: Float[Tensor, "V 7"], lens: Lenses, pose: Pose, are_all: boo
 def _best_points(
     outlines: Outlines, lens: Lens, pose: Pose, view: Numbers, pixels: Float[Tensor, "R 2"]
 ) -> tuple[Points, Numbers, Float[Tensor, " R"]]:
-    """The point of each ray (of silhouettes in ascending order) that is deepest in the other silhouettes, the
-    one that it is least deep in, and its signed depth in that in pixels."""
+    """The point of each ray that is deepest in the other silhouettes, the silhouette that it is least deep
+    in, and its signed depth in that in pixels. ``view``: the silhouette of each ray, ascending."""
     centers = -(pose[:, :3, :3].mT @ pose[:, :3, 3:])[..., 0]
     along = torch.linspace(-HEIGHT / 2, HEIGHT / 2, _DEPTHS).to(pixels)
     views, points = range(len(pose)), []
@@ -291,7 +288,7 @@ def _best_points(
 
 
 def _gradients(outlines: Outlines, lens: Lens, pose: Pose, points: Points, other: Numbers) -> Points:
-    """Derivatives of the distances by the positions of the points, in the world's axes."""
+    """Derivatives of the distances with respect to the points, in the world's axes."""
     seen, depth = project(points, lens[other], pose[other])
     slopes = outlines.slopes(other, seen) * lens[other][:, [0, 1], [0, 1]]
     inside = world_to_camera(points, pose[other])
@@ -303,8 +300,8 @@ def _gradients(outlines: Outlines, lens: Lens, pose: Pose, points: Points, other
 def _rows(
     points: Points, gradients: Points, pose: Float[Tensor, "R 4 4"], middle: Float[Tensor, " 3"]
 ) -> Float[Tensor, "R 7"]:
-    """Derivatives of the distances by a camera's rotation vector around the points, its shift in half heights
-    and the logarithm of its focal length, which moves points away from the optical axis."""
+    """Derivatives of the distances by a camera's rotation vector about the frame's origin, its shift in half
+    heights and the logarithm of its focal length, which moves points away from the optical axis."""
     across = world_to_camera(points, pose)[:, :2]
     zoom = ((pose[:, :3, :3] @ gradients[..., None])[:, :2, 0] * across).sum(-1, keepdim=True)
     return torch.cat((torch.linalg.cross(points + middle, gradients), HEIGHT / 2 * gradients, zoom), -1)

@@ -1,4 +1,4 @@
-"""Outlines of the silhouettes of one instant, as maps of distances, and the rays that pass near them."""
+"""Distance maps of the outlines of one instant's silhouettes, and the rays that pass near them."""
 
 from dataclasses import dataclass
 
@@ -11,19 +11,18 @@ from torch import Tensor
 from ghgs_lit.geometry.masks import signed_distance, soft_signed_distance
 from ghgs_lit.geometry.projection import pixel_centers, sample
 
-_FINER = 4  #: Size of the distance maps over that of the photographs
-_FAR = 20.0  #: Farther than this from an outline, in pixels, distances are all the same
-_FROM, TO = 0.25, 8.0  #: Pixels inside their outline whose rays are tried: from, and to
-#: Of a look: size of the maps, pixels inside outlines to which rays are tried, and of how many one is.
+_FINER = 4  #: Size of the distance maps relative to photographs
+_FAR = 20.0  #: Distances are clamped to this, in pixels
+_FROM, TO = 0.25, 8.0  #: Range of depth inside the outline, in pixels, whose rays are tried
+#: Size of the maps, greatest depth of rays in pixels, and every how many rays one is used.
 CAREFUL, QUICK = (_FINER, TO, 1), (1, 1.5, 2)
-_REACH = 0.75  #: Half the width in pixels over which a slope of a distance map is taken
+_REACH = 0.75  #: Half the step in pixels of slopes of a distance map
 
 
 @dataclass(frozen=True)
 class Outlines:
-    """Signed distances in pixels to the outline of each silhouette, above 0 inside, and the rays near it.
-
-    Ray ``r`` passes ``pixels[r]`` of silhouette ``view[r]``, ``depth[r]`` pixels inside the outline."""
+    """Signed distances in pixels to the outline of each silhouette, above 0 inside, and the rays near it: ray
+    ``r`` passes ``pixels[r]`` of silhouette ``view[r]``, ``depth[r]`` pixels inside the outline."""
 
     maps: Float[Tensor, "V 1 h w"]
     view: Int[Tensor, " R"]
@@ -46,7 +45,7 @@ class Outlines:
         return cls(maps, *(each[near][::every] for each in (view, pixels, depth)), size, finer)
 
     def at(self, view: Int[Tensor, "*n"], pixels: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
-        """Distances at pixels; beyond the photograph those of its border, where a subject may go on."""
+        """Distances at pixels; beyond the photograph those at its border, where a subject may go on."""
         half = 0.5 / self.finer
         within = torch.minimum(pixels.clamp(min=half), pixels.new_tensor(self.size[::-1]) - half)
         return sample(self.maps, view, self.finer * within)[..., 0]
@@ -55,7 +54,7 @@ class Outlines:
         self, view: int, lens: Tensor, pose: Tensor, start: Tensor, ahead: Tensor, depths: Float[Tensor, " D"]
     ) -> Float[Tensor, "R D"]:
         """Distances in a silhouette (lens [3, 3], pose [4, 4]) at ``start`` [3] + depth ``ahead`` [R, 3]."""
-        # From -1 to 1 over the photograph; what is seen of a ray is a ratio of two lines.
+        # Places from -1 to 1 over the photograph: ratios of functions that are linear in depth.
         height, width = self.size
         onto = lens.new_tensor([[2 / width, 0, -1], [0, 2 / height, -1], [0, 0, 1]]) @ lens
         first, slope = onto @ (pose[:3, :3] @ start + pose[:3, 3]), ahead @ (onto @ pose[:3, :3]).mT

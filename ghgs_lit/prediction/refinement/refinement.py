@@ -1,9 +1,8 @@
-"""Gaussians of the inputs' pixels, optimised until their renders are the input photographs.
+"""Optimisation of predicted Gaussians towards the input photographs.
 
-A prediction is near enough that a few steps suffice, and every change is bounded, so that what no photograph
-shows stays as predicted. Photographs that are reproduced say nothing of other views (with wrong geometry they
-are reproduced, too), so :meth:`Refinement.report` holds one out and predicts again from the others.
-"""
+A few steps suffice, and every change is bounded, so that what no photograph shows stays as predicted. Inputs
+that are reproduced say nothing about other views (wrong geometry reproduces them, too), so
+:meth:`Refinement.report` holds one out and predicts again from the others."""
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -25,13 +24,13 @@ Seen = tuple[Tensor, Tensor, Cameras]  #: Photographs on black, silhouettes and 
 
 @dataclass(frozen=True)
 class Change:
-    """The largest change of a value, and the step of Adam while it is near its start."""
+    """The largest change of a value, and the step of Adam near its start."""
 
     limit: float
     rate: float
 
 
-#: Near enough to a prediction that what no photograph shows stays as predicted.
+#: Changes so small that what no photograph shows stays as predicted.
 NEAR = {
     "means": Change(1.0, 0.02),
     "scales": Change(1.0, 0.02),
@@ -45,7 +44,7 @@ WEIGHTS: Weights = (0.8, 0.2, 0.1)
 
 @dataclass(frozen=True)
 class Report:
-    """PSNR in dB before and after: of the inputs, and of one that the others predicted (of four or more)."""
+    """PSNR in dB before and after: of the inputs, and (of four or more) of one held out."""
 
     steps: int
     inputs: tuple[float, float]
@@ -59,14 +58,13 @@ class Report:
 
 
 class Descent:
-    """Gaussians with bounded changes, and the optimiser of these; at first nothing is changed. InputError:
-    means that belong to no pixel.
+    """Bounded changes of Gaussians, at first 0, and their optimiser. InputError: ``means`` change, but the
+    Gaussians belong to no pixel.
 
     Args:
         gaussians: predicted from ``batch``, each at a pixel of an input.
-        batch: None where ``means`` are not changed.
-        changes: what may change, as of :class:`Refinement`.
-    """
+        batch: None where ``means`` do not change.
+        changes: what may change, as for :class:`Refinement`."""
 
     def __init__(self, gaussians: Gaussians, batch: Batch | None, changes: Mapping[str, Change]):
         self.start, self.changes = gaussians.detach(), changes
@@ -81,11 +79,11 @@ class Descent:
     @property
     @torch.no_grad()
     def gaussians(self) -> Gaussians:
-        """As they are now, without a gradient."""
+        """The Gaussians as they are now, without a gradient."""
         return self._changed()
 
     def step(self, renderer: Renderer, seen: Seen, weights: Weights = WEIGHTS) -> Rendering:
-        """One step towards photographs on black and silhouettes; the renders that it follows from."""
+        """Take a step towards ``seen``. Returns: the renders before it."""
         with exact(self.start.means.device.type), torch.enable_grad():
             drawn = renderer(self._changed(), seen[2], background=0.0)
             self._optimizer.zero_grad()
@@ -94,7 +92,6 @@ class Descent:
         return drawn
 
     def _changed(self) -> Gaussians:
-        """Gaussians with bounded changes; none where they are 0."""
         start = self.start
         change = {n: c.limit * torch.tanh(self._raw[n] / c.limit) for n, c in self.changes.items()}
         changed = {name: getattr(start, name) + value for name, value in change.items()}
@@ -115,17 +112,15 @@ class Refinement:
     Args:
         steps: of the optimiser, 1 or more.
         renderer: draws the inputs, with gradients.
-        changes: by name, what may change: of a mean in footprints of its pixel, of the logarithm of a scale,
-            of the logit of an opacity, of a unit quaternion, of a colour. Others stay.
-    """
+        changes: by field, what may change: means in footprints of their pixels, scales by their logarithm,
+            opacities by their logit, quaternions, colours. Other fields stay."""
 
     def __init__(self, steps: int, renderer: Renderer, changes: Mapping[str, Change] = NEAR):
         require(steps >= 1, "refine", "1 or more steps", steps)
         self.steps, self.renderer, self.changes = steps, renderer, changes
 
     def __call__(self, gaussians: Gaussians, batch: Batch) -> Gaussians:
-        """The refined Gaussians. ``gaussians``: predicted from ``batch``, each at a pixel of an input.
-        InputError: Gaussians that belong to no pixel."""
+        """The refined Gaussians. InputError: they do not belong to pixels of ``batch``."""
         return deque(self.states(gaussians, batch), maxlen=1).pop()
 
     def states(self, gaussians: Gaussians, batch: Batch) -> Iterator[Gaussians]:
@@ -139,10 +134,10 @@ class Refinement:
     def report(
         self, gaussians: Gaussians, refined: Gaussians, batch: Batch, predict: Callable[[Batch], Gaussians]
     ) -> Report:
-        """The gain of a refinement; holding out the last input takes as long as prediction and refinement.
-        ``batch``: one element, of which they were predicted. ``predict``: the Gaussians of a batch, here of
-        the inputs without the last: of fewer than four none is held out, since two show too little of a
-        person."""
+        """The gain of a refinement. Of four inputs or more the last is held out (two that remain would show
+        too little of a person), which takes as long as prediction and refinement. ``batch``: one element,
+        from which both were predicted. ``predict``: gives the Gaussians of a batch, here of the inputs
+        without the last."""
         inputs, held_out = tuple(self._psnr(splats, batch) for splats in (gaussians, refined)), None
         *seen, hidden = range(batch.images.shape[1])
         if len(seen) > 2:
@@ -160,12 +155,12 @@ class Refinement:
 
 
 def seen_by(batch: Batch) -> Seen:
-    """What the inputs show."""
+    """Photographs on black, silhouettes [B, V, 1, H, W] and cameras of the inputs."""
     return on_black(batch), coverage(batch)[:, :, None], batch.cameras
 
 
 def _footprints(gaussians: Gaussians, batch: Batch) -> Tensor:
-    """Size [N, 1] of each Gaussian's pixel where it is, in the unit of the world."""
+    """Side [N, 1] of a pixel at each Gaussian's depth in its image, in the unit of the world."""
     extrinsics, intrinsics = batch.cameras.extrinsics.flatten(0, 1), batch.cameras.intrinsics.flatten(0, 1)
     image, dtype = gaussians.image, gaussians.means.dtype
     depth = world_to_camera(gaussians.means, extrinsics.to(dtype)[image])[:, 2]

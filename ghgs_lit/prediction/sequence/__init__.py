@@ -1,1 +1,1 @@
-"""Several instants of one rig: what its cameras share, and instants that start from the last."""
+"""Sequences: instants whose prediction starts from that of the last."""

@@ -1,10 +1,9 @@
-"""Instants that start from the last: Gaussians move with the photographs and are predicted anew now and then.
+"""Prediction of a sequence: Gaussians follow the photographs and are predicted anew now and then.
 
-The Gaussians of the last instant follow the scene flow (:mod:`ghgs_lit.geometry.scene_flow`), and a few
-gradient steps on the inputs' renders, whose optimiser goes on over the instants, take back what flow leaves
-and what light changes (as in Luiten et al., 3DV 2024). Where renders no longer fit photographs or masks, and
-every few instants, all is predicted anew.
-"""
+The Gaussians of the last instant follow the scene flow (:mod:`ghgs_lit.geometry.scene_flow`). A few gradient
+steps on the inputs' renders, with one optimiser over the instants, correct its errors and follow changes of
+light (as in Luiten et al., 3DV 2024). Where renders no longer fit photographs or masks, and every few
+instants, Gaussians are predicted anew."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -20,14 +19,13 @@ from ghgs_lit.geometry.scene_flow import Instant, pyramid, scene_flow
 from ghgs_lit.prediction.refinement.refinement import NEAR, Change, Descent, Renderer, seen_by
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction
 
-_SHOWN = 0.03  #: Metres behind the rendered surface up to which a view shows a Gaussian
-#: Steps at each instant. They may go farther than those of a single one: an error of the flow is larger than
-#: that of a prediction.
+_SHOWN = 0.03  #: A view shows Gaussians this near to the rendered surface, in metres
+#: Steps at each instant, with larger changes than ``NEAR``: flow is less exact than a prediction.
 _STEPS = 2
 _CHANGES = NEAR | {"means": Change(10.0, 0.1), "colors": Change(0.1, 0.004)}
-#: Of L1 and of the silhouettes' L1; without SSIM, which takes as long as the renders.
+#: Of L1, 1 - SSIM (it takes as long as the renders) and the silhouettes' L1.
 _WEIGHTS = (0.8, 0.0, 0.1)
-_WORSE = 1.5  #: Times the misfit after a new prediction at which Gaussians no longer fit
+_WORSE = 1.5  #: Times the misfit after a new prediction above which Gaussians do not fit
 
 
 @dataclass(frozen=True)
@@ -47,12 +45,11 @@ class Temporal:
 
     Args:
         predict: gives the prediction of a batch of one subject, as a model does.
-        every: of so many instants the first is predicted anew; 1: all are, and nothing is kept.
+        every: at least one of so many instants is predicted anew; 1: all are, and nothing is kept.
         renderer: draws the inputs, with gradients.
 
     Attributes:
-        anew: how many instants were predicted anew.
-    """
+        anew: how many instants were predicted anew."""
 
     def __init__(self, predict: Callable[[Batch], Prediction], every: int, renderer: Renderer):
         self.predict, self.every, self.renderer = predict, every, renderer
@@ -60,7 +57,7 @@ class Temporal:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the last instant: the next one has nothing to do with it."""
+        """Forget the last instant, before one that does not follow it."""
         self._last: _Last | None = None
         self._age = 0
 
@@ -79,7 +76,7 @@ class Temporal:
             if (misfit <= _WORSE * self._misfit).all():
                 self._age += 1
                 return found
-            age = self.every - 1  # what moves too fast is not followed in vain at every instant
+            age = self.every - 1  # what moves too fast is not followed at every instant
         prediction = self.predict(batch)
         self.anew, self._age = self.anew + 1, age
         self._descent = Descent(prediction.gaussians, batch, _CHANGES)
@@ -89,8 +86,8 @@ class Temporal:
     def _improved(
         self, prediction: Prediction, batch: Batch, levels: list[Tensor]
     ) -> tuple[Prediction, Float[Tensor, " 2"]]:
-        """The prediction after some steps, and by how much the inputs' renders before the last one do not
-        fit: the error within masks, and the share of the subject beyond its mask in the worst view."""
+        """The prediction after some steps, and the misfit of the inputs' renders before the last step: the
+        error within masks, and the share of the subject beyond its mask in the worst view."""
         photographs, silhouettes, _ = seen = seen_by(batch)
         for _ in range(_STEPS):
             drawn = self._descent.step(self.renderer, seen, _WEIGHTS)
@@ -104,16 +101,14 @@ class Temporal:
 
 
 def _are_equal(first: Batch, second: Batch) -> bool:
-    """Whether two instants have the same photographs, mattes and cameras."""
     known = ((b.images, coverage(b), b.cameras.intrinsics, b.cameras.extrinsics) for b in (first, second))
     return all(map(torch.equal, *known))
 
 
 def _moved(gaussians: Gaussians, last: _Last, batch: Batch, levels: list[Tensor]) -> Gaussians:
-    """Gaussians that go where those of the last instant went."""
     seen = last.prediction.gaussians
     metre = 1.0 if seen.metre is None else float(seen.metre[0])
-    # Near the origin and in metres: the world may be anywhere, and have any unit.
+    # Near the origin and in metres: the world may have any place and unit.
     origin = seen.means.double().nanmedian(0).values if len(seen) else seen.means.new_zeros(3).double()
     points = ((seen.means.double() - origin) / metre).to(levels[0])
     before, after = (
@@ -131,7 +126,7 @@ def _moved(gaussians: Gaussians, last: _Last, batch: Batch, levels: list[Tensor]
 
 
 def _around(cameras: Cameras, origin: Float[Tensor, " 3"], metre: float) -> Cameras:
-    """The cameras [V] of one element in metres around a point of the world."""
+    """The cameras [V] of one element in metres around ``origin``."""
     extrinsics = cameras.extrinsics[0].double().clone()
     extrinsics[:, :3, 3] = (extrinsics[:, :3, :3] @ origin + extrinsics[:, :3, 3]) / metre
     return replace(cameras, intrinsics=cameras.intrinsics[0], extrinsics=extrinsics)
@@ -140,7 +135,7 @@ def _around(cameras: Cameras, origin: Float[Tensor, " 3"], metre: float) -> Came
 def _shown(
     points: Float[Tensor, "N 3"], cameras: Cameras, depth: Float[Tensor, "V 1 H W"]
 ) -> Bool[Tensor, "N V"]:
-    """Which views show points: those whose rendered surface is not before them."""
+    """Which views show points: those whose rendered surface is at the depth of the point."""
     lens, pose = cameras.intrinsics[:, None], cameras.extrinsics[:, None]
     pixels, z = project(points.expand(len(depth), -1, -1), lens, pose)
     view = torch.arange(len(depth), device=z.device)[:, None].expand(z.shape)
@@ -150,7 +145,6 @@ def _shown(
 def _as_drawn(
     prediction: Prediction, gaussians: Gaussians, batch: Batch, depth: Float[Tensor, "1 V H W"]
 ) -> Prediction:
-    """A prediction with other Gaussians, and with the depths of their renders."""
     valid, drawn = batch.masks, depth > 0
     # Pixels that no Gaussian covers have the mean depth of their view.
     sums, counts = (each.sum((-2, -1), keepdim=True) for each in (depth, drawn))

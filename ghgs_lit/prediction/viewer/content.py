@@ -53,7 +53,7 @@ class Content:
 
     @cached_property
     def points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Centres [N, 3] and colours [N, 3] uint8 of the Gaussians, in their ``order``."""
+        """Centres [N, 3] and colours [N, 3] uint8 of the Gaussians, in ``order``."""
         colors = (self.gaussians.colors[self.order].clamp(0, 1) * 255).round().byte()
         return self.gaussians.means[self.order].numpy(), colors.numpy()
 
@@ -66,8 +66,8 @@ class Content:
 
     @torch.no_grad()
     def comparison(self, view: int) -> dict[str, np.ndarray | float]:
-        """One view beside its photograph. Returns: Pictures [H, W, 3] uint8 ``render``, ``photograph`` and
-        ``FLIP``; in the subject's box ``psnr`` (dB) and ``flip``, nan where the mask is empty."""
+        """One view and its photograph: pictures [H, W, 3] uint8 ``render``, ``photograph`` and ``FLIP``, and
+        in the subject's box ``psnr`` (dB) and ``flip``, nan where the mask is empty."""
         camera, target = self.batch.cameras[:, view : view + 1], self.batch.images[:, view]
         image = render(self.gaussians, camera).image[:, 0].clamp(0, 1)
         difference, box = flip_map(image, target), box_of(self.batch.masks[:, view])
@@ -83,7 +83,7 @@ class Content:
 def read_content(path: str | Path, up: str | None) -> Content:
     """Read what ``ghgs predict`` wrote into a directory (its formats ``ply`` and ``inputs``), or a PLY.
     ``up``: the axis ``y``, ``-y`` or ``z`` that points up; None: the up of the cameras, and ``y`` for a PLY.
-    InputError: there is no such thing."""
+    InputError: ``path`` is neither, or a file of it is missing or wrong."""
     path = Path(path)
     choice("up", up, (None, *AXES))
     if path.is_file():
@@ -98,7 +98,6 @@ def read_content(path: str | Path, up: str | None) -> Content:
 
 
 def _read_inputs(directory: Path) -> Batch:
-    """The photographs with their masks as alpha, and their cameras, as a batch of one subject."""
     stored = read_json(directory / "cameras.json")
     pictures, cameras = [], []
     for name, camera in stored.cameras.items():

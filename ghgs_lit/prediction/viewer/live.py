@@ -1,4 +1,4 @@
-"""A page that shows the newest of what goes on, and how fast that is."""
+"""A page that shows the newest capture, and how many captures a second."""
 
 import contextlib
 import math
@@ -18,11 +18,11 @@ from ghgs_lit.prediction.viewer.content import Content
 from ghgs_lit.prediction.viewer.server import Viewer
 from ghgs_lit.types import Batch
 
-_RECENT = 30  #: Instants over which times are means, the newest with the largest weight
+_RECENT = 30  #: Instants over which run times are averaged, later ones with more weight
 
 
 class Recording:
-    """Numbered PLYs of what is shown, ``sequence/0000.ply`` and so on, in place of those of earlier runs.
+    """Numbered PLYs of what is shown, ``sequence/0000.ply`` and so on, which replace those of earlier runs.
     InputError: a file of another origin is in the way."""
 
     def __init__(self, directory: Path):
@@ -38,13 +38,12 @@ class Recording:
         self.instants[name] = subject.name
 
     def end(self) -> None:
-        """Write the report, by which a later run knows the files."""
+        """Write the report, from which a later run knows the files."""
         end_files(self.directory, [*self.instants], {"instants": [*self.instants.values()]})
 
 
 class Pause:
-    """``pause(seconds)`` lets them pass, and raises CancelledError once the event ``stopped`` is set; the
-    attribute ``seconds`` says how long all pauses took."""
+    """``pause(seconds)`` waits; CancelledError once ``stopped`` is set. ``seconds``: length of all pauses."""
 
     def __init__(self):
         self.stopped, self.seconds = threading.Event(), 0.0
@@ -66,16 +65,15 @@ def show_live(
     seconds: float = math.inf,
     delay: float = math.inf,
 ) -> None:
-    """Show the newest capture again and again until no more come or ``seconds`` are over. However it ends,
-    the page is closed and a summary printed.
+    """Show the newest capture until no more come or ``seconds`` are over; then, also after an error, close
+    the page and print a summary.
 
     Args:
-        frames: captures as they come; it waits by ``pause``, which ends here.
-        crop: gives what the model sees; of the next capture in a thread while one is predicted.
+        frames: captures as they come; waits with ``pause``, which is stopped here.
+        crop: gives what the model sees; called in a thread, while the capture before is predicted.
         predict: gives what is shown.
         open_page: called with the first content.
-        delay: seconds between a capture and its picture after which it is dropped.
-    """
+        delay: seconds after which a capture is dropped rather than shown."""
     page, shown, dropped, late, line, times = None, 0, 0, 0, "0 shown", {}
     try:
         with contextlib.closing(_read_ahead(frames, pause, crop, seconds)) as batches:
@@ -118,8 +116,7 @@ def show_live(
 def _read_ahead(
     frames: Iterator[Arrived], pause: Pause, crop: Callable[[Capture], Batch], seconds: float
 ) -> Iterator[tuple[Batch, int, float, float]]:
-    """Batches, how many captures were dropped before each and when it came, and the seconds of reading it
-    without pauses."""
+    """Batches, captures dropped before each, its time of arrival, and seconds of reading without pauses."""
 
     def following() -> tuple[Batch, int, float, float] | None:
         begin = time.perf_counter() - pause.seconds

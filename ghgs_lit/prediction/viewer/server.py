@@ -23,7 +23,7 @@ PICTURES = ("render", "photograph", "FLIP")
 
 
 def _require_address(host: str) -> None:
-    """Refuse an address that is none of this machine: viser would wait for it without a word."""
+    """Refuse an address that is not this machine's: viser would wait for it silently."""
     try:
         family, *_ = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
         socket.create_server((host, 0), family=family).close()
@@ -32,7 +32,7 @@ def _require_address(host: str) -> None:
 
 
 def _refuse_other_addresses(connection: Any, request: Any, response: Any) -> Any:
-    """The answer to a connection of a page of another address than the one it connects to; None: accepted."""
+    """Answer 403 to a page whose origin is not the address that it connects to; None: accepted."""
     origin = request.headers.get("Origin")
     if response.status_code != 101 or origin is None or origin.split("://")[-1] == request.headers["Host"]:
         return None
@@ -41,11 +41,11 @@ def _refuse_other_addresses(connection: Any, request: Any, response: Any) -> Any
 
 @contextlib.contextmanager
 def _own_pages_only(host: str) -> Iterator[None]:
-    """Let servers that begin meanwhile refuse pages of other sites; viser would take those of any origin."""
+    """Make servers that start in this context refuse pages of other sites; viser accepts any origin."""
     from websockets.asyncio import server
 
     serve, names = server.serve, "|".join(map(re.escape, (host, "localhost", "127.0.0.1", "[::1]")))
-    # Who opens it to the network has visitors by any name of this machine; it is in the address they use.
+    # A server open to the network has many names; the Host header has the one in use.
     names = ".+" if host in ("0.0.0.0", "::") else names
     origins = [None, re.compile(rf"https?://({names})(:\d+)?")]
     server.serve = partial(serve, origins=origins, process_response=_refuse_other_addresses)
@@ -61,15 +61,14 @@ class Viewer:
     Args:
         host: the address to listen at; ``127.0.0.1`` is seen by this machine alone.
         port: the first one to try.
-        layers: cameras, photographs, point cloud and hull are there, too, of the first content alone.
-    """
+        layers: also show cameras, photographs, point cloud and hull, of the first content alone."""
 
     def __init__(self, content: Content, host: str = "127.0.0.1", port: int = 8080, layers: bool = True):
         viser = installed("viser", "viewer", "ghgs view")
         _require_address(host)
         self.content = content
         self._lock = threading.Lock()  # controls are answered by several threads
-        logging.getLogger("websockets").setLevel(logging.WARNING)  # a line for each visitor otherwise
+        logging.getLogger("websockets").setLevel(logging.WARNING)  # else a line for each visitor
         with _own_pages_only(host):
             self.server = viser.ViserServer(host, port, label="ghgs", verbose=False)
         self.server.scene.set_up_direction(content.up.numpy())
@@ -101,10 +100,9 @@ class Viewer:
         self.show_splats()
 
     def _prepare(self) -> None:
-        """Covariances of all Gaussians, in the order in which a count takes them."""
         g, order = self.content.gaussians, self.content.order
         if self.content.batch is not None:
-            # On a screen that is larger than the photographs there would be gaps.
+            # Else a screen larger than the photographs shows gaps.
             g = smoothed(g, pixel_size(self.content.cameras, self.content.center))
         root = quaternion_to_matrix(g.quaternions[order]) * g.scales[order][:, None, :]
         self._covariances = (root @ root.mT).numpy()
@@ -120,9 +118,9 @@ class Viewer:
             control.on_update(lambda _: self.show_splats())
 
     def show_splats(self) -> None:
-        """Show as many Gaussians, and as opaque ones, as the controls say."""
+        """Show the Gaussians with the count and the opacity of the controls."""
         with self._lock:
-            # At its end it means all, also where there were fewer at first.
+            # The slider's end means all, also where the first content had fewer.
             n = None if self.count.value == self.count.max else self.count.value
             self.splats = self.server.scene.add_gaussian_splats(
                 "/gaussians",
@@ -147,7 +145,6 @@ class Viewer:
                 self._switch(name, node)
 
     def _switch(self, name: str, node: Any) -> None:
-        """A checkbox that shows and hides a node of the scene."""
         box = self.server.gui.add_checkbox(name, node.visible)
 
         @box.on_update
@@ -155,7 +152,7 @@ class Viewer:
             node.visible = box.value
 
     def _show_frustums(self) -> None:
-        """At a camera, ``picture`` says whether its photograph lies over the Gaussians."""
+        """Show the cameras; that of the visitors hides its photograph unless ``picture`` chooses it."""
         for view, frustum in enumerate(self._frustums):
             is_clear = view != self._at or self._shown == "photograph"
             frustum.visible = self.cameras.value and is_clear
@@ -189,7 +186,7 @@ class Viewer:
         self._at: int | None = None  # the camera that visitors were put at
 
     def _place_visitors(self) -> None:
-        """They begin behind the first camera and beside it: its photograph would hide the subject."""
+        """Start visitors behind and beside the first camera: its photograph would hide the subject."""
         cameras, target = self.content.cameras, self.content.center.numpy()
         up = self.content.up.numpy().astype(np.float64)
         away = cameras.centers[0].numpy() - target

@@ -1,4 +1,4 @@
-"""A rasterizer for CPUs in kernels on explicit vectors; ``layout`` describes their data."""
+"""A rasterizer for CPUs, in kernels with explicit vectors; ``layout`` describes their data."""
 
 from ghgs_lit.rendering.cpu.backend import rasterize
 

@@ -1,4 +1,4 @@
-"""The CPU backend as one differentiable function of PyTorch, and the plan of each call."""
+"""The CPU backend as a differentiable function of PyTorch."""
 
 import threading
 from dataclasses import dataclass
@@ -20,12 +20,10 @@ from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 @dataclass(frozen=True)
 class Plan:
-    """What to render, without the values of the Gaussians. View ``v`` shows batch element ``v // T``.
-
-    ``views`` are the cameras as rows of ``layout.VIEW`` doubles; ``edges`` [B, P + 1] bound the parts of each
-    element; Gaussian ``n`` is splat ``n + shifts[v]`` of view ``v``; ``splats`` counts those of all views;
-    ``shape`` is (B, T).
-    """
+    """The work of a call, without the values of the Gaussians. View ``v`` shows batch element ``v // T``.
+    ``views``: cameras as rows of ``layout.VIEW`` doubles. ``edges`` [B, P + 1]: ends of the parts of each
+    element. ``shifts``: Gaussian ``n`` is splat ``n + shifts[v]`` of view ``v``. ``splats``: their number in
+    all views. ``shape``: (B, T)."""
 
     views: np.ndarray
     edges: np.ndarray
@@ -42,7 +40,7 @@ class Plan:
     def of(cls, gaussians, cameras, settings, near, far) -> "Plan":
         counts, views_each = np.array(gaussians.splits, dtype=np.int64), cameras.shape[1]
         firsts = np.cumsum(counts) - counts
-        # Each view has whole vectors of splats, so that two threads never write to the same vector.
+        # Each view has whole vectors of splats, so two threads never write to the same vector.
         sizes = np.repeat(-(-counts // simd.DOUBLES) * simd.DOUBLES, views_each)
         views, edges = _view_rows(cameras, settings), _part_edges(firsts, counts)
         shifts = np.cumsum(sizes) - sizes - np.repeat(firsts, views_each)
@@ -61,7 +59,7 @@ class Plan:
 
     @property
     def parts(self) -> list[tuple[int, int, int, int, slice]]:
-        """Each part as (batch element, part, first Gaussian, last Gaussian, views of the element)."""
+        """Parts as (batch element, part, first Gaussian, last Gaussian, views of the element)."""
         views = self.shape[1]
         return [
             (b, p, int(edges[p]), int(edges[p + 1]), slice(b * views, (b + 1) * views))
@@ -72,7 +70,7 @@ class Plan:
 
 
 def _part_edges(firsts: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Where the parts of each element begin and end [B, P + 1]; all but the last are whole vectors."""
+    """Ends [B, P + 1] of the parts of each element; all parts but the last are whole vectors."""
     threads, total = torch.get_num_threads(), int(counts.sum())
     parts = 1 if threads == 1 else max(1, min(-(-2 * threads // max(1, len(counts))), total // pool.GRAIN))
     steps = -(-counts // (parts * simd.DOUBLES)) * simd.DOUBLES
@@ -96,22 +94,19 @@ def _view_rows(cameras: Cameras, settings: RasterSettings) -> np.ndarray:
     return rows
 
 
-# Runs of tiles for each thread: with several short runs, no thread waits long for the last one.
+# Runs of tiles per thread: with several short ones, no thread waits long for the last one.
 _RUNS = 8
-# The kernels are compiled once for this number of channels and once for all others.
+# Kernels are compiled for this number of channels, and once for all others.
 _COLORS = 3
-# Bytes of the lists of tiles and their gradients: splats that fill the frame are in every one of its tiles.
+# Limit of the lists of tiles and their gradients in bytes: a splat that fills the frame is in all its tiles.
 _MEMORY = 1 << 32
 
 
 def rasterize(
     gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Rendering:
-    """Gaussians on black, in float32; see :func:`ghgs_lit.rendering.render`.
-
-    Differentiable in the Gaussians, not in the cameras. The result has the same bits with any number of
-    threads.
-    """
+    """Render on black in float32; see :func:`ghgs_lit.rendering.render`. Differentiable in the Gaussians, not
+    in the cameras. The result has the same bits with any number of threads."""
     fields = (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.colors)
     plan = Plan.of(gaussians, cameras, settings, near, far)
     return Rendering(*_Rasterize.apply(*(field.float().contiguous() for field in fields), plan))
@@ -119,7 +114,7 @@ def rasterize(
 
 @dataclass
 class _Splats:
-    """Splats of all views and entries of all tiles; see ``layout``."""
+    """Splats of all views, and entries of all tiles; see ``layout``."""
 
     records: np.ndarray
     boxes: np.ndarray
@@ -131,8 +126,8 @@ class _Splats:
 
 
 def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differentiable: bool) -> _Splats:
-    """Project all Gaussians into their views and list the splats of each tile. InputError: the lists, with
-    their gradients where they are needed, would exceed :data:`_MEMORY`."""
+    """Project all Gaussians into their views and list the splats of each tile. InputError: the lists and, if
+    ``differentiable``, their gradients would exceed :data:`_MEMORY`."""
     settings, (tiles_x, tiles_y), total = plan.settings, plan.tiles, plan.splats
     (elements, views), parts = plan.shape, plan.parts
     records = simd.aligned_floats(total * layout.RECORD).reshape(total, layout.RECORD)
@@ -173,7 +168,7 @@ def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differen
 
 
 def _tile_runs(tile_starts: np.ndarray) -> list[np.ndarray]:
-    """Tiles that have entries, divided into runs of about equal work."""
+    """Tiles with entries, in runs of about equal work."""
     counts = np.diff(tile_starts)
     tiles = np.flatnonzero(counts)
     threads = torch.get_num_threads()
@@ -236,12 +231,12 @@ class _Rasterize(torch.autograd.Function):
 
 
 _kept = threading.local()
-# Floats of scratch memory that a thread may keep: allocating it again takes longer than filling it.
+# Floats of scratch memory that a thread may keep: allocating them takes longer than filling them.
 _KEEP = 1 << 24
 
 
 def _scratch(count: int) -> np.ndarray:
-    """Aligned floats that the caller may use until this thread calls this function again."""
+    """Aligned floats, valid until this thread calls this function again."""
     buffer = getattr(_kept, "buffer", None)
     if buffer is None or len(buffer) < count:
         buffer = simd.aligned_floats(count + count // 4)
@@ -250,17 +245,16 @@ def _scratch(count: int) -> np.ndarray:
 
 
 def _zeros(*shape: int) -> Tensor:
-    """Zeros by NumPy, which takes memory zeroed by the system; PyTorch would start threads to write them."""
+    """Zeros by NumPy, in memory that the system has zeroed; PyTorch would start threads to write them."""
     return torch.from_numpy(np.zeros(shape, np.float32))
 
 
 def _flat(tensor: Tensor | None) -> np.ndarray:
-    """All values of an image as a flat array; an empty array where there is no image."""
     if tensor is None:
         return np.empty(0, np.float32)
     return tensor.detach().float().contiguous().flatten().numpy()
 
 
 def _channels(count: int):
-    """The number of channels for a kernel; as a tuple of that length, the kernel is compiled for it."""
+    """The number of channels for a kernel; as a tuple of that length, it is a constant of the compiler."""
     return (0,) * count if count == _COLORS else count

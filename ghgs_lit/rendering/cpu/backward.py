@@ -1,10 +1,9 @@
-"""From gradients of pixels to gradients of splats, one tile at a time.
+"""Gradients of splats from gradients of pixels, one tile at a time.
 
 The backward pass repeats the forward pass front to back. Let ``v_i`` be the product of the pixel's gradient
 with splat ``i``'s colour, depth and 1, and ``S`` the sum of ``w_j v_j`` over the splats behind it. Then
-``dL/d alpha_i = T_i v_i - S / (1 - alpha_i)``. ``S`` starts as the sum over all splats of the pixel and
-shrinks: one number per pixel.
-"""
+``dL/d alpha_i = T_i v_i - S / (1 - alpha_i)``. ``S``, one number per pixel, starts as the sum over all
+splats."""
 
 import numpy as np
 
@@ -19,7 +18,7 @@ _AHEAD = 8
 
 @helper
 def _read(image, first, width, rows, columns, block):
-    """One block of a tile whose first pixel is ``image[first]``; zero outside ``rows`` x ``columns``."""
+    """A block of a tile whose first pixel is ``image[first]``; 0 outside ``rows`` x ``columns``."""
     y, x = block // 4 * 4, block % 4 * 4
     if y + 4 <= rows and x + 4 <= columns:
         return tables.load_block(image, first + y * width + x, width)
@@ -36,10 +35,8 @@ def _read_gradients(
     upstream, suffix,
 ):  # fmt: skip
     """Fill ``upstream`` with the gradients of a tile's planes and ``suffix`` with ``S`` of all splats.
-
     Gradients of alpha and depth may be missing (size 0). With depth = D / A, ``dL/dD = g / A`` and
-    ``dL/dA = -g depth / A``, so the parts of D and A in ``S`` cancel.
-    """
+    ``dL/dA = -g depth / A``, so the parts of D and A in ``S`` cancel."""
     channels, start = simd.length(count), view * height * width + first
     for block in range(BLOCKS):
         at = block * LANES
@@ -115,10 +112,8 @@ def backward(
     some_tiles, tiles_x, tiles_y, height, width, views, tile_starts, entries, shifts, records, colors, count,
     alpha_max, stop, drawn, image, alpha, depth, d_image, d_alpha, d_depth, gradients,
 ):  # fmt: skip
-    """Write gradients of the drawn entries of the given tiles to ``gradients`` [slots x gradient_width].
-
-    ``gradients`` is flat and starts on a cache line; images and their gradients are flat as in ``forward``.
-    """
+    """Write gradients of the drawn entries of tiles to ``gradients`` [slots x gradient_width], which is flat
+    and starts on a cache line; images and their gradients are flat as in ``forward``."""
     channels = simd.length(count)
     transmittance, suffix = simd.aligned(layout.PIXELS), simd.aligned(layout.PIXELS)
     upstream = simd.aligned((channels + 2) * layout.PIXELS)

@@ -1,9 +1,6 @@
-"""From splats to pixels, one tile at a time, front to back.
-
-Before, each part of the Gaussians lists its splats in their tiles in the order of their index; then each tile
-sorts its own list by depth with a stable sort. So the order does not depend on the number of parts or
-threads, and no sort is larger than a tile.
-"""
+"""Drawing of splats, one tile at a time, front to back. First each part of the Gaussians lists its splats in
+their tiles by index; then each tile sorts its list by depth with a stable sort. So the order does not depend
+on the number of parts or threads, and no sort is larger than a tile."""
 
 import numpy as np
 
@@ -14,17 +11,15 @@ from ghgs_lit.rendering.cpu.tiles import BLOCKS, LANES, LEAST_ALPHA, ZERO
 
 _DIGIT = 8
 _BUCKETS = 1 << _DIGIT
-# For this many keys or fewer, insertion sort is faster than radix sort.
+# Up to this many keys, insertion sort is faster than radix sort.
 _FEW = 24
 
 
 @kernel
 def scatter(first, last, shifts, depths, boxes, tiles_x, slot, entry_starts, next_free, entries):
-    """List the splats of Gaussians ``first`` to ``last`` in every tile that they touch.
-
-    ``next_free`` [T, tiles] is the place of this part's next entry in each tile; the slots of the part begin
-    at ``slot``, and ``entry_starts`` receives the first slot of every visible splat.
-    """
+    """List the splats of Gaussians ``first`` to ``last`` in every tile that they touch. ``next_free``
+    [T, tiles]: place of the part's next entry in each tile. ``slot``: first slot of the part.
+    ``entry_starts`` gets the first slot of every splat."""
     keys = depths.view(np.int32)
     for t in range(len(shifts)):
         for m in range(first + shifts[t], last + shifts[t]):
@@ -51,7 +46,7 @@ def _insertion_sort(keys, count):
 
 @helper
 def _radix_pass(keys, new_keys, count, shift, places):
-    """Sort by one digit of the keys, stably, to ``new_keys``."""
+    """Sort stably by one digit of the keys, to ``new_keys``."""
     places[:] = 0
     for i in range(count):
         places[(keys[i] >> shift) & (_BUCKETS - 1)] += 1
@@ -68,11 +63,8 @@ def _radix_pass(keys, new_keys, count, shift, places):
 
 @helper
 def depth_order(entries, start, end, keys, spare, places):
-    """The entries of one tile sorted by depth, ties in their present order.
-
-    Returns keys whose lower halves are rows of ``entries``. The bits of positive floats sort like integers;
-    relative to the smallest of a tile, only a few low digits differ.
-    """
+    """The entries of a tile sorted stably by depth, as keys whose lower halves are rows of ``entries``. Bits
+    of positive floats sort like integers; relative to a tile's smallest, only a few low digits differ."""
     count, least, most = end - start, entries[start, layout.KEY], entries[start, layout.KEY]
     for i in range(start, end):
         least, most = min(least, entries[i, layout.KEY]), max(most, entries[i, layout.KEY])
@@ -89,7 +81,7 @@ def depth_order(entries, start, end, keys, spare, places):
     return keys[:count]
 
 
-# Entries that are drawn into all blocks before the next entries are read: the bits of an integer.
+# Entries that are drawn into all blocks before the next ones are read: the bits of an integer.
 _CHUNK = 64
 # Places of depth and colours in a gathered row, after the values of ``tiles.read_splat``.
 _DEPTH, _COLOR = 7, 8
@@ -97,12 +89,9 @@ _DEPTH, _COLOR = 7, 8
 
 @helper
 def _touches(numbers, slope_x, slope_y, block):
-    """Which of 16 splats have an ellipse that meets a block, as bits.
-
-    The smallest p^2 + q^2 over a box lies on the column or on the row of the box that is nearest to the
-    splat's centre, at the minimum along that column or row. The comparison is slightly more generous than
-    the cutoff, since it only saves work.
-    """
+    """Which of 16 splats have an ellipse that meets a block, as bits. The smallest p^2 + q^2 over a box lies
+    on its column or row nearest to the splat's centre, at the minimum along it. The comparison is slightly
+    generous, since it only saves work."""
     side = np.float32(layout.BLOCK - 1)
     left, top = numbers[0] + np.float32(block % 4 * 4), numbers[1] + np.float32(block // 4 * 4)
     right, bottom = left + side, top + side
@@ -118,7 +107,7 @@ def _touches(numbers, slope_x, slope_y, block):
 
 @helper
 def _fetch(order, i, entries, shift, records, colors, splats):
-    """The splats of a chunk, the last one repeated to whole vectors; prefetches the next chunk's records."""
+    """Write the splats of a chunk, filled up with the last one; prefetch the records of the next chunk."""
     for k in range(_CHUNK):
         splats[k] = entries[order[min(i + k, len(order) - 1)] & 0xFFFFFFFF, layout.SPLAT]
         if i + k + _CHUNK < len(order):
@@ -128,10 +117,8 @@ def _fetch(order, i, entries, shift, records, colors, splats):
 
 @helper
 def _list_chunk(splats, count, shift, records, colors, x0, y0, live, rows, todo):
-    """Gather ``count`` splats to ``rows``; ``todo`` gets the splats that touch each block, as bits.
-
-    ``rows`` holds ``_CHUNK`` numbers for each value of ``tiles.read_splat``, the depth, and each channel.
-    """
+    """Gather ``count`` splats to ``rows``, and write the splats that touch each block, as bits, to ``todo``.
+    ``rows`` has ``_CHUNK`` numbers for each value of ``tiles.read_splat``, the depth, and each channel."""
     todo[:] = 0
     for i in range(0, count, LANES):
         record = tables.gather_lines(records, splats, i)
@@ -166,7 +153,7 @@ def _add(planes, position, value):
 
 @helper
 def _draw_block(block, todo, rows, count, pixels, planes, transmittance, alpha_max, stop, hits):
-    """Blend the splats ``todo`` (bits) into one block, front to back; returns whether light still passes."""
+    """Blend the splats ``todo`` (bits) into a block, front to back; returns whether light still passes."""
     at, bit = block * LANES, np.int32(1) << block
     x, y = memory.load(pixels, at), memory.load(pixels, layout.PIXELS + at)
     before = memory.load(transmittance, at)
@@ -183,7 +170,7 @@ def _draw_block(block, todo, rows, count, pixels, planes, transmittance, alpha_m
             hits[i] |= bit
         weight = simd.select(seen, before * alpha, ZERO)
         for c in range(simd.length(count)):
-            # Selected after the product: zero times a colour that is not finite would be NaN.
+            # Selected after the product: 0 times a colour that is not finite would be NaN.
             color = simd.select(seen, weight * rows[(_COLOR + c) * _CHUNK + i], ZERO)
             _add(planes, c * layout.PIXELS + at, color)
         _add(planes, simd.length(count) * layout.PIXELS + at, weight * rows[_DEPTH * _CHUNK + i])
@@ -197,7 +184,7 @@ def _draw_block(block, todo, rows, count, pixels, planes, transmittance, alpha_m
 
 @helper
 def _write(image, first, width, rows, columns, block, value):
-    """Write the ``rows`` x ``columns`` part of one block of a tile whose first pixel is ``image[first]``."""
+    """Write the part of a block inside ``rows`` x ``columns`` of a tile that starts at ``image[first]``."""
     y, x = block // 4 * 4, block % 4 * 4
     if y + 4 <= rows and x + 4 <= columns:
         tables.store_block(image, first + y * width + x, width, value)
@@ -228,12 +215,9 @@ def forward(
     some_tiles, tiles_x, tiles_y, height, width, views, tile_starts, entries, shifts, records, colors, count,
     alpha_max, stop, drawn, reached, image, alpha, depth,
 ):  # fmt: skip
-    """Draw the given tiles to flat ``image`` [V C h w], ``alpha`` and (expected) ``depth`` [V h w].
-
-    For the backward pass (see ``layout``) it writes the drawn entries to ``entries``, their number in each
-    tile to ``drawn``, and marks their slots in ``reached``. ``count`` is the number of channels, or a tuple
-    of that length, for which the kernel is then compiled.
-    """
+    """Draw tiles to flat ``image`` [V C h w], ``alpha`` and expected ``depth`` [V h w]. For the backward pass
+    (see ``layout``) the drawn entries are written to ``entries``, their number in each tile to ``drawn``, and
+    their slots are marked in ``reached``. ``count``: number of channels, or a tuple of that length."""
     channels, longest = simd.length(count), 1
     for tile in some_tiles:
         longest = max(longest, tile_starts[tile + 1] - tile_starts[tile])

@@ -1,8 +1,6 @@
-"""Geometry of eight splats at once in doubles, used by the projection and its gradient.
-
-Points and vectors are tuples of vectors of eight doubles; matrices are such tuples, row by row. Doubles
-cost little (they are used once per splat, not per pixel), and with them no finite float32 input overflows.
-"""
+"""Geometry of eight splats at once in doubles, for the projection and its gradient. Points, vectors and
+matrices (row by row) are tuples of vectors of eight doubles. Doubles cost little, as they are used once per
+splat, not per pixel, and with them no finite float32 input overflows."""
 
 import math
 
@@ -17,7 +15,7 @@ K_SCALE = math.sqrt(0.5 * TO_LOG2)
 
 @helper
 def unit(quaternions):
-    """Unit quaternions and 1 / norm; for the zero quaternion the identity and 0."""
+    """Unit quaternions, and 1 / norm; the identity and 0 for the zero quaternion."""
     w, x, y, z = quaternions
     norm = simd.sqrt(w * w + x * x + (y * y + z * z))
     is_zero = norm == 0.0
@@ -67,7 +65,7 @@ def camera_points(view, mean):
 
 @helper
 def clamped(view, x, y):
-    """x / z and y / z clamped to the frame and its margin, where the Jacobian is evaluated."""
+    """x / z and y / z clamped to the frame and its margin, for the Jacobian."""
     x = simd.minimum(simd.maximum(x, view[layout.X_LOW]), view[layout.X_HIGH])
     y = simd.minimum(simd.maximum(y, view[layout.Y_LOW]), view[layout.Y_HIGH])
     return x, y
@@ -75,7 +73,7 @@ def clamped(view, x, y):
 
 @helper
 def affine(view, x, y, inverse):
-    """``J W``, 2 x 3: the local affine map of the projection, for clamped ``x`` and ``y``."""
+    """``J W``, 2 x 3, the local affine map of the projection, at clamped ``x`` and ``y``."""
     fx, fy, r = view[layout.FX] * inverse, view[layout.FY] * inverse, layout.ROTATION
     a, b, c = view[r + 6], view[r + 7], view[r + 8]
     return (
@@ -105,7 +103,7 @@ def normal(m):
 
 @helper
 def determinants(m, n, low_pass):
-    """``det(M M^T)``, the same after the low-pass filter, and the diagonal of ``M M^T``."""
+    """``det(M M^T)`` before and after the low-pass filter, and the diagonal of ``M M^T``."""
     bare = dot(n[0], n[1], n[2], n[0], n[1], n[2])
     xx, yy = dot(m[0], m[1], m[2], m[0], m[1], m[2]), dot(m[3], m[4], m[5], m[3], m[4], m[5])
     return bare, bare + low_pass * (xx + yy) + low_pass * low_pass, xx, yy

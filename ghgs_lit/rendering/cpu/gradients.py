@@ -1,7 +1,5 @@
-"""From gradients of entries to gradients of Gaussians: the derivative of the projection, eight at a time.
-
-Sums are added in a fixed order (entries of a splat, then views), so results do not depend on threads.
-"""
+"""Gradients of Gaussians from gradients of entries: the derivative of the projection, eight at a time. Sums
+have a fixed order (entries of a splat, then views), so results do not depend on threads."""
 
 import numpy as np
 
@@ -10,17 +8,17 @@ from ghgs_lit.kernels.compile import helper, kernel
 from ghgs_lit.rendering.cpu import geometry, layout, tables
 
 _WIDE = simd.DOUBLES
-# Rows of 8 doubles for each Gaussian: gradients of its mean, of R S, and of its opacity.
+# Rows of 8 doubles: gradients of the mean, of R S, and of the opacity.
 _MEAN, _ROOT, _OPACITY = 0, 3, 12
 _SUMS = 13
 
-# Each K, and so each whitened coordinate in a moment, contains a factor K_SCALE.
+# Each K, and so each whitened coordinate, contains a factor K_SCALE.
 _FIRST_MOMENT, _SECOND_MOMENT = geometry.K_SCALE**-2, geometry.K_SCALE**-4
 
 
 @helper
 def _gather_splats(m, boxes, entry_starts, reached, gradients, width, lines):
-    """Sum the entries of splats ``m`` to ``m + 8`` to rows of ``lines``; returns the drawn ones, as bits."""
+    """Sum the entries of splats ``m`` to ``m + 8`` into ``lines``; returns the drawn splats, as bits."""
     drawn = 0
     for lane in range(_WIDE):
         s = m + lane
@@ -41,11 +39,9 @@ def _gather_splats(m, boxes, entry_starts, reached, gradients, width, lines):
 
 @helper
 def _footprint_gradient(moments, record, m, low_pass, antialiased):
-    """``dL/dM`` (2 x 3) and ``dL/d opacity``.
-
-    The covariance's gradient is ``G = L^-T H L^-1 / 2`` with the whitened second moments H, and
-    ``dL/dM = 2 G M``. With anti-aliasing, opacity also contains ``(det before / det after)^(1/2)``.
-    """
+    """``dL/dM`` (2 x 3) and ``dL/d opacity``. The covariance's gradient is ``G = L^-T H L^-1 / 2`` with the
+    whitened second moments H, and ``dL/dM = 2 G M``. With anti-aliasing, opacity also contains
+    ``(det before / det after)^(1/2)``."""
     k_xx, k_yx, k_yy = record[layout.K_XX], record[layout.K_YX], record[layout.K_YY]
     pp, pq = _SECOND_MOMENT * moments[layout.H_PP], _SECOND_MOMENT * moments[layout.H_PQ]
     qq = _SECOND_MOMENT * moments[layout.H_QQ]
@@ -76,10 +72,8 @@ def _footprint_gradient(moments, record, m, low_pass, antialiased):
 
 @helper
 def _point_gradient(view, x, y, clamped_x, clamped_y, inverse, d_u, d_v, d_z, d_t):
-    """``dL/d point`` in camera axes, from the gradients of the centre, the depth and ``J W`` (2 x 3).
-
-    ``x`` and ``y`` are x / z and y / z of the point.
-    """
+    """``dL/d point`` in camera axes, from the gradients of the centre, the depth and ``J W`` (2 x 3); ``x``
+    and ``y`` are x / z and y / z of the point."""
     r, fx, fy = layout.ROTATION, view[layout.FX] * inverse, view[layout.FY] * inverse
     # J_xx = fx and J_xz = -fx clamped_x; dL/dJ = dL/d(J W) W^T.
     d_xz = geometry.dot(view[r + 6], view[r + 7], view[r + 8], d_t[0], d_t[1], d_t[2])
@@ -94,7 +88,7 @@ def _point_gradient(view, x, y, clamped_x, clamped_y, inverse, d_u, d_v, d_z, d_
 
 @helper
 def _add(sums, k, drawn, value):
-    """Add to a row in the drawn lanes only; other lanes may hold values that are not finite."""
+    """Add to a row in the drawn lanes only; values in others may not be finite."""
     old = memory.load(sums, k * _WIDE)
     memory.store(sums, k * _WIDE, simd.select(drawn, old + value, old))
 
@@ -144,7 +138,7 @@ def _root_rows(sums):
 
 @helper
 def _quaternion_gradient(w, x, y, z, inverse, d):
-    """Gradient of quaternions from that of their rotation matrices; it is orthogonal to the quaternion."""
+    """Gradient of quaternions from that of their rotation matrices, orthogonal to the quaternions."""
     d_w = 2.0 * (x * (d[7] - d[5]) + y * (d[2] - d[6]) + z * (d[3] - d[1]))
     d_x = 2.0 * (y * (d[1] + d[3]) + z * (d[2] + d[6]) + w * (d[7] - d[5]) - 2.0 * x * (d[4] + d[8]))
     d_y = 2.0 * (x * (d[1] + d[3]) + z * (d[5] + d[7]) + w * (d[2] - d[6]) - 2.0 * y * (d[0] + d[8]))

@@ -1,40 +1,39 @@
-"""The layout of the arrays that the kernels share.
+"""Layout of the arrays that the kernels share.
 
 A *splat* is one Gaussian seen by one camera: splat ``m`` of view ``v`` is Gaussian ``m - shift[v]``; the
 splats of a view start at a multiple of eight. Its record is 16 floats. With ``Sigma = L L^T`` its 2D
 covariance (low-pass included) and ``d`` the vector from its centre to a pixel's centre, the exponent of the
-Gaussian is ``-(p^2 + q^2) ln 2`` where ``p = K_XX dx`` and ``q = K_YX dx + K_YY dy``: a sum of squares,
-which loses no digits and is never negative.
-"""
+Gaussian is ``-(p^2 + q^2) ln 2`` where ``p = K_XX dx`` and ``q = K_YX dx + K_YY dy``: a sum of squares, which
+loses no digits and is never negative."""
 
 from ghgs_lit.kernels.compile import helper
 
 RECORD = 16
-# Centre: the pixel, and 0.5 minus the fraction, so that distances near the centre keep all their digits.
+# Centre: the pixel, and 0.5 minus the fraction, so that small distances from it keep all their digits.
 COLUMN, ROW, REST_X, REST_Y = 0, 1, 2, 3
 K_XX, K_YX, K_YY = 4, 5, 6
 OPACITY, CUTOFF, DEPTH = 7, 8, 9
 # Along a column of pixels p^2 + q^2 is smallest at dy = SLOPE_Y dx, along a row at dx = SLOPE_X dy.
 SLOPE_X, SLOPE_Y = 10, 11
-# The colour follows if it has at most ROOM channels.
+# Colours with at most ROOM channels follow.
 COLORS, ROOM = 12, 4
 
 TILE = 16
 BLOCK = 4
 PIXELS = TILE * TILE
 
-# The box of tiles that a splat touches; empty where the camera does not see it.
+# The box of tiles that a splat touches; empty if the camera does not see it.
 X0, X1, Y0, Y1 = 0, 1, 2, 3
 
-# An entry is one splat in one tile, a row of integers: the bits of its depth, the splat, the slot of its
-# gradients (the slots of one splat are neighbours). After a tile is drawn, its visible splats come first,
-# front to back, with the blocks that each of them reaches instead of the depth.
+# An entry is a splat in a tile, a row of integers: the bits of its depth, the splat, the slot of its
+# gradients (the slots of a splat are contiguous). After a tile is drawn, its visible splats come first, front
+# to back, with the blocks that each reaches in place of the depth.
 KEY, SPLAT, SLOT = 0, 1, 2
 BLOCKS = KEY
 ENTRY = 4
 
-# The gradients of an entry, with ``h = dL / d ln(alpha)`` summed over pixels: the moments of h in
-# whitened coordinates, the gradient of the depth, then from COLOR on those of the colours.
+# Gradients of an entry, with ``h = dL / d ln(alpha)`` and sums over pixels: moments of h in whitened
+# coordinates, the gradient of the depth, then from COLOR on those of the colours.
 H, H_P, H_Q, H_PP, H_PQ, H_QQ, D_DEPTH = 0, 1, 2, 3, 4, 5, 6
 COLOR = 7
 
@@ -47,7 +46,7 @@ VIEW = 24
 
 
 def gradient_width(channels: int) -> int:
-    """Floats of an entry's gradients: COLOR and the channels, in whole vectors."""
+    """Floats of an entry's gradients, in whole vectors."""
     return -(-(COLOR + channels) // 16) * 16
 
 

@@ -1,4 +1,4 @@
-"""Gaussians to splats: perspective projection of means and covariances, eight at a time, in doubles."""
+"""Perspective projection of Gaussians to splats, eight at a time, in doubles."""
 
 import numpy as np
 
@@ -7,13 +7,13 @@ from ghgs_lit.kernels.compile import helper, kernel
 from ghgs_lit.rendering.cpu import geometry, layout, tables
 
 _WIDE = simd.DOUBLES
-# Splats farther away, in pixels, are not seen; up to here float32 does not overflow.
+# Splats farther away, in pixels, are not drawn; up to here float32 does not overflow.
 _FAR = 1e30
 
 
 @helper
 def _extents(view, u, v, a, c, cutoff):
-    """First and last pixels of the image, across and down, whose centres lie in the boxes around splats."""
+    """First and last pixels, across and down, whose centres lie in the bounding boxes of splats."""
     reach = (2.0 / geometry.TO_LOG2) * cutoff
     half_width = simd.minimum(simd.sqrt(reach * a), _FAR)
     half_height = simd.minimum(simd.sqrt(reach * c), _FAR)
@@ -74,10 +74,7 @@ def project(
     alpha_min, antialiased, tiles_x, records, depths, boxes, tile_counts,
 ):  # fmt: skip
     """Project Gaussians ``first`` to ``last`` into all ``views`` [T]; returns the number of their entries.
-
-    Gaussian ``n`` is splat ``n + shifts[t]`` of view ``t``. Fills ``records``, ``depths`` and ``boxes``;
-    adds to ``tile_counts`` [T, tiles].
-    """
+    Fills ``records``, ``depths`` and ``boxes``; adds to ``tile_counts`` [T, tiles]."""
     entries = 0
     for n in range(first, last, _WIDE):
         mean, quaternion = tables.columns3(means, n, last), tables.columns4(quaternions, n, last)

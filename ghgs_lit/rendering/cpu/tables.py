@@ -1,4 +1,4 @@
-"""Loading and storing vectors: 4 x 4 blocks of an image, columns of a table, transposed rows."""
+"""Loads and stores of vectors: 4 x 4 blocks of an image, columns of a table, transposed rows."""
 
 from llvmlite import ir
 from numba.core import cgutils, types
@@ -25,7 +25,7 @@ def _block_rows(context, builder, array_type, array, index, stride, index_type):
 
 @intrinsic
 def load_block(typing_context, array, index, stride):
-    """The 4 x 4 pixels of a flat image from ``index`` on; rows of the image are ``stride`` floats apart."""
+    """The 4 x 4 pixels of a flat image from ``index`` on; image rows are ``stride`` floats apart."""
 
     def emit(context, builder, sig, args):
         rows = _block_rows(context, builder, array, *args, index)
@@ -50,7 +50,7 @@ def store_block(typing_context, array, index, stride, value):
 
 
 def _fold(builder, first, second, width):
-    """One vector with the sums of the two halves of every group of ``width`` lanes of two vectors."""
+    """A vector with the sums of the two halves of every group of ``width`` lanes of two vectors."""
     low = [i for i in range(2 * LANES) if i % width < width // 2]
     high = [i + width // 2 for i in low]
     return builder.fadd(
@@ -61,10 +61,8 @@ def _fold(builder, first, second, width):
 
 @intrinsic
 def row_sums(typing_context, array, index, count):
-    """Sums of the 16 rows of 16 floats from ``index`` on, row ``k`` in lane ``k``, in a fixed order.
-
-    Where ``count`` is a tuple, rows from ``COLOR + len(count)`` on count as zero.
-    """
+    """Sums of 16 rows of 16 floats from ``index`` on, row ``k`` in lane ``k``, in a fixed order; with a tuple
+    ``count``, rows from ``COLOR + len(count)`` on count as 0."""
     used = layout.COLOR + len(count) if isinstance(count, types.BaseTuple) else LANES
 
     def emit(context, builder, sig, args):
@@ -92,7 +90,7 @@ def _flat_rows(context, builder, array_type, args, index_type, count, kind):
 
 
 def _masked(builder, name: str, kind, rows, count: int, *args):
-    """Load or store a vector of eight rows of ``count`` floats, but only the first ``rows`` of them."""
+    """Load or store the first ``rows`` of a vector of eight rows of ``count`` floats."""
     wide, lanes = ir.VectorType(I64, kind.count), range(kind.count)
     limit = everywhere(builder, rows, kind.count)
     mask = builder.icmp_signed("<", ir.Constant(wide, [lane // count for lane in lanes]), limit)
@@ -112,10 +110,8 @@ def _make_columns(count: int):
 
     @intrinsic
     def columns(typing_context, array, row, last):
-        """Rows ``row`` to ``row + 8`` of a float32 table as doubles: one vector for each column.
-
-        Lanes from row ``last`` on are zero.
-        """
+        """Rows ``row`` to ``row + 8`` of a float32 table, a vector of doubles per column; 0 from ``last``
+        on."""
 
         def emit(context, builder, sig, args):
             address = _flat_rows(context, builder, array, args, row, count, kind)
@@ -130,10 +126,8 @@ def _make_columns(count: int):
 
     @intrinsic
     def store_columns(typing_context, array, row, last, values):
-        """Write one vector of doubles for each column to rows ``row`` to ``row + 8`` of a float32 table.
-
-        Rows from ``last`` on are not written.
-        """
+        """Write a vector of doubles per column to rows ``row`` to ``row + 8``, if before ``last``, of a
+        table."""
 
         def emit(context, builder, sig, args):
             columns = cgutils.unpack_tuple(builder, args[3], count)
@@ -153,7 +147,7 @@ def _make_columns(count: int):
 
 
 def _interleave(builder, columns: list):
-    """One long vector: the first lanes of all (eight-lane) columns, then their second lanes, and so on."""
+    """A long vector with the first lanes of all (eight-lane) columns, then their second lanes, and so on."""
     lines = columns[0]
     for column in columns[1:]:
         # A shuffle needs two vectors of the same length.
@@ -215,7 +209,7 @@ def gather_lines(typing_context, array, rows, index):
 
 @intrinsic
 def store_lines(typing_context, array, row, values):
-    """Write up to 16 vectors of doubles as the columns of rows ``row`` to ``row + 8`` of 16 floats each."""
+    """Write up to 16 vectors of doubles as columns of the rows ``row`` to ``row + 8`` of 16 floats."""
 
     def emit(context, builder, sig, args):
         columns = [builder.fptrunc(c, _FLOAT8) for c in cgutils.unpack_tuple(builder, args[2], values.count)]
@@ -235,7 +229,7 @@ def store_lines(typing_context, array, row, values):
 
 @intrinsic
 def load_lines(typing_context, array, row, stride):
-    """The first 16 floats of eight rows of ``stride`` floats, from ``row`` on: 16 vectors of doubles."""
+    """The first 16 floats of eight rows of ``stride`` floats from ``row`` on, as 16 vectors of doubles."""
 
     def emit(context, builder, sig, args):
         position = builder.mul(args[1], args[2])

@@ -1,10 +1,6 @@
-"""Parts of drawing a tile that the forward and the backward pass share.
-
-A tile is 16 x 16 pixels in 16 blocks of 4 x 4; a block is one vector. Most splats are small (there is one for
-each input pixel), and a small splat fits into a 4 x 4 block better than into a row of 16.
-
-The planes of a tile are its colour channels, then the sum of ``w z``, then the sum of ``w``.
-"""
+"""Parts of drawing a tile that the forward and the backward pass share. A tile is 16 x 16 pixels in 16 blocks
+of 4 x 4; a block is one vector. Most splats are small (one for each input pixel) and fit a 4 x 4 block better
+than a row of 16. The planes of a tile are its colour channels, the sum of ``w z`` and the sum of ``w``."""
 
 import numpy as np
 
@@ -21,7 +17,7 @@ LEAST_ALPHA = np.float32(1e-10)
 
 @helper
 def grid():
-    """Columns, then rows, of a tile's pixels, block by block."""
+    """Columns, then rows of a tile's pixels, block by block."""
     pixels = simd.aligned(2 * layout.PIXELS)
     for pixel in range(layout.PIXELS):
         block, lane = pixel // LANES, pixel % LANES
@@ -32,7 +28,7 @@ def grid():
 
 @helper
 def place(tile, tiles_x, tiles_y, height, width):
-    """View of a tile, its first column and row, its rows and columns inside the image, its first pixel."""
+    """View, first column and row, rows and columns in the image, and index of the first pixel of a tile."""
     view, inner = tile // (tiles_x * tiles_y), tile % (tiles_x * tiles_y)
     y0, x0 = inner // tiles_x * layout.TILE, inner % tiles_x * layout.TILE
     rows, columns = min(layout.TILE, height - y0), min(layout.TILE, width - x0)
@@ -41,7 +37,7 @@ def place(tile, tiles_x, tiles_y, height, width):
 
 @helper
 def open_pixels(view, x0, y0, pixels, transmittance):
-    """Set the transmittance to 1 in the pixels of a tile that are drawn, else to 0; returns their blocks."""
+    """Set the transmittance to 1 in pixels that are drawn, else to 0; returns their blocks, as bits."""
     live = 0
     left = simd.full(np.float32(view[layout.LEFT] - x0))
     right = simd.full(np.float32(view[layout.RIGHT] - x0))
@@ -77,7 +73,7 @@ def color(records, s, colors, n, c, count):
 
 @helper
 def prefetch(records, s, colors, n):
-    """Prefetch splat ``s``, which is Gaussian ``n``: the splats of a tile may lie anywhere in memory."""
+    """Prefetch splat ``s``, which is Gaussian ``n``: splats of a tile may lie anywhere in memory."""
     memory.prefetch(records, s * layout.RECORD)
     if colors.shape[1] > layout.ROOM:
         memory.prefetch(colors, n * colors.shape[1])
@@ -91,16 +87,15 @@ def whiten(numbers, dx, dy):
 
 @helper
 def blend(numbers, p, q, before, alpha_max, stop):
-    """One splat over one block of pixels with transmittance ``before``.
+    """Blend a splat over a block of pixels with transmittance ``before``.
 
-    Returns the unclamped and the clamped alpha; the lanes that the splat reaches, those where it is seen and
-    those that stay open; and the transmittance behind it. Where that would fall to ``stop``, the splat is
-    left out and the transmittance becomes 0, which also excludes all splats behind. Vectors are stored
-    whole, with zeros in masked lanes: a masked store could not be forwarded to the next splat's load.
-    """
+    Returns the unclamped and the clamped alpha; the lanes that the splat reaches, where it is seen, and that
+    stay open; and the transmittance behind it. Where that would fall to ``stop``, the splat is left out and
+    the transmittance becomes 0, which excludes all splats behind. Masked lanes hold zeros, so that vectors
+    are stored whole: a masked store could not be forwarded to the next splat's load."""
     squared = simd.fma(p, p, q * q)
     reached = squared <= numbers[6]
-    # Lanes out of reach are clamped to the cutoff, since denormal numbers there would be slow.
+    # Lanes out of reach are clamped to the cutoff: denormal numbers would be slow.
     raw = numbers[5] * simd.exp2_minus(simd.minimum(squared, numbers[6]))
     alpha = simd.select(reached, simd.minimum(raw, alpha_max), ZERO)
     behind = before - before * alpha

@@ -1,4 +1,4 @@
-"""Rounds for CPUs: all that is done with a few Gaussians, then with the next."""
+"""Rounds for CPUs: all steps for a few Gaussians at a time."""
 
 from functools import partial
 from itertools import accumulate, pairwise
@@ -11,9 +11,9 @@ from ghgs_lit.kernels import pool
 from ghgs_lit.kernels.pool import even_parts
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
-#: Gaussians of one task, and how many of the pool's pieces of work one of them is.
+#: Gaussians in one task, and the work of one as the pool counts it.
 _TASK, _WORK = 512, 8
-#: Gaussians of one task of the gradients: each adds up sums of its own.
+#: Gaussians in one task of the gradients: each task has its own sums.
 _LEARNED = 2048
 
 
@@ -25,10 +25,10 @@ def remembered(
     known: Float[Tensor, "N k"],
     before: Float[Tensor, "N h"],
 ) -> Float[Tensor, "N h"]:
-    """``tanh(before + memory(update(seen, known, before)))``; see :meth:`ghgs_lit.rounds.Rounds._remembered`.
-    Differentiable in ``before`` and the layers. ``view``, ``update``: of two layers each; ``seen`` is
-    ``view`` of the own view, and of the others the mean and the largest. ``each``: what each view shows, the
-    own one first."""
+    """``tanh(before + memory(update(seen, known, before)))``, differentiable in ``before`` and the layers;
+    see :meth:`ghgs_lit.rounds.Rounds._remembered`. ``seen``: results of ``view`` for the Gaussian's own view,
+    and their mean and maximum over the other views. ``view``, ``update``: two layers each. ``each``:
+    observations of each view, the own one first."""
     from ghgs_lit.kernels.layers import parameters  # here, like the kernels: it loads a compiler
 
     return _Remember.apply(each, known, before, *parameters((*view, *update, memory)))
@@ -37,7 +37,7 @@ def remembered(
 def answered(
     hear: nn.Linear, change: nn.Linear, heard: Float[Tensor, "N e"], before: Float[Tensor, "N h"]
 ) -> tuple[Float[Tensor, "N h"], Float[Tensor, "N c"]]:
-    """``after = before + hear(relu(heard))``, and ``change(after)``; without a gradient."""
+    """``after = before + hear(relu(heard))`` and ``change(after)``, without a gradient."""
     from ghgs_lit.kernels.layers import packed, parameters
     from ghgs_lit.rounds.cpu.kernel import answer
 
@@ -81,7 +81,7 @@ class _Remember(torch.autograd.Function):
         return None, None, d_before, *sums.gradients()
 
 
-#: Gaussians of one task.
+#: Gaussians in one task of :func:`compare`.
 _OBSERVED = 1024
 
 
@@ -94,8 +94,8 @@ def compare(
     near: float,
     out: Float[Tensor, "N V 11"],
 ) -> None:
-    """Write the values of :func:`ghgs_lit.rounds.observation.observe`. ``rendering``: of the Gaussians, by
-    ``cameras``. ``near``: metres behind the rendered surface at which a Gaussian counts as hidden."""
+    """Write the values of :func:`ghgs_lit.rounds.observation.observe` to ``out``. ``rendering``: of the
+    Gaussians from ``cameras``. ``near``: scale in metres of the distance behind the rendered surface."""
     from ghgs_lit.rounds.cpu.kernel import observe  # here: it loads a compiler
 
     inputs = (

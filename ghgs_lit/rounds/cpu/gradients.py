@@ -1,4 +1,4 @@
-"""Gradients of what the rounds remember; values inside are computed again, in the cache."""
+"""Gradients of the memory of rounds; values of inner layers are computed again, which stays in the cache."""
 
 import numpy as np
 from numba.core import types
@@ -24,7 +24,7 @@ _LAYERS = (FLOATS[1], FLOATS[1], types.Array(types.int64, 2, "C"), FLOATS[1])
 
 @helper
 def _unsee(view, hidden, views, shown, seen, slopes, own):
-    """Put the slopes of what a view shows into ``own``; the largest of equal maxima takes the slope."""
+    """Write the gradient of a view's values to ``own``; of equal maxima the first view gets the gradient."""
     size = hidden * PANEL
     share = ONE / np.float32(views - 1)
     for i in range(0, size, LANES):
@@ -53,7 +53,7 @@ def _layer(layers, place, outputs, inputs, before, after):
 
 @helper
 def _look(each, known, before, layers, places, start, count, given, one, two, seen, up, narrow):
-    """Fill the inputs of all layers: of the views' two, of the update's two and of the last."""
+    """Compute the inputs of all layers: two of each view, two of the update and the last one."""
     views, channels, hidden = each.shape[1], each.shape[2], before.shape[1]
     inputs, wide = 4 * hidden + known.shape[1], 2 * hidden
     for view in range(views):
@@ -74,7 +74,8 @@ def _look(each, known, before, layers, places, start, count, given, one, two, se
 def remember_back(
     each, known, before, after, slopes, layers, backs, places, sums, d_before, first, last
 ):  # fmt: skip
-    """Write ``d_before`` of rows ``first`` to ``last``, add up ``sums``; see :func:`.network.remembered`."""
+    """Write ``d_before`` of rows ``first`` to ``last`` and add to ``sums``; see
+    :func:`ghgs_lit.rounds.cpu.remembered`."""
     views, channels, hidden = each.shape[1], each.shape[2], before.shape[1]
     inputs, wide = 4 * hidden + known.shape[1], 2 * hidden
     line, most = lines(hidden + 1) * PANEL, lines(inputs + 1) * PANEL
@@ -82,7 +83,7 @@ def remember_back(
     one, two = simd.aligned(views * line), simd.aligned(views * line)
     seen, slope, turned = simd.aligned(most), simd.aligned(most), simd.aligned(most + PANEL * PANEL)
     up, narrow, down = simd.aligned(2 * line), simd.aligned(line), simd.aligned(2 * line)
-    for buffer in (given, one, two, seen, up, narrow, turned):  # rows that no gradient is read of stay finite
+    for buffer in (given, one, two, seen, up, narrow, turned):  # padding must be finite
         buffer[:] = ZERO
     for start in range(first, last, PANEL):
         count = min(PANEL, last - start)

@@ -1,4 +1,4 @@
-"""What views show of each Gaussian, and what the rounds remember of it."""
+"""Kernels of rounds: observations of Gaussians in views, and the networks of the memory."""
 
 import numpy as np
 from numba.core import types
@@ -16,7 +16,7 @@ _MAPS = (FLOATS[5], FLOATS[4], FLOATS[5], FLOATS[5], FLOATS[5])
 
 @helper
 def see(view, hidden, views, shown, seen):
-    """Put what a view shows into ``seen``: the own view's, then the others' mean and their maximum."""
+    """Add a view's values to ``seen``: those of the own view, the others' mean, the others' maximum."""
     size = hidden * PANEL
     share = ONE / np.float32(views - 1)
     for i in range(0, size, LANES):
@@ -105,7 +105,7 @@ def _axis(row, x, y, z):
 
 @helper
 def _put_cells(place, side, cells):
-    """Two cells beside places along an axis, and their shares in four lines: 0 beyond the border."""
+    """Write the two cells around positions along an axis and their weights, 0 beyond the border."""
     place = place - HALF
     first = simd.floor(place)
     share, last = place - first, np.float32(side - 1)
@@ -123,7 +123,6 @@ def _between(plane, rows, columns, weights):
 
 @helper
 def _cells(lane, down, across):
-    """Rows, columns and weights of the four cells around a point."""
     rows = np.uint64(down[lane]), np.uint64(down[LANES + lane])
     columns = np.uint64(across[lane]), np.uint64(across[LANES + lane])
     top, bottom = down[2 * LANES + lane], down[3 * LANES + lane]
@@ -133,7 +132,7 @@ def _cells(lane, down, across):
 
 @helper
 def _project(camera, pose, x, y, z, height, width, down, across, z_depth):
-    """Put the cells around points in a view, and their depths; returns which it can see, as bits."""
+    """Write the cells around points in a view, and their depths; returns the visible points, as bits."""
     distance = _axis(pose[2], x, y, z)
     inverse = ONE / distance
     right, below = _axis(pose[0], x, y, z) * inverse, _axis(pose[1], x, y, z) * inverse
@@ -150,12 +149,12 @@ def _project(camera, pose, x, y, z, height, width, down, across, z_depth):
 def observe(
     means, colors, image, intrinsics, extrinsics, photo, mask, drawn, alpha, depth, near, out, first, last
 ):
-    """Write rows ``first`` to ``last``, of one element; see :func:`ghgs_lit.rounds.cpu.observe`."""
+    """Write rows ``first`` to ``last`` of one element; see :func:`ghgs_lit.rounds.cpu.compare`."""
     views, height, width = photo.shape[1], photo.shape[3], photo.shape[4]
     element = image[first] // views
     point, z_depth, behind = simd.aligned(3 * LANES), simd.aligned(LANES), simd.aligned(LANES)
     down, across = simd.aligned(4 * LANES), simd.aligned(4 * LANES)
-    # Place of each view among the values of a Gaussian, by the view of the Gaussian.
+    # Index of each view among the values of a Gaussian, for each own view.
     places = np.empty((views, views), np.int64)
     for own in range(views):
         for view in range(views):

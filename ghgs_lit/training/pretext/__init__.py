@@ -1,1 +1,1 @@
-"""The pretext stage: semantic features learn what part of a body a patch shows, from built-in people."""
+"""The pretext stage: training of semantic features to tell which body part a patch shows."""

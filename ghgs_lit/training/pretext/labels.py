@@ -1,4 +1,4 @@
-"""Parts of the built-in body, from its skinning weights, and which of them the patches of a batch show."""
+"""Parts of the built-in body, from its skinning weights, and the parts that patches show."""
 
 from functools import cache
 
@@ -14,7 +14,7 @@ from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.synthesis.people.body import BODY_VERTICES, load_body
 from ghgs_lit.types import Batch, Tokens
 
-# The beginnings of the names of a part's bones. Names end with .L and .R on limbs, whose sides are two parts.
+# Prefixes of the names of a part's bones. Bones of limbs end with .L or .R, and their sides are two parts.
 _TRUNK = {
     "head": ("head", "neck"),
     "chest": ("spine01", "spine02", "clavicle", "shoulder"),
@@ -43,7 +43,7 @@ def _part_of(bone: str) -> str:
 
 @cache
 def vertex_parts() -> np.ndarray:
-    """The part of each vertex of the skin [n]: the one whose bones have the largest weight together."""
+    """The part of each vertex of the skin [n]: that with the largest total weight of its bones."""
     body = load_body()
     weights = np.zeros((BODY_VERTICES, len(PARTS)))
     for bone, name in enumerate(body.bone_names):
@@ -52,12 +52,11 @@ def vertex_parts() -> np.ndarray:
 
 
 def parts_of_points(points: Float[Tensor, "n 3"], vertices: Float[Tensor, "m 3"]) -> Int[Tensor, " n"]:
-    """The part of the body beneath each world point: that of the nearest vertex of the skin. ``points``: on
-    clothes, hair or skin. ``vertices``: of the posed body [:data:`BODY_VERTICES`, 3], in the same world.
-    InputError: not the vertices of a built-in body."""
+    """The body part of each world point on clothes, hair or skin: that of the nearest vertex of the skin.
+    ``vertices``: of the posed body [:data:`BODY_VERTICES`, 3]. InputError: not those of a built-in body."""
     expected = f"{BODY_VERTICES}, all of a built-in person (data=synthetic)"
     require(len(vertices) == BODY_VERTICES, "vertices of the body", expected, len(vertices))
-    # Made for one batch: a tree that is quick to build, not the quickest to ask.
+    # For one batch: a tree that is quick to build, not the quickest to query.
     tree = cKDTree(vertices.double().cpu().numpy(), balanced_tree=False, compact_nodes=False)
     nearest = tree.query(points.double().cpu().numpy())[1]
     return torch.from_numpy(vertex_parts()[nearest]).to(points.device)
@@ -70,18 +69,16 @@ def has_parts(batch: Batch) -> bool:
 
 
 def token_parts(shares: Float[Tensor, "n P"], tokens: Tokens) -> Int[Tensor, " N"]:
-    """The part with the largest share in the patch of each token; -1 where it shows none. ``shares``: of all
-    patches, from :func:`part_shares`. ``tokens``: of the same photographs."""
+    """The part with the largest of ``shares`` (:func:`part_shares`) in the patch of each token; -1: none."""
     _, _, h, w = tokens.grid
     own = shares[(tokens.image * h + tokens.row) * w + tokens.column]
     return torch.where(own.any(1), own.argmax(1), -1)
 
 
 def part_shares(batch: Batch, patch_size: int) -> Float[Tensor, "n P"]:
-    """Shares of :data:`PARTS` among the subject's pixels of each patch; 0 where it has no such pixel.
-    ``batch``: with true depths and the vertices of built-in bodies. ``patch_size``: in pixels. Returns: of
-    all patches of all images, ordered by image, row and column. InputError: the batch has no depths or no
-    bodies, or other bodies."""
+    """Shares of :data:`PARTS` among the subject's pixels of each patch, ordered by image, row and column; 0
+    without such a pixel. ``batch``: with true depths and vertices of built-in bodies; sides are divisible by
+    the patch size. InputError: no depths, no bodies, or other bodies."""
     require(batch.depths is not None, "data", "true depths, which the labels are made from", "none")
     require(batch.body_vertices is not None, "data", "people with bodies, as data=synthetic", "none")
     b, v, height, width = batch.depths.shape

@@ -1,4 +1,4 @@
-"""The LightningModule of the pretext stage, and what it measures: part-awareness of features."""
+"""The LightningModule of the pretext stage, and its measure of how well features tell body parts."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -21,9 +21,8 @@ from ghgs_lit.types import Batch
 def neighbor_shows_part(
     features: Float[Tensor, "n c"], parts: Int[Tensor, " n"], views: Int[Tensor, " n"]
 ) -> Bool[Tensor, " n"]:
-    """Whether the part of the most similar patch (cosine) among those of the other views is a patch's own.
-    ``features``: of the patches of one person. ``views``: the view of each patch. Patches without another
-    view are wrong."""
+    """Whether the most similar patch (cosine) of the other views shows the same part as a patch; false
+    without other views. ``features``: of the patches of one person. ``views``: the view of each patch."""
     directions = unit(features)
     cosines = (directions @ directions.T).masked_fill(views[:, None] == views, -torch.inf)
     best, nearest = cosines.max(1) if len(features) else (cosines.new_zeros(0), views)
@@ -31,14 +30,14 @@ def neighbor_shows_part(
 
 
 class Pretext(nn.Module):
-    """A branch under the name that it has in a model."""
+    """A semantic branch under its name in a model."""
 
     def __init__(self, branch: SemanticBranch):
         super().__init__()
         self.encoder = nn.ModuleDict({"semantic": branch})
 
     def forward(self, batch: Batch) -> tuple[Float[Tensor, "N P"], Float[Tensor, "N P"], KeptPatches]:
-        """Logarithms of predicted shares, true shares, and the patches that have any of these."""
+        """Logarithms of predicted shares, true shares, and their patches."""
         branch = self.encoder["semantic"]
         kept = KeptPatches(branch.subject(batch.masks), batch.images.device)
         shares = part_shares(batch, branch.patch_size)[kept.index]
@@ -46,12 +45,12 @@ class Pretext(nn.Module):
 
 
 def cross_entropy(log_shares: Float[Tensor, "N P"], shares: Float[Tensor, "N P"]) -> Tensor:
-    """Mean over the patches with a part; 0 without such a patch."""
+    """Mean cross-entropy over the patches with a part; 0 without any."""
     return -(shares * log_shares).sum() / shares.any(1).sum().clamp_min(1)
 
 
 class PretextModule(BudgetedModule):
-    """Trains a semantic branch to tell parts of the body; arguments as of :class:`BudgetedModule`."""
+    """Trains a semantic branch to tell body parts; arguments as of :class:`BudgetedModule`."""
 
     def __init__(self, model: Pretext, optimization: Optimization, config: Mapping[str, Any]):
         super().__init__(model, optimization, config)
@@ -80,8 +79,7 @@ class PretextModule(BudgetedModule):
         self.log("val/parts", cross_entropy(log_shares, shares), on_epoch=True, batch_size=size)
 
     def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
-        """Clip to ``optimizer.clip`` and log the norm before it; the arguments are not used. DivergedError:
-        the norm is not finite."""
+        """Clip to ``optimizer.clip`` and log the norm before. DivergedError: the norm is not finite."""
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.optimization.clip, foreach=True)
         if not norm.isfinite():
             raise DivergedError(

@@ -1,4 +1,4 @@
-"""The rows of the matrix."""
+"""Stages of the stress test, by name."""
 
 from ghgs_lit.diagnostics.stress.stages import geometry, heads, recalibration, rendering, whole
 

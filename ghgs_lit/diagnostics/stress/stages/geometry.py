@@ -1,4 +1,4 @@
-"""Bounds, projection, unprojection, token points, padding, photo-consistency, undistortion."""
+"""Stages of geometry: bounds, projection, unprojection, token points, padding, photo-consistency, lenses."""
 
 import torch
 from kornia.geometry.calibration import distort_points
@@ -37,7 +37,6 @@ def _project_inputs(family: str, g: Generator) -> Values:
 
 
 def _project(v: Values) -> Values:
-    """Camera coordinates of all points, pixels of those that lie clearly before the camera."""
     intrinsics, extrinsics = inputs.matrices(v["lenses"], v["poses"])
     pixels, z = project(v["points"], intrinsics, extrinsics)
     camera = world_to_camera(v["points"], extrinsics)
@@ -50,7 +49,6 @@ def _unproject_inputs(family: str, g: Generator) -> Values:
 
 
 def _unproject_slowly(v: Values) -> Values:
-    """By the inverses of the matrices of the whole camera."""
     homogeneous = torch.cat((v["pixels"], torch.ones_like(v["pixels"][..., :1])), -1)
     intrinsics = inputs.intrinsics(v["lenses"])
     camera = torch.einsum("nvij,npj->npi", torch.linalg.inv(intrinsics), homogeneous)
@@ -74,7 +72,7 @@ def _hits(cameras: Cameras, middle: Tensor, half: Tensor) -> Tensor:
 
 
 def _rays(v: Values) -> Values:
-    """Rays, and where those meet the box that neither graze nor barely miss it: that is a decision."""
+    """Rays, and their depths in the box except where they nearly graze it, which is a decision."""
     cameras = cameras_of(v, 4)
     with exact("cpu"):  # as in the stage
         bounds = depths_in_box(cameras, v["middle"] - v["half"], v["middle"] + v["half"])
@@ -120,8 +118,8 @@ _HULL = VisualHull(dilation=0.02)
 
 
 def _bounds(v: Values) -> Values:
-    """Bounds of the subject's pixels as the model asks for them, in the subject's frame, whose limits are in
-    metres; and how far the true surface lies outside them."""
+    """Bounds of the subject's pixels, computed in the subject's frame as the model does, and the distance of
+    the true surface outside them."""
     batch, masks = batch_of(v), v["masks"]
     frame = Frame.of(batch)
     found, metre = _HULL(frame.enter(batch)), frame.metre.to(v["truth"])[:, None, None, None]
@@ -136,12 +134,11 @@ def _bounds(v: Values) -> Values:
 
 
 def _cells(v: Values) -> Tensor:
-    """Bounds are decisions on a grid of cells: one cell of 1/20 of the subject's depth may differ."""
+    """Condition number by which bounds, decisions on a grid, may differ by one cell of 1/20 of the depth."""
     return torch.full((len(v["images"]),), 0.05 / (100 * torch.finfo(torch.float32).eps))
 
 
 def _frame(v: Values) -> Values:
-    """Cameras in the subject's frame, and points of the frame in the world."""
     batch = batch_of(v)
     frame = Frame.of(batch)
     element = torch.arange(len(v["points"]))[:, None]
@@ -150,7 +147,6 @@ def _frame(v: Values) -> Values:
 
 
 def _places(v: Values) -> Tensor:
-    """Pixels of points, far outside where they are behind the camera."""
     pixels, z = project(v["points"], *inputs.matrices(v["lenses"], v["poses"]))
     return torch.where(z[..., None] > 0, pixels, 1e9)
 
@@ -161,7 +157,6 @@ def _sample(v: Values) -> Values:
 
 
 def _sample_slowly(v: Values) -> Values:
-    """Every pixel times its share of the place."""
     places = _places(v).clamp(-2, _SIZE + 2)
     centers = torch.arange(_SIZE) + 0.5
     across, down = (torch.relu(1 - (places[..., axis, None] - centers).abs()) for axis in (0, 1))
@@ -174,7 +169,7 @@ def _photo_inputs(family: str, g: Generator) -> Values:
 
 
 def _photo(v: Values) -> Values:
-    """What is left to full agreement: a share of 1, however small the agreement is."""
+    """Disagreement, whose error relates to 1 however small the agreement is."""
     return {"disagreement": 1 - photo_consistency(batch_of(v), DepthBounds(v["near"], v["far"]), 3)}
 
 
@@ -197,7 +192,6 @@ def _tokens(v: Values) -> Values:
 
 
 def _padding(v: Values) -> Values:
-    """Maps that were padded and cut, and a point's pixel in the padded camera, moved back."""
     padding = pad_to_patches(v["masks"], 4)
     padded = padding.pad_batch(batch_of(v))
     cameras, images = padded.cameras, padding.cut(padded.images.movedim(2, -1)).movedim(-1, 2)
@@ -222,7 +216,6 @@ def _lens(v: Values) -> Values:
 
 
 def _lens_slowly(v: Values) -> Values:
-    """OpenCV's model by kornia at the same knots."""
     knots = torch.linspace(0.5, 15.5, 3, dtype=torch.float64)
     rows, columns = torch.meshgrid(knots, knots, indexing="ij")
     pixels = torch.stack((columns, rows), -1).flatten(0, 1).expand(len(v["lens"]), 9, 2)

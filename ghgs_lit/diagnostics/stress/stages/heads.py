@@ -1,4 +1,4 @@
-"""Dense heads, activations of depth and of the Gaussians' attributes, quaternions and covariances."""
+"""Stages of heads: dense heads, activations of depth and attributes, quaternions and covariances."""
 
 import copy
 
@@ -51,7 +51,7 @@ def _covariance(v: Values) -> Values:
 
 
 def _covariance_slowly(v: Values) -> Values:
-    """By products of the quaternion with the axes: q e conj(q)."""
+    """Rotation and covariance by quaternion products with the axes, q e conj(q)."""
     q = v["quaternions"]
     length = q.norm(dim=-1, keepdim=True)
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=q.dtype)

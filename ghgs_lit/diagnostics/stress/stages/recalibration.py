@@ -1,4 +1,4 @@
-"""Neighbours, cosines and attention among them, and the encoder's compiled attention."""
+"""Stages of recalibration: neighbours, cosines and attention; and the encoder's compiled attention."""
 
 import torch
 from torch import Generator, Tensor
@@ -25,14 +25,12 @@ def _point_inputs(family: str, g: Generator) -> Values:
 
 
 def _distances(v: Values) -> Values:
-    """Distances, in float64, of the neighbours that are found."""
     exact = v["points"].double()
     near = nearest_neighbors(v["points"], v["view"], _K)
     return {"all": (exact[near.index] - exact[:, None]).norm(dim=-1)}
 
 
 def _distances_slowly(v: Values) -> Values:
-    """Every difference, sorted."""
     distance = (v["points"][:, None] - v["points"]).norm(dim=-1)
     return {"all": distance.sort(-1).values[:, :_K]}
 
@@ -52,7 +50,6 @@ def _cosine_inputs(family: str, g: Generator) -> Values:
 
 
 def _cosines_slowly(v: Values) -> Values:
-    """Angles of scaled features."""
     largest = v["features"].abs().amax(-1, keepdim=True)
     scaled = v["features"] / torch.where(largest > 0, largest, 1.0)
     length = scaled.norm(dim=-1, keepdim=True)
@@ -61,7 +58,7 @@ def _cosines_slowly(v: Values) -> Values:
 
 
 def _attention_features(family: str, g: Generator, *shape: int) -> Tensor:
-    """Features of a family; huge ones are of 30 times the ordinary size."""
+    """Features of a family, of which huge ones are 30 times as large as ordinary ones."""
     if family == "huge_features":
         return 30.0 * inputs.normal(g, *shape)
     return inputs.features(family, g, *shape)
@@ -85,7 +82,6 @@ def _attention(v: Values) -> Values:
 
 
 def _attention_slowly(v: Values) -> Values:
-    """Gathered, one softmax a head."""
     q, k, value = (v[name].unflatten(-1, (2, 16)) for name in ("q", "k", "v"))
     s, logits = v["cosines"], torch.einsum("mad,mkad->amk", q, k[v["index"]]) / 4.0
     changed = {
@@ -99,13 +95,13 @@ def _attention_slowly(v: Values) -> Values:
 
 
 def _products(v: Values) -> Tensor:
-    """The gradient of a softmax subtracts products of a value and a query or key from their mean."""
+    """Size of the products of a value and a query or key, whose mean a softmax's gradient subtracts."""
     q, k, value = (v[name].abs().flatten(1).amax(1) for name in ("q", "k", "v"))
     return torch.maximum(q, k) * value
 
 
 def _head_inputs(family: str, g: Generator) -> Values:
-    """Of two heads, equal ones but for huge features."""
+    """Queries, keys and values of two heads, which are equal except for huge features."""
     shape = (2, 20, 64) if family == "huge_features" else (20, 64)
     features = {name: _attention_features(family, g, *shape) for name in ("q", "k", "v")}
     return {name: value.expand(2, 20, 64).clone() for name, value in features.items()}

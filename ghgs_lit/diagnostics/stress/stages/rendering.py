@@ -1,4 +1,4 @@
-"""Splats on the image, losses and metrics: covariances, compositing, L1, SSIM, Chamfer, PSNR, FLIP."""
+"""Stages of rendering, losses and metrics: splats, compositing, L1, SSIM, Chamfer, PSNR, FLIP."""
 
 import torch
 from torch import Generator, Tensor
@@ -17,7 +17,6 @@ _FIELDS = ("means", "quaternions", "scales", "opacities", "colors")
 
 
 def _inputs(family: str, g: Generator) -> Values:
-    """Splats of some pixels around the middle of a scene, before one camera."""
     count = 1500 if family == "stacked" else 24
     middle = inputs.place(family, g)
     lenses, poses = inputs.cameras(family, g, 1, _SIZE, middle)
@@ -46,7 +45,6 @@ def _cameras(v: Values) -> Cameras:
 
 
 def _project(v: Values) -> Values:
-    """Centres, covariances, their inverses and determinants of the splats before the camera."""
     with exact("cpu"):  # as in render()
         splats = reference.project(
             Gaussians(*(v[name] for name in _FIELDS), splits=(len(v["means"]),)),
@@ -57,7 +55,7 @@ def _project(v: Values) -> Values:
     found = {
         "centers": splats.centers,
         "inverses": torch.stack((yy, -xy, xx), -1) / splats.determinants[:, None],
-        # What is fainter is not drawn.
+        # Fainter splats are not drawn.
         "opacities": torch.relu(splats.opacities[:, None] - 1 / 255),
         "covariances": splats.covariances,
     }
@@ -81,7 +79,7 @@ def _l1(v: Values) -> Tensor:
 
 
 def _ssim_slowly(v: Values) -> Values:
-    """Moments about the mean of each window."""
+    """L1, and SSIM by moments about the mean of each window."""
     x = torch.arange(11, dtype=v["image"].dtype) - 5
     line = torch.exp(-x.square() / (2 * 1.5**2))
     weights = (line[:, None] * line / line.sum() ** 2).flatten()
@@ -100,12 +98,12 @@ def _brightest(v: Values) -> Tensor:
 
 
 def _moments(v: Values) -> Tensor:
-    """SSIM's definition subtracts moments of the size x^2 and compares the rest with 0.03^2."""
+    """Condition number of SSIM, which subtracts moments of size x^2 and compares the rest with 0.03^2."""
     return _brightest(v).square() / 9e-4
 
 
 def _terms(v: Values) -> Tensor:
-    """Gradients of SSIM subtract terms of the size 2 x / 0.03^2, each a mean over the windows."""
+    """Size of the terms that SSIM's gradients subtract: 2 x / 0.03^2, each a mean over the windows."""
     windows = 3 * (_SIZE - 10) ** 2
     return 2 * _brightest(v) / (9e-4 * windows)
 
@@ -125,7 +123,6 @@ def _clouds(family: str, g: Generator) -> Values:
 
 
 def _chamfer_slowly(v: Values) -> Values:
-    """All distances, in the precision of the inputs."""
     apart = (v["points"][:, None] - v["surface"]).square().sum(-1)
     return {"chamfer": 2 * torch.cat((apart.amin(1), apart.amin(0))).mean()}
 
@@ -162,7 +159,7 @@ STAGES = (
     Stage(
         "PSNR and FLIP", ("images",), _pair, _metrics, 100,
         "powers 0.42 and 2.4 of colours, seven filters, a power 0.7 of a distance",
-        # Colours that differ by a rounding have a distance of its power 0.1 or so: one pixel of 256 may.
+        # FLIP raises a rounding error of a colour to a power of about 0.1; one pixel of 256 may have one.
         kappa=lambda v: torch.full((len(v["image"]),), 8.0, dtype=torch.float64),
         silent="FLIP clamps colours to [0, 1]",
     ),

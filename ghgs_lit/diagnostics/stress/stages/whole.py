@@ -1,4 +1,4 @@
-"""The whole method: a tiny model, and a training step through renderer and losses."""
+"""Stages of the whole method: tiny models, and a training step through renderer and losses."""
 
 import copy
 from collections.abc import Callable
@@ -24,7 +24,7 @@ _TINY += ("encoder.vit.channels=8", "recalibration.k=4", "recalibration.num_head
 
 @cache
 def _models(name: str, kicked: bool) -> dict[torch.dtype, GHGS]:
-    """A tiny model that has left its initial state, in both precisions."""
+    """A tiny model in both precisions, without the zero layers of its initialisation."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(3)
         model = GHGS.from_config(resolve(compose("train", [f"model={name}", *_TINY])))
@@ -40,7 +40,7 @@ def _models(name: str, kicked: bool) -> dict[torch.dtype, GHGS]:
 
 
 def _in_float32(bounds: Callable[[Batch], DepthBounds | None], batch: Batch) -> DepthBounds | None:
-    """Bounds as in single precision: decisions on a grid, which "bounds and hull" measures, are the same."""
+    """Bounds computed in float32, so that their decisions, tested in a stage of their own, agree."""
     found = bounds(replace(batch, cameras=batch.cameras.to(torch.float32)))
     return found if found is None else DepthBounds(found.near.double(), found.far.double())
 
@@ -52,7 +52,7 @@ def _inputs(family: str, g: Generator) -> Values:
 
 
 def _dense(prediction: Prediction, batch: Batch) -> Values:
-    """Depths and Gaussians as maps, 0 where there are none; a depth of the subject that was lost is NaN."""
+    """Depths and Gaussians as maps; 0 where there are none, NaN for lost depths of the subject."""
     gaussians, size = prediction.gaussians, batch.masks.shape
     parts = (gaussians.means, gaussians.scales, gaussians.opacities[:, None], gaussians.colors)
     rows = torch.cat(parts, dim=-1)
@@ -76,7 +76,6 @@ _LOSSES = Losses(weights={"chamfer": 0.0, "depth": 1.0})  # Chamfer has a stage 
 
 @torch.enable_grad()
 def _step(v: Values) -> Values:
-    """The loss of a case, and the gradient of every parameter."""
     one = {name: value[None] for name, value in v.items()}
     model, exact = _model("hull", one), v["images"].dtype == torch.float64
     cameras = Cameras(*inputs.matrices(one["target_lenses"], one["target_poses"]), _SIZE, _SIZE)
@@ -93,8 +92,8 @@ def _step(v: Values) -> Values:
 
 
 def _far(v: Values) -> Tensor:
-    """A point is its camera's centre and a depth, both in float32: it loses the digits of the distance over
-    the subject's size, of whose depth one half is seen."""
+    """Condition number of points, sums of a camera's centre and a depth in float32: the distance over the
+    subject's size, of whose depth one half is seen."""
     depth = v["truth"].flatten(1)
     nearest = torch.where(depth > 0, depth, torch.inf).amin(1)
     return depth.amax(1) / (2 * (depth.amax(1) - nearest))
@@ -102,7 +101,7 @@ def _far(v: Values) -> Tensor:
 
 _NETWORK = "thirty layers in a row, each as accurate as a dense head alone; their errors add up"
 _FRAME = ("truth", "middle", "target", "target_lenses", "target_poses")
-#: What all rows here share.
+#: What all stages here share.
 _stage = partial(
     Stage,
     ingredients=("cameras", "images", "masks", "weights"),

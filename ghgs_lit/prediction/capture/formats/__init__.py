@@ -26,10 +26,10 @@ FORMATS: dict[str, Callable[[Path], CameraFile]] = {
 
 
 def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
-    """Read a file or a folder of cameras; a warning names what is in it and not read. ``path``: of the file;
-    COLMAP's models, OpenCV's files for each camera and EasyMocap's are folders. ``format``: one of
-    :data:`FORMATS`; ``auto`` tells it from the names of files and the keys of JSON. InputError: there is no
-    such path, the format is not known, or a camera is wrong."""
+    """Read a file or a folder of cameras; a warning names entries that are not read. ``path``: a folder for
+    COLMAP's models, OpenCV's files for each camera and EasyMocap's. ``format``: one of :data:`FORMATS`;
+    ``auto`` tells it by file names and keys of JSON. InputError: no such path or format, or a wrong camera.
+    """
     path = Path(path).expanduser()
     choice("calibration.format", format, ("auto", *FORMATS))
     if not path.exists():

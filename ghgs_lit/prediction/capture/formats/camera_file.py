@@ -16,7 +16,7 @@ from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
 from ghgs_lit.readers import read_parsed
 
 _SUFFIXES = ("jpg", "jpeg", "png", "tif", "tiff", "bmp", "webp")
-# Entries about a lens, as :func:`plain` spells them, and models of which the entries do not say enough.
+# Entries about a lens, as :func:`plain` spells them, and models that such entries may name.
 _LENS = re.compile("(?<!un)dist(?!ance)|lens|radial|tangent|fisheye|model|omni|theta|^[kps][0-9]$|^xi$")
 _MODELS = re.compile("fisheye|equidist|kannala|omni|spher|equirect|theta|division|panoram|orthogr|prism|fov")
 
@@ -33,10 +33,9 @@ class CameraFile:
     def of(cls, cameras: Sequence[StoredCamera], convention: Convention, format: str) -> "CameraFile":
         """Cameras in their order, named by their photographs without folder and suffix.
 
-        Where several cameras share these names, those of instants, they are named by folders, or as the file
-        has it. A camera that is listed for several photographs is one, without their masks. InputError: two
-        cameras have one name.
-        """
+        Where different cameras share such a name (that of an instant), all are named by their folders, or as
+        the file has it. A camera that is listed for several photographs is one, without their masks.
+        InputError: two cameras have one name."""
         for part in (-1, -2, 0):
             named: dict[str, StoredCamera] = {}
             for camera in cameras:
@@ -53,21 +52,20 @@ class CameraFile:
 
 
 def _parts(name: str) -> list[str]:
-    """Folders and name of a photograph, without its suffix."""
     *folders, last = unicodedata.normalize("NFC", name).replace("\\", "/").split("/")
     stem, dot, suffix = last.rpartition(".")
     return [*folders, stem if dot and suffix.lower() in _SUFFIXES else last]
 
 
 def plain(key: str) -> str:
-    """A key without case, signs and the word coefficients or parameters, by which files differ."""
+    """A key without case, signs and a final "coefficients" or "parameters", by which files differ."""
     return re.sub(r"(coef|param)\w*$", "", "".join(filter(str.isalnum, key.lower())))
 
 
 def check_unread(origin: str, fields: Mapping[str, Any], known: Collection[str]) -> None:
-    """Name in a warning what a reader does not know. ``fields``: of a camera, or of the file. ``known``: what
-    is read or of no matter, as :func:`plain` spells it. InputError: it is about the lens, and not empty or 0:
-    without it the picture would be bent."""
+    """Warn of entries that are not read. ``fields``: of a camera, or of the file. ``known``: entries that are
+    read or do not matter, as :func:`plain` spells them. InputError: an entry about the lens is neither empty
+    nor 0: without it the picture would be bent."""
     unread = {key: value for key, value in fields.items() if plain(key) not in known}
     lens = [key for key, value in unread.items() if _LENS.search(plain(key)) and _bends(value)]
     expected = "lens distortion as D or dist: k1 k2 p1 p2 k3 k4 k5 k6, with fisheye k1 k2 k3 k4"
@@ -77,22 +75,21 @@ def check_unread(origin: str, fields: Mapping[str, Any], known: Collection[str])
 
 
 def _bends(value: Any) -> bool:
-    """Whether an entry about the lens says something: numbers other than 0, or a model of another kind."""
+    """Whether an entry about the lens matters: numbers other than 0, or a model of another kind."""
     if isinstance(value, str):
         return bool(_MODELS.search(plain(value)))
     return bool(np.any(np.asarray(value, object)))
 
 
 def read_mapping(path: Path, parse: Callable[[str], Any], kind: str, content: str) -> dict[str, Any]:
-    """The mapping that a file of text holds. ``kind``, ``content``: of such files, for messages. InputError:
-    the file cannot be read or parsed, or holds something else."""
+    """The mapping in a text file. ``kind``, ``content``: for messages. InputError: there is none."""
     value = read_parsed(path, kind, parse)
     require(isinstance(value, dict), str(path), content, type(value).__name__)
     return value
 
 
 def finite(origin: str, key: str, value: Any) -> float:
-    """The number that an entry holds."""
+    """An entry as a number. InputError: it is not finite, or no number."""
     try:
         number = float(value)
     except (TypeError, ValueError):

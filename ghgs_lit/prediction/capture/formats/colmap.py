@@ -55,7 +55,7 @@ def read_colmap(path: Path) -> CameraFile:
 
 
 def _names(folder: Path) -> dict[int, str]:
-    """The photographs of ``images.txt``, whose names COLMAP's own reader cuts at a space."""
+    """Names of photographs in ``images.txt`` by id; COLMAP's own reader cuts them at a space."""
     path = folder / "images.txt"
     if (folder / "images.bin").exists() or not path.exists():
         return {}

@@ -26,8 +26,7 @@ def read_json(path: Path) -> CameraFile:
 
     ``intrinsics`` [3, 3], ``extrinsics`` [4, 4] or [3, 4], ``width``, ``height``, ``distortion``, ``fisheye``
     and ``gains``: this package's conventions (:mod:`ghgs_lit.types`); only the first two must be there.
-    ``K``, ``R``, ``T``, ``D``: OpenCV's. InputError: a camera is missing or wrong.
-    """
+    ``K``, ``R``, ``T``, ``D``: OpenCV's. InputError: a camera is missing or wrong."""
     content = read_json_file(path)
     named = _cameras_of(path, content)
     with_extrinsics = {n: c for n, c in named.items() if isinstance(c, Mapping) and "extrinsics" in c}
@@ -39,7 +38,7 @@ def read_json(path: Path) -> CameraFile:
 
 
 def _cameras_of(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
-    """Cameras by name, where they have an entry of their own beside others, in which they may be a list."""
+    """Cameras by name: those of the entry ``cameras``, a mapping or a list, or all entries without one."""
     named = content.get("cameras", content)
     if isinstance(named, list) and all(isinstance(camera, Mapping) for camera in named):
         named = {str(camera.get("name", i)): camera for i, camera in enumerate(named)}
@@ -58,7 +57,6 @@ def read_toml(path: Path) -> CameraFile:
 
 
 def _read_matrices(path: Path, named: Mapping[str, Any], name_of_format: str) -> CameraFile:
-    """OpenCV's matrices by the names of cameras."""
     expected = "cameras with intrinsics and extrinsics (or K, R and T)"
     with_intrinsics = {name: camera for name, camera in named.items() if opencv.has_intrinsics(camera)}
     cameras = opencv.cameras_from_fields(path, with_intrinsics, expected, sorted(named))

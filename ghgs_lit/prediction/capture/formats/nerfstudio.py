@@ -16,7 +16,7 @@ from ghgs_lit.prediction.capture.formats.json_and_toml import read_json_file
 _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
 _KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", *_LENS)
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE")
-# Read, or of no matter for a camera.
+# Read, or irrelevant for a camera.
 _KNOWN = {
     *map(camera_file.plain, _KEYS),
     *("frames", "filepath", "transformmatrix", "maskpath", "cameramodel", "isfisheye", "aabbscale", "scale"),
@@ -26,8 +26,7 @@ _KNOWN = {
 
 
 def read_nerfstudio(path: Path) -> camera_file.CameraFile:
-    """Cameras of ``frames``; intrinsics of a frame win over those of the whole file. InputError: a frame is
-    wrong."""
+    """Cameras of ``frames``, whose intrinsics win over those of the file. InputError: a frame is wrong."""
     content = read_json_file(path)
     frames = content.get("frames")
     require(isinstance(frames, list) and len(frames) > 0, f"{path}: frames", "a list of frames", frames)

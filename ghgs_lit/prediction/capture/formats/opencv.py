@@ -1,9 +1,8 @@
 """OpenCV's matrices under the names that programs give them, and the YAML that has them.
 
 YAML of ``cv2.FileStorage`` is a file for each camera, all cameras in one, or EasyMocap's pair. Files differ
-in the spelling: ``camera_matrix`` or ``K``, ``distortion_coefficients`` or ``dist``, ``rvec`` or ``R``. Poses
-map the world to the camera, pixel centres are at integers.
-"""
+in spelling: ``camera_matrix`` or ``K``, ``distortion_coefficients`` or ``dist``, ``rvec`` or ``R``. Poses map
+the world to the camera; pixel centres are at integers."""
 
 import re
 from collections.abc import Mapping
@@ -32,7 +31,7 @@ _NAMES = {
     "fisheye": ("fisheye", "isfisheye", "usefisheye", "fisheyemodel"),
 }
 _SINGLE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # Coefficients with an entry each
-#: Entries that are read, or of no matter for a camera.
+#: Entries that are read, or irrelevant for a camera.
 KNOWN = {
     *(name for names in _NAMES.values() for name in names),
     *_SINGLE,
@@ -120,8 +119,7 @@ def _by_name(origin: str, fields: Mapping[str, Any]) -> dict[str, dict[str, Any]
 def cameras_from_fields(
     path: Path, named: Mapping[str, Any], expected: str, keys: list[str]
 ) -> list[StoredCamera]:
-    """The cameras of a file by name. InputError: there is none of what is ``expected`` among the ``keys``, or
-    one is wrong."""
+    """The cameras of a file. InputError: none (names ``expected`` and ``keys``), or one is wrong."""
     require(bool(named), str(path), expected, keys)
     return [camera_from_fields(name, f"{path}: {name}", camera) for name, camera in named.items()]
 
@@ -133,13 +131,12 @@ def find(fields: Mapping[str, Any], what: str) -> Any:
 
 
 def has_intrinsics(fields: Any) -> bool:
-    """True of a mapping with a camera matrix."""
+    """Whether this is a mapping with a camera matrix."""
     return isinstance(fields, Mapping) and find(fields, "intrinsics") is not None
 
 
 def camera_from_fields(name: str, origin: str, fields: Mapping[str, Any]) -> StoredCamera:
-    """The camera that ``fields`` describe. ``fields``: matrices, lists and numbers by any of their names.
-    InputError: a matrix is missing, or is none."""
+    """The camera in ``fields``, under any of ``_NAMES``. InputError: a matrix is missing or wrong."""
 
     def array(what: str, *shapes: tuple[int | None, ...]) -> np.ndarray:
         value, names = find(fields, what), " or ".join(_NAMES[what])

@@ -16,8 +16,7 @@ _DISTORTION = {"k": "radialDistortion", "p": "tangentalDistortion"}
 
 
 def read_qualisys(path: Path) -> CameraFile:
-    """The cameras by their serial numbers; results are in metres. InputError: it is no such file, or an entry
-    is missing or no number."""
+    """The cameras by serial number. InputError: no such file, or an entry is missing or no number."""
     require_file(path, "cameras of Qualisys")
     try:
         cameras = [_camera(path, camera) for camera in ElementTree.parse(path).getroot().iter("camera")]
