@@ -125,6 +125,8 @@ def adapt(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
         f" {after:.2f} dB after ({rendered:.0f} s of rendering, {stats['seconds']:.0f} s of training)",
         flush=True,
     )
+    if after <= before:
+        print(f"no better: checkpoint={config['checkpoint']} stays the better one for this rig", flush=True)
     announce(out)
     return after
 

@@ -48,6 +48,8 @@ def check_cameras(folder: CaptureFolder) -> None:
         except InputError:
             if not last:
                 raise
+    if not found:
+        print("cameras are not checked: none of the instants looked at can be read", flush=True)
     for name, diagnosis in found.items():
         parts = in_parts(diagnosis.ranking[0].views)
         if len(parts) > 1:

@@ -11,6 +11,7 @@ from pathlib import Path
 from statistics import geometric_mean
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from omegaconf import DictConfig
 
@@ -26,7 +27,7 @@ from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.formats.json_and_toml import json_text
 from ghgs_lit.prediction.capture.predict import TimedPrediction, crop_size, in_frame, predict, predict_batch
-from ghgs_lit.prediction.capture.rig import INSTANTS, Rig, corrected_rig
+from ghgs_lit.prediction.capture.rig import INSTANTS, Rig, corrected_rig, turned_from
 from ghgs_lit.prediction.export.reports import REPORT
 from ghgs_lit.prediction.export.unseen import GUESSED
 from ghgs_lit.prediction.sequence.temporal import Temporal
@@ -40,6 +41,8 @@ if TYPE_CHECKING:  # it would import Lightning, which takes seconds
 
 #: PSNR in dB, in the subject's box, below which the render of an input counts as poor.
 LOW_PSNR = 25.0
+#: Degrees that a camera is turned by, from which weights for one rig are said to be for another.
+OTHER_RIG = 5.0
 
 
 @torch.no_grad()
@@ -100,7 +103,8 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         check_cameras(folder)
     device = inputs.pick_device(config["device"])
     renderer, model = inputs.build_renderer(config, device), inputs.load_model(config, device)
-    size = crop_size(config["size"], read_checkpoint(config["checkpoint"])["config"], model)
+    trained = read_checkpoint(config["checkpoint"])["config"]
+    size = crop_size(config["size"], trained, model)
     write_config(config, directory)
     refining = {name: config[name] for name in ("refine_cameras", "refine_masks", "refine")}
     temporal = Temporal(partial(in_frame, model), model.skip.every, renderer)
@@ -120,7 +124,7 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
             together.add(directories[capture.name], result.batch, result.prediction, renderer)
         count += 1
         if count == 1:
-            for line in advice_of(directories[capture.name]):
+            for line in (*advice_of(directories[capture.name]), *rig_advice(trained, result.batch)):
                 print(line, flush=True)
         for stage, value in seconds.items():
             totals[stage] = totals.get(stage, 0.0) + value
@@ -186,7 +190,7 @@ def advice_of(directory: Path) -> Iterator[str]:
         yield f"{', '.join(names)} end at the subject's {edge}: what no photograph shows is missing"
     guessed = [part for part, share in report["seen_once"].items() if share > GUESSED]
     if guessed:
-        yield f"at {', '.join(guessed)} of its height mostly one photograph shows the subject: a guess"
+        yield f"at {', '.join(guessed)} of its height at most one photograph shows most of it: a guess"
     low, high = min(quality), max(quality)
     if low < LOW_PSNR:
         left = [key for key in ("refine_cameras", "refine_masks") if key not in report]
@@ -195,6 +199,21 @@ def advice_of(directory: Path) -> Iterator[str]:
             f"photographs come back at {low:.1f} to {high:.1f} dB only, sound ones at 30 or more: mostly"
             f" cameras or masks are off{hint}; sheet.png shows where"
         )
+
+
+def rig_advice(trained: Mapping[str, Any], batch: Batch) -> Iterator[str]:
+    """Lines that say where photographs are not of the rig that ``ghgs adapt`` trained weights for, by their
+    configuration ``trained``."""
+    data, count = trained.get("data", {}), len(batch.views[0])
+    if data.get("kind") != "people_in_rig":
+        return
+    hint = "checkpoint=shipped, or ghgs adapt with these cameras, may predict them better"
+    if count not in (counts := trained["views"]["training_counts"]):
+        yield f"the weights were adapted to {' or '.join(map(str, counts))} photographs, not {count}; {hint}"
+    rig = np.array([camera["extrinsics"] for camera in data["cameras"].values()])
+    turned = turned_from(rig, batch.cameras.extrinsics[0].double().cpu().numpy())
+    if turned > OTHER_RIG:
+        yield f"the weights were adapted to another rig: a camera is {turned:.0f} degrees off; {hint}"
 
 
 def moved_line(moved: dict[str, float]) -> str:

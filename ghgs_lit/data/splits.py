@@ -9,7 +9,8 @@ from ghgs_lit.data.reader import PHASES
 from ghgs_lit.errors import InputError
 from ghgs_lit.readers import read_json, read_text
 
-_SPLIT_FILES = ("splits.json", "split_train.txt")
+_LISTS = tuple(f"split_{phase}.txt" for phase in PHASES)
+_SPLIT_FILES = ("splits.json", _LISTS[0])
 
 Split = str | Path | Mapping[str, Sequence[str]]
 
@@ -51,7 +52,7 @@ def read_split(split: Split, names: Sequence[str]) -> dict[str, list[str]]:
         folder = place = Path(split).expanduser()
         if folder.is_dir():
             place = next((p for n in _SPLIT_FILES if (p := folder / n).exists()), folder)
-        if not place.is_file():
+        if not place.is_file() or (place.suffix != ".json" and place.name not in _LISTS):
             raise InputError(f"{place}: expected a JSON file or a folder with split_train.txt; found neither")
         chosen = _read_split(place)
     if both := sorted(set(chosen["train"]) & set(chosen["val"])):

@@ -58,9 +58,10 @@ class BudgetedModule(L.LightningModule):
             schedule.base_lrs[number] = option["lr"]
 
     def step_seed(self, batch_idx: int) -> int:
-        """Seed of this step's random numbers, which does not depend on interruptions of the run."""
+        """Seed of the random numbers of this step: the same after an interruption, and in all processes, so
+        that none waits for one that has drawn more rounds."""
         part = batch_idx % self.trainer.accumulate_grad_batches
-        numbers = [self.config.get("seed", 0), self.global_step, part, self.global_rank]
+        numbers = [self.config.get("seed", 0), self.global_step, part]
         return int(np.random.SeedSequence(numbers).generate_state(1)[0])
 
     def progress(self) -> float:

@@ -61,3 +61,12 @@ def test_few_scans_leave_somebody_to_validate(tmp_path, count):
 def test_all_scans_can_be_measured(tmp_path):
     """data.val_fraction=1: nobody is trained on."""
     assert split_names(tmp_path, ["a", "b"], None, 1, 0) == {"train": [], "val": ["a", "b"]}
+
+
+def test_a_file_that_is_no_split_is_refused(tmp_path):
+    """The lists beside it are not what was named."""
+    for name, listed in (("split_train.txt", "0000"), ("split_val.txt", "0001"), ("people.txt", "0002")):
+        (tmp_path / name).write_text(listed)
+    with pytest.raises(InputError, match=r"people\.txt: expected a JSON file or a folder with split_train"):
+        read_split(tmp_path / "people.txt", [])
+    assert read_split(tmp_path / "split_val.txt", []) == {"train": ["0000"], "val": ["0001"]}

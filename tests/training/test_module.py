@@ -313,8 +313,8 @@ def test_impossible_values_name_their_key(values, key):
         Optimization(**values)
 
 
-def test_random_numbers_of_a_step_are_those_of_seed_step_part_and_process(monkeypatch):
-    """Each changes them, and nothing else does."""
+def test_random_numbers_of_a_step_are_those_of_seed_step_and_part(monkeypatch):
+    """Each changes them, and nothing else does: processes draw alike."""
     monkeypatch.setattr(GHGSModule, "global_step", property(lambda self: self._trainer.global_step))
     monkeypatch.setattr(GHGSModule, "global_rank", property(lambda self: self._trainer.global_rank))
 
@@ -325,9 +325,9 @@ def test_random_numbers_of_a_step_are_those_of_seed_step_part_and_process(monkey
         torch.manual_seed(int(torch.randint(1000, ())))
         return subject.step_seed(4 + part)
 
-    different = [seed(), seed(seed=2), seed(step=8), seed(part=1), seed(rank=1)]
-    assert len(set(different)) == 5
-    assert different == [seed(), seed(seed=2), seed(step=8), seed(part=1), seed(rank=1)]
+    different = [seed(), seed(seed=2), seed(step=8), seed(part=1)]
+    assert len(set(different)) == 4
+    assert different == [seed(rank=1), seed(seed=2), seed(step=8), seed(part=1)]
 
 
 def test_two_seeds_of_training_differ_and_one_repeats(tmp_path):

@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.model import GHGS
@@ -131,6 +132,22 @@ def shared_gains(batch: Batch, model: GHGS) -> np.ndarray | None:
     logs = (logs - logs.mean(0)).double()
     scale = (math.log(MOST_GAIN) / logs.abs().amax(0)).clamp(max=1)
     return torch.exp(logs * scale).clamp(1 / MOST_GAIN, MOST_GAIN).cpu().numpy()
+
+
+def turned_from(rig: np.ndarray, cameras: np.ndarray) -> float:
+    """Degrees between cameras [n, 4, 4] and those of a rig [R, 4, 4] that look alike: the greatest, after the
+    rotation of the world that makes it least. A subset of the rig, in any order, has 0.
+
+    Photographs may be turned upright, so quarter turns about the optical axis do not count.
+    """
+    quarters = Rotation.from_euler("z", [[0], [90], [180], [270]], degrees=True).as_matrix()
+    known = (quarters[:, None] @ rig[:, :3, :3]).reshape(-1, 1, 3, 3)
+    taken = cameras[:, :3, :3]
+    worlds = known.mT @ taken[0]
+    between = known[:, None] @ worlds[None] @ taken.mT
+    cosines = (np.trace(between, axis1=-2, axis2=-1) - 1) / 2
+    angles = np.degrees(np.arccos(cosines.clip(-1, 1)))
+    return float(angles.min(0).max(-1).min())
 
 
 def _names(capture: Capture) -> tuple[str, ...]:

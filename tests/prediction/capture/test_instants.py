@@ -11,6 +11,7 @@ from PIL import Image
 from ghgs_lit.cli.photographs import check_cameras
 from ghgs_lit.cli.predict import captures_of
 from ghgs_lit.errors import InputError
+from ghgs_lit.prediction.capture import camera_report
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.types import Cameras
 from tests.helpers.captures import truncate
@@ -147,6 +148,15 @@ def test_cameras_that_are_exchanged_half_way(place, capsys):
     assert all("cam0 and cam1 are exchanged" in line for line in wrong)
     with pytest.raises(InputError, match="cam0 and cam1 are exchanged"):
         check_cameras(opened(place, sequence={"start": 4}))
+
+
+def test_cameras_that_no_instant_can_check_are_said(place, capsys, monkeypatch):
+    def unreadable(*_):
+        raise InputError("broken")
+
+    monkeypatch.setattr(camera_report, "diagnose", unreadable)
+    check_cameras(opened(place))
+    assert "cameras are not checked: none of the instants" in capsys.readouterr().out
 
 
 def test_two_people_are_said(place, capsys):
