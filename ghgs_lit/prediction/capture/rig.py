@@ -135,11 +135,9 @@ def shared_gains(batch: Batch, model: GHGS) -> np.ndarray | None:
 
 
 def turned_from(rig: np.ndarray, cameras: np.ndarray) -> float:
-    """Degrees between cameras [n, 4, 4] and those of a rig [R, 4, 4] that look alike: the greatest, after the
-    rotation of the world that makes it least. A subset of the rig, in any order, has 0.
-
-    Photographs may be turned upright, so quarter turns about the optical axis do not count.
-    """
+    """Greatest angle in degrees between cameras [n, 4, 4] and the nearest of a rig's [R, 4, 4], after the
+    rotation of the world that makes it least; 0 for cameras of the rig, whichever and in any order. Quarter
+    turns about the optical axis do not count: photographs may be turned upright."""
     quarters = Rotation.from_euler("z", [[0], [90], [180], [270]], degrees=True).as_matrix()
     known = (quarters[:, None] @ rig[:, :3, :3]).reshape(-1, 1, 3, 3)
     taken = cameras[:, :3, :3]
