@@ -90,9 +90,10 @@ def write_text_atomically(path: str | Path, text: str) -> None:
 def append_line(path: Path, text: str) -> None:
     """Append ``text`` as a line of its own, also after an unfinished line of a killed process."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    is_torn = path.is_file() and path.stat().st_size > 0 and not path.read_bytes().endswith(b"\n")
-    with path.open("a") as file:
-        file.write(("\n" if is_torn else "") + text + "\n")
+    with path.open("a+b") as file:
+        file.seek(max(0, file.tell() - 1))
+        is_torn = file.read(1) not in (b"", b"\n")
+        file.write((("\n" if is_torn else "") + text + "\n").encode())
 
 
 def _remove_leftovers(path: Path) -> None:

@@ -40,8 +40,10 @@ def check_batch(batch: Batch, patch_size: int, values: bool = True) -> None:
 
 
 def _check_shapes(batch: Batch, patch_size: int) -> None:
-    require(batch.images.dim() == 5, "batch.images", "[B, V, 3, H, W]", tuple(batch.images.shape))
-    for name, tensor in (("images", batch.images), ("depths", batch.depths), ("alpha", batch.alpha)):
+    colored = batch.images.dim() == 5 and batch.images.shape[2] == 3
+    require(colored, "batch.images", "[B, V, 3, H, W]", tuple(batch.images.shape))
+    for name in ("images", "depths", "alpha", "log_gains"):
+        tensor = getattr(batch, name)
         floating = tensor is None or tensor.is_floating_point()
         require(floating, f"batch.{name}", "floating-point values", tensor is not None and tensor.dtype)
     require(batch.masks.dtype == torch.bool, "batch.masks", "dtype torch.bool", batch.masks.dtype)
@@ -50,8 +52,8 @@ def _check_shapes(batch: Batch, patch_size: int) -> None:
     divisible = height % patch_size == width % patch_size == 0
     expected = f"sides divisible by the patch size {patch_size} (or model.pad=multiple)"
     require(divisible, "batch.images", expected, (height, width))
-    for name in ("masks", "alpha"):
-        maps, expected = getattr(batch, name), (b, v, height, width)
+    for name in ("masks", "alpha", "depths", "log_gains"):
+        maps, expected = getattr(batch, name), (b, v, 3) if name == "log_gains" else (b, v, height, width)
         fits = maps is None or maps.shape == expected
         require(fits, f"batch.{name}", str(expected), maps is not None and tuple(maps.shape))
     cameras = batch.cameras

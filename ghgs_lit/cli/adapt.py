@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 # Training people are as tall in a photograph as the user's subject, give or take this share.
 _SPREAD = 0.1
+# Minutes for which the training people of conf/adapt.yaml suffice; ten passes over them learn them by heart.
+_MINUTES = 3
 
 
 def run(cfg: DictConfig) -> float | str | None:
@@ -60,10 +62,16 @@ def with_rig(config: dict[str, Any]) -> dict[str, Any]:
     views = {**config["views"], "training_counts": trained, "evaluation_count": count}
     return {
         **config,
-        "data": {**people, "cameras": entries, "fill": fill},
+        "data": {**people, **_more_people(people, config["minutes"]), "cameras": entries, "fill": fill},
         "views": views,
         "evaluation": {**config["evaluation"], "views": [count]},
     }
+
+
+def _more_people(data: dict[str, Any], minutes: float) -> dict[str, dict[str, int]]:
+    """Numbers of people of each kind, as many more to train on as ``minutes`` exceed three."""
+    kinds = [kind for kind in ("people", "active") if f"data.{kind}.train" not in said()]
+    return {k: {**data[k], "train": round(data[k]["train"] * max(1, minutes / _MINUTES))} for k in kinds}
 
 
 def _cameras_of_data(config: dict[str, Any]) -> tuple[dict[str, dict[str, Any]], list[float]]:

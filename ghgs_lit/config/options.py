@@ -31,7 +31,7 @@ from ghgs_lit.errors import InputError, require
 
 _NOUNS = {type(None): "null", bool: "true or false", int: "an integer", float: "a number"}
 _NOUNS |= {str: "a text", tuple: "a list", dict: "a mapping"}
-_LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
+_LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<", "multiple_of": "a multiple of"}
 
 
 @dataclass(frozen=True)

@@ -197,7 +197,7 @@ class Benchmark(Measured):
     split: Literal["train", "val", "bench", "sealed"] = "val"
     """bench, sealed: frozen people of data=synthetic."""
     subjects: Count | None = 4
-    """Number of subjects, the first of the split; null: all."""
+    """Number of subjects, the first of the split, rounded up to whole batches; null: all."""
     timing: Timing = Timing()
     """How times are taken."""
     threads: int | None = Field(None, ge=1, le=1024)

@@ -36,7 +36,7 @@ class StereoHeadOptions(Options):
     """Photographs to one depth for each pixel, by stereo between neighbouring views."""
 
     group = "depth_head"
-    consistency_depths: int = Field(48, ge=2 ** (LEVELS - 1), le=4096)
+    consistency_depths: int = Field(48, gt=0, le=4096, multiple_of=2 ** (LEVELS - 1))
     """Inverse depths from near to far at which neighbouring views are correlated."""
     updates: int = Field(3, ge=1, le=64)
     """Updates of the inverse depth by the GRU; 3 as published, and no stereo method takes more than 64."""

@@ -109,7 +109,9 @@ class Pictures(Callback):
         shares = part_shares(padding.pad_batch(batch) if padding else batch, tokens.patch_size)
         part = token_parts(shares, tokens)
         found = attention_on_other_parts(stage, tokens, points, part)
-        pl_module.log("attention/other_parts", found.mean(), batch_size=len(batch.images))
+        pl_module.log(
+            "attention/other_parts", found.mean(), batch_size=len(batch.images), rank_zero_only=True
+        )
 
 
 def _publish(trainer: L.Trainer, tag: str, picture: np.ndarray, file: str) -> None:

@@ -57,6 +57,15 @@ def test_all_cameras_of_a_file_are_the_rig(calibration):
     assert (camera["height"], camera["width"]) == (120, 100)
 
 
+def test_longer_trainings_see_more_people(calibration, monkeypatch):
+    """Ten minutes over the people of three learn these by heart; numbers that were said stay."""
+    config = resolve(compose("adapt", [f"cameras={calibration}", "minutes=9", "data.active.train=5"]))
+    monkeypatch.setattr(adapt, "said", lambda: ["data.active.train"])
+    data, few = with_rig(config)["data"], with_rig({**config, "minutes": 1})["data"]
+    assert (data["people"], data["active"]) == ({"train": 96, "val": 6}, {"train": 5, "val": 2})
+    assert few["people"] == config["data"]["people"]
+
+
 def test_cameras_that_do_not_say_their_size_are_refused(calibration):
     content = json.loads(calibration.read_text())
     for camera in content["cameras"].values():
