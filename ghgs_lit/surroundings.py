@@ -52,10 +52,11 @@ def _check_shapes(batch: Batch, patch_size: int) -> None:
     divisible = height % patch_size == width % patch_size == 0
     expected = f"sides divisible by the patch size {patch_size} (or model.pad=multiple)"
     require(divisible, "batch.images", expected, (height, width))
-    for name in ("masks", "alpha", "depths", "log_gains"):
-        maps, expected = getattr(batch, name), (b, v, 3) if name == "log_gains" else (b, v, height, width)
-        fits = maps is None or maps.shape == expected
-        require(fits, f"batch.{name}", str(expected), maps is not None and tuple(maps.shape))
+    shapes = dict.fromkeys(("masks", "alpha", "depths"), (b, v, height, width)) | {"log_gains": (b, v, 3)}
+    for name, shape in shapes.items():
+        tensor = getattr(batch, name)
+        fits = tensor is None or tensor.shape == shape
+        require(fits, f"batch.{name}", str(shape), tensor is not None and tuple(tensor.shape))
     cameras = batch.cameras
     require(cameras.shape == (b, v), "batch.cameras", f"cameras of shape {(b, v)}", tuple(cameras.shape))
     size = (cameras.height, cameras.width)

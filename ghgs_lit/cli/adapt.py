@@ -70,7 +70,7 @@ def with_rig(config: dict[str, Any]) -> dict[str, Any]:
 
 def _more_people(data: dict[str, Any], minutes: float) -> dict[str, dict[str, int]]:
     """Numbers of people of each kind, as many more to train on as ``minutes`` exceed three."""
-    kinds = [kind for kind in ("people", "active") if f"data.{kind}.train" not in said()]
+    kinds = [k for k in ("people", "active") if {f"data.{k}", f"data.{k}.train"}.isdisjoint(said())]
     return {k: {**data[k], "train": round(data[k]["train"] * max(1, minutes / _MINUTES))} for k in kinds}
 
 

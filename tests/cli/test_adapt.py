@@ -57,10 +57,11 @@ def test_all_cameras_of_a_file_are_the_rig(calibration):
     assert (camera["height"], camera["width"]) == (120, 100)
 
 
-def test_longer_trainings_see_more_people(calibration, monkeypatch):
+@pytest.mark.parametrize("numbers", ["data.active.train=5", "data.active={train: 5, val: 2}"])
+def test_longer_trainings_see_more_people(calibration, monkeypatch, numbers):
     """Ten minutes over the people of three learn these by heart; numbers that were said stay."""
-    config = resolve(compose("adapt", [f"cameras={calibration}", "minutes=9", "data.active.train=5"]))
-    monkeypatch.setattr(adapt, "said", lambda: ["data.active.train"])
+    config = resolve(compose("adapt", [f"cameras={calibration}", "minutes=9", numbers]))
+    monkeypatch.setattr(adapt, "said", lambda: [numbers.partition("=")[0]])
     data, few = with_rig(config)["data"], with_rig({**config, "minutes": 1})["data"]
     assert (data["people"], data["active"]) == ({"train": 96, "val": 6}, {"train": 5, "val": 2})
     assert few["people"] == config["data"]["people"]
