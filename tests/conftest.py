@@ -3,10 +3,16 @@
 import gc
 import os
 import signal
+import sys
 import threading
 from pathlib import Path
 
-from tests.helpers.shapes import begin_test, check_shapes
+# Where Python keeps no bytecode, as in many containers, each process that a test starts compiles PyTorch and
+# Lightning anew, which takes longer than most tests.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+from tests.helpers.shapes import begin_test, check_shapes  # noqa: E402
 
 # Modules and tests are no garbage, and looking through what is left takes a tenth of the suite: it is done
 # between tests, now and then, also where a verb turns the collector on again.

@@ -104,7 +104,7 @@ def test_a_lock_is_held_by_one_process_and_freed_by_its_death(tmp_path):
 def limited_write(kind, path, answers):
     """In a process of its own: write 4 MB where files may have half of one, as on a disk that is full."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 19, 1 << 19))
-    content = {"weights": torch.zeros(1 << 20)}
+    content = {"weights": torch.from_numpy(np.zeros(1 << 20, np.float32))}  # no threads after a fork
     write = {
         "text": lambda temporary: temporary.write_text("x" * (4 << 20)),
         "torch": lambda temporary: torch.save(content, temporary),
