@@ -4,8 +4,8 @@
     python benchmarks/training_step.py --packages ../before . -- experiment=scans data.root=/data/scans
 
 The arguments are overrides of ``ghgs train``. Each round trains ``--steps`` steps with each package in a
-process of its own; ``--warmup`` steps before them, which compile and fill caches, do not count. The table has
-the medians of the rounds, and the loss of the last step, which versions that compute the same share.
+process of its own; as many before them, which compile and fill caches, do not count. The table has the
+medians of the rounds, and the loss of the last step, which versions that compute the same share.
 """
 
 import argparse
@@ -27,9 +27,12 @@ from omegaconf import OmegaConf
 from ghgs_lit.config import build, conf_dir
 from ghgs_lit.model import GHGS
 from ghgs_lit.training import GHGSModule
-from ghgs_lit.training.callbacks import Costs
+try:
+    from ghgs_lit.training.cost import Costs
+except ImportError:
+    from ghgs_lit.training.callbacks import Costs
 
-steps, warmup, threads, *overrides = sys.argv[1:]
+steps, threads, *overrides = sys.argv[1:]
 torch.set_num_threads(int(threads))
 try:  # as the command line of the version does
     from ghgs_lit.kernels.allocation import keep_freed_memory
@@ -47,17 +50,16 @@ found = {}
 
 class Keep(L.Callback):
     def on_train_batch_end(self, trainer, pl_module, *args):
-        if trainer.global_step == int(warmup):
-            pl_module.clock.means()
         if trainer.global_step == trainer.max_steps:
-            found["ms"] = pl_module.clock.means()
-            found["loss"] = float(trainer.callback_metrics["loss/total"])
+            values = {name: float(value) for name, value in trainer.callback_metrics.items()}
+            found["ms"] = {n.split("/")[1]: v for n, v in sorted(values.items()) if n.startswith("time_ms/")}
+            found["loss"] = values["loss/total"]
 
 with tempfile.TemporaryDirectory() as folder:
     L.Trainer(
-        accelerator="cpu", max_steps=int(steps) + int(warmup), max_epochs=-1, logger=False,
+        accelerator="cpu", max_steps=2 * int(steps), max_epochs=-1, logger=False,
         enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
-        limit_val_batches=0, num_sanity_val_steps=0, log_every_n_steps=10**9, default_root_dir=folder,
+        limit_val_batches=0, num_sanity_val_steps=0, log_every_n_steps=int(steps), default_root_dir=folder,
         callbacks=[Costs(), Keep()],
     ).fit(module, data)
 print("RESULT" + json.dumps(found))
@@ -66,7 +68,7 @@ print("RESULT" + json.dumps(found))
 
 def measure(package: Path, arguments: argparse.Namespace) -> dict:
     """Milliseconds by part and the last loss of one process."""
-    numbers = [str(n) for n in (arguments.steps, arguments.warmup, arguments.threads)]
+    numbers = [str(n) for n in (arguments.steps, arguments.threads)]
     run = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", CHILD, *numbers, *arguments.overrides],
         cwd=package,  # the first place where python -c looks for modules
@@ -86,7 +88,6 @@ def main() -> None:
     parser.add_argument("--packages", nargs="+", type=Path, default=[Path(__file__).parents[1]])
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--steps", type=int, default=30)
-    parser.add_argument("--warmup", type=int, default=3)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("overrides", nargs="*")
     arguments = parser.parse_args()

@@ -19,8 +19,8 @@ from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.refinement import CameraRefinement, Refinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.training import GHGSModule, Optimization
-from ghgs_lit.training.callbacks import Costs
 from ghgs_lit.training.checkpoints import CheckpointOptions
+from ghgs_lit.training.cost import Costs
 from ghgs_lit.training.validation_pictures import PicturesOptions
 from ghgs_lit.types import Targets
 from ghgs_lit.weights.checkpoint import write_checkpoint

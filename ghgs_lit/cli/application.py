@@ -8,16 +8,10 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 
 import hydra
-import omegaconf._utils
-import yaml
-from hydra._internal.hydra import Hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
@@ -80,31 +74,6 @@ class Verb:
             raise SystemExit(1) from error
 
 
-def read_yaml_quickly() -> None:
-    """Let OmegaConf 2.3 parse with LibYAML if PyYAML has it, which halves the time of a composition."""
-    if not hasattr(omegaconf._utils, "get_yaml_loader"):
-        return
-    before, yaml.SafeLoader = yaml.SafeLoader, getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    loader = omegaconf._utils.get_yaml_loader()
-    yaml.SafeLoader = before
-    omegaconf._utils.get_yaml_loader = lambda: loader
-
-
-@contextmanager
-def composed_once(arguments: Sequence[str]) -> Iterator[None]:
-    """Skip the first of Hydra's two compositions, which only reads ``hydra.mode``. It stays where a sweep, an
-    argument or a file of the user's own (named by a flag or the search path) may set the mode."""
-    says = any(key in text for text in arguments for key in ("sweep", "hydra.mode", "hydra.searchpath"))
-    if says or any(text.startswith("-") and text not in ("-m", "--multirun") for text in arguments):
-        yield
-        return
-    before, Hydra.get_mode = Hydra.get_mode, lambda *_, **__: None
-    try:
-        yield
-    finally:
-        Hydra.get_mode = before
-
-
 def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
     """Rewrite arguments for Hydra: ``data.*`` keys are forced where the data comes from a checkpoint, and
     ``sweep=<file>`` sets the mode, which Hydra 1.4 needs before it composes."""
@@ -117,13 +86,11 @@ def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
     return arguments
 
 
-def _help(verb: str, arguments: list[str]) -> int:
+def _help(verb: str, words: list[str], folder: str | None) -> int:
     from ghgs_lit.cli.help import print_group, print_verb
 
-    words = messages.flags_first(arguments)
-    folders = [Path(folder) for flag, folder in pairwise(words) if flag in ("-cd", "--config-dir")]
-    values = {word for flag, word in pairwise(words) if messages.takes_value(flag)}
-    groups = [word for word in words if not word.startswith("-") and "=" not in word and word not in values]
+    folders = [] if folder is None else [Path(folder)]
+    groups = [word for word in words if "=" not in word]
     for group in groups:
         print_group(verb, group, folders)
     if not groups:
@@ -137,12 +104,12 @@ def run(verb: str, argv: list[str]) -> int:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     task = Verb(verb, tuple(argv), wants_trace)
     try:
-        if "--help" in argv or "-h" in argv:
-            return _help(verb, argv[2:])
-        sys.argv = [argv[0], *messages.flags_first(_for_hydra(verb, argv[2:]))]
-        messages.check_deletions(sys.argv[1:])
-        read_yaml_quickly()
-        with interruptible(), composed_once(sys.argv[1:]):
+        flags, overrides, found = messages.parsed(argv[2:])
+        if found.help:
+            return _help(verb, overrides, found.config_dir)
+        sys.argv = [argv[0], *flags, *_for_hydra(verb, overrides)]
+        messages.check_deletions(overrides)
+        with interruptible():
             hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=verb)(task)()
         sys.stdout.flush()
     except BrokenPipeError:

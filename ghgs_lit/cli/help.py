@@ -49,7 +49,6 @@ def print_verb(verb: str, summary: str, example: str, folders: Sequence[Path] = 
     for line in _fields(VERBS[verb]):
         print(line)
     print("\n--cfg job prints the composed configuration, --info defaults says where each part comes from.")
-    print('Tab completion for bash: eval "$(ghgs -sc install=bash)"')
 
 
 def print_group(verb: str, group: str, folders: Sequence[Path] = ()) -> None:

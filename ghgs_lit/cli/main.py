@@ -9,24 +9,7 @@ from ghgs_lit.kernels.allocation import collect_garbage_again, keep_freed_memory
 from ghgs_lit.kernels.cores import spin_if_alone
 
 
-def _completion_argv(argv: list[str]) -> list[str] | None:
-    """Arguments with which Hydra completes the shell's line (``ghgs -sc ...``) without the verb. While the
-    verb itself is being typed, print the verbs and return None."""
-    if "query" not in argv[2]:
-        return [argv[0], "train", *argv[1:]]
-    line = os.environ.get("COMP_LINE", "")
-    words = line.split()
-    if len(words) < 2 or words[1] not in VERBS:
-        print(" ".join(VERBS))
-        return None
-    os.environ["COMP_LINE"] = line.replace(f" {words[1]}", "", 1)
-    return [argv[0], words[1], *argv[1:]]
-
-
 def _command(argv: list[str]) -> int:
-    if len(argv) > 2 and argv[1] in ("-sc", "--shell-completion"):
-        completed = _completion_argv(argv)
-        return 0 if completed is None else _run(completed)
     if len(argv) < 2 or argv[1] in ("-h", "--help", "help"):
         print(usage())
         return 0 if len(argv) > 1 else 2
@@ -41,10 +24,6 @@ def _command(argv: list[str]) -> int:
         hint = did_you_mean(argv[1], VERBS)
         print(f"ghgs: expected a verb ({', '.join(VERBS)}); found {argv[1]!r}{hint}", file=sys.stderr)
         return 2
-    return _run(argv)
-
-
-def _run(argv: list[str]) -> int:
     from ghgs_lit.cli.application import run  # here: it loads Hydra
 
     return run(argv[1], argv)

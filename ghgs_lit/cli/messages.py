@@ -1,13 +1,15 @@
 """One-line error messages: ``<path or key>: expected ...; found ...``."""
 
+import argparse
 import os
 import re
 import shlex
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import OmegaConf
@@ -24,14 +26,6 @@ from ghgs_lit.errors import InputError
 BAD_INPUT = (InputError, OSError, HydraException, OmegaConfBaseException)
 
 _EXTRAS = {"joblib": "cluster", "submitit": "cluster", "ray": "ray", "optuna": "optuna"}
-
-#: Hydra's flags, and whether a value follows.
-_FLAGS = {
-    **dict.fromkeys(("-h", "--help", "--hydra-help", "--version", "-r", "--run", "-m", "--multirun"), False),
-    **dict.fromkeys(("--resolve", "-sc", "--shell-completion"), False),
-    **dict.fromkeys(("-c", "--cfg", "-i", "--info", "-p", "--package", "-cp", "--config-path"), True),
-    **dict.fromkeys(("-cn", "--config-name", "-cd", "--config-dir", "--experimental-rerun"), True),
-}
 
 #: Nodes of Lightning's classes, whose keys have defaults and so may be deleted.
 _LIGHTNING = ("trainer", "callbacks", "logger")
@@ -124,31 +118,18 @@ class BadUsage(Exception):
     """A flag that Hydra does not have."""
 
 
-def takes_value(flag: str) -> bool:
-    """Whether one of Hydra's flags takes a value."""
-    return _FLAGS.get(flag, False)
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> None:
+        raise BadUsage(f"{message} (--hydra-help lists the flags)")
 
 
-def flags_first(arguments: Sequence[str]) -> list[str]:
-    """Put Hydra's flags before all overrides. BadUsage: a flag is unknown or lacks its value."""
-    flags, overrides = [], []
-    rest: Iterator[str] = iter(arguments)
-    for argument in rest:
-        name, _, value = argument.partition("=")
-        if not argument.startswith("-"):
-            overrides.append(argument)
-        elif name not in _FLAGS:
-            raise BadUsage(f"{name}: expected a flag of --hydra-help; found none of that name")
-        elif _FLAGS[name]:
-            value = value or next(rest, "")
-            if not value:
-                raise BadUsage(f"{name}: expected a value after it, as --hydra-help says; found none")
-            if name in ("-c", "--cfg") and value not in ("job", "hydra", "all"):
-                raise BadUsage(f"{name}: expected one of job, hydra, all; found {value!r}")
-            flags += [name, value]
-        else:
-            flags.append(argument)
-    return flags + overrides
+def parsed(arguments: Sequence[str]) -> tuple[list[str], list[str], argparse.Namespace]:
+    """Hydra's flags, which must stand before all overrides, the overrides, and the flags' values. BadUsage: a
+    flag is unknown, or lacks its value."""
+    parser = get_args_parser()
+    parser.__class__ = _Parser
+    found = parser.parse_intermixed_args(list(arguments))
+    return [each for each in arguments if each not in found.overrides], found.overrides, found
 
 
 def check_deletions(arguments: Sequence[str]) -> None:

@@ -2,12 +2,11 @@
 
 import sys
 
-import pandas as pd
 from omegaconf import DictConfig
 
 from ghgs_lit.cli.inputs import choices
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
-from ghgs_lit.diagnostics.output import pivoted, print_tables
+from ghgs_lit.diagnostics.output import print_tables
 from ghgs_lit.diagnostics.stress import report
 from ghgs_lit.diagnostics.stress.run import run_tasks, tasks_of
 from ghgs_lit.errors import require
@@ -29,9 +28,9 @@ def run(cfg: DictConfig) -> None:
         return
     tasks = tasks_of(config["stages"], config["families"], config["quick"])
     require(bool(tasks), "families", "a family that one of the stages has", config["families"])
-    workers = allowed_cores() if config["workers"] is None else config["workers"]
-    rows = run_tasks(tasks, directory / "cells.jsonl", workers)
-    _print(rows)
+    rows = run_tasks(tasks, allowed_cores() if config["workers"] is None else config["workers"])
+    print_tables(report.tables_of(rows))
+    print(report.said_of(rows))
     source = provenance(config, seed=0, verb="stress", choices=choices())
     announce(report.write(directory, rows, source))
     failed = [row for row in rows if row["failures"]]
@@ -44,13 +43,3 @@ def run(cfg: DictConfig) -> None:
         )
     if failed:
         raise SystemExit(1)
-
-
-def _print(rows: list[report.Row]) -> None:
-    worst = pd.DataFrame([{**row, "error": report.bounded(row["error"])} for row in report.worst_of(rows)])
-    table = pivoted(worst, "stage", "dtype", "error", "{}")
-    stages = pd.DataFrame(rows).groupby("stage", sort=False)
-    table.insert(1, "cases", list(stages.cases.sum()))
-    table.insert(2, "budget", [f"{budget:g}" for budget in stages.budget.first()])
-    cases, failures = (sum(row[name] for row in rows) for name in ("cases", "failures"))
-    print_tables({f"{cases} cases, {failures} failures": table})

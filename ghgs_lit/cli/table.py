@@ -1,19 +1,18 @@
-"""``ghgs table``: show the runs below a directory as one of the paper's tables, or as a list."""
+"""``ghgs table``: show the runs below a directory as one of the paper's tables."""
 
 import re
 from pathlib import Path
 from typing import Any
 
+import rich
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.text import Text
-from tabulate import tabulate
+from rich.markdown import Markdown
 
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation import tables as t
 from ghgs_lit.files import write_text_atomically
-from ghgs_lit.runs.listing import list_runs
+from ghgs_lit.runs.progress import on_terminal
 
 
 def _listed(value: Any) -> tuple | None:
@@ -40,17 +39,11 @@ def _options(config: dict[str, Any]) -> t.TableOptions:
 
 
 def run(cfg: DictConfig) -> None:
-    """Print and write the tables, or with ``list`` the runs."""
+    """Print and write the tables."""
     directory = output_dir()
     config = save_config(cfg, directory)
     options = _options(config)
     folders = [Path(p).expanduser() for p in _listed(config["runs"]) or ()]
-    if config["list"]:
-        runs = list_runs(folders)
-        write_text_atomically(directory / "runs.csv", runs.to_csv(index=False))
-        print(tabulate(runs, "keys", showindex=False, disable_numparse=True))
-        announce(directory / "runs.csv")
-        return
     others = [t.read_others(Path(p).expanduser()) for p in _listed(config["others"]) or ()]
     sweep = t.read_sweep(folders, _listed(config["by"]) or ())
     tables = t.build_tables(sweep, others, options)
@@ -58,14 +51,10 @@ def run(cfg: DictConfig) -> None:
     latex = "\n".join(t.to_latex(table, label) for table, label in zip(tables, labels, strict=True))
     write_text_atomically(directory / "table.csv", t.to_csv(tables))
     write_text_atomically(directory / "table.tex", t.PREAMBLE + latex)
-    write_text_atomically(directory / "table.md", "\n".join(t.to_markdown(table) for table in tables))
-    for table in tables:
-        _print(table)
+    text = "\n".join(map(t.to_markdown, tables))
+    write_text_atomically(directory / "table.md", text)
+    if on_terminal():  # cells are folded to its width
+        rich.print(Markdown(text))
+    else:
+        print(text)
     announce(directory / "table.md")
-
-
-def _print(table: t.Table) -> None:
-    console = Console()
-    console.print(table.caption.replace("`", ""), highlight=False)
-    console.print(Text.from_ansi(t.to_terminal(table, console.width)), soft_wrap=True)
-    console.print("\n".join(table.notes).replace("**", "").replace("`", ""), markup=False, highlight=False)

@@ -89,7 +89,7 @@ def build_trainer(config: dict[str, Any], directory: Path, *further: Callback) -
         callbacks=callbacks,
         default_root_dir=str(directory),
         enable_checkpointing=any(isinstance(c, Checkpoint) for c in callbacks),
-        enable_progress_bar=any(isinstance(c, L.callbacks.ProgressBar) for c in callbacks),
+        enable_progress_bar=False,
     )
 
 

@@ -107,7 +107,7 @@ KINDS: dict[str, dict[str | None, str]] = {
     "augmentation": {None: "ghgs_lit.data.augmentation.Augmentation"},
     "callbacks": {
         "checkpoints": "ghgs_lit.training.checkpoints.CheckpointOptions",
-        "costs": "ghgs_lit.training.callbacks.CostsOptions",
+        "costs": "ghgs_lit.training.cost.CostsOptions",
         "pictures": "ghgs_lit.training.validation_pictures.PicturesOptions",
         "progress": "ghgs_lit.training.callbacks.ProgressOptions",
     },

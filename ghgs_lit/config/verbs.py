@@ -268,8 +268,6 @@ class Table(Options):
         Text | Annotated[tuple[Text, ...], Field(min_length=1)], Words("a text or a list of paths")
     ]
     """The directory of a sweep, or a list of directories."""
-    list: bool = False
-    """No table, but all runs with their state, their best figure and their overrides."""
     layout: Literal["ablation", "table1", "table2", "table3", "table4"] = "ablation"
     """ablation: four rows, 3 to 5 views | table1: data sets | table2: 3 to 5 views | table3: NeRF methods |
     table4: the paper's ablation."""

@@ -11,7 +11,7 @@ from torch import nn
 from torchmetrics import MeanMetric
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.training.cost import StepClock
+from ghgs_lit.kernels.watching import time_mark
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION
@@ -31,7 +31,7 @@ class BudgetedModule(L.LightningModule):
             together with the model's own. None: only that of the model.
 
     Attributes:
-        clock: measures the parts of a step; the callback ``Costs`` starts it.
+        ready: time mark of the end of the last step and all that followed, from where a step waits for data.
         used_budget: used share of the run's budget in [0, 1], as of the last step."""
 
     def __init__(self, model: nn.Module, optimization: Optimization, config: Mapping[str, Any] | None):
@@ -40,13 +40,14 @@ class BudgetedModule(L.LightningModule):
         self.optimization = optimization
         self.config = {**getattr(model, "config", {}), **(config or {})}
         self.used_budget = 0.0
-        self.clock = StepClock()
+        self.ready = time_mark(torch.device("cpu"))
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
         # Lightning copies unknown structures one tensor at a time, and waits for each.
         return batch.to(device, non_blocking=device.type != "cpu")
 
     def on_train_start(self) -> None:
+        self.ready = time_mark(self.device)
         # After a restart the scheduler updates it only after a step.
         self.used_budget = self.progress()
         # This run's options of the optimizer replace those of a resumed checkpoint.
@@ -96,8 +97,7 @@ class BudgetedModule(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_train_batch_end(self, *args: Any) -> None:
-        # Called after all callbacks, so that their time is not counted.
-        self.clock.restart()
+        self.ready = time_mark(self.device)  # called after all callbacks
 
     def on_validation_end(self) -> None:
         self.on_train_batch_end()

@@ -1,79 +1,86 @@
 """Cost of training: time of the parts of a step, and time and memory over all sessions of a run."""
 
 import time
-from collections.abc import Sequence
-from itertools import pairwise
+from contextlib import ExitStack
 from typing import Any
 
 import lightning.pytorch as L
 import torch
 from lightning.pytorch.callbacks import Callback
 
+from ghgs_lit.config.options import Options
 from ghgs_lit.kernels.allocation import forget_peak, resident_bytes
-from ghgs_lit.kernels.watching import Mark, seconds_between, time_mark
+from ghgs_lit.kernels.watching import Inputs, Stopwatch, Watcher, watched
+from ghgs_lit.model import STAGES
 
 #: Parts of a step in their order.
-PARTS = (
-    "data", "interval", "encode", "depth", "unproject", "recalibrate", "gaussians", "rounds", "render",
-    "loss", "backward", "optimizer",
-)  # fmt: skip
+PARTS = ("data", *STAGES, "rounds", "render", "loss", "backward", "optimizer")
 
 
-class StepClock:
-    """Measures the parts of a step: the time between two marks belongs to the part of the second. It does
-    nothing before :meth:`start` and after :meth:`stop`. On CUDA marks are events, read at the end of the next
-    step, so that nothing waits for the device."""
+class CostsOptions(Options):
+    """``time_ms/*``: milliseconds of each part of a step; ``memory_mb/*``: of the process and of the GPU."""
 
-    def __init__(self) -> None:
-        self.device = torch.device("cpu")
-        self.stop()
+    def build(self) -> "Costs":
+        return Costs()
 
-    def start(self, device: torch.device) -> None:
-        """Begin to measure on ``device``; the first part is the wait for data."""
-        self.device, self.running = device, True
-        self.restart()
 
-    def stop(self) -> None:
-        """Stop measuring, and discard all measurements."""
-        self.running = False
-        self._totals: dict[str, float] = {}
-        self._steps = 0
-        self._marks: list[tuple[str | None, Mark]] = []
-        self._pending: list[tuple[str | None, Mark]] = []
+class Costs(Callback, Watcher):
+    """Logs milliseconds of a step and of its parts, means since the last log, and memory in MiB, on CUDA the
+    peak of all tensors since the last log. ``time_ms/01_data`` is the wait for data. Validation, other
+    callbacks and writing of checkpoints and logs do not count."""
 
-    def restart(self) -> None:
-        """Begin the step here; marks since the last :meth:`end_step` are discarded."""
-        if self.running:
-            self._marks = [(None, self._now())]
+    def __init__(self):
+        self._stack = ExitStack()
+        self._inside = False  # a step, not a validation
 
-    def mark(self, part: str) -> None:
-        """``part`` ends here."""
-        if self.running:
-            self._marks.append((part, self._now()))
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        self._begin_interval(pl_module)
+        places = {name: f"model.{name}" for name in (*STAGES, "rounds")}
+        places |= {"render": "renderer", "loss": "losses"}
+        self._stack.enter_context(watched(pl_module, places, self))
 
-    def end_step(self) -> None:
-        """The step ends here with its last part, the optimizer; the next one begins."""
-        self.mark("optimizer")
-        if self.device.type == "cuda":
-            self._pending, self._marks = self._marks, self._pending
-        self._add(self._marks)
-        self.restart()
+    def _begin_interval(self, pl_module: L.LightningModule) -> None:
+        self._watch, self._steps = Stopwatch(pl_module.device), 0
 
-    def means(self) -> dict[str, float]:
-        """Mean milliseconds of each part of a step since the last call, in order, and of the ``step``."""
-        found = {part: 1e3 * self._totals[part] / self._steps for part in PARTS if part in self._totals}
-        if found:
-            found["step"] = sum(found.values())
-        self._totals, self._steps = {}, 0
-        return found
+    def begin(self, stage: str, inputs: Inputs = ((), {})) -> None:
+        if self._inside:
+            self._watch.begin(stage)
 
-    def _add(self, marks: Sequence[tuple[str | None, Mark]]) -> None:
-        self._steps += bool(marks)
-        for (_, begin), (part, stop) in pairwise(marks):
-            self._totals[part] = self._totals.get(part, 0.0) + seconds_between(begin, stop)
+    def end(self, stage: str, result: Any = None) -> None:
+        if self._inside:
+            self._watch.end(stage)
 
-    def _now(self) -> Mark:
-        return time_mark(self.device)
+    def on_train_batch_start(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
+        self._inside = True
+        for stage in ("step", "data"):
+            self._watch.begin(stage, since=pl_module.ready)
+        self.end("data")
+
+    def on_before_backward(self, *args: Any) -> None:
+        self.begin("backward")
+
+    def on_after_backward(self, *args: Any) -> None:
+        self.end("backward")
+        self.begin("optimizer")
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
+        self.end("optimizer")
+        self.end("step")
+        self._inside = False
+        self._steps += 1
+        if trainer.global_step % trainer.log_every_n_steps == 0:
+            means = {part: 1e3 * s / self._steps for part, s in self._watch.seconds().items()}
+            names = {part: f"{number:02d}_{part}" for number, part in enumerate(PARTS, start=1)}
+            pl_module.log_dict({f"time_ms/{names.get(part, part)}": ms for part, ms in means.items()})
+            self._begin_interval(pl_module)
+            pl_module.log("memory_mb/process", resident_bytes() / 2**20)
+            if pl_module.device.type == "cuda":
+                peak = torch.cuda.max_memory_allocated(pl_module.device)
+                pl_module.log("memory_mb/cuda_peak", peak / 2**20)
+                torch.cuda.reset_peak_memory_stats(pl_module.device)
+
+    def teardown(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        self._stack.close()
 
 
 class TrainingCost(Callback):

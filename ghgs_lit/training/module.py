@@ -90,10 +90,7 @@ class GHGSModule(BudgetedModule):
     def forward(self, batch: Batch) -> tuple[Prediction, Rendering]:
         """The prediction for a batch, and its Gaussians rendered from the batch's target cameras."""
         prediction = self.model(batch)
-        self.clock.mark("gaussians")
-        rendering = self.renderer(prediction.gaussians, batch.targets.cameras)
-        self.clock.mark("render")
-        return prediction, rendering
+        return prediction, self.renderer(prediction.gaussians, batch.targets.cameras)
 
     def forward_losses(self, step: Step) -> tuple[Prediction, Tensor, dict[str, Tensor]]:
         """The prediction of a step, its loss and the loss's terms, with the random numbers of its seed."""
@@ -101,7 +98,6 @@ class GHGSModule(BudgetedModule):
         with token_budget(self.model, step.budget):
             prediction, rendering = self(step.batch)
         total, values = self.losses(prediction, rendering, step.batch)
-        self.clock.mark("loss")
         return prediction, total, values
 
     def _step(self, batch: Batch, batch_idx: int) -> Step:

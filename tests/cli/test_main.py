@@ -1,4 +1,4 @@
-"""The command line: verbs, one-line errors, exit codes, completion."""
+"""The command line: verbs, one-line errors, exit codes."""
 
 import importlib
 import logging
@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 from ghgs_lit.cli import application
 from ghgs_lit.cli import main as cli
 from ghgs_lit.cli.application import discard_unused
-from ghgs_lit.cli.messages import flags_first
+from ghgs_lit.cli.messages import parsed
 from ghgs_lit.cli.runtime import write_config
 from ghgs_lit.config import compose, conf_dir
 from ghgs_lit.config.verbs import VERBS
@@ -187,16 +187,6 @@ def test_a_prediction_does_not_wait_for_what_training_needs():
     assert not {"lightning", "torchmetrics", "torch._dynamo", "trimesh", "matplotlib.pyplot"} & loaded
 
 
-def test_completion_offers_verbs_then_groups(monkeypatch, capsys):
-    """Hydra completes one application; the shell needs verbs first, and then the groups of that verb."""
-    monkeypatch.setenv("COMP_LINE", "ghgs tr")
-    _, out, _ = call(monkeypatch, capsys, "-sc", "query=bash")
-    assert set(out.split()) == set(cli.VERBS)
-    monkeypatch.setenv("COMP_LINE", "ghgs train abl")
-    _, out, _ = call(monkeypatch, capsys, "-sc", "query=bash")
-    assert "ablation=" in out
-
-
 def test_the_verb_is_in_argv_while_the_task_runs(monkeypatch):
     """Lightning starts the other processes of a DDP job by sys.argv, which must contain the verb."""
     seen = {}
@@ -224,10 +214,9 @@ def test_a_verb_prints_the_path_of_its_configuration(monkeypatch, capsys, tmp_pa
 
 def test_flags_may_stand_anywhere():
     """Hydra takes none between overrides."""
-    assert flags_first(["seed=1", "-m", "--config-dir", "x", "seed=2"]) == [
-        "-m", "--config-dir", "x", "seed=1", "seed=2",
-    ]  # fmt: skip
-    assert flags_first(["--cfg=job", "seed=1"]) == ["--cfg", "job", "seed=1"]
+    flags, overrides, _ = parsed(["seed=1", "-m", "--config-dir", "x", "seed=2"])
+    assert (flags, overrides) == (["-m", "--config-dir", "x"], ["seed=1", "seed=2"])
+    assert parsed(["--cfg=job", "seed=1"])[:2] == (["--cfg=job"], ["seed=1"])
 
 
 class Seeded(BaseException):

@@ -9,7 +9,6 @@ import time
 import pytest
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.runs.listing import list_runs
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory, State
 from tests.helpers.jobs import (
@@ -53,26 +52,6 @@ def test_figures_that_are_no_finite_numbers_are_refused(tmp_path, part, value):
     with pytest.raises(InputError, match=rf"metrics\.json\.{part}\[0\]\.psnr: expected"):
         read_results(path)
     assert not RunDirectory(tmp_path).done
-
-
-def test_runs_are_listed_with_what_tells_them_apart(tmp_path):
-    """Their state, their best figure, of a run that trains that of its validations, and what was said."""
-    for name in ("done", "going", "planned", "other"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "config.yaml").write_text("a: 1" if name == "other" else "trainer: {}")
-    write_finished_run(tmp_path / "done", {"seed": 1}, psnr=23.456)
-    said = tmp_path / "done" / ".hydra" / "overrides.yaml"
-    said.parent.mkdir()
-    said.write_text("- seed=1\n- optimizer.lr=0.1\n")
-    log = tmp_path / "going" / "csv" / "metrics.csv"
-    log.parent.mkdir()
-    log.write_text("step,loss,val/psnr\n1,3,\n2,,21.5\n3,,20.0\n")
-    listed = list_runs([tmp_path]).set_index("run")
-    listed.index = [os.path.basename(path) for path in listed.index]
-    assert list(listed.index) == ["done", "going", "planned"]
-    assert list(listed.state) == ["done", "missing", "missing"]
-    assert list(listed.best) == ["23.46 dB (model, 4 views, release)", "21.50 dB (validation)", ""]
-    assert list(listed.overrides) == ["seed=1 optimizer.lr=0.1", "", ""]
 
 
 def test_a_kill_while_writing_results_leaves_nothing_behind(tmp_path):

@@ -17,8 +17,7 @@ from ghgs_lit.config import build
 from ghgs_lit.errors import InputError
 from ghgs_lit.kernels.allocation import resident_bytes
 from ghgs_lit.training import GHGSModule, Optimization
-from ghgs_lit.training.callbacks import Costs
-from ghgs_lit.training.cost import PARTS, StepClock
+from ghgs_lit.training.cost import Costs
 from ghgs_lit.training.loggers import (
     CsvLog,
     TensorBoardLog,
@@ -89,7 +88,7 @@ def run(tmp_path_factory):
 def test_tags_are_grouped_by_what_they_are(run):
     """The tags are those that the documentation lists, no more and no fewer."""
     tags = set(events(run[0] / "tensorboard").Tags()["scalars"])
-    stages = ("01_data", "02_interval", "03_encode", "04_depth", "07_gaussians", "09_render", "10_loss")
+    stages = ("01_data", "03_encoder", "04_depth_head", "09_render", "10_loss")
     times = {f"time_ms/{part}" for part in (*stages, "11_backward", "12_optimizer", "step")}
     assert tags == times | {
         "loss/total", "loss/render_l1", "loss/chamfer", "memory_mb/process",
@@ -100,7 +99,7 @@ def test_tags_are_grouped_by_what_they_are(run):
 
 
 def test_the_numbers_are_those_of_the_steps(run):
-    """Values are logged at the steps taken, and the parts of a step add up to its time."""
+    """Values are logged at the steps taken, and a step takes as long as its parts or longer."""
     found = events(run[0] / "tensorboard")
     rates = {e.step: e.value for e in found.Scalars("train/learning_rate")}
     assert sorted(rates) == [2, 4, 6, 8]
@@ -108,7 +107,7 @@ def test_the_numbers_are_those_of_the_steps(run):
     assert [e.value for e in found.Scalars("train/budget")] == pytest.approx([1 / 8, 3 / 8, 5 / 8, 7 / 8])
     parts = [tag for tag in found.Tags()["scalars"] if tag.startswith("time_ms/") and "step" not in tag]
     for place, whole in enumerate(found.Scalars("time_ms/step")):
-        assert whole.value == pytest.approx(sum(found.Scalars(p)[place].value for p in parts), rel=1e-4)
+        assert 0 < sum(found.Scalars(p)[place].value for p in parts) <= whole.value
     assert 10 < found.Scalars("memory_mb/process")[0].value < 1e6
 
 
@@ -139,9 +138,9 @@ def test_the_session_says_what_the_run_is_and_that_it_ended(run):
 
 
 def test_nothing_of_the_clock_stays(run):
-    """After training the model has no hooks and the clock does not run: evaluation is not slowed down."""
+    """After training the model has no hooks: evaluation is not slowed down."""
     _, subject = run
-    assert not subject.clock.running
+    assert subject.renderer is flat_renderer
     assert not subject.model.encoder._forward_hooks
     assert not subject.model.encoder._forward_pre_hooks
 
@@ -215,26 +214,6 @@ def test_final_numbers_name_their_protocol():
         {"method": "model", "views": 4, "targets": "midway", "subjects": 2, "psnr": 28, "lpips": None},
     ]
     assert final_numbers(summary) == {"hparam/psnr": 30.0, "hparam_v4_midway/psnr": 28.0}
-
-
-def test_a_clock_gives_each_span_to_the_part_that_ends_it(monkeypatch):
-    """Times belong to the right part, and validations are not counted."""
-    now = iter([0.0, 1.0, 3.0, 3.5, 10.0, 10.0, 11.0, 11.0, 12.0, 20.0, 20.0])
-    monkeypatch.setattr("time.perf_counter", lambda: next(now))
-    clock = StepClock()
-    clock.mark("render")  # does not run yet: nothing to measure from
-    clock.start(torch.device("cpu"))
-    for part in ("data", "encode", "data"):
-        clock.mark(part)
-    clock.end_step()  # at 10.0
-    clock.mark("data")
-    clock.restart()  # a validation: not counted
-    clock.mark("data")
-    clock.end_step()
-    means = clock.means()
-    assert means == {"data": 1250.0, "encode": 1000.0, "optimizer": 7250.0, "step": 9500.0}
-    assert clock.means() == {}
-    assert list(means) == [p for p in PARTS if p in means] + ["step"]
 
 
 def test_memory_is_that_of_this_process():

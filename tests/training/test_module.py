@@ -21,8 +21,9 @@ from ghgs_lit.metrics.functional import psnr, ssim
 from ghgs_lit.model import GHGS
 from ghgs_lit.runs.progress import Lines, track
 from ghgs_lit.training import DivergedError, GHGSModule, Optimization
-from ghgs_lit.training.callbacks import Costs, RunProgress
+from ghgs_lit.training.callbacks import RunProgress
 from ghgs_lit.training.checkpoints import CheckpointOptions, Checkpoints
+from ghgs_lit.training.cost import Costs
 from ghgs_lit.training.trainer import TrainerOptions
 from ghgs_lit.training.validation_pictures import PicturesOptions
 from ghgs_lit.types import Targets
@@ -222,11 +223,9 @@ def test_tf32_is_for_networks_alone():
         torch.set_float32_matmul_precision("highest")
 
 
-def test_without_a_terminal_lines_say_how_far_the_run_is(tmp_path, capsys, monkeypatch):
+def test_lines_say_how_far_the_run_is(tmp_path, capsys, monkeypatch):
     """A log of a batch job shows step, loss, seconds a step, time left and validation, as does train.log."""
-    monkeypatch.setattr("ghgs_lit.training.callbacks.on_terminal", lambda: False)
-    monkeypatch.setattr("ghgs_lit.runs.progress.EVERY", 0.0)
-    monkeypatch.setattr(Lines.__init__, "__defaults__", (None, True, 0.0))
+    monkeypatch.setattr("ghgs_lit.training.callbacks.EVERY", 0.0)
     trainer(tmp_path, steps=12, callbacks=[RunProgress()]).fit(module(), loader(), loader(1))
     lines = (tmp_path / "train.log").read_text().splitlines()
     assert len(lines) == 12
@@ -240,7 +239,7 @@ def test_the_lines_come_once_a_minute(monkeypatch):
     """A log of days has thousands of lines, not millions."""
     now = iter([0.0, 0.0, 30.0, 60.0, 90.0, 125.0])
     monkeypatch.setattr("ghgs_lit.runs.progress.time.monotonic", lambda: next(now))
-    lines = Lines(printed=False)
+    lines = Lines()
     assert [lines.due() for _ in range(5)] == [True, False, True, False, True]
 
 

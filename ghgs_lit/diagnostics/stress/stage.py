@@ -103,7 +103,8 @@ class Stage:
         quick: the same in a quick run, which misses rare failures.
         network: whether the stage computes in autocast's dtype, not in float32 or wider.
         kappa: lower bound of the condition number, where the stage's definition subtracts large numbers.
-        excluded: families that do not apply although their ingredient does, with the reason.
+        excluded: families that do not apply although their ingredient does, separated by spaces, with the
+            reason.
         sizes: magnitude [n] of terms that cancel in the gradients by definition.
         ties: families whose gradients are not unique and must only be finite.
         refused: families that must be refused with an :class:`~ghgs_lit.errors.InputError`.
@@ -134,17 +135,11 @@ class Stage:
         if not (0 < self.factor <= LARGEST and self.reason):
             raise ValueError(f"{self.name}: a budget needs a factor up to {LARGEST} and a reason")
 
-    def missing(self, family: str) -> str | None:
-        """Why a family has no cases; None if it has."""
+    def has(self, family: str) -> bool:
+        """Whether the stage has cases of a family."""
         ingredient = FAMILIES[family].ingredient
-        if ingredient is not None and ingredient not in self.ingredients:
-            return f"takes no {ingredient}"
-        return self.excluded.get(family)
-
-
-def except_for(reasons: Mapping[str, str]) -> dict[str, str]:
-    """``excluded`` of a stage, from reasons by several names that are separated by spaces."""
-    return {name: reason for names, reason in reasons.items() for name in names.split()}
+        fits = ingredient is None or ingredient in self.ingredients
+        return fits and family not in " ".join(self.excluded).split()
 
 
 def case_by_case(run: Callable[[Values], Values]) -> Callable[[Values], Values]:

@@ -26,7 +26,6 @@ from ghgs_lit.config import conf_dir
 from ghgs_lit.config.keys import ABLATIONS, EXPECTED_TO_DIFFER, flatten, is_below, lookup, switches_of
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.readers import read_json, read_yaml
-from ghgs_lit.runs.listing import files_below
 from ghgs_lit.runs.results import KEYS, METHOD, read_results, validated
 
 SETTING = ["data", "split", "targets", "protocol"]
@@ -215,6 +214,15 @@ def _planned(path: Path, by: Sequence[str]) -> Planned | None:
     seed = config.get("seed", 0)
     require(isinstance(seed, int), f"{path}: seed", "a whole number", seed)
     return Planned(model_variant(config, str(path), by), data, seed, done)
+
+
+def files_below(folders: Sequence[Path], name: str) -> list[Path]:
+    """Files called ``name`` below folders, except in ``.hydra``. FileNotFoundError: a folder is missing."""
+    for folder in folders:
+        if not folder.is_dir():
+            raise FileNotFoundError(f"{folder}: expected a directory of runs; found none")
+    paths = [path for folder in folders for path in sorted(folder.rglob(name))]
+    return [path for path in paths if path.parent.name != ".hydra"]
 
 
 def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:

@@ -1,4 +1,4 @@
-r"""Writers of tables: Markdown, terminal, CSV, and LaTeX in the paper's layout.
+r"""Writers of tables: Markdown, CSV, and LaTeX in the paper's layout.
 
 LaTeX needs ``\usepackage{booktabs,multirow,adjustbox,pifont}``.
 """
@@ -9,13 +9,10 @@ from dataclasses import asdict
 from typing import Any
 
 import pandas as pd
-from tabulate import tabulate
 
 from ghgs_lit.evaluation.tables.layouts import Line, Table, arrow, data_title, decimals, title
 from ghgs_lit.evaluation.tables.notes import MARK
 
-#: Bold and green on a terminal.
-_BEST = "\033[1;32m{}\033[0m"
 COLUMNS = (
     "table", "kind", "method", "model", "encoder", "ablation", "unprojection", "semantic", "extra", "data",
     "split", "targets", "protocol", "views", "metric", "mean", "deviation", "seeds", "seeds_lacking",
@@ -46,9 +43,9 @@ def texts(table: Table, write: Write) -> pd.DataFrame:
     return pd.Series(cells, table.cells.index).unstack(["group", "metric"])
 
 
-def heading(table: Table, group: int, metric: str, between: str) -> str:
+def heading(table: Table, group: int, metric: str) -> str:
     """Title of a column after that of its group, if the layout has one."""
-    named = f"{table.groups[group].title}{between}" if table.layout.heading != "none" else ""
+    named = f"{table.groups[group].title} " if table.layout.heading != "none" else ""
     return named + f"{title(metric)} {arrow(metric)}".strip()
 
 
@@ -66,38 +63,11 @@ def to_markdown(table: Table) -> str:
             empty = [""] * (len(table.stub) + numbers.shape[1] - 1)
             rows.append([f"*{table.block_title(block)}*", *empty])
         rows += [[*table.lines[i].stub, *numbers.loc[i]] for i in block]
-    names = [*table.stub, *(heading(table, *column, " ") for column in numbers)]
+    names = [*table.stub, *(heading(table, *column) for column in numbers)]
     align = ["center" if len(table.stub) > 1 else "left"] * len(table.stub) + ["right"] * numbers.shape[1]
     frame = pd.DataFrame(rows, columns=pd.Index(names))
     text = frame.to_markdown(index=False, colalign=align, disable_numparse=True)
     return "\n\n".join((table.caption, text, *table.notes)) + "\n"
-
-
-def to_terminal(table: Table, width: int) -> str:
-    """Cells for a terminal; groups stand below one another if the table is wider than ``width``."""
-
-    def write(number: str, tail: str, best: bool) -> str:
-        # Brackets stand below their number; beside it few tables would fit.
-        lines = re.sub(r" (?=[\[(])", "\n", number + tail).split("\n")
-        return "\n".join(_BEST.format(line) if best else line for line in lines)
-
-    numbers = texts(table, write)
-    whole = _terminal(table, numbers)
-    if max(map(len, re.sub(r"\033\[[\d;]*m", "", whole).splitlines())) <= width:
-        return whole
-    return "\n\n".join(_terminal(table, numbers[[group]]) for group in range(len(table.groups)))
-
-
-def _terminal(table: Table, numbers: pd.DataFrame) -> str:
-    short = {"3D Unproj.": "3D\nunp.", "Semantic Cons.": "sem.\ncons."}
-    names = [short.get(name, name) for name in table.stub]
-    names += [heading(table, *column, "\n") for column in numbers]
-    rows = []
-    for block in table.blocks:
-        mark = "† " if table.lines[block[0]].is_reported else ""
-        rows += [[mark + (stub := table.lines[i].stub)[0], *stub[1:], *numbers.loc[i]] for i in block]
-    align = ["center" if len(table.stub) > 1 else "left"] * len(table.stub) + ["right"] * numbers.shape[1]
-    return tabulate(rows, names, colalign=align, disable_numparse=True)
 
 
 def to_csv(tables: Sequence[Table]) -> str:

@@ -58,7 +58,6 @@ class PretextModule(BudgetedModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         loss = cross_entropy(*self.model(batch)[:2])
-        self.clock.mark("loss")
         size = len(batch.images)
         self.log("loss/parts", loss.detach(), prog_bar=True, batch_size=size)
         rate = self.optimizers().param_groups[0]["lr"]

@@ -7,7 +7,7 @@ from torch import Generator, Tensor
 from ghgs_lit.bounds import VisualHull
 from ghgs_lit.bounds.silhouettes import depths_in_box, ray_directions
 from ghgs_lit.diagnostics.stress import inputs
-from ghgs_lit.diagnostics.stress.stage import FLOAT32_ONLY, Stage, Values, except_for
+from ghgs_lit.diagnostics.stress.stage import FLOAT32_ONLY, Stage, Values
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.geometry.masks import relative_bounds, relative_depth
 from ghgs_lit.geometry.padding import pad_to_patches
@@ -263,7 +263,7 @@ STAGES = (
         lambda f, g: {**_project_inputs(f, g), "maps": inputs.images(f, g, 3, _SIZE, _SIZE)}, _sample, 20,
         "a mean of four pixels; their shares lose the digits of a pixel's place (kappa)", _sample_slowly,
         steady=("middle",), seeds=64,
-        excluded=except_for({"nan inf": "its callers clean their maps"}),
+        excluded={"nan inf": "its callers clean their maps"},
     ),
     Stage(
         "photo-consistency", ("cameras", "images", "masks"), _photo_inputs, _photo, 100,

@@ -6,7 +6,7 @@ import torch
 from torch import Generator
 
 from ghgs_lit.diagnostics.stress import inputs
-from ghgs_lit.diagnostics.stress.stage import Stage, Values, except_for
+from ghgs_lit.diagnostics.stress.stage import Stage, Values
 from ghgs_lit.geometry.rotations import quaternion_to_matrix, unit
 from ghgs_lit.heads.activations import confidence_of
 from ghgs_lit.heads.depth import BOUNDED, bounded_depth
@@ -90,10 +90,10 @@ STAGES = (
     Stage(
         "depth activation", ("raw values", "cameras", "depths"), _depth_inputs, _depth, 50,
         "a sigmoid and two divisions", gradients=("raw", "near", "far"), silent=_BOUNDED,
-        excluded=except_for({
+        excluded={
             "zero_depth negative_depth near_zero_depth huge_depth": "depths are the result",
             "shifted wide long skewed mirrored degenerate": "takes bounds, not cameras",
-        }),
+        },
     ),
     Stage(
         "attributes", ("raw values", "depths"), _attribute_inputs, _attributes, 50,

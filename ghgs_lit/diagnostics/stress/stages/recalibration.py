@@ -4,7 +4,7 @@ import torch
 from torch import Generator, Tensor
 
 from ghgs_lit.diagnostics.stress import inputs
-from ghgs_lit.diagnostics.stress.stage import FLOAT32_ONLY, Stage, Values, case_by_case, except_for
+from ghgs_lit.diagnostics.stress.stage import FLOAT32_ONLY, Stage, Values, case_by_case
 from ghgs_lit.encoder.cpu import attend as attend_heads
 from ghgs_lit.kernels.compile import processor_features
 from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
@@ -119,7 +119,7 @@ STAGES = [
     Stage(
         "neighbours", ("cameras", "points", "neighbors"), _point_inputs, case_by_case(_distances), 20,
         "distances of differences: three squares and a root", case_by_case(_distances_slowly), seeds=48,
-        excluded=except_for(inputs.NO_CAMERA),
+        excluded=inputs.NO_CAMERA,
         silent="a point that is not finite is nobody's neighbour while there are others",
     ),
     Stage(

@@ -4,7 +4,7 @@ import torch
 from torch import Generator, Tensor
 
 from ghgs_lit.diagnostics.stress import inputs
-from ghgs_lit.diagnostics.stress.stage import FLOAT32_ONLY, Stage, Values, case_by_case, except_for
+from ghgs_lit.diagnostics.stress.stage import FLOAT32_ONLY, Stage, Values, case_by_case
 from ghgs_lit.geometry.chamfer import chamfer
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.metrics.flip import flip_map
@@ -154,7 +154,7 @@ STAGES = (
         case_by_case(lambda v: {"chamfer": chamfer(v["points"], v["surface"])}), 20,
         "means of squares of differences", case_by_case(_chamfer_slowly), gradients=("points", "surface"),
         seeds=96, ties=("duplicates", "collapsed"),
-        excluded=except_for({**inputs.NO_CAMERA, "masked": "takes no masks"}),
+        excluded={**inputs.NO_CAMERA, "masked": "takes no masks"},
     ),
     Stage(
         "PSNR and FLIP", ("images",), _pair, _metrics, 100,
