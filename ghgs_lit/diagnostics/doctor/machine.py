@@ -35,6 +35,9 @@ def machine_lines(device: torch.device) -> list[Line]:
 def missing_extras() -> Iterator[Line]:
     """Yield each incomplete extra of the package with the command that installs it."""
     wanted: dict[str, list[str]] = {}
+    if _version(DISTRIBUTION) is None:  # run from its sources
+        yield DISTRIBUTION, "not installed, so that its extras are not known: pip install -e ."
+        return
     for requirement in importlib.metadata.requires(DISTRIBUTION) or []:
         extra = re.search(r"extra == ['\"]([\w-]+)['\"]", requirement)
         if extra and extra[1] != "dev":

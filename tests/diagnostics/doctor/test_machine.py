@@ -17,6 +17,17 @@ def test_what_is_missing_is_named_with_the_command_that_installs_it(monkeypatch)
     assert list(missing_extras()) == [("magic", "nothing-there missing: pip install 'ghgs-lit[magic]'")]
 
 
+def test_a_package_that_is_not_installed_is_said(monkeypatch):
+    """Run from its sources, it has no extras to look up, and nothing fails."""
+
+    def unknown(name: str):
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "distribution", unknown)
+    ((name, said),) = missing_extras()
+    assert name == "ghgs-lit" and "not installed" in said
+
+
 def test_the_machine_is_described():
     """Versions, processor, memory, GPU and renderer are there."""
     found = dict(machine_lines(torch.device("cpu")))
