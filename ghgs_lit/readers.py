@@ -32,10 +32,10 @@ def require_file(path: str | os.PathLike, expected: str) -> None:
     require(is_file, str(path), expected, "a folder" if os.path.isdir(path) else "no regular file")
 
 
-def require_data_folder(folder: Path) -> None:
-    """Refuse a folder of a data set that is missing."""
+def require_folder(folder: Path, expected: str = "the folder of the data set") -> None:
+    """Refuse a folder that is missing."""
     if not folder.is_dir():
-        raise InputError(f"{folder}: expected the folder of the data set; found no such folder")
+        raise InputError(f"{folder}: expected {expected}; found no such folder")
 
 
 def read_text(path: Path, expected: str = "text") -> str:

@@ -11,7 +11,6 @@ from PIL import Image, PngImagePlugin
 from ghgs_lit.data.decoding import read_array, read_image
 from ghgs_lit.data.layout import Completeness
 from ghgs_lit.data.pickles import load_npy
-from ghgs_lit.data.splits import read_split
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.tables.records import read_others, read_sweep
 from ghgs_lit.readers import LARGEST, read_json, read_lines_of_json, read_npy, read_rows, read_text, read_yaml
@@ -125,7 +124,6 @@ def test_foreign_content_of_files_of_this_program(tmp_path, content):
     readers = {
         folder / "plan.json": lambda: Completeness(tmp_path).plan,
         folder / "settings.json": lambda: Progress(tmp_path).check_settings({"size": 3}),
-        tmp_path / "splits.json": lambda: read_split(tmp_path / "splits.json", ["a"]),
         tmp_path / "metrics.json": lambda: read_results(tmp_path / "metrics.json"),
         tmp_path / "other.json": lambda: read_others(tmp_path / "other.json"),
     }

@@ -6,7 +6,7 @@ from typing import Any
 
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.folder import CaptureFolder
-from ghgs_lit.readers import require_data_folder
+from ghgs_lit.readers import require_folder
 from ghgs_lit.weights.reading import require_weights
 
 _BEGUN: list[CaptureFolder] = []  #: The folder whose photographs are being decoded, if any
@@ -90,4 +90,4 @@ def require_paths(verb: str, config: Mapping[str, Any]) -> None:
     data = config.get("data")
     is_read = verb in _READERS and isinstance(data, Mapping) and not data.get("source")
     if is_read and isinstance(data.get("root"), str):
-        require_data_folder(Path(data["root"]).expanduser())
+        require_folder(Path(data["root"]).expanduser())

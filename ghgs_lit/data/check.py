@@ -3,8 +3,8 @@
 import hashlib
 import json
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from rich.progress import track
 from rich.table import Table
 from torch.utils.data import DataLoader, Dataset
 
-from ghgs_lit.data.cross_checks import Phase, Photograph, Report, Seen, agreeing, shared
+from ghgs_lit.data.cross_checks import Photograph, Seen, compare_masks
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.overlap import Tile, draw_tile, overlap, save_sheet
 from ghgs_lit.data.reader import PHASES, Photographs, Reader
@@ -35,6 +35,33 @@ _BLACK = 8
 _TALLEST = 10.0
 
 
+@dataclass
+class Phase:
+    """Results of a phase."""
+
+    reader: Reader
+    seen: list[Seen]
+
+    @property
+    def bodies(self) -> int:
+        """Number of subjects with a body."""
+        return len({one.name for one in self.seen if one.body})
+
+    def known(self, key: str) -> list[float]:
+        """All known values of ``iou``, ``agreement`` or ``tall``."""
+        return [value for one in self.seen if (value := getattr(one, key)) is not None]
+
+
+@dataclass
+class Report:
+    """Result of a check. ``problems``: lines ``<place>: expected ...; found ...`` that prevent training;
+    ``notes``: lines that do not."""
+
+    phases: dict[str, Phase] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
 @dataclass(frozen=True)
 class _Readings(Dataset):
     """Item ``i`` is the result of reading photograph ``i``."""
@@ -49,33 +76,28 @@ class _Readings(Dataset):
 
     def __getitem__(self, index: int) -> Seen:
         photograph = self.listed[index]
-        wanted = photograph in self.pictured
+        seen, wanted = Seen(*photograph), photograph in self.pictured
         try:
             view = self.photographs.view(*photograph)
-            body = self.photographs.body(photograph[0])
+            body = self.photographs.body(seen.name)
         except InputError as error:
-            return Seen(*photograph, problem=str(error), tile=draw_tile(None, None) if wanted else None)
-        seen = Seen(
-            *photograph,
-            body=body is not None,
-            tall=None if body is None else float(np.ptp(body, axis=0).max()),
-            digest=hashlib.blake2b(view.image.tobytes(), digest_size=16).hexdigest(),
-            tile=draw_tile(view, body) if wanted else None,
-        )
-        fit = None if body is None else overlap(body, view)
-        if fit is not None:
-            seen = replace(seen, iou=fit.iou, inside=fit.inside)
-        problem = self._problem(view, seen)
-        if problem is not None:
-            return replace(seen, problem=f"{self.photographs.reader.place(*photograph)}: {problem}")
-        return seen if fit is not None else replace(seen, silhouette=silhouette(view))
+            seen.problem = str(error)
+            seen.tile = draw_tile(None, None) if wanted else None
+            return seen
+        seen.digest = hashlib.blake2b(view.image.tobytes(), digest_size=16).hexdigest()
+        seen.tile = draw_tile(view, body) if wanted else None
+        if body is not None:
+            seen.body, seen.tall, seen.iou = True, float(np.ptp(body, axis=0).max()), overlap(body, view)
+        if (problem := self._problem(view, seen.iou)) is not None:
+            seen.problem = f"{self.photographs.reader.place(*photograph)}: {problem}"
+        elif seen.iou is None:
+            seen.silhouette = silhouette(view)
+        return seen
 
-    def _problem(self, view: View, seen: Seen) -> str | None:
-        if seen.iou is not None and seen.iou < self.min_iou:
-            return (
-                f"expected the body in its mask (IoU of {self.min_iou:.2f} or more); found IoU {seen.iou:.2f}"
-            )
-        if seen.iou is None and (problem := implausible(view.mask)) is not None:
+    def _problem(self, view: View, iou: float | None) -> str | None:
+        if iou is not None and iou < self.min_iou:
+            return f"expected the body in its mask (IoU of {self.min_iou:.2f} or more); found IoU {iou:.2f}"
+        if iou is None and (problem := implausible(view.mask)) is not None:
             return problem
         brightest = int(view.image[view.mask].max())
         if brightest < _BLACK:
@@ -83,45 +105,14 @@ class _Readings(Dataset):
         return None
 
 
-@dataclass(frozen=True)
-class _Inspections(Dataset):
-    """Item ``i`` is the problem of inspection ``i``, or None."""
-
-    inspections: Sequence[Callable[[], None]]
-
-    def __len__(self) -> int:
-        return len(self.inspections)
-
-    def __getitem__(self, index: int) -> str | None:
-        try:
-            self.inspections[index]()
-        except InputError as error:
-            return str(error)
-        return None
-
-
-def _read_all(items: Dataset, workers: int, label: str) -> list:
-    loader = DataLoader(items, batch_size=None, num_workers=min(workers, len(items)))
-    return list(track(loader, label, total=len(items), console=Console(stderr=True)))
-
-
 def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: float = 0.9) -> Report:
     """Read everything that training and evaluation would read, once, with the workers of ``data``.
     ``min_iou``: least IoU of a body's silhouette and a mask; clothed people reach 0.75 to 0.95, wrong cameras
     0 to 0.4. ``min_agreement``, without a body: least share of a mask that the subject's other masks allow;
     right cameras reach 0.98 to 1."""
-    report = Report()
-    dataset, workers = data.dataset, data.dataset.workers
+    report, dataset = Report(), data.dataset
     # Static cameras allow only one protocol.
     targets = CAMERAS if dataset.static_cameras else data.targets
-    inspections = dataset.inspections()
-    report.inspections = len(inspections)
-    if inspections:
-        found = _read_all(_Inspections(inspections), workers, "checking files")
-        report.problems += [line for line in found if line is not None]
-    if dataset.root is None and inspections:
-        return report
-    readers: dict[str, Reader] = {}
     for phase in PHASES:
         try:
             if phase == "train" and not dataset.has(phase):
@@ -133,56 +124,60 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
         except InputError as error:
             report.problems.append(str(error))
             continue
-        report.problems += reader.problems
-        cache_mb = min(data.dataset.cache_images_mb, _CACHE_MB)
-        found = _inspect_phase(phase, Photographs(reader, None, cache_mb), targets, min_iou, workers)
-        found.seen = agreeing(found.seen, reader, min_agreement)
+        photographs = Photographs(reader, None, min(dataset.cache_images_mb, _CACHE_MB))
+        found = Phase(reader, _read(photographs, targets, min_iou, dataset.workers, f"checking {phase}"))
+        compare_masks(found.seen, reader, min_agreement)
         report.phases[phase] = found
-        readers[phase] = reader
-        report.problems += [seen.problem for seen in found.seen if seen.problem]
-        report.notes += _notes(dataset.published.get(phase), phase, reader, found)
-    report.problems += shared(str(dataset.root), report.phases, readers)
+        report.problems += reader.problems + [seen.problem for seen in found.seen if seen.problem]
+        report.notes += _notes(dataset.published.get(phase), phase, found)
+    report.problems += _in_both(str(dataset.root), report.phases)
     if not report.problems:
         report.problems += _cannot_sample(data, targets, "train" in report.phases)
     report.problems = list(dict.fromkeys(report.problems))
     return report
 
 
-def _inspect_phase(
-    phase: str, photographs: Photographs, targets: TargetProtocol, min_iou: float, workers: int
-) -> Phase:
+def _read(
+    photographs: Photographs, targets: TargetProtocol, min_iou: float, workers: int, label: str
+) -> list[Seen]:
     reader = photographs.reader
     # Views that the protocol may ask for are read even if no file of theirs exists.
     needed = {RING_VIEW} | targets.view_numbers
     places = [(name, position) for name, positions in reader.subjects.items() for position in positions]
     listed = [(*place, view) for place in places for view in sorted(needed | set(reader.views_at(*place)))]
+    if not listed:
+        return []
     items = _Readings(photographs, listed, _pictured(reader), min_iou)
-    seen = _read_all(items, workers, f"checking {phase}") if listed else []
-    bodies = len({s.name for s in seen if s.body})
-    return Phase(reader.people, len(reader.subjects), bodies, seen)
+    loader = DataLoader(items, batch_size=None, num_workers=min(workers, len(items)))
+    return list(track(loader, label, total=len(items), console=Console(stderr=True)))
 
 
 def _pictured(reader: Reader) -> set[Photograph]:
+    """Photographs of the contact sheet: some positions of some subjects, evenly spaced."""
 
     def some(items: Sequence, count: int) -> list:
         return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, count).round().astype(int))]
 
-    names = some(list(reader.subjects), _PICTURED_SUBJECTS) if reader.subjects else []
-    chosen = {name: some(reader.subjects[name], _PICTURED_VIEWS) for name in names}
-    return {(name, position, RING_VIEW) for name, positions in chosen.items() for position in positions}
+    return {
+        (name, position, RING_VIEW)
+        for name in some(list(reader.subjects), _PICTURED_SUBJECTS)
+        for position in some(reader.subjects[name], _PICTURED_VIEWS)
+    }
 
 
-def _notes(published: int | None, phase: str, reader: Reader, read: Phase) -> list[str]:
-    notes = []
-    if published is not None and read.people != published:
-        notes.append(f"{phase}: expected {published} people as published; found {read.people}")
-    if read.bodies < read.subjects:
+def _notes(published: int | None, phase: str, found: Phase) -> list[str]:
+    reader, notes = found.reader, []
+    if published is not None and reader.people != published:
+        notes.append(f"{phase}: expected {published} people as published; found {reader.people}")
+    if found.bodies < len(reader.subjects):
         notes.append(
-            f"{phase}: expected a body for each of {read.subjects} subjects; found {read.bodies} "
+            f"{phase}: expected a body for each of {len(reader.subjects)} subjects; found {found.bodies} "
             "(no Chamfer term; cameras are checked by their masks alone)"
         )
-    if read.tall is not None and read.tall > _TALLEST:
-        notes.append(f"{phase}: expected metres; found subjects {read.tall:.0f} units tall (millimetres?)")
+    if sizes := found.known("tall"):
+        tall = np.median(sizes)
+        if tall > _TALLEST:
+            notes.append(f"{phase}: expected metres; found subjects {tall:.0f} units tall (millimetres?)")
     most = max(map(len, reader.subjects.values()), default=0)
     fewer = [name for name, positions in reader.subjects.items() if len(positions) < most]
     if fewer:
@@ -190,6 +185,24 @@ def _notes(published: int | None, phase: str, reader: Reader, read: Phase) -> li
             f"{phase}: expected {most} cameras of every subject; found fewer of {len(fewer)}, as {fewer[0]}"
         )
     return notes
+
+
+def _in_both(root: str, phases: dict[str, Phase]) -> list[str]:
+    """Problems: subjects, or photographs under different names, in both ``train`` and ``val``."""
+    if set(phases) != set(PHASES):
+        return []
+    train, val = (phases[phase] for phase in PHASES)
+    both = sorted(set(train.reader.subjects) & set(val.reader.subjects))
+    lines = [f"{root}: expected each subject in train or in val; found {name!r} in both" for name in both]
+    trained = {one.digest: one for one in train.seen if one.digest is not None}
+    repeated: dict[tuple[str, str], str] = {}
+    for one in val.seen:
+        twin = trained.get(one.digest)
+        if twin is not None and one.name not in both:
+            places = val.reader.place(*one.photograph), train.reader.place(*twin.photograph)
+            line = "{}: expected a photograph that train has not; found {}".format(*places)
+            repeated.setdefault((one.name, twin.name), line)
+    return lines + list(repeated.values())
 
 
 def _cannot_sample(data: PhotographsDataModule, targets: TargetProtocol, training: bool) -> list[str]:
@@ -208,22 +221,22 @@ def split_line(line: str) -> tuple[str, str, str]:
     return (match["place"], match["expected"], match["found"]) if match else ("", "", line)
 
 
+def _counts(phase: Phase) -> dict[str, int]:
+    reader, broken = phase.reader, sum(one.problem is not None for one in phase.seen)
+    counts = (reader.people, len(reader.subjects), len(phase.seen), broken, phase.bodies)
+    return dict(zip(("people", "subjects", "photos", "broken", "bodies"), counts, strict=True))
+
+
 def show(report: Report) -> None:
     """Print the report as tables."""
-    columns = ("people", "subjects", "photos", "broken", "bodies", "mean IoU", "min IoU", "inside", "agree")
-    table = Table("phase", *columns)
+    table = Table("phase", "people", "subjects", "photos", "broken", "bodies", "mean IoU", "min IoU", "agree")
     for name, phase in report.phases.items():
-        iou, inside = phase.overlaps("iou"), phase.overlaps("inside")
-        numbers = [f"{np.mean(iou):.3f}", f"{min(iou):.3f}", f"{min(inside):.3f}"] if iou else ["-"] * 3
-        agreement = phase.overlaps("agreement")
+        iou, agreement = phase.known("iou"), phase.known("agreement")
+        numbers = [f"{np.mean(iou):.3f}", f"{min(iou):.3f}"] if iou else ["-", "-"]
         numbers.append(f"{min(agreement):.3f}" if agreement else "-")
-        broken = sum(seen.problem is not None for seen in phase.seen)
-        counts = (phase.people, phase.subjects, len(phase.seen), broken, phase.bodies)
-        table.add_row(name, *map(str, counts), *numbers)
+        table.add_row(name, *map(str, _counts(phase).values()), *numbers)
     if report.phases:
         rich.print(table)
-    if report.inspections:
-        rich.print(f"{report.inspections} scans or other sources were read.")
     for title, lines in (("problem", report.problems), ("note", report.notes)):
         if lines:
             table = Table(title, "expected", "found")
@@ -236,24 +249,23 @@ def show(report: Report) -> None:
 
 def write(report: Report, folder: Path) -> Path:
     """Write ``check.json`` and, if there are photographs, ``contact.png``; return ``folder``."""
-    keys = ("place", "expected", "found")
+    keys, rows = ("place", "expected", "found"), dict[str, list[Tile]]()
     content = {
         "problems": [dict(zip(keys, split_line(line), strict=True)) for line in report.problems],
         "notes": report.notes,
-        "inspections": report.inspections,
-        "phases": {name: asdict(phase) for name, phase in report.phases.items()},
+        "phases": {},
     }
-    for phase in content["phases"].values():
-        for seen in phase["seen"]:
-            del seen["tile"], seen["silhouette"]
+    for name, phase in report.phases.items():
+        seen = [asdict(one) for one in phase.seen]
+        for one in seen:
+            tile = one.pop("tile")
+            del one["silhouette"]
+            if tile is not None:
+                label = f"{one['position']:03d}" + ("" if one["iou"] is None else f" {one['iou']:.2f}")
+                rows.setdefault(f"{name} {one['name']}", []).append((label, tile))
+        content["phases"][name] = {**_counts(phase), "seen": seen}
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "check.json").write_text(json.dumps(content, indent=1))
-    rows: dict[str, list[Tile]] = {}
-    for name, phase in report.phases.items():
-        for seen in phase.seen:
-            if seen.tile is not None:
-                label = "" if seen.iou is None else f" {seen.iou:.2f}"
-                rows.setdefault(f"{name} {seen.name}", []).append((f"{seen.position:03d}{label}", seen.tile))
     if rows:
         save_sheet(rows, folder / "contact.png")
     return folder

@@ -1,7 +1,7 @@
 """Options of data sets: location, reading and batching."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -13,7 +13,7 @@ from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.reader import PHASES, Reader
 from ghgs_lit.data.sampling import TargetProtocol, ViewProtocol
 from ghgs_lit.errors import InputError
-from ghgs_lit.readers import require_data_folder
+from ghgs_lit.readers import require_folder
 
 if TYPE_CHECKING:  # it imports Lightning, which takes seconds
     from ghgs_lit.data.datamodule import PhotographsDataModule
@@ -91,11 +91,6 @@ class DataOptions(Options):
         """Make missing data of these splits; called once, before any process reads."""
         return
 
-    def inspections(self) -> Sequence[Callable[[], None]]:
-        """Further checks for ``task=check``, which raise InputError: functions of a module, or partials of
-        these, because they run in other processes."""
-        return []
-
     def check_targets(self, targets: TargetProtocol) -> None:
         """Refuse a target protocol whose views this data set never has."""
         return
@@ -104,7 +99,7 @@ class DataOptions(Options):
     def folder(self) -> Path:
         """Folder of the data, ``root`` of a subclass. InputError: ``data.root`` is null or not a folder."""
         folder = required_folder("data.root", "the folder of the data set", self.root)
-        require_data_folder(folder)
+        require_folder(folder)
         return folder
 
     @property

@@ -19,7 +19,7 @@ and ``done/<phase>/<subject>`` (an empty file for each complete subject, written
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,7 +37,7 @@ from ghgs_lit.data.decoding import (
 from ghgs_lit.data.reader import PHASES, Reader
 from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.readers import read_json
+from ghgs_lit.readers import read_json, require_folder
 
 #: Folder of the renderer's notes.
 FOLDER = "rendering"
@@ -76,19 +76,11 @@ class Completeness:
         """Those of ``names`` that are not completely rendered."""
         return [name for name in names if not self.marker(phase, name).exists()] if self.rendered_here else []
 
-    def whole(self, phase: str, names: Sequence[str]) -> list[str]:
-        """Those of ``names`` that are completely rendered."""
-        missing = set(self.missing(phase, names))
-        return [name for name in names if name not in missing]
-
 
 _IMAGE_SUFFIXES = (".jpg", ".png", ".jpeg")
 _POSITION = re.compile(r"(.+)_(\d{3,})")
 #: Folders of bodies; the first that exists is read.
 _BODY_MODELS = ("smpl", "smplx")
-
-#: Maps a subject's name to its body vertices [n, 3], or None.
-BodyReader = Callable[[str], np.ndarray | None]
 
 
 class Rendered(DataOptions):
@@ -108,13 +100,9 @@ class Rendered(DataOptions):
             return (self.folder / phase).is_dir() or bool(Completeness(self.folder).plan.get(phase))
         return len(names) > 0
 
-    def further_bodies(self) -> BodyReader | None:
-        """Reader of bodies that are not among the renders."""
-        return None
-
     def reader(self, phase: str, strict: bool = True) -> "Layout":
-        names, limit, further = self.subject_names(phase), self.limit.of(phase), self.further_bodies()
-        return Layout(self.folder, phase, names, limit, self.pixel_centers, further, strict)
+        names, limit = self.subject_names(phase), self.limit.of(phase)
+        return Layout(self.folder, phase, names, limit, self.pixel_centers, strict)
 
 
 class Layout(Reader):
@@ -134,29 +122,24 @@ class Layout(Reader):
         names: Sequence[str] | None = None,
         limit: int | None = None,
         pixel_centers: str = "half",
-        further_bodies: BodyReader | None = None,
         strict: bool = True,
     ) -> None:
         super().__init__(strict)
-        self.further_bodies = further_bodies
         self.root = Path(root).expanduser()
         self._complete = Completeness(self.root)
         integer = pixel_centers == "auto" and not self._complete.rendered_here
         self._shift = 0.5 if integer or pixel_centers == "integer" else 0.0
         self._folders: dict[str, Path] = {}
-        self.find(phase, names, limit)
+        self._find(phase, names, limit)
 
-    def find(self, phase: str, names: Sequence[str] | None, limit: int | None = None) -> None:
+    def _find(self, phase: str, names: Sequence[str] | None, limit: int | None) -> None:
         """Fill ``subjects`` with complete ones."""
-        if not self.root.is_dir():
-            raise InputError(f"{self.root}: expected the root of a rendered data set; found no such folder")
+        require_folder(self.root, "the root of a rendered data set")
         phases = [phase] if names is None else [phase, *(p for p in PHASES if p != phase)]
         stored = {p: _positions(self.root / p / "img") for p in phases}
         images = self.root / phase / "img"
-        if not any(stored.values()) and not images.is_dir():
-            raise InputError(
-                f"{images}: expected a folder <id>_<position> for every camera; found no such folder"
-            )
+        if not any(stored.values()):
+            require_folder(images, "a folder <id>_<position> for every camera")
         if names is None:
             other = _positions(self.root / next(p for p in PHASES if p != phase) / "img")
             for name in sorted(stored[phase].keys() & other.keys()):
@@ -191,7 +174,7 @@ class Layout(Reader):
             path = self._folders[name] / model / name / "vertices.npy"
             if path.exists():
                 return read_vertices(path)
-        return None if self.further_bodies is None else self.further_bodies(name)
+        return None
 
     def read_surface(self, name: str) -> np.ndarray | None:
         path = self._folders[name] / "surface" / name / "vertices.npy"

@@ -1,7 +1,6 @@
 """Overlap of projected bodies and masks, which reveals wrong units, axes and centres, and pictures of it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +15,6 @@ MIN_VERTICES = 500
 _CELLS = 96
 
 
-@dataclass(frozen=True)
-class Overlap:
-    """Fit of body and mask. ``iou``: of the body's silhouette and the mask. ``inside``: share of the vertices
-    inside the photograph that lie in the mask or a cell beside it (a hundredth of the body's height)."""
-
-    iou: float
-    inside: float
-
-
 def project(vertices: np.ndarray, view: View) -> np.ndarray:
     """Pixels [m, 2] (u, v), float64, of the vertices [n, 3] in front of the camera."""
     pose, matrix = view.extrinsics.astype(np.float64), view.intrinsics.astype(np.float64)
@@ -33,8 +23,8 @@ def project(vertices: np.ndarray, view: View) -> np.ndarray:
     return points[:, :2] / points[:, 2:]
 
 
-def overlap(vertices: np.ndarray, view: View) -> Overlap | None:
-    """Compare the silhouette of a body with a mask; None with fewer than :data:`MIN_VERTICES` vertices. The
+def overlap(vertices: np.ndarray, view: View) -> float | None:
+    """IoU of the silhouette of a body and a mask; None with fewer than :data:`MIN_VERTICES` vertices. The
     silhouette is taken on a grid so coarse that vertices can be joined without faces. Parts outside the
     photograph do not count. ``vertices``: [n, 3] in the world, metres."""
     if len(vertices) < MIN_VERTICES:
@@ -43,7 +33,7 @@ def overlap(vertices: np.ndarray, view: View) -> Overlap | None:
     pixels = project(vertices, view)
     shown = ((pixels >= 0) & (pixels < (width, height))).all(-1)
     if not shown.any() or not view.mask.any():
-        return Overlap(0.0, 0.0)
+        return 0.0
     pixels = pixels[shown]
     cells = min(_CELLS, int(1.2 * np.sqrt(len(vertices))))
     cell = max(np.ptp(pixels[:, 1]) / cells, 1.0)
@@ -53,11 +43,8 @@ def overlap(vertices: np.ndarray, view: View) -> Overlap | None:
     row = (pixels[:, 1] * rows / height).astype(int)
     column = (pixels[:, 0] * columns / width).astype(int)
     hit[row, column] = True
-    body = _joined(hit)
-    subject = share >= 128
-    near = ndimage.binary_dilation(share > 0, np.ones((3, 3)))
-    iou = (body & subject).sum() / max((body | subject).sum(), 1)
-    return Overlap(float(iou), float(near[row, column].mean()))
+    body, subject = _joined(hit), share >= 128
+    return float((body & subject).sum() / max((body | subject).sum(), 1))
 
 
 def _joined(hit: np.ndarray) -> np.ndarray:

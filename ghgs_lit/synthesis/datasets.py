@@ -3,11 +3,9 @@
 import functools
 import hashlib
 import json
-import multiprocessing
 import os
-import sys
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -16,7 +14,7 @@ from pydantic import Field
 from ghgs_lit.config import options
 from ghgs_lit.config.options import Index, Options, Share, Size, Text, Words, Workers
 from ghgs_lit.data.dataset import DataSet, Limit, required_folder
-from ghgs_lit.data.layout import Completeness, Layout, Rendered
+from ghgs_lit.data.layout import Rendered
 from ghgs_lit.data.reader import PHASES
 from ghgs_lit.data.sampling import RING_VIEW, TargetProtocol
 from ghgs_lit.data.splits import read_split, split_names
@@ -31,63 +29,15 @@ from ghgs_lit.synthesis.jobs import (
     everything,
     identity,
     render_people,
-    start_worker,
 )
 from ghgs_lit.synthesis.motion import instant_names
-from ghgs_lit.synthesis.progress import Progress
 from ghgs_lit.synthesis.rig import Fill, Rig, RigOptions
 from ghgs_lit.synthesis.scans import ScanSource
-
-# A process of this priority only takes time that training leaves idle.
-_NICE = 19
-_running: dict[Path, multiprocessing.process.BaseProcess] = {}
-
-
-class Joining(dict[str, tuple[int, ...]]):
-    """``subjects`` of a training layout; iterating adds those that have become complete."""
-
-    def __init__(self, layout: Layout, made: Completeness, names: Sequence[str]) -> None:
-        super().__init__(layout.subjects)
-        self._layout, self._made, self._names = layout, made, names
-        layout.subjects = self
-
-    def __iter__(self) -> Iterator[str]:
-        if len(self) < len(self._names):
-            whole = self._made.whole("train", self._names)
-            if len(whole) > len(self):
-                self._layout.find("train", whole)
-        return super().__iter__()
-
-
-def render_beside(
-    root: Path, names: Sequence[str], source: PersonSource, rig: object, settings: RenderOptions, seed: int
-) -> None:
-    """Start to render training people below ``root`` in a process that ends with this one; arguments as of
-    :func:`ghgs_lit.synthesis.jobs.render_people`."""
-    if not Progress(root).complete.missing("train", names) or (
-        root in _running and _running[root].is_alive()
-    ):
-        return
-    arguments = (root, {"train": list(names)}, source, rig, settings, seed)
-    _running[root] = multiprocessing.get_context("spawn").Process(target=_render, args=arguments, daemon=True)
-    _running[root].start()
-
-
-def _render(*arguments: object) -> None:
-    start_worker()
-    os.nice(_NICE)
-    try:
-        render_people(*arguments, workers=0, shown=False)
-    except (InputError, OSError) as error:
-        print(f"training goes on with the people rendered so far: {error}", file=sys.stderr, flush=True)
-
 
 # Seed of built-in people: they are one population, numbered.
 _PEOPLE_SEED = 0
 # Seed of heights, yaws, lights and of the split by fraction of scans.
 _SEED = 0
-# People in a rig that are rendered before training begins.
-_FIRST_TRAIN = 8
 
 
 class _Renderable(Rendered):
@@ -101,12 +51,6 @@ class _Renderable(Rendered):
     @abstractmethod
     def camera_rig(self) -> Rig | CaptureRig:
         """The cameras around each subject."""
-
-    def render_into(
-        self, root: Path, names: Mapping[str, Sequence[str]], source: PersonSource, seed: int
-    ) -> int:
-        """Render the people of each phase that are missing in ``root``; returns their number."""
-        return render_people(root, names, source, self.camera_rig(), self.render, seed, self.render_workers)
 
 
 class _OnRing(_Renderable):
@@ -200,13 +144,11 @@ class _Generated(_Renderable):
         for split in frozen:
             made_with = everything(self.camera_rig(), self.render)
             bench.check_settings(split, {"people_seed": _PEOPLE_SEED, **made_with})
-        self.render_first({phase: self.subject_names(phase) for phase in splits})
+        names = {phase: self.subject_names(phase) for phase in splits}
+        source, rig = self.source_of_people, self.camera_rig()
+        render_people(Path(self.root), names, source, rig, self.render, _PEOPLE_SEED, self.render_workers)
         for split in frozen:
             bench.check_photographs(split, self.reader(split))
-
-    def render_first(self, names: Mapping[str, Sequence[str]]) -> None:
-        """Render these people, by phase."""
-        self.render_into(Path(self.root), names, self.source_of_people, _PEOPLE_SEED)
 
     def check_targets(self, targets: TargetProtocol) -> None:
         needed = {RING_VIEW} | targets.view_numbers
@@ -239,8 +181,7 @@ class Synthetic(_Generated, _OnRing):
 
 
 class PeopleInRig(_Generated):
-    """Generated people in the rig of a capture, as crops around them: what ``ghgs adapt`` trains on. Training
-    waits for the first people only (for all with ``render_workers=0``); the others are rendered meanwhile."""
+    """Generated people in the rig of a capture, as crops around them: what ``ghgs adapt`` trains on."""
 
     name: Text = "people_in_rig"
     cameras: Annotated[dict, Words("a mapping of cameras")] = Field({})
@@ -257,22 +198,6 @@ class PeopleInRig(_Generated):
         """Names sorted by number, so that the first ones are of both kinds."""
         return sorted(super().subject_names(phase), key=lambda name: name[1:])
 
-    def render_first(self, names: Mapping[str, Sequence[str]]) -> None:
-        """Render these people, but of training only the first; start to render the others."""
-        if self.render_workers == 0:
-            return super().render_first(names)
-        trained, root, source = list(names.get("train", [])), Path(self.root), SyntheticSource(_PEOPLE_SEED)
-        super().render_first({**names, "train": trained[:_FIRST_TRAIN]})
-        render_beside(root, trained, source, self.camera_rig(), self.render, _PEOPLE_SEED)
-
-    def reader(self, phase: str, strict: bool = True) -> Layout:
-        if phase != "train":
-            return super().reader(phase, strict)
-        names, made = self.subject_names(phase), Completeness(self.folder)
-        layout = Layout(self.folder, phase, made.whole(phase, names) or names, strict=strict)
-        Joining(layout, made, names)
-        return layout
-
     def camera_rig(self) -> CaptureRig:
         read = [RigCamera.read(camera, f"data.cameras.{name}") for name, camera in self.cameras.items()]
         return CaptureRig.of(read, self.fill)
@@ -286,7 +211,7 @@ class Scans(DataSet, _OnRing):
     source: options.Path | None = None
     """Folder of textured meshes, <id>/<id>.obj or .glb; only for rendering."""
     split: options.Path | dict[str, tuple[Text | Index, ...] | None] | None = None
-    """Which subjects are train and val: a JSON file, a folder with split_train.txt and split_val.txt, or
+    """Which subjects are train and val: a folder with split_train.txt and split_val.txt, or
     {train: [0000-0425], val: [0426-0525]}. Null: the folders train and val of root; when rendering, the split
     files in source, else a fraction."""
     val_fraction: Share = 0.1
@@ -316,7 +241,8 @@ class Scans(DataSet, _OnRing):
         source, root = self.scans(), required_folder("data.root", "a folder", self.root)
         names = split_names(self.source_folder, source.names(), self.split, self.val_fraction, _SEED)
         names = {phase: listed[: self.limit.of(phase)] for phase, listed in names.items()}
-        return self.render_into(root, names, source, _SEED)
+        rig, workers = self.camera_rig(), self.render_workers
+        return render_people(root, names, source, rig, self.render, _SEED, workers)
 
 
 @functools.cache

@@ -21,8 +21,7 @@ import torch
 from PIL import Image
 from pydantic import Field
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-from rich.progress import Progress as Bar
+from rich.progress import track
 
 from ghgs_lit.config.options import Index, Options, Size
 from ghgs_lit.data.layout import position_name
@@ -181,7 +180,6 @@ def render_people(
     settings: RenderOptions,
     seed: int,
     workers: int | None = None,
-    shown: bool = True,
 ) -> int:
     """Render people below ``root``; existing ones are kept. Returns the number of people rendered now.
 
@@ -196,28 +194,27 @@ def render_people(
     instants = source.instants if isinstance(source, SyntheticSource) else 0
     progress, made_with = Progress(Path(root)), identity(rig, settings, seed, instants)
     progress.check_settings(made_with)
-    missing = progress.complete.missing
-    if not any(missing(phase, listed) for phase, listed in names.items()):
+    if not any(progress.missing(phase, listed) for phase, listed in names.items()):
         return 0
     with progress.lock(), naming(progress.root):
         progress.check_settings(made_with)  # another process may have written others meanwhile
         progress.clear_workspaces()
-        progress.plan(names)
+        progress.request(names)
         todo = [
             _Job(source, rig, settings, seed, phase, name, progress.workspace(phase, name), instants)
             for phase, listed in names.items()
             # The name of the person is the instant's without _t000.
-            for name in dict.fromkeys(name[:-5] if instants else name for name in missing(phase, listed))
+            for name in dict.fromkeys(
+                name[:-5] if instants else name for name in progress.missing(phase, listed)
+            )
         ]
-        with _bar(shown) as bar:
-            task = bar.add_task(f"rendering into {root}", total=len(todo))
-            try:
-                with contextlib.closing(_run(todo, workers)) as finished:
-                    for job in finished:
-                        progress.publish(job.workspace, job.phase, job.subjects)
-                        bar.advance(task)
-            finally:
-                progress.clear_workspaces()
+        console, label = Console(stderr=True), f"rendering into {root}"
+        try:
+            with contextlib.closing(_run(todo, workers)) as finished:
+                for job in track(finished, label, total=len(todo), console=console):
+                    progress.publish(job.workspace, job.phase, job.subjects)
+        finally:
+            progress.clear_workspaces()
     return len(todo)
 
 
@@ -230,7 +227,7 @@ def _run(jobs: list[_Job], workers: int | None) -> Iterator[_Job]:
         # A worker of joblib inherits the name of a start method that a fresh process does not know.
         multiprocessing.set_start_method("spawn", force=True)
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, initializer=start_worker) as pool:
+    with ProcessPoolExecutor(workers, context, initializer=_start_worker) as pool:
         try:
             futures = [pool.submit(render_subject, job) for job in jobs]
             for future in as_completed(futures):
@@ -253,7 +250,7 @@ def _check_main_guard() -> None:
         )
 
 
-def start_worker() -> None:
+def _start_worker() -> None:
     """Prepare a worker: one thread, Ctrl-C only in the parent, and an end with the parent."""
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -264,11 +261,6 @@ def _end_with_parent() -> None:
     """End this worker when its parent is killed (``kill``, ``kill -9``, the batch system)."""
     multiprocessing.parent_process().join()
     os._exit(1)
-
-
-def _bar(shown: bool) -> Bar:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Bar(*columns, console=Console(stderr=True), disable=not shown)
 
 
 def write_view(phase: Path, folder: str, number: int, view: View, quality: int | None = 98) -> None:

@@ -21,12 +21,8 @@ log = logging.getLogger(__name__)
 _KINDS = ("mask", "alpha", "depth", "parm", "img", "smpl", "surface")
 
 
-class Progress:
+class Progress(Completeness):
     """The progress of rendering the data set at ``root``."""
-
-    def __init__(self, root: Path) -> None:
-        self.root, self.complete = root, Completeness(root)
-        self.folder = self.complete.folder
 
     def check_settings(self, settings: dict) -> None:
         """Store ``settings`` in an empty data set; refuse a data set with other settings or foreign files."""
@@ -47,9 +43,9 @@ class Progress:
                     "(render into another folder, or delete this one)"
                 )
 
-    def plan(self, names: Mapping[str, Sequence[str]]) -> None:
+    def request(self, names: Mapping[str, Sequence[str]]) -> None:
         """Store that these subjects were requested; call under the lock."""
-        known = self.complete.plan
+        known = self.plan
         phases = known.keys() | names.keys()
         plan = {p: sorted({*known.get(p, []), *names.get(p, [])}) for p in phases}
         _write_json(self.folder / "plan.json", plan)
@@ -81,7 +77,7 @@ class Progress:
                     shutil.rmtree(target)
                 os.replace(source, target)
         for name in names:
-            marker = self.complete.marker(phase, name)
+            marker = self.marker(phase, name)
             marker.parent.mkdir(parents=True, exist_ok=True)
             marker.touch()
         shutil.rmtree(workspace, ignore_errors=True)

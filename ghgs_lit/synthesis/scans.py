@@ -9,6 +9,7 @@ from PIL import Image
 
 from ghgs_lit.data.decoding import check_extent, read_image, read_vertices
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.readers import require_folder
 from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
 
 _MESH_SUFFIXES = (".glb", ".gltf", ".obj")
@@ -25,8 +26,7 @@ class ScanSource:
 
     def names(self) -> list[str]:
         """Ids of all scans, sorted. InputError: the folder is missing or holds no scans."""
-        if not self.folder.is_dir():
-            raise InputError(f"{self.folder}: expected a folder of scans; found no such folder")
+        require_folder(self.folder, "a folder of scans")
         names = sorted(p.name for p in self.folder.iterdir() if p.is_dir() and _mesh_file(p) is not None)
         if not names:
             raise InputError(f"{self.folder}: expected <id>/<id>.obj or <id>/<id>.glb; found none")

@@ -87,7 +87,7 @@ MISSING = [
     (
         "train data=humman model.pad=multiple data.root={empty} targets=cameras evaluation.targets=[cameras]",
         1,
-        "data.smpl_model: expected",
+        "{empty}: expected sequences such as",
     ),
     (
         "train data=zju_mocap model.pad=multiple data.root={empty} targets=cameras "

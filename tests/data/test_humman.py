@@ -33,7 +33,7 @@ def root(tmp_path_factory) -> Path:
 
 
 def photographs(root: Path, size=None, **options) -> Photographs:
-    data = HuMMan(root=root, split={"val": [TEST]}, frames=(0, 97, 6), **{"body": "none", **options})
+    data = HuMMan(root=root, split={"val": [TEST]}, frames=(0, 97, 6), **options)
     return Photographs(data.reader("val"), size)
 
 
@@ -56,7 +56,7 @@ def test_named_sequences_are_for_testing_and_the_rest_for_training(root, tmp_pat
     """The official test sequences never reach training."""
     shutil.copytree(root, tmp_path / "recon")
     (tmp_path / "recon" / "notes").mkdir()
-    data = build_data("humman", tmp_path / "recon", "data.body=none").dataset
+    data = build_data("humman", tmp_path / "recon").dataset
     assert len(data.split.val) == len(set(data.split.val)) == 22
     assert data.sequences("train") == ["p100001_a000048"]
     assert data.reader("val").sequences == {TEST}
@@ -67,7 +67,7 @@ def test_named_sequences_are_for_testing_and_the_rest_for_training(root, tmp_pat
 def test_the_world_is_the_first_cameras_frame_in_metres(root):
     """A wrong unit or direction of the extrinsics would move the cameras."""
     content = json.loads((root / TEST / "cameras.json").read_text())
-    assert len(content) == 20
+    assert len(content) == 10
     views = [photographs(root).view(f"{TEST}_000000", k) for k in range(10)]
     np.testing.assert_allclose(views[0].extrinsics, np.eye(4), atol=1e-6)
     np.testing.assert_allclose(views[3].extrinsics[:3, 3], content["kinect_color_003"]["T"], rtol=1e-6)
@@ -115,45 +115,17 @@ def test_intrinsics_fit_resized_photographs(root, tmp_path, share):
     np.testing.assert_allclose(centroid(view.image), project(view, point), atol=0.02)
 
 
-def test_depth_points_lie_on_the_performer(root):
-    """Points that replace a body lie inside every mask, upright and of human height."""
-    data = photographs(root, body="depth")
-    for name in data.reader.subjects:
-        points = data.body(name)
-        assert len(points) > 500
-        assert points.dtype == np.float32
-        assert min(inside(data.view(name, k), points) for k in range(10)) > 0.99
-        extent = np.ptp(points, axis=0)
-        assert 1.4 < extent[1] < 2.0  # y points down in the first camera's frame, about upright
-
-
-def test_depth_points_are_millimetres_of_the_depth_cameras(root, tmp_path):
-    """Shifting the depth cameras by 0.3 m moves the points off the performer."""
-    shutil.copytree(root / TEST, tmp_path / TEST)
-    content = json.loads((tmp_path / TEST / "cameras.json").read_text())
-    for key in content:
-        if "depth" in key:
-            content[key]["T"][0] += 0.3
-    (tmp_path / TEST / "cameras.json").write_text(json.dumps(content))
-    name = f"{TEST}_000000"
-    assert len(photographs(tmp_path, body="depth").body(name)) < 0.7 * len(
-        photographs(root, body="depth").body(name)
-    )
-
-
 def test_no_body_is_a_choice(root):
     """Without a body a batch says so, and training without Chamfer loss is possible."""
-    assert photographs(root, body="none").body(f"{TEST}_000000") is None
-    batch = build_data(
-        "humman", root, "data.body=none", "data.size=[36,64]", "data.workers=0"
-    ).training_batch(0)
+    assert photographs(root).body(f"{TEST}_000000") is None
+    batch = build_data("humman", root, "data.size=[36,64]", "data.workers=0").training_batch(0)
     assert batch.body_vertices is None
     assert batch.images.shape == (1, 4, 3, 36, 64)
 
 
 def test_evaluation_takes_evenly_spaced_inputs_and_all_other_targets(root):
     """The documented protocol: inputs 0 3 6 and seven targets; frames are not people."""
-    data = build_data("humman", root, "data.body=none", "data.size=[36,64]", "data.workers=0")
+    data = build_data("humman", root, "data.size=[36,64]", "data.workers=0")
     samples = list(data.evaluation_loader(views=3))
     assert len(samples) == 3
     assert samples[0].views == (("000/0", "003/0", "006/0"),)
@@ -180,7 +152,7 @@ def test_the_stand_in_has_the_shapes_of_smpl(root):
 def test_smpl_vertices_project_into_every_mask(root):
     """Model, parameters and cameras agree about where the body is."""
     pytest.importorskip("smplx")
-    data = photographs(root, body="smpl", smpl_model=root.with_name("recon_body_models"))
+    data = photographs(root, smpl_model=root.with_name("recon_body_models"))
     for name in data.reader.subjects:
         assert data.body(name).shape == (6890, 3)
         assert min(inside(data.view(name, k), data.body(name)) for k in range(10)) > 0.97
@@ -239,16 +211,14 @@ def test_pickles_of_the_official_release_are_read_without_chumpy(tmp_path, monke
 def test_the_same_numbers_make_the_same_miniature(root, tmp_path):
     """A miniature is reproducible, whatever else is made."""
     make_miniature(humman, tmp_path / "recon", [TEST], {"train": 1, "val": 0}, WIDTH, seed=3, frames=[0])
-    for name in ("kinect_color/kinect_007/000000.png", "kinect_depth/kinect_007/000000.png", "cameras.json"):
+    for name in ("kinect_color/kinect_007/000000.png", "kinect_mask/kinect_007/000000.png", "cameras.json"):
         place = Path("p100001_a000048") / name
         assert (tmp_path / "recon" / place).read_bytes() == (root / place).read_bytes()
 
 
 def test_targets_between_cameras_that_stand_still_are_refused(root):
     """Views that do not exist are refused before anything is read."""
-    data = build_data(
-        "humman", root, "data.body=none", "data.size=[36,64]", "data.workers=0", "targets=release"
-    )
+    data = build_data("humman", root, "data.size=[36,64]", "data.workers=0", "targets=release")
     for draw in (
         data.training_sampler,
         data.evaluation_loader,

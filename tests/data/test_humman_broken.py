@@ -11,9 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from ghgs_lit.data.humman.dataset import check_world
 from ghgs_lit.data.humman.smpl import read_model, read_parameters
 from scripts.miniatures import humman
 from scripts.miniatures.smpl import stand_in
@@ -21,7 +19,6 @@ from tests.helpers.captures import (
     Malice,
     blank,
     build_data,
-    inside,
     make_miniature,
     refused,
     shrink,
@@ -30,7 +27,7 @@ from tests.helpers.captures import (
 )
 
 NAME = "p000455_a000986"
-COLOR, MASK, DEPTH = (f"kinect_{kind}/kinect_000/000000.png" for kind in ("color", "mask", "depth"))
+COLOR, MASK = (f"kinect_{kind}/kinect_000/000000.png" for kind in ("color", "mask"))
 
 
 def calibrated(change):
@@ -62,10 +59,6 @@ def millimetres(content: dict) -> None:
 def together(content: dict) -> None:
     for camera in content.values():
         camera["T"] = [0, 0, 0]
-
-
-def eight_bits(folder: Path) -> None:
-    Image.new("L", (40, 36), 7).save(folder / DEPTH)
 
 
 def renumber(folder: Path) -> None:
@@ -100,11 +93,11 @@ CASES = {
     ),
     "millimetres": (
         calibrated(millimetres),
-        r"expected translations T in metres; found color cameras \d+ m apart",
+        r"expected translations T in metres; found cameras \d+ m apart",
     ),
     "all cameras in one place": (
         calibrated(together),
-        r"expected translations T in metres; found color cameras 0 m",
+        r"expected translations T in metres; found cameras 0 m",
     ),
     "no photographs": (
         lambda f: shutil.rmtree(f / "kinect_color"),
@@ -128,18 +121,6 @@ CASES = {
         lambda f: blank(f / MASK),
         r"kinect_mask/kinect_000/000000.png: expected a subject in the mask; found",
     ),
-    "no depth": (
-        lambda f: shutil.rmtree(f / "kinect_depth"),
-        r"kinect_depth/kinect_000/000000.png: expected an image; found no such file",
-    ),
-    "depth of 8 bits": (
-        eight_bits,
-        r"000000.png: expected 16 bits of depth in millimetres; found uint8 \(36, 40\)",
-    ),
-    "no depth cameras": (
-        calibrated(lambda c: c.pop("kinect_depth_002")),
-        r"cameras.json: expected K of kinect_depth_002; found none",
-    ),
     "no sequence": (shutil.rmtree, r"expected sequences such as p000455_a000986; found none of the split"),
 }
 
@@ -153,18 +134,16 @@ def whole(tmp_path_factory) -> Path:
 
 def read_all(root: Path) -> list:
     """What evaluation reads of the frame."""
-    photographs = stored(build_data("humman", root, "data.body=depth"), "val", (72, 128))
-    return [(name, photographs.view(name, 0), photographs.body(name)) for name in photographs.reader.subjects]
+    photographs = stored(build_data("humman", root), "val", (72, 128))
+    return [(name, photographs.view(name, 0)) for name in photographs.reader.subjects]
 
 
 def test_the_whole_one_is_read(whole):
     """The intact miniature is read: the broken cases fail for their own reason."""
-    ((name, view, body),) = read_all(whole.parent)
+    ((name, view),) = read_all(whole.parent)
     assert name == f"{NAME}_000000"
     assert view.image.shape == (72, 128, 3)
     assert view.mask.any()
-    assert len(body) > 500
-    assert inside(view, body) > 0.9
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -175,25 +154,6 @@ def test_a_broken_one_gets_its_line(case, whole, tmp_path, monkeypatch):
     spoil, line = CASES[case]
     spoil(tmp_path / NAME)
     refused(line, lambda: read_all(tmp_path))
-
-
-def test_another_world_is_reported(whole, tmp_path):
-    """Cameras in another world frame would silently misplace depth points."""
-    assert check_world(whole / "cameras.json") is None
-    content = json.loads((whole / "cameras.json").read_text())
-    for camera in content.values():  # the same cameras in the frame of the second one
-        pose = np.linalg.inv(_pose(json.loads((whole / "cameras.json").read_text())["kinect_color_001"]))
-        moved = _pose(camera) @ pose
-        camera["R"], camera["T"] = moved[:3, :3].tolist(), moved[:3, 3].tolist()
-    (tmp_path / "cameras.json").write_text(json.dumps(content))
-    line = r"expected the world in the frame of kinect_color_000 \(R = 1, T = 0\)"
-    refused(line, lambda: check_world(tmp_path / "cameras.json"))
-
-
-def _pose(camera: dict) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = camera["R"], camera["T"]
-    return pose
 
 
 GOOD = {"betas": np.zeros(10), "body_pose": np.zeros(69), "global_orient": np.zeros(3), "transl": np.zeros(3)}
@@ -249,14 +209,9 @@ def test_a_broken_model_gets_its_line(case, tmp_path, monkeypatch):
     ("overrides", "line"),
     [
         (
-            [],
-            r"data.smpl_model: expected the licensed SMPL_NEUTRAL.pkl .*; found null .*body=depth.*none",
-        ),
-        (
             ["data.smpl_model=/nowhere"],
             "/nowhere: expected SMPL_NEUTRAL.pkl, or a folder with smpl/SMPL_NEUTRAL.pkl",
         ),
-        (["data.body=smplx"], "data.body: expected one of smpl, depth, none; found 'smplx'"),
         (["data.masks=mask"], "data.masks: expected one of kinect_mask, kinect_mask_manual; found 'mask'"),
         (["data.frames=[0,0,6]"], r"data.frames: expected \[start, stop, step\] with start < stop; found"),
         (["data.split.val=[]"], r"data.split.val: expected names of sequences; found \[\]"),
@@ -274,5 +229,6 @@ def test_without_smplx_the_message_says_what_to_install(whole, monkeypatch):
     place = whole.parent.with_name("recon_body_models")
     data = build_data("humman", whole.parent, f"data.smpl_model={place}").dataset
     refused(
-        r"data.body: expected the package smplx .*pip install 'ghgs-lit\[smpl\]'", lambda: data.reader("val")
+        r"data.smpl_model: expected the package smplx .*pip install 'ghgs-lit\[smpl\]'",
+        lambda: data.reader("val"),
     )

@@ -114,9 +114,7 @@ def test_a_split_chooses_among_rendered_scans(tmp_path):
     """Another file measured the same subjects, and a missing one was not noticed."""
     render_boxes(tmp_path / "out", tmp_path / "scans", train=2, val=1, settings=TINY.replace(positions=(0,)))
     assert list(rendered(tmp_path / "out").subjects("val")) == ["s2"]
-    mine = tmp_path / "mine.json"
-    mine.write_text('{"train": ["s2"], "val": ["s0", "s1"]}')
-    data = rendered(tmp_path / "out", split=mine)
+    data = rendered(tmp_path / "out", split={"train": ["s2"], "val": ["s0", "s1"]})
     assert [list(data.subjects(phase)) for phase in ("train", "val")] == [["s2"], ["s0", "s1"]]
-    with pytest.raises(InputError, match=r"none\.json: expected a JSON file or a folder"):
-        rendered(tmp_path / "out", split=tmp_path / "none.json").subjects("val")
+    with pytest.raises(InputError, match=r"none: expected a folder with split_train\.txt"):
+        rendered(tmp_path / "out", split=tmp_path / "none").subjects("val")

@@ -2,17 +2,17 @@
 
 ``<root>/p<subject>_a<action>/`` holds, for the Kinects 000 to 009 and frames that are multiples of 6 (some
 are missing), ``kinect_color/kinect_<k>/<frame>.png`` (1920 x 1080), ``kinect_mask/`` with the same names
-(matting: any value but 0 is the performer), for the test sequences ``kinect_mask_manual/``, ``kinect_depth/``
-(640 x 576, millimetres, frame of the depth camera), ``smpl_params/<frame>.npz`` and ``cameras.json``.
+(matting: any value but 0 is the performer), for the test sequences ``kinect_mask_manual/``,
+``smpl_params/<frame>.npz`` and ``cameras.json``: ``K`` (3, 3), ``R`` (3, 3) and ``T`` (3) of each
+``kinect_color_<k>`` as in OpenCV, world to camera in metres, without lens distortion.
 """
 
 import logging
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import model_validator
@@ -20,21 +20,64 @@ from pydantic import model_validator
 from ghgs_lit.config import options
 from ghgs_lit.config.options import Count, Index, Options, Size, Text, Workers
 from ghgs_lit.data.dataset import DataSet
-from ghgs_lit.data.decoding import check_center, check_name, read_image, read_map, read_photograph
-from ghgs_lit.data.humman.cameras import KINECTS, Calibration, read_calibration, surface_points
+from ghgs_lit.data.decoding import (
+    check_array,
+    check_center,
+    check_extrinsics,
+    check_intrinsics,
+    check_name,
+    read_map,
+    read_photograph,
+)
 from ghgs_lit.data.humman.smpl import Body, read_parameters
-from ghgs_lit.data.reader import PHASES, FrameReader
+from ghgs_lit.data.reader import FrameReader
 from ghgs_lit.data.view import View, opencv_view
 from ghgs_lit.errors import InputError
+from ghgs_lit.readers import read_json
 
 log = logging.getLogger(__name__)
+
+KINECTS = range(10)
+# Metres: least and greatest plausible distance between cameras of one studio.
+_NEAREST, _FURTHEST = 0.1, 100.0
+_SEQUENCE = re.compile(r"p\d{6}_a\d{6}")
+
+#: Intrinsics [3, 3] with pixel centres at integers, and extrinsics [4, 4].
+Camera = tuple[np.ndarray, np.ndarray]
+
+
+def read_cameras(path: Path) -> list[Camera]:
+    """Read the ten colour cameras of a sequence. InputError: the file or a camera is missing or bad, or
+    translations are not in metres."""
+    content = read_json(path, "the cameras of a sequence in JSON")
+    cameras = [_camera(path, content, f"kinect_color_{k:03d}") for k in KINECTS]
+    centers = np.stack([-pose[:3, :3].T @ pose[:3, 3] for _, pose in cameras])
+    spread = np.linalg.norm(centers - centers[0], axis=-1).max()
+    if not _NEAREST < spread < _FURTHEST:
+        raise InputError(f"{path}: expected translations T in metres; found cameras {spread:.4g} m apart")
+    return cameras
+
+
+def _camera(path: Path, content: Any, key: str) -> Camera:
+    camera = content.get(key) if isinstance(content, dict) else None
+    for name in ("K", "R", "T"):
+        if not isinstance(camera, dict) or name not in camera:
+            raise InputError(f"{path}: expected {name} of {key}; found none")
+    place = f"{path}: {key}"
+    rotation = check_array(f"{place}: R", camera["R"], [(3, 3)])
+    translation = check_array(f"{place}: T", camera["T"], [(3,), (3, 1)]).reshape(3, 1)
+    extrinsics = check_extrinsics(place, np.concatenate((rotation, translation), 1))
+    return check_intrinsics(f"{place}: K", camera["K"]), extrinsics
 
 
 @dataclass(frozen=True)
 class _Frame:
     folder: Path
-    cameras: Calibration
+    cameras: Sequence[Camera]
     number: int
+
+    def file(self, kind: str, kinect: int) -> Path:
+        return self.folder / kind / f"kinect_{kinect:03d}" / f"{self.number:06d}.png"
 
 
 class HuMManReader(FrameReader):
@@ -46,16 +89,16 @@ class HuMManReader(FrameReader):
         super().__init__(strict)
         self.data, folder, names = data, data.folder, data.sequences(phase)
         self._body: Body | None = None
-        if data.body == "smpl":
+        if data.smpl_model is not None:
             with self.collecting():
-                self._body = _load_model(data.smpl_model)
+                self._body = Body(Path(data.smpl_model).expanduser())
         for name in self.existing(folder, names, "p000455_a000986"):
             with self.collecting():
                 self._add(folder / name, range(*data.frames))
         self.subjects = dict(list(self.subjects.items())[: data.limit.of(phase)])
 
     def _add(self, path: Path, frames: Sequence[int]) -> None:
-        cameras = read_calibration(path / "cameras.json", "color")
+        cameras = read_cameras(path / "cameras.json")
         there = {k: _frames_of(path / "kinect_color" / f"kinect_{k:03d}") for k in KINECTS}
         # Existing frames are listed, because any number may be asked for.
         numbers = [number for number in sorted(set().union(*there.values())) if number in frames]
@@ -77,58 +120,27 @@ class HuMManReader(FrameReader):
 
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
         frame = self.frames[name]
-        path = _file(frame.folder, "kinect_color", position, frame.number)
+        path = frame.file("kinect_color", position)
         image = read_photograph(path)
-        mask = self._mask(frame, position, image.shape[:2])
-        intrinsics = frame.cameras.intrinsics[position]
+        mask = read_map(frame.file(self.data.masks, position), image.shape[:2]) != 0
+        intrinsics, extrinsics = frame.cameras[position]
         check_center(path, intrinsics, *image.shape[:2])
-        return opencv_view(image, mask, intrinsics, frame.cameras.extrinsics[position])
+        return opencv_view(image, mask, intrinsics, extrinsics)
 
     def read_body(self, name: str) -> np.ndarray | None:
-        frame = self.frames[name]
-        if self.data.body == "depth":
-            masks = {position: self._mask(frame, position) for position in self.subjects[name]}
-            depth_cameras = read_calibration(frame.folder / "cameras.json", "depth")
-            return surface_points(frame.folder, frame.number, depth_cameras, frame.cameras, masks)
         if self._body is None:
             return None
+        frame = self.frames[name]
         return self._body.vertices(read_parameters(frame.folder / "smpl_params" / f"{frame.number:06d}.npz"))
 
     def place(self, name: str, position: int, view: int) -> str:
-        frame = self.frames[name]
-        return str(_file(frame.folder, self.data.masks, position, frame.number))
-
-    def _mask(self, frame: _Frame, position: int, size: tuple[int, int] | None = None) -> np.ndarray:
-        path = _file(frame.folder, self.data.masks, position, frame.number)
-        if size is None:
-            image = read_image(path)
-            size = (image.height, image.width)
-        return read_map(path, size) != 0
-
-
-def _load_model(path: str | None) -> Body:
-    if path is None:
-        raise InputError(
-            "data.smpl_model: expected the licensed SMPL_NEUTRAL.pkl for body=smpl; found null "
-            "(body=depth takes points of the depth cameras in its place; body=none with "
-            "loss.weights.chamfer=0 trains without)"
-        )
-    return Body(Path(path).expanduser())
-
-
-def _file(folder: Path, kind: str, kinect: int, number: int) -> Path:
-    return folder / kind / f"kinect_{kinect:03d}" / f"{number:06d}.png"
+        return str(self.frames[name].file(self.data.masks, position))
 
 
 def _frames_of(folder: Path) -> set[int]:
     if not folder.is_dir():
         return set()
     return {int(p.stem) for p in folder.iterdir() if p.suffix == ".png" and p.stem.isdecimal()}
-
-
-_SEQUENCE = re.compile(r"p\d{6}_a\d{6}")
-# Largest difference of the first camera's pose from the identity.
-_POSE_TOLERANCE = 1e-2
 
 
 class SequenceNames(Options):
@@ -143,10 +155,6 @@ class SequenceNames(Options):
     def _check(self) -> "SequenceNames":
         self.require(self.val != (), "val", "names of sequences")
         return self
-
-    def of(self, phase: str) -> tuple[str, ...] | None:
-        """Names of a phase."""
-        return getattr(self, phase)
 
 
 class HuMMan(DataSet):
@@ -165,11 +173,9 @@ class HuMMan(DataSet):
     """[start, stop, step] of frame numbers; those that a sequence lacks are left out."""
     masks: Literal["kinect_mask", "kinect_mask_manual"] = "kinect_mask"
     """Folder of masks; kinect_mask_manual is there for the test sequences only."""
-    body: Literal["smpl", "depth", "none"] = "smpl"
-    """smpl: vertices of the licensed model. depth: points of the depth cameras instead. none: train with
-    loss.weights.chamfer=0."""
     smpl_model: options.Path | None = None
-    """SMPL_NEUTRAL.pkl, or a folder with smpl/SMPL_NEUTRAL.pkl; needs the package smplx."""
+    """The licensed SMPL_NEUTRAL.pkl, or a folder with smpl/SMPL_NEUTRAL.pkl: its vertices are the bodies. It
+    needs the package smplx. Null: no bodies; train with loss.weights.chamfer=0."""
 
     @model_validator(mode="after")
     def _check(self) -> "HuMMan":
@@ -178,7 +184,7 @@ class HuMMan(DataSet):
 
     def sequences(self, phase: str) -> list[str]:
         """Names of the sequences of a phase; listed ones need not exist."""
-        if (names := self.split.of(phase)) is not None:
+        if (names := getattr(self.split, phase)) is not None:
             return list(names)
         names = (p.name for p in self.folder.iterdir() if p.is_dir() and _SEQUENCE.fullmatch(p.name))
         return sorted(set(names) - set(self.split.val))
@@ -188,18 +194,3 @@ class HuMMan(DataSet):
 
     def reader(self, phase: str, strict: bool = True) -> HuMManReader:
         return HuMManReader(self, phase, strict)
-
-    def inspections(self) -> Sequence[Callable[[], None]]:
-        names = {name for phase in PHASES for name in self.sequences(phase)} if self.root else set()
-        there = [path for name in sorted(names) if (path := self.folder / name).is_dir()]
-        return [partial(check_world, path / "cameras.json") for path in there]
-
-
-def check_world(path: Path) -> None:
-    """Check a ``cameras.json``. InputError: it is bad, or its world is not the first colour camera's."""
-    first = read_calibration(path, "color").extrinsics[0]
-    if np.abs(first - np.eye(4)).max() > _POSE_TOLERANCE:
-        raise InputError(
-            f"{path}: expected the world in the frame of kinect_color_000 (R = 1, T = 0); "
-            f"found T = {first[:3, 3].round(3).tolist()}"
-        )

@@ -18,7 +18,8 @@ from scipy import sparse
 
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.data.pickles import load_pickle
-from ghgs_lit.errors import InputError, installed
+from ghgs_lit.errors import InputError, installed, require
+from ghgs_lit.readers import require_file
 
 VERTICES = 6890
 #: Length of each vector in ``smpl_params/<frame>.npz``.
@@ -27,7 +28,7 @@ _SHAPES = {
     "v_template": (VERTICES, 3), "shapedirs": (VERTICES, 3, None), "posedirs": (VERTICES, 3, 207),
     "J_regressor": (24, VERTICES), "kintree_table": (2, 24), "weights": (VERTICES, 24), "f": (None, 3),
 }  # fmt: skip
-_FILES = ("smpl/SMPL_NEUTRAL.pkl", "smpl/SMPL_NEUTRAL.npz", "SMPL_NEUTRAL.pkl", "SMPL_NEUTRAL.npz")
+_FILE = "smpl/SMPL_NEUTRAL.pkl"
 
 
 class _Chumpy:
@@ -60,22 +61,9 @@ _REPLACEMENTS = {
 }
 
 
-def model_file(path: Path) -> Path:
-    """Model file at ``path``, or under a usual name in the folder ``path``. InputError: there is none."""
-    files = [path, *(path / name for name in _FILES)]
-    found = next((file for file in files if file.is_file()), None)
-    if found is None:
-        raise InputError(f"{path}: expected SMPL_NEUTRAL.pkl, or a folder with {_FILES[0]}; found neither")
-    return found
-
-
 def read_model(path: Path) -> dict[str, np.ndarray]:
     """Arrays of an SMPL model file. InputError: the file or an array is missing or bad, or it names code."""
-    if path.suffix == ".npz":
-        with _opened(path) as archive:
-            content = {key: archive[key] for key in _SHAPES if key in archive}
-    else:
-        content = load_pickle(path, also=_REPLACEMENTS)
+    content = load_pickle(path, also=_REPLACEMENTS)
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected the arrays of an SMPL model; found {type(content).__name__}")
     arrays = {key: getattr(content.get(key), "array", content.get(key)) for key in _SHAPES}
@@ -85,31 +73,27 @@ def read_model(path: Path) -> dict[str, np.ndarray]:
 def read_parameters(path: Path) -> dict[str, np.ndarray]:
     """Parameters of one frame as float64 vectors. InputError: the file is missing or broken, or a vector is
     missing, has another length or is not finite."""
-    if not path.is_file():
-        raise InputError(f"{path}: expected SMPL parameters; found no such file")
-    with _opened(path) as archive:
-        found = {key: archive[key] for key in PARAMETERS if key in archive}
+    require_file(path, "SMPL parameters")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            found = {key: archive[key] for key in PARAMETERS if key in archive}
+    except Exception as error:  # zipfile, zlib and NumPy raise many types
+        raise InputError(f"{path}: expected an .npz file of arrays; found {error}") from error
     for key in PARAMETERS:
         if key not in found:
             raise InputError(f"{path}: expected {key}; found {sorted(found)}")
     return {key: check_array(f"{path}: {key}", np.ravel(found[key]), [(n,)]) for key, n in PARAMETERS.items()}
 
 
-@contextlib.contextmanager
-def _opened(path: Path):
-    """Open an ``.npz``; every error, also inside the block, becomes an InputError."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            yield archive
-    except Exception as error:  # zipfile, zlib and NumPy raise many types
-        raise InputError(f"{path}: expected an .npz file of arrays; found {error}") from error
-
-
 class Body:
-    """SMPL_NEUTRAL from a file or folder. InputError: it is missing or bad, or ``smplx`` is missing."""
+    """SMPL_NEUTRAL from its file, or a folder with ``smpl/SMPL_NEUTRAL.pkl``. InputError: it is missing or
+    bad, or ``smplx`` is missing."""
 
     def __init__(self, path: Path) -> None:
-        self.model = _model(model_file(path))
+        file = path / _FILE if path.is_dir() else path
+        expected = f"SMPL_NEUTRAL.pkl, or a folder with {_FILE}"
+        require(file.is_file(), str(path), expected, "neither")
+        self.model = _model(file)
 
     @torch.no_grad()
     def vertices(self, parameters: dict[str, np.ndarray]) -> np.ndarray:
@@ -120,7 +104,7 @@ class Body:
 
 @functools.lru_cache(maxsize=1)
 def _model(path: Path) -> torch.nn.Module:
-    smplx = installed("smplx", "smpl", "data.body")
+    smplx = installed("smplx", "smpl", "data.smpl_model")
     struct = importlib.import_module("smplx.utils").Struct(**read_model(path))
     with contextlib.redirect_stdout(io.StringIO()):  # it prints how many shapes the model has
         return smplx.SMPL("", data_struct=struct, gender="neutral").eval()
