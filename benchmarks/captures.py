@@ -88,6 +88,7 @@ MENDED = {
     "all cameras up to 3 px": Imperfection(augmentation={"calibration": 1.5}),
     "one focal length 3 % off": Imperfection(zoom=1.03),
     "one gamma of 1.2": Imperfection(gamma=1.2),
+    "one gamma of 0.8": Imperfection(gamma=0.8),
 }
 CAPTURES = {
     "clean": Imperfection(),
