@@ -14,8 +14,7 @@ import torch
 from safetensors.torch import save_file
 
 from ghgs_lit.files import is_locked, lock, lock_owner, naming, write_atomically, write_text_atomically
-
-SPAWN = multiprocessing.get_context("spawn")
+from tests.helpers.processes import PREPARED
 
 
 def names(folder) -> list[str]:
@@ -60,7 +59,7 @@ def write_often(path, letter):
 def test_two_processes_write_one_file_and_readers_see_whole_ones(tmp_path):
     """Two processes of one sweep write the same plan: a reader must never see a mixture."""
     path = tmp_path / "plan"
-    writers = [SPAWN.Process(target=write_often, args=(path, letter)) for letter in "ab"]
+    writers = [PREPARED.Process(target=write_often, args=(path, letter)) for letter in "ab"]
     for writer in writers:
         writer.start()
     seen = set()
@@ -81,9 +80,9 @@ def hold_lock(path, ready):
 
 def test_a_lock_is_held_by_one_process_and_freed_by_its_death(tmp_path):
     """Two processes must not work on one run, and a killed one must not block it."""
-    path, ready = tmp_path / "folder" / "lock", SPAWN.Event()
+    path, ready = tmp_path / "folder" / "lock", PREPARED.Event()
     assert not is_locked(path)
-    holder = SPAWN.Process(target=hold_lock, args=(path, ready))
+    holder = PREPARED.Process(target=hold_lock, args=(path, ready))
     holder.start()
     assert ready.wait(60)
     assert is_locked(path)

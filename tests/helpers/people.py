@@ -1,19 +1,24 @@
 """Tiny people for tests: coloured boxes, as meshes, as scans on disk and as a rendered data set."""
 
+from __future__ import annotations
+
 import dataclasses
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 import trimesh
 from PIL import Image
 
-from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.synthesis.datasets import Scans
 from ghgs_lit.synthesis.jobs import RenderOptions, render_people
 from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
 from ghgs_lit.synthesis.rig import Rig
 from ghgs_lit.synthesis.scans import ScanSource
+
+if TYPE_CHECKING:  # processes that render need not import Lightning
+    from ghgs_lit.data.datamodule import PhotographsDataModule
 
 V4 = {"training_counts": [4], "evaluation_count": 4}
 RELEASE = {"name": "release", "training_views": [2, 3, 4]}

@@ -166,13 +166,13 @@ def test_workers_end_with_the_process_that_started_them(scans, tmp_path):
 UNGUARDED = """
 import sys
 from pathlib import Path
-from ghgs_lit.synthesis.jobs import render_people
+from ghgs_lit.synthesis.jobs import RenderOptions, render_people
+from ghgs_lit.synthesis.rig import Rig
 from ghgs_lit.synthesis.scans import ScanSource
-from tests.helpers.people import RIG, TINY
 
 Path(sys.argv[1], str(__import__("os").getpid())).touch()
 root, scans = map(Path, sys.argv[2:])
-render_people(root, {"train": ["s0", "s1"]}, ScanSource(scans), RIG, TINY, 0, workers=2)
+render_people(root, {"train": ["s0", "s1"]}, ScanSource(scans), Rig(), RenderOptions(size=42), 0, workers=2)
 """
 
 
@@ -200,9 +200,9 @@ def test_several_workers_make_the_same_files(scans, reference, tmp_path, monkeyp
 
 def test_people_are_rendered_inside_a_worker_of_joblib(scans, reference, tmp_path):
     """A sweep with ``hydra/launcher=joblib`` makes its people in joblib's worker, in further processes."""
-    joblib = pytest.importorskip("joblib")
-    job = joblib.delayed(render_boxes)(tmp_path / "out", scans, 3, 1, settings=SMALL, workers=2)
-    joblib.Parallel(n_jobs=2, backend="loky")([job])
+    loky = pytest.importorskip("joblib.externals.loky")
+    worker = loky.get_reusable_executor(max_workers=1)
+    worker.submit(render_boxes, tmp_path / "out", scans, 3, 1, settings=SMALL, workers=2).result()
     assert contents(tmp_path / "out") == reference
 
 

@@ -63,7 +63,7 @@ def test_the_verb_finds_nothing_on_the_cpu_and_writes_a_table(tmp_path, capsys):
 def test_it_runs_on_the_pretend_device():
     """Every check; the renderer is the reference, as no other one knows the device."""
     with pretend_device():
-        found = list(selfcheck(settings("renderer.backend=reference"), DEVICE))
+        found = list(selfcheck(settings("renderer.backend=reference", "data.size=28"), DEVICE))
     assert failures(found) == []
     assert statuses(found)["model, float16"] == SKIPPED
     assert statuses(found)["model, float32: gaussian_head, means"] == PASSED
