@@ -76,6 +76,11 @@ class Completeness:
         """Those of ``names`` that are not completely rendered."""
         return [name for name in names if not self.marker(phase, name).exists()] if self.rendered_here else []
 
+    def whole(self, phase: str, names: Sequence[str]) -> list[str]:
+        """Those of ``names`` that are completely rendered."""
+        missing = set(self.missing(phase, names))
+        return [name for name in names if name not in missing]
+
 
 _IMAGE_SUFFIXES = (".jpg", ".png", ".jpeg")
 _POSITION = re.compile(r"(.+)_(\d{3,})")
@@ -130,9 +135,9 @@ class Layout(Reader):
         integer = pixel_centers == "auto" and not self._complete.rendered_here
         self._shift = 0.5 if integer or pixel_centers == "integer" else 0.0
         self._folders: dict[str, Path] = {}
-        self._find(phase, names, limit)
+        self.find(phase, names, limit)
 
-    def _find(self, phase: str, names: Sequence[str] | None, limit: int | None) -> None:
+    def find(self, phase: str, names: Sequence[str] | None, limit: int | None = None) -> None:
         """Fill ``subjects`` with complete ones."""
         require_folder(self.root, "the root of a rendered data set")
         phases = [phase] if names is None else [phase, *(p for p in PHASES if p != phase)]

@@ -5,7 +5,7 @@ import hashlib
 import json
 import os
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -14,12 +14,13 @@ from pydantic import Field
 from ghgs_lit.config import options
 from ghgs_lit.config.options import Index, Options, Share, Size, Text, Words, Workers
 from ghgs_lit.data.dataset import DataSet, Limit, required_folder
-from ghgs_lit.data.layout import Rendered
+from ghgs_lit.data.layout import Completeness, Layout, Rendered
 from ghgs_lit.data.reader import PHASES
 from ghgs_lit.data.sampling import RING_VIEW, TargetProtocol
 from ghgs_lit.data.splits import read_split, split_names
 from ghgs_lit.errors import InputError
 from ghgs_lit.synthesis import bench, people
+from ghgs_lit.synthesis.beside import Joining, render_beside
 from ghgs_lit.synthesis.capture_rig import CaptureRig, RigCamera
 from ghgs_lit.synthesis.jobs import (
     ACTIVE,
@@ -38,6 +39,8 @@ from ghgs_lit.synthesis.scans import ScanSource
 _PEOPLE_SEED = 0
 # Seed of heights, yaws, lights and of the split by fraction of scans.
 _SEED = 0
+# People in a rig that are rendered before training begins: a first run of ``ghgs adapt`` takes minutes.
+_FIRST_TRAIN = 8
 
 
 class _Renderable(Rendered):
@@ -144,11 +147,14 @@ class _Generated(_Renderable):
         for split in frozen:
             made_with = everything(self.camera_rig(), self.render)
             bench.check_settings(split, {"people_seed": _PEOPLE_SEED, **made_with})
-        names = {phase: self.subject_names(phase) for phase in splits}
-        source, rig = self.source_of_people, self.camera_rig()
-        render_people(Path(self.root), names, source, rig, self.render, _PEOPLE_SEED, self.render_workers)
+        self.render_first({phase: self.subject_names(phase) for phase in splits})
         for split in frozen:
             bench.check_photographs(split, self.reader(split))
+
+    def render_first(self, names: Mapping[str, Sequence[str]]) -> None:
+        """Render these people, by phase."""
+        source, rig = self.source_of_people, self.camera_rig()
+        render_people(Path(self.root), names, source, rig, self.render, _PEOPLE_SEED, self.render_workers)
 
     def check_targets(self, targets: TargetProtocol) -> None:
         needed = {RING_VIEW} | targets.view_numbers
@@ -181,7 +187,8 @@ class Synthetic(_Generated, _OnRing):
 
 
 class PeopleInRig(_Generated):
-    """Generated people in the rig of a capture, as crops around them: what ``ghgs adapt`` trains on."""
+    """Generated people in the rig of a capture, as crops around them: what ``ghgs adapt`` trains on. Training
+    waits for the first people only (for all with ``render_workers=0``); the others are rendered meanwhile."""
 
     name: Text = "people_in_rig"
     cameras: Annotated[dict, Words("a mapping of cameras")] = Field({})
@@ -197,6 +204,24 @@ class PeopleInRig(_Generated):
     def subject_names(self, phase: str) -> list[str]:
         """Names sorted by number, so that the first ones are of both kinds."""
         return sorted(super().subject_names(phase), key=lambda name: name[1:])
+
+    def render_first(self, names: Mapping[str, Sequence[str]]) -> None:
+        """Render these people, but of training only the first; start to render the others."""
+        if self.render_workers == 0:
+            return super().render_first(names)
+        trained, root = list(names.get("train", [])), Path(self.root)
+        super().render_first({**names, "train": trained[:_FIRST_TRAIN]})
+        render_beside(root, trained, self.source_of_people, self.camera_rig(), self.render, _PEOPLE_SEED)
+
+    def reader(self, phase: str, strict: bool = True) -> Layout:
+        if phase != "train":
+            return super().reader(phase, strict)
+        names = self.subject_names(phase)
+        layout = Layout(
+            self.folder, phase, Completeness(self.folder).whole(phase, names) or names, strict=strict
+        )
+        Joining(layout, names)
+        return layout
 
     def camera_rig(self) -> CaptureRig:
         read = [RigCamera.read(camera, f"data.cameras.{name}") for name, camera in self.cameras.items()]

@@ -180,13 +180,14 @@ def render_people(
     settings: RenderOptions,
     seed: int,
     workers: int | None = None,
+    shown: bool = True,
 ) -> int:
     """Render people below ``root``; existing ones are kept. Returns the number of people rendered now.
 
     It is safe to kill, to repeat, and to start twice at once: a second process waits for the first.
     ``names``: subjects of each phase: people, or their instants if they move. ``workers``: number of
-    processes (None: one for each core; 0: only this one). InputError: ``root`` holds something else, a person
-    is bad, or the script has no main guard."""
+    processes (None: one for each core; 0: only this one). ``shown``: whether there is a progress bar.
+    InputError: ``root`` holds something else, a person is bad, or the script has no main guard."""
     _check_main_guard()
     positions = settings.positions
     fits = positions is None or set(positions) <= set(range(rig.positions))
@@ -211,7 +212,7 @@ def render_people(
         console, label = Console(stderr=True), f"rendering into {root}"
         try:
             with contextlib.closing(_run(todo, workers)) as finished:
-                for job in track(finished, label, total=len(todo), console=console):
+                for job in track(finished, label, total=len(todo), console=console, disable=not shown):
                     progress.publish(job.workspace, job.phase, job.subjects)
         finally:
             progress.clear_workspaces()
@@ -227,7 +228,7 @@ def _run(jobs: list[_Job], workers: int | None) -> Iterator[_Job]:
         # A worker of joblib inherits the name of a start method that a fresh process does not know.
         multiprocessing.set_start_method("spawn", force=True)
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, initializer=_start_worker) as pool:
+    with ProcessPoolExecutor(workers, context, initializer=start_worker) as pool:
         try:
             futures = [pool.submit(render_subject, job) for job in jobs]
             for future in as_completed(futures):
@@ -250,7 +251,7 @@ def _check_main_guard() -> None:
         )
 
 
-def _start_worker() -> None:
+def start_worker() -> None:
     """Prepare a worker: one thread, Ctrl-C only in the parent, and an end with the parent."""
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
