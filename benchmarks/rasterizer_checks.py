@@ -102,7 +102,7 @@ def _areas(part: TexturedMesh) -> np.ndarray:
 
 
 def _sample(part: TexturedMesh, areas: np.ndarray, count: int, generator) -> tuple[np.ndarray, ...]:
-    """Points, normals and colours at ``count`` random places of a mesh, without transparent texels."""
+    """Points, normals and colours at ``count`` random places of a mesh."""
     chosen = generator.choice(len(areas), count, p=areas / areas.sum())
     weights = generator.dirichlet((1, 1, 1), count)[..., None]
     corners = part.vertices[part.faces[chosen]]
@@ -111,10 +111,9 @@ def _sample(part: TexturedMesh, areas: np.ndarray, count: int, generator) -> tup
     height, width = part.texture.shape[:2]
     rows = np.clip(((1 - v) * height).astype(int), 0, height - 1)
     texels = part.texture[rows, np.clip((u * width).astype(int), 0, width - 1)] / 255
-    solid = np.ones(count, bool) if part.alpha_cutoff is None else texels[:, 3] >= part.alpha_cutoff
     points = (corners * weights).sum(1)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return points[solid], normals[solid], texels[solid, :3]
+    return points, normals, texels
 
 
 @torch.no_grad()

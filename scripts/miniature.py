@@ -54,7 +54,7 @@ def _root(dataset: DataSet) -> Path:
 def _zju_mocap(dataset: ZJUMoCap, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
     chosen = []
     for phase in PHASES:
-        chosen += [s for some in dataset.split.of(phase) for s in some.sequences][: people[phase]]
+        chosen += [s for some in getattr(dataset.split, phase) for s in some.sequences][: people[phase]]
     root = _root(dataset)
     with writing(root):
         return zju_mocap.make(root, chosen, size, seed)

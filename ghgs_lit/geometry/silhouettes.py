@@ -64,20 +64,13 @@ class Silhouette:
 
 @dataclass(frozen=True)
 class HullSearch:
-    """Precision of a search for the visual hull.
+    """Precision of a search for the visual hull."""
 
-    Attributes:
-        rays: largest number of cells of a mask that are tried.
-        depths: points along each ray.
-        reach: range of depths around the subject's middle, in radii of the subject.
-        others: largest number of other silhouettes that a ray is compared with; None: all.
-        wrong: share of these that may say "outside"."""
-
-    rays: int = 300
-    depths: int = 96
-    reach: float = 1.25
-    others: int | None = None
-    wrong: float = 0.0
+    rays: int = 300  # largest number of cells of a mask that are tried
+    depths: int = 96  # points along each ray
+    reach: float = 1.25  # range of depths around the subject's middle, in radii of the subject
+    others: int | None = None  # largest number of other silhouettes that a ray is compared with; None: all
+    wrong: float = 0.0  # share of these that may say "outside"
 
     def shares(self, silhouettes: Sequence[Silhouette]) -> list[float]:
         """For each silhouette, the share of its cells whose rays meet the hull of the others; 0 if empty."""

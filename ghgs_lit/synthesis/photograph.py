@@ -23,10 +23,6 @@ from ghgs_lit.types import Cameras
 
 # Rays traced at once: they fit the processor's cache, which is three times as fast as a whole photograph.
 _CHUNK = 1 << 14
-# Transparent layers (strands of hair) that a ray may pass; after more it counts as a miss.
-_MAX_LAYERS = 64
-# Step of a ray behind a transparent hit, in metres: more than float32 error, less than any real gap.
-_STEP = 2e-5
 
 
 @dataclass(frozen=True)
@@ -34,21 +30,14 @@ class Lights:
     """White lights around a person, the same for every camera, so that views agree.
 
     Shading is Lambertian with soft terminators, ``ambient + sum_l w_l max((n.l + s) / (1 + s), 0)``, and
-    multiplies texture values as stored.
-
-    Attributes:
-        ambient: share of ambient light, 0 to 1.
-        softness: s of the formula, 0 (Lambertian) to 1.
-        exposure: approximate mean brightness over all directions of the normal.
-        elevation: largest elevation of a light in degrees.
-        jitter: relative variation of the strengths of the lights, 0 to below 1."""
+    multiplies texture values as stored."""
 
     count: int = 6
-    ambient: float = 0.5
-    softness: float = 0.3
-    exposure: float = 0.6
-    elevation: float = 30.0
-    jitter: float = 0.25
+    ambient: float = 0.5  # share of ambient light, 0 to 1
+    softness: float = 0.3  # s of the formula, 0 (Lambertian) to 1
+    exposure: float = 0.6  # approximate mean brightness over all directions of the normal
+    elevation: float = 30.0  # largest elevation of a light in degrees
+    jitter: float = 0.25  # relative variation of the strengths of the lights, 0 to below 1
 
     def draw(self, rng: np.random.Generator) -> "LightRig":
         """Draw the lights of one person: evenly spaced in azimuth, with random elevations and strengths."""
@@ -98,21 +87,12 @@ class Photographs:
 
 class Studio:
     """A person under fixed lights, photographed from any number of cameras. Surfaces are double-sided:
-    normals are flipped towards the camera. Rays pass through a surface where the alpha of its texture is
-    below the part's ``alpha_cutoff``. ``samples``: 1 to 16. InputError: no faces, values that are not finite,
-    or a texture that is not uint8."""
+    normals are flipped towards the camera. ``samples``: 1 to 16. InputError: the person has no faces."""
 
     def __init__(self, person: Person, lights: LightRig, samples: int = 3) -> None:
-        require(1 <= samples <= 16, "samples", "between 1 and 16", samples)
         parts = [part for part in person.parts if len(part.faces)]
         if not parts:
             raise InputError(f"{person.name}: expected a mesh with faces; found none")
-        for part in parts:  # TexturedMesh does not check this, and Embree would render it wrongly
-            if part.texture.dtype != np.uint8:
-                raise InputError(f"{person.name}: expected a texture of uint8; found {part.texture.dtype}")
-            if not np.isfinite(part.vertices).all() or not np.isfinite(part.uv).all():
-                expected = "finite vertices and texture coordinates"
-                raise InputError(f"{person.name}: expected {expected}; found NaN or infinity")
         self.lights, self.samples = lights, samples
         counts = np.cumsum([0] + [len(part.vertices) for part in parts])
         self._vertices = np.concatenate([part.vertices for part in parts]).astype(np.float32)
@@ -123,9 +103,6 @@ class Studio:
         self._normals = np.concatenate([smooth_normals(part.vertices, part.faces) for part in parts])
         self._part = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
         self._textures = [part.texture for part in parts]
-        self._cutoff = np.array(
-            [0.0 if p.alpha_cutoff is None else p.alpha_cutoff for p in parts], np.float32
-        )
         corners = self._vertices[self._faces].astype(np.float64)
         self._face_normals = trimesh.unitize(trimesh.triangles.cross(corners)).astype(np.float32)
         self._scene = EmbreeScene(robust=True)
@@ -178,10 +155,11 @@ class Studio:
         directions = (rays @ pose[:3, :3]).astype(np.float32)
         origin = (-pose[:3, :3].T @ pose[:3, 3]).astype(np.float32)
 
-        depth, face, weights = self._trace(origin, directions)
-        hit = face >= 0
+        hits = self._scene.run(np.tile(origin, (len(directions), 1)), directions, output=True)
+        hit, u, v = hits["primID"] >= 0, hits["u"], hits["v"]
+        depth, weights = np.where(hit, hits["tfar"], 0), np.stack((1 - u - v, u, v), -1)
         colors = np.zeros((len(rays), 3), np.float32)
-        colors[hit] = self._shade(directions[hit], face[hit], weights[hit])
+        colors[hit] = self._shade(directions[hit], hits["primID"][hit], weights[hit])
 
         hit, depth = hit.reshape(h, w, n * n), depth.reshape(h, w, n * n)
         offset = np.abs(np.arange(n) - (n - 1) / 2)
@@ -192,48 +170,14 @@ class Studio:
         image = colors.reshape(h, w, n * n, 3).mean(2)
         return np.clip(image, 0, 1), alpha, np.where(alpha > 0, center, 0)
 
-    def _trace(self, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Distance [n], face [n] (-1: none) and barycentric weights [n, 3] of the first opaque hit."""
-        distance = np.zeros(len(directions), np.float32)
-        face = np.full(len(directions), -1, np.int64)
-        weights = np.zeros((len(directions), 3), np.float32)
-        active, start = np.arange(len(directions)), np.zeros(len(directions), np.float32)
-        for _ in range(_MAX_LAYERS):
-            rays = directions[active]
-            hits = self._scene.run(origin + start[:, None] * rays, rays, output=True)
-            hit = np.flatnonzero(hits["primID"] >= 0)
-            active, reached = active[hit], start[hit] + hits["tfar"][hit]
-            u, v, triangle = hits["u"][hit], hits["v"][hit], hits["primID"][hit]
-            corners = np.stack((1 - u - v, u, v), -1)
-            solid = self._solid(triangle, corners)
-            done = active[solid]
-            distance[done], face[done], weights[done] = reached[solid], triangle[solid], corners[solid]
-            active, start = active[~solid], reached[~solid] + _STEP
-            if not len(active):
-                break
-        return distance, face, weights
-
-    def _solid(self, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        solid = np.ones(len(face), bool)
-        part = self._part[face]
-        for k in np.flatnonzero(self._cutoff):
-            index = np.flatnonzero(part == k)
-            if len(index):
-                alpha = self._textured(k, face[index], weights[index])[:, 3]
-                solid[index] = alpha >= self._cutoff[k]
-        return solid
-
-    def _textured(self, part: int, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        uv = np.einsum("nk,nkc->nc", weights, self._uv[self._faces[face]])
-        return sample_texture(self._textures[part], uv)
-
     def _shade(self, directions: np.ndarray, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Colours [n, 3] of hits seen along ``directions`` [n, 3]."""
         colors = np.empty((len(face), 3), np.float32)
         part = self._part[face]
         for k in np.unique(part):
             index = np.flatnonzero(part == k)
-            colors[index] = self._textured(k, face[index], weights[index])[:, :3]
+            uv = np.einsum("nk,nkc->nc", weights[index], self._uv[self._faces[face[index]]])
+            colors[index] = sample_texture(self._textures[k], uv)
         flat = self._face_normals[face]
         smooth = trimesh.unitize(np.einsum("nk,nkc->nc", weights, self._normals[self._faces[face]]))
         cancelled = np.square(smooth).sum(-1, keepdims=True) < 0.5

@@ -88,27 +88,18 @@ class Poses:
 
 @dataclass(frozen=True)
 class Rig:
-    """A ring of cameras; defaults are those of the published scripts.
-
-    Attributes:
-        radius: distance of the cameras from ``look_at``, metres.
-        look_at: the point that all cameras look at, metres.
-        pitch: degrees; below 0 the cameras look down.
-        focal: focal length as a fraction of the image's height.
-        shift_y: offset of the principal point below the centre, as a fraction of the image's height.
-        yaw_jitter: largest rotation of the ring of a subject, degrees.
-        height: height that subjects are scaled to, metres (None: they keep their own).
-        height_jitter: largest deviation from ``height``, metres."""
+    """A ring of cameras; defaults are those of the published scripts."""
 
     positions: int = 16
-    radius: float = 2.0
-    look_at: tuple[float, float, float] = (0.0, 0.85, 0.0)
-    pitch: float = -8.0
-    focal: float = 0.8
+    radius: float = 2.0  # distance of the cameras from ``look_at``, metres
+    look_at: tuple[float, float, float] = (0.0, 0.85, 0.0)  # the point that all cameras look at, metres
+    pitch: float = -8.0  # degrees; below 0 the cameras look down
+    focal: float = 0.8  # focal length as a fraction of the image's height
+    # offset of the principal point below the centre, as a fraction of the image's height
     shift_y: float = 25 / 1024
-    yaw_jitter: float = 11.0
-    height: float | None = 1.80
-    height_jitter: float = 0.05
+    yaw_jitter: float = 11.0  # largest rotation of the ring of a subject, degrees
+    height: float | None = 1.80  # height that subjects are scaled to, metres (None: they keep their own)
+    height_jitter: float = 0.05  # largest deviation from ``height``, metres
     variation: Variation = STILL
 
     def yaws(self, rng: np.random.Generator) -> np.ndarray:

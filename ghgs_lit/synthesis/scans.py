@@ -72,11 +72,10 @@ def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
 
 
 def _part(path: Path, name: str, mesh: trimesh.Trimesh, transform: np.ndarray) -> TexturedMesh:
-    material = getattr(mesh.visual, "material", None)
-    uv = getattr(mesh.visual, "uv", None)
-    texture, cutoff = _texture(path, material)
+    texture = _texture(path, getattr(mesh.visual, "material", None))
     if texture is None:
         raise InputError(f"{path}: expected a texture for the mesh {name!r}; found none")
+    uv = getattr(mesh.visual, "uv", None)
     if texture.shape[:2] == (1, 1) and uv is None:
         uv = np.zeros((len(mesh.vertices), 2))
     if uv is None or len(uv) != len(mesh.vertices):
@@ -84,31 +83,27 @@ def _part(path: Path, name: str, mesh: trimesh.Trimesh, transform: np.ndarray) -
     vertices = trimesh.transform_points(mesh.vertices, transform)
     check_extent(f"{path}: {name}", vertices)
     arrays = vertices.astype(np.float32), np.asarray(mesh.faces, np.int64), np.asarray(uv, np.float32)
-    return TexturedMesh(*arrays, texture, cutoff)
+    return TexturedMesh(*arrays, texture)
 
 
-def _texture(path: Path, material: object) -> tuple[np.ndarray | None, float | None]:
-    """Texture [h, w, 3 or 4] uint8 and alpha cutoff of a material; None if it has no texture or no cutoff."""
+def _texture(path: Path, material: object) -> np.ndarray | None:
+    """Texture [h, w, 3] uint8 of a material, None if it has none. InputError: its alpha cuts parts away."""
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is not None and image.format is None:  # not from a file: trimesh replaced a missing material
         image = None
     factor = getattr(material, "baseColorFactor", None)
     if image is None and factor is not None:  # one plain colour, as buttons and eyes often have
-        return np.asarray(factor, np.uint8).reshape(1, 1, -1)[..., :3], None
+        return np.asarray(factor, np.uint8).reshape(1, 1, -1)[..., :3]
     if image is None and path.suffix == ".obj":
         image = _image_beside(path)
     if image is None:
-        return None, None
+        return None
     mode = str(getattr(material, "alphaMode", None) or "OPAQUE").upper()
-    # Blended hair is cut off at 0.5, as each ray of a photograph sees one surface.
-    cutoff = None if mode == "OPAQUE" else float(getattr(material, "alphaCutoff", None) or 0.5)
-    has_alpha = "A" in image.getbands() or "transparency" in image.info
-    cutoff = cutoff if has_alpha else None
-    texture = np.asarray(image.convert("RGB" if cutoff is None else "RGBA"))
+    require(mode == "OPAQUE" or not image.has_transparency_data, str(path), "opaque textures", mode)
+    texture = np.asarray(image.convert("RGB"))
     if factor is not None:
-        scale = np.asarray(factor, np.float64)[: texture.shape[2]] / 255
-        texture = np.round(texture * scale).astype(np.uint8)
-    return texture, cutoff
+        texture = np.round(texture * (np.asarray(factor, np.float64)[:3] / 255)).astype(np.uint8)
+    return texture
 
 
 def _image_beside(path: Path) -> Image.Image | None:

@@ -214,7 +214,7 @@ def test_a_broken_model_gets_its_line(case, tmp_path, monkeypatch):
         ),
         (["data.masks=mask"], "data.masks: expected one of kinect_mask, kinect_mask_manual; found 'mask'"),
         (["data.frames=[0,0,6]"], r"data.frames: expected \[start, stop, step\] with start < stop; found"),
-        (["data.split.val=[]"], r"data.split.val: expected names of sequences; found \[\]"),
+        (["data.split.val=[]"], r"data.split.val: expected a list \(each a text\); found \[\]"),
         (["data.split.val=null"], r"data.split.val: expected a list \(each a text\); found None"),
     ],
 )

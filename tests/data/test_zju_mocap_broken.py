@@ -219,8 +219,8 @@ def test_problems_are_collected_where_that_is_asked_for(whole, tmp_path):
             "data.split.train=[{sequences: [386], frames: [5, 5, 1]}]",
             r"data.split.train.frames: expected \[start, stop",
         ),
-        ("data.split.train=[{sequences: [], frames: [0, 5, 1]}]", "data.split.train.sequences: expected ids"),
-        ("data.split.train=[]", "data.split.train: expected sequences and frames"),
+        ("data.split.train=[{sequences: [], frames: [0, 5, 1]}]", "split.train.sequences: expected a list"),
+        ("data.split.train=[]", "data.split.train: expected a list"),
         (
             "data.split.train=[{sequence: [386], frames: [0, 5, 1]}]",
             "data.split.train key: expected one of frames, sequences; found 'sequence'",

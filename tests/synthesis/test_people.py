@@ -275,12 +275,14 @@ def test_textured_mesh_refuses_other_shapes():
         "texture": np.zeros((2, 2, 3), np.uint8),
     }
     TexturedMesh(**square)
-    with pytest.raises(InputError, match=r"uv: expected \[4, 2\]"):
+    with pytest.raises(InputError, match="uv: expected an array 4x2; found 3x2"):
         TexturedMesh(**{**square, "uv": np.zeros((3, 2))})
     with pytest.raises(InputError, match="faces: expected indices"):
         TexturedMesh(**{**square, "faces": np.array([[0, 1, 4]])})
-    with pytest.raises(InputError, match="alpha_cutoff"):
-        TexturedMesh(**square, alpha_cutoff=0.5)
+    with pytest.raises(InputError, match=r"texture: expected uint8 \[h, w, 3\]; found 'float64 \[2, 2, 3\]'"):
+        TexturedMesh(**{**square, "texture": np.zeros((2, 2, 3))})
+    with pytest.raises(InputError, match="vertices: expected finite numbers"):
+        TexturedMesh(**{**square, "vertices": np.full((4, 3), np.nan)})
 
 
 # ---- mesh operations

@@ -1,4 +1,4 @@
-"""Photographs of analytic shapes: depth, silhouettes, antialiasing, cut-outs, light."""
+"""Photographs of analytic shapes: depth, silhouettes, antialiasing, light."""
 
 import numpy as np
 import pytest
@@ -24,19 +24,19 @@ def plain(color=(255, 255, 255), size=4) -> np.ndarray:
     return np.tile(np.array(color, np.uint8), (size, size, 1))
 
 
-def mesh_part(mesh: trimesh.Trimesh, texture=None, cutoff=None) -> TexturedMesh:
+def mesh_part(mesh: trimesh.Trimesh, texture=None) -> TexturedMesh:
     """A mesh in one plain colour."""
     vertices = np.asarray(mesh.vertices, np.float32)
     uv = np.full((len(vertices), 2), 0.5, np.float32)
-    return TexturedMesh(vertices, np.asarray(mesh.faces), uv, plain() if texture is None else texture, cutoff)
+    return TexturedMesh(vertices, np.asarray(mesh.faces), uv, plain() if texture is None else texture)
 
 
-def quad(z=0.0, half=0.5, texture=None, cutoff=None, x=0.0) -> TexturedMesh:
+def quad(z=0.0, half=0.5, texture=None, x=0.0) -> TexturedMesh:
     """A square that faces +z, its texture upright seen from +z."""
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float32)
     vertices = np.concatenate((corners * half + [x, 0], np.full((4, 1), z)), 1).astype(np.float32)
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    return TexturedMesh(vertices, faces, (corners + 1) / 2, plain() if texture is None else texture, cutoff)
+    return TexturedMesh(vertices, faces, (corners + 1) / 2, plain() if texture is None else texture)
 
 
 def front_camera(size=48, distance=2.0, focal=1.0, shift=0.0) -> Cameras:
@@ -150,24 +150,6 @@ def test_vertices_project_into_the_mask_from_every_side():
             (points[:, 0], points[:, 1] - np.clip(points[:, 1], radius, tall - radius), points[:, 2])
         )
         assert np.abs(np.linalg.norm(axis, axis=0) - radius).max() < 1.5e-3  # facets of 1 mm
-
-
-def test_cut_away_texels_show_what_lies_behind():
-    """Rays pass through cut-away strands of hair, whose colour does not bleed into what remains."""
-    strands = np.full((8, 8, 4), 255, np.uint8)
-    strands[:, :4, 3] = 0
-    strands[:, :4, :3] = 0  # black under the cut: must not bleed into what stays
-    layers = [quad(z=0.3 + 0.01 * k, half=0.6, texture=strands, cutoff=0.5) for k in range(5)]
-    image, mask, depth = shoot(
-        [*layers, quad(z=0, half=0.6, texture=plain((255, 0, 0)))], front_camera(32, distance=2.0)
-    )
-    assert mask[16, 10]
-    np.testing.assert_allclose(depth[16, [10, 22]], [2.0, 1.66], atol=1e-5)
-    np.testing.assert_allclose(image[16, [10, 22]], [[1, 0, 0], [1, 1, 1]], atol=1e-6)
-    image, mask, _ = shoot(layers, front_camera(32))
-    assert not mask[:, :12].any()
-    assert mask[16, 22]
-    assert image[mask].min() > 0.5
 
 
 def test_texture_is_upright_and_bilinear():

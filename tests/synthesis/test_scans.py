@@ -32,23 +32,26 @@ def test_obj_scans_are_loaded_as_they_are(tmp_path):
     assert ScanSource(tmp_path).load("a").parts[0].texture.shape == (4, 4, 3)
 
 
-def test_glb_scans_keep_parts_frames_and_cutouts(tmp_path):
-    """Parts keep their transforms and alpha modes; a mesh without texture is refused."""
+def test_glb_scans_keep_parts_and_frames(tmp_path):
+    """Parts keep their transforms; a mesh without texture, or with one that cuts parts away, is refused."""
     scene = trimesh.Scene()
-    for k, (mode, cutoff) in enumerate([("OPAQUE", None), ("MASK", 0.3), ("BLEND", None)]):
+    for k, mode in enumerate(("OPAQUE", "OPAQUE", "MASK")):
         mesh = trimesh.creation.box((0.1, 0.2, 0.3))
         texture = Image.fromarray(np.full((4, 4, 4), 50 * k, np.uint8))
-        material = PBRMaterial(baseColorTexture=texture, alphaMode=mode, alphaCutoff=cutoff)
+        material = PBRMaterial(baseColorTexture=texture, alphaMode=mode)
         mesh.visual = TextureVisuals(uv=np.zeros((len(mesh.vertices), 2)), material=material)
         scene.add_geometry(
             mesh, node_name=f"n{k}", transform=trimesh.transformations.translation_matrix([0, k, 0])
         )
     (tmp_path / "g").mkdir()
     scene.export(tmp_path / "g" / "g.glb")
+    with pytest.raises(InputError, match=r"g\.glb: expected opaque textures; found 'MASK'"):
+        ScanSource(tmp_path).load("g")
+    scene.delete_geometry(list(scene.geometry)[2])
+    scene.export(tmp_path / "g" / "g.glb")
     parts = ScanSource(tmp_path).load("g").parts
-    assert [part.alpha_cutoff for part in parts] == [None, pytest.approx(0.3), 0.5]
-    assert [part.texture.shape[2] for part in parts] == [3, 4, 4]
-    np.testing.assert_allclose([part.vertices[:, 1].mean() for part in parts], [0, 1, 2], atol=1e-6)
+    assert [part.texture.shape[2] for part in parts] == [3, 3]
+    np.testing.assert_allclose([part.vertices[:, 1].mean() for part in parts], [0, 1], atol=1e-6)
     plain = trimesh.Scene([trimesh.creation.box()])
     plain.export(tmp_path / "g" / "g.glb")
     with pytest.raises(InputError, match=r"g\.glb: expected a texture for the mesh"):

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from ghgs_lit.config import options
 from ghgs_lit.config.options import Count, Index, Options, Size, Text, Workers
@@ -148,13 +148,8 @@ class SequenceNames(Options):
 
     train: tuple[Text, ...] | None = None
     """Names of sequences; null: all that exist but those of val."""
-    val: tuple[Text, ...]
+    val: tuple[Text, ...] = Field(min_length=1)
     """Names of sequences."""
-
-    @model_validator(mode="after")
-    def _check(self) -> "SequenceNames":
-        self.require(self.val != (), "val", "names of sequences")
-        return self
 
 
 class HuMMan(DataSet):

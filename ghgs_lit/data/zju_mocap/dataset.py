@@ -34,7 +34,7 @@ _BODIES = ("new_vertices", "vertices")
 class Frames(Options):
     """Frames of several sequences."""
 
-    sequences: tuple[Annotated[Text | Index, AfterValidator(str)], ...]
+    sequences: tuple[Annotated[Text | Index, AfterValidator(str)], ...] = Field(min_length=1)
     """Ids, such as 377."""
     frames: tuple[Index, Index, Count]
     """[start, stop, step] of the indices in annots.npy, from 0. A shorter sequence gives the
@@ -42,7 +42,6 @@ class Frames(Options):
 
     @model_validator(mode="after")
     def _check(self) -> "Frames":
-        self.require(self.sequences != (), "sequences", "ids such as 377")
         self.require(self.frames[0] < self.frames[1], "frames", "[start, stop, step] with start < stop")
         return self
 
@@ -65,7 +64,8 @@ class ZJUMoCapReader(FrameReader):
     def __init__(self, data: "ZJUMoCap", phase: str, strict: bool = True) -> None:
         super().__init__(strict)
         self.data, folder = data, data.folder
-        wanted = [(f"CoreView_{s}", some.frames) for some in data.split.of(phase) for s in some.sequences]
+        chosen = getattr(data.split, phase)
+        wanted = [(f"CoreView_{s}", some.frames) for some in chosen for s in some.sequences]
         there = self.existing(folder, [name for name, _ in wanted], wanted[0][0])
         for name, frames in wanted:
             if name in there:
@@ -146,20 +146,10 @@ _ALL = 21
 class FramesByPhase(Options):
     """Frames of each phase."""
 
-    train: tuple[Frames, ...]
+    train: tuple[Frames, ...] = Field(min_length=1)
     """Sequences and their frames."""
-    val: tuple[Frames, ...]
+    val: tuple[Frames, ...] = Field(min_length=1)
     """Sequences and their frames."""
-
-    @model_validator(mode="after")
-    def _check(self) -> "FramesByPhase":
-        for phase in ("train", "val"):
-            self.require(self.of(phase) != (), phase, "sequences and frames")
-        return self
-
-    def of(self, phase: str) -> tuple[Frames, ...]:
-        """Frames of a phase."""
-        return getattr(self, phase)
 
 
 class ZJUMoCap(DataSet):

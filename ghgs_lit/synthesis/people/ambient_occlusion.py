@@ -50,13 +50,8 @@ def occluding_spheres(figure: Figure) -> Spheres:
 
 
 def visibility(points: np.ndarray, normals: np.ndarray, spheres: Spheres) -> np.ndarray:
-    """Share [g] of the surroundings, weighted by the cosine, that spheres and the ground do not hide.
-
-    Args:
-        points: [g, 3] metres.
-        normals: [g, 3] unit normals.
-        spheres: centres [s, 3] and radii [s].
-    """
+    """Share [g] of the surroundings, weighted by the cosine, that spheres and the ground do not hide from
+    points [g, 3] with unit normals [g, 3]."""
     light = np.ones(len(points))
     for centre, radius in zip(*spheres, strict=True):
         away = centre - points

@@ -28,35 +28,20 @@ class Surface:
 
 @dataclass(frozen=True)
 class BodyModel:
-    """The body model as stored in the asset.
+    """The body model as stored in the asset."""
 
-    Attributes:
-        mean: [n + b, 3] float64, the n vertices and then the b joints of the average adult at rest.
-        components: [k, n + b, 3] float64, principal components for coefficients of unit variance.
-        bodies: [s, k] coefficients of plausible adults.
-        female: [s] bool.
-        age: [s] from 0.67 (young) to 1 (old).
-        bone_names: b names.
-        bone_parents: [b] int, -1 for the root; parents come before children.
-        weights: [n, b] float64, skinning weights; rows sum to 1.
-        uv: [t, 2] float32, points of the UV layout of the base mesh.
-        head_uv: [4] box of the head in the UV layout: left, bottom, right, top.
-        head_masks: [h, w, 4] uint8 over that box: lips, eyelids, ears, face.
-        surfaces: body, eyes, tights, skirt.
-    """
-
-    mean: np.ndarray
-    components: np.ndarray
-    bodies: np.ndarray
-    female: np.ndarray
-    age: np.ndarray
-    bone_names: tuple[str, ...]
-    bone_parents: np.ndarray
-    weights: np.ndarray
-    uv: np.ndarray
-    head_uv: np.ndarray
-    head_masks: np.ndarray
-    surfaces: dict[str, Surface]
+    mean: np.ndarray  # [n + b, 3] float64, the n vertices and then the b joints of the average adult at rest
+    components: np.ndarray  # [k, n + b, 3] float64, principal components for coefficients of unit variance
+    bodies: np.ndarray  # [s, k] coefficients of plausible adults
+    female: np.ndarray  # [s] bool
+    age: np.ndarray  # [s] from 0.67 (young) to 1 (old)
+    bone_names: tuple[str, ...]  # b names
+    bone_parents: np.ndarray  # [b] int, -1 for the root; parents come before children
+    weights: np.ndarray  # [n, b] float64, skinning weights; rows sum to 1
+    uv: np.ndarray  # [t, 2] float32, points of the UV layout of the base mesh
+    head_uv: np.ndarray  # [4] box of the head in the UV layout: left, bottom, right, top
+    head_masks: np.ndarray  # [h, w, 4] uint8 over that box: lips, eyelids, ears, face
+    surfaces: dict[str, Surface]  # body, eyes, tights, skirt
 
     @property
     def vertex_count(self) -> int:
@@ -112,14 +97,9 @@ def load_body() -> BodyModel:
 def bone_transforms(
     parents: np.ndarray, joints: np.ndarray, rotations: np.ndarray, root: np.ndarray
 ) -> np.ndarray:
-    """Transforms of the bones from rest to pose. Returns: [b, 3, 4] rotations and translations.
-
-    Args:
-        parents: [b], -1 for the root; parents come before children.
-        joints: [b, 3] at rest, metres.
-        rotations: [b, 3, 3] of each bone in world axes (not relative to its parent).
-        root: [3], position of the root joint in the pose, metres.
-    """
+    """Transforms [b, 3, 4] of the bones from rest to pose. ``parents``: [b], -1 for the root; parents come
+    before children. ``joints``: [b, 3] at rest, metres. ``rotations``: [b, 3, 3] of each bone in world axes
+    (not relative to its parent). ``root``: [3], position of the root joint in the pose, metres."""
     posed = np.empty_like(joints)
     for bone, parent in enumerate(parents):
         if parent < 0:

@@ -20,39 +20,24 @@ FEET_UV = 0.9068  # v coordinate below which the helper garment's UV layout show
 
 @dataclass(frozen=True)
 class Chart:
-    """A surface with one texture.
+    """A surface with one texture."""
 
-    Attributes:
-        interpolation: [g, n] sparse, from the vertices of the base mesh to the g points of the surface.
-        weights: [g, b] skinning weights.
-        smooth: [g, g] sparse, one step of Laplacian smoothing.
-        point_faces: [m, 3] triangles over the g points.
-        point_of_vertex: [c] the point of each textured vertex (a point on a UV seam has several).
-        faces: [m, 3] triangles over the c textured vertices.
-        uv: [c, 2] of the textured vertices.
-        place: of the g points.
-        shape: height and width of the texture.
-        texels: [k] flat numbers of the texels that the surface covers.
-        nearest: [height * width] the position in `texels` of the covered texel nearest to each texel.
-        texel_place: of the k covered texels.
-        texel_points: [k, 3] the points of the triangle that a covered texel lies in.
-        texel_shares: [k, 3] its barycentric coordinates there.
-    """
-
+    # [g, n] sparse, from the vertices of the base mesh to the g points of the surface
     interpolation: sparse.csr_matrix
-    weights: np.ndarray
-    smooth: sparse.csr_matrix
-    point_faces: np.ndarray
-    point_of_vertex: np.ndarray
-    faces: np.ndarray
-    uv: np.ndarray
-    place: Place
-    shape: tuple[int, int]
-    texels: np.ndarray
+    weights: np.ndarray  # [g, b] skinning weights
+    smooth: sparse.csr_matrix  # [g, g] sparse, one step of Laplacian smoothing
+    point_faces: np.ndarray  # [m, 3] triangles over the g points
+    point_of_vertex: np.ndarray  # [c] the point of each textured vertex (a point on a UV seam has several)
+    faces: np.ndarray  # [m, 3] triangles over the c textured vertices
+    uv: np.ndarray  # [c, 2] of the textured vertices
+    place: Place  # of the g points
+    shape: tuple[int, int]  # height and width of the texture
+    texels: np.ndarray  # [k] flat numbers of the texels that the surface covers
+    # [height * width] the position in `texels` of the covered texel nearest to each texel
     nearest: np.ndarray
-    texel_place: Place
-    texel_points: np.ndarray
-    texel_shares: np.ndarray
+    texel_place: Place  # of the k covered texels
+    texel_points: np.ndarray  # [k, 3] the points of the triangle that a covered texel lies in
+    texel_shares: np.ndarray  # [k, 3] its barycentric coordinates there
 
     def image(self, colours: np.ndarray) -> np.ndarray:
         """Texture [h, w, 3] uint8 of colours [k, 3] (0 to 1) of covered texels; others copy the nearest."""

@@ -20,20 +20,16 @@ IRISES = ((0.28, 0.17, 0.08), (0.20, 0.12, 0.06), (0.35, 0.45, 0.55), (0.33, 0.4
 
 @dataclass(frozen=True)
 class Complexion:
-    """The colours of a person.
+    """The colours of a person."""
 
-    Attributes:
-        skin, lips, hair, iris: [3] in [0, 1].
-        beard, brows, makeup, freckles: strengths, about 0 to 1.
-        beard_style: none, stubble, full, goatee or moustache.
-    """
-
+    # skin, lips, hair, iris: [3] in [0, 1]
     skin: np.ndarray
     lips: np.ndarray
     hair: np.ndarray
     iris: np.ndarray
+    # beard, brows, makeup, freckles: strengths, about 0 to 1
     beard: float
-    beard_style: str
+    beard_style: str  # none, stubble, full, goatee or moustache
     brows: float
     makeup: float
     freckles: float

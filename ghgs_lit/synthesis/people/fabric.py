@@ -29,20 +29,13 @@ def random_colour(rng: np.random.Generator, neutral: float = 0.4) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Fabric:
-    """A pattern in up to three colours.
-
-    Attributes:
-        colours: [3, 3] in [0, 1].
-        scale: period of the pattern in metres.
-        tilt: rotation of the pattern in radians.
-        grain: strength of the fine noise.
-    """
+    """A pattern in up to three colours."""
 
     pattern: str
-    colours: np.ndarray
-    scale: float
-    tilt: float
-    grain: float
+    colours: np.ndarray  # [3, 3] in [0, 1]
+    scale: float  # period of the pattern in metres
+    tilt: float  # rotation of the pattern in radians
+    grain: float  # strength of the fine noise
     noise: Noise
     fine: Noise
 

@@ -20,21 +20,13 @@ SOLE = 0.013  # thickness of a sole, metres
 
 @dataclass(frozen=True)
 class Figure:
-    """A naked person in a pose.
+    """A naked person in a pose."""
 
-    Attributes:
-        rest: [n, 3] vertices of the base mesh at rest, metres.
-        joints: [b, 3] at rest.
-        faces: [m, 3] triangles of the skin.
-        transforms: [b, 3, 4] of the bones from rest to pose.
-        posed: [BODY_VERTICES, 3] vertices of the skin in the pose.
-    """
-
-    rest: np.ndarray
-    joints: np.ndarray
-    faces: np.ndarray
-    transforms: np.ndarray
-    posed: np.ndarray
+    rest: np.ndarray  # [n, 3] vertices of the base mesh at rest, metres
+    joints: np.ndarray  # [b, 3] at rest
+    faces: np.ndarray  # [m, 3] triangles of the skin
+    transforms: np.ndarray  # [b, 3, 4] of the bones from rest to pose
+    posed: np.ndarray  # [BODY_VERTICES, 3] vertices of the skin in the pose
 
 
 # ---- where garments end: signed distance to the edge in metres, positive where there is cloth
@@ -90,14 +82,8 @@ def shoe_field(place: Place, shoes: Shoes) -> np.ndarray:
 def push_out(
     points: np.ndarray, vertices: np.ndarray, normals: np.ndarray, clearance: np.ndarray
 ) -> np.ndarray:
-    """Move points outwards until they keep a distance from the body.
-
-    Args:
-        points: [g, 3].
-        vertices: [n, 3] of the body.
-        normals: [n, 3] of the body, unit.
-        clearance: [g] distance to keep along the normal of the nearest vertex, metres.
-    """
+    """Move points [g, 3] outwards until they keep a distance ``clearance`` [g] in metres along the normal of
+    the nearest of the body's ``vertices`` [n, 3] with unit ``normals`` [n, 3]."""
     _, index = cKDTree(vertices).query(points)
     height = np.einsum("gi,gi->g", points - vertices[index], normals[index])
     lack = np.clip(clearance - height, 0.0, 0.04)

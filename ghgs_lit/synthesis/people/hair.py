@@ -26,18 +26,12 @@ ROWS, COLUMNS = 56, 80
 
 @dataclass(frozen=True)
 class Haircut:
-    """A haircut.
-
-    Attributes:
-        thickness: of the shell in metres.
-        end: height on the average body where a curtain ends, metres.
-        wave: how wavy the strands are, 0 to 1.
-    """
+    """A haircut."""
 
     style: str
-    thickness: float
-    end: float
-    wave: float
+    thickness: float  # of the shell in metres
+    end: float  # height on the average body where a curtain ends, metres
+    wave: float  # how wavy the strands are, 0 to 1
 
 
 def sample_haircut(rng: np.random.Generator, female: bool) -> Haircut:

@@ -58,16 +58,9 @@ def neighbour_mean(faces: np.ndarray, count: int) -> sparse.csr_matrix:
 
 
 def clip(faces: np.ndarray, field: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Cut a mesh along the zero line of a field and keep the positive side.
-
-    Args:
-        faces: [m, 3] indices of vertices.
-        field: [n] a value at each vertex.
-
-    Returns:
-        Faces [k, 3] of new vertices, and for each of these two old ones `a`, `b` and the share `t` of `b`:
-        an attribute of the new mesh is `(1 - t) * x[a] + t * x[b]`.
-    """
+    """Cut a mesh of ``faces`` [m, 3] along the zero line of a ``field`` [n] on its vertices and keep the
+    positive side. Returns: Faces [k, 3] of new vertices, and for each of these two old ones `a`, `b` and the
+    share `t` of `b`: an attribute of the new mesh is `(1 - t) * x[a] + t * x[b]`."""
     count = len(field)
     inside = field[faces] >= 0
     number = inside.sum(1)

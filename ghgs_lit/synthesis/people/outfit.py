@@ -21,70 +21,44 @@ SKIRTINGS = ("plain", "dots", "blobs", "checks", "zigzag", "gradient", "gingham"
 
 @dataclass(frozen=True)
 class Top:
-    """A garment for the upper body.
+    """A garment for the upper body."""
 
-    Attributes:
-        kind: tee, sweater, shirt, tank or jacket.
-        sleeve: length of the sleeves in metres; of a tank, distance of the armholes from the middle.
-        hem: height in metres.
-        neck: neckline: crew, scoop, vee, collar or straps.
-        ease: air between cloth and body in metres.
-        hang: 0 to 1, how straight it falls from the chest.
-        tucked: into trousers or skirt.
-        emblem: printed on the front, the back or both; None: nowhere.
-        opening: half width in metres of the gap of an open jacket.
-    """
-
-    kind: str
-    sleeve: float
-    hem: float
-    neck: str
-    ease: float
-    hang: float
-    tucked: bool
+    kind: str  # tee, sweater, shirt, tank or jacket
+    sleeve: float  # length of the sleeves in metres; of a tank, distance of the armholes from the middle
+    hem: float  # height in metres
+    neck: str  # neckline: crew, scoop, vee, collar or straps
+    ease: float  # air between cloth and body in metres
+    hang: float  # 0 to 1, how straight it falls from the chest
+    tucked: bool  # into trousers or skirt
     fabric: Fabric
-    emblem: str | None = None
-    opening: float = 0.0
+    emblem: str | None = None  # printed on the front, the back or both; None: nowhere
+    opening: float = 0.0  # half width in metres of the gap of an open jacket
 
 
 @dataclass(frozen=True)
 class Bottom:
-    """Trousers or a skirt.
+    """Trousers or a skirt."""
 
-    Attributes:
-        kind: jeans, chinos, joggers, leggings, shorts or skirt.
-        waist: height in metres.
-        hem: height in metres.
-        width: radius of a leg at the hem in metres; of shorts, how much wider than the thigh; of a skirt, its
-            flare.
-        belt: colour [3]; None: no belt.
-    """
-
-    kind: str
-    waist: float
-    hem: float
+    kind: str  # jeans, chinos, joggers, leggings, shorts or skirt
+    waist: float  # height in metres
+    hem: float  # height in metres
+    # radius of a leg at the hem in metres; of shorts, how much wider than the thigh; of a skirt, its flare
     width: float
     fabric: Fabric
-    belt: np.ndarray | None = None
+    belt: np.ndarray | None = None  # colour [3]; None: no belt
 
 
 @dataclass(frozen=True)
 class Shoes:
-    """Shoes and socks.
+    """Shoes and socks."""
 
-    Attributes:
-        kind: sneakers, leather or boots.
-        top: height in metres.
-        upper, sole, laces: colours [3].
-        socks: height in metres and colour [3]; None: no socks.
-    """
-
-    kind: str
-    top: float
+    kind: str  # sneakers, leather or boots
+    top: float  # height in metres
+    # upper, sole, laces: colours [3]
     upper: np.ndarray
     sole: np.ndarray
     laces: np.ndarray
-    socks: tuple[float, np.ndarray] | None
+    socks: tuple[float, np.ndarray] | None  # height in metres and colour [3]; None: no socks
 
 
 @dataclass(frozen=True)

@@ -16,25 +16,15 @@ EYE = np.array([0.0288, 1.5661, 0.1909])  # centre of the left eye in the frame 
 
 @dataclass(frozen=True)
 class Place:
-    """Coordinates of n points on the average body at rest, float32.
+    """Coordinates of n points on the average body at rest, float32."""
 
-    Attributes:
-        point: [n, 3] metres.
-        arm: [n] 0 on the trunk, 1 on an arm, smooth between.
-        sleeve: [n] metres from the shoulder joint along the arm; at most 0 on the trunk.
-        side: [n] +1 left, -1 right.
-        trunk_angle: [n] radians around the trunk, 0 in front, positive to the left.
-        arm_angle: [n] radians around the arm, 0 in front, positive outwards.
-        leg_angle: [n] radians around the leg, 0 in front, positive outwards.
-    """
-
-    point: np.ndarray
-    arm: np.ndarray
-    sleeve: np.ndarray
-    side: np.ndarray
-    trunk_angle: np.ndarray
-    arm_angle: np.ndarray
-    leg_angle: np.ndarray
+    point: np.ndarray  # [n, 3] metres
+    arm: np.ndarray  # [n] 0 on the trunk, 1 on an arm, smooth between
+    sleeve: np.ndarray  # [n] metres from the shoulder joint along the arm; at most 0 on the trunk
+    side: np.ndarray  # [n] +1 left, -1 right
+    trunk_angle: np.ndarray  # [n] radians around the trunk, 0 in front, positive to the left
+    arm_angle: np.ndarray  # [n] radians around the arm, 0 in front, positive outwards
+    leg_angle: np.ndarray  # [n] radians around the leg, 0 in front, positive outwards
 
     @property
     def x(self) -> np.ndarray:

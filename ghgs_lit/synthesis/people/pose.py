@@ -63,13 +63,9 @@ class _Skeleton:
 def sample_pose(
     body: BodyModel, joints: np.ndarray, rng: np.random.Generator, widen: float = 0.0, active: bool = False
 ) -> np.ndarray:
-    """Draw a pose. Returns: Transforms [b, 3, 4] of the bones from rest to pose.
-
-    Args:
-        joints: [b, 3] at rest, of one shape.
-        widen: 0 to 1, how far the arms move away from the body.
-        active: as in sport and dance, with legs far apart, bent or crossed, in place of standing or walking.
-    """
+    """Transforms [b, 3, 4] of the bones from rest to a random pose. ``joints``: [b, 3] at rest, of one shape.
+    ``widen``: 0 to 1, how far the arms move away from the body. ``active``: as in sport and dance, with legs
+    far apart, bent or crossed, in place of standing or walking."""
     if active:
         stance = str(rng.choice(list(BENT), p=(0.4, 0.3, 0.2, 0.1)))
     else:
