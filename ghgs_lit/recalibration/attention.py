@@ -6,7 +6,7 @@ from typing import Literal
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
@@ -15,7 +15,6 @@ from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.kernels.linear import Linear
 from ghgs_lit.kernels.pool import even_parts
 from ghgs_lit.kernels.precision import exact
-from ghgs_lit.recalibration.neighbors import Neighbors
 
 #: How the similarity of two tokens changes their logit; see :class:`SemanticAttention`.
 Similarity = Literal["product", "product_clamped", "log", "none"]
@@ -58,24 +57,24 @@ class SemanticAttention(nn.Module):
         self.mlp = nn.Sequential(Linear(dim, dim), nn.GELU(), Linear(dim, dim))
 
     def forward(
-        self, x: Float[Tensor, "N C"], neighbors: Sequence[Neighbors], cosines: Sequence[Tensor] | None
+        self, x: Float[Tensor, "N C"], neighbors: Sequence[Tensor], cosines: Sequence[Tensor] | None
     ) -> Float[Tensor, "N C"]:
         """Recalibrated tokens. ``x``: the tokens of all elements, one after the other. ``neighbors``: for
-        each element, as indices in it. ``cosines``: [n_b, k_b] for each element, if they are used."""
-        counts = [len(element.index) for element in neighbors]
+        each element [n_b, k_b], as indices in it. ``cosines``: of the same shapes, if they are used."""
+        counts = [len(near) for near in neighbors]
         elements = zip(x.split(counts), neighbors, cosines or [None] * len(counts), strict=True)
         results = [self._recalibrate_element(*element) for element in elements]
         return results[0] if len(results) == 1 else torch.cat(results)
 
     def attention_weights(
-        self, x: Float[Tensor, "n C"], rows: slice, neighbors: Neighbors, cosines: Float[Tensor, "n k"] | None
+        self, x: Float[Tensor, "n C"], rows: slice, near: Int[Tensor, "n k"], cosines: Tensor | None
     ) -> Float[Tensor, "m k a"]:
         """Softmax weights of each head from the ``m`` tokens ``rows`` to their neighbours, for inspection.
-        ``x``: tokens of one element. ``neighbors``, ``cosines``: of all ``n``."""
-        near, normed = neighbors.index[rows], self.norm1(x)
+        ``x``: tokens of one element. ``near``, ``cosines`` [n, k]: of all ``n``."""
+        near, normed = near[rows], self.norm1(x)
         q, k = at_least_float32(self.q_proj(normed[rows])), at_least_float32(self.k_proj(normed))
         changes = self._factor_and_bias(None if cosines is None else cosines[rows])
-        return self._weights(q, k[near], neighbors.valid[rows], *(y.expand(near.shape) for y in changes))
+        return self._weights(q, k[near], *(y.expand(near.shape) for y in changes))
 
     def apply_similarity(
         self, logits: Float[Tensor, "a m k"], cosines: Float[Tensor, "m k"]
@@ -85,7 +84,7 @@ class SemanticAttention(nn.Module):
         return logits * factor + bias
 
     def _recalibrate_element(
-        self, x: Float[Tensor, "n C"], neighbors: Neighbors, cosines: Float[Tensor, "n k"] | None
+        self, x: Float[Tensor, "n C"], near: Int[Tensor, "n k"], cosines: Float[Tensor, "n k"] | None
     ) -> Float[Tensor, "n C"]:
         """Recalibrate one element: keys and values of all tokens first, then the tokens in parts."""
         linears = (self.q_proj, self.k_proj, self.v_proj, self.o_proj, self.mlp[0], self.mlp[2])
@@ -98,9 +97,8 @@ class SemanticAttention(nn.Module):
         k, v = _in_parts(keys_values, len(x), x.device).chunk(2, dim=-1)
 
         def recalibrate(rows: slice) -> Float[Tensor, "m C"]:
-            near = Neighbors(neighbors.index[rows], neighbors.valid[rows])
             q = at_least_float32(q_proj(self.norm1(x[rows])))
-            y = self._attend(q, k, v, near, None if cosines is None else cosines[rows])
+            y = self._attend(q, k, v, near[rows], None if cosines is None else cosines[rows])
             residual = x[rows] + o_proj(y)
             # One expression, so that the input of each layer is freed before the next one runs.
             return residual + mlp_out(self.mlp[1](mlp_in(self.norm2(residual))))
@@ -112,36 +110,36 @@ class SemanticAttention(nn.Module):
         q: Float[Tensor, "m i"],
         k: Float[Tensor, "n i"],
         v: Float[Tensor, "n i"],
-        neighbors: Neighbors,
+        near: Int[Tensor, "m k"],
         cosines: Float[Tensor, "m k"] | None,
     ) -> Float[Tensor, "m i"]:
         """Weighted values of the neighbours of ``m`` tokens (Eq. 3), in float32 or wider."""
         with exact(q.device.type):
             if q.device.type != "cpu" or self.num_heads * len(q) * len(k) > _SCORES:
-                return self._attend_gathered(q, k, v, neighbors, cosines)
+                return self._attend_gathered(q, k, v, near, cosines)
             q, k, v = (t.unflatten(1, (self.num_heads, -1)).transpose(0, 1) for t in (q, k, v))
-            return self._attend_dense(q, k, v, neighbors, cosines).transpose(0, 1).flatten(1)
+            return self._attend_dense(q, k, v, near, cosines).transpose(0, 1).flatten(1)
 
     def _attend_gathered(
         self,
         q: Float[Tensor, "m i"],
         k: Float[Tensor, "n i"],
         v: Float[Tensor, "n i"],
-        neighbors: Neighbors,
+        near: Int[Tensor, "m k"],
         cosines: Float[Tensor, "m k"] | None,
     ) -> Float[Tensor, "m i"]:
         """Eq. 3 with gathered keys and values of neighbours; nothing is as large as the square of the tokens.
         If there are several parts, the backward pass computes each again."""
-        factor, bias = (x.expand(neighbors.index.shape) for x in self._factor_and_bias(cosines))
+        factor, bias = (x.expand(near.shape) for x in self._factor_and_bias(cosines))
 
         def attend(q: Tensor, k: Tensor, v: Tensor, index: Tensor, *others: Tensor) -> Tensor:
             weights = self._weights(q, k[index], *others)
             return (weights[..., None] * v[index].unflatten(-1, (self.num_heads, -1))).sum(1).flatten(1)
 
-        rows = even_parts(len(q), _GATHERED // max(1, neighbors.index.shape[1] * q.shape[1]))
+        rows = even_parts(len(q), _GATHERED // max(1, near.shape[1] * q.shape[1]))
         parts = []
         for part in rows:
-            inputs = (q[part], k, v, *(x[part] for x in (neighbors.index, neighbors.valid, factor, bias)))
+            inputs = (q[part], k, v, *(x[part] for x in (near, factor, bias)))
             if len(rows) > 1 and torch.is_grad_enabled():
                 parts.append(checkpoint(attend, *inputs, use_reentrant=False, preserve_rng_state=False))
             else:
@@ -152,35 +150,31 @@ class SemanticAttention(nn.Module):
         self,
         q: Float[Tensor, "m i"],
         k: Float[Tensor, "m k i"],
-        valid: Bool[Tensor, "m k"],
         factor: Float[Tensor, "m k"],
         bias: Float[Tensor, "m k"],
     ) -> Float[Tensor, "m k a"]:
         """Softmax weights, in each head, of the neighbours of ``m`` tokens; ``k``: keys of the neighbours."""
         products = (q[:, None] * k).unflatten(-1, (self.num_heads, -1)).sum(-1)
         logits = products * (q.shape[1] // self.num_heads) ** -0.5 * factor[..., None] + bias[..., None]
-        return logits.masked_fill(~valid[..., None], float("-inf")).softmax(1)
+        return logits.softmax(1)
 
     def _attend_dense(
         self,
         q: Float[Tensor, "a m d"],
         k: Float[Tensor, "a n d"],
         v: Float[Tensor, "a n d"],
-        neighbors: Neighbors,
+        near: Int[Tensor, "m k"],
         cosines: Float[Tensor, "m k"] | None,
     ) -> Float[Tensor, "a m d"]:
         """Eq. 3 by a product with all tokens: faster than gathering, without a tensor of size m x k x C."""
-        index = neighbors.index[None].expand(len(q), -1, -1)
+        index = near[None].expand(len(q), -1, -1)
         scores = q * q.shape[-1] ** -0.5 @ k.mT
         logits = scores.gather(2, index)
         if cosines is not None:
             logits = self.apply_similarity(logits, cosines)
-        logits = logits.masked_fill(~neighbors.valid, float("-inf"))
         # Without a gradient the weights reuse the memory of the scores.
         weights = torch.zeros_like(scores) if torch.is_grad_enabled() else scores.zero_()
-        # Invalid neighbours have weight 0 and may repeat a valid index, so weights are added, not set.
-        weights = weights.scatter_add_(2, index, logits.softmax(-1))
-        return weights @ v
+        return weights.scatter_(2, index, logits.softmax(-1)) @ v
 
     def _factor_and_bias(self, cosines: Float[Tensor, "m k"] | None) -> tuple[Tensor, Tensor]:
         one = torch.ones((), device=self.q_proj.weight.device)

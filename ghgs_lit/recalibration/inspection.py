@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ghgs_lit.recalibration.neighbors import Neighbors, nearest_neighbors
+from ghgs_lit.recalibration.neighbors import nearest_neighbors
 from ghgs_lit.recalibration.recalibration import Recalibration, neighbor_cosines
 from ghgs_lit.types import Points, Tokens
 
@@ -36,10 +36,7 @@ def attention_of(
     row = int((chosen == query).nonzero())
     stage = (recalibration, tokens, points, chosen, slice(row, row + 1))
     (near, weights), (_, plain) = _weights(*stage), _weights(*stage, plain=True)
-    valid = near.valid[row]
-    return TokenAttention(
-        query, chosen[near.index[row][valid]], weights[:, 0, valid].mT, plain[:, 0, valid].mT
-    )
+    return TokenAttention(query, chosen[near[row]], weights[:, 0].mT, plain[:, 0].mT)
 
 
 @torch.no_grad()
@@ -53,8 +50,8 @@ def attention_on_other_parts(
     for number in range(tokens.grid[0]):
         chosen = (takes_part & (element == number)).nonzero()[:, 0]
         near, weights = _weights(recalibration, tokens, points, chosen, slice(None))
-        own, others = part[chosen, None], part[chosen][near.index]
-        differs = near.valid & (own != others) & (others >= 0)
+        own, others = part[chosen, None], part[chosen][near]
+        differs = (own != others) & (others >= 0)
         found.append((weights.mean(-1) * differs).sum(-1).T[own[:, 0] >= 0])
     return torch.cat(found)
 
@@ -66,7 +63,7 @@ def _weights(
     chosen: Int[Tensor, " n"],
     rows: slice,
     plain: bool = False,
-) -> tuple[Neighbors, Float[Tensor, "L m k a"]]:
+) -> tuple[Int[Tensor, "n k"], Float[Tensor, "L m k a"]]:
     """Neighbours of the ``chosen`` tokens of an element, as indices among them, and weights of ``rows``."""
     places, positions = recalibration.places(tokens), recalibration.positions(tokens, points)
     places = None if places is None else places[chosen]

@@ -1,12 +1,7 @@
 """Exact nearest neighbours among the tokens of one batch element (paper, section 3.3)."""
 
-import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import torch
-import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ghgs_lit.geometry.projection import at_least_float32
@@ -16,29 +11,11 @@ from ghgs_lit.kernels.pool import at_once, even_parts
 _BLOCK, _GPU_BLOCK = 1 << 17, 1 << 23
 
 
-@dataclass(frozen=True)
-class Neighbors:
-    """Indices of the ``k`` neighbours of each of ``n`` tokens; only ``valid`` ones count."""
-
-    index: Int[Tensor, "n k"]
-    valid: Bool[Tensor, "n k"]
-
-    @classmethod
-    def join(cls, elements: Sequence["Neighbors"]) -> "Neighbors":
-        """Neighbours of all tokens of a batch, as indices among them; shorter lists get invalid entries."""
-        k = max(element.index.shape[1] for element in elements)
-        starts = itertools.accumulate((len(element.index) for element in elements), initial=0)
-        return cls(
-            torch.cat([widened(e.index + start, k) for e, start in zip(elements, starts, strict=False)]),
-            torch.cat([widened(element.valid, k) for element in elements]),
-        )
-
-
 @torch.no_grad()
 def nearest_neighbors(
     points: Float[Tensor, "n d"], view: Int[Tensor, " n"], k: int, places: Int[Tensor, " n"] | None = None
-) -> Neighbors:
-    """The ``min(k, n)`` nearest points of each point in any view, itself included, nearest first.
+) -> Int[Tensor, "n k"]:
+    """Indices of the ``min(k, n)`` nearest points of each point in any view, itself included, nearest first.
 
     Distances are computed from differences in float32 or wider: products would lose digits far from the
     origin.
@@ -60,12 +37,7 @@ def nearest_neighbors(
         distance = torch.cdist(points[rows], points, compute_mode="donot_use_mm_for_euclid_dist")
         ranks = None if places is None else _turns(places, view, views, rows)
         index[rows] = _smallest(distance, ranks, k)
-    return Neighbors(index, torch.ones_like(index, dtype=torch.bool))
-
-
-def widened(table: Tensor, k: int) -> Tensor:
-    """A table of neighbours [n, _], filled up with zeros to ``k`` columns."""
-    return table if table.shape[1] == k else F.pad(table, (0, k - table.shape[1]))
+    return index
 
 
 def _turns(places: Tensor, view: Tensor, views: int, block: slice) -> Int[Tensor, "m n"]:

@@ -14,7 +14,7 @@ from ghgs_lit.kernels.linear import linear
 from ghgs_lit.kernels.pool import at_once, even_parts
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.recalibration.attention import SemanticAttention, Similarity
-from ghgs_lit.recalibration.neighbors import Neighbors, nearest_neighbors, widened
+from ghgs_lit.recalibration.neighbors import nearest_neighbors
 from ghgs_lit.types import DecodedPixels, Points, Tokens, true_places
 
 #: Cosines in memory at once, on a CPU and on a GPU.
@@ -71,10 +71,6 @@ class Recalibration(nn.Module):
         if self.block.similarity != "none":
             semantic = part(tokens.semantic).split(counts)
             cosines = [neighbor_cosines(*pair) for pair in zip(semantic, neighbors, strict=True)]
-        if takes_part.device.type != "cpu" and batch_size > 1:  # fewer calls
-            neighbors = [Neighbors.join(neighbors)]
-            k = neighbors[0].index.shape[1]
-            cosines = cosines and [torch.cat([widened(element, k) for element in cosines])]
         layers = []
         for layer in tokens.latent:
             new = self.block(part(layer), neighbors, cosines).to(layer.dtype)
@@ -101,16 +97,17 @@ class Recalibration(nn.Module):
 
 
 @torch.no_grad()
-def neighbor_cosines(semantic: Float[Tensor, "n s"], neighbors: Neighbors) -> Float[Tensor, "n k"]:
-    """Cosines of the semantic features of tokens and neighbours (Eq. 4), float32 or wider; 0 for zeros."""
+def neighbor_cosines(semantic: Float[Tensor, "n s"], near: Int[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+    """Cosines of the semantic features of tokens and their neighbours ``near`` (Eq. 4), float32 or wider; 0
+    for zeros."""
     with exact(semantic.device.type):
         semantic = at_least_float32(semantic)
         # Allocated before temporary tensors, so that their memory can be freed.
-        cosines = semantic.new_empty(neighbors.index.shape)
+        cosines = semantic.new_empty(near.shape)
         directions = unit(semantic)
         most = at_once(semantic.device, _COSINES, _GPU_COSINES)
         for rows in even_parts(len(directions), most // max(1, len(directions))):
-            torch.gather(linear(directions[rows], directions), 1, neighbors.index[rows], out=cosines[rows])
+            torch.gather(linear(directions[rows], directions), 1, near[rows], out=cosines[rows])
     return cosines
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from ghgs_lit.recalibration import Neighbors, nearest_neighbors
+from ghgs_lit.recalibration import nearest_neighbors
 from tests.helpers.tokens import literal_neighbors, make_stage, scene
 
 
@@ -18,9 +18,8 @@ def test_neighbors_are_those_of_the_definition(k, dtype):
     for count in (1, 2, 9, 43):
         points = torch.rand(count, 3, dtype=dtype, generator=torch.Generator().manual_seed(1))
         near = nearest_neighbors(points, torch.arange(count) % 3, k)
-        assert near.index.shape == (count, min(k, count))
-        assert near.valid.all()
-        for i, row in enumerate(near.index.tolist()):
+        assert near.shape == (count, min(k, count))
+        for i, row in enumerate(near.tolist()):
             assert row == literal_neighbors(points, i, k)
     tokens, points = scene(((1, 0, 0), (1, 2, 0)))
     found = make_stage(k=k)(tokens, points)
@@ -35,7 +34,7 @@ def test_ties_on_the_image_plane_favor_no_view_and_no_side(dtype):
     position = module.positions(tokens, points).to(dtype)
     near = nearest_neighbors(position, tokens.image, 48, module.places(tokens))
     inside = (tokens.row - 5.5).abs().maximum((tokens.column - 5.5).abs()) < 2
-    index = near.index[inside]
+    index = near[inside]
     turn = (tokens.image[index] - tokens.image[inside, None]) % 4
     counts = [(turn == t).sum(1) for t in range(4)]
     assert [c.float().mean().item() for c in counts] == [12] * 4
@@ -71,15 +70,15 @@ def test_neighbors_match_a_kd_tree(offset):
     distance, index = cKDTree(points.double().numpy()).query(points.double().numpy(), 17)
     clear = distance[:, 16] - distance[:, 15] > 1e-6
     assert clear.mean() > 0.9
-    assert (np.sort(found.index.numpy())[clear] == np.sort(index[:, :16])[clear]).all()
-    assert (found.index[:, 0] == torch.arange(500)).all()
+    assert (np.sort(found.numpy())[clear] == np.sort(index[:, :16])[clear]).all()
+    assert (found[:, 0] == torch.arange(500)).all()
 
 
 def test_ties_go_to_the_lower_index():
     """Equal distances give the same neighbours on every machine."""
     points = torch.zeros(700, 3)
     points[300:] = 1
-    found = nearest_neighbors(points, torch.zeros(700, dtype=torch.int64), 5).index
+    found = nearest_neighbors(points, torch.zeros(700, dtype=torch.int64), 5)
     assert (found[:300] == torch.arange(5)).all()
     assert (found[300:] == torch.arange(300, 305)).all()
 
@@ -91,15 +90,14 @@ def test_blocks_do_not_change_the_neighbors(monkeypatch):
     expected = nearest_neighbors(points, view, 7)
     monkeypatch.setattr("ghgs_lit.recalibration.neighbors._BLOCK", 1000)
     found = nearest_neighbors(points, view, 7)
-    assert torch.equal(found.index, expected.index)
-    assert torch.equal(found.valid, expected.valid)
+    assert torch.equal(found, expected)
 
 
 def test_fewer_points_than_k_and_none():
     """Fewer points than ``k``, and elements without points, do not fail or give NaN."""
     found = nearest_neighbors(torch.rand(3, 3), torch.zeros(3, dtype=torch.int64), 64)
-    assert found.index.shape == (3, 3)
-    assert nearest_neighbors(torch.zeros(0, 3), torch.zeros(0, dtype=torch.int64), 4).index.shape[0] == 0
+    assert found.shape == (3, 3)
+    assert nearest_neighbors(torch.zeros(0, 3), torch.zeros(0, dtype=torch.int64), 4).shape[0] == 0
     for counts in (((0, 0, 0), (3, 0, 0)), ((0, 0, 0), (0, 0, 0))):
         tokens, points = scene(counts)
         found = make_stage(k=64)(tokens, points)
@@ -111,18 +109,9 @@ def test_points_of_all_sizes_have_neighbors():
     points = torch.rand(40, 3) * torch.logspace(-20, 25, 40)[:, None]
     points[7], points[8] = float("nan"), float("inf")
     found = nearest_neighbors(points, torch.zeros(40, dtype=torch.int64), 8)
-    assert ((found.index >= 0) & (found.index < 40)).all()
-    rest = found.index[[i for i in range(40) if i not in (7, 8)]]
+    assert ((found >= 0) & (found < 40)).all()
+    rest = found[[i for i in range(40) if i not in (7, 8)]]
     assert ((rest != 7) & (rest != 8)).all()
-
-
-def test_neighbors_of_elements_are_joined_with_invalid_ones_where_there_are_fewer():
-    """Indices count the tokens of all elements."""
-    elements = [nearest_neighbors(torch.rand(n, 3), torch.zeros(n, dtype=torch.int64), 4) for n in (6, 3)]
-    found = Neighbors.join(elements)
-    assert torch.equal(found.index[:6], elements[0].index)
-    assert torch.equal(found.index[6:, :3], elements[1].index + 6)
-    assert found.valid.sum(1).tolist() == [4] * 6 + [3] * 3
 
 
 def test_at_each_place_of_the_image_plane_the_own_view_comes_first():
@@ -130,7 +119,7 @@ def test_at_each_place_of_the_image_plane_the_own_view_comes_first():
     tokens, points = scene(((16, 16, 16, 16),))
     module = make_stage(neighborhood="image_plane", k=5)
     near = nearest_neighbors(module.positions(tokens, points), tokens.image, 5, module.places(tokens))
-    turn = (tokens.image[near.index] - tokens.image[:, None]) % 4
+    turn = (tokens.image[near] - tokens.image[:, None]) % 4
     assert torch.equal(turn, torch.tensor([0, 1, 2, 3, 0]).expand(64, 5))
 
 

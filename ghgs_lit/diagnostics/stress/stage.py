@@ -40,7 +40,6 @@ FAMILIES = {
     "collapsed": Family("points", "all points at one place"),
     "few": Family("neighbors", "fewer points than k"),
     "single": Family("neighbors", "one point"),
-    "masked": Family("neighbors", "all neighbours but one are masked"),
     "zero_quaternion": Family("quaternions", "quaternions of 0"),
     "tiny_quaternion": Family("quaternions", "quaternions of length 1e-20"),
     "huge_quaternion": Family("quaternions", "quaternions of length 1e20"),

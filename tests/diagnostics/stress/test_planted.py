@@ -70,10 +70,6 @@ DEFECTS = (
         "logits.exp() / logits.exp().sum(-1, keepdim=True)", "attention", "huge_features",
     ),
     Defect(
-        "a mask that is dropped", SemanticAttention._attend_dense, "~neighbors.valid",
-        "~neighbors.valid & False", "attention", "masked",
-    ),
-    Defect(
         "distances in half precision", nearest_neighbors, "torch.cdist(points[rows], points,",
         "torch.cdist(points[rows].half().float(), points.half().float(),", "neighbours", "shifted",
     ),

@@ -8,7 +8,6 @@ from ghgs_lit.diagnostics.stress.stage import FLOAT32_ONLY, Stage, Values, case_
 from ghgs_lit.encoder.cpu import attend as attend_heads
 from ghgs_lit.kernels.compile import processor_features
 from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
-from ghgs_lit.recalibration.neighbors import Neighbors
 from ghgs_lit.recalibration.recalibration import neighbor_cosines
 
 _K = 6
@@ -19,15 +18,13 @@ def _point_inputs(family: str, g: Generator) -> Values:
     count = _COUNT.get(family, 20)
     middle = inputs.place(family, g)
     view = torch.randint(3, (count,), generator=g)
-    if family == "masked":
-        view = torch.zeros_like(view)
     return {"points": inputs.points(family, g, count, middle), "view": view}
 
 
 def _distances(v: Values) -> Values:
     exact = v["points"].double()
     near = nearest_neighbors(v["points"], v["view"], _K)
-    return {"all": (exact[near.index] - exact[:, None]).norm(dim=-1)}
+    return {"all": (exact[near] - exact[:, None]).norm(dim=-1)}
 
 
 def _distances_slowly(v: Values) -> Values:
@@ -35,18 +32,14 @@ def _distances_slowly(v: Values) -> Values:
     return {"all": distance.sort(-1).values[:, :_K]}
 
 
-def _neighbor_table(family: str, g: Generator, count: int, k: int) -> Values:
-    index = torch.stack([torch.randperm(count, generator=g)[:k] for _ in range(count)])
-    valid = torch.ones_like(index, dtype=torch.bool)
-    if family == "masked":
-        valid[:, 1:] = False
-    return {"index": index, "valid": valid}
+def _neighbor_table(g: Generator, count: int, k: int) -> Tensor:
+    return torch.stack([torch.randperm(count, generator=g)[:k] for _ in range(count)])
 
 
 def _cosine_inputs(family: str, g: Generator) -> Values:
     count = _COUNT.get(family, 12)
     features = inputs.features(family, g, count, 16)
-    return {"features": features, **_neighbor_table("", g, count, min(_K, count))}
+    return {"features": features, "index": _neighbor_table(g, count, min(_K, count))}
 
 
 def _cosines_slowly(v: Values) -> Values:
@@ -69,7 +62,7 @@ def _attention_inputs(family: str, g: Generator) -> Values:
     k = min(_K, count)
     features = {name: _attention_features(family, g, count, 32) for name in ("q", "k", "v")}
     cosines = inputs.uniform(g, -1, 1, count, k)
-    return {**features, "cosines": cosines, **_neighbor_table(family, g, count, k)}
+    return {**features, "cosines": cosines, "index": _neighbor_table(g, count, k)}
 
 
 _BLOCKS = {s: SemanticAttention(128, 2, s) for s in ("product", "product_clamped", "log")}
@@ -77,8 +70,8 @@ _BLOCKS = {s: SemanticAttention(128, 2, s) for s in ("product", "product_clamped
 
 def _attention(v: Values) -> Values:
     """Eq. 3 with every use of the similarity."""
-    near, tokens = Neighbors(v["index"], v["valid"]), (v["q"], v["k"], v["v"])
-    return {name: block._attend(*tokens, near, v["cosines"]) for name, block in _BLOCKS.items()}
+    inputs = [v[name] for name in ("q", "k", "v", "index", "cosines")]
+    return {name: block._attend(*inputs) for name, block in _BLOCKS.items()}
 
 
 def _attention_slowly(v: Values) -> Values:
@@ -89,7 +82,7 @@ def _attention_slowly(v: Values) -> Values:
         "product_clamped": logits * s.clamp(min=0),
         "log": logits + s.clamp(min=0.01).log(),
     }
-    weights = {name: x.masked_fill(~v["valid"], -torch.inf).softmax(-1) for name, x in changed.items()}
+    weights = {name: x.softmax(-1) for name, x in changed.items()}
     rows = value[v["index"]]
     return {name: torch.einsum("amk,mkad->mad", w, rows).flatten(1) for name, w in weights.items()}
 
@@ -124,7 +117,7 @@ STAGES = [
     ),
     Stage(
         "cosine", ("features", "neighbors"), _cosine_inputs, case_by_case(
-            lambda v: {"cosines": neighbor_cosines(v["features"], Neighbors(v["index"], v["valid"]))}
+            lambda v: {"cosines": neighbor_cosines(v["features"], v["index"])}
         ), 20,
         "a product of two unit vectors of 16 components", case_by_case(_cosines_slowly),
     ),

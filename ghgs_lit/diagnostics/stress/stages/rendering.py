@@ -154,7 +154,7 @@ STAGES = (
         case_by_case(lambda v: {"chamfer": chamfer(v["points"], v["surface"])}), 20,
         "means of squares of differences", case_by_case(_chamfer_slowly), gradients=("points", "surface"),
         seeds=96, ties=("duplicates", "collapsed"),
-        excluded={**inputs.NO_CAMERA, "masked": "takes no masks"},
+        excluded=inputs.NO_CAMERA,
     ),
     Stage(
         "PSNR and FLIP", ("images",), _pair, _metrics, 100,
