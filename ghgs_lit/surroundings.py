@@ -124,25 +124,16 @@ class Surrounding:
         return prediction
 
 
-class Checks(Surrounding):
-    """Refuses a batch that the stages cannot work on (:func:`check_batch`)."""
+class Photographs(Surrounding):
+    """Checked, with masks that are thresholds of soft mattes, if any (:mod:`ghgs_lit.geometry.masks`)."""
 
-    def __init__(self, side_multiple: int, values: bool) -> None:
-        self.side_multiple, self.values = side_multiple, values
-
-    def enter(self, batch: Batch) -> Batch:
-        check_batch(batch, self.side_multiple, self.values)
-        return batch
-
-
-class Mattes(Surrounding):
-    """Replaces masks by thresholds of soft mattes (:mod:`ghgs_lit.geometry.masks`)."""
-
-    def __init__(self, least: float | None) -> None:
-        self.least = least
+    def __init__(self, side_multiple: int, checks_values: bool, least_matte: float | None) -> None:
+        self.options = side_multiple, checks_values
+        self.least_matte = least_matte
 
     def enter(self, batch: Batch) -> Batch:
-        return with_matte(batch, self.least)
+        check_batch(batch, *self.options)
+        return with_matte(batch, self.least_matte)
 
 
 class SubjectFrame(Surrounding):
@@ -178,8 +169,7 @@ def side_multiple(options: ModelOptions, patch_size: int) -> int:
 def surroundings(options: ModelOptions, patch_size: int, checks_values: bool) -> Sequence[Surrounding]:
     """The layers around the stages for one batch, the outermost first."""
     return [
-        Checks(side_multiple(options, patch_size), checks_values),
-        Mattes(options.matte),
+        Photographs(side_multiple(options, patch_size), checks_values, options.matte),
         *([SubjectFrame()] if options.frame == "subject" else []),
         *([Border(patch_size)] if options.pad == "multiple" else []),
     ]

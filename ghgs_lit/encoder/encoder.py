@@ -7,11 +7,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ghgs_lit.encoder.block import REGISTERS, Block, draw_normal_, rotary_tables, run_block
-from ghgs_lit.encoder.options import VGGTSettings
+from ghgs_lit.encoder.options import VGGTOptions
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.semantic import PARTS
 from ghgs_lit.encoder.vit import ConvStem, PatchEmbed, VisionTransformer
-from ghgs_lit.errors import choice, require
+from ghgs_lit.errors import require
 from ghgs_lit.geometry.masks import (
     BOUNDS_CHANNELS,
     patches_around_subject,
@@ -35,7 +35,7 @@ class Aggregator(nn.Module):
     of the views only permutes it. ``patch_embed``: images [n, i, H, W] and :class:`KeptPatches` to tokens
     [N, width]."""
 
-    def __init__(self, patch_embed: nn.Module, options: VGGTSettings):
+    def __init__(self, patch_embed: nn.Module, options: VGGTOptions):
         super().__init__()
         width, heads = options.width, options.heads
         self.patch_size, self.layers = options.patch_size, options.layers
@@ -95,10 +95,8 @@ class VGGTEncoder(nn.Module):
             positions; a view with an empty mask has its special tokens only.
         margin: patches around these that are kept, too."""
 
-    def __init__(self, options: VGGTSettings, tokens: str = "all", margin: int = 1):
+    def __init__(self, options: VGGTOptions, tokens: str = "all", margin: int = 1):
         super().__init__()
-        choice("skip.tokens", tokens, ("all", *KEPT))
-        require(margin >= 0, "skip.margin", "0 or more patches", margin)
         self.options, self.tokens, self.margin = options, tokens, margin
         self.patch_size, self.dim_latent = options.patch_size, 2 * options.width
         self.mask_input, self.bounds_input = options.mask_input, options.bounds_input
@@ -132,7 +130,8 @@ class VGGTEncoder(nn.Module):
         """Tokens of the kept patches of all views. ``images``: sides divisible by the patch size. ``masks``:
         read with ``mask_input``, ``bounds_input`` or ``semantic``, and where ``tokens`` is not ``all``.
         ``bounds``: read with ``bounds_input``. ``kept``: None: the patches of :meth:`keeps`."""
-        self._check(images, masks)
+        narrow = images.dtype != torch.float64 or self.aggregator.camera_token.dtype == torch.float64
+        require(narrow, "images", "float32 where the weights are no float64", images.dtype)
         chosen = self.keeps(masks) if kept is None else kept
         kept = KeptPatches(chosen, images.device)
         pairs, patches = self.aggregator(self._normalized(images, masks, bounds), kept)
@@ -149,23 +148,12 @@ class VGGTEncoder(nn.Module):
         grid = (b, v, height // self.patch_size, width // self.patch_size)
         return torch.ones(grid, dtype=torch.bool, device="cpu")
 
-    def _check(self, images: Tensor, masks: Tensor) -> None:
-        b, v, channels, height, width = images.shape
-        require(channels == 3, "images", "3 channels", channels)
-        narrow = images.dtype != torch.float64 or self.aggregator.camera_token.dtype == torch.float64
-        require(narrow, "images", "float32 where the weights are no float64", images.dtype)
-        expected = f"height and width divisible by the patch size {self.patch_size}"
-        divisible = height % self.patch_size == width % self.patch_size == 0 < min(height, width)
-        require(divisible, "images", expected, f"{height} x {width}")
-        require(masks.shape == (b, v, height, width), "masks", str((b, v, height, width)), tuple(masks.shape))
-
     def _normalized(self, images: Tensor, masks: Tensor, bounds: DepthBounds | None) -> Tensor:
         x = at_least_float32(images)
         if self.mask_input:
             x = torch.cat((x, masks.to(x.dtype)[:, :, None]), dim=2)
         x = (x - self.mean) / self.std
         if self.bounds_input:
-            require(bounds is not None, "encoder.bounds_input", "depths that are bounded", "no bounds")
             x = torch.cat((x, relative_bounds(bounds, masks).to(x.dtype)), dim=2)
         return x.to(self.aggregator.camera_token.dtype)
 
@@ -176,7 +164,7 @@ def _joined(pairs: list[Pair], kept: KeptPatches, special: int) -> Iterator[Floa
         yield torch.cat([kept.take(tokens, special) for tokens in pairs.pop(0)], dim=-1)
 
 
-def _patch_embedding(options: VGGTSettings, channels: int) -> nn.Module:
+def _patch_embedding(options: VGGTOptions, channels: int) -> nn.Module:
     vit, width, patch_size = options.vit, options.width, options.patch_size
     if vit.kind == "conv":
         return PatchEmbed(channels, width, patch_size)
@@ -185,11 +173,3 @@ def _patch_embedding(options: VGGTSettings, channels: int) -> nn.Module:
     return VisionTransformer(
         channels, width, vit.depth, vit.heads, patch_size, options.image_size, options.checkpointing
     )
-
-
-class VGGTOptions(VGGTSettings):
-    """Photographs and masks to tokens, by VGGT of any size."""
-
-    def build(self, tokens: str = "all", margin: int = 1) -> VGGTEncoder:
-        """The stage; arguments as of :class:`VGGTEncoder`."""
-        return VGGTEncoder(self, tokens, margin)

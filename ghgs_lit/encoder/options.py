@@ -1,12 +1,15 @@
 """Options of the encode stage."""
 
 import re
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field, model_validator
 
 from ghgs_lit.config.options import Count, Options, Side, Text, Width
 from ghgs_lit.encoder.semantic import SemanticOptions
+
+if TYPE_CHECKING:
+    from ghgs_lit.encoder.encoder import VGGTEncoder
 
 #: Fields of each kind of patch embedding.
 _FIELDS = {"conv": (), "stem": ("channels",), "dinov2": ("depth", "heads")}
@@ -35,8 +38,8 @@ class PatchOptions(Options):
         return self
 
 
-class VGGTSettings(Options):
-    """The fields of :class:`ghgs_lit.encoder.VGGTOptions`, for the modules of the encoder."""
+class VGGTOptions(Options):
+    """Photographs and masks to tokens, by VGGT of any size."""
 
     group = "encoder"
     width: Width
@@ -71,7 +74,7 @@ class VGGTSettings(Options):
     ghgs import and ghgs pretext, a note for tables only"""
 
     @model_validator(mode="after")
-    def _parts_fit(self) -> "VGGTSettings":
+    def _parts_fit(self) -> "VGGTOptions":
         fits = self.width % (4 * self.heads) == 0
         self.require(fits, "width", "a multiple of 4 * heads (rows and columns rotate)")
         if self.vit.kind == "dinov2":
@@ -86,3 +89,9 @@ class VGGTSettings(Options):
         fits = match is not None and int(match[1] or 0) <= self.depth
         self.require(fits, "trainable", f"all, none or last_<n>, n up to {self.depth}")
         return self
+
+    def build(self, tokens: str = "all", margin: int = 1) -> "VGGTEncoder":
+        """The stage; arguments as of :class:`VGGTEncoder`."""
+        from ghgs_lit.encoder.encoder import VGGTEncoder  # here: it imports these options
+
+        return VGGTEncoder(self, tokens, margin)

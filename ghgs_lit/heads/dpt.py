@@ -217,8 +217,6 @@ class DPTHead(nn.Module):
             return self._maps(tokens, guide, window)
 
     def _maps(self, tokens: Tokens, guide: Guide | None, window: Window | None) -> Tensor:
-        expected = "none" if self.guide is None else "maps"
-        require((guide is None) == (self.guide is None), "guide", expected, guide is not None)
         rows, columns = tokens.grid[2:]
         size = (tokens.patch_size * rows, tokens.patch_size * columns)
         windows = self.windows(window or Window.whole(size), (rows, columns))

@@ -12,7 +12,7 @@ from pydantic import Field
 from torch import Tensor
 
 from ghgs_lit.config.options import Options, Positive
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.projection import at_least_float32, world_to_camera
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.rendering import gsplat_backend
@@ -20,9 +20,10 @@ from ghgs_lit.rendering.settings import RasterSettings
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 BACKENDS = ("auto", "gsplat", "cpu", "reference")
+_OF_DEVICE = {"cuda": "gsplat", "cpu": "cpu"}
 #: Farthest depth in metres: practically no limit.
 FAR = 1e10
-_MODULES = {"gsplat": "gsplat_backend", "cpu": "cpu", "reference": "reference"}
+_MODULES = {"gsplat": "gsplat_backend", "cpu": "cpu.backend", "reference": "reference"}
 
 Background = Tensor | float | Sequence[float]
 
@@ -81,20 +82,13 @@ def resolve_backend(backend: str, device: torch.device) -> str:
     """The backend for tensors on ``device``, with ``auto`` resolved. InputError: it does not run on
     ``device``. BackendUnavailable: gsplat cannot run on this machine."""
     choice("renderer.backend", backend, BACKENDS)
-    is_cuda = device.type == "cuda"
     if backend == "auto":
-        if is_cuda:
-            gsplat_backend.load()
-        elif device.type != "cpu":
-            raise InputError(
-                f"renderer.backend=auto: no backend for tensors on {device}; move them to cuda or cpu"
-            )
-        return "gsplat" if is_cuda else "cpu"
-    if backend == "gsplat" and not is_cuda:
+        require(device.type in _OF_DEVICE, "renderer.backend=auto", "tensors on cuda or cpu", str(device))
+        backend = _OF_DEVICE[device.type]
+    if backend == "gsplat":
         gsplat_backend.load()
-    wanted = {"gsplat": "cuda", "cpu": "cpu"}.get(backend, device.type)
-    if device.type != wanted:
-        raise InputError(f"renderer.backend={backend}: expected tensors on {wanted}; found {device}")
+    fits = backend == "reference" or backend == _OF_DEVICE.get(device.type)
+    require(fits, f"renderer.backend={backend}", "tensors on its device (cuda for gsplat)", str(device))
     return backend
 
 

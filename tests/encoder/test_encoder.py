@@ -246,21 +246,6 @@ def test_stored_positions_serve_any_grid():
 
 
 @pytest.mark.parametrize(
-    ("shape", "masks", "message"),
-    [
-        ((1, 2, 3, 30, 28), (1, 2, 30, 28), "images: .*divisible by the patch size 14; found '30 x 28'"),
-        ((1, 2, 4, 28, 28), (1, 2, 28, 28), "images: expected 3 channels; found 4"),
-        ((1, 2, 3, 28, 28), (1, 2, 28, 14), r"masks: expected \(1, 2, 28, 28\)"),
-        ((1, 2, 3, 28, 28), (1, 3, 28, 28), r"masks: expected \(1, 2, 28, 28\)"),
-    ],
-)
-def test_bad_inputs_are_refused(shape, masks, message):
-    """Images that the patches do not fit must be named."""
-    with pytest.raises(InputError, match=message):
-        _encoder()(torch.rand(shape), torch.ones(masks, dtype=torch.bool))
-
-
-@pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"heads": 5}, "encoder.width"),

@@ -7,7 +7,6 @@ import torch.nn.functional as F
 from ghgs_lit.encoder import VGGTEncoder
 from ghgs_lit.encoder.block import rotary_tables, rotate
 from ghgs_lit.encoder.packing import KeptPatches
-from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.masks import patches_around_subject, patches_in_window
 from tests.helpers.encoders import make_encoder
 
@@ -242,16 +241,3 @@ def test_gradients_are_finite_and_those_of_masked_attention(vit, checkpointing):
         expected = encoder.get_parameter(name).grad
         # Position embeddings are resampled in float32, and so are their gradients.
         torch.testing.assert_close(grad, expected, rtol=1e-5, atol=1e-6 * float(expected.abs().max()))
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"tokens": "person"}, "skip.tokens: expected one of all, window, subject; found 'person'"),
-        ({"margin": -1}, "skip.margin: expected 0 or more patches; found -1"),
-    ],
-)
-def test_impossible_options_are_refused(options, message):
-    """A bad value is found when the configuration is read, by its key."""
-    with pytest.raises(InputError, match=message):
-        _encoder(**options)

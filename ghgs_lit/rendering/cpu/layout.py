@@ -38,11 +38,11 @@ H, H_P, H_Q, H_PP, H_PQ, H_QQ, D_DEPTH = 0, 1, 2, 3, 4, 5, 6
 COLOR = 7
 
 # A view: focal lengths, principal point, rotation, translation, the limits of x/z and y/z, then the
-# first and last column and row of pixels to draw.
+# last column and row of pixels.
 FX, FY, CX, CY, ROTATION, TRANSLATION = 0, 1, 2, 3, 4, 13
 X_LOW, X_HIGH, Y_LOW, Y_HIGH = 16, 17, 18, 19
-LEFT, RIGHT, TOP, BOTTOM = 20, 21, 22, 23
-VIEW = 24
+RIGHT, BOTTOM = 20, 21
+VIEW = 22
 
 
 def gradient_width(channels: int) -> int:

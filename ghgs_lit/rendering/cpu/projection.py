@@ -17,9 +17,9 @@ def _extents(view, u, v, a, c, cutoff):
     reach = (2.0 / geometry.TO_LOG2) * cutoff
     half_width = simd.minimum(simd.sqrt(reach * a), _FAR)
     half_height = simd.minimum(simd.sqrt(reach * c), _FAR)
-    left = simd.maximum(0.0 - simd.floor(0.5 - (u - half_width)), view[layout.LEFT])
+    left = simd.maximum(0.0 - simd.floor(0.5 - (u - half_width)), 0.0)
     right = simd.minimum(simd.floor(u + half_width - 0.5), view[layout.RIGHT])
-    top = simd.maximum(0.0 - simd.floor(0.5 - (v - half_height)), view[layout.TOP])
+    top = simd.maximum(0.0 - simd.floor(0.5 - (v - half_height)), 0.0)
     bottom = simd.minimum(simd.floor(v + half_height - 0.5), view[layout.BOTTOM])
     return left, right, top, bottom
 

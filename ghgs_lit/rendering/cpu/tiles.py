@@ -37,16 +37,14 @@ def place(tile, tiles_x, tiles_y, height, width):
 
 @helper
 def open_pixels(view, x0, y0, pixels, transmittance):
-    """Set the transmittance to 1 in pixels that are drawn, else to 0; returns their blocks, as bits."""
+    """Set the transmittance to 1 in pixels of the image, to 0 beyond; returns their blocks, as bits."""
     live = 0
-    left = simd.full(np.float32(view[layout.LEFT] - x0))
     right = simd.full(np.float32(view[layout.RIGHT] - x0))
-    top = simd.full(np.float32(view[layout.TOP] - y0))
     bottom = simd.full(np.float32(view[layout.BOTTOM] - y0))
     for block in range(BLOCKS):
         at = block * LANES
         x, y = memory.load(pixels, at), memory.load(pixels, layout.PIXELS + at)
-        within = (x >= left) & (x <= right) & (y >= top) & (y <= bottom)
+        within = (x <= right) & (y <= bottom)
         memory.store(transmittance, at, simd.select(within, simd.full(ONE), ZERO))
         if simd.bits(within) != 0:
             live |= 1 << block
