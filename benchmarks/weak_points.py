@@ -62,7 +62,8 @@ def similarity() -> Row:
     raw, cosines = torch.tensor([-3.0, -3.0]), torch.tensor([0.1, 1.0])
     plain = torch.exp(raw * cosines)
     block = SemanticAttention(16, 2, "log")
-    ours = block.apply_similarity(raw[None, None], cosines[None])[0, 0].exp()
+    factor, bias = block.factor_and_bias(cosines)
+    ours = (raw * factor + bias).exp()
     return (
         "W6", "logit times s: a neighbour with s = 0.1 against an identical one, both with a logit of -3",
         f"{float(plain[0] / plain[1]):.1f} times its weight",

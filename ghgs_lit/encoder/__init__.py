@@ -1,6 +1,5 @@
 """The encode stage: VGGT's aggregator of any size over patch tokens."""
 
-from ghgs_lit.encoder.encoder import VGGTEncoder
-from ghgs_lit.encoder.options import VGGTOptions
+from ghgs_lit.encoder.encoder import VGGTEncoder, VGGTOptions
 
 __all__ = ["VGGTEncoder", "VGGTOptions"]

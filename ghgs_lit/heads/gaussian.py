@@ -122,17 +122,12 @@ class FootprintAttributes(Options):
 
     @model_validator(mode="after")
     def _check(self) -> "FootprintAttributes":
-        for name, start in self._starts.items():
-            between = self.scale_floor < start < SCALE_CAP
-            limits = f"between scale_floor={self.scale_floor:g} and {SCALE_CAP:g}"
-            self.require(between or getattr(self, name) is None, name, f"a number {limits}")
+        for name in ("scale_start", "thickness_start"):
+            start, limits = getattr(self, name), f"between scale_floor={self.scale_floor:g} and {SCALE_CAP:g}"
+            fits = start is None or self.scale_floor < start < SCALE_CAP
+            self.require(fits, name, f"a number {limits}")
         self.require(self.opacity_floor < OPACITY_START, "opacity_floor", f"a number below {OPACITY_START:g}")
         return self
-
-    @property
-    def _starts(self) -> dict[str, float]:
-        thickness = self.scale_start if self.thickness_start is None else self.thickness_start
-        return {"scale_start": self.scale_start, "thickness_start": thickness}
 
     @property
     def scale_range(self) -> float:
@@ -142,7 +137,8 @@ class FootprintAttributes(Options):
     @property
     def scale_biases(self) -> tuple[float, float]:
         """Biases of raw scales of the first two axes and of the third, so that 0 gives the start."""
-        starts = self._starts.values()
+        thickness = self.scale_start if self.thickness_start is None else self.thickness_start
+        starts = (self.scale_start, thickness)
         return tuple(_logit(log(start / self.scale_floor) / self.scale_range) for start in starts)
 
     @property

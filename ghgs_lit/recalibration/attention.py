@@ -73,15 +73,8 @@ class SemanticAttention(nn.Module):
         ``x``: tokens of one element. ``near``, ``cosines`` [n, k]: of all ``n``."""
         near, normed = near[rows], self.norm1(x)
         q, k = at_least_float32(self.q_proj(normed[rows])), at_least_float32(self.k_proj(normed))
-        changes = self._factor_and_bias(None if cosines is None else cosines[rows])
+        changes = self.factor_and_bias(None if cosines is None else cosines[rows])
         return self._weights(q, k[near], *(y.expand(near.shape) for y in changes))
-
-    def apply_similarity(
-        self, logits: Float[Tensor, "a m k"], cosines: Float[Tensor, "m k"]
-    ) -> Float[Tensor, "a m k"]:
-        """Logits changed by the semantic similarity of query and neighbour."""
-        factor, bias = self._factor_and_bias(cosines)
-        return logits * factor + bias
 
     def _recalibrate_element(
         self, x: Float[Tensor, "n C"], near: Int[Tensor, "n k"], cosines: Float[Tensor, "n k"] | None
@@ -113,12 +106,22 @@ class SemanticAttention(nn.Module):
         near: Int[Tensor, "m k"],
         cosines: Float[Tensor, "m k"] | None,
     ) -> Float[Tensor, "m i"]:
-        """Weighted values of the neighbours of ``m`` tokens (Eq. 3), in float32 or wider."""
+        """Weighted values of the neighbours of ``m`` tokens (Eq. 3), in float32 or wider. On a CPU by a
+        product with all tokens: faster than gathering, without a tensor of size m x k x C."""
         with exact(q.device.type):
             if q.device.type != "cpu" or self.num_heads * len(q) * len(k) > _SCORES:
                 return self._attend_gathered(q, k, v, near, cosines)
             q, k, v = (t.unflatten(1, (self.num_heads, -1)).transpose(0, 1) for t in (q, k, v))
-            return self._attend_dense(q, k, v, near, cosines).transpose(0, 1).flatten(1)
+            index = near[None].expand(len(q), -1, -1)
+            scores = q * q.shape[-1] ** -0.5 @ k.mT
+            logits = scores.gather(2, index)
+            if cosines is not None:
+                factor, bias = self.factor_and_bias(cosines)
+                logits = logits * factor + bias
+            # Without a gradient the weights reuse the memory of the scores.
+            weights = torch.zeros_like(scores) if torch.is_grad_enabled() else scores.zero_()
+            weights = weights.scatter_(2, index, logits.softmax(-1))
+            return (weights @ v).transpose(0, 1).flatten(1)
 
     def _attend_gathered(
         self,
@@ -130,7 +133,7 @@ class SemanticAttention(nn.Module):
     ) -> Float[Tensor, "m i"]:
         """Eq. 3 with gathered keys and values of neighbours; nothing is as large as the square of the tokens.
         If there are several parts, the backward pass computes each again."""
-        factor, bias = (x.expand(near.shape) for x in self._factor_and_bias(cosines))
+        factor, bias = (x.expand(near.shape) for x in self.factor_and_bias(cosines))
 
         def attend(q: Tensor, k: Tensor, v: Tensor, index: Tensor, *others: Tensor) -> Tensor:
             weights = self._weights(q, k[index], *others)
@@ -158,25 +161,8 @@ class SemanticAttention(nn.Module):
         logits = products * (q.shape[1] // self.num_heads) ** -0.5 * factor[..., None] + bias[..., None]
         return logits.softmax(1)
 
-    def _attend_dense(
-        self,
-        q: Float[Tensor, "a m d"],
-        k: Float[Tensor, "a n d"],
-        v: Float[Tensor, "a n d"],
-        near: Int[Tensor, "m k"],
-        cosines: Float[Tensor, "m k"] | None,
-    ) -> Float[Tensor, "a m d"]:
-        """Eq. 3 by a product with all tokens: faster than gathering, without a tensor of size m x k x C."""
-        index = near[None].expand(len(q), -1, -1)
-        scores = q * q.shape[-1] ** -0.5 @ k.mT
-        logits = scores.gather(2, index)
-        if cosines is not None:
-            logits = self.apply_similarity(logits, cosines)
-        # Without a gradient the weights reuse the memory of the scores.
-        weights = torch.zeros_like(scores) if torch.is_grad_enabled() else scores.zero_()
-        return weights.scatter_(2, index, logits.softmax(-1)) @ v
-
-    def _factor_and_bias(self, cosines: Float[Tensor, "m k"] | None) -> tuple[Tensor, Tensor]:
+    def factor_and_bias(self, cosines: Float[Tensor, "*n"] | None) -> tuple[Tensor, Tensor]:
+        """What the semantic similarity multiplies a logit by, and what it adds."""
         one = torch.ones((), device=self.q_proj.weight.device)
         if cosines is None:
             return one, one * 0

@@ -172,9 +172,7 @@ def _in_metres(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Camer
     return gaussians, dataclasses.replace(cameras, extrinsics=extrinsics)
 
 
-def _background(background: Background, color: Float[Tensor, "B T C h w"]) -> Tensor | float:
-    if isinstance(background, (int, float)):
-        return background
+def _background(background: Background, color: Float[Tensor, "B T C h w"]) -> Tensor:
     tensor = torch.as_tensor(background, dtype=color.dtype, device=color.device)
     if tensor.ndim == 1:
         channels = color.shape[2]

@@ -35,30 +35,21 @@ def rasterize(
 ) -> Rendering:
     """Render on black; see :func:`ghgs_lit.rendering.render`."""
     channels = gaussians.colors.shape[1]
-    sums = _sums(gaussians, cameras, settings, near, far)
-    image, depth, alpha = sums.split((channels, 1, 1), dim=2)
+    each = [
+        _view(gaussians[element], cameras[element, view], settings, near, far)
+        for element in range(cameras.shape[0])
+        for view in range(cameras.shape[1])
+    ]
+    empty = gaussians.means.new_zeros(0, channels + 2, cameras.height, cameras.width)
+    sums = torch.stack(each) if each else empty
+    image, depth, alpha = sums.unflatten(0, cameras.shape).split((channels, 1, 1), dim=2)
     return Rendering(image=image, alpha=alpha, depth=depth / alpha.clamp_min(1e-10))
-
-
-def _sums(
-    gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
-) -> Float[Tensor, "B T channels h w"]:
-    """Sums over the Gaussians that a pixel sees of ``w colour`` (C channels), ``w z`` and ``w``."""
-    images = []
-    for element in range(len(gaussians.splits)):
-        images += [
-            _view(gaussians[element], cameras[element, view], settings, near, far)
-            for view in range(cameras.shape[1])
-        ]
-    if not images:
-        shape = (gaussians.colors.shape[1] + 2, cameras.height, cameras.width)
-        return gaussians.means.new_zeros(*cameras.shape, *shape)
-    return torch.stack(images).unflatten(0, cameras.shape)
 
 
 def _view(
     gaussians: Gaussians, camera: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Float[Tensor, "channels h w"]:
+    """Sums over the Gaussians that a pixel sees of ``w colour`` (C channels), ``w z`` and ``w``."""
     index = visible(gaussians, camera, settings, near, far)
     splats = project(gaussians.select(index, (len(index),)), camera, settings)
     centers = pixel_centers(camera.height, camera.width, splats.centers).flatten(0, 1)
@@ -113,7 +104,7 @@ def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> 
 
 
 def _blend(splats: Splats, pixels: Float[Tensor, "P 2"], settings: RasterSettings) -> Float[Tensor, "P c"]:
-    """Composite all splats over ``P`` pixels; see :func:`_sums`."""
+    """Composite all splats over ``P`` pixels; see :func:`_view`."""
     dx, dy = (pixels[None] - splats.centers[:, None]).unbind(-1)
     xx, xy, _ = splats.covariances[:, None].unbind(-1)
     sigma = 0.5 * (dx * dx / xx + (dy - xy / xx * dx).square() * xx / splats.determinants[:, None])

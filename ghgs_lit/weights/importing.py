@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.errors import InputError, installed, require
 from ghgs_lit.weights import names
 from ghgs_lit.weights.checkpoint import describe, require_shape, shape_of, write_checkpoint
 from ghgs_lit.weights.reading import cast, open_file
@@ -28,30 +28,27 @@ def is_repository(name: str) -> bool:
     )
 
 
-def fetch(repository: str) -> tuple[Path, str]:
-    """Path and SHA-256 of the weights of ``owner/repository``, from the local cache or the hub. InputError:
-    the package, the network or the repository is missing, or the checksum is not the published one."""
-    try:
-        import huggingface_hub
-    except ImportError:
-        raise InputError(
-            f"{repository}: expected the package huggingface_hub (pip install 'ghgs-lit[hub]'); found none."
-            f" Or download https://huggingface.co/{repository}/resolve/main/{FILE} by hand and set"
-            " vggt=<that file>"
-        ) from None
-    address = huggingface_hub.hf_hub_url(repository, FILE)
-    cached = huggingface_hub.try_to_load_from_cache(repository, FILE)
+def fetch(repository: str) -> tuple[str, Path, str]:
+    """Name, path and SHA-256 of the weights of ``owner/repository``, from the local cache or the hub.
+    InputError: the package, the network or the repository is missing, or the checksum is not the published
+    one."""
+    hub = installed("huggingface_hub", "hub", repository)
+    cached = hub.try_to_load_from_cache(repository, FILE)
     if not isinstance(cached, str):
         try:
-            cached = huggingface_hub.hf_hub_download(repository, FILE)
+            cached = hub.hf_hub_download(repository, FILE)
         except Exception as error:
             reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
             raise InputError(
-                f"{repository}: expected the hub or a cached copy; found: {reason}. Download {address} by"
-                " hand and set vggt=<that file>"
+                f"{repository}: expected the hub or a cached copy; found: {reason}. Download"
+                f" {hub.hf_hub_url(repository, FILE)} by hand and set vggt=<that file>"
             ) from error
     path = Path(cached)
-    return path, _checked(path)
+    # The name of a file in the cache is the published checksum.
+    found, published = sha256(path), path.resolve().name
+    is_whole = found == published or not re.fullmatch(r"[0-9a-f]{64}", published)
+    require(is_whole, str(path.resolve()), f"SHA-256 {published}", f"{found}: a broken download: delete it")
+    return repository, path, found
 
 
 def sha256(path: Path) -> str:
@@ -61,16 +58,6 @@ def sha256(path: Path) -> str:
         while block := file.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
-
-
-def _checked(path: Path) -> str:
-    """SHA-256 of a cached file, whose name in the cache is the published one."""
-    found, published = sha256(path), path.resolve().name
-    if re.fullmatch(r"[0-9a-f]{64}", published) and found != published:
-        raise InputError(
-            f"{path.resolve()}: expected SHA-256 {published}; found {found}: a broken download: delete it"
-        )
-    return found
 
 
 KINDS = {"vggt": "VGGT-1B", "release": "the authors' release"}  #: Names in messages
@@ -123,26 +110,25 @@ class Source:
 
     def report(self) -> str:
         """Numbers of used and ignored tensors, as one line."""
-        ignored = ", ".join(f"{part} {count}" for part, count in sorted(self.skipped.items()))
-        return f"{self.key}: {self.path}: {len(self.used)} tensors used, {self.skipped.total()} ignored" + (
-            f" ({ignored})" if ignored else ""
-        )
+        parts = ", ".join(f"{part} {count}" for part, count in sorted(self.skipped.items()))
+        ignored = f"{self.skipped.total()} ignored" + f" ({parts})" * bool(parts)
+        return f"{self.key}: {self.path}: {len(self.used)} tensors used, {ignored}"
 
 
 def sources(vggt: str | None, release: str | None) -> Iterator[Source]:
     """Yield the files to read; a repository of the hub is downloaded first."""
     require(vggt is not None, "vggt", "a file or facebook/VGGT-1B (heads need their encoder)", None)
-    if is_repository(vggt):
-        label, (path, checksum) = vggt, fetch(vggt)
-    else:
-        path = Path(vggt)
-        open_file(path)
-        label, checksum = path.name, sha256(path)
-    yield Source("vggt", label, path, checksum, names.VGGT, names.VGGT_IGNORED)
+    file = fetch(vggt) if is_repository(vggt) else local(vggt)
+    yield Source("vggt", *file, names.VGGT, names.VGGT_IGNORED)
     if release is not None:
-        path = Path(release)
-        open_file(path)
-        yield Source("release", path.name, path, sha256(path), names.RELEASE, entry=names.RELEASE_ENTRY)
+        yield Source("release", *local(release), names.RELEASE, entry=names.RELEASE_ENTRY)
+
+
+def local(name: str) -> tuple[str, Path, str]:
+    """Name, path and SHA-256 of a file of weights; raises as :func:`open_file` does."""
+    path = Path(name)
+    open_file(path)
+    return path.name, path, sha256(path)
 
 
 def import_weights(
@@ -191,16 +177,10 @@ def match_files(state: Mapping[str, Tensor], files: Sequence[Source]) -> list[st
     for source in files:
         source.match(state)
     missing = [name for name in state if not any(name in source.used for source in files)]
-    for name in missing:
-        if state[name].is_meta:
-            _refuse_missing(name, state[name], files)
+    for name in (name for name in missing if state[name].is_meta):
+        for source in reversed(files):
+            published = names.to_published(name, source.table)
+            expected = f"a tensor of shape {tuple(state[name].shape)}"
+            require(published is None, f"{source.path}: {published}", expected, "nothing")
+        require(False, name, "a model in which every tensor is published", "one of our own")
     return missing
-
-
-def _refuse_missing(name: str, tensor: Tensor, files: Sequence[Source]) -> None:
-    for source in reversed(files):
-        published = names.to_published(name, source.table)
-        if published is not None:
-            where, expected = f"{source.path}: {published}", f"a tensor of shape {tuple(tensor.shape)}"
-            raise InputError(f"{where}: expected {expected}; found nothing")
-    raise InputError(f"{name}: expected a model in which every tensor is published; found one of our own")

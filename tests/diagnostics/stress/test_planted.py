@@ -66,7 +66,7 @@ DEFECTS = (
         "projection", "ordinary", "bfloat16",
     ),
     Defect(
-        "a softmax without its maximum", SemanticAttention._attend_dense, "logits.softmax(-1)",
+        "a softmax without its maximum", SemanticAttention._attend, "logits.softmax(-1)",
         "logits.exp() / logits.exp().sum(-1, keepdim=True)", "attention", "huge_features",
     ),
     Defect(
