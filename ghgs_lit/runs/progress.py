@@ -11,7 +11,7 @@ from rich.progress import track as bar
 
 T = TypeVar("T")
 
-EVERY, EVERY_ON_TERMINAL = 60.0, 10.0  #: Seconds between two lines
+EVERY = 60.0  #: Seconds between two lines
 
 
 def on_terminal() -> bool:
@@ -20,10 +20,10 @@ def on_terminal() -> bool:
 
 
 class Lines:
-    """Progress lines, printed and appended to the file ``log``, if any."""
+    """Progress lines, appended to the file ``log``, if any, and printed (not beside a bar)."""
 
-    def __init__(self, log: Path | None = None, every: float = EVERY) -> None:
-        self.log, self.every = log, every
+    def __init__(self, log: Path | None = None, every: float = EVERY, printed: bool = True) -> None:
+        self.log, self.every, self.printed = log, every, printed
         self._next = time.monotonic()
 
     def due(self) -> bool:
@@ -37,7 +37,8 @@ class Lines:
     def say(self, text: str) -> None:
         """Write one line with the time of day."""
         line = f"{datetime.datetime.now():%H:%M:%S} {text}"
-        print(line, flush=True)
+        if self.printed:
+            print(line, flush=True)
         if self.log is not None:
             with open(self.log, "a") as file:
                 file.write(line + "\n")

@@ -6,29 +6,36 @@ from typing import Any
 
 import lightning.pytorch as L
 from lightning.pytorch.callbacks import Callback
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from ghgs_lit.config.options import Options
-from ghgs_lit.runs.progress import EVERY, EVERY_ON_TERMINAL, Lines, clock, on_terminal
+from ghgs_lit.runs.progress import Lines, clock, on_terminal
 
 
 class ProgressOptions(Options):
-    """Lines on the progress of the run over its budget of steps or time."""
+    """Progress of the run over its budget of steps or time."""
 
     def build(self) -> "RunProgress":
         return RunProgress()
 
 
 class RunProgress(Callback):
-    """Prints how far the run is, every ten seconds on a terminal and every minute elsewhere, and appends the
-    lines to ``<run>/train.log``."""
+    """Shows how far the run is: a bar on a terminal, elsewhere a line every minute. ``<run>/train.log`` gets
+    the lines in both cases."""
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        every = EVERY_ON_TERMINAL if on_terminal() else EVERY
-        self._lines = Lines(Path(trainer.default_root_dir) / "train.log", every)
+        has_bar = on_terminal()
+        self._lines = Lines(Path(trainer.default_root_dir) / "train.log", printed=not has_bar)
+        columns = (BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+        self._bar = Progress(*columns, disable=not (has_bar and trainer.is_global_zero))
+        self._task = self._bar.add_task("training", total=1.0)
+        self._bar.start()
         self._first = None  # time, step and used budget of the first line, then of the last one
         self._last = (time.monotonic(), trainer.global_step, pl_module.used_budget)
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
+        text = "  ".join([f"step {trainer.global_step}", *_numbers(trainer)])
+        self._bar.update(self._task, completed=pl_module.used_budget, description=text)
         # Nothing is new between two parts of an accumulated step.
         if trainer.is_global_zero and trainer.global_step > self._last[1] and self._lines.due():
             self._say(trainer, pl_module)
@@ -36,8 +43,7 @@ class RunProgress(Callback):
     def _say(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         now = (time.monotonic(), trainer.global_step, pl_module.used_budget)
         total = f" of {trainer.max_steps}" if trainer.max_steps > 0 else ""
-        parts = [f"step {now[1]}{total}"]
-        parts += [f"{name} {value:.4g}" for name, value in trainer.progress_bar_metrics.items()]
+        parts = [f"step {now[1]}{total}", *_numbers(trainer)]
         if self._first is None:  # the first step compiles and fills caches: its time is not typical
             self._first = now
         else:
@@ -47,3 +53,14 @@ class RunProgress(Callback):
                 parts.append(f"{clock((now[0] - self._first[0]) * (1 - now[2]) / used)} left")
         self._lines.say("  ".join(parts))
         self._last = now
+
+    def on_train_end(self, *args: Any) -> None:
+        self._bar.stop()
+
+    def on_exception(self, *args: Any) -> None:
+        if hasattr(self, "_bar"):  # training had begun
+            self._bar.stop()
+
+
+def _numbers(trainer: L.Trainer) -> list[str]:
+    return [f"{name} {value:.4g}" for name, value in trainer.progress_bar_metrics.items()]
