@@ -48,7 +48,7 @@ def trainer(folder, steps=12, callbacks=(), **options) -> L.Trainer:
     defaults = {
         "logger": False,
         "enable_checkpointing": any(isinstance(c, Checkpoints) for c in callbacks),
-        "enable_progress_bar": any(isinstance(c, RunProgress) for c in callbacks),
+        "enable_progress_bar": False,
         "val_check_interval": 6,
     }
     return L.Trainer(
@@ -225,7 +225,7 @@ def test_tf32_is_for_networks_alone():
 
 def test_lines_say_how_far_the_run_is(tmp_path, capsys, monkeypatch):
     """A log of a batch job shows step, loss, seconds a step, time left and validation, as does train.log."""
-    monkeypatch.setattr("ghgs_lit.training.callbacks.EVERY", 0.0)
+    monkeypatch.setattr("ghgs_lit.training.callbacks.Lines.due", lambda _: True)
     trainer(tmp_path, steps=12, callbacks=[RunProgress()]).fit(module(), loader(), loader(1))
     lines = (tmp_path / "train.log").read_text().splitlines()
     assert len(lines) == 12
@@ -233,6 +233,18 @@ def test_lines_say_how_far_the_run_is(tmp_path, capsys, monkeypatch):
     assert re.fullmatch(r"\d\d:\d\d:\d\d step 1 of 12  loss/total \S+", lines[0])
     last = r"step 11 of 12  loss/total \S+  val/psnr \S+  \S+ s a step  0:00:0\d left"
     assert re.search(last, lines[10])
+
+
+def test_a_bar_shows_how_far_the_run_is(tmp_path, capsys, monkeypatch):
+    """On a terminal there are no lines beside it; the log has them."""
+    monkeypatch.setattr("ghgs_lit.training.callbacks.on_terminal", lambda: True)
+    monkeypatch.setattr("ghgs_lit.training.callbacks.Lines.due", lambda _: True)
+    monkeypatch.setenv("COLUMNS", "120")
+    trainer(tmp_path, steps=12, callbacks=[RunProgress()]).fit(module(), loader(), loader(1))
+    shown = capsys.readouterr().out
+    assert re.search(r"100% \S+ step 12 +loss/total", shown)
+    assert "step 12 of 12" not in shown
+    assert len((tmp_path / "train.log").read_text().splitlines()) == 12
 
 
 def test_the_lines_come_once_a_minute(monkeypatch):
