@@ -17,7 +17,7 @@ from ghgs_lit.files import write_text_atomically
 from ghgs_lit.prediction.capture.calibration import calibrate
 from ghgs_lit.prediction.capture.camera_report import diagnose
 from ghgs_lit.prediction.capture.drawing import camera_sheet
-from ghgs_lit.prediction.capture.formats.json_file import write_json
+from ghgs_lit.prediction.capture.formats.json_and_toml import write_json
 from ghgs_lit.visualization.pictures import save_png
 
 _LISTED = 6  #: Number of interpretations of a calibration that are listed

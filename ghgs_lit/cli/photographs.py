@@ -9,16 +9,30 @@ from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.readers import require_folder
 from ghgs_lit.weights.reading import require_weights
 
+_BEGUN: list[CaptureFolder] = []  #: The folder whose photographs are being decoded, if any
+
 _SOURCES = ("images", "cameras", "masks", "backgrounds", "segment", "calibration", "sequence")
 _CHECKED = 5  #: Number of instants of a sequence whose cameras are checked
 
 
-def capture_folder(config: Mapping[str, Any]) -> CaptureFolder:
-    """The folder of ``images``, ``cameras`` and the keys beside them. InputError: a key or file is missing or
-    wrong."""
+def sources_of(config: Mapping[str, Any]) -> dict[str, Any]:
+    """``images``, ``cameras`` and the keys beside them. InputError: one of the two is missing."""
     for name, example in (("images", "images=<folder of photographs>"), ("cameras", "cameras=<calibration>")):
         require(config[name] is not None, name, example, None)
-    return CaptureFolder(**{name: config[name] for name in _SOURCES if name in config})
+    return {name: config[name] for name in _SOURCES if name in config}
+
+
+def capture_folder(config: Mapping[str, Any]) -> CaptureFolder:
+    """The folder that :func:`sources_of` describes. InputError: a key or file is missing or wrong."""
+    folder = CaptureFolder(**sources_of(config))
+    return _BEGUN.pop() if [folder] == _BEGUN else folder
+
+
+def begin_to_read(config: Mapping[str, Any]) -> None:
+    """Start decoding the first instant for the next :func:`capture_folder`; raises what that raises."""
+    _BEGUN[:] = [capture_folder(config)]
+    if config["segment"] is None:
+        _BEGUN[0].begin(_BEGUN[0].instants[0])
 
 
 def check_cameras(folder: CaptureFolder) -> None:
@@ -65,14 +79,14 @@ _READERS = ("evaluate", "predict", "pretext", "train")
 
 
 def require_paths(verb: str, config: Mapping[str, Any]) -> None:
-    """Check that the files of a verb exist, with the messages of their readers. FileNotFoundError,
-    InputError: a file or folder is missing or wrong."""
+    """Check that the files of a verb exist, with the messages of their readers, and start decoding
+    photographs. FileNotFoundError, InputError: a file or folder is missing or wrong."""
     for key in _WEIGHTS.get(verb, ()):
         if config[key] is not None:
             require_weights(config[key])
     has_photographs = config.get("images") is not None and config.get("cameras") is not None
     if has_photographs and (verb == "predict" or config.get("task") == "cameras"):
-        capture_folder(config)
+        begin_to_read(config)
     data = config.get("data")
     is_read = verb in _READERS and isinstance(data, Mapping) and not data.get("source")
     if is_read and isinstance(data.get("root"), str):

@@ -11,6 +11,7 @@ from pathlib import Path
 from statistics import geometric_mean
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from omegaconf import DictConfig
 
@@ -24,10 +25,11 @@ from ghgs_lit.prediction import export
 from ghgs_lit.prediction.capture.backgrounds import Backgrounds
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
-from ghgs_lit.prediction.capture.formats.json_file import json_text
+from ghgs_lit.prediction.capture.formats.json_and_toml import json_text
 from ghgs_lit.prediction.capture.predict import TimedPrediction, crop_size, in_frame, predict, predict_batch
-from ghgs_lit.prediction.capture.rig import INSTANTS, Rig, corrected_rig
+from ghgs_lit.prediction.capture.rig import INSTANTS, Rig, corrected_rig, turned_from
 from ghgs_lit.prediction.export.reports import REPORT
+from ghgs_lit.prediction.export.unseen import GUESSED
 from ghgs_lit.prediction.sequence.temporal import Temporal
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch
@@ -39,6 +41,8 @@ if TYPE_CHECKING:  # it would import Lightning, which takes seconds
 
 #: PSNR in dB, in the subject's box, below which the render of an input counts as poor.
 LOW_PSNR = 25.0
+#: Degrees that a camera is turned by, from which weights for one rig are said to be for another.
+OTHER_RIG = 5.0
 
 
 @torch.no_grad()
@@ -99,10 +103,12 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         check_cameras(folder)
     device = inputs.pick_device(config["device"])
     renderer, model = inputs.build_renderer(config, device), inputs.load_model(config, device)
-    size = crop_size(config["size"], read_checkpoint(config["checkpoint"])["config"], model)
+    trained = read_checkpoint(config["checkpoint"])["config"]
+    size = crop_size(config["size"], trained, model)
     write_config(config, directory)
     refining = {name: config[name] for name in ("refine_cameras", "refine_masks", "refine")}
     temporal = Temporal(partial(in_frame, model), model.skip.every, renderer)
+    totals: dict[str, float] = {}
     count, begin = 0, time.perf_counter()
     rig, backgrounds = None, Backgrounds({})
     if together:
@@ -113,18 +119,23 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         capture = rig.applied(capture) if rig else capture
         result = predict(capture, model, size, **refining, renderer=renderer, temporal=temporal)
         result.seconds["read"] = waited
-        write_result(directories[capture.name], result, model, renderer, config, options)
+        seconds = write_result(directories[capture.name], result, model, renderer, config, options)
         if together:
             together.add(directories[capture.name], result.batch, result.prediction, renderer)
         count += 1
         if count == 1:
-            print("".join(f"{line}\n" for line in advice_of(directories[capture.name])), end="", flush=True)
+            for line in (*advice_of(directories[capture.name]), *rig_advice(trained, result.batch)):
+                print(line, flush=True)
+        for stage, value in seconds.items():
+            totals[stage] = totals.get(stage, 0.0) + value
     left_out = len(folder.instants) - count
     require(count > 0, str(folder.images), "an instant that can be read", f"none of {left_out}")
     if together:
         paths = together.write(directory)
         print("\n".join(str(path) for path in paths if path.parent == directory), flush=True)
-        print(f"{count} instants, {count / (time.perf_counter() - begin):.3g} a second", flush=True)
+        total = time.perf_counter() - begin
+        stages = ", ".join(f"{stage} {value / count:.3g} s" for stage, value in totals.items())
+        print(f"{count} instants, {count / total:.3g} a second (each: {stages})", flush=True)
         if model.skip.every > 1:
             print(f"skip.every={model.skip.every}: {temporal.anew} instants predicted anew", flush=True)
     if left_out:
@@ -177,6 +188,9 @@ def advice_of(directory: Path) -> Iterator[str]:
         yield f"{len(quality)} photographs leave much unseen: 3 to 5 all around show a person"
     for edge, names in report["cut"].items():
         yield f"{', '.join(names)} end at the subject's {edge}: what no photograph shows is missing"
+    guessed = [part for part, share in report["seen_once"].items() if share > GUESSED]
+    if guessed:
+        yield f"at {', '.join(guessed)} of its height at most one photograph shows most of it: a guess"
     low, high = min(quality), max(quality)
     if low < LOW_PSNR:
         left = [key for key in ("refine_cameras", "refine_masks") if key not in report]
@@ -185,6 +199,21 @@ def advice_of(directory: Path) -> Iterator[str]:
             f"photographs come back at {low:.1f} to {high:.1f} dB only, sound ones at 30 or more: mostly"
             f" cameras or masks are off{hint}; sheet.png shows where"
         )
+
+
+def rig_advice(trained: Mapping[str, Any], batch: Batch) -> Iterator[str]:
+    """Lines that say where photographs are not of the rig that ``ghgs adapt`` trained weights for, by their
+    configuration ``trained``."""
+    data, count = trained.get("data", {}), len(batch.views[0])
+    if data.get("kind") != "people_in_rig":
+        return
+    hint = "checkpoint=shipped, or ghgs adapt with these cameras, may predict them better"
+    if count not in (counts := trained["views"]["training_counts"]):
+        yield f"the weights were adapted to {' or '.join(map(str, counts))} photographs, not {count}; {hint}"
+    rig = np.array([camera["extrinsics"] for camera in data["cameras"].values()])
+    turned = turned_from(rig, batch.cameras.extrinsics[0].double().cpu().numpy())
+    if turned > OTHER_RIG:
+        yield f"the weights were adapted to another rig: a camera is {turned:.0f} degrees off; {hint}"
 
 
 def moved_line(moved: dict[str, float]) -> str:
@@ -226,10 +255,10 @@ def write_result(
     renderer: Renderer,
     config: dict[str, Any],
     options: export.OutputOptions,
-) -> None:
-    """Write the files of a result and print what was done."""
-    prediction = result.prediction
-    facts: dict[str, Any] = {"checkpoint": config["checkpoint"], "seconds": result.seconds, "why": result.why}
+) -> dict[str, float]:
+    """Write the files of a result and print what was done; return the seconds of each stage."""
+    prediction, seconds = result.prediction, dict(result.seconds)
+    facts: dict[str, Any] = {"checkpoint": config["checkpoint"], "seconds": seconds, "why": result.why}
     why = {name: f"; {doubt} ({name}=0 leaves it)" for name, doubt in result.why.items()}
     if result.changed:
         shares = ", ".join(f"{share:.1%}" for share in result.changed)
@@ -247,5 +276,7 @@ def write_result(
     if result.refined is not None:
         facts["refine"] = asdict(result.refined)
         print(result.refined, flush=True)
+    begin = time.perf_counter()
     paths = export.write_prediction(directory, result.batch, prediction, renderer, options, facts)
     print("\n".join(str(path) for path in paths if path.parent == directory), flush=True)
+    return {**seconds, "write": time.perf_counter() - begin}

@@ -3,36 +3,89 @@
 import ipaddress
 import math
 import time
+from functools import partial
+from pathlib import Path
 
+import torch
 from omegaconf import DictConfig
 
 from ghgs_lit.cli import predict
-from ghgs_lit.cli.runtime import output_dir, save_config
+from ghgs_lit.cli.inputs import build_renderer, load_model, model_of, pick_device
+from ghgs_lit.cli.photographs import sources_of
+from ghgs_lit.cli.runtime import output_dir, save_config, write_config
+from ghgs_lit.config import resolve
 from ghgs_lit.errors import require
-from ghgs_lit.prediction.viewer.content import read_content
+from ghgs_lit.prediction.capture.capture import Capture
+from ghgs_lit.prediction.capture.live import live_frames
+from ghgs_lit.prediction.capture.predict import crop_size, in_frame, predict_batch
+from ghgs_lit.prediction.export import output_options
+from ghgs_lit.prediction.export.subject import ExportedSubject, exported_subject
+from ghgs_lit.prediction.sequence.temporal import Temporal
+from ghgs_lit.prediction.viewer.content import Content, read_content
+from ghgs_lit.prediction.viewer.live import Pause, Recording, show_live
 from ghgs_lit.prediction.viewer.server import Viewer
+from ghgs_lit.types import Batch
+from ghgs_lit.weights.checkpoint import read_checkpoint
 from ghgs_lit.weights.reading import SHIPPED
 
 
 def run(cfg: DictConfig) -> None:
-    """Show ``path``; without it predict first. Ctrl-C ends it."""
-    has_source = any(cfg.get(key) is not None for key in ("path", "checkpoint", "images"))
+    """Show ``path``; without it predict first, or with ``live`` again and again. Ctrl-C ends it."""
+    has_source = cfg.live or any(cfg.get(key) is not None for key in ("path", "checkpoint", "images"))
     require(has_source, "path", "a directory of ghgs predict or a PLY, or checkpoint=<file>", None)
+    is_folder = not isinstance(cfg.images, DictConfig)
+    require(cfg.live or is_folder, "images", "a folder, or live=true beside cameras", cfg.images)
+    if cfg.path is None and cfg.checkpoint is None:
+        cfg.checkpoint = SHIPPED
+    if cfg.live:
+        _run_live(cfg)
+        return
     if cfg.path is None:
-        cfg.checkpoint = cfg.checkpoint or SHIPPED
         predict.run(cfg)
     else:
         save_config(cfg, output_dir())
     # A new prediction is already in the frame of ``up``, and its cameras tell which axis that is.
-    content = read_content(cfg.path or output_dir(), cfg.up if cfg.path else None)
-    viewer = Viewer(content, cfg.host, cfg.port)
-    print(f"viewer: {viewer.address} ({_reach(cfg.host)}); Ctrl-C ends it", flush=True)
+    viewer = _opened(cfg, read_content(cfg.path or output_dir(), cfg.up if cfg.path else None))
     end = time.monotonic() + (cfg.seconds or math.inf)
     try:
         while time.monotonic() < end:
             time.sleep(0.2)
     finally:
         viewer.stop()
+
+
+@torch.no_grad()
+def _run_live(cfg: DictConfig) -> None:
+    require(cfg.path is None, "path", "null with live=true", cfg.path)
+    config, pause = resolve(cfg), Pause()
+    frames = live_frames(**sources_of(config), sleep=pause)
+    config |= model_of(config["checkpoint"], cfg)
+    options, device = output_options(config), pick_device(config["device"])
+    renderer, model = build_renderer(config, device), load_model(config, device)
+    size = crop_size(config["size"], read_checkpoint(config["checkpoint"])["config"], model)
+    write_config(config, output_dir())
+    # To decide at each instant what ``auto`` should refine would take as long as a prediction.
+    masks, cameras = (0 if n == "auto" else n for n in (config["refine_masks"], config["refine_cameras"]))
+    forward = partial(in_frame, model)
+    temporal = Temporal(forward, model.skip.every, renderer)
+
+    def predicted(batch: Batch) -> ExportedSubject:
+        batch = batch.to(device)
+        result = predict_batch(batch, model, renderer, cameras, config["refine"], forward, temporal)
+        return exported_subject(result.batch, result.prediction, renderer, options)
+
+    crop = partial(Capture.batch, size=size, refine_masks=masks)
+    recording = None if config["out"] is None else Recording(Path(config["out"]).expanduser().resolve())
+    print(f"waiting for an instant in {config['images']}", flush=True)
+    page = partial(_opened, cfg, layers=False)
+    until, delay = cfg.seconds or math.inf, cfg.delay or math.inf
+    show_live(frames, pause, crop, predicted, page, recording, until, delay)
+
+
+def _opened(cfg: DictConfig, content: Content, layers: bool = True) -> Viewer:
+    viewer = Viewer(content, cfg.host, cfg.port, layers)
+    print(f"viewer: {viewer.address} ({_reach(cfg.host)}); Ctrl-C ends it", flush=True)
+    return viewer
 
 
 def _reach(host: str) -> str:

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ghgs_lit.config.options import Count, Index, Options, Positive, Share, Text, Words
+from ghgs_lit.config.options import Count, Index, Options, Path, Positive, Share, Text, Words
 
 #: One value or several.
 Texts = Text | tuple[Text, ...]
@@ -16,13 +16,15 @@ class Calibration(Options):
     """Corrections of what the file of cameras omits or says wrongly; null: as its format defines it."""
 
     group = "calibration"
-    format: Literal["auto", "ghgs", "colmap", "nerfstudio", "opencv", "easymocap"] = "auto"
+    format: Literal["auto", "ghgs", "colmap", "nerfstudio", "opencv", "easymocap", "toml", "qualisys"] = (
+        "auto"
+    )
     """Format of the file."""
     extrinsics: Literal["world_to_camera", "camera_to_world"] | None = None
     """What the matrices map."""
     axes: Literal["opencv", "opengl"] | None = None
     """Axes of a camera."""
-    intrinsics: Literal["pixels", "normalized"] | None = None
+    intrinsics: Literal["pixels", "normalized", "normalized_principal"] | None = None
     """Unit of focal lengths and principal point; normalized: shares of width and height."""
     pixel_centers: Literal["half", "integer"] | None = None
     """Where the first pixel's centre lies: at 0.5 or at 0."""
@@ -46,9 +48,9 @@ class Sequence(Options):
     """Number of the first one that no longer counts; negative: from the end."""
     step: Count = 1
     """Every so many of them."""
-    sync: Annotated[dict | None, Words("a mapping of cameras to frames or null")] = None
+    sync: Path | Annotated[dict, Words("a mapping of cameras to frames")] | None = None
     """Of videos. null: their frames are numbered alike. {camera: frames} by which it began before the others.
-    """
+    A CSV (camera,frame,seconds): the frames nearest to those of the first camera."""
 
 
 class Turntable(Options):

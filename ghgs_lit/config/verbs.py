@@ -71,7 +71,7 @@ class Photographs(Options):
     images: Path | None = None
     """Folder of photographs or videos named after their cameras; of such folders: one for each instant."""
     cameras: Path | None = None
-    """Their calibration: JSON, transforms.json, COLMAP, YAML of OpenCV or EasyMocap."""
+    """Their calibration: JSON, transforms.json, COLMAP, YAML of OpenCV or EasyMocap, TOML of Pose2Sim."""
     masks: Path | None = None
     """Folder of masks; null: backgrounds, segment, <name>_mask.png, those of the calibration, or alpha."""
     backgrounds: Path | None = None
@@ -115,8 +115,9 @@ class Predict(Photographs, Measured):
     """Without images: name of the subject, or its number in the split."""
     split: Literal["train", "val"] = "val"
     """Without images: where the subject is."""
-    formats: Texts = ("ply", "html", "turntable", "depth", "inputs")
-    """What is written: ply, viewers, html, turntable, depth, inputs; with the extra video: mp4; or all."""
+    formats: Texts = ("ply", "html", "turntable", "depth", "points", "inputs")
+    """What is written: ply, html, turntable, depth, points, inputs, splat; with the extra formats:
+    compressed_ply, spz, sog, glb; with the extra video: mp4; or all."""
     up: Axis | None = None
     """Axis that points up in all files; null: they are in the world of the cameras."""
     smooth: bool = False
@@ -130,6 +131,9 @@ class Predict(Photographs, Measured):
 class View(Predict):
     """A page in the browser with Gaussians, cameras, photographs, point cloud and visual hull."""
 
+    images: Path | Annotated[dict, Words("a folder or a mapping of cameras to devices")] | None = None
+    """As for ``ghgs predict``; with live also {camera: number of a device, or address of a stream}, which
+    OpenCV opens."""
     path: Path | None = None
     """A directory of ``ghgs predict`` (its formats ply and inputs), or a PLY; null: predict first."""
     checkpoint: Path | None = None
@@ -142,6 +146,12 @@ class View(Predict):
     """The next free one is taken where it is in use."""
     seconds: Positive | None = None
     """The page is closed after so long; null: never."""
+    live: bool = False
+    """Show the newest instant of images again and again: of a folder that is being written, of videos at
+    their rate, or of cameras. Their calibration is not checked, auto refines nothing, and out gets
+    sequence/0000.ply and so on."""
+    delay: Positive | None = None
+    """Of live: seconds between an instant and its picture after which it is dropped; null: none is."""
 
 
 class Doctor(Photographs):

@@ -1,4 +1,4 @@
-"""Pictures and attention of the first validation subjects."""
+"""Pictures, attention and point clouds of the first validation subjects."""
 
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,20 @@ from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.recalibration import Recalibration
 from ghgs_lit.recalibration.inspection import attention_of, attention_on_other_parts
 from ghgs_lit.training.pretext.labels import has_parts, part_shares, token_parts
-from ghgs_lit.types import Batch
+from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.attention import attention_sheet, chosen_token
+from ghgs_lit.visualization.clouds import clouds
 from ghgs_lit.visualization.pictures import save_png, sheet
+
+#: TensorBoard's view of clouds: points of two centimetres through a perspective camera.
+CLOUD_VIEW = {
+    "camera": {"cls": "PerspectiveCamera", "fov": 40},
+    "material": {"cls": "PointsMaterial", "size": 0.02},
+}
 
 
 class PicturesOptions(Options):
-    """Pictures of the first subjects of each validation; of the first one also attention."""
+    """Pictures of the first subjects of each validation; of the first one also attention and point clouds."""
 
     group = "callbacks.pictures"
     subjects: Index = 2
@@ -34,8 +41,9 @@ class PicturesOptions(Options):
 
 
 class Pictures(Callback):
-    """Logs ``sheet/<subject>`` and ``attention/<subject>``. A sheet has inputs, depths, targets, renders and
-    errors. Attention is of one token of the recalibration."""
+    """Logs ``sheet/<subject>``, ``attention/<subject>`` and, in TensorBoard's mesh tab, ``<subject>/points``.
+    A sheet has inputs, depths, targets, renders and errors. Attention is of one token of the recalibration.
+    Clouds are the predicted points and the body's vertices."""
 
     def __init__(self, options: PicturesOptions):
         self.options = options
@@ -69,6 +77,7 @@ class Pictures(Callback):
             if number == 0:
                 self._show_attention(trainer, batch, element, name)
                 self._log_other_parts(pl_module, batch)
+                _show_clouds(trainer, batch, prediction, element, name)
             self._left -= 1
         self._forget()
 
@@ -114,3 +123,16 @@ def _publish(trainer: L.Trainer, tag: str, picture: np.ndarray, file: str) -> No
             logger.experiment.add_image(tag, picture, step, dataformats="HWC")
         elif isinstance(logger, WandbLogger):
             logger.log_image(tag, [picture])
+
+
+def _show_clouds(trainer: L.Trainer, batch: Batch, prediction: Prediction, element: int, name: str) -> None:
+    loggers = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
+    for kind, (positions, colors) in clouds(batch, prediction, element).items() if loggers else ():
+        for logger in loggers:
+            logger.experiment.add_mesh(
+                f"{name}/{kind}",
+                positions[None],
+                (255 * colors[None]).byte(),
+                config_dict=CLOUD_VIEW,
+                global_step=trainer.global_step,
+            )

@@ -1,1 +1,1 @@
-"""Pictures of predictions and of attention."""
+"""Pictures of predictions, of attention, and point clouds."""

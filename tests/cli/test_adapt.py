@@ -1,6 +1,7 @@
 """``ghgs adapt``: the cameras that it reads, and weights that predict."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import torch
 from ghgs_lit.cli import adapt
 from ghgs_lit.cli.adapt import _fill_of, with_rig
 from ghgs_lit.cli.inputs import build_data
+from ghgs_lit.cli.predict import rig_advice
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.data.view import half_centers
 from ghgs_lit.errors import InputError
@@ -17,6 +19,7 @@ from ghgs_lit.readers import read_yaml
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.synthesis import jobs
 from ghgs_lit.synthesis.rig import Rig
+from ghgs_lit.weights.checkpoint import read_checkpoint
 from scripts.miniatures import zju_mocap
 from tests.helpers.captures import make_miniature
 from tests.helpers.figures import Figure
@@ -105,6 +108,13 @@ def test_weights_learn_and_are_written(calibration, tmp_path, monkeypatch, capsy
     cameras = Figure(views=3).write(tmp_path / "other")
     photographs = [f"images={cameras.parent}", f"cameras={cameras}", "formats=[ply]"]
     assert ghgs("predict", f"checkpoint={out}", *photographs, f"out={tmp_path / 'splat'}") == 0
+    printed = capsys.readouterr().out
+    assert "the weights were adapted to 4 photographs, not 3; checkpoint=shipped, or ghgs adapt" in printed
+    assert "the weights were adapted to another rig: a camera is 30 degrees off; " in printed
+    trained, own = read_checkpoint(out)["config"], Rig().cameras(np.array(YAWS[::-1]), 70, 70)
+    batch = SimpleNamespace(views=[list("abcd")], cameras=own[None])
+    assert list(rig_advice(trained, batch)) == []
+    assert list(rig_advice(read_checkpoint("shipped")["config"], batch)) == []
 
 
 def test_no_file_is_replaced(calibration, capsys):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from imageio_ffmpeg import read_frames
 from plyfile import PlyData
 from scipy.ndimage import binary_dilation
 
@@ -114,6 +115,7 @@ def test_what_makes_a_prediction_poor_is_said(here, checkpoint, capsys):
         assert ghgs("predict", "images=images", f"cameras={cameras}", "out=splat", "size=70", *run) == 0
     out = capsys.readouterr().out
     assert "2 photographs leave much unseen: 3 to 5 all around show a person" in out
+    assert "of its height at most one photograph shows most of it: a guess" in out
     report = json.loads((here / "splat" / "report.json").read_text())
     low, high = sorted(report["psnr_box_of_inputs"].values())
     said = (
@@ -127,9 +129,13 @@ def test_what_makes_a_prediction_poor_is_said(here, checkpoint, capsys):
 def test_a_folder_for_each_instant_becomes_a_folder_of_splats(here, checkpoint, capsys):
     cameras = Figure().write(here / "images" / "000")
     shutil.copytree(here / "images" / "000", here / "images" / "001")
-    common = (f"checkpoint={checkpoint}", "formats=[ply]", "turntable.frames=0", "device=cpu")
+    common = (f"checkpoint={checkpoint}", "formats=[ply,mp4]", "turntable.frames=1", "device=cpu")
     assert ghgs("predict", "images=images", f"cameras={cameras}", "out=splats", *common) == 0
     assert "2 instants" in capsys.readouterr().out
+    _, first, second = read_frames(str(here / "splats" / "instants.mp4"))
+    first, second = (np.frombuffer(frame, np.uint8) for frame in (first, second))
+    assert first.max() > 60  # the person is in the picture
+    assert np.abs(first.astype(int) - second).max() < 8
     one, two = ((here / "splats" / name / "gaussians.ply").read_bytes() for name in ("000", "001"))
     assert one == two
 
@@ -268,43 +274,6 @@ def test_the_example_runs(here, checkpoint, monkeypatch, capsys):
     runpy.run_path(str(EXAMPLES / "photographs_to_splat.py"), run_name="__main__")
     assert "splat.ply: " in capsys.readouterr().out
     assert inside_the_figure(here / "splat.ply") > 0.95
-
-
-def test_the_live_example_shows_the_newest_whole_instant(here, monkeypatch, capsys):
-    """One that lacks a photograph, or has half of one, is waited for."""
-    figure = Figure()
-    for instant in ("000", "001"):
-        cameras = figure.write(here / "images" / instant)
-    cameras.rename(here / "cameras.json")
-    late = here / "images" / "002"
-    shutil.copytree(here / "images" / "001", late)
-    content = (late / "cam3.png").read_bytes()
-    (late / "cam3.png").unlink()
-    waits, shown = [], []
-
-    def sleep(seconds):
-        waits.append(seconds)
-        if len(waits) == 1:
-            (late / "cam3.png").write_bytes(content[: len(content) // 2])
-        elif len(waits) == 2:
-            (late / "cam3.png").write_bytes(content)
-        elif len(waits) == 3:
-            raise KeyboardInterrupt
-
-    class Page:
-        address = "http://page"
-
-        def __init__(self, content, layers):
-            shown.append(content)
-
-    monkeypatch.setattr("time.sleep", sleep)
-    monkeypatch.setattr("ghgs_lit.prediction.viewer.server.Viewer", Page)
-    main = runpy.run_path(str(EXAMPLES / "live.py"))["main"]
-    with pytest.raises(KeyboardInterrupt):
-        main(str(here / "images"), str(here / "cameras.json"))
-    assert len(waits) == 3
-    assert [content.batch.subjects for content in shown] == [("002",)]
-    assert "002: " in capsys.readouterr().out
 
 
 def test_inputs_are_never_replaced(here, checkpoint, capsys):

@@ -30,6 +30,7 @@ def turned(degrees):
 
 
 NORMALIZED = lens(lambda k, c: k / [[c["width"]], [c["height"]], [1]])
+PRINCIPAL = lens(lambda k, c: k / [[1, 1, c["width"]], [1, 1, c["height"]], [1, 1, 1]])
 SHIFTED = lens(lambda k, c: k + np.array([[0, 0, 0.1 * c["width"]], [0, 0, 0.05 * c["height"]], [0, 0, 0]]))
 INVERSE, OPENGL = pose(np.linalg.inv), pose(lambda e: FLIP @ e)
 
@@ -42,19 +43,20 @@ ALL = {
         "calibration.extrinsics=camera_to_world calibration.axes=opengl",
     ),
     "normalized": (NORMALIZED, "calibration.intrinsics=normalized"),
+    "normalized principal point": (PRINCIPAL, "calibration.intrinsics=normalized_principal"),
     "photographs halved": (scaled(2), "calibration.resized=0.5"),
     "inverse and photographs doubled": (
         lambda c: INVERSE(scaled(0.5)(c)),
         "calibration.extrinsics=camera_to_world calibration.resized=2",
     ),
 }
-# What one camera of four has wrong.
+# What one camera of four has wrong, and words that explain it.
 ONE = {
-    "inverse": INVERSE,
-    "axes": OPENGL,
-    "millimetres": longer(1000),
-    "principal point": SHIFTED,
-    "size": scaled(2),
-    "turned by 6 degrees": turned(6),
-    "other lens": scaled(1.3),
+    "inverse": (INVERSE, "camera_to_world"),
+    "axes": (OPENGL, "opengl"),
+    "millimetres": (longer(1000), "translation is 1000 times too long"),
+    "principal point": (SHIFTED, "principal point"),
+    "size": (scaled(2), "photographs 2 times as large"),
+    "turned by 6 degrees": (turned(6), "disagrees with the others"),
+    "other lens": (scaled(1.3), "disagrees with the others"),
 }

@@ -111,14 +111,20 @@ def test_the_numbers_are_those_of_the_steps(run):
     assert 10 < found.Scalars("memory_mb/process")[0].value < 1e6
 
 
-def test_pictures(run):
-    """They are logged at every validation."""
+def test_pictures_and_clouds(run):
+    """Pictures and point clouds are logged at every validation, with all points of the body."""
     folder, _ = run
     found = events(folder / "tensorboard")
     steps = [e.step for e in found.Scalars("val/psnr")]
     assert [e.step for e in found.Images("sheet/p0")] == steps == [4, 8]
     assert sorted(path.name for path in (folder / "pictures").iterdir()) == ["step_000004", "step_000008"]
     assert [e.step for e in found.Scalars("hparam/psnr")] == [8]
+    clouds = [tag for tag in found.Tags()["tensors"] if tag.startswith("p0/")]
+    kinds = {tag.removeprefix("p0/").removesuffix("_VERTEX").removesuffix("_COLOR") for tag in clouds}
+    assert {"points", "body", "points_and_body"} <= {kind.rstrip("_") for kind in kinds}
+    vertices = found.Tensors("p0/body_VERTEX")
+    assert [e.step for e in vertices] == steps
+    assert list(vertices[0].tensor_proto.tensor_shape.dim)[1].size == 20
 
 
 def test_the_session_says_what_the_run_is_and_that_it_ended(run):

@@ -9,6 +9,7 @@ import torch
 from ghgs_lit.errors import InputError
 from ghgs_lit.recalibration.inspection import attention_of, attention_on_other_parts
 from ghgs_lit.visualization.attention import attention_sheet, chosen_token
+from ghgs_lit.visualization.clouds import clouds
 from tests.helpers.models import make_model
 from tests.helpers.scenes import make_batch
 
@@ -116,3 +117,23 @@ def test_attention_is_drawn_on_the_tokens_it_names(skip):
         for t in attention.neighbors.tolist()
     }
     assert drawn == named
+
+
+def test_clouds_are_the_subjects_points_and_its_body():
+    """Clouds belong to one subject, keep their colours and respect the limit."""
+    model, batch = make_model().eval(), make_batch(2, 3)
+    body = [torch.rand(9, 3), torch.rand(4, 3)]
+    batch = dataclasses.replace(batch, body_vertices=body)
+    _, _, prediction = seen(model, batch)
+    found = clouds(batch, prediction, 1, limit=50)
+    assert list(found) == ["points", "body", "points_and_body"]
+    positions, colors = found["points"]
+    assert 25 < len(positions) <= 50
+    assert positions.shape == colors.shape
+    valid = prediction.points.valid[1] & batch.masks[1]
+    assert torch.equal(positions[0], prediction.points.pixels[1][valid][0])
+    assert torch.equal(colors[0], batch.images[1].movedim(1, -1)[valid][0])
+    assert torch.equal(found["body"][0], body[1])
+    assert len(found["points_and_body"][0]) == len(positions) + 4
+    nothing = dataclasses.replace(batch, masks=torch.zeros_like(batch.masks), body_vertices=None)
+    assert clouds(nothing, prediction, 0) == {}

@@ -16,12 +16,14 @@ from ghgs_lit.errors import InputError, require
 
 EXTRINSICS = ("world_to_camera", "camera_to_world")
 AXES = ("opencv", "opengl")
-INTRINSICS = ("pixels", "normalized")
+INTRINSICS = ("pixels", "normalized", "normalized_principal")
 
 #: Largest gain of a camera's colours relative to the mean of all; the least is its inverse.
 MOST_GAIN = 2.0
 #: Between the camera axes of OpenGL (y up, z backward) and OpenCV (y down, z forward).
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+# Video is coded in blocks of 16 pixels: a sensor's 1088 are 1080 in the pictures of some programs.
+_CODED, _SHOWN = 1088, 1080
 # Distance from the origin beyond which a rotation's seventh digit moves a centre by more than 0.1 mm.
 _FAR = 1e3
 # Pixels by which a side may differ from the calibration's ratio of sides: rounding of a resize.
@@ -35,7 +37,8 @@ class Convention:
     Attributes:
         extrinsics: what the poses map: ``world_to_camera`` | ``camera_to_world``.
         axes: of the camera: ``opencv`` (y down, z forward) | ``opengl`` (y up, z backward).
-        intrinsics: in ``pixels``, or ``normalized``: shares of width and height.
+        intrinsics: ``pixels``, or shares of width and height: ``normalized`` (all) | ``normalized_principal``
+            (the principal point alone).
         pixel_centers: the first pixel's centre lies at 0.5 (``half``) or at 0 (``integer``, as OpenCV's).
         resized: factor of a resize after the calibration, beyond the sizes that the file says.
         unit: metres of one unit of length."""
@@ -120,10 +123,14 @@ def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[in
     """The camera of a photograph in this package's conventions. ``photograph``: (height, width) in pixels;
     intrinsics for another size of the same aspect ratio are scaled. InputError: the aspect ratio differs."""
     size = camera.size or photograph
+    if not same_ratio(size, photograph):
+        shown = tuple(_SHOWN if side == _CODED else side for side in size)
+        size = shown if same_ratio(shown, photograph) else size
     intrinsics = camera.intrinsics.copy()
     height, width = size
-    if convention.intrinsics == "normalized":
-        intrinsics[:2] *= np.array([[width], [height]])
+    if convention.intrinsics != "pixels":
+        columns = slice(None) if convention.intrinsics == "normalized" else slice(2, None)
+        intrinsics[:2, columns] *= np.array([[width], [height]])
     if convention.pixel_centers == "integer":
         intrinsics = half_centers(intrinsics)
     if size != photograph:

@@ -43,7 +43,7 @@ class Hypothesis:
     """A meaning of a calibration, and how well masks and cameras agree with it."""
 
     says: str
-    option: str  #: of the command line, for this meaning; empty: as given
+    option: str  #: of the command line, for this meaning; empty: none
     views: tuple[StoredView, ...]
     blames: tuple[str, ...] = ()  #: the cameras that are wrong by it; empty: all, or none
     shares: dict[str, float] = field(default_factory=dict)  #: of each mask, in the hull of the others
@@ -87,6 +87,7 @@ class Diagnosis:
     lines: tuple[str, ...]
     option: str  #: of the command line, for the best meaning; empty: none
     ranking: tuple[Hypothesis, ...]  #: all meanings that were tried, the best first
+    size: float  #: the subject's largest extent in the user's unit, by the best meaning
     suspects: tuple[str, ...] = ()  #: cameras that disagree with the others
 
 
@@ -97,22 +98,26 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
     same = twins({view.name: view.camera.pose for view in views})
     if same is not None:
         line = f"{' and '.join(same)} have the same pose: one of them is a copy"
-        return Diagnosis(False, (line,), "", (given,), same)
+        return Diagnosis(False, (line,), "", (given,), given.size(folder), same)
     if given.score >= AGREES:
-        agree = f"{given.score:.0%} of each mask or more lies in the hull of the others"
-        lines = f"cameras and masks agree ({agree})", _size_line(given.size(folder))
-        return Diagnosis(True, lines, "", (given,))
+        size, agree = (
+            given.size(folder),
+            f"{given.score:.0%} of each mask or more lies in the hull of the others",
+        )
+        return Diagnosis(True, (f"cameras and masks agree ({agree})", _size_line(size)), "", (given,), size)
     tried = [given, *(hypothesis.ranked(folder) for hypothesis in _for_all(views))]
     best = max(tried, key=lambda hypothesis: hypothesis.score)
     if best.score < AGREES:
+        # A single wrong camera is sought with the best meaning for all.
         base = best if best.score > given.score + BETTER else given
-        tried += [hypothesis.ranked(folder) for hypothesis in _exchanged(base.views)]
+        tried += [hypothesis.ranked(folder) for hypothesis in _for_some(base.views)]
         best = max(tried, key=lambda hypothesis: hypothesis.score)
     tried.sort(key=lambda hypothesis: -hypothesis.score)
     if best.score >= max(AGREES, given.score + BETTER):
-        line = f"{best.says}: masks agree by {best.score:.0%} instead of {given.score:.0%}"
-        lines = line, f"try {best.option}", _size_line(best.size(folder))
-        return Diagnosis(False, lines, best.option, tuple(tried), best.blames)
+        size = best.size(folder)
+        lines = [f"{best.says}: masks agree by {best.score:.0%} instead of {given.score:.0%}"]
+        lines += [f"try {best.option}"] if best.option else []
+        return Diagnosis(False, (*lines, _size_line(size)), best.option, tuple(tried), size, best.blames)
     return _unexplained(folder, given, tried)
 
 
@@ -176,16 +181,61 @@ def _plausible(view: StoredView) -> bool:
     return bool(((share >= _MIDDLE[0]) & (share <= _MIDDLE[1])).all())
 
 
-def _exchanged(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
-    """Two cameras that are exchanged, or their masks, which looks alike."""
+def _for_some(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
+    """Mistakes of one camera, and two cameras or masks that are exchanged."""
+    for i, view in enumerate(views):
+        for says, changed in _mistakes(view):
+            mended = (*views[:i], changed, *views[i + 1 :])
+            yield Hypothesis(f"{view.name} alone: {says}", "", mended, (view.name,))
     for i, j in itertools.combinations(range(len(views)), 2):
         one, other = views[i], views[j]
         swapped = list(views)
         swapped[i] = replace(one, camera=other.camera)
         swapped[j] = replace(other, camera=one.camera)
-        says = f"the cameras (or masks) of {one.name} and {other.name} are exchanged"
+        names, blames = f"{one.name} and {other.name}", (one.name, other.name)
+        # Outlines of the masks may follow edges of the other photograph rather than of their own.
+        if one.mask.shape == other.mask.shape and (
+            _contrast(one, other.mask) * _contrast(other, one.mask)
+            > _contrast(one, one.mask) * _contrast(other, other.mask)
+        ):
+            swapped[i], swapped[j] = replace(one, mask=other.mask), replace(other, mask=one.mask)
+            yield Hypothesis(f"the masks of {names} are exchanged", "", tuple(swapped), blames)
+            continue
         option = f"'calibration.names={{{one.name}: {other.name}, {other.name}: {one.name}}}'"
-        yield Hypothesis(says, option, tuple(swapped), (one.name, other.name))
+        yield Hypothesis(f"the cameras of {names} are exchanged", option, tuple(swapped), blames)
+
+
+def _mistakes(view: StoredView) -> Iterator[tuple[str, StoredView]]:
+    """Usual mistakes of a single camera in words, each with the view after mending it."""
+    given = view.convention
+    for extrinsics, axes in itertools.product(EXTRINSICS, AXES):
+        convention = replace(given, extrinsics=extrinsics, axes=axes)
+        if convention != given:
+            yield f"its extrinsics are {extrinsics} with axes of {axes}", replace(view, convention=convention)
+
+    def with_camera(says: str, **changes: np.ndarray) -> tuple[str, StoredView]:
+        return says, replace(view, camera=replace(view.camera, **changes))
+
+    for factor, says in ((0.001, "long"), (1000.0, "short")):
+        pose = view.camera.pose.copy()
+        pose[:3, 3] *= factor
+        yield with_camera(f"its translation is 1000 times too {says}", pose=pose)
+    intrinsics = view.camera.intrinsics.copy()
+    sides = np.array(view.camera.size)[::-1] if given.intrinsics == "pixels" else 1.0
+    intrinsics[:2, 2] = sides / 2 / given.resized
+    yield with_camera("its principal point should be near the middle", intrinsics=intrinsics)
+    for factor in (0.5, 2.0):
+        intrinsics = view.camera.intrinsics * [[factor], [factor], [1.0]]
+        says = f"its intrinsics are for photographs {1 / factor:g} times as large"
+        yield with_camera(says, intrinsics=intrinsics)
+
+
+def _contrast(view: StoredView, mask: np.ndarray) -> float:
+    """Mean gradient of the photograph on the outline of a mask, largest for the right mask."""
+    grey = view.pixels.image.astype(np.float64).mean(-1)
+    gradient = np.hypot(*np.gradient(grey))
+    outline = np.hypot(*np.gradient(mask.astype(np.float64))) > 0
+    return float(gradient[outline].mean()) if outline.any() else 0.0
 
 
 def _size_line(size: float) -> str:
@@ -216,4 +266,4 @@ def _unexplained(folder: CaptureFolder, given: Hypothesis, tried: list[Hypothesi
     elif fitting:
         lines.append(f"{' or '.join(fitting)} disagrees with the others (three cameras cannot tell for sure)")
     suspects = () if not fitting else (best,) if len(views) > 3 else tuple(fitting)
-    return Diagnosis(False, tuple(lines), "", tuple(tried), suspects)
+    return Diagnosis(False, tuple(lines), "", tuple(tried), base.size(folder), suspects)

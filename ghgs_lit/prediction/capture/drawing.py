@@ -1,23 +1,29 @@
-"""Cameras checked by eye: photographs with masks and hulls."""
+"""Cameras checked by eye: photographs with masks, hulls and epipolar lines."""
 
 from collections.abc import Sequence
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw
 from scipy import ndimage
 
-from ghgs_lit.geometry.silhouettes import Silhouette, hull_in_view
-from ghgs_lit.visualization.pictures import row
+from ghgs_lit.geometry.silhouettes import Silhouette, hull_in_view, subject_sphere
+from ghgs_lit.visualization.pictures import row, stack
 
-_CELLS = 160  # of the hull along the longer side of a photograph
+# Cells of the hull along the longer side of a photograph, and steps of an epipolar line.
+_CELLS, _STEPS = 160, 200
 _MASK, _HULL = (0, 255, 90), (255, 60, 40)
+_COLORS = ((255, 220, 0), (0, 200, 255), (255, 120, 255), (255, 160, 60), (160, 255, 120))
 
 
 def camera_sheet(
     names: Sequence[str], images: Sequence[np.ndarray], views: Sequence[Silhouette]
 ) -> np.ndarray:
-    """Picture [H, W, 3] uint8: photographs with outlines of masks (green) and of the others' hull (red).
-    ``images``: [h, w, 3] uint8. ``views``: masks of the photographs' sizes with their cameras."""
+    """Picture [H, W, 3] uint8: a row with masks (green) and hulls of the others (red), then epipolar lines.
+
+    Each row of lines begins with points of one mask; the other pictures show the line on which each point
+    must be, near the subject's depth: it passes the same part of the body in every photograph. ``images``:
+    [h, w, 3] uint8. ``views``: masks of the photographs' sizes with their cameras."""
+    focus, radius = subject_sphere(views)
     small, tiles = [_smaller(view) for view in views], []
     for i, (image, view) in enumerate(zip(images, views, strict=True)):
         hull = Image.fromarray(hull_in_view(small, i)).resize(view.mask.shape[::-1], Image.Resampling.NEAREST)
@@ -25,7 +31,14 @@ def camera_sheet(
         for shape, color in ((np.asarray(hull), _HULL), (view.mask, _MASK)):
             picture[shape ^ ndimage.binary_erosion(shape)] = color
         tiles.append(picture)
-    return row(tiles, [f"{name}: mask green, hull of the others red" for name in names])
+    rows = [row(tiles, [f"{name}: mask green, hull of the others red" for name in names])]
+    for i, view in enumerate(views):
+        order = [i, *(j for j in range(len(views)) if j != i)]
+        points, depths = _extremes(view.mask), view.depths_around(focus, radius, _STEPS)
+        tiles = [_dots(images[i], points)]
+        tiles += [_lines(images[j], view, views[j], points, depths) for j in order[1:]]
+        rows.append(row(tiles, [f"points of {names[i]}", *(f"on {names[j]}" for j in order[1:])]))
+    return stack(rows)
 
 
 def _smaller(view: Silhouette) -> Silhouette:
@@ -33,3 +46,34 @@ def _smaller(view: Silhouette) -> Silhouette:
     intrinsics = view.intrinsics.copy()
     intrinsics[:2] /= step
     return Silhouette(view.mask[step // 2 :: step, step // 2 :: step], intrinsics, view.extrinsics)
+
+
+def _extremes(mask: np.ndarray) -> np.ndarray:
+    """Pixels [5, 2] (column, row): the mask's top, bottom, left and right ones, and one in its middle."""
+    pixels = np.argwhere(mask)[:, ::-1]
+    middle = np.abs(pixels - np.median(pixels, 0)).sum(1).argmin()
+    ends = [pixels[:, 1].argmin(), pixels[:, 1].argmax(), pixels[:, 0].argmin(), pixels[:, 0].argmax()]
+    return pixels[[*ends, middle]] + 0.5
+
+
+def _dots(image: np.ndarray, points: np.ndarray) -> np.ndarray:
+    picture = Image.fromarray(image)
+    draw = ImageDraw.Draw(picture)
+    for (x, y), color in zip(points.tolist(), _COLORS, strict=True):
+        draw.ellipse((x - 3, y - 3, x + 3, y + 3), fill=color)
+    return np.asarray(picture)
+
+
+def _lines(
+    image: np.ndarray, view: Silhouette, other: Silhouette, points: np.ndarray, depths: np.ndarray
+) -> np.ndarray:
+    picture = Image.fromarray(image)
+    draw = ImageDraw.Draw(picture)
+    for ray, color in zip(view.rays(points), _COLORS, strict=True):
+        local = (view.center + ray * depths[:, None]) @ other.extrinsics[:3, :3].T + other.extrinsics[:3, 3]
+        local = local[local[:, 2] > 0]
+        pixels = local @ other.intrinsics.T
+        line = (pixels[:, :2] / pixels[:, 2:]).clip(-1e4, 1e4)
+        if len(line) > 1:
+            draw.line([tuple(p) for p in line.tolist()], fill=color, width=1)
+    return np.asarray(picture)

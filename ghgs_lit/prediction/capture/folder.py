@@ -60,8 +60,8 @@ class CaptureFolder:
     segment: str | None = None
     calibration: Mapping[str, Any] = field(default_factory=dict)
     sequence: Mapping[str, Any] = field(default_factory=dict)
-    #: The views of one instant.
-    _decoded: dict[str, dict[str, Future]] = field(default_factory=dict, init=False, repr=False)
+    #: The views of one instant that are decoded, or are being decoded.
+    _begun: dict[str, dict[str, Future]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name in ("images", "cameras", "masks", "backgrounds"):
@@ -99,7 +99,7 @@ class CaptureFolder:
         # Numbers, too, are names of cameras.
         names = {composed(str(key)): composed(str(name)) for key, name in (self._said.names or {}).items()}
         if has_videos(folder, cameras, names):
-            return find_frames(folder, self.masks, cameras, names, self.convention, part.sync)
+            return find_frames(folder, self.masks, cameras, names, self.convention, part.sync, part.step)
         require(part.sync is None, "sequence.sync", "null for photographs", part.sync)
         return find_instants(folder, cameras, names), ""
 
@@ -143,7 +143,7 @@ class CaptureFolder:
     def photographs(self, instant: str) -> tuple[Photograph, ...]:
         """The photographs of one instant, two or more. InputError: as for :meth:`decode`."""
         views = self.decode(instant)
-        self._decoded.clear()  # they take much memory
+        self._begun.clear()  # they take much memory
         upright = {n: partial(self.photograph, n, *view, self.convention) for n, view in views.items()}
         return tuple(self._complete(instant, upright).values())
 
@@ -153,14 +153,8 @@ class CaptureFolder:
         They are kept until :meth:`photographs` has them, or another instant is decoded. InputError: a
         photograph or mask is missing or wrong; of several instants one may lack photographs (:attr:`missing`)
         where three or more remain."""
-        if instant not in self._decoded:
-            self._decoded.clear()
-            # Segmentation has threads of its own, and one session.
-            with ThreadPoolExecutor(allowed_cores() if self.segment is None else 1) as pool:
-                self._decoded[instant] = {
-                    name: pool.submit(self._view, name, path) for name, path in self.paths[instant].items()
-                }
-        return self._complete(instant, {name: view.result for name, view in self._decoded[instant].items()})
+        self.begin(instant)
+        return self._complete(instant, {name: view.result for name, view in self._begun[instant].items()})
 
     def _complete(self, instant: str, views: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
         """The values of all views; in a sequence, without those that fail where the others are enough."""
@@ -177,6 +171,18 @@ class CaptureFolder:
         least, why = (ENOUGH, f"{len(found)} ({why})") if missing else (2, len(found))
         require(len(found) >= least, f"{self.images}: {instant}", f"{least} photographs or more", why)
         return found
+
+    def begin(self, instant: str) -> None:
+        """Decode the views of an instant in threads; :meth:`decode` waits for them."""
+        if instant in self._begun:
+            return
+        self._begun.clear()
+        # Segmentation has threads of its own, and one session.
+        pool = ThreadPoolExecutor(allowed_cores() if self.segment is None else 1)
+        self._begun[instant] = {
+            name: pool.submit(self._view, name, path) for name, path in self.paths[instant].items()
+        }
+        pool.shutdown(wait=False)
 
     def _view(self, name: str, path: Source) -> tuple[StoredCamera, Pixels, np.ndarray]:
         camera = self.file.cameras[name]
@@ -225,9 +231,7 @@ class CaptureFolder:
             return matte_of_background(pixels, background)
         elif self.segment is not None:
             return _segmenter(self.segment)(pixels)
-        mask = camera.mask if mask is None else mask
-        if isinstance(mask, np.ndarray):
-            return mask
+        mask = mask or camera.mask
         if isinstance(mask, VideoFrame):
             return mask.matte(pixels)
         if mask is not None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ghgs_lit.errors import require
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera, calibrate
 from ghgs_lit.prediction.capture.photographs import (
@@ -20,6 +20,7 @@ from ghgs_lit.prediction.capture.photographs import (
     images_in,
 )
 from ghgs_lit.prediction.capture.videos import SUFFIXES, Reader, Video, read_video
+from ghgs_lit.readers import read_rows
 
 # Coding changes black and white by less than this.
 _CODED = 16
@@ -28,12 +29,11 @@ _DIGITS = 6
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A decoded photograph [h, w, 3] uint8 RGB, its source for messages, and its mask or matte [h, w] uint8,
-    where known."""
+    """A decoded photograph [h, w, 3] uint8 RGB, and its source; ``mask`` as for :class:`VideoFrame`."""
 
     origin: str
     image: np.ndarray
-    mask: np.ndarray | None = None
+    mask: None = None
 
     def __str__(self) -> str:
         return self.origin
@@ -83,7 +83,8 @@ def find_frames(
     cameras: Mapping[str, StoredCamera],
     names: Mapping[str, str],
     convention: Convention,
-    sync: Mapping[str, int] | None,
+    sync: Mapping[str, int] | str | None,
+    step: int,
 ) -> tuple[dict[str, dict[str, VideoFrame]], str]:
     """The frames of each instant that all videos show. Returns: ``{instant: {camera: frame}}``, instants
     named by the first camera's frame; and a line about frames that are left over. InputError: videos do not
@@ -92,17 +93,22 @@ def find_frames(
     Args:
         masks: folder of masks: for each video one of the same name, or a folder of numbered images; None:
             videos beside the others that end with ``_mask``, if any.
-        sync: frames by which a camera began before the others; None: all began together."""
+        sync: frames by which a camera began before the others; or a CSV of ``camera,frame,seconds``, by which
+            each frame of the first camera gets the nearest one of every other; None: all began together.
+        step: of the instants that will be read."""
     paths = by_camera(folder, images_in(folder, SUFFIXES), cameras, names)
     with ThreadPoolExecutor(allowed_cores()) as pool:
         videos = dict(zip(paths, pool.map(read_video, paths.values()), strict=True))
     for name, video in videos.items():
         camera = cameras[name]
         calibrate(replace(camera, origin=f"{video.path}: {camera.origin}"), convention, video.size)
-    numbers = _by_number(videos, {names.get(str(key), str(key)): n for key, n in (sync or {}).items()})
+    if isinstance(sync, str):
+        numbers, step = _by_time(videos, Path(sync).expanduser(), names), 1
+    else:
+        numbers = _by_number(videos, {names.get(str(key), str(key)): n for key, n in (sync or {}).items()})
     frames = {}
     for name, video in videos.items():
-        reader, drawn = Reader(video, "rgb24"), _masks_of(video, folder, masks)
+        reader, drawn = Reader(video, "rgb24", step), _masks_of(video, folder, masks, step)
         frames[name] = {n: VideoFrame(reader, n, drawn.get(n)) for n in video.numbers.tolist()}
     instants = {
         f"{instant:0{_DIGITS}d}": {name: frames[name][n] for name, n in shown.items() if n in frames[name]}
@@ -122,7 +128,8 @@ def _by_number(videos: Mapping[str, Video], offsets: Mapping[str, Any]) -> dict[
     rates = {name: round(video.rate, 4) for name, video in videos.items() if video.count > 1}
     length = min(video.count for video in videos.values())
     drift = (max(rates.values(), default=1) / min(rates.values(), default=1) - 1) * length
-    require(drift < 0.5, "images", "videos of as many frames a second", rates)
+    expected = "as many frames a second of all, or the path of a CSV with camera,frame,seconds"
+    require(drift < 0.5, "sequence.sync", expected, rates)
     first = next(iter(videos))
     shift = {name: offsets.get(name, 0) - offsets.get(first, 0) for name in videos}
     begin = max(-n for n in shift.values())
@@ -131,7 +138,36 @@ def _by_number(videos: Mapping[str, Video], offsets: Mapping[str, Any]) -> dict[
     return {number: {name: number + n for name, n in shift.items()} for number in range(begin, end)}
 
 
-def _masks_of(video: Video, folder: Path, masks: Path | None) -> dict[int, VideoFrame | Path]:
+def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) -> dict[int, dict[str, int]]:
+    """The frame of each camera nearest to each of the first camera's, within half of its frame time."""
+    import pandas as pd  # here: it takes time to import
+
+    columns, rows = {"camera": str, "frame": int, "seconds": float}, read_rows(path)
+    try:
+        table = pd.DataFrame(rows, columns=list(columns)).astype(columns)
+        if not np.isfinite(table.seconds).all():
+            raise ValueError("no time")
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: expected camera,frame,seconds with numbers; found {error}") from None
+    cameras = table.camera.map(lambda name: names.get(composed(name), composed(name)))
+    times = {name: found.sort_values("seconds") for name, found in table.groupby(cameras)}
+    require(times.keys() == videos.keys(), str(path), f"the times of {', '.join(videos)}", ", ".join(times))
+    first, *others = videos
+    steps = times[first].seconds.diff().dropna()
+    half = float(steps.median()) / 2 if len(steps) else np.inf
+    begin = max(found.seconds.iloc[0] for found in times.values()) - half
+    end = min(found.seconds.iloc[-1] for found in times.values()) + half
+    shared = times[first][times[first].seconds.between(begin, end)][["seconds", "frame"]]
+    require(len(shared) > 0, str(path), "times that all cameras share", "none")
+    shared = shared.rename(columns={"frame": first})
+    for other in others:
+        found = times[other][["seconds", "frame"]].rename(columns={"frame": other})
+        shared = pd.merge_asof(shared, found, on="seconds", direction="nearest", tolerance=half)
+    entries = shared.drop(columns="seconds").to_dict("records")
+    return {entry[first]: {name: int(n) for name, n in entry.items() if n == n} for entry in entries}
+
+
+def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict[int, VideoFrame | Path]:
     """The masks of a video by frame number; empty if there are none beside it."""
     name, place = composed(video.path.stem), folder if masks is None else masks
     marked = f"{name}{MASK_ENDING}"
@@ -139,7 +175,7 @@ def _masks_of(video: Video, folder: Path, masks: Path | None) -> dict[int, Video
     path = image_named(place, *names, suffixes=SUFFIXES)
     if path is not None:
         drawn = read_video(path)
-        reader, numbers = Reader(drawn, "gray"), drawn.numbers.tolist()
+        reader, numbers = Reader(drawn, "gray", step), drawn.numbers.tolist()
         # Masks made frame by frame lack those that the camera dropped.
         known = video.numbers.tolist() if len(numbers) == len(video.numbers) else numbers
         return {n: VideoFrame(reader, its) for n, its in zip(known, numbers, strict=True)}

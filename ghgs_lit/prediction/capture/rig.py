@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.model import GHGS
@@ -131,6 +132,20 @@ def shared_gains(batch: Batch, model: GHGS) -> np.ndarray | None:
     logs = (logs - logs.mean(0)).double()
     scale = (math.log(MOST_GAIN) / logs.abs().amax(0)).clamp(max=1)
     return torch.exp(logs * scale).clamp(1 / MOST_GAIN, MOST_GAIN).cpu().numpy()
+
+
+def turned_from(rig: np.ndarray, cameras: np.ndarray) -> float:
+    """Greatest angle in degrees between cameras [n, 4, 4] and the nearest of a rig's [R, 4, 4], after the
+    rotation of the world that makes it least; 0 for cameras of the rig, whichever and in any order. Quarter
+    turns about the optical axis do not count: photographs may be turned upright."""
+    quarters = Rotation.from_euler("z", [[0], [90], [180], [270]], degrees=True).as_matrix()
+    known = (quarters[:, None] @ rig[:, :3, :3]).reshape(-1, 1, 3, 3)
+    taken = cameras[:, :3, :3]
+    worlds = known.mT @ taken[0]
+    between = known[:, None] @ worlds[None] @ taken.mT
+    cosines = (np.trace(between, axis1=-2, axis2=-1) - 1) / 2
+    angles = np.degrees(np.arccos(cosines.clip(-1, 1)))
+    return float(angles.min(0).max(-1).min())
 
 
 def _names(capture: Capture) -> tuple[str, ...]:

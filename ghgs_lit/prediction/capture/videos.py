@@ -92,16 +92,17 @@ def _source(path: Path, seek: float = 0.0, log: str = "quiet") -> list[str]:
     return [ffmpeg, "-v", log, "-nostdin", "-copyts", *start, "-i", str(path), "-map", "0:v:0"]
 
 
-def _command(path: Path, pixels: str, *output: str, **source: Any) -> list[str]:
-    filters = ["-vf", _TELL, "-sws_flags", _EXACT, "-fps_mode", "passthrough"]
+def _command(path: Path, pixels: str, *output: str, select: str = "1", **source: Any) -> list[str]:
+    filters = ["-vf", f"select='{select}',{_TELL}", "-sws_flags", _EXACT, "-fps_mode", "passthrough"]
     return [*_source(path, **source), *filters, "-pix_fmt", pixels, *output, "-"]
 
 
 class Reader:
-    """Frames of one video, decoded in order; elsewhere it is sought. ``pixels``: ``rgb24`` | ``gray``."""
+    """Frames of one video, decoded in order; elsewhere it is sought. ``pixels``: ``rgb24`` | ``gray``.
+    ``step``: distance of the frames that will be asked for; ffmpeg drops the others."""
 
-    def __init__(self, video: Video, pixels: str) -> None:
-        self.video, self.pixels = video, pixels
+    def __init__(self, video: Video, pixels: str, step: int = 1) -> None:
+        self.video, self.pixels, self.step = video, pixels, step
         self._lock, self._process = threading.Lock(), None
         # The numbers of the frame at hand and of the one before: no frame between them could be decoded.
         self._at = self._before = -1
@@ -109,7 +110,7 @@ class Reader:
 
     def frame(self, number: int) -> np.ndarray:
         """A frame, [h, w, 3] or [h, w] uint8. InputError: none of this number can be decoded."""
-        far = _PATIENCE * self.video.rate
+        far = _PATIENCE * self.video.rate + self.step
         with self._lock:
             if self._process is None or number <= self._before or number > self._at + far:
                 self._open(number)
@@ -120,12 +121,16 @@ class Reader:
             return self._frame
 
     def _open(self, number: int) -> None:
-        video = self.video
+        video, select = self.video, "1"
         place = min(np.searchsorted(video.numbers, number), len(video.numbers) - 1)
-        seek = float(video.seconds[place] - video.seconds[0]) - 1.0
+        time, length = float(video.seconds[place]), 1 / video.rate
+        uneven = np.abs(video.seconds - video.seconds[0] - video.numbers * length).max()
+        if self.step > 1 and uneven < length / 4:
+            select = f"lt(mod(t-{time - length / 2:.6f},{self.step * length:.9f}),{length:.6f})"
+        seek = time - float(video.seconds[0]) - 1.0
         if self._process is not None:
             self._end()
-        command = _command(video.path, self.pixels, "-f", "rawvideo", seek=seek)
+        command = _command(video.path, self.pixels, "-f", "rawvideo", select=select, seek=seek)
         self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
         self._end = weakref.finalize(self, _stop, self._process)
         self._at = self._before = number - 1

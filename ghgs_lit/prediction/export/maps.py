@@ -1,65 +1,67 @@
-"""Contents of files in common formats: depth maps, photographs, videos and cameras."""
+"""Contents of files in common formats: depth maps, photographs, cameras and point clouds."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from io import BytesIO
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from ghgs_lit.geometry.masks import unmultiplied
+from ghgs_lit.prediction.export.ply import vertices_ply
 from ghgs_lit.prediction.export.subject import ExportedSubject
 from ghgs_lit.visualization.pictures import to_uint8
 
+_LEVELS = 65535  # of a picture of 16 bits
 
-def png(picture: np.ndarray) -> bytes:
-    """A picture as PNG: [h, w, 3] or with alpha [h, w, 4] uint8."""
+
+def png(picture: np.ndarray, text: PngInfo | None = None) -> bytes:
+    """A picture as PNG: [h, w] uint16, [h, w, 3] or with alpha [h, w, 4] uint8."""
     content = BytesIO()
-    Image.fromarray(picture).save(content, format="PNG")
+    Image.fromarray(picture).save(content, format="PNG", pnginfo=text)
     return content.getvalue()
 
 
-# Without these, a player guesses matrix and range, and may show other colours.
-_COLORS = (
-    "-vf scale=out_color_matrix=bt709:out_range=tv -colorspace bt709 -color_primaries bt709 -color_trc bt709"
-)
+def depth_unit(largest: float) -> float:
+    """The length of one grey level of a depth picture: 0.001, or another power of ten if ``largest`` needs it
+    to fit into 16 bits and have at least 1000 levels."""
+    exponent = -3
+    while largest > _LEVELS * 10.0**exponent:
+        exponent += 1
+    while 0 < largest < 1000 * 10.0**exponent:
+        exponent -= 1
+    return 10.0**exponent
 
 
-def mp4_bytes(pictures: Sequence[np.ndarray], fps: int) -> bytes:
-    """The content of a video of pictures [h, w, 3] uint8; odd sides get another row or column."""
-    import imageio_ffmpeg
-
-    height, width = pictures[0].shape[:2]
-    padding = ((0, height % 2), (0, width % 2), (0, 0))
-    with TemporaryDirectory() as folder:
-        path = Path(folder, "video.mp4")
-        writer = imageio_ffmpeg.write_frames(
-            str(path),
-            (width + width % 2, height + height % 2),
-            fps=fps,
-            quality=8,
-            macro_block_size=2,
-            output_params=[*_COLORS.split(), "-movflags", "+faststart"],
-        )
-        writer.send(None)
-        for picture in pictures:
-            writer.send(np.ascontiguousarray(np.pad(picture, padding, mode="edge")))
-        writer.close()
-        return path.read_bytes()
-
-
-def depth_npz(subject: ExportedSubject) -> bytes:
-    """An NPZ with ``depth`` [V, H, W] (nan: none), ``intrinsics``, ``extrinsics`` and ``views``."""
+def depth_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
+    """Functions that make a 16-bit PNG of each view (0: no depth; the unit stands in the file), then an exact
+    NPZ with ``depth`` [V, H, W] (nan: none), ``intrinsics``, ``extrinsics`` and ``views``."""
     valid = subject.depth_valid.cpu().numpy()
     depth = np.where(valid, subject.depth.float().cpu().numpy(), np.float32(np.nan))
+    unit = depth_unit(float(np.max(depth, where=valid, initial=0)))
+    text = PngInfo()
+    text.add_text("Unit", f"{unit:g} (length of one grey level; 0: no depth)")
+    for values in depth:
+        yield partial(png, np.nan_to_num(np.round(values / unit)).astype(np.uint16), text)
     cameras = {name: getattr(subject.cameras, name).cpu().numpy() for name in ("intrinsics", "extrinsics")}
-    content = BytesIO()
-    np.savez_compressed(content, depth=depth, **cameras, views=np.array(subject.views))
-    return content.getvalue()
+
+    def exact() -> bytes:
+        content = BytesIO()
+        np.savez_compressed(content, depth=depth, **cameras, views=np.array(subject.views))
+        return content.getvalue()
+
+    yield exact
+
+
+def points_ply(subject: ExportedSubject) -> bytes:
+    """A PLY of the unprojected pixels of the subject with their colours."""
+    positions = subject.points.float().cpu().numpy()
+    colors = (subject.colors.float().clamp(0, 1) * 255).round().byte().cpu().numpy()
+    columns = dict(zip("xyz", positions.T, strict=True))
+    return vertices_ply(columns | dict(zip(("red", "green", "blue"), colors.T, strict=True)))
 
 
 def input_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:

@@ -1,6 +1,5 @@
 """The files of a prediction: one entry of ``FORMATS`` for each format."""
 
-import itertools
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,14 +15,18 @@ from ghgs_lit.geometry.frame import HEIGHT
 from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.metrics import psnr
 from ghgs_lit.metrics.functional import box_of
-from ghgs_lit.prediction.export.maps import depth_npz, input_files, mp4_bytes, png
+from ghgs_lit.prediction.export.compact import CONVERTED, converted, to_records
+from ghgs_lit.prediction.export.gltf import glb_bytes
+from ghgs_lit.prediction.export.instants import mp4_bytes
+from ghgs_lit.prediction.export.maps import depth_files, depth_unit, input_files, png, points_ply
 from ghgs_lit.prediction.export.page import page
 from ghgs_lit.prediction.export.ply import ply_bytes
 from ghgs_lit.prediction.export.reports import begin_files, end_files, write_file
 from ghgs_lit.prediction.export.subject import ExportedSubject, OutputOptions, exported_subject, file_names
+from ghgs_lit.prediction.export.unseen import unseen
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import versions
-from ghgs_lit.types import Batch, Prediction
+from ghgs_lit.types import Batch, Gaussians, Prediction
 from ghgs_lit.visualization.pictures import palette, sheet
 
 SHEET = "sheet.png"  #: The picture to look at
@@ -35,6 +38,8 @@ class Format:
 
     files: tuple[str, ...]  #: names; one for each ``{view}``, or ``{frame}`` of the turntable
     contents: Callable[[ExportedSubject], Iterable[Callable[[], bytes]]]
+    package: str | None = None  #: package that it needs
+    extra: str = "formats"  #: extra of this package that installs it
 
     def names(self, views: Sequence[str], frames: int) -> list[str]:
         """The names of all files."""
@@ -53,13 +58,31 @@ def _one(content: Callable[[ExportedSubject], bytes]) -> Callable[[ExportedSubje
     return lambda subject: [partial(content, subject)]
 
 
+def _of_viewers(content: Callable[[Gaussians], bytes]) -> Callable[[ExportedSubject], list]:
+    """Contents of one file from the Gaussians for other viewers, which are made before threads begin."""
+    return lambda subject: [partial(content, subject.for_other_renderers)]
+
+
 FORMATS: dict[str, Format] = {
     "ply": Format(("gaussians.ply",), _one(lambda s: ply_bytes(s.stored))),
-    "viewers": Format(("viewers.ply",), lambda s: [partial(ply_bytes, s.for_other_renderers)]),
+    **{
+        name: Format((f"gaussians.{suffix}",), _of_viewers(partial(converted, name)), "gaussforge")
+        for name, suffix in CONVERTED.items()
+    },
+    "splat": Format(("gaussians.splat",), _of_viewers(lambda g: to_records(g).tobytes())),
+    "glb": Format(
+        ("gaussians.glb",), lambda s: [partial(glb_bytes, s.for_other_renderers, s.up)], "pygltflib"
+    ),
     "html": Format(("viewer.html",), _one(lambda s: page(s, s.name).encode())),
     "turntable": Format(("turntable/{frame:03d}.png",), lambda s: (partial(png, p) for p in s.turntable)),
-    "mp4": Format(("turntable.mp4",), lambda s: [partial(mp4_bytes, s.turntable, s.options.fps)]),
-    "depth": Format(("depth.npz",), _one(depth_npz)),
+    "mp4": Format(
+        ("turntable.mp4",),
+        lambda s: [partial(mp4_bytes, s.turntable, s.options.fps)],
+        "imageio_ffmpeg",
+        "video",
+    ),
+    "depth": Format(("depth/{view}.png", "depth.npz"), depth_files),
+    "points": Format(("points.ply",), _one(points_ply)),
     "inputs": Format(("inputs/{view}.png", "cameras.json"), input_files),
 }
 
@@ -73,8 +96,8 @@ def output_options(config: Mapping[str, Any]) -> OutputOptions:
     formats = tuple(FORMATS) if "all" in formats else tuple(dict.fromkeys(formats))
     for name in formats:
         choice("formats", name, ("all", *FORMATS))
-    if "mp4" in formats:
-        installed("imageio_ffmpeg", "video", "formats=mp4")
+        if FORMATS[name].package is not None:
+            installed(FORMATS[name].package, FORMATS[name].extra, f"formats={name}")
     frames = config["turntable"]["frames"]
     require(frames > 0 or "mp4" not in formats, "turntable.frames", "at least 1 for formats=mp4", frames)
     return OutputOptions(formats, config["up"], config["smooth"], frames, config["turntable"]["fps"])
@@ -133,7 +156,8 @@ def write_prediction(
 def _report(subject: ExportedSubject) -> dict[str, Any]:
     gaussians, valid = subject.gaussians, subject.depth_valid
     lost = subject.masks & ~valid
-    image = subject.renderer(gaussians, subject.cameras[None]).image[0].clamp(0, 1)
+    drawn = subject.renderer(gaussians, subject.cameras[None])
+    image = drawn.image[0].clamp(0, 1)
     quality = psnr(image, subject.images, box_of(subject.masks)).tolist()
     means = gaussians.means if len(gaussians) else gaussians.means.new_full((1, 3), torch.nan)
     return {
@@ -148,16 +172,8 @@ def _report(subject: ExportedSubject) -> dict[str, Any]:
         "largest": means.amax(0).tolist(),
         "depths_not_finite": dict(zip(subject.views, lost.flatten(1).sum(1).tolist(), strict=True)),
         "depth_pixels": dict(zip(subject.views, valid.flatten(1).sum(1).tolist(), strict=True)),
+        "depth_png_unit": depth_unit(float(torch.where(valid, subject.depth, 0).max())),
         "psnr_box_of_inputs": dict(zip(subject.views, quality, strict=True)),
-        "cut": _cut(subject),
+        **unseen(subject, drawn.depth),
         "versions": versions(),
     }
-
-
-def _cut(subject: ExportedSubject) -> dict[str, list[str]]:
-    """By edge of the frame, the photographs whose mask reaches it."""
-    masks = subject.masks
-    lines = {"top": masks[:, 0], "bottom": masks[:, -1], "left": masks[..., 0], "right": masks[..., -1]}
-    touched = {edge: line.any(-1).tolist() for edge, line in lines.items()}
-    found = {edge: list(itertools.compress(subject.views, which)) for edge, which in touched.items()}
-    return {edge: names for edge, names in found.items() if names}

@@ -1,4 +1,4 @@
-"""``report.json`` marks a directory as that of a prediction, whose files may be replaced later."""
+"""``report.json`` of a directory lists the files of predictions; only those are replaced later."""
 
 import json
 import time
@@ -15,29 +15,34 @@ REPORT = "report.json"  #: The file that lists the others
 
 
 def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] = ()) -> None:
-    """Refuse to replace inputs, or files where no earlier prediction was. InputError: names the first."""
+    """Refuse to replace inputs, or ``names`` and a report of other origin. InputError: names the first."""
     read = {path.resolve() for path in inputs}
-    is_known = _has_report(directory)
+    written = _written_before(directory)
     for name in (*names, REPORT):
         path = directory / name
         expected = "another folder (out=...) than that of an input"
         require(path.resolve() not in read, str(path), expected, "the input")
-        expected = "no file, or the folder of an earlier prediction (out=... names another one)"
-        require(is_known or not path.exists(), str(path), expected, "another file")
+        expected = "no file, or one that an earlier prediction wrote (out=... names another folder)"
+        require(name in written or not path.exists(), str(path), expected, "another file")
 
 
-def begin_files(directory: Path, names: Sequence[str]) -> None:
-    """Write a report before the files, so that those of an interrupted run may be replaced, too. InputError:
-    a file of another origin is in the way."""
+def begin_files(directory: Path, names: Sequence[str]) -> list[str]:
+    """List files in the report before they are written, so that those of an interrupted run are known, too.
+    Returns: other files of earlier predictions. InputError: a file of another origin is in the way."""
     require_free(directory, names)
-    write_text_atomically(directory / REPORT, json.dumps({"files": dict.fromkeys(names)}, indent=1))
+    earlier = _beside(directory, names)
+    known = {"files": dict.fromkeys(names), "earlier_files": earlier}
+    write_text_atomically(directory / REPORT, json.dumps(known, indent=1))
+    return earlier
 
 
 def end_files(directory: Path, names: Sequence[str], report: Mapping[str, Any]) -> list[Path]:
     """Write the report, with the sizes of the files. Returns: their paths, that of the report last."""
     paths = [directory / name for name in names]
     sizes = {name: path.stat().st_size for name, path in zip(names, paths, strict=True)}
-    text = json.dumps(plain({**report, "files": sizes}), indent=1, allow_nan=False)
+    earlier = _beside(directory, names)
+    kept = {"earlier_files": earlier} if earlier else {}
+    text = json.dumps(plain({**report, "files": sizes, **kept}), indent=1, allow_nan=False)
     write_text_atomically(directory / REPORT, text)
     return [*paths, directory / REPORT]
 
@@ -50,9 +55,16 @@ def write_file(path: Path, content: Callable[[], bytes]) -> float:
     return time.perf_counter() - begin
 
 
-def _has_report(directory: Path) -> bool:
+def _beside(directory: Path, names: Sequence[str]) -> list[str]:
+    written = _written_before(directory)
+    return [name for name in written if name not in (REPORT, *names) and (directory / name).exists()]
+
+
+def _written_before(directory: Path) -> list[str]:
     try:
         report = read_json(directory / REPORT)
     except InputError:
-        return False
-    return isinstance(report, dict) and isinstance(report.get("files"), dict)
+        return []
+    if not isinstance(report, dict) or not isinstance(report.get("files"), dict):
+        return []
+    return [REPORT, *report["files"], *report.get("earlier_files", ())]

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.errors import choice, require
-from ghgs_lit.geometry.masks import coverage
+from ghgs_lit.geometry.masks import coverage, surface_colors
+from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.geometry.rotations import multiply_quaternions, quaternion_to_matrix
 from ghgs_lit.prediction.refinement import Change, Descent
 from ghgs_lit.rendering import Renderer
@@ -117,8 +118,9 @@ def fitted(theirs: Gaussians, ours: Gaussians, cameras: Sequence[Cameras], rende
 class ExportedSubject:
     """One subject. Lengths are in the unit of the cameras; ``up`` is the upward unit vector.
 
-    ``images`` are premultiplied by ``mattes`` (the masks, where there are none). ``dropped`` counts Gaussians
-    that are not finite, which no renderer draws and no file holds."""
+    ``images`` are premultiplied by ``mattes`` (the masks, where there are none). ``points`` are the subject's
+    unprojected pixels with their ``colors``; ``dropped`` counts Gaussians that are not finite, which no
+    renderer draws and no file holds."""
 
     name: str
     views: tuple[str, ...]
@@ -130,6 +132,8 @@ class ExportedSubject:
     mattes: Float[Tensor, "V H W"]
     depth: Float[Tensor, "V H W"]
     depth_valid: Bool[Tensor, "V H W"]
+    points: Float[Tensor, "n 3"]
+    colors: Float[Tensor, "n 3"]
     up: Float[Tensor, "3"]
     renderer: Renderer
     options: OutputOptions
@@ -147,7 +151,7 @@ class ExportedSubject:
 
     @cached_property
     def for_other_renderers(self) -> Gaussians:
-        """The Gaussians of the PLY for other viewers, fitted to our renders of inputs and all around."""
+        """The Gaussians of files without image constants, fitted to our renders of inputs and all around."""
         if self.options.smooth:
             return self.stored
         converted = for_other_renderers(self.gaussians, self.pixel)
@@ -208,6 +212,8 @@ def exported_subject(
         mattes=coverage(batch)[0],
         depth=depth,
         depth_valid=valid,
+        points=unproject_maps(depth, cameras)[valid],
+        colors=surface_colors(batch)[0].movedim(1, -1)[valid],
         up=up,
         renderer=renderer,
         options=options,

@@ -19,6 +19,8 @@ from ghgs_lit.prediction.viewer.content import Content
 from ghgs_lit.visualization.pictures import to_uint8
 from ghgs_lit.visualization.turntable import pixel_size
 
+PICTURES = ("render", "photograph", "FLIP")
+
 
 def _require_address(host: str) -> None:
     """Refuse an address that is not this machine's: viser would wait for it silently."""
@@ -79,6 +81,8 @@ class Viewer:
             self._place_visitors()
         if content.batch is not None and layers:
             self._add_cameras()
+            with self.server.gui.add_folder("Photographs"):
+                self._add_comparison()
         self.show_splats()
 
     @property
@@ -148,9 +152,10 @@ class Viewer:
             node.visible = box.value
 
     def _show_frustums(self) -> None:
-        """Show the cameras but that of the visitors, whose photograph would hide the subject."""
+        """Show the cameras; that of the visitors hides its photograph unless ``picture`` chooses it."""
         for view, frustum in enumerate(self._frustums):
-            frustum.visible = self.cameras.value and view != self._at
+            is_clear = view != self._at or self._shown == "photograph"
+            frustum.visible = self.cameras.value and is_clear
 
     def _add_cameras(self) -> None:
         from viser.transforms import SO3
@@ -197,5 +202,37 @@ class Viewer:
             with client.atomic():
                 client.camera.wxyz, client.camera.position = pose["wxyz"], pose["position"]
                 client.camera.fov = fov
+        self.view.value = self.content.batch.views[0][view]
         self._at = view
         self._show_frustums()
+
+    def _add_comparison(self) -> None:
+        gui, views = self.server.gui, self.content.batch.views[0]
+        self.view = gui.add_dropdown("view", views)
+        self.picture = gui.add_button_group("picture", PICTURES, hint="one after the other at one place")
+        self.text = gui.add_markdown("")
+        self._shown = PICTURES[0]
+        self._comparison = self.content.comparison(0)
+        self.image = gui.add_image(self._comparison[self._shown])
+        go = gui.add_button("go to this camera")
+        go.on_click(lambda _: self.go_to(views.index(self.view.value)))
+
+        def show() -> None:
+            self._show_frustums()
+            self.image.image = self._comparison[self._shown]
+            quality = "FLIP {flip:.4f}, PSNR {psnr:.2f} dB".format(**self._comparison)
+            self.text.content = f"{self._shown} of {self.view.value}; in the subject's box: {quality}"
+
+        @self.view.on_update
+        def _(_) -> None:
+            with self._lock:
+                self._comparison = self.content.comparison(views.index(self.view.value))
+                show()
+
+        @self.picture.on_click
+        def _(_) -> None:
+            with self._lock:
+                self._shown = self.picture.value
+                show()
+
+        show()

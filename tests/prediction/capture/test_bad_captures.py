@@ -132,6 +132,7 @@ BAD = {
     "unknown kind": (lambda p: write(p, "cams.csv", ""), "cams.csv: expected JSON", "found '.csv'"),
     "broken JSON": (lambda p: write(p, "c.json", "{"), "c.json: expected JSON; found"),
     "broken YAML": (lambda p: write(p, "c.yml", "a: [1"), "c.yml: expected YAML of OpenCV; found"),
+    "broken TOML": (lambda p: write(p, "c.toml", "[a"), "c.toml: expected TOML; found"),
     "no cameras": (
         lambda p: write(p, "c.json", "{}"),
         "c.json: expected cameras with intrinsics",
@@ -178,6 +179,7 @@ BAD = {
     ),
     "links in a loop": (lambda p: loop(p, "cam1.png"), "cam1.png: expected an image", "Too many levels"),
     "deep JSON": (lambda p: write(p, "c.json", "[" * 9999), "c.json: expected JSON", "recursion"),
+    "deep TOML": (lambda p: write(p, "c.toml", "a = " + "[" * 9999), "c.toml: expected TOML", "recursion"),
     "deep YAML": (lambda p: write(p, "c.yml", "a: " + "[" * 9999), "c.yml: expected YAML", "64 levels"),
     "billion laughs": (lambda p: write(p, "c.yml", LAUGHS), "c.yml: expected YAML", "a million values"),
     "alias of itself": (lambda p: write(p, "c.yml", "a: &a [*a]"), "c.yml: expected YAML", "an alias"),

@@ -1,9 +1,8 @@
 """Planted mistakes are named, with the option that mends them; right captures raise no alarm."""
 
-import re
-
 import numpy as np
 import pytest
+from PIL import Image
 
 from ghgs_lit.data.view import area_mask
 from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette
@@ -43,11 +42,12 @@ def test_a_mistake_of_all_cameras_is_mended_by_an_option(tmp_path, name):
 
 @pytest.mark.parametrize("name", ONE)
 def test_one_camera_that_disagrees_is_named(tmp_path, name):
-    figure, mistake = Figure(), ONE[name]
+    mistake, words = ONE[name]
+    figure = Figure()
     found = examine(tmp_path, {**figure.cameras, "cam2": mistake(figure.cameras["cam2"])}, figure)
     assert not found.consistent
     assert found.suspects == ("cam2",)
-    assert any("cam2 disagrees with the others" in line for line in found.lines)
+    assert any(words in line and "cam2" in line for line in found.lines)
 
 
 def test_exchanged_cameras_and_copies_are_named(tmp_path):
@@ -63,11 +63,12 @@ def test_exchanged_cameras_and_copies_are_named(tmp_path):
     assert "copy" in copied.lines[0]
 
 
-def test_exchanged_masks_look_like_exchanged_cameras(tmp_path):
+def test_exchanged_masks_are_told_from_exchanged_cameras(tmp_path):
+    """Both look alike to the hull; the outlines follow edges of the photographs."""
     figure = Figure()
     figure.masks = figure.masks[[0, 2, 1, 3]]
     found = examine(tmp_path, figure=figure)
-    assert found.lines[0].startswith("the cameras (or masks) of cam1 and cam2 are exchanged")
+    assert found.lines[0].startswith("the masks of cam1 and cam2 are exchanged")
     assert found.suspects == ("cam1", "cam2")
 
 
@@ -79,8 +80,7 @@ def test_units_are_reported(tmp_path, factor, words):
     found = examine(tmp_path, figure=figure)
     assert found.consistent
     assert words in found.lines[1]
-    said = float(re.match(r"the subject is (\S+) units tall", found.lines[1])[1])
-    assert said == pytest.approx(1.73 * factor, rel=0.06)
+    assert found.size == pytest.approx(1.73 * factor, rel=0.06)
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -113,15 +113,20 @@ def test_agreement_is_the_share_of_a_mask_within_the_hull(tmp_path):
     assert shares[[0, 2, 3]] == pytest.approx(below, abs=0.12)
 
 
-def test_the_picture_has_the_hull_on_the_mask(tmp_path):
+def test_the_picture_has_the_hull_on_the_mask_and_lines_through_the_body(tmp_path):
+    """In a right capture a line runs through the mask of the other photograph."""
     figure = Figure()
     figure.write(tmp_path)
     photographs = CaptureFolder(tmp_path, tmp_path / "cameras.json").photographs(tmp_path.name)
     views = [coarse(photograph, 128) for photograph in photographs]
     picture = camera_sheet(figure.names, [p.image for p in photographs], views)
-    assert picture.shape == (14 + 128, 4 * 96 + 3 * 2, 3)
-    hull = (picture[14:, :96] == (255, 60, 40)).all(-1)
+    assert picture.shape[1] == 4 * 96 + 3 * 2
+    assert Image.fromarray(picture).getcolors(1 << 20) is not None
+    first_row = picture[14 : 14 + 128, :96]
+    hull = (first_row == (255, 60, 40)).all(-1)
     grown = np.pad(figure.masks[0], 4)
     near = np.lib.stride_tricks.sliding_window_view(grown, (9, 9)).any((2, 3))
     assert hull.any()
     assert (hull & near).sum() > 0.3 * hull.sum()
+    line = (picture[14 + 130 + 14 :][:128, 98 : 98 + 96] == (160, 255, 120)).all(-1)  # of the middle point
+    assert (line & figure.masks[1]).any()

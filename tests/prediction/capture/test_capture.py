@@ -16,7 +16,6 @@ from ghgs_lit.geometry.projection import project
 from ghgs_lit.geometry.undistortion import undistorting_grid
 from ghgs_lit.metrics.functional import psnr
 from ghgs_lit.prediction.capture.folder import CaptureFolder
-from ghgs_lit.prediction.capture.frames import Frame as Decoded
 from ghgs_lit.prediction.capture.masks import matte_of_file
 from ghgs_lit.prediction.capture.photographs import Pixels
 from ghgs_lit.prediction.refinement import Refinement
@@ -285,18 +284,3 @@ def test_a_mask_of_the_stored_pixels_is_turned_as_its_photograph(tmp_path, turns
     for name, mask in (("stored", stored), ("shown", np.ascontiguousarray(shown))):
         Image.fromarray(mask).save(tmp_path / f"{name}.png")
         np.testing.assert_array_equal(matte_of_file(tmp_path / f"{name}.png", pixels), shown)
-
-
-def test_photographs_in_memory(tmp_path):
-    """Arrays in place of files, with their masks: the same capture."""
-    figure = Figure()
-    path = figure.write(tmp_path)
-    frames = {
-        name: Decoded(name, image, mask * np.uint8(255))
-        for name, image, mask in zip(figure.names, figure.images, figure.masks, strict=True)
-    }
-    found = CaptureFolder(frames, path).photographs("")
-    for one, other in zip(found, Capture.read(tmp_path, path).photographs, strict=True):
-        np.testing.assert_array_equal(one.image, other.image)
-        np.testing.assert_array_equal(one.matte, other.matte)
-        np.testing.assert_array_equal(one.extrinsics, other.extrinsics)

@@ -18,7 +18,7 @@ from ghgs_lit.prediction.capture.calibration import (
     quarter_turned,
 )
 from ghgs_lit.prediction.capture.formats import FORMATS, read_cameras
-from ghgs_lit.prediction.capture.formats.json_file import write_json
+from ghgs_lit.prediction.capture.formats.json_and_toml import write_json
 from tests.helpers.rigs import POINTS, SIZE, opencv_pixels, rig
 from tests.helpers.scenes import FIXTURES
 
@@ -140,25 +140,21 @@ def test_nerfstudio_with_an_angle_of_view(tmp_path):
     np.testing.assert_allclose(found.intrinsics, [[1000, 0, 400], [0, 1000, 300], [0, 0, 1]])
 
 
-def json_of_opencv(tmp_path):
-    cameras = {
-        name: {key: value.tolist() for key, value in c.items()} | {"width": SIZE[1], "height": SIZE[0]}
-        for name, c in rig().items()
-    }
-    (tmp_path / "cameras.json").write_text(json.dumps(cameras))
-    return cameras
+def test_anipose_and_pose2sim():
+    check(FIXTURES / "cameras" / "anipose.toml", "toml")
 
 
 def test_json_of_opencv_matrices(tmp_path):
-    cameras = json_of_opencv(tmp_path)
+    cameras = {name: {key: value.tolist() for key, value in c.items()} for name, c in rig().items()}
+    (tmp_path / "cameras.json").write_text(json.dumps(cameras))
     check(tmp_path / "cameras.json", "opencv")
     (tmp_path / "cameras.json").write_text(json.dumps({"cameras": cameras, "units": "metre"}))
-    check(tmp_path / "cameras.json", "opencv")
+    with pytest.warns(UserWarning, match="entries that are not read: units"):
+        check(tmp_path / "cameras.json", "opencv")
 
 
 def test_own_json_comes_back(tmp_path):
-    json_of_opencv(tmp_path)
-    read = read_cameras(tmp_path / "cameras.json")
+    read = read_cameras(FIXTURES / "cameras" / "anipose.toml")
     calibrations = {n: (calibrate(c, read.convention, SIZE), SIZE) for n, c in read.cameras.items()}
     write_json(tmp_path / "cameras.json", calibrations)
     check(tmp_path / "cameras.json", "ghgs")
@@ -166,9 +162,8 @@ def test_own_json_comes_back(tmp_path):
     assert {(camera["height"], camera["width"]) for camera in stored.values()} == {SIZE}
 
 
-def test_a_photograph_of_another_size_scales_the_intrinsics(tmp_path):
-    json_of_opencv(tmp_path)
-    found = read_cameras(tmp_path / "cameras.json")
+def test_a_photograph_of_another_size_scales_the_intrinsics():
+    found = read_cameras(FIXTURES / "cameras" / "anipose.toml")
     half = calibrate(found.cameras["cam_02"], found.convention, (SIZE[0] // 2, SIZE[1] // 2))
     assert np.abs(projected(half) - expected(rig()["cam_02"]) / 2).max() < 0.01
     with pytest.raises(InputError, match=r"cam_02: expected a photograph of 854x640 .*found 640x854"):

@@ -116,10 +116,7 @@ REFUSED = {
     "nothing before the start": ({"start": 3, "stop": 2}, "from 3 to 2"),
     "no step": ({"step": 0}, r"sequence\.step: expected an integer >= 1; found 0"),
     "no such key": ({"skip": 1}, "sequence key: expected one of .*found 'skip'"),
-    "no offsets": (
-        {"sync": "nowhere.csv"},
-        r"sequence\.sync: expected a mapping of cameras to frames or null",
-    ),
+    "no such file": ({"sync": "nowhere.csv"}, r"nowhere\.csv: expected"),
 }
 
 

@@ -11,11 +11,13 @@ from PIL import Image
 
 from ghgs_lit import Capture
 from ghgs_lit.errors import InputError
+from ghgs_lit.prediction.capture.calibration import calibrate
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.formats import read_cameras
 from ghgs_lit.prediction.capture.masks import matte_of_file
 from ghgs_lit.prediction.capture.photographs import Pixels
 from tests.helpers.figures import Figure
+from tests.helpers.rigs import POINTS, SIZE, opencv_pixels, rig
 
 CAMERA = {"K": [[1000, 0, 320], [0, 1000, 240], [0, 0, 1]], "R": np.eye(3).tolist(), "T": [0, 0, 3]}
 LENS = [-0.35, 0.12, 0.001, -0.0005, 0.01]
@@ -68,6 +70,13 @@ def test_a_lens_of_single_numbers_counts(tmp_path):
 def test_a_lens_that_is_not_read_is_refused(tmp_path, entries, line):
     with pytest.raises(InputError, match=line):
         one_camera(tmp_path, **entries)
+
+
+def test_other_entries_that_are_not_read_are_named(tmp_path):
+    content = {"cameras": {"a": CAMERA | {"colour": 3}, "b": {}}, "units": "cm"}
+    with pytest.warns(UserWarning, match="cameras: entries that are not read: ") as shown:
+        read_cameras(write(tmp_path / "cameras.json", content))
+    assert [str(warning.message).rpartition(": ")[2] for warning in shown] == ["units", "colour", "b"]
 
 
 def frame(name, **entries):
@@ -162,14 +171,77 @@ def colmap(tmp_path, *images):
     return tmp_path
 
 
+def test_names_with_spaces_in_colmaps_text(tmp_path):
+    cameras = read_cameras(colmap(tmp_path, (1, "front view 1.jpg"), (1, "front view 2.jpg"))).cameras
+    assert {name: camera.pose[0, 3] for name, camera in cameras.items()} == {
+        "front view 1": 1,
+        "front view 2": 2,
+    }
+
+
 def test_a_photograph_of_an_unknown_camera_of_colmap(tmp_path):
     with pytest.raises(InputError, match=r"expected a COLMAP model; found Rig with ID 2 does not exist"):
         read_cameras(colmap(tmp_path, (1, "a.jpg"), (2, "b.jpg")))
 
 
+def test_caliscope(tmp_path):
+    """Tables below ``cameras``; a camera that was left out has no matrices."""
+    text = "".join(
+        f"[cameras.{n}]\nport = {n}\nrotation_count = 0\nsize = [640, 480]\nmatrix = {CAMERA['K']}\n"
+        f"distortions = {LENS}\ntranslation = {CAMERA['T']}\nrotation = [0.0, 0.1, 0.0]\n"
+        for n in (1, 2)
+    )
+    path = write(tmp_path / "camera_array.toml", "[cameras.0]\nport = 0\nignore = true\n" + text)
+    with pytest.warns(UserWarning, match="entries that are not read: 0"):
+        cameras = read_cameras(path).cameras
+    assert list(cameras) == ["1", "2"]
+    assert cameras["1"].size == (480, 640)
+
+
 def test_marks_of_windows_editors(tmp_path):
     (tmp_path / "a.json").write_text(json.dumps({"a": CAMERA}), encoding="utf-8-sig")
     assert list(read_cameras(tmp_path / "a.json").cameras) == ["a"]
+
+
+QUALISYS = """<calibration><cameras><camera serial="{name}">
+<fov_video left="0" top="0" right="{right}" bottom="{bottom}"/>
+<transform x="{x}" y="{y}" z="{z}" {turn}/>
+<intrinsic focalLengthU="{fx}" focalLengthV="{fy}" centerPointU="{cx}" centerPointV="{cy}"
+ radialDistortion1="{k1}" radialDistortion2="{k2}" radialDistortion3="{k3}"
+ tangentalDistortion1="{p1}" tangentalDistortion2="{p2}"/>
+</camera></cameras></calibration>"""
+
+
+def test_qualisys(tmp_path):
+    """Millimetres, 1/64 pixels, y up and z backward, as its own program writes them."""
+    for name, camera in rig().items():
+        eye = -1000 * camera["R"].T @ camera["T"]
+        turn = np.diag([1, -1, -1]) @ camera["R"]
+        lens = dict(zip(("k1", "k2", "p1", "p2", "k3"), camera["D"], strict=True))
+        k = 64 * camera["K"]
+        text = QUALISYS.format(
+            name=name, right=SIZE[1] - 1, bottom=SIZE[0] - 1,
+            turn=" ".join(f'r{i + 1}{j + 1}="{turn[i, j]}"' for i in range(3) for j in range(3)),
+            **dict(zip("xyz", eye, strict=True)), **lens,
+            fx=k[0, 0], fy=k[1, 1], cx=k[0, 2], cy=k[1, 2],
+        )  # fmt: skip
+        file = read_cameras(write(tmp_path / "Calib.qca.txt", text))
+        c = calibrate(file.cameras[name], file.convention, SIZE)
+        pixels = opencv_pixels(POINTS, c.extrinsics[:3, :3], c.extrinsics[:3, 3], c.intrinsics, c.distortion)
+        expected = opencv_pixels(POINTS, camera["R"], camera["T"], camera["K"], camera["D"]) + 0.5
+        assert np.abs(pixels - expected).max() < 0.01
+    with pytest.raises(
+        InputError, match=r"Calib\.qca\.txt: expected cameras of Qualisys; found KeyError..focalLengthU"
+    ):
+        read_cameras(write(tmp_path / "Calib.qca.txt", text.replace("focalLengthU", "other")))
+
+
+def test_video_of_1080_pixels_of_a_sensor_of_1088(tmp_path):
+    camera = one_camera(tmp_path, width=1088, height=1920)
+    file = read_cameras(tmp_path / "cameras.json")
+    assert calibrate(camera, file.convention, (960, 540)).intrinsics[0, 0] == pytest.approx(500)
+    with pytest.raises(InputError, match="expected a photograph of 1920x1088"):
+        calibrate(camera, file.convention, (960, 500))
 
 
 @pytest.fixture

@@ -7,16 +7,18 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.capture import rig as rig_module
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
-from ghgs_lit.prediction.capture.formats.json_file import json_text
+from ghgs_lit.prediction.capture.formats.json_and_toml import json_text
 from ghgs_lit.prediction.capture.predict import predict
-from ghgs_lit.prediction.capture.rig import Rig, corrected_rig, shared_gains
+from ghgs_lit.prediction.capture.rig import Rig, corrected_rig, shared_gains, turned_from
 from ghgs_lit.rendering import Renderer
+from tests.helpers.cameras import camera_ring
 from tests.helpers.figures import Figure
 
 NAMES = [f"cam{v}" for v in range(4)]
@@ -254,3 +256,23 @@ def test_exposures_that_change_are_left_to_each_instant(tmp_path, monkeypatch, m
         seen = change * logs + noise * torch.randn(8, 4, 3)
         monkeypatch.setattr(rig_module, "log_gains", lambda gaussians, batch, seen=seen: seen)
         assert (shared_gains(batch, model) is None) == bool(change)
+
+
+def looking(*yaws, raised=0.4):
+    """Poses [n, 4, 4] of cameras around a place at these degrees."""
+    rings = [camera_ring(1, 90, 90, 1, (90.0, 90.0), raised=raised, start=yaw) for yaw in yaws]
+    return np.stack([ring.extrinsics[0, 0].double().numpy() for ring in rings])
+
+
+def test_cameras_of_a_rig_are_known_in_any_world_order_and_number():
+    """Also where photographs are turned upright; others by as many degrees as they are off."""
+    rig, world, quarter = looking(0, 70, 200, 250), np.eye(4), np.eye(4)
+    world[:3, :3], world[:3, 3] = Rotation.random(random_state=3).as_matrix(), [1.0, -2.0, 0.5]
+    quarter[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    for same_rig in (rig, rig[::-1], rig[1:], rig[[2]], quarter @ rig):
+        assert turned_from(rig, same_rig @ world) < 0.1
+    off = looking(0, 90, 200, 250)
+    between = np.degrees(Rotation.from_matrix(off[1, :3, :3] @ rig[1, :3, :3].T).magnitude())
+    assert turned_from(rig, off @ world) == pytest.approx(between, abs=0.1)
+    assert turned_from(rig, looking(0, -70, -200, -250) @ world) > 15  # a mirrored rig is another one
+    assert turned_from(rig, looking(0, 70, 200, 250, raised=1.6) @ world) > 10

@@ -1,5 +1,6 @@
 """Videos of a sequence: right ones and what goes wrong in them."""
 
+import csv
 import shutil
 import subprocess
 import sys
@@ -66,12 +67,14 @@ def test_frames_that_were_cut_off_do_not_count(tmp_path):
 
 
 def test_a_long_video_is_sought(tmp_path):
+    """Also where one frame of many is decoded at a time."""
     rng = np.random.default_rng(0)
     order = rng.permutation(400) % 7
     write_video(tmp_path / "a.mp4", (np.full((16, 16, 3), 30 * n, np.uint8) for n in order), fps=20)
     video = read_video(tmp_path / "a.mp4")
-    reader, wanted = Reader(video, "gray"), (350, 20, 21, 399, 0)
-    assert [round(float(reader.frame(n).mean()) / 30) for n in wanted] == [order[n] for n in wanted]
+    for step, wanted in ((1, (350, 20, 21, 399, 0)), (25, (50, 75, 325, 350, 0))):
+        reader = Reader(video, "gray", step)
+        assert [round(float(reader.frame(n).mean()) / 30) for n in wanted] == [order[n] for n in wanted]
 
 
 def test_a_frame_that_a_camera_dropped_shifts_no_other(place):
@@ -118,7 +121,7 @@ def test_another_size_of_a_mask_video(place, capsys):
 
 def test_another_rate(place):
     write_video(place / "images" / "cam3.mp4", frames_of(3), fps=15)
-    line = r"images: expected videos of as many frames a second; found .*'cam2': 10\.0, 'cam3': 15\.0"
+    line = r"sequence\.sync: expected as many frames a second .*found .*'cam2': 10\.0, 'cam3': 15\.0"
     with pytest.raises(InputError, match=line):
         opened(place)
 
@@ -201,6 +204,58 @@ def test_offsets(place):
     assert found == {f"{n:06d}": alike(n) | {"cam1": n + 2} for n in range(4)}
     found = all_numbers(opened(place, sequence={"sync": {"cam1": -2, "cam2": 1}}))
     assert found == {f"{n:06d}": alike(n) | {"cam1": n - 2, "cam2": n + 1} for n in (2, 3, 4)}
+
+
+def write_csv(place, rows, header=("camera", "frame", "seconds")):
+    with (place / "times.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([header, *rows])
+    return {"sync": str(place / "times.csv")}
+
+
+def test_time_stamps(place):
+    """The nearest frame; a frame that is too far is missing, and its instant is predicted without it."""
+    late = {"cam0": 0.0, "cam1": 0.04, "cam2": -0.2, "cam3": 0.0}
+    rows = [(c, n, n / FPS + late[c]) for c in FIGURE.names for n in range(FRAMES) if (c, n) != ("cam3", 2)]
+    found = all_numbers(opened(place, sequence=write_csv(place, rows)))
+    assert found == {
+        f"{n:06d}": {name: n + 2 * (name == "cam2") for name in FIGURE.names if (name, n) != ("cam3", 2)}
+        for n in range(4)
+    }
+
+
+def test_time_stamps_say_how_rates_fit(place):
+    write_video(place / "images" / "cam3.mp4", frames_of(3, 3), fps=FPS // 2)
+    write_video(place / "masks" / "cam3.mp4", [mask(3)] * 3)
+    rows = [(c, n, n / FPS * (2 if c == "cam3" else 1)) for c in FIGURE.names for n in range(FRAMES)]
+    found = all_numbers(opened(place, sequence=write_csv(place, rows)))
+    assert found["000004"] == alike(4) | {"cam3": 2}
+    assert found["000003"] == alike(3, ["cam0", "cam1", "cam2"])
+
+
+ROWS = [(name, n, n / FPS) for name in FIGURE.names for n in range(FRAMES)]
+WRONG = {
+    "a camera is missing": (ROWS[:-FRAMES], "the times of cam0, cam1, cam2, cam3"),
+    "other names": ([("left", n, t) for _, n, t in ROWS], "the times of .*found 'left'"),
+    "one more": ([*ROWS, ("cam9", 0, 0.0)], "the times of cam0, .*found '.*cam9'"),
+    "no number": ([*ROWS, ("cam0", "x", 0.0)], "camera,frame,seconds with numbers; found"),
+    "no time": ([*ROWS, ("cam0", 3, "nan")], "camera,frame,seconds with numbers; found"),
+    "no frame": ([*ROWS, ("cam0", "", 0.3)], "camera,frame,seconds with numbers; found"),
+    "a part of a line": ([*ROWS, ("cam0",)], "camera,frame,seconds with numbers; found"),
+    "nothing": ([], "the times of cam0, cam1, cam2, cam3; found ''"),
+    "no shared time": ([(c, n, t + 9 * (c == "cam1")) for c, n, t in ROWS], "times that all cameras share"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_time_stamps(place, name):
+    rows, line = WRONG[name]
+    with pytest.raises(InputError, match=rf"times\.csv: expected .*{line}"):
+        opened(place, sequence=write_csv(place, rows))
+
+
+def test_other_columns(place):
+    with pytest.raises(InputError, match=r"times\.csv: expected camera,frame,seconds"):
+        opened(place, sequence=write_csv(place, ROWS, ("camera", "frame", "time")))
 
 
 def test_videos_without_ffmpeg(place, monkeypatch):

@@ -5,23 +5,30 @@ import io
 import json
 import re
 import subprocess
+import weakref
 from types import SimpleNamespace
 
 import numpy as np
+import pygltflib
 import pytest
 import torch
+import trimesh
 from gaussforge import GaussForge
 from imageio_ffmpeg import get_ffmpeg_exe, read_frames
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
+from ghgs_lit.errors import InputError
 from ghgs_lit.metrics import psnr
-from ghgs_lit.prediction.export.maps import input_files, mp4_bytes
-from ghgs_lit.prediction.export.page import page
-from ghgs_lit.prediction.export.ply import ply_bytes, read_ply
+from ghgs_lit.prediction.export.compact import CONVERTED, converted, to_records
+from ghgs_lit.prediction.export.gltf import EXTENSION, glb_bytes
+from ghgs_lit.prediction.export.instants import mp4_bytes
+from ghgs_lit.prediction.export.maps import input_files
+from ghgs_lit.prediction.export.page import page, unpack
+from ghgs_lit.prediction.export.ply import SH_CONSTANT, ply_bytes, read_ply
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Gaussians
 from ghgs_lit.visualization.turntable import pixel_size
-from tests.helpers.packed import unpack
 from tests.helpers.splats import body, camera_ring
 
 UP = torch.tensor([0.0, -1.0, 0.0])
@@ -44,6 +51,65 @@ def read_back(data: bytes, name: str, path) -> Gaussians:
     """The content of a file as gaussforge reads it."""
     path.write_bytes(GaussForge().convert(data, name, "ply")["data"])
     return read_ply(path)
+
+
+# What is lost is quantization; a wrong axis, order or unit is below 25 dB.
+@pytest.mark.parametrize(("name", "least"), [("compressed_ply", 45), ("spz", 45), ("sog", 55)])
+def test_compact_files_render_alike(gaussians, name, least, tmp_path):
+    ply = ply_bytes(gaussians)
+    content = converted(name, gaussians)
+    assert len(content) < len(ply) / 2
+    assert decibels(read_back(content, CONVERTED[name], tmp_path / "a.ply"), gaussians) > least
+
+
+def test_a_splat_file_renders_alike_and_begins_with_large_gaussians(gaussians, tmp_path):
+    records = to_records(gaussians)
+    assert records.nbytes == 32 * len(gaussians)
+    read = read_back(records.tobytes(), "splat", tmp_path / "a.ply")
+    assert decibels(read, gaussians) > 50
+    found, wanted = (
+        torch.nn.functional.normalize(g.quaternions[g.means[:, 0].argsort()], dim=-1)
+        for g in (read, gaussians)
+    )
+    assert (found * wanted).sum(-1).abs().min() > 0.9998  # two degrees
+    size = records["scale"].astype(np.float64).prod(-1) * records["color"][:, 3]
+    assert size[:500].mean() > 2 * size[-500:].mean()
+
+
+def test_a_glb_has_the_khronos_extension_and_stands_upright(gaussians, tmp_path):
+    """Linear scales, opacities, xyzw, SH; lossless; the node turns the world's up to glTF's +y."""
+    (tmp_path / "a.glb").write_bytes(glb_bytes(gaussians, UP))
+    model = pygltflib.GLTF2().load(tmp_path / "a.glb")
+    primitive, blob = model.meshes[0].primitives[0], model.binary_blob()
+    assert model.extensionsUsed == [EXTENSION]
+    assert primitive.mode == pygltflib.POINTS
+    assert primitive.extensions[EXTENSION]["kernel"] == "ellipse"
+
+    def column(name: str) -> torch.Tensor:
+        accessor = model.accessors[vars(primitive.attributes)[name]]
+        view = model.bufferViews[accessor.bufferView]
+        assert view.byteOffset % 4 == 0
+        data = blob[view.byteOffset : view.byteOffset + view.byteLength]
+        return torch.from_numpy(np.frombuffer(data, "<f4").reshape(accessor.count, -1).copy())
+
+    read = Gaussians(
+        means=column("POSITION"),
+        quaternions=column(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]],
+        scales=column(f"{EXTENSION}:SCALE"),
+        opacities=column(f"{EXTENSION}:OPACITY")[:, 0],
+        colors=column(f"{EXTENSION}:SH_DEGREE_0_COEF_0") * SH_CONSTANT + 0.5,
+        splits=gaussians.splits,
+    )
+    assert decibels(read, gaussians) > 80
+    turned = Rotation.from_quat(model.nodes[0].rotation).apply(UP.numpy())
+    assert np.allclose(turned, [0, 1, 0], atol=1e-6)
+    cloud = trimesh.load(tmp_path / "a.glb").to_geometry()  # as points, for programs without the extension
+    upright = gaussians.means.numpy() * [1, -1, -1]
+    assert np.allclose(np.sort(cloud.vertices[:, 1]), np.sort(upright[:, 1]), atol=1e-5)
+    colors = (gaussians.colors.clamp(0, 1) * 255).round().numpy()
+    assert np.array_equal(cloud.colors[:, :3], colors)
+    with pytest.raises(InputError, match="at least one Gaussian; found 0"):
+        glb_bytes(gaussians.select(slice(0, 0), (0,)), UP)
 
 
 def test_a_ply_is_lossless(gaussians, tmp_path):
@@ -70,6 +136,23 @@ def test_a_page_holds_the_scene_and_needs_no_network(gaussians, tmp_path):
     data = base64.b64decode(parts["data"])
     found = unpack(data, scene["pixel"], torch.tensor(scene["target"]), scene["steps"], gaussians)
     assert decibels(found, gaussians) > 50
+
+
+def test_a_long_video_is_not_in_memory_as_a_whole():
+    """A picture is made when the one before is written."""
+    made, alive = [], []
+
+    def pictures():
+        for number in range(20):
+            picture = np.full((16, 16, 3), 10 * number, np.uint8)
+            made.append(weakref.ref(picture))
+            yield picture
+            del picture
+            alive.append(sum(ref() is not None for ref in made))
+
+    assert mp4_bytes(pictures(), 10)
+    assert len(alive) == 20
+    assert max(alive) <= 2
 
 
 def test_a_video_shows_the_pictures_in_their_colors(tmp_path):

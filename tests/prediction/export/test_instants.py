@@ -9,6 +9,7 @@ import zlib
 import numpy as np
 import pytest
 import torch
+from imageio_ffmpeg import read_frames
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.prediction.export import Instants, OutputOptions, require_free, write_prediction
@@ -77,8 +78,21 @@ def test_a_page_plays_the_instants_and_numbered_plys_are_theirs(tmp_path):
     assert list(sizes) == ["viewer.html", *(f"sequence/000{number}.ply" for number in range(3))]
 
 
+def test_the_video_shows_all_of_a_subject_that_walks_away(tmp_path):
+    """In the middle of every picture, not cut, and not from one side alone."""
+    write(tmp_path, walk(4), "mp4")
+    _, *frames = read_frames(str(tmp_path / "instants.mp4"))
+    pictures = [np.frombuffer(frame, np.uint8).reshape(720, 720, 3).max(-1) for frame in frames]
+    assert len(pictures) == 4
+    for picture in pictures:
+        rows, columns = np.nonzero(picture > 60)
+        assert np.allclose([rows.mean(), columns.mean()], 360, atol=24)
+        assert max(border.max() for border in (picture[0], picture[-1], picture[:, 0], picture[:, -1])) < 30
+    assert np.abs(pictures[0].astype(int) - pictures[1]).max() > 100
+
+
 def test_files_of_another_origin_stay(tmp_path):
-    """An output replaces no input and no file elsewhere; those of a longer sequence before are removed."""
+    """An output replaces no input and nobody's file; those of a longer sequence before are removed."""
     instants = walk(3)
     write(tmp_path, instants, "ply")
     assert {*(path.name for path in (tmp_path / "sequence").iterdir())} == {f"000{n}.ply" for n in range(3)}
@@ -86,14 +100,15 @@ def test_files_of_another_origin_stay(tmp_path):
     write(tmp_path, instants[:2], "ply", "html")
     kept = {"0000.ply", "0001.ply", "mine.ply"}
     assert {*(path.name for path in (tmp_path / "sequence").iterdir())} == kept
-    together = Instants(2, OutputOptions(("html",), fps=4))
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "viewer.html").write_text("somebody's")
-    with pytest.raises(InputError, match=r"viewer\.html: expected no file, or the folder of an earlier"):
-        require_free(tmp_path / "other", together.files)
+    write(tmp_path, instants[:2], "ply")
+    (tmp_path / "instants.mp4").write_text("somebody's")
+    options = OutputOptions(("html", "mp4"), fps=4)
+    together = Instants(2, options)
+    with pytest.raises(InputError, match=r"instants\.mp4: expected no file, or one that an earlier"):
+        require_free(tmp_path, together.files)
     with pytest.raises(InputError, match=r"viewer\.html: expected another folder .* than that of an input"):
         require_free(tmp_path, together.files, [tmp_path / "viewer.html"])
-    require_free(tmp_path, ["viewer.html"])
+    require_free(tmp_path, ["viewer.html"])  # that of the run before the last
 
 
 def test_instants_without_files_of_all_get_none(tmp_path):
@@ -102,12 +117,12 @@ def test_instants_without_files_of_all_get_none(tmp_path):
 
 
 def test_an_empty_instant_does_not_end_the_sequence(tmp_path):
-    """Nobody in the photographs of one instant: the page has none there."""
+    """Nobody in the photographs of one instant: the page has none there, the video a black picture."""
     instants = walk(3)
     batch, prediction = instants[1]
     nothing = prediction.gaussians.select(slice(0, 0), (0,))
     instants[1] = (batch, dataclasses.replace(prediction, gaussians=nothing))
-    write(tmp_path, instants, "html")
-    data = re.search(r'id="data">(.*?)</script>', (tmp_path / "viewer.html").read_text(), re.S)[1]
-    counts = [len(zlib.decompress(base64.b64decode(line))) // 22 for line in data.split("\n")]
-    assert counts == [1500, 0, 1300]
+    write(tmp_path, instants, "html", "mp4")
+    _, *frames = read_frames(str(tmp_path / "instants.mp4"))
+    brightest = [np.frombuffer(frame, np.uint8).max() for frame in frames]
+    assert brightest[1] < 20 < 100 < min(brightest[0], brightest[2])

@@ -14,9 +14,8 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from ghgs_lit.prediction.export.page import COARSE, FINE, pack
+from ghgs_lit.prediction.export.page import COARSE, FINE, pack, unpack
 from ghgs_lit.types import Gaussians
-from tests.helpers.packed import unpack
 from tests.helpers.splats import body
 
 PIXEL, CENTER = 0.01, torch.tensor([0.1, -0.2, 30.0])

@@ -9,17 +9,19 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+import trimesh
 from gaussforge import GaussForge
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
-from ghgs_lit.cli.predict import advice_of
 from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.projection import project
 from ghgs_lit.metrics import psnr
 from ghgs_lit.metrics.functional import box_of
 from ghgs_lit.prediction.capture.calibration import calibrate
-from ghgs_lit.prediction.capture.formats.json_file import read_json
+from ghgs_lit.prediction.capture.formats.json_and_toml import read_json
 from ghgs_lit.prediction.export import OutputOptions, output_options, write_prediction
+from ghgs_lit.prediction.export.maps import depth_unit
 from ghgs_lit.prediction.export.ply import read_ply
 from ghgs_lit.prediction.export.subject import (
     AXES,
@@ -54,11 +56,11 @@ def subject():
 
 
 def test_everything_is_written_and_reported(subject, tmp_path):
-    """The report names each file with its size; other programs read depths and photographs."""
+    """The report names each file with its size; other programs read depths, points and photographs."""
     batch, prediction = subject
     depth = prediction.depth.detach() + torch.rand(batch.masks.shape)
     prediction = dataclasses.replace(prediction, depth=depth)
-    options = OutputOptions(("ply", "turntable", "depth", "inputs"), frames=2)
+    options = OutputOptions(("ply", "turntable", "depth", "points", "inputs"), frames=2)
     paths = write_prediction(tmp_path, batch, prediction, Renderer(), options, {"seconds": {"predict": 1}})
     report = json.loads((tmp_path / "report.json").read_text())
     written = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
@@ -68,9 +70,21 @@ def test_everything_is_written_and_reported(subject, tmp_path):
     assert {f"write {name}" for name in options.formats} < set(report["seconds"])
     valid = batch.masks[0].numpy()
     depth = depth[0].numpy()
+    unit = report["depth_png_unit"]
+    picture = iio.imread(tmp_path / "depth" / "001_0.png")
+    assert picture.dtype == np.uint16
+    assert np.abs(picture * unit - np.where(valid[1], depth[1], 0)).max() <= unit / 2 * 1.001
     exact = np.load(tmp_path / "depth.npz")
     assert np.array_equal(exact["depth"][valid], depth[valid])
     assert np.isnan(exact["depth"][~valid]).all()
+    points = trimesh.load(tmp_path / "points.ply")
+    camera, positions = batch.cameras[0, 0], torch.tensor(np.asarray(points.vertices)).float()
+    pixels, z = project(positions, camera.intrinsics, camera.extrinsics)
+    count, (rows, columns) = valid[0].sum(), valid[0].nonzero()
+    assert np.allclose(pixels[:count], np.stack([columns, rows], -1) + 0.5, atol=1e-3)
+    assert np.allclose(z[:count], depth[0][valid[0]], atol=1e-5)
+    colors = batch.images[0].movedim(1, -1).numpy()[valid]
+    assert np.abs(points.colors[:, :3] / 255 - colors).max() <= 0.5 / 255 * 1.001
     photograph = iio.imread(tmp_path / "inputs" / "000_0.png")
     assert np.array_equal(photograph[..., 3] > 0, valid[0])
     cameras = json.loads((tmp_path / "cameras.json").read_text())["cameras"]
@@ -93,9 +107,9 @@ def test_mattes_are_the_alpha_of_the_photographs(subject, tmp_path):
 
 
 def test_up_turns_everything_and_changes_no_picture(subject, tmp_path):
-    """With up=z the cameras' up is +z; Gaussians and cameras fit one another as before."""
+    """With up=z the cameras' up is +z; Gaussians, points and cameras fit one another as before."""
     batch, prediction = subject
-    options = OutputOptions(("ply", "inputs"), up="z")
+    options = OutputOptions(("ply", "points", "inputs"), up="z")
     write_prediction(tmp_path, batch, prediction, Renderer(), options)
     gaussians, own = read_ply(tmp_path / "gaussians.ply"), batch.cameras[0]
     written = json.loads((tmp_path / "cameras.json").read_text())["cameras"].values()
@@ -106,6 +120,10 @@ def test_up_turns_everything_and_changes_no_picture(subject, tmp_path):
     before = render(prediction.gaussians, batch.cameras, backend="reference").image
     after = render(gaussians, cameras[None], backend="reference").image
     assert torch.allclose(before, after, atol=1e-4)
+    points = torch.tensor(np.asarray(trimesh.load(tmp_path / "points.ply").vertices)).float()
+    count = int(batch.masks[0, 0].sum())
+    pixels, _ = project(points[:count], cameras.intrinsics[0], cameras.extrinsics[0])
+    assert torch.allclose(pixels.round(decimals=2) % 1, torch.tensor(0.5), atol=0.02)
 
 
 @pytest.mark.parametrize("end", AXES)
@@ -126,6 +144,12 @@ def test_a_world_is_turned_as_scipy_turns_it(up, end):
     assert torch.allclose(*images, atol=1e-4)
 
 
+@pytest.mark.parametrize(("largest", "unit"), [(2.5, 1e-3), (300.0, 1e-2), (0.3, 1e-4), (0.0, 1e-3)])
+def test_depths_of_any_scale_fit_into_16_bits(largest, unit):
+    assert depth_unit(largest) == pytest.approx(unit)
+    assert largest / depth_unit(largest) <= 65535
+
+
 def test_gaussians_that_are_not_finite_are_counted_and_left_out(subject, tmp_path):
     """A viewer fails on a file with NaN; our renderer does not draw such Gaussians."""
     batch, prediction = subject
@@ -141,7 +165,7 @@ def test_a_subject_without_gaussians_is_written(subject, tmp_path):
     """Empty masks give empty files and a report without numbers."""
     batch, _ = subject
     batch = dataclasses.replace(batch, masks=torch.zeros_like(batch.masks), targets=None)
-    options = OutputOptions(("ply", "viewers", "html", "turntable", "depth", "inputs"), frames=1)
+    options = OutputOptions(("ply", "splat", "html", "turntable", "depth", "points", "inputs"), frames=1)
     write_prediction(tmp_path, batch, Standin()(batch), Renderer(), options)
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["gaussians"] == 0
@@ -176,10 +200,10 @@ def test_options_are_read():
 
 
 def test_a_missing_package_is_named_before_any_work(monkeypatch):
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    line = r"formats=mp4: expected the package imageio_ffmpeg \(pip install 'ghgs-lit\[video\]'\); found none"
+    monkeypatch.setitem(sys.modules, "gaussforge", None)
+    line = r"formats=spz: expected the package gaussforge \(pip install 'ghgs-lit\[formats\]'\); found none"
     with pytest.raises(InputError, match=line):
-        output_options(CONFIG | {"formats": ["ply", "mp4"]})
+        output_options(CONFIG | {"formats": ["ply", "spz"]})
 
 
 @pytest.mark.parametrize(("antialiased", "size"), [(False, 0.3), (True, 1.0)])
@@ -211,16 +235,15 @@ def made_for_thin_pixels(size: int = 60):
 
 
 def test_other_viewers_draw_what_ours_draws(tmp_path):
-    """They add 0.3 px^2 and are not antialiased: their PLY makes up for it, the other says it."""
+    """They add 0.3 px^2 and are not antialiased: their files make up for it, the PLY says it."""
     batch, prediction = made_for_thin_pixels()
     wanted, boxes = batch.images[0], box_of(batch.masks[0])
-    write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions(("ply", "viewers"), frames=0))
+    write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions(("ply", "splat"), frames=0))
     exact = render(read_ply(tmp_path / "gaussians.ply"), batch.cameras).image[0]
     assert psnr(exact, wanted, boxes).min() > 60
-    data = GaussForge().convert((tmp_path / "viewers.ply").read_bytes(), "ply", "splat")["data"]
-    data = GaussForge().convert(data, "splat", "ply")["data"]  # as a program that knows no comments has it
-    (tmp_path / "theirs.ply").write_bytes(data)
-    adapted = render(read_ply(tmp_path / "theirs.ply"), batch.cameras).image[0]
+    data = GaussForge().convert((tmp_path / "gaussians.splat").read_bytes(), "splat", "ply")["data"]
+    (tmp_path / "viewer.ply").write_bytes(data)
+    adapted = render(read_ply(tmp_path / "viewer.ply"), batch.cameras).image[0]
     as_is = dataclasses.replace(prediction.gaussians, low_pass=0.3, antialiased=False)
     blurred = render(as_is, batch.cameras).image[0]
     gain = psnr(adapted.clamp(0, 1), wanted, boxes) - psnr(blurred.clamp(0, 1), wanted, boxes)
@@ -271,38 +294,19 @@ def test_no_picture_of_a_turntable_cuts_the_subject(tmp_path):
 
 
 def test_only_files_of_earlier_predictions_are_replaced(subject, tmp_path):
+    """Files of an earlier prediction stay known over runs that write others."""
     batch, prediction = subject
 
     def write(*formats):
         return write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions(formats, frames=0))
 
+    write("points", "inputs")
+    write("ply")
+    write("points", "inputs")
     (tmp_path / "depth.npz").write_text("somebody's")
-    with pytest.raises(InputError, match=r"depth\.npz: expected no file, or the folder of an earlier pred"):
+    with pytest.raises(InputError, match=r"depth\.npz: expected no file, or one that an earlier prediction"):
         write("ply", "depth")
     assert (tmp_path / "depth.npz").read_text() == "somebody's"
-    (tmp_path / "depth.npz").unlink()
-    write("depth")
-    write("ply")
-    write("depth")
     (tmp_path / "report.json").write_text("{}")
     with pytest.raises(InputError, match=r"found 'another file'"):
         write("ply")
-
-
-@pytest.mark.parametrize(
-    ("edge", "shift"), [("top", (0, -30)), ("bottom", (0, 30)), ("left", (-30, 0)), ("right", (30, 0))]
-)
-def test_photographs_that_end_at_the_subject_are_said(tmp_path, edge, shift):
-    """By the edge of the frame, in the report and in a line."""
-    gaussians, cameras = body(1500, 60), camera_ring(3, 60, 60)
-    intrinsics = cameras.intrinsics.clone()
-    intrinsics[0, 1, :2, 2] += torch.tensor(shift)
-    cameras = dataclasses.replace(cameras, intrinsics=intrinsics)
-    rendering = render(gaussians, cameras)
-    masks = rendering.alpha[:, :, 0] > 0.5
-    batch = Batch(rendering.image.clamp(0, 1), masks, cameras, views=(("a", "b", "c"),))
-    prediction = dataclasses.replace(Standin()(batch), gaussians=gaussians)
-    write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions(("ply",)))
-    assert json.loads((tmp_path / "report.json").read_text())["cut"] == {edge: ["b"]}
-    said = f"b end at the subject's {edge}: what no photograph shows is missing"
-    assert said in list(advice_of(tmp_path))

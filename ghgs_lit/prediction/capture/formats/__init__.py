@@ -6,9 +6,10 @@ from pathlib import Path
 from ghgs_lit.errors import InputError, choice
 from ghgs_lit.prediction.capture.formats.camera_file import CameraFile
 from ghgs_lit.prediction.capture.formats.colmap import model_folder, read_colmap
-from ghgs_lit.prediction.capture.formats.json_file import read_json, read_json_file
+from ghgs_lit.prediction.capture.formats.json_and_toml import read_json, read_json_file, read_toml
 from ghgs_lit.prediction.capture.formats.nerfstudio import read_nerfstudio
 from ghgs_lit.prediction.capture.formats.opencv import EASYMOCAP, read_easymocap, read_opencv
+from ghgs_lit.prediction.capture.formats.qualisys import read_qualisys
 
 __all__ = ["FORMATS", "CameraFile", "read_cameras"]
 
@@ -19,6 +20,8 @@ FORMATS: dict[str, Callable[[Path], CameraFile]] = {
     "nerfstudio": read_nerfstudio,
     "opencv": read_opencv,
     "easymocap": read_easymocap,
+    "toml": read_toml,
+    "qualisys": read_qualisys,
 }
 
 
@@ -45,11 +48,16 @@ def _format_of(path: Path) -> str:
             return "opencv"
     elif suffix in (".yml", ".yaml"):
         return "opencv"
+    elif suffix == ".toml":
+        return "toml"
     elif suffix == ".json":
         return "nerfstudio" if "frames" in read_json_file(path) else "ghgs"
+    elif path.name.endswith(".qca.txt"):
+        return "qualisys"
     elif suffix in (".bin", ".txt") and model_folder(folder) is not None:
         return "colmap"
     raise InputError(
-        f"{path}: expected JSON, transforms.json, a COLMAP model, or YAML of OpenCV or EasyMocap; "
+        f"{path}: expected JSON, transforms.json, a COLMAP model, YAML of OpenCV or EasyMocap, TOML, or"
+        f" Qualisys' .qca.txt; "
         f"found {'a folder without any' if path.is_dir() else repr(path.suffix)}"
     )

@@ -3,6 +3,7 @@
 import math
 import re
 import unicodedata
+import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -61,15 +62,16 @@ def plain(key: str) -> str:
     return re.sub(r"(coef|param)\w*$", "", "".join(filter(str.isalnum, key.lower())))
 
 
-def check_lens(origin: str, fields: Mapping[str, Any], known: Collection[str]) -> None:
-    """Refuse entries about the lens that are not read: without them the picture would be bent.
-
-    ``fields``: of a camera, or of the file. ``known``: entries that are read, as :func:`plain` spells them.
-    InputError: another one about the lens is neither empty nor 0."""
-    unread = [key for key in fields if plain(key) not in known and _LENS.search(plain(key))]
-    lens = [key for key in unread if _bends(fields[key])]
+def check_unread(origin: str, fields: Mapping[str, Any], known: Collection[str]) -> None:
+    """Warn of entries that are not read. ``fields``: of a camera, or of the file. ``known``: entries that are
+    read or do not matter, as :func:`plain` spells them. InputError: an entry about the lens is neither empty
+    nor 0: without it the picture would be bent."""
+    unread = {key: value for key, value in fields.items() if plain(key) not in known}
+    lens = [key for key, value in unread.items() if _LENS.search(plain(key)) and _bends(value)]
     expected = "lens distortion as D or dist: k1 k2 p1 p2 k3 k4 k5 k6, with fisheye k1 k2 k3 k4"
     require(not lens, origin, expected, lens)
+    if unread:  # the same text for each camera, which Python shows once
+        warnings.warn(f"cameras: entries that are not read: {', '.join(sorted(unread))}", stacklevel=2)
 
 
 def _bends(value: Any) -> bool:

@@ -40,14 +40,30 @@ def read_colmap(path: Path) -> CameraFile:
     for file in folder.iterdir():
         if file.stem in _FILES:
             require_file(file, "a file of a COLMAP model")
+    names = _names(folder)
     try:
         model = pycolmap.Reconstruction(str(folder))
         images = [image for image in model.images.values() if image.has_pose]
     except (RuntimeError, ValueError, OSError, IndexError) as error:
         raise InputError(f"{folder}: expected a COLMAP model; found {error}") from error
     require(bool(images), str(folder), "photographs with a pose", "none")
-    cameras = [_camera(folder, image.name, image, model.cameras[image.camera_id]) for image in images]
+    cameras = [
+        _camera(folder, names.get(image.image_id, image.name), image, model.cameras[image.camera_id])
+        for image in images
+    ]
     return CameraFile.of(cameras, Convention(), "colmap")
+
+
+def _names(folder: Path) -> dict[int, str]:
+    """Names of photographs in ``images.txt`` by id; COLMAP's own reader cuts them at a space."""
+    path = folder / "images.txt"
+    if (folder / "images.bin").exists() or not path.exists():
+        return {}
+    lines = path.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    lines = [line for line in lines if not line.startswith("#")]
+    # Every second line has points.
+    images = [fields for line in lines[::2] if len(fields := line.split(maxsplit=9)) == 10]
+    return {int(fields[0]): fields[9].rstrip() for fields in images if fields[0].isdecimal()}
 
 
 def _camera(folder: Path, name: str, image, camera) -> StoredCamera:

@@ -11,12 +11,18 @@ from ghgs_lit.data.decoding import check_array
 from ghgs_lit.errors import choice, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
 from ghgs_lit.prediction.capture.formats import camera_file
-from ghgs_lit.prediction.capture.formats.json_file import read_json_file
+from ghgs_lit.prediction.capture.formats.json_and_toml import read_json_file
 
 _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
 _KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", *_LENS)
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE")
-_KNOWN = {camera_file.plain(key) for key in (*_KEYS, "camera_model", "is_fisheye")}
+# Read, or irrelevant for a camera.
+_KNOWN = {
+    *map(camera_file.plain, _KEYS),
+    *("frames", "filepath", "transformmatrix", "maskpath", "cameramodel", "isfisheye", "aabbscale", "scale"),
+    *("offset", "appliedtransform", "appliedscale", "orientationoverride", "plyfilepath", "depthfilepath"),
+    *("colmapimid", "sharpness", "rotation", "trainfilenames", "valfilenames", "testfilenames", "time", "up"),
+}
 
 
 def read_nerfstudio(path: Path) -> camera_file.CameraFile:
@@ -48,7 +54,7 @@ def _camera(path: Path, origin: str, shared: Mapping[str, Any], frame: Any) -> S
     distortion = camera_file.coefficients(numbers, names)
     pose = check_array(f"{origin}: transform_matrix", frame["transform_matrix"], [(4, 4), (3, 4)])
     mask = path.parent / str(frame["mask_path"]) if frame.get("mask_path") else None
-    camera_file.check_lens(origin, fields, _KNOWN)
+    camera_file.check_unread(origin, fields, _KNOWN)
     return StoredCamera(str(frame["file_path"]), origin, intrinsics, pose, size, distortion, fisheye, mask)
 
 

@@ -4,7 +4,6 @@ YAML of ``cv2.FileStorage`` is a file for each camera, all cameras in one, or Ea
 in spelling: ``camera_matrix`` or ``K``, ``distortion_coefficients`` or ``dist``, ``rvec`` or ``R``. Poses map
 the world to the camera; pixel centres are at integers."""
 
-import itertools
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -32,8 +31,14 @@ _NAMES = {
     "fisheye": ("fisheye", "isfisheye", "usefisheye", "fisheyemodel"),
 }
 _SINGLE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # Coefficients with an entry each
-#: Entries that are read.
-KNOWN = {*itertools.chain(*_NAMES.values()), *_SINGLE}
+#: Entries that are read, or irrelevant for a camera.
+KNOWN = {
+    *(name for names in _NAMES.values() for name in names),
+    *_SINGLE,
+    *("name", "names", "id", "camid", "port", "serial", "rotationcount", "error", "exposure", "gridcount"),
+    *("ignore", "verifiedresolutions", "rectifyalpha", "metadata", "cameras"),
+    *("time", "n", "f", "v", "ccm", "bounds"),
+}
 
 
 class _Loader(yaml.SafeLoader):
@@ -107,7 +112,7 @@ def _by_name(origin: str, fields: Mapping[str, Any]) -> dict[str, dict[str, Any]
         name = max((name for name in cameras if key.endswith(f"_{name}")), key=len, default="")
         field = key.removesuffix(f"_{name}")
         cameras.get(name, others)["time" if field == "t" else field] = value  # EasyVolcap's t is a time
-    camera_file.check_lens(origin, others, KNOWN)
+    camera_file.check_unread(origin, others, KNOWN)
     return cameras
 
 
@@ -157,7 +162,7 @@ def camera_from_fields(name: str, origin: str, fields: Mapping[str, Any]) -> Sto
     else:
         numbers = {key: camera_file.finite(origin, key, value) for key, value in single.items()}
         distortion = camera_file.coefficients(numbers, "k1 k2 k3 k4" if fisheye else " ".join(_SINGLE))
-    camera_file.check_lens(origin, fields, KNOWN)
+    camera_file.check_unread(origin, fields, KNOWN)
     return StoredCamera(name, origin, intrinsics, pose, size, distortion, bool(fisheye))
 
 

@@ -1,6 +1,7 @@
-"""This package's JSON of cameras, and OpenCV's matrices as JSON."""
+"""This package's JSON, OpenCV's matrices as JSON, and the TOML of Pose2Sim, Anipose and Caliscope."""
 
 import json
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from ghgs_lit.errors import require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.prediction.capture.calibration import Calibration, Convention, StoredCamera
 from ghgs_lit.prediction.capture.formats import opencv
-from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, check_lens, read_mapping
+from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, check_unread, read_mapping
 
 _KEYS = ("intrinsics", "extrinsics", "width", "height", "distortion", "fisheye", "gains")
 
@@ -30,8 +31,8 @@ def read_json(path: Path) -> CameraFile:
     named = _cameras_of(path, content)
     with_extrinsics = {n: c for n, c in named.items() if isinstance(c, Mapping) and "extrinsics" in c}
     if not with_extrinsics:
-        return _read_matrices(path, named)
-    check_lens(str(path), {n: c for n, c in named.items() if n not in with_extrinsics}, opencv.KNOWN)
+        return _read_matrices(path, named, "opencv")
+    check_unread(str(path), {n: c for n, c in named.items() if n not in with_extrinsics}, opencv.KNOWN)
     cameras = [_camera(name, f"{path}: {name}", camera) for name, camera in with_extrinsics.items()]
     return CameraFile.of(cameras, Convention(), "ghgs")
 
@@ -43,16 +44,24 @@ def _cameras_of(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
         named = {str(camera.get("name", i)): camera for i, camera in enumerate(named)}
     require(isinstance(named, dict), f"{path}: cameras", "cameras by name", type(named).__name__)
     if "cameras" in content:
-        check_lens(str(path), content, opencv.KNOWN)
+        check_unread(str(path), content, opencv.KNOWN)
     return named
 
 
-def _read_matrices(path: Path, named: Mapping[str, Any]) -> CameraFile:
+def read_toml(path: Path) -> CameraFile:
+    """Pose2Sim's, Anipose's and Caliscope's TOML: a table for each camera, named by its key ``name``.
+    InputError: a camera is missing or wrong."""
+    tables = _cameras_of(path, read_mapping(path, tomllib.loads, "TOML", "TOML"))
+    named = {str(t.get("name", key)): t for key, t in tables.items() if isinstance(t, dict)}
+    return _read_matrices(path, named, "toml")
+
+
+def _read_matrices(path: Path, named: Mapping[str, Any], name_of_format: str) -> CameraFile:
     expected = "cameras with intrinsics and extrinsics (or K, R and T)"
     with_intrinsics = {name: camera for name, camera in named.items() if opencv.has_intrinsics(camera)}
     cameras = opencv.cameras_from_fields(path, with_intrinsics, expected, sorted(named))
-    check_lens(str(path), {n: c for n, c in named.items() if n not in with_intrinsics}, opencv.KNOWN)
-    return CameraFile.of(cameras, Convention(pixel_centers="integer"), "opencv")
+    check_unread(str(path), {n: c for n, c in named.items() if n not in with_intrinsics}, opencv.KNOWN)
+    return CameraFile.of(cameras, Convention(pixel_centers="integer"), name_of_format)
 
 
 def _camera(name: str, origin: str, camera: Mapping[str, Any]) -> StoredCamera:
