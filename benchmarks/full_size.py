@@ -18,9 +18,10 @@ from literal import write_out
 
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import compose, resolve
+from ghgs_lit.config.compose import read_options
 from ghgs_lit.diagnostics.benchmark.machine import in_words, machine_facts
 from ghgs_lit.diagnostics.benchmark.measure import inspect, time_cases
-from ghgs_lit.diagnostics.benchmark.presets import Case, Source, cases_of, presets_of
+from ghgs_lit.diagnostics.benchmark.presets import Case, Source, cases_of
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL, top_level
 from ghgs_lit.types import Batch
 
@@ -28,7 +29,7 @@ from ghgs_lit.types import Batch
 def variants(cfg, presets: list[str], device: torch.device) -> list[Case]:
     """The presets, ``fast`` without a margin, and the literal forward of ``none``, with the same weights."""
     config = resolve(cfg)
-    chosen = presets_of(presets, config["skip"])
+    chosen = read_options("skip", presets, config["skip"], "presets")
     if "fast" in chosen:
         chosen["fast, margin 0"] = {**chosen["fast"], "margin": 0}
     chosen["literal"] = chosen["none"]

@@ -13,11 +13,12 @@ from omegaconf import DictConfig
 from ghgs_lit.cli.inputs import build_data, choices, overrides, pick_device, with_trained_data
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config import build
+from ghgs_lit.config.compose import read_options
 from ghgs_lit.config.keys import is_below
 from ghgs_lit.diagnostics.benchmark import report
 from ghgs_lit.diagnostics.benchmark.machine import machine_facts
 from ghgs_lit.diagnostics.benchmark.measure import record_cases, threads
-from ghgs_lit.diagnostics.benchmark.presets import KNOBS, YARDSTICK, Case, Source, cases_of, presets_of
+from ghgs_lit.diagnostics.benchmark.presets import KNOBS, YARDSTICK, Case, Source, cases_of
 from ghgs_lit.diagnostics.output import print_tables
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.measure import decisions_of
@@ -64,7 +65,7 @@ def configured_cases(config: Mapping[str, Any], device: torch.device) -> list[Ca
     """The model in every preset, always including the yardstick. Raises what :func:`read_checkpoint` and
     :func:`cases_of` raise."""
     names = dict.fromkeys([YARDSTICK, *config["presets"]])
-    presets = presets_of(list(names), config["skip"])
+    presets = read_options("skip", list(names), config["skip"], "presets")
     path = config["checkpoint"]
     source = Source(config if path is None else read_checkpoint(path)["config"], path)
     shared = {name: config[name] for name in ("renderer", "precision")}

@@ -19,12 +19,12 @@ from torch import nn
 from ghgs_lit.cli.inputs import build_data, check_size, choices, overrides, said
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import build, resolve
+from ghgs_lit.errors import require
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.protocols import check_evaluation
 from ghgs_lit.evaluation.report import measure_and_write
 from ghgs_lit.model import GHGS
 from ghgs_lit.runs import job
-from ghgs_lit.runs.grid import print_single_plan
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.runs.signals import Interrupted, interruptible, print_how_to_go_on
@@ -103,9 +103,10 @@ def _environment() -> list[LightningEnvironment]:
 def run(cfg: DictConfig) -> float | str | None:
     """Train and measure (in a sweep: unless done); return the mean PSNR. Interrupted: Ctrl-C or SIGTERM."""
     config, run_directory = resolve(cfg), RunDirectory(output_dir())
-    if config["dry_run"]:
-        return print_single_plan(config, run_directory)
+    require(not config["dry_run"], "dry_run", "false without a grid (-m, or sweep=<file>)", True)
     job.check_config(config)
+    if job.in_sweep():
+        job.check_launcher(config, HydraConfig.get().runtime.choices["hydra/launcher"])
     return run_job(config, run_directory, train)
 
 
@@ -121,7 +122,7 @@ def run_job(config: dict[str, Any], run_directory: RunDirectory, train: job.Trai
 
 
 def _changes_to_go_on(run_directory: RunDirectory) -> str:
-    if job.is_multirun():
+    if job.in_sweep():
         return f"hydra.sweep.dir={HydraConfig.get().sweep.dir}"
     if run_directory.checkpoint is None:
         return "another hydra.run.dir, or overwrite=true (there was no checkpoint yet)"
@@ -129,8 +130,6 @@ def _changes_to_go_on(run_directory: RunDirectory) -> str:
 
 
 def _run(config: dict[str, Any], run_directory: RunDirectory, train: job.Train) -> float | str | None:
-    if job.needs_own_process(config):
-        return job.train_in_own_process(run_directory)
     if rank_zero_only.rank == 0:
         return job.train_once(run_directory, config, train)
     # The first process has locked the run for all of them.
@@ -190,7 +189,6 @@ def fit(
     """Train from ``step`` (None: a new run); ``stats`` is filled even if training is interrupted."""
     if step is not None:
         loggers.resume(trainer.loggers, step)
-    loggers.log_hyperparameters(trainer.loggers, loggers.hyperparameters(config, choices(), overrides()))
     started = time.perf_counter()
     try:
         trainer.fit(module, data, ckpt_path=config["resume"])
@@ -228,6 +226,7 @@ def measure_last(
         sessions=RunDirectory(directory).sessions(),
     )
     summary = read_results(path)["summary"]
-    loggers.log_results(trainer.loggers, summary, trainer.global_step)
+    values = loggers.hyperparameters(config, choices(), overrides())
+    loggers.log_results(trainer.loggers, values, summary, trainer.global_step)
     announce(path)
     return summary[0]["psnr"]

@@ -1,6 +1,6 @@
 """Find and compose the Hydra configuration of a verb, and turn it into plain data."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -69,6 +69,14 @@ def own_keys(cfg: DictConfig, verb: str | None) -> dict[str, Any]:
     if verb is not None:
         VERBS[verb].read({name: value for name, value in data.items() if name not in KINDS}, "")
     return data
+
+
+def read_options(
+    group: str, names: Sequence[str], configured: Mapping[str, Any], key: str
+) -> dict[str, dict[str, Any]]:
+    """Options of a group by name; the one that the configuration has chosen has its ``configured`` values."""
+    chosen = configured["name"]
+    return {name: dict(configured) if name == chosen else read_option(group, name, key) for name in names}
 
 
 def read_option(group: str, name: str, key: str | None = None) -> dict[str, Any]:

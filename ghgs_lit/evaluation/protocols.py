@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ghgs_lit.config import build
-from ghgs_lit.config.compose import read_option
+from ghgs_lit.config.compose import read_options
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.sampling import TargetProtocol
 from ghgs_lit.errors import choice, require
@@ -13,11 +13,8 @@ from ghgs_lit.errors import choice, require
 def target_protocols(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Protocols that ``evaluation.targets`` lists, by name, with the values of their file in ``conf/targets``
     or, for the one that ``targets=`` selects, the configured values. InputError: there is no such file."""
-    configured = config["targets"]
-    protocols = {
-        name: configured if name == configured["name"] else read_option("targets", name, "evaluation.targets")
-        for name in config["evaluation"]["targets"]
-    }
+    names = config["evaluation"]["targets"]
+    protocols = read_options("targets", names, config["targets"], "evaluation.targets")
     return {
         name: {**values, "kind": values.get("kind") or values["name"], "name": name}
         for name, values in protocols.items()

@@ -1,7 +1,6 @@
 """Grid sweeper of ``conf/hydra/sweeper/grid.yaml``: launches those runs of a grid that are not done."""
 
 import datetime
-import itertools
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +11,6 @@ from typing import Any
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
 from hydra.core.utils import JobReturn, JobStatus, filter_overrides
 from omegaconf import DictConfig, OmegaConf, open_dict
 from tabulate import tabulate
@@ -22,7 +20,7 @@ from ghgs_lit.config.compose import saved_text
 from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
-from ghgs_lit.runs.job import BUSY, check_config, is_multirun, trains_in_several_processes
+from ghgs_lit.runs.job import BUSY, check_config, check_launcher
 from ghgs_lit.runs.progress import clock
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import RunDirectory, State
@@ -106,10 +104,10 @@ def print_plan(planned: Sequence[PlannedRun], directory: Path) -> None:
     reason = "; ".join(basis) or "no trainer.max_time, and no finished run to measure a step in"
     print(f"expected training time of the remaining runs, one after another: {known} ({reason})")
     print(f"outputs: {directory}/<run>/ with {OUTPUTS}", flush=True)
-    print_refusals([item.config for item in planned])
+    _print_refusals([item.config for item in planned])
 
 
-def print_refusals(configs: Sequence[Mapping[str, Any]]) -> None:
+def _print_refusals(configs: Sequence[Mapping[str, Any]]) -> None:
     """Print why configured runs would be refused, each reason once."""
     reasons = {}
     for config in configs:
@@ -129,22 +127,8 @@ def print_results(planned: Sequence[PlannedRun], directory: Path) -> None:
     print(f"wrote {directory}", flush=True)
 
 
-def print_single_plan(config: Mapping[str, Any], run: RunDirectory) -> None:
-    """Print the plan of one training run; refused in a sweep whose runs are not known in advance."""
-    if is_multirun():
-        # Any other error would count as one failed job, and the sweep would continue.
-        raise SystemExit(
-            "dry_run: expected hydra/sweeper=grid, which knows its runs in advance; found another"
-        )
-    budget = _budget(config, expected_seconds(config, None))
-    _print_table([PlannedRun(config_hash(config), (), (), config, run)], {"trains for": [budget]})
-    print(f"nothing was run; outputs: {run.path}/ with {OUTPUTS}", flush=True)
-    print_refusals([config])
-
-
 log = logging.getLogger(__name__)
 _POLL = 2.0  # seconds between checks of runs that other processes work on
-_MOST_RUNS = 10_000  # of a sweep
 
 Launch = Callable[[Sequence[Sequence[str]], int], Sequence[JobReturn]]
 
@@ -169,7 +153,7 @@ def _sweep(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> 
         lambda overrides: loader.load_sweep_config(config, overrides),
     )
     for item in planned:  # an impossible launcher is refused before anything starts
-        trains_in_several_processes(item.config, config.hydra.runtime.choices["hydra/launcher"])
+        check_launcher(item.config, config.hydra.runtime.choices["hydra/launcher"])
     if config.get("dry_run"):
         print_plan(planned, directory)
         return []
@@ -193,20 +177,8 @@ def combinations(
     given = parser.parse_overrides(list(arguments))
     keys = {override.get_key_element() for override in given}
     own = parser.parse_overrides([f"{k}={v}" for k, v in (params or {}).items() if k not in keys])
-    _require_few([*own, *given])
     (batch,) = BasicSweeper.split_arguments([*own, *given], None)
     return batch
-
-
-def _require_few(overrides: Sequence[Override]) -> None:
-    """Refuse a grid so large that listing its runs would exhaust the memory."""
-    count = 1
-    for override in overrides:
-        if override.is_sweep_override() and override.is_discrete_sweep():
-            # The sweep iterator of a range would list all of it.
-            values = override.value().range() if override.is_range_sweep() else override.sweep_iterator()
-            count *= sum(1 for _ in itertools.islice(values, _MOST_RUNS + 1))
-            require(count <= _MOST_RUNS, override.key_or_group, f"at most {_MOST_RUNS} runs", "more")
 
 
 def plan(combos: Sequence[Sequence[str]], compose: Callable[[list[str]], DictConfig]) -> list[PlannedRun]:

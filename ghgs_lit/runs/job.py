@@ -1,9 +1,6 @@
 """Jobs that train: lock a run that is free and not done, then train or resume it."""
 
-import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,32 +15,22 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import resolved
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import RunDirectory
-from ghgs_lit.runs.signals import STOP, Interrupted
 
 BUSY = "busy"  #: Return value of a job whose run another process works on
 SWEEPER = "hydra_plugins.ghgs_lit_sweeper.GridSweeper"
-# Environment variable of a job's own process: "skip" a locked run, or "wait" for it.
-_VARIABLE = "GHGS_SWEEP_JOB"
 
 Train = Callable[[dict[str, Any], Path, dict[str, Any]], float | None]
 """``(config, directory, stats) -> metric``; ``stats`` is filled for ``sessions.jsonl``."""
 
 
-def is_multirun() -> bool:
+def in_sweep() -> bool:
     """Whether Hydra launched this job as one of several."""
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
-def in_sweep() -> bool:
-    """Whether this process runs a job of a sweep."""
-    return is_multirun() or _VARIABLE in os.environ
-
-
 def _waits() -> bool:
     """Whether to wait for a locked run: the grid sweeper returns to it later, others need its result now."""
-    if is_multirun():
-        return HydraConfig.get().sweeper.get("_target_") != SWEEPER
-    return os.environ.get(_VARIABLE) == "wait"
+    return in_sweep() and HydraConfig.get().sweeper.get("_target_") != SWEEPER
 
 
 def register_resolvers() -> None:
@@ -94,52 +81,11 @@ def train_once(run: RunDirectory, config: dict[str, Any], train: Train) -> float
             return train(config, run.path, stats)
 
 
-def train_in_own_process(run: RunDirectory) -> float | str | None:
-    """Run this job as a separate ``ghgs``, because training in several processes cannot share this one. The
-    new process locks the run, so that the lock outlives this process."""
-    hydra = HydraConfig.get()
-    command = [sys.executable, "-m", "ghgs_lit", hydra.job.name, *hydra.overrides.task]
-    command += [f"hydra.run.dir='{run.path}'", "hydra.mode=RUN"]
-    mode = {_VARIABLE: "wait" if _waits() else "skip"}
-    code = _run_process(command, {**os.environ, **mode})
-    if code in [128 + number for number in STOP]:
-        raise Interrupted(code - 128)
-    if code:
-        raise InputError(f"{run.path}: expected a job that succeeds; found exit code {code}")
-    return run.metric if run.done else BUSY
-
-
-def _run_process(command: list[str], environment: Mapping[str, str]) -> int:
-    """Exit code of ``command``; a signal that stops this process is passed on to it."""
-    with subprocess.Popen(command, env=environment) as process:
-        try:
-            return process.wait()
-        except Interrupted as stop:
-            process.send_signal(stop.number)
-            process.wait()
-            raise
-
-
-def trains_in_several_processes(config: Mapping[str, Any], launcher: str) -> bool:
-    """Whether a job trains in several processes. InputError: ``launcher`` runs all jobs in one process."""
+def check_launcher(config: Mapping[str, Any], launcher: str) -> None:
+    """Check that a job of a sweep can train in several processes. InputError: only SLURM starts these."""
     devices = config["trainer"].get("devices", 1)
-    if devices in (1, "1", [0]):
-        return False
-    if launcher == "basic":
-        raise InputError(
-            f"trainer.devices: expected 1 in a sweep whose jobs share a process; found {devices}"
-            " (hydra/launcher=joblib, submitit_local or submitit_slurm gives each job its own)"
-        )
-    return True
-
-
-def needs_own_process(config: Mapping[str, Any]) -> bool:
-    """Whether this job of a sweep trains in several processes that Lightning starts."""
-    if not is_multirun():
-        return False
-    launcher = HydraConfig.get().runtime.choices.get("hydra/launcher", "basic")
-    # SLURM starts the processes of a job itself.
-    return trains_in_several_processes(config, launcher) and "slurm" not in launcher
+    fits = devices in (1, "1", [0]) or "slurm" in launcher
+    require(fits, "trainer.devices", "1 in a sweep, or hydra/launcher=slurm, which starts processes", devices)
 
 
 #: What training writes into a run's directory, beside the logs of Hydra.

@@ -1,7 +1,6 @@
 """Checkpoints, written atomically, also when a run is killed or asked to stop."""
 
 import os
-import shutil
 import time
 from collections.abc import Mapping
 from datetime import timedelta
@@ -19,8 +18,6 @@ from ghgs_lit.errors import require
 from ghgs_lit.files import write_atomically
 from ghgs_lit.runs.signals import Interrupted, handle, handlers
 from ghgs_lit.weights import frozen
-
-_PATHS = ("best_model_path", "kth_best_model_path", "last_model_path")
 
 
 def check_training_state(path: str | Path, checkpoint: Mapping[str, Any]) -> None:
@@ -132,30 +129,9 @@ class Checkpoints(ModelCheckpoint):
             super().on_train_batch_end(trainer, pl_module, None, None, 0)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Continue with the best checkpoint so far, also if the run resumes in another folder."""
-        state = dict(state_dict)
-        if state.get("dirpath") not in (None, self.dirpath):
-            state = self._moved(state)
-        if all(Path(path).exists() for path in state["best_k_models"]):
-            super().load_state_dict(state)
-
-    def _moved(self, state: Mapping[str, Any]) -> dict[str, Any]:
-        """``state`` with paths in this folder, into which the best files are copied."""
-        folder = Path(self.dirpath)
-
-        def here(path: str) -> str:
-            return str(folder / Path(path).name) if path else path
-
-        best = [Path(path) for path in state["best_k_models"]]
-        # Frozen weights first, since checkpoints refer to them.
-        shared = {file for path in best for file in path.parent.glob(frozen.PATTERN)}
-        for path in [*shared, *best]:
-            target = folder / path.name
-            if path.exists() and not target.exists():
-                write_atomically(target, lambda temporary, source=path: shutil.copyfile(source, temporary))
-        moved = {name: here(state.get(name, "")) for name in _PATHS}
-        scores = {here(path): score for path, score in state["best_k_models"].items()}
-        return {**state, **moved, "best_k_models": scores, "dirpath": self.dirpath}
+        """Continue with the best checkpoint so far, unless it is gone; Lightning: or in another folder."""
+        if all(Path(path).exists() for path in state_dict["best_k_models"]):
+            super().load_state_dict(state_dict)
 
 
 #: Seconds within which a second signal counts as the same one: a terminal sends it to all processes, which

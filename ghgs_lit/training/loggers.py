@@ -44,7 +44,7 @@ class CsvLog(_StepsTaken, CSVLogger):
 
 
 class TensorBoardLog(_StepsTaken, TensorBoardLogger):
-    """TensorBoard's event files, with the run's row in the HParams tab."""
+    """TensorBoard's event files."""
 
     def resume(self, step: int) -> None:
         """Make TensorBoard drop values logged after ``step``."""
@@ -56,24 +56,6 @@ class TensorBoardLog(_StepsTaken, TensorBoardLogger):
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Log without the epoch that Lightning adds."""
         super().log_metrics({name: value for name, value in metrics.items() if name != "epoch"}, step)
-
-    @rank_zero_only
-    def log_hyperparams(self, params: Mapping[str, Value], *args: Any, **kwargs: Any) -> None:
-        """Begin a session without a list of metrics, so that TensorBoard compares runs by all of them."""
-        from torch.utils.tensorboard.summary import hparams
-
-        _, session, _ = hparams(dict(params), {})
-        self.experiment.file_writer.add_summary(session)
-
-    @rank_zero_only
-    def log_results(self, results: Mapping[str, float], step: int) -> None:
-        """Log the final values and end the session with success."""
-        from torch.utils.tensorboard.summary import hparams
-
-        self.log_metrics(dict(results), step - 1)
-        _, _, end = hparams({}, {})
-        self.experiment.file_writer.add_summary(end)
-        self.experiment.flush()
 
 
 class CsvOptions(Options):
@@ -111,23 +93,20 @@ def resume(loggers: Sequence[Logger], step: int) -> None:
 
 
 @rank_zero_only
-def log_hyperparameters(loggers: Sequence[Logger], values: Mapping[str, Value]) -> None:
-    """Log the values of :func:`hyperparameters`, but not to CSV, since ``config.yaml`` has them."""
-    for logger in loggers:
-        if not isinstance(logger, CSVLogger):
-            logger.log_hyperparams(dict(values))
-
-
-@rank_zero_only
-def log_results(loggers: Sequence[Logger], summary: Sequence[Mapping[str, Any]], step: int) -> None:
-    """Log :func:`final_numbers` of the weights after ``step``. ``summary``: of ``metrics.json``."""
+def log_results(
+    loggers: Sequence[Logger], values: Mapping[str, Value], summary: Sequence[Mapping[str, Any]], step: int
+) -> None:
+    """Log the :func:`hyperparameters` ``values``, which CSV has in ``config.yaml``, and :func:`final_numbers`
+    of the weights after ``step``. ``summary``: of ``metrics.json``."""
     results = final_numbers(summary)
     for logger in loggers:
-        if isinstance(logger, TensorBoardLog):
-            logger.log_results(results, step)
-        else:
-            logger.log_metrics(results, step - 1)
-            logger.save()
+        if isinstance(logger, TensorBoardLogger):
+            logger.log_hyperparams(dict(values), results)
+            continue
+        if not isinstance(logger, CSVLogger):
+            logger.log_hyperparams(dict(values))
+        logger.log_metrics(results, step - 1)
+        logger.save()
 
 
 def close(loggers: Sequence[Logger]) -> None:

@@ -9,6 +9,7 @@ import hydra
 
 from ghgs_lit.cli.runtime import output_dir
 from ghgs_lit.config import VERSION_BASE, conf_dir, own_keys
+from ghgs_lit.runs import job as job_module
 from ghgs_lit.runs.grid import PlannedRun, run_all
 from ghgs_lit.runs.job import register_resolvers, train_once
 from ghgs_lit.runs.provenance import config_hash, provenance
@@ -63,7 +64,8 @@ def plan_seeds(sweep: Path, count: int) -> list[PlannedRun]:
 
 def work_through(sweep: Path, count: int, barrier) -> None:
     """One of several processes that work on the same grid, one run after another."""
-    os.environ["GHGS_SWEEP_JOB"] = "skip"
+    job_module.in_sweep = lambda: True
+    job_module._waits = lambda: False
     items = plan_seeds(sweep, count)
 
     def slow(config, directory, stats):

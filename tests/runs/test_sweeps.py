@@ -3,11 +3,9 @@
 import json
 import os
 import signal
-import sys
 import time
 
 import pytest
-from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import JobReturn, JobStatus
 
 from ghgs_lit.cli import train as train_verb
@@ -18,7 +16,6 @@ from ghgs_lit.runs.grid import combinations, run_all
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
-from ghgs_lit.runs.signals import Interrupted, interruptible
 from tests.cli.test_main import call
 from tests.helpers.jobs import (
     executed,
@@ -26,7 +23,6 @@ from tests.helpers.jobs import (
     plan_seeds,
     record_execution,
     work_through,
-    write_finished_run,
 )
 from tests.helpers.processes import PREPARED
 
@@ -131,22 +127,6 @@ def test_a_sweep_that_is_stopped_starts_no_further_run(sweep, monkeypatch, numbe
     assert "3 runs: 3 done" in out
 
 
-def test_a_job_in_its_own_process_is_stopped_and_awaited(tmp_path):
-    """A signal to a sweep must reach its job, which saves a checkpoint before it ends."""
-    note = tmp_path / "note"
-    script = (
-        "import os, signal, sys, time, pathlib\n"
-        f"def stop(*_): time.sleep(0.3); pathlib.Path({str(note)!r}).write_text('saved'); sys.exit(143)\n"
-        "signal.signal(signal.SIGTERM, stop)\n"
-        "os.kill(os.getppid(), signal.SIGTERM)\n"
-        "time.sleep(60)\n"
-    )
-    with interruptible(), pytest.raises(Interrupted) as stop:
-        job._run_process([sys.executable, "-c", script], os.environ)
-    assert stop.value.code == 143
-    assert note.read_text() == "saved"
-
-
 def test_a_failing_run_is_named_and_the_others_are_run(sweep, monkeypatch):
     """One bad run must not cost the rest of the night."""
 
@@ -170,7 +150,7 @@ def test_an_impossible_job_fails_before_any_is_launched(sweep):
     assert "seed: expected an integer >= 0" in err
     code, _, err = sweep("seed=1,2", "trainer=ddp_cpu", "dry_run=true")
     assert code == 1
-    assert "trainer.devices: expected 1 in a sweep whose jobs share a process; found 2" in err
+    assert "trainer.devices: expected 1 in a sweep, or hydra/launcher=slurm" in err
     assert not executed(sweep.directory)
 
 
@@ -279,38 +259,6 @@ def test_tables_share_runs_and_take_other_data(sweep):
     small = names("sweep=table4", "data=synthetic", "encoder=vggt_nano", "trainer=cpu")
     assert len(small) == 4
     assert not small & table4
-
-
-def test_training_in_several_processes_gets_a_process_of_its_own(monkeypatch, tmp_path):
-    """Lightning repeats the command line for its other processes, which must be that of this job."""
-    started = {}
-    write_finished_run(tmp_path, {"seed": 1}, 31.0)
-
-    def fake(command, environment):
-        started.update(command=command, env=environment)
-        return started.get("code", 0)
-
-    cfg = composed("trainer=ddp_cpu", "seed=5", "hydra.mode=MULTIRUN")
-    cfg.hydra.runtime.choices["hydra/launcher"] = "joblib"
-    monkeypatch.setattr(HydraConfig.instance(), "cfg", cfg)
-    monkeypatch.setattr(job, "_run_process", fake)
-    assert job.needs_own_process({"trainer": {"devices": 2}})
-    assert job.train_in_own_process(RunDirectory(tmp_path)) == 31.0
-    assert started["command"][2:] == [
-        "ghgs_lit",
-        "train",
-        "trainer=ddp_cpu",
-        "seed=5",
-        f"hydra.run.dir='{tmp_path}'",
-        "hydra.mode=RUN",
-    ]
-    assert started["env"]["GHGS_SWEEP_JOB"] == "skip"
-    started["code"] = 143
-    with pytest.raises(Interrupted) as stop:  # its own process was stopped, and so is the sweep
-        job.train_in_own_process(RunDirectory(tmp_path))
-    assert stop.value.code == 143
-    cfg.hydra.runtime.choices["hydra/launcher"] = "submitit_slurm"
-    assert not job.needs_own_process({"trainer": {"devices": 2}})
 
 
 def test_hash_ignores_only_what_no_number_depends_on():

@@ -24,7 +24,6 @@ from ghgs_lit.training.loggers import (
     close,
     final_numbers,
     hyperparameters,
-    log_hyperparameters,
     log_results,
     resume,
 )
@@ -79,9 +78,9 @@ def run(tmp_path_factory):
         enable_checkpointing=False, enable_model_summary=False, enable_progress_bar=False,
         num_sanity_val_steps=0, check_val_every_n_epoch=None, val_check_interval=4, log_every_n_steps=2,
     )  # fmt: skip
-    log_hyperparameters(trainer.loggers, {"ablation": "full", "seed": 1, "lr": 0.1})
     trainer.fit(subject, StepData())
-    log_results(trainer.loggers, [{"views": 4, "targets": "release", "psnr": 30.0, "ssim": None}], 8)
+    values = {"ablation": "full", "seed": 1, "lr": 0.1}
+    log_results(trainer.loggers, values, [{"views": 4, "targets": "release", "psnr": 30.0, "ssim": None}], 8)
     return folder, subject
 
 
@@ -118,7 +117,6 @@ def test_pictures_and_clouds(run):
     steps = [e.step for e in found.Scalars("val/psnr")]
     assert [e.step for e in found.Images("sheet/p0")] == steps == [4, 8]
     assert sorted(path.name for path in (folder / "pictures").iterdir()) == ["step_000004", "step_000008"]
-    assert [e.step for e in found.Scalars("hparam/psnr")] == [8]
     clouds = [tag for tag in found.Tags()["tensors"] if tag.startswith("p0/")]
     kinds = {tag.removeprefix("p0/").removesuffix("_VERTEX").removesuffix("_COLOR") for tag in clouds}
     assert {"points", "body", "points_and_body"} <= {kind.rstrip("_") for kind in kinds}
@@ -179,11 +177,10 @@ def test_runs_of_a_sweep_leave_no_threads(tmp_path):
     before = threading.active_count()
     for number in range(3):
         of_run = loggers(tmp_path / str(number))
-        log_hyperparameters(of_run, {"seed": number})
         for logger in of_run:
             logger.log_metrics({"a": 1.0}, 0)
             logger.finalize("success")  # as Lightning does when training ends
-        log_results(of_run, [{"views": 4, "targets": "release", "psnr": 30.0}], 1)
+        log_results(of_run, {"seed": number}, [{"views": 4, "targets": "release", "psnr": 30.0}], 1)
         close(of_run)
         assert events(tmp_path / str(number) / "tensorboard").Scalars("hparam/psnr")[0].value == 30
     assert threading.active_count() == before
@@ -233,7 +230,6 @@ def test_wandb_is_built_where_it_is_installed(tmp_path, monkeypatch):
             build(node, "logger.wandb", save_dir=str(tmp_path))
     else:
         logger = build(node, "logger.wandb", save_dir=str(tmp_path))
-        log_hyperparameters([logger], {"seed": 1})
-        log_results([logger], [{"views": 4, "targets": "release", "psnr": 30.0}], 8)
+        log_results([logger], {"seed": 1}, [{"views": 4, "targets": "release", "psnr": 30.0}], 8)
         logger.experiment.finish()
         assert list((tmp_path / "wandb").glob("offline-run-*"))

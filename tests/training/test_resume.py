@@ -161,15 +161,6 @@ def test_every_batch_is_trained_once_and_in_order(tmp_path, monkeypatch, accumul
     assert drawn[: 5 * epochs + rest * accumulate] == list(range(5 * epochs + rest * accumulate))
 
 
-def test_a_run_that_resumes_elsewhere_takes_its_best_along(whole, tmp_path):
-    """A run that resumes in another folder keeps its best checkpoint and score."""
-    folder, _, _ = whole
-    with pytest.raises(PowerCut):
-        fit(tmp_path / "a", Cut(13))
-    fit(tmp_path / "b", Cut(), resume=tmp_path / "a" / "checkpoints" / "last.ckpt")
-    assert score(tmp_path / "b") == score(folder)
-
-
 @pytest.mark.parametrize("elsewhere", [False, True])
 def test_a_run_with_frozen_weights_resumes_from_one_file_of_them(tmp_path, monkeypatch, elsewhere):
     """Killed and resumed, also in another folder when the first is gone: weights as of a run in one piece."""

@@ -10,7 +10,6 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from ghgs_lit.config import build
-from ghgs_lit.config.compose import read_option
 from ghgs_lit.config.keys import flatten, is_below
 from ghgs_lit.diagnostics.benchmark.scene import random_model
 from ghgs_lit.errors import require
@@ -59,15 +58,6 @@ class Case:
         return self.preset == YARDSTICK and not self.knobs
 
 
-def presets_of(names: Sequence[str], configured: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Values of presets by name (files of ``conf/skip``); the preset of the run's own node ``skip`` has the
-    ``configured`` values. InputError: there is no such file."""
-    return {
-        name: dict(configured) if name == configured["name"] else read_option("skip", name, "presets")
-        for name in names
-    }
-
-
 def combinations(knobs: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
     """All combinations of values of the knobs. InputError: a knob does not exist or has no list of values."""
     for key, values in knobs.items():
@@ -98,9 +88,9 @@ def cases_of(
     device: torch.device,
     seed: int = 0,
 ) -> list[Case]:
-    """Cases of a model, every preset (:func:`presets_of`) with every combination of knobs; they share one
-    copy of the weights. The yardstick, if among the presets, comes first, without knobs. InputError: the
-    model refuses a preset or knob, or the weights do not fit it."""
+    """Cases of a model, every preset (values of ``conf/skip`` by name) with every combination of knobs; they
+    share one copy of the weights. The yardstick, if among the presets, comes first, without knobs.
+    InputError: the model refuses a preset or knob, or the weights do not fit it."""
     choices = [(name, change) for name in presets for change in combinations(knobs)]
     if YARDSTICK in presets:
         choices = [(YARDSTICK, {}), *(choice for choice in choices if choice != (YARDSTICK, {}))]

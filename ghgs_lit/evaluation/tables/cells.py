@@ -118,24 +118,19 @@ def _values(table: Table) -> pd.DataFrame:
 def _refuse_rivals(table: Table, values: pd.DataFrame) -> None:
     """Refuse several runs for one cell; names them and the keys in which they differ."""
     means = values.groupby([*CELL, "seed", "source"], sort=False)["value"].mean().reset_index("source")
-    rivals: dict[tuple[str, ...], str] = {}
     for (line, group, _, seed), part in means.groupby(level=[*CELL, "seed"], sort=False):
-        if part["value"].nunique() > 1:
-            variant, views = table.lines[line].variant, table.groups[group].views
-            what = f"ablation={variant.ablation}" if variant.switches else variant.name
-            rivals.setdefault(tuple(part["source"]), f"{what}, {views} views, seed {seed}")
-    if not rivals:
-        return
-    clashes, apart = [], {}
-    for sources, what in list(rivals.items())[:3]:
+        if part["value"].nunique() < 2:
+            continue
+        variant, sources = table.lines[line].variant, list(part["source"])
+        what = f"ablation={variant.ablation}" if variant.switches else variant.name
         of_models = [table.configs[source] for source in sources if source in table.configs]
         keys = differing(of_models)
-        apart |= dict.fromkeys(telling_apart(of_models, keys))
-        said = f" (they differ in {differing_text(keys)})" if keys else ""
-        clashes.append(f"one run for {what}; found {' and '.join(sources)}{said}")
-    more = f"; and {len(rivals) - 3} more such pairs" if len(rivals) > 3 else ""
-    rows = f"by=[{','.join(apart)}] gives each a row, " if apart else ""
-    raise InputError(f"runs: expected {'; '.join(clashes)}{more}: {rows}runs=[...] lists those to show")
+        apart = ",".join(telling_apart(of_models, keys))
+        rows = f"; they differ in {differing_text(keys)}: by=[{apart}] gives each a row" if keys else ""
+        raise InputError(
+            f"runs: expected one run for {what}, {table.groups[group].views} views, seed {seed}; found"
+            f" {' and '.join(sources)}{rows}; runs=[...] lists those to show"
+        )
 
 
 def _lacking(table: Table, cell: Any) -> tuple[int, ...]:

@@ -60,9 +60,7 @@ def write_notes(table: Table) -> list[str]:
         )
     said += _about_others(table)
     said += _about_test(table)
-    said += _about_steps(table)
-    said += _about_seeds(table)
-    return said + _about_runs(table)
+    return said + _about_training(table) + _about_runs(table)
 
 
 def _of(rows: pd.DataFrame, kind: str) -> pd.DataFrame:
@@ -112,25 +110,20 @@ def _about_test(table: Table) -> list[str]:
     ]
 
 
-def _about_steps(table: Table) -> list[str]:
-    if "steps" not in table.rows:
-        return []
-    rows = table.rows.dropna(subset="steps")
-    if rows["steps"].nunique() < 2:
-        return []
-    steps = rows.groupby("variant", sort=False)["steps"].agg(list)
-    stubs = {line.variant: " ".join(line.stub) for line in table.lines}
-    rows = [f"{stubs[variant]}: {_range([round(n) for n in each])}" for variant, each in steps.items()]
-    return [f"Rows were trained for different numbers of steps ({'; '.join(rows)})."]
-
-
-def _about_seeds(table: Table) -> list[str]:
-    seeds = _of(table.rows, "model").groupby("variant", sort=False)["seed"].unique().map(sorted)
-    if len({tuple(each) for each in seeds}) < 2:
-        return []
-    lines = [line for line in table.ours if line.variant in seeds]
-    rows = [f"{' '.join(line.stub)}: {', '.join(map(str, seeds[line.variant]))}" for line in lines]
-    return [f"Rows are of different seeds ({'; '.join(rows)})."]
+def _about_training(table: Table) -> list[str]:
+    """Rows that were trained for different numbers of steps, or with different seeds."""
+    ours, stubs = _of(table.rows, "model"), {line.variant: " ".join(line.stub) for line in table.lines}
+    said = []
+    if "steps" in ours and ours["steps"].nunique() > 1:
+        steps = ours.dropna(subset="steps").groupby("variant", sort=False)["steps"].agg(list)
+        rows = [f"{stubs[variant]}: {_range([round(n) for n in each])}" for variant, each in steps.items()]
+        said.append(f"Rows were trained for different numbers of steps ({'; '.join(rows)}).")
+    seeds = ours.groupby("variant", sort=False)["seed"].unique().map(sorted)
+    if seeds.map(tuple).nunique() > 1:
+        lines = [line.variant for line in table.ours if line.variant in seeds]
+        rows = [f"{stubs[variant]}: {', '.join(map(str, seeds[variant]))}" for variant in lines]
+        said.append(f"Rows are of different seeds ({'; '.join(rows)}).")
+    return said
 
 
 def _about_runs(table: Table) -> list[str]:

@@ -4,7 +4,7 @@ LaTeX needs ``\usepackage{booktabs,multirow,adjustbox,pifont}``.
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -152,46 +152,38 @@ def _column_spec(table: Table) -> str:
     return spec.replace(" |", "", 1) if table.layout.columns == "data" else spec
 
 
-def _frame(table: Table) -> pd.DataFrame:
-    numbers = texts(table, _number)
-    named = table.layout.heading != "none"
-    stub = [
-        (rf"\multirow{{2}}{{*}}{{{escape(name)}}}", "") if named else ("", escape(name))
-        for name in table.stub
-    ]
-    metrics = [
-        (escape(table.groups[group].title), f"{escape(title(metric))}{_ARROWS[arrow(metric)]}")
-        for group, metric in numbers
-    ]
-    rows = []
-    for i in (i for block in table.blocks for i in block):
-        bold = table.lines[i].is_ours and table.layout.rows == "methods"
-        names = map(escape, table.lines[i].stub)
-        rows.append([*(rf"\textbf{{{name}}}" if bold else name for name in names), *numbers.loc[i]])
-    columns = pd.MultiIndex.from_tuples([*stub, *metrics])
-    return pd.DataFrame(rows, columns=columns if named else columns.droplevel(0))
+def _row(cells: Iterable[str]) -> str:
+    return " & ".join(cells) + r" \\"
+
+
+def _head(table: Table) -> list[str]:
+    """Rows of titles, with a rule below each group of columns."""
+    stub, width = list(map(escape, table.stub)), len(table.metrics)
+    metrics = [f"{escape(title(metric))}{_ARROWS[arrow(metric)]}" for metric in table.metrics]
+    if table.layout.heading == "none":
+        return [_row([*stub, *metrics * len(table.groups)])]
+    names = [rf"\multirow{{2}}{{*}}{{{name}}}" for name in stub]
+    groups = [rf"\multicolumn{{{width}}}{{c}}{{{escape(group.title)}}}" for group in table.groups]
+    starts = [len(stub) + 1 + i * width for i in range(len(groups))]
+    rules = "".join(rf"\cmidrule(lr){{{start}-{start + width - 1}}}" for start in starts)
+    return [_row([*names, *groups]), rules, _row([*[""] * len(stub), *metrics * len(groups)])]
 
 
 def _tabular(table: Table) -> str:
-    """The ``tabular`` environment of pandas, with rules below groups and above blocks."""
-    frame = _frame(table)
-    text = frame.style.hide(axis="index").to_latex(
-        column_format=_column_spec(table), hrules=True, multicol_align="c"
-    )
-    lines = text.strip().split("\n")
-    first, end = lines.index(r"\midrule") + 1, lines.index(r"\bottomrule")
-    head, rows, body = lines[: first - 1], lines[first:end], []
-    if table.layout.heading != "none":
-        stub, width = len(table.stub), len(table.metrics)
-        starts = [stub + 1 + i * width for i in range(len(table.groups))]
-        head.insert(-1, "".join(rf"\cmidrule(lr){{{start}-{start + width - 1}}}" for start in starts))
+    """The ``tabular`` environment, with rules above blocks."""
+    numbers, body = texts(table, _number), []
     for block in table.blocks:
         body.append(r"\midrule")
         if len(table.blocks) > 1:
-            name = escape(table.block_title(block))
-            body += [rf"\multicolumn{{{frame.shape[1]}}}{{l}}{{\emph{{{name}}}}} \\", r"\midrule"]
-        body += [rows.pop(0) for _ in block]
-    return "\n".join([*head, *body, *lines[end:]])
+            count, name = len(table.stub) + numbers.shape[1], escape(table.block_title(block))
+            body += [rf"\multicolumn{{{count}}}{{l}}{{\emph{{{name}}}}} \\", r"\midrule"]
+        for line in block:
+            names = map(escape, table.lines[line].stub)
+            if table.lines[line].is_ours and table.layout.rows == "methods":
+                names = (rf"\textbf{{{name}}}" for name in names)
+            body.append(_row([*names, *numbers.loc[line]]))
+    begin = rf"\begin{{tabular}}{{{_column_spec(table)}}}"
+    return "\n".join([begin, r"\toprule", *_head(table), *body, r"\bottomrule", r"\end{tabular}"])
 
 
 def to_latex(table: Table, label: str) -> str:

@@ -1,19 +1,17 @@
-"""Stages of geometry: bounds, projection, unprojection, token points, padding, photo-consistency, lenses."""
+"""Stages of geometry: bounds, projection, unprojection, token points, padding, photo-consistency."""
 
 import torch
-from kornia.geometry.calibration import distort_points
 from torch import Generator, Tensor
 
 from ghgs_lit.bounds import VisualHull
 from ghgs_lit.bounds.silhouettes import depths_in_box, ray_directions
 from ghgs_lit.diagnostics.stress import inputs
-from ghgs_lit.diagnostics.stress.stage import FLOAT32_ONLY, Stage, Values
+from ghgs_lit.diagnostics.stress.stage import Stage, Values
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.geometry.masks import relative_bounds, relative_depth
 from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import project, sample, unproject, world_to_camera
-from ghgs_lit.geometry.undistortion import undistorting_grid
 from ghgs_lit.geometry.unprojection import subject_tokens
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds, DepthMaps
@@ -205,26 +203,6 @@ def _padding_slowly(v: Values) -> Values:
     return {"images": v["images"], "masks": v["masks"].to(v["images"]), "pixel": pixel}
 
 
-def _lens_inputs(family: str, g: Generator) -> Values:
-    distortion = inputs.uniform(g, -0.1, 0.1, 5)
-    return {"lens": _rig(family, g, size=16)["lenses"][0], "distortion": distortion}
-
-
-def _lens(v: Values) -> Values:
-    pairs = zip(inputs.intrinsics(v["lens"]).numpy(), v["distortion"].numpy(), strict=True)
-    return {"grid": torch.cat([undistorting_grid(k, d, 16, 16) for k, d in pairs])}
-
-
-def _lens_slowly(v: Values) -> Values:
-    knots = torch.linspace(0.5, 15.5, 3, dtype=torch.float64)
-    rows, columns = torch.meshgrid(knots, knots, indexing="ij")
-    pixels = torch.stack((columns, rows), -1).flatten(0, 1).expand(len(v["lens"]), 9, 2)
-    grid = 2 * distort_points(pixels, inputs.intrinsics(v["lens"]), v["distortion"]) / 16 - 1
-    grid = grid.mT.unflatten(-1, (3, 3))
-    dense = torch.nn.functional.interpolate(grid, (16, 16), mode="bilinear", align_corners=True)
-    return {"grid": dense.permute(0, 2, 3, 1)}
-
-
 _OUTSIDE_FRAME = {"wide": "the subject is smaller than a pixel", "degenerate": "nothing is in the frame"}
 _HOLDS = "a sum of a few products a coordinate; each rounds once, and the inputs' rounding is in kappa"
 
@@ -279,10 +257,5 @@ STAGES = (
         "padding", ("cameras", "images", "masks"), lambda family, g: scene(family, g, 2, 18), _padding, 10,
         "copies, and a principal point that moves by whole pixels", _padding_slowly,
         gradients=("images",), steady=("truth", "poses"),
-    ),
-    Stage(
-        "undistortion", ("cameras",), _lens_inputs, _lens, 50,
-        "a polynomial of degree 7 and its division by the focal length", _lens_slowly,
-        dtypes=FLOAT32_ONLY,
     ),
 )  # fmt: skip
