@@ -73,6 +73,8 @@ SMALL = [
     (r"^(ghgs benchmark (?!.*-help).*)", r"\1 timing.repeats=1 subjects=1", "one round"),
     (r"^(ghgs benchmark data=synthetic .*)", rf"\1 {TINY}", "two people of 56 x 56 pixels"),
     (r"refine=15", "refine=2", "two steps"),
+    (r"^(ghgs predict .*)", r"\1 turntable.frames=2", "two pictures"),
+    (r"^(ghgs predict data=.*)", r"\1 data.size=112", "112 x 112 pixels"),
     (r"data\.active\.train=\d+", "data.active.train=1", "one person"),
     (r"^(ghgs pretext .*)", rf"\1 {TINY} {SHORT}", "two people of 56 x 56 pixels, two steps"),
     (r"^(python benchmarks/part_awareness\.py.*)", rf"\1 {TINY}", "two people of 56 x 56 pixels"),
@@ -230,9 +232,8 @@ class Command:
 
     def script(self) -> tuple[str, list[str]]:
         """What is run, and the reasons for which it differs from the text."""
-        if self.is_python:
-            return GIVEN.get(self.document, "") + self.text, []
-        text, reasons = self.text, []
+        given = GIVEN.get(self.document, "") if self.is_python else ""
+        text, reasons = given + self.text, []
         for pattern, instead, why in SMALL:
             changed = re.sub(pattern, instead, text)
             if changed != text:

@@ -48,7 +48,7 @@ def one_thread():
 
 def full_batch():
     """Two elements with all that data can have; the first view is the target, too."""
-    batch = make_batch(2, 3, 28, 42)
+    batch = make_batch(2, 3, 28, 28)
     generator = torch.Generator().manual_seed(0)
     return dataclasses.replace(
         batch,

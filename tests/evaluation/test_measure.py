@@ -309,7 +309,8 @@ def test_two_processes_train_together_and_write_once(boxes, tmp_path):
     directory = tmp_path / "run"
     command = [
         sys.executable, "-m", "ghgs_lit", "train", *data_of(boxes), "trainer=ddp_cpu", "trainer.max_steps=2",
-        "evaluation.pictures=0", "evaluation.targets=[release]", f"hydra.run.dir={directory}",
+        "evaluation.pictures=0", "evaluation.targets=[release]", "evaluation.views=[3]",
+        f"hydra.run.dir={directory}",
     ]  # fmt: skip
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment)
