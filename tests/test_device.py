@@ -46,15 +46,15 @@ def one_thread():
     torch.set_num_threads(before)
 
 
-def full_batch():
-    """Two elements with all that data can have; the first view is the target, too."""
-    batch = make_batch(2, 3, 28, 28)
+def full_batch(count=2):
+    """Elements with all that data can have; the first view is the target, too."""
+    batch = make_batch(count, 3, 28, 42)
     generator = torch.Generator().manual_seed(0)
     return dataclasses.replace(
         batch,
         targets=Targets(batch.images[:, :1], batch.masks[:, :1], batch.cameras[:, :1], protocols=("own",)),
         body_vertices=[torch.rand(40, 3, generator=generator) for _ in batch.images],
-        subjects=("a", "b"),
+        subjects=("a", "b")[:count],
     )
 
 
@@ -180,7 +180,7 @@ def test_everything_is_measured_there(tmp_path, monkeypatch):
         methods["cameras"] = ModelMethod(refined, REFERENCE, cameras=cameras)
         found = []
         for name, method in methods.items():
-            found += measure(method, name, [full_batch()], metrics.to(device), device, tmp_path, 1)
+            found += measure(method, name, [full_batch(1)], metrics.to(device), device, tmp_path, 1)
         return found
 
     expected = rows("cpu")

@@ -22,7 +22,6 @@ import torch
 from torch import library
 from torch.nn import functional
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_flatten, tree_map_only
 from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
 
 import ghgs_lit
@@ -210,7 +209,7 @@ def pretend_device(by_line: bool = False) -> Iterator[Log]:
 def _call(function, args, kwargs):
     """Run an operator on the values of its arguments; its result is on the device that CUDA would choose."""
     name = function.name().split(".")[0]
-    tensors = [value for value in tree_flatten((args, kwargs))[0] if isinstance(value, torch.Tensor)]
+    tensors = list(_tensors((args, *kwargs.values())))
     is_here = any(isinstance(value, PretendTensor) for value in tensors)
     if is_here:
         _refuse_strangers(name, tensors)
@@ -224,14 +223,34 @@ def _call(function, args, kwargs):
         reason = _reason_to_wait(name, args, kwargs, to_here)
         for log in _logs:
             log.add(name, reason)
-    bare_args, bare_kwargs = tree_map_only(PretendTensor, lambda value: value.inner, (args, kwargs))
-    result = function(*bare_args, **bare_kwargs)
+    bare = {key: _mapped(value, _inner) for key, value in kwargs.items()}
+    result = function(*_mapped(args, _inner), **bare)
     if function._schema.is_mutable:
         written = _written(function, args, kwargs)
         _require_same_size(name, written)
         if function._schema.returns and written:
             return written[0] if len(written) == 1 else tuple(written)
-    return tree_map_only(torch.Tensor, PretendTensor, result) if to_here else result
+    return _mapped(result, PretendTensor) if to_here else result
+
+
+def _tensors(values) -> Iterator[torch.Tensor]:
+    """Tensors among arguments of an operator, which has no other containers than lists and tuples."""
+    for value in values:
+        if isinstance(value, torch.Tensor):
+            yield value
+        elif isinstance(value, list | tuple):
+            yield from _tensors(value)
+
+
+def _mapped(value, function):
+    """``value`` with ``function`` applied to its tensors."""
+    if isinstance(value, torch.Tensor):
+        return function(value)
+    return type(value)(_mapped(v, function) for v in value) if isinstance(value, list | tuple) else value
+
+
+def _inner(tensor: torch.Tensor) -> torch.Tensor:
+    return tensor.inner if isinstance(tensor, PretendTensor) else tensor
 
 
 def _refuse_strangers(name: str, tensors: list[torch.Tensor]) -> None:
