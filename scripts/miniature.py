@@ -22,25 +22,14 @@ from ghgs_lit.data.zju_mocap.dataset import ZJUMoCap
 from ghgs_lit.errors import InputError
 from ghgs_lit.synthesis.thuman2 import THuman2
 from scripts.miniatures import humman, scans, thuman2, zju_mocap
-from scripts.miniatures.scans import writing
+from scripts.miniatures.scans import mark
 
 
 def make_miniature(dataset: DataSet, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
-    """Write a small data set that the reader of ``dataset`` reads.
-
-    Args:
-        dataset: says which layout, and where it is written.
-        people: number of people of each phase.
-        size: longer side of the photographs in pixels.
-        seed: seed of the people.
-
-    Returns:
-        The folders that were written.
-
-    Raises:
-        InputError: no layout is published for the data set, it has no folder, or files lie there that are not
-            a miniature's.
-    """
+    """Write a small data set that the reader of ``dataset`` reads; returns the folders that were written.
+    ``people``: number of people of each phase. ``size``: longer side of the photographs in pixels.
+    InputError: no layout is published for the data set, it has no folder, or the folder holds anything but a
+    miniature."""
     for kind, make in _MAKERS.items():
         if isinstance(dataset, kind):
             return make(dataset, people, size, seed)
@@ -56,25 +45,25 @@ def _zju_mocap(dataset: ZJUMoCap, people: Mapping[str, int], size: int, seed: in
     for phase in PHASES:
         chosen += [s for some in getattr(dataset.split, phase) for s in some.sequences][: people[phase]]
     root = _root(dataset)
-    with writing(root):
-        return zju_mocap.make(root, chosen, size, seed)
+    mark(root)
+    return zju_mocap.make(root, chosen, size, seed)
 
 
 def _humman(dataset: HuMMan, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
     root = _root(dataset)
-    with writing(root, humman.body_models(root)):
-        return humman.make(root, dataset.split.val, people, size, seed)
+    mark(root, humman.body_models(root))
+    return humman.make(root, dataset.split.val, people, size, seed)
 
 
 def _thuman2(dataset: THuman2, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
     """Renders as the published scripts make them; with ``data.source`` raw scans with their fits."""
     if dataset.source is not None:
         source = dataset.source_folder
-        with writing(source, scans.fit_folder(source)):
-            return [scans.make_scans(source, people, size, seed)]
+        mark(source, scans.fit_folder(source))
+        return [scans.make_scans(source, people, size, seed)]
     root = _root(dataset)
-    with writing(root):
-        return [thuman2.make(root, people, size, seed)]
+    mark(root)
+    return [thuman2.make(root, people, size, seed)]
 
 
 _MAKERS: dict[type[DataSet], Callable[..., list[Path]]] = {

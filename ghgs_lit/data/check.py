@@ -14,14 +14,14 @@ from rich.progress import track
 from rich.table import Table
 from torch.utils.data import DataLoader, Dataset
 
-from ghgs_lit.data.cross_checks import Photograph, Seen, compare_masks
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.overlap import Tile, draw_tile, overlap, save_sheet
 from ghgs_lit.data.reader import PHASES, Photographs, Reader
 from ghgs_lit.data.sampling import CAMERAS, RING_VIEW, TargetProtocol
-from ghgs_lit.data.silhouettes import implausible, silhouette
+from ghgs_lit.data.silhouettes import SEARCH, height, implausible, silhouette, twins
 from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.silhouettes import Silhouette
 
 _LINE = re.compile(r"(?P<place>.*?): expected (?P<expected>.*); found (?P<found>.*)", re.DOTALL)
 # Rows of a table on the terminal; check.json has all.
@@ -33,6 +33,33 @@ _PICTURED_SUBJECTS, _PICTURED_VIEWS = 6, 8
 _BLACK = 8
 # Metres: taller subjects suggest another unit.
 _TALLEST = 10.0
+
+
+#: Subject, position and view.
+Photograph = tuple[str, int, int]
+
+
+@dataclass
+class Seen:
+    """Result of reading one photograph. ``iou``: of body and mask (:func:`overlap`). Without a body to
+    compare: ``agreement``, the share of the mask that the other masks allow, and ``silhouette``, the coarse
+    mask. ``tall``: the subject's largest side in world units, by body or masks."""
+
+    name: str
+    position: int
+    view: int
+    iou: float | None = None
+    agreement: float | None = None
+    body: bool = False
+    tall: float | None = None
+    digest: str | None = None
+    problem: str | None = None
+    silhouette: Silhouette | None = None
+    tile: Tile | None = None
+
+    @property
+    def photograph(self) -> Photograph:
+        return self.name, self.position, self.view
 
 
 @dataclass
@@ -126,7 +153,7 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
             continue
         photographs = Photographs(reader, None, min(dataset.cache_images_mb, _CACHE_MB))
         found = Phase(reader, _read(photographs, targets, min_iou, dataset.workers, f"checking {phase}"))
-        compare_masks(found.seen, reader, min_agreement)
+        _compare_masks(found.seen, reader, min_agreement)
         report.phases[phase] = found
         report.problems += reader.problems + [seen.problem for seen in found.seen if seen.problem]
         report.notes += _notes(dataset.published.get(phase), phase, found)
@@ -163,6 +190,39 @@ def _pictured(reader: Reader) -> set[Photograph]:
         for name in some(list(reader.subjects), _PICTURED_SUBJECTS)
         for position in some(reader.subjects[name], _PICTURED_VIEWS)
     }
+
+
+def _compare_masks(seen: Sequence[Seen], reader: Reader, least: float) -> None:
+    """Find the agreement of masks without a body; at most one problem for each subject. ``least``: share of
+    a mask that the other masks of its subject must allow."""
+    by_subject: dict[str, list[Seen]] = {}
+    for one in seen:
+        if one.silhouette is not None:
+            by_subject.setdefault(one.name, []).append(one)
+    for several in by_subject.values():
+        if len(several) > 1:
+            _compare_subject(several, reader, least)
+
+
+def _compare_subject(seen: Sequence[Seen], reader: Reader, least: float) -> None:
+    ring = {one.position: one for one in seen if one.view == RING_VIEW}
+    pair = twins({position: one.silhouette.extrinsics for position, one in ring.items()})
+    if pair is not None:
+        place = reader.place(*ring[pair[1]].photograph)
+        line = f"{place}: expected a camera of its own; found that of position {pair[0]}"
+        ring[pair[1]].problem = line
+        return
+    silhouettes = [one.silhouette for one in seen]
+    tall = height(silhouettes)
+    for one, share in zip(seen, SEARCH.shares(silhouettes), strict=True):
+        one.agreement, one.tall = share, tall if one.tall is None else one.tall
+    worst = min(seen, key=lambda one: one.agreement)
+    if worst.agreement < least:
+        worst.problem = (
+            f"{reader.place(*worst.photograph)}: expected a mask that the others of its subject allow "
+            f"({least:.0%} of it or more); found {worst.agreement:.0%} (wrong axes, units, direction or size "
+            "of a camera?)"
+        )
 
 
 def _notes(published: int | None, phase: str, found: Phase) -> list[str]:

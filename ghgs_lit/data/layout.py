@@ -10,8 +10,6 @@
     parm/<id>_<position:03d>/<view>_intrinsic.npy  3 x 3 in pixels of the stored image
     parm/<id>_<position:03d>/<view>_extrinsic.npy  3 x 4 or 4 x 4, world to camera, metres, OpenCV axes
     smpl/<id>/vertices.npy                         optional (or smplx/): vertices of the body [n, 3]
-    surface/<id>/vertices.npy                      optional, of people in motion (<id> ends with the number of
-                                                   an instant): the same points [n, 3] at each instant
 
 This package's renderer writes ``<root>/rendering/`` with ``plan.json`` (the requested subjects of each phase)
 and ``done/<phase>/<subject>`` (an empty file for each complete subject, written last). Data without
@@ -180,10 +178,6 @@ class Layout(Reader):
             if path.exists():
                 return read_vertices(path)
         return None
-
-    def read_surface(self, name: str) -> np.ndarray | None:
-        path = self._folders[name] / "surface" / name / "vertices.npy"
-        return read_vertices(path) if path.exists() else None
 
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
         stem = self._folder(name, "img", position) / str(view)

@@ -43,10 +43,6 @@ class Reader(ABC):
     def read_body(self, name: str) -> np.ndarray | None:
         """Body vertices [n, 3] float32 in the world, metres; None if the data has none."""
 
-    def read_surface(self, name: str) -> np.ndarray | None:
-        """Points [n, 3] of a person in motion, the same at all instants; None if the data has none."""
-        return None
-
     @property
     def people(self) -> int:
         """Number of people; fewer than subjects where a subject is one frame of a person."""

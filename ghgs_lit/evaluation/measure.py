@@ -8,49 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from lightning.pytorch import LightningDataModule
 from torch import Tensor, nn
 
-from ghgs_lit.data.batches import BatchBuilder
 from ghgs_lit.errors import InputError
 from ghgs_lit.metrics import ImageMetrics, depth_error_mm
-from ghgs_lit.metrics.functional import flicker
 from ghgs_lit.prediction.refinement import CameraRefinement, Refinement
 from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
 from ghgs_lit.types import Batch, Cameras, Decision, Gaussians, Prediction, Rendering
 from ghgs_lit.visualization.pictures import save_png, sheet
-
-
-class Flickers:
-    """Flicker of each instant of a person against the one measured just before; ``builder``: of the split."""
-
-    def __init__(self, builder: BatchBuilder) -> None:
-        self._builder, self._last = builder, ("", ())
-
-    def __call__(self, batch: Batch, image: Tensor) -> list[Row]:
-        """Rows with the ``flicker`` of each subject and target of ``image`` [B, T, 3, h, w], else empty."""
-        return [row for element in range(len(image)) for row in self._element(batch, image[element], element)]
-
-    def _element(self, batch: Batch, image: Tensor, element: int) -> list[Row]:
-        targets, subject = batch.targets, batch.subjects[element]
-        points = self._builder.inputs.reader.read_surface(subject)
-        if points is None:
-            return [{}] * len(image)
-        photos = [map(int, name.split("/")) for name in targets.names[element]]
-        depths = np.stack([self._builder.targets.view(subject, *photo).depth for photo in photos])
-        errors, cameras = image.clamp(0, 1) - targets.images[element], targets.cameras[element]
-        surface = (errors.new_tensor(points), errors.new_tensor(depths))
-        (last, before), now = self._last, (errors, *surface, cameras.intrinsics, cameras.extrinsics)
-        self._last = (subject, now)
-        if last != f"{subject[:-3]}{int(subject[-3:]) - 1:03d}":
-            return [{}] * len(image)
-        *both, intrinsics, extrinsics = map(torch.stack, zip(before, now, strict=True))
-        values = flicker(*both, Cameras(intrinsics, extrinsics, cameras.height, cameras.width))
-        return [{"flicker": value} for value in values.tolist()]
-
 
 Renderer = Callable[[Gaussians, Cameras], Rendering]
 
@@ -161,12 +129,10 @@ def measure(
     device: torch.device | str = "cpu",
     pictures: Path | None = None,
     picture_count: int = 0,
-    flickers: Flickers | None = None,
 ) -> list[Row]:
     """Measure a method: one row for each subject and target, with one prediction for all protocols.
     ``seconds`` of a row: prediction and all renders of a batch, divided by its subjects. ``pictures``: folder
-    for pictures of the first ``picture_count`` subjects, or None. ``flickers``: adds flicker to the rows.
-    InputError: a batch has no targets."""
+    for pictures of the first ``picture_count`` subjects, or None. InputError: a batch has no targets."""
     rows: list[Row] = []
     for batch in loader:
         batch = batch.to(device)
@@ -181,10 +147,7 @@ def measure(
             for element in range(min(picture_count, len(batch.images))):
                 _draw(batch, estimate, element, pictures, name)
             picture_count = max(picture_count - len(batch.images), 0)
-        found = _rows(batch, estimate, metrics)
-        if flickers is not None:
-            found = [row | more for row, more in zip(found, flickers(batch, estimate.image), strict=True)]
-        rows += [{"method": name, **row, "seconds": seconds} for row in found]
+        rows += [{"method": name, **row, "seconds": seconds} for row in _rows(batch, estimate, metrics)]
     return rows
 
 
@@ -206,7 +169,6 @@ def measure_all(
         found: list[Row] = []
         for name, method in methods.items():
             batches = track(loader, f"measuring {name}, {count} views")
-            flickers = Flickers(data.builder(split))
-            found += measure(method, name, batches, metrics, device, pictures, picture_count, flickers)
+            found += measure(method, name, batches, metrics, device, pictures, picture_count)
         rows += [row for kind in targets for row in found if row["targets"] == kind]
     return rows

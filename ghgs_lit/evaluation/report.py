@@ -20,7 +20,6 @@ from ghgs_lit.runs.results import METHOD, Row, metric_names, summarize, write_re
 print_once = cache(print)
 #: Printed metrics and their decimals.
 PRINTED = {"psnr": 2, "psnr_box": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1, "seconds": 2}
-PRINTED |= {"flicker": 4}
 #: Descriptions of splits for readers of the results.
 SPLITS = {
     "train": "the subjects that were trained on",

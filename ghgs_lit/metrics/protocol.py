@@ -120,7 +120,6 @@ class ImageMetrics:
         said = {
             "image": f"renders {renders}, RGB, data range 1",
             "psnr": f"-10 log10(MSE) of each image, at most {PSNR_CAP:g} dB (equal images)",
-            "flicker": "mean |change of the error| between instants at visible points of the moving surface",
             "depth_error_mm": "mean |z - true z| over a subject's input pixels with predicted and true depth",
         }
         if options.regions:

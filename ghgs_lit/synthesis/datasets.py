@@ -31,7 +31,6 @@ from ghgs_lit.synthesis.jobs import (
     identity,
     render_people,
 )
-from ghgs_lit.synthesis.motion import instant_names
 from ghgs_lit.synthesis.rig import Fill, Rig, RigOptions
 from ghgs_lit.synthesis.scans import ScanSource
 
@@ -112,7 +111,7 @@ class _Generated(_Renderable):
     @property
     def root(self) -> str:
         """The cache's folder, named after everything that the photographs depend on."""
-        made_with = identity(self.camera_rig(), self.render, _PEOPLE_SEED, self.source_of_people.instants)
+        made_with = identity(self.camera_rig(), self.render, _PEOPLE_SEED)
         made_with["people"] = people_version()
         key = hashlib.sha256(json.dumps(made_with, sort_keys=True).encode()).hexdigest()[:16]
         cache = self.cache_dir or os.environ.get("GHGS_CACHE") or "~/.cache/ghgs_lit"
@@ -128,10 +127,6 @@ class _Generated(_Renderable):
 
     def split_facts(self, split: str) -> dict[str, str]:
         return super().split_facts(split) | (bench.facts(split) if split in bench.SPLITS else {})
-
-    @property
-    def source_of_people(self) -> SyntheticSource:
-        return SyntheticSource(_PEOPLE_SEED)
 
     def subject_names(self, phase: str) -> list[str]:
         if phase in bench.SPLITS:
@@ -153,7 +148,7 @@ class _Generated(_Renderable):
 
     def render_first(self, names: Mapping[str, Sequence[str]]) -> None:
         """Render these people, by phase."""
-        source, rig = self.source_of_people, self.camera_rig()
+        source, rig = SyntheticSource(_PEOPLE_SEED), self.camera_rig()
         render_people(Path(self.root), names, source, rig, self.render, _PEOPLE_SEED, self.render_workers)
 
     def check_targets(self, targets: TargetProtocol) -> None:
@@ -170,20 +165,6 @@ class Synthetic(_Generated, _OnRing):
 
     name: Text = "synthetic"
     rig: RigOptions = RigOptions(height=None)
-    motion: int = Field(0, ge=0, lt=1000)
-    """Instants, 1/30 s apart, of each person in motion; each is a subject. 0: people stand still."""
-
-    @property
-    def source_of_people(self) -> SyntheticSource:
-        return SyntheticSource(_PEOPLE_SEED, self.motion)
-
-    @property
-    def split_names(self) -> tuple[str, ...]:
-        return PHASES if self.motion else super().split_names  # the frozen people stand still
-
-    def subject_names(self, phase: str) -> list[str]:
-        people = super().subject_names(phase)
-        return [subject for person in people for subject in instant_names(person, self.motion)]
 
 
 class PeopleInRig(_Generated):
@@ -211,7 +192,9 @@ class PeopleInRig(_Generated):
             return super().render_first(names)
         trained, root = list(names.get("train", [])), Path(self.root)
         super().render_first({**names, "train": trained[:_FIRST_TRAIN]})
-        render_beside(root, trained, self.source_of_people, self.camera_rig(), self.render, _PEOPLE_SEED)
+        render_beside(
+            root, trained, SyntheticSource(_PEOPLE_SEED), self.camera_rig(), self.render, _PEOPLE_SEED
+        )
 
     def reader(self, phase: str, strict: bool = True) -> Layout:
         if phase != "train":

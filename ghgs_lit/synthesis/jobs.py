@@ -12,7 +12,7 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -30,7 +30,7 @@ from ghgs_lit.data.view import View, encode_depth
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import naming
 from ghgs_lit.kernels.cores import allowed_cores
-from ghgs_lit.synthesis import motion, people
+from ghgs_lit.synthesis import people
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import Lights, Studio
 from ghgs_lit.synthesis.progress import Progress
@@ -39,8 +39,6 @@ from ghgs_lit.synthesis.rig import STILL, Poses, Rig
 _GUARD = 'if __name__ == "__main__":'
 # Part of every cache key: to be increased when photographs of the same settings change.
 RENDER_VERSION = 2
-# Vertices of a person in motion that are stored at each instant.
-_FOLLOWED = 4000
 #: Lights of all people.
 LIGHTS = Lights()
 
@@ -60,17 +58,12 @@ ACTIVE = "a"
 
 @dataclass(frozen=True)
 class SyntheticSource:
-    """Generated people, named ``p<index>``, and those in poses of sport and dance, ``a<index>``. With
-    ``instants`` above 0 they move, and a :class:`Person` has all instants."""
+    """Generated people, named ``p<index>``, and those in poses of sport and dance, ``a<index>``."""
 
     seed: int
-    instants: int = 0
 
     def load(self, name: str) -> Person:
-        index, active = int(name[1:]), name.startswith(ACTIVE)
-        if self.instants:
-            return motion.generate_moving(self.seed, index, self.instants, active)
-        return people.generate(self.seed, index, active)
+        return people.generate(self.seed, int(name[1:]), name.startswith(ACTIVE))
 
     def facing(self, name: str) -> float:
         return 0.0
@@ -103,11 +96,6 @@ class _Job:
     phase: str
     name: str
     workspace: Path
-    instants: int
-
-    @property
-    def subjects(self) -> tuple[str, ...]:
-        return motion.instant_names(self.name, self.instants)
 
 
 def everything(rig: Rig, settings: RenderOptions) -> dict:
@@ -116,8 +104,8 @@ def everything(rig: Rig, settings: RenderOptions) -> dict:
     return {"rig": cameras, "render": {**settings.model_dump(), "lights": asdict(LIGHTS)}}
 
 
-def identity(rig: Rig, settings: RenderOptions, seed: int, instants: int = 0) -> dict:
-    """:func:`everything` with seed and instants, in the form of cache keys and stored settings."""
+def identity(rig: Rig, settings: RenderOptions, seed: int) -> dict:
+    """:func:`everything` with the seed, in the form of cache keys and stored settings."""
     cameras, render = everything(rig, settings).values()
     render["vids"] = render.pop("views")  # the name in stored data sets and in the keys of caches
     still = STILL.model_dump()
@@ -125,8 +113,7 @@ def identity(rig: Rig, settings: RenderOptions, seed: int, instants: int = 0) ->
     varied = {name: value for name, value in cameras.pop("variation").items() if value != still[name]}
     if varied:
         cameras["variation"] = varied
-    moving = {"motion": [motion.VERSION, instants]} if instants else {}
-    return {"version": RENDER_VERSION, "seed": seed, "rig": cameras, "render": render, **moving}
+    return {"version": RENDER_VERSION, "seed": seed, "rig": cameras, "render": render}
 
 
 def render_subject(job: _Job) -> _Job:
@@ -137,39 +124,33 @@ def render_subject(job: _Job) -> _Job:
     height, width = job.settings.size
     # A separate generator: heights, yaws and lights do not depend on what is varied.
     rig, poses = job.rig.drawn(person, yaws, width / height, rng.spawn(1)[0])
-    count = len(job.subjects)
-    for i, name in enumerate(job.subjects):
-        parts = person.parts[i * len(person.parts) // count : (i + 1) * len(person.parts) // count]
-        studio = Studio(replace(person, parts=parts), lights, job.settings.samples)
-        _photograph(job, name, studio, rig, yaws, poses)
-        if job.instants:
-            vertices = np.concatenate([part.vertices for part in parts])
-            followed = np.linspace(0, len(vertices) - 1, _FOLLOWED).astype(int)
-            write_body(job.workspace, name, vertices[followed], "surface")
-        if person.body_vertices is not None:
-            write_body(job.workspace, name, np.split(person.body_vertices, count)[i])
+    studio = Studio(person, lights, job.settings.samples)
+    for position, number, view in photographs(studio, rig, job.settings, yaws, poses):
+        write_view(job.workspace, position_name(job.name, position), number, view, job.settings.quality)
+    if person.body_vertices is not None:
+        write_body(job.workspace, job.name, person.body_vertices)
     return job
 
 
-def _photograph(job: _Job, name: str, studio: Studio, rig: Rig, yaws: np.ndarray, poses: Poses) -> None:
-    numbers, (height, width) = job.settings.views, job.settings.size
-    # Errors of compression would be measured as flicker.
-    quality = None if job.instants else job.settings.quality
-    positions = range(job.rig.positions) if job.settings.positions is None else job.settings.positions
-    for position in positions:
-        index = (position, list(numbers))
+def photographs(
+    studio: Studio, rig: Rig, settings: RenderOptions, yaws: np.ndarray, poses: Poses
+) -> Iterator[tuple[int, int, View]]:
+    """Ring position, number and content of each view of ``settings``; ``yaws``, ``poses``: of all views."""
+    height, width = settings.size
+    for position in range(len(yaws)) if settings.positions is None else settings.positions:
+        index = (position, list(settings.views))
         cameras = rig.cameras(yaws[index], height, width, poses[index])
-        photographs = studio.shoot(cameras)
-        for n, number in enumerate(numbers):
+        shot = studio.shoot(cameras)
+        for n, number in enumerate(settings.views):
             view = View(
-                image=np.round(photographs.images[n] * 255).astype(np.uint8),
-                mask=photographs.masks[n],
-                inverse_depth=encode_depth(photographs.depths[n]),
+                image=np.round(shot.images[n] * 255).astype(np.uint8),
+                mask=shot.masks[n],
+                inverse_depth=encode_depth(shot.depths[n]),
                 intrinsics=cameras.intrinsics[n].numpy(),
                 extrinsics=cameras.extrinsics[n].numpy(),
-                matte=np.round(photographs.alphas[n] * 255).astype(np.uint8),
+                matte=np.round(shot.alphas[n] * 255).astype(np.uint8),
             )
-            write_view(job.workspace, position_name(name, position), number, view, quality)
+            yield position, number, view
 
 
 def render_people(
@@ -185,15 +166,14 @@ def render_people(
     """Render people below ``root``; existing ones are kept. Returns the number of people rendered now.
 
     It is safe to kill, to repeat, and to start twice at once: a second process waits for the first.
-    ``names``: subjects of each phase: people, or their instants if they move. ``workers``: number of
-    processes (None: one for each core; 0: only this one). ``shown``: whether there is a progress bar.
-    InputError: ``root`` holds something else, a person is bad, or the script has no main guard."""
+    ``names``: people of each phase. ``workers``: number of processes (None: one for each core; 0: only this
+    one). ``shown``: whether there is a progress bar. InputError: ``root`` holds something else, a person is
+    bad, or the script has no main guard."""
     _check_main_guard()
     positions = settings.positions
     fits = positions is None or set(positions) <= set(range(rig.positions))
     require(fits, "data.render.positions", f"some of 0 to {rig.positions - 1}", positions)
-    instants = source.instants if isinstance(source, SyntheticSource) else 0
-    progress, made_with = Progress(Path(root)), identity(rig, settings, seed, instants)
+    progress, made_with = Progress(Path(root)), identity(rig, settings, seed)
     progress.check_settings(made_with)
     if not any(progress.missing(phase, listed) for phase, listed in names.items()):
         return 0
@@ -202,18 +182,15 @@ def render_people(
         progress.clear_workspaces()
         progress.request(names)
         todo = [
-            _Job(source, rig, settings, seed, phase, name, progress.workspace(phase, name), instants)
+            _Job(source, rig, settings, seed, phase, name, progress.workspace(phase, name))
             for phase, listed in names.items()
-            # The name of the person is the instant's without _t000.
-            for name in dict.fromkeys(
-                name[:-5] if instants else name for name in progress.missing(phase, listed)
-            )
+            for name in progress.missing(phase, listed)
         ]
         console, label = Console(stderr=True), f"rendering into {root}"
         try:
             with contextlib.closing(_run(todo, workers)) as finished:
                 for job in track(finished, label, total=len(todo), console=console, disable=not shown):
-                    progress.publish(job.workspace, job.phase, job.subjects)
+                    progress.publish(job.workspace, job.phase, job.name)
         finally:
             progress.clear_workspaces()
     return len(todo)
@@ -264,15 +241,14 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def write_view(phase: Path, folder: str, number: int, view: View, quality: int | None = 98) -> None:
+def write_view(phase: Path, folder: str, number: int, view: View, quality: int = 98) -> None:
     """Write one view; the JPEG keeps the full resolution of colours. The mask has three equal channels, as
     the authors' loader reads channel 0. ``folder``: name of the subject's position, ``<id>_<position>``.
-    ``quality``: of the JPEG, 1 to 100; None: a PNG."""
+    ``quality``: of the JPEG, 1 to 100."""
     folders = {kind: phase / kind / folder for kind in ("img", "mask", "alpha", "depth", "parm")}
     for path in folders.values():
         path.mkdir(parents=True, exist_ok=True)
-    path, lossy = folders["img"] / f"{number}.jpg", {"quality": quality, "subsampling": 0}
-    Image.fromarray(view.image).save(path.with_suffix(".png") if quality is None else path, **lossy)
+    Image.fromarray(view.image).save(folders["img"] / f"{number}.jpg", quality=quality, subsampling=0)
     mask = np.repeat(view.mask[..., None].astype(np.uint8) * 255, 3, axis=-1)
     Image.fromarray(mask).save(folders["mask"] / f"{number}.png")
     if view.matte is not None:
@@ -283,8 +259,8 @@ def write_view(phase: Path, folder: str, number: int, view: View, quality: int |
     np.save(folders["parm"] / f"{number}_extrinsic.npy", view.extrinsics[:3].astype(np.float64))
 
 
-def write_body(phase: Path, name: str, vertices: np.ndarray, kind: str = "smpl") -> None:
-    """Write the vertices [n, 3] of a subject's body, or of its surface with ``kind="surface"``."""
-    folder = phase / kind / name
+def write_body(phase: Path, name: str, vertices: np.ndarray) -> None:
+    """Write the vertices [n, 3] of a subject's body."""
+    folder = phase / "smpl" / name
     folder.mkdir(parents=True, exist_ok=True)
     np.save(folder / "vertices.npy", vertices.astype(np.float32))

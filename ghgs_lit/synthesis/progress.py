@@ -18,7 +18,7 @@ from ghgs_lit.readers import read_json
 
 log = logging.getLogger(__name__)
 
-_KINDS = ("mask", "alpha", "depth", "parm", "img", "smpl", "surface")
+_KINDS = ("mask", "alpha", "depth", "parm", "img", "smpl")
 
 
 class Progress(Completeness):
@@ -67,8 +67,8 @@ class Progress(Completeness):
         path.mkdir(parents=True)
         return path
 
-    def publish(self, workspace: Path, phase: str, names: Sequence[str]) -> None:
-        """Move the subjects of a workspace to their place, then mark them as complete."""
+    def publish(self, workspace: Path, phase: str, name: str) -> None:
+        """Move the subject of a workspace to its place, then mark it as complete."""
         for kind in _KINDS:
             for source in sorted((workspace / kind).glob("*")):
                 target = self.root / phase / kind / source.name
@@ -76,10 +76,9 @@ class Progress(Completeness):
                 if target.exists():  # left by a run that was killed between two moves
                     shutil.rmtree(target)
                 os.replace(source, target)
-        for name in names:
-            marker = self.marker(phase, name)
-            marker.parent.mkdir(parents=True, exist_ok=True)
-            marker.touch()
+        marker = self.marker(phase, name)
+        marker.parent.mkdir(parents=True, exist_ok=True)
+        marker.touch()
         shutil.rmtree(workspace, ignore_errors=True)
 
     def clear_workspaces(self) -> None:

@@ -2,14 +2,12 @@
 
 Names, types, shapes and units are those of the real files (:mod:`ghgs_lit.synthesis.thuman2`). Bodies
 are MakeHuman's in place of SMPL-X: the parameters in ``smplx_param.pkl`` have the right shapes and place the
-body correctly, but do not pose it. Folders that are written get the marker ``miniature.json``, which lists
-their files, so that real data of the same names is never overwritten.
+body correctly, but do not pose it. Folders that are written get a mark, so that real data of the same names
+is never overwritten.
 """
 
-import contextlib
-import json
 import pickle
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -21,59 +19,31 @@ from trimesh.caching import TrackedArray
 
 from ghgs_lit.data.sampling import subject_rng
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.files import write_text_atomically
-from ghgs_lit.readers import read_json
 from ghgs_lit.synthesis import people
 from ghgs_lit.synthesis.people.generate import join
 from ghgs_lit.synthesis.people.mesh import TexturedMesh
 from ghgs_lit.synthesis.thuman2 import FIT_FOLDERS
 
-#: In each folder that a miniature was written to: which files are its own.
-MARKER = "miniature.json"
+#: A file in each folder that a miniature was written to.
+MARKER = "miniature"
 # Id of the first scan of each phase.
 _FIRST = {"train": 0, "val": 426}
 POSE_SIZES = {"betas": 10, "body_pose": 63, "left_hand_pose": 12, "right_hand_pose": 12, "jaw_pose": 3}
 POSE_SIZES |= {"leye_pose": 3, "reye_pose": 3, "expression": 10}
 
 
-@contextlib.contextmanager
-def writing(*folders: Path) -> Iterator[None]:
-    """Mark as a miniature's what is written into folders. InputError: a folder holds anything but a
-    miniature."""
+def mark(*folders: Path) -> None:
+    """Mark folders as a miniature's before they are written. InputError: one holds files and has no mark."""
     for folder in folders:
-        _check_own(folder)
+        marked = (folder / MARKER).is_file() or not folder.is_dir()
+        found = [] if marked else sorted(path.name for path in folder.iterdir())
+        if found:
+            raise InputError(
+                f"{folder}: expected an empty folder or a miniature; found files such as {found[0]}"
+            )
     for folder in folders:
-        _mark(folder, None)
-    yield
-    for folder in folders:
-        _mark(folder, _files(folder))
-
-
-def _files(folder: Path) -> list[str]:
-    return sorted(
-        p.relative_to(folder).as_posix() for p in folder.rglob("*") if not p.is_dir() and p.name != MARKER
-    )
-
-
-def _mark(folder: Path, files: list[str] | None) -> None:
-    """Note the files of a miniature; None while they are written, so that a killed run can be repeated."""
-    write_text_atomically(folder / MARKER, json.dumps({"files": files}, indent=1))
-
-
-def _check_own(folder: Path) -> None:
-    marker = folder / MARKER
-    found = _files(folder) if folder.is_dir() else []
-    if marker.is_file():
-        content = read_json(marker, "a miniature's list of its files")
-        own = content.get("files") if isinstance(content, dict) else "no mapping"
-        is_list = isinstance(own, list) and all(isinstance(name, str) for name in own)
-        require(own is None or is_list, f"{marker}: files", "a list of names or null", own)
-        found = [] if own is None else sorted(set(found) - set(own))
-    if found:
-        raise InputError(
-            f"{folder}: expected an empty folder, or a miniature and nothing else; found "
-            f"{len(found)} other files such as {found[0]}"
-        )
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / MARKER).touch()
 
 
 def fit_folder(source: Path) -> Path:

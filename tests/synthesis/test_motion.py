@@ -1,4 +1,4 @@
-"""People in motion: what moves, what stays, and how they are rendered and read."""
+"""People in motion: what moves, what stays, and how they are rendered."""
 
 from dataclasses import replace
 
@@ -6,17 +6,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.measure import Estimate, measure_all
-from ghgs_lit.metrics import MetricsOptions
-from ghgs_lit.synthesis import motion, people
-from ghgs_lit.synthesis.datasets import Synthetic
+from benchmarks import moving_people as motion
+from ghgs_lit.synthesis import people
+from ghgs_lit.synthesis.jobs import RenderOptions
 from ghgs_lit.synthesis.people.body import load_body
 from ghgs_lit.synthesis.people.mesh import Person
-from tests.helpers.people import V4, box_person
+from ghgs_lit.synthesis.rig import Rig
+from tests.helpers.people import box_person
 
 INSTANTS, STEP = 3, 0.1
-RELEASE = {"name": "release", "training_views": (3,)}
 INDEX = 2_000_015  # walks, in trousers and with hair
 
 
@@ -42,18 +40,6 @@ def boxes(monkeypatch):
         return Person(box.name, parts, np.concatenate([person.body_vertices for person in moved]))
 
     monkeypatch.setattr(motion, "generate_moving", generate)
-
-
-def built(tmp_path, **changes):
-    arguments = {
-        "people": {"train": 1, "val": 2},
-        "motion": INSTANTS,
-        "size": 56,
-        "render": {"size": 56, "samples": 1, "positions": (0, 4, 8, 12), "views": (0, 3)},
-        "cache_dir": str(tmp_path),
-        "render_workers": 0,
-    }
-    return Synthetic(**(arguments | changes)).build(V4, RELEASE)
 
 
 def test_the_first_instant_is_the_person_who_stands_still(moving):
@@ -103,63 +89,21 @@ def test_one_foot_stays_and_the_lower_one_is_on_the_ground(index):
     assert np.ptp(shift, axis=0).max() < 1e-9
 
 
-def test_each_instant_is_a_subject_before_the_same_cameras(tmp_path, boxes):
+def test_each_instant_is_a_subject_before_the_same_cameras(boxes):
     """In their order; the points of the surface move as the box does, and lie on it."""
-    data = built(tmp_path)
-    data.prepare_data()
-    subjects = list(data.subjects("val"))
-    assert subjects == [f"p100000{person}_t00{instant}" for person in range(2) for instant in range(INSTANTS)]
-    found = [data.evaluation_batch(name, targets=RELEASE) for name in subjects[:INSTANTS]]
-    reader = data.builder("val").inputs.reader
-    points = [reader.read_surface(name) for name in subjects[:INSTANTS]]
-    for number, batch in enumerate(found):
-        assert (batch.cameras.extrinsics == found[0].cameras.extrinsics).all()
+    settings = RenderOptions(size=56, samples=1, positions=(0, 4, 8, 12), views=(0, 3))
+    reader = motion.MovingPerson("p2000015", INSTANTS, Rig(height=None), settings)
+    assert list(reader.subjects) == [f"p2000015_t00{instant}" for instant in range(INSTANTS)]
+    assert set(reader.subjects.values()) == {(0, 4, 8, 12)}
+    points = list(reader.surfaces.values())
+    first = reader.read_view("p2000015_t000", 4, 3, depth=True)
+    for number, name in enumerate(reader.subjects):
+        view = reader.read_view(name, 4, 3, depth=True)
+        assert (view.extrinsics == first.extrinsics).all()
+        assert view.mask.any()
         assert points[number] - points[0] == pytest.approx(
             np.tile([STEP * number, 0, 0], (4000, 1)), abs=1e-6
         )
     # The rig is around the whole motion.
     ends = np.concatenate([points[0], points[-1]])
     assert ends.min(0)[0] == pytest.approx(-ends.max(0)[0], abs=1e-6)
-    image = data.dataset.folder / "val" / "img" / "p1000000_t001_000"
-    assert {path.suffix for path in image.iterdir()} == {".png"}
-
-
-def test_a_rendering_that_was_killed_goes_on_with_whole_sequences(tmp_path, boxes):
-    data = built(tmp_path)
-    data.prepare_data()
-    marker = data.dataset.folder / "rendering" / "done" / "val" / "p1000001_t002"
-    marker.unlink()
-    with pytest.raises(InputError, match="p1000001_t002 is missing or half-rendered"):
-        built(tmp_path).subjects("val")
-    again = built(tmp_path)
-    again.prepare_data()
-    assert marker.exists()
-    assert len(again.subjects("val")) == 2 * INSTANTS
-
-
-def test_an_evaluation_has_the_flicker_of_each_instant_but_the_first(tmp_path, boxes):
-    """An error that alternates between instants, and one that stays; each person is a sequence."""
-    data = built(tmp_path)
-    data.prepare_data()
-
-    def alternating(batch):
-        odd = int(batch.subjects[0][-1]) % 2
-        return Estimate((0.5 + 0.2 * odd) * batch.targets.images)
-
-    methods = {"alternating": alternating, "dark": lambda batch: Estimate(0.5 * batch.targets.images)}
-    rows = measure_all(methods, data, [4], {"release": RELEASE}, "val", MetricsOptions(lpips="off").build())
-    flickers = {name: [row.get("flicker") for row in rows if row["method"] == name] for name in methods}
-    for person in range(2):
-        first, *later = flickers["alternating"][INSTANTS * person : INSTANTS * (person + 1)]
-        assert first is None
-        # 0.2 of the colours (200, 90, 30), in lights of 0.3 to 1
-        assert all(0.3 * 0.2 * 107 / 255 < value < 0.2 * 107 / 255 for value in later)
-    steady = [value for value in flickers["dark"] if value is not None]
-    assert len(steady) == 2 * (INSTANTS - 1)
-    assert max(steady) < 0.005
-
-
-def test_the_frozen_people_stand_still(tmp_path):
-    """They are not among the splits of people in motion."""
-    with pytest.raises(InputError, match=r"split: expected one of train, val; found 'bench'"):
-        built(tmp_path).prepare_data(["bench"])

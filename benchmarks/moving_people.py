@@ -1,27 +1,28 @@
-"""Built-in people in motion: from one pose to another and back, at instants of 1/30 s. At the first instant a
-person in motion equals the still one of the same number. Only vertices move: faces, texture coordinates and
-textures (with the shadows of the first instant) are the same at all instants."""
+"""Built-in people in motion, rendered in memory: from one pose to another and back, at instants of 1/30 s. At
+the first instant a person in motion equals the still one of the same number. Only vertices move: faces,
+texture coordinates and textures (with the shadows of the first instant) are the same at all instants."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ghgs_lit.data.reader import Reader
+from ghgs_lit.data.sampling import subject_rng
+from ghgs_lit.data.view import View
+from ghgs_lit.synthesis.jobs import LIGHTS, RenderOptions, photographs
 from ghgs_lit.synthesis.people.ambient_occlusion import occluding_spheres
 from ghgs_lit.synthesis.people.body import BODY_VERTICES, BodyModel, bone_transforms, skin
 from ghgs_lit.synthesis.people.garments import Figure
 from ghgs_lit.synthesis.people.generate import MAX_POSES, Character, arm_depth, pose_figure
 from ghgs_lit.synthesis.people.mesh import Person
+from ghgs_lit.synthesis.photograph import Studio
+from ghgs_lit.synthesis.rig import Rig
 
-#: Part of the keys of caches: to be increased when people of the same number move differently.
-VERSION = 1
 #: Instants from one pose to the other: one second.
 PASSAGE = 30
-
-
-def instant_names(person: str, instants: int) -> tuple[str, ...]:
-    """Names of a person's subjects, one for each instant; with 0 instants the person's name."""
-    return tuple(f"{person}_t{i:03d}" for i in range(instants)) or (person,)
+# Vertices that are followed over all instants.
+_FOLLOWED = 4000
 
 
 def shares(instants: int) -> np.ndarray:
@@ -69,7 +70,7 @@ class Motion:
 
 def generate_moving(seed: int, index: int, instants: int, active: bool = False) -> Person:
     """Person ``index`` of the family ``seed`` at all instants: parts and bodies of one instant after another.
-    Arguments as of :func:`.people.generate`; the frame is that of the first instant."""
+    Arguments as of :func:`ghgs_lit.synthesis.people.generate`; the frame is that of the first instant."""
     person = Character(seed, index, active)
     first = person.first
     for _ in range(MAX_POSES):  # until the arms do not cut the trunk on the way
@@ -84,3 +85,33 @@ def generate_moving(seed: int, index: int, instants: int, active: bool = False) 
         moved = zip(parts[:count], person.dressed(figure, unshaded), strict=True)
         parts += [replace(part, vertices=like.vertices) for part, like in moved]
     return person.placed(parts, np.concatenate([figure.posed for figure in figures]), count)
+
+
+class MovingPerson(Reader):
+    """Photographs of a built-in person at all instants, each a subject ``<person>_t<number>``. ``surfaces``:
+    points [n, 3] of the surface, the same at all instants."""
+
+    def __init__(self, person: str, instants: int, rig: Rig, settings: RenderOptions, seed: int = 0) -> None:
+        super().__init__()
+        rng = subject_rng(seed, person)
+        moving = rig.place(generate_moving(seed, int(person[1:]), instants, person.startswith("a")), rng)
+        yaws, lights = rig.yaws(rng), LIGHTS.draw(rng)
+        height, width = settings.size
+        drawn, poses = rig.drawn(moving, yaws, width / height, rng.spawn(1)[0])
+        self.surfaces: dict[str, np.ndarray] = {}
+        self._views: dict[tuple[str, int, int], View] = {}
+        count = len(moving.parts) // instants
+        for i in range(instants):
+            name, parts = f"{person}_t{i:03d}", moving.parts[i * count : (i + 1) * count]
+            studio = Studio(replace(moving, parts=parts), lights, settings.samples)
+            shot = {(p, n): view for p, n, view in photographs(studio, drawn, settings, yaws, poses)}
+            self._views |= {(name, *place): view for place, view in shot.items()}
+            self.subjects[name] = tuple(dict.fromkeys(position for position, _ in shot))
+            vertices = np.concatenate([part.vertices for part in parts])
+            self.surfaces[name] = vertices[np.linspace(0, len(vertices) - 1, _FOLLOWED).astype(int)]
+
+    def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
+        return self._views[name, position, view]
+
+    def read_body(self, name: str) -> None:
+        return None
