@@ -19,10 +19,10 @@ from literal import write_out
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.config.compose import read_options
-from ghgs_lit.diagnostics.benchmark.machine import in_words, machine_facts
 from ghgs_lit.diagnostics.benchmark.measure import inspect, time_cases
 from ghgs_lit.diagnostics.benchmark.presets import Case, Source, cases_of
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL, top_level
+from ghgs_lit.diagnostics.machine import in_words, machine_facts
 from ghgs_lit.types import Batch
 
 

@@ -26,11 +26,11 @@ from torch import Tensor
 from ghgs_lit.cli.benchmark import check_options, configured_cases
 from ghgs_lit.cli.inputs import pick_device
 from ghgs_lit.config import compose, resolve
-from ghgs_lit.diagnostics.benchmark.machine import in_words, machine_facts
 from ghgs_lit.diagnostics.benchmark.measure import order
 from ghgs_lit.diagnostics.benchmark.presets import Case
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL, SecondsProbe, forward, top_level
+from ghgs_lit.diagnostics.machine import in_words, machine_facts
 from ghgs_lit.kernels.allocation import keep_freed_memory
 from ghgs_lit.types import Batch
 from ghgs_lit.visualization.pictures import to_uint8

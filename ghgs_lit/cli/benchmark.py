@@ -16,9 +16,9 @@ from ghgs_lit.config import build
 from ghgs_lit.config.compose import read_options
 from ghgs_lit.config.keys import is_below
 from ghgs_lit.diagnostics.benchmark import report
-from ghgs_lit.diagnostics.benchmark.machine import machine_facts
 from ghgs_lit.diagnostics.benchmark.measure import record_cases, threads
 from ghgs_lit.diagnostics.benchmark.presets import KNOBS, YARDSTICK, Case, Source, cases_of
+from ghgs_lit.diagnostics.machine import machine_facts
 from ghgs_lit.diagnostics.output import print_tables
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.measure import decisions_of

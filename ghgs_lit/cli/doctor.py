@@ -10,8 +10,8 @@ from ghgs_lit.cli.inputs import pick_device
 from ghgs_lit.cli.photographs import capture_folder
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config import resolve
-from ghgs_lit.diagnostics.doctor.machine import machine_lines, missing_extras
 from ghgs_lit.diagnostics.doctor.selfcheck import FAILED, selfcheck, table
+from ghgs_lit.diagnostics.machine import machine_lines, missing_extras
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.prediction.capture.calibration import calibrate

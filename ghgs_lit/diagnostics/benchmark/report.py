@@ -7,9 +7,9 @@ from typing import Any
 
 import pandas as pd
 
-from ghgs_lit.diagnostics.benchmark.machine import in_words
 from ghgs_lit.diagnostics.benchmark.measure import Record
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL
+from ghgs_lit.diagnostics.machine import in_words
 from ghgs_lit.diagnostics.output import Tables, document, pivoted, texts
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.results import Row, plain, summarize

@@ -21,7 +21,7 @@ from ghgs_lit.diagnostics.doctor.selfcheck import (
 )
 from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.recalibration import Recalibration
-from ghgs_lit.rendering import cpu
+from ghgs_lit.rendering.cpu import backend as cpu
 from tests.helpers.models import TINY
 from tests.helpers.pretend_device import DEVICE, pretend_device
 from tests.helpers.verbs import ghgs

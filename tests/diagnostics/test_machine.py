@@ -5,7 +5,7 @@ import importlib.metadata
 import torch
 
 from ghgs_lit.cli import doctor
-from ghgs_lit.diagnostics.doctor.machine import machine_lines, missing_extras
+from ghgs_lit.diagnostics.machine import machine_lines, missing_extras
 from tests.helpers.verbs import ghgs
 
 

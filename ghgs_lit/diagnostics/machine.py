@@ -1,19 +1,51 @@
-"""Facts about this machine, and optional extras that are missing."""
+"""This machine: what times are measured on, and optional extras that are missing."""
 
 import importlib.metadata
 import os
+import platform
 import re
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import torch
 from rich.filesize import decimal
 
-from ghgs_lit.diagnostics.benchmark.machine import machine_facts
+from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.rendering import gsplat_backend
+from ghgs_lit.runs.provenance import version_of
 
 DISTRIBUTION = "ghgs-lit"
 
 Line = tuple[str, str]
+
+
+def processor_name() -> str:
+    """Model name of the processor; on other systems than Linux what Python knows of it."""
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text().splitlines() if path.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def machine_facts(device: torch.device) -> dict[str, Any]:
+    """Processor, vector width, cores, threads, device and PyTorch's version, as plain data."""
+    return {
+        "processor": processor_name(),
+        "vectors": torch.backends.cpu.get_cpu_capability(),
+        "cores": allowed_cores(),
+        "threads": torch.get_num_threads(),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+        "platform": platform.platform(),
+        "torch": torch.__version__,
+    }
+
+
+def in_words(machine: dict[str, Any]) -> str:
+    """:func:`machine_facts` on one line."""
+    device = "" if machine["device"] == "cpu" else f"{machine['device']}, "
+    cores = f"{machine['threads']} of {machine['cores']} cores"
+    return f"{device}{machine['processor']} ({machine['vectors']}, {cores}), torch {machine['torch']}"
 
 
 def machine_lines(device: torch.device) -> list[Line]:
@@ -21,7 +53,7 @@ def machine_lines(device: torch.device) -> list[Line]:
     facts = machine_facts(device)
     versions = (DISTRIBUTION, "torch", "lightning", "numpy", "numba", "gsplat")
     return [
-        ("versions", ", ".join(f"{name} {_version(name) or 'none'}" for name in versions)),
+        ("versions", ", ".join(f"{name} {version_of(name) or 'none'}" for name in versions)),
         ("platform", facts["platform"]),
         ("processor", f"{facts['processor']}, vectors {facts['vectors']}"),
         ("threads", f"{facts['threads']} of {facts['cores']} cores"),
@@ -35,7 +67,7 @@ def machine_lines(device: torch.device) -> list[Line]:
 def missing_extras() -> Iterator[Line]:
     """Yield each incomplete extra of the package with the command that installs it."""
     wanted: dict[str, list[str]] = {}
-    if _version(DISTRIBUTION) is None:  # run from its sources
+    if version_of(DISTRIBUTION) is None:  # run from its sources
         yield DISTRIBUTION, "not installed, so that its extras are not known: pip install -e ."
         return
     for requirement in importlib.metadata.requires(DISTRIBUTION) or []:
@@ -43,16 +75,9 @@ def missing_extras() -> Iterator[Line]:
         if extra and extra[1] != "dev":
             wanted.setdefault(extra[1], []).append(re.match(r"[\w.-]+", requirement)[0])
     for extra, names in wanted.items():
-        absent = [name for name in names if _version(name) is None]
+        absent = [name for name in names if version_of(name) is None]
         if absent:
             yield extra, f"{', '.join(absent)} missing: pip install '{DISTRIBUTION}[{extra}]'"
-
-
-def _version(name: str) -> str | None:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def _gpus() -> list[Line]:
