@@ -41,7 +41,7 @@ from ghgs_lit.recalibration.inspection import attention_on_other_parts
 from ghgs_lit.rounds.rounds import State, prediction_of
 from ghgs_lit.surroundings import Surrounding, computing, surroundings
 from ghgs_lit.training.optimization import Optimization
-from ghgs_lit.training.pretext.labels import part_shares
+from ghgs_lit.training.pretext.labels import part_shares, token_parts
 from ghgs_lit.types import Batch, DepthMaps, Points, Prediction, Rendering, Tokens
 
 ARMS, DEVIATION, OFF = ("none", "product", "log", "off", "shuffled"), 3.0, 6.0
@@ -69,13 +69,6 @@ class Seen:
     points: Points
     depths: DepthMaps
     part: Tensor
-
-
-def token_parts(shares: Tensor, tokens: Tokens) -> Tensor:
-    """The part with the largest of ``shares`` [n, P] of all patches in that of each token [N]; -1: none."""
-    _, _, h, w = tokens.grid
-    own = shares[(tokens.image * h + tokens.row) * w + tokens.column]
-    return torch.where(own.any(1), own.argmax(1), -1)
 
 
 class Experiment:

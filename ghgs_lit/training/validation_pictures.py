@@ -12,7 +12,8 @@ from lightning.pytorch.utilities import rank_zero_only
 from ghgs_lit.config.options import Index, Options
 from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.recalibration import Recalibration
-from ghgs_lit.recalibration.inspection import attention_of
+from ghgs_lit.recalibration.inspection import attention_of, attention_on_other_parts
+from ghgs_lit.training.pretext.labels import has_parts, part_shares, token_parts
 from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.attention import attention_sheet, chosen_token
 from ghgs_lit.visualization.clouds import clouds
@@ -75,6 +76,7 @@ class Pictures(Callback):
             _publish(trainer, f"sheet/{name}", picture, name)
             if number == 0:
                 self._show_attention(trainer, batch, element, name)
+                self._log_other_parts(pl_module, batch)
                 _show_clouds(trainer, batch, prediction, element, name)
             self._left -= 1
         self._forget()
@@ -97,6 +99,19 @@ class Pictures(Callback):
             padding = pad_to_patches(batch.masks, tokens.patch_size)
             picture = attention_sheet(padding.pad_batch(batch) if padding else batch, tokens, attention)
             _publish(trainer, f"attention/{name}", picture, f"{name}_attention")
+
+    def _log_other_parts(self, pl_module: L.LightningModule, batch: Batch) -> None:
+        """Log the share of attention on other body parts, for built-in people with true depths."""
+        if self._seen is None or batch.depths is None or not has_parts(batch):
+            return
+        stage, tokens, points = self._seen
+        padding = pad_to_patches(batch.masks, tokens.patch_size)
+        shares = part_shares(padding.pad_batch(batch) if padding else batch, tokens.patch_size)
+        part = token_parts(shares, tokens)
+        found = attention_on_other_parts(stage, tokens, points, part)
+        pl_module.log(
+            "attention/other_parts", found.mean(), batch_size=len(batch.images), rank_zero_only=True
+        )
 
 
 def _publish(trainer: L.Trainer, tag: str, picture: np.ndarray, file: str) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.synthesis.people.body import BODY_VERTICES, load_body
-from ghgs_lit.types import Batch
+from ghgs_lit.types import Batch, Tokens
 
 # Prefixes of the names of a part's bones. Bones of limbs end with .L or .R, and their sides are two parts.
 _TRUNK = {
@@ -60,6 +60,19 @@ def parts_of_points(points: Float[Tensor, "n 3"], vertices: Float[Tensor, "m 3"]
     tree = cKDTree(vertices.double().cpu().numpy(), balanced_tree=False, compact_nodes=False)
     nearest = tree.query(points.double().cpu().numpy())[1]
     return torch.from_numpy(vertex_parts()[nearest]).to(points.device)
+
+
+def has_parts(batch: Batch) -> bool:
+    """Whether the bodies of a batch are built-in ones, whose parts are known."""
+    bodies = batch.body_vertices or ()
+    return len(bodies) > 0 and all(len(body) == BODY_VERTICES for body in bodies)
+
+
+def token_parts(shares: Float[Tensor, "n P"], tokens: Tokens) -> Int[Tensor, " N"]:
+    """The part with the largest of ``shares`` (:func:`part_shares`) in the patch of each token; -1: none."""
+    _, _, h, w = tokens.grid
+    own = shares[(tokens.image * h + tokens.row) * w + tokens.column]
+    return torch.where(own.any(1), own.argmax(1), -1)
 
 
 def part_shares(batch: Batch, patch_size: int) -> Float[Tensor, "n P"]:
