@@ -175,7 +175,10 @@ def test_attention_without_512_bit_vectors():
     """The kernel of a processor with AVX2 alone is as accurate; a wider one is limited by Numba's setting."""
     if not {"avx2", "fma"} <= processor_features():
         pytest.skip("needs AVX2")
-    run_python(NARROW, NUMBA_CPU_FEATURES="-avx512f")
+    if "avx512f" in processor_features():
+        run_python(NARROW, NUMBA_CPU_FEATURES="-avx512f")
+    else:
+        exec(NARROW, {})  # this processor is such a one
 
 
 def test_tiles_fit_the_blocks():
