@@ -17,7 +17,7 @@ from ghgs_lit.files import write_text_atomically
 from ghgs_lit.prediction.capture.calibration import calibrate
 from ghgs_lit.prediction.capture.camera_report import diagnose
 from ghgs_lit.prediction.capture.drawing import camera_sheet
-from ghgs_lit.prediction.capture.formats.json_and_toml import write_json
+from ghgs_lit.prediction.capture.formats.json_and_toml import json_text
 from ghgs_lit.visualization.pictures import save_png
 
 _LISTED = 6  #: Number of interpretations of a calibration that are listed
@@ -55,7 +55,7 @@ def cameras(cfg: DictConfig) -> None:
         announce(picture)
     if diagnosis.option:
         found = {v.name: (calibrate(v.camera, v.convention, v.camera.size), v.camera.size) for v in views}
-        write_json(calibration, found)
+        write_text_atomically(calibration, json_text(found))
         announce(calibration)
     if not diagnosis.consistent:
         found = "; ".join(diagnosis.lines)

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
@@ -108,7 +109,7 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
     write_config(config, directory)
     refining = {name: config[name] for name in ("refine_cameras", "refine_masks", "refine")}
     temporal = Temporal(partial(in_frame, model), model.skip.every, renderer)
-    totals: dict[str, float] = {}
+    totals: Counter[str] = Counter()
     count, begin = 0, time.perf_counter()
     rig, backgrounds = None, Backgrounds({})
     if together:
@@ -126,8 +127,7 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         if count == 1:
             for line in (*advice_of(directories[capture.name]), *rig_advice(trained, result.batch)):
                 print(line, flush=True)
-        for stage, value in seconds.items():
-            totals[stage] = totals.get(stage, 0.0) + value
+        totals.update(seconds)
     left_out = len(folder.instants) - count
     require(count > 0, str(folder.images), "an instant that can be read", f"none of {left_out}")
     if together:

@@ -16,8 +16,8 @@ from ghgs_lit.readers import read_npy, require_file
 _OFF_CENTRE = 0.25
 # Largest entry of ``R R^T - I``: allows rounding, but no other unit or axis.
 _ROTATION_TOLERANCE = 1e-3
-# Modes that convert to RGB without loss of range, and the EXIF orientation of upright images.
-_EIGHT_BITS, _UPRIGHT = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr"), 1
+#: Modes that convert to RGB without loss of range, and the EXIF orientation of upright images.
+EIGHT_BITS, _UPRIGHT = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr"), 1
 #: Largest coordinate of a vertex: a kilometre in millimetres.
 _FURTHEST = 1e6
 _SAFE_NAME = re.compile(r"[\w.+-]+")
@@ -40,7 +40,7 @@ def read_photograph(path: Path) -> np.ndarray:
     """Read [h, w, 3] uint8 from an image of 8 bits a channel (grey, palette, RGB or CMYK, alpha ignored).
     InputError: it is missing or cannot be decoded, has other values, or an EXIF orientation."""
     image = read_image(path)
-    if image.mode not in _EIGHT_BITS:
+    if image.mode not in EIGHT_BITS:
         raise InputError(f"{path}: expected a photograph of 8 bits a channel; found mode {image.mode}")
     turn = image.getexif().get(ExifTags.Base.Orientation, _UPRIGHT)
     if turn != _UPRIGHT:

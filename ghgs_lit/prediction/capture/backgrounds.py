@@ -54,8 +54,7 @@ class _Background:
     def mended(self, photograph: Photograph) -> Photograph:
         """The photograph with a corrected mask; itself where the background does not contradict it."""
         reach = _reach(self.known.shape)
-        lines = (np.nonzero(photograph.mask.any(axis))[0] for axis in (1, 0))
-        box = tuple(slice(max(n[0] - 24 * reach, 0), n[-1] + 24 * reach + 1) for n in lines)
+        box = tuple(slice(max(a - 24 * reach, 0), b + 24 * reach) for a, b in photograph.extents)
         seen = (photograph.image, photograph.matte, self.image, self.known)
         found = _mended(*(pixels[box] for pixels in seen), reach)
         if found is None:

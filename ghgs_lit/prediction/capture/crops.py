@@ -28,6 +28,12 @@ class Photograph:
         """[h, w] bool, true where the subject fills half of a pixel or more."""
         return self.matte > 127
 
+    @property
+    def extents(self) -> list[tuple[int, int]]:
+        """The first row and the one after the last of the subject, then its columns."""
+        lines = (np.nonzero(self.mask.any(axis))[0] for axis in (1, 0))
+        return [(int(found[0]), int(found[-1]) + 1) for found in lines]
+
 
 def crop_to_subject(photograph: Photograph, size: tuple[int, int], refine_masks: int = 0) -> Photograph:
     """A crop of ``size`` (height, width) with the subject in its middle, and its camera.
@@ -35,8 +41,7 @@ def crop_to_subject(photograph: Photograph, size: tuple[int, int], refine_masks:
     Beyond the photograph and beside the subject it is black. A large photograph's sharp mask becomes a soft
     matte. Where the photograph's border cuts the subject the crop ends, too: black beside it would look like
     the subject's end. ``refine_masks``: as for ``Capture.batch``."""
-    rows, columns = (np.nonzero(photograph.mask.any(axis))[0] for axis in (1, 0))
-    extents = [(int(lines[0]), int(lines[-1]) + 1) for lines in (rows, columns)]
+    extents = photograph.extents
     scale = max((end - first) / (SHARE * side) for (first, end), side in zip(extents, size, strict=True))
     spans = [
         _span(first, end, max(round(scale * side), 1), whole)

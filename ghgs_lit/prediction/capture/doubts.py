@@ -36,13 +36,13 @@ def doubt_of_cameras(capture: Capture, batch: Batch) -> str:
 
 def _outline(photograph: Photograph, size: tuple[int, int]) -> float:
     """Pixels of the crop inside the mask's outline at which the photograph has the most contrast."""
-    extents = [np.nonzero(photograph.mask.any(axis))[0][[0, -1]] for axis in (1, 0)]
-    steps = [(end - start + 1) / (SHARE * side) for (start, end), side in zip(extents, size, strict=True)]
+    extents = photograph.extents
+    steps = [(end - start) / (SHARE * side) for (start, end), side in zip(extents, size, strict=True)]
     step = max(*steps, 1)
     reach = (_REACH + 2) * step
     # One pixel of the photograph for each of the crop: fast, and edges stay where they are.
     lines = [
-        np.arange(max(start - reach, 0), min(end + reach, whole - 1) + 0.5, step).astype(int)
+        np.arange(max(start - reach, 0), min(end - 1 + reach, whole - 1) + 0.5, step).astype(int)
         for (start, end), whole in zip(extents, photograph.mask.shape, strict=True)
     ]
     seen = np.ix_(*lines)

@@ -21,7 +21,7 @@ from ghgs_lit.prediction.capture.frames import Frame, Source, VideoFrame, find_f
 from ghgs_lit.prediction.capture.masks import mask_path, matte_of_background, matte_of_file, segmenter
 from ghgs_lit.prediction.capture.photographs import (
     Pixels,
-    composed,
+    composed_names,
     find_instants,
     fits_stored,
     image_named,
@@ -96,8 +96,7 @@ class CaptureFolder:
         folder, cameras, part = self.images, self.file.cameras, self._part
         if isinstance(folder, Mapping):
             return {"": dict(folder)}, ""
-        # Numbers, too, are names of cameras.
-        names = {composed(str(key)): composed(str(name)) for key, name in (self._said.names or {}).items()}
+        names = composed_names(self._said.names)
         if has_videos(folder, cameras, names):
             return find_frames(folder, self.masks, cameras, names, self.convention, part.sync, part.step)
         require(part.sync is None, "sequence.sync", "null for photographs", part.sync)
@@ -207,10 +206,7 @@ class CaptureFolder:
             from ghgs_lit.geometry.undistortion import undistort
 
             # All that undistortion depends on, as the key of a cache that instants share.
-            lens = (
-                *map(tuple, (calibration.intrinsics.ravel(), calibration.distortion)),
-                calibration.fisheye,
-            )
+            lens = tuple(calibration.intrinsics.ravel()), tuple(calibration.distortion), calibration.fisheye
             image, matte = undistort(image, matte, _grid(*lens, *size))
             expected, lens = "a lens distortion that leaves some of the subject", calibration.distortion
             require(bool((matte > 127).any()), camera.origin, expected, lens.tolist())

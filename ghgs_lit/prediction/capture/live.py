@@ -15,7 +15,7 @@ from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import ENOUGH, CaptureFolder
 from ghgs_lit.prediction.capture.formats import CameraFile, read_cameras
 from ghgs_lit.prediction.capture.frames import Frame
-from ghgs_lit.prediction.capture.photographs import by_camera, composed, counted, images_in
+from ghgs_lit.prediction.capture.photographs import by_camera, composed_names, counted, images_in
 from ghgs_lit.prediction.capture.videos import SUFFIXES
 
 #: Seconds between looks for a frame and for a folder, and of waiting for a camera at the end.
@@ -136,7 +136,7 @@ def live_frames(
         require(bool(is_told), "masks", expected, masks)
         least = min(ENOUGH, len(devices))
         return _watched(newest_frames(opened(devices), least, clock, sleep), stored, options)
-    names = {composed(str(key)): composed(str(name)) for key, name in (said.get("names") or {}).items()}
+    names = composed_names(said.get("names"))
     places = [folder] if masks is None else [folder, Path(masks).expanduser()]
 
     def read(name: str) -> Capture:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import ExifTags
 
-from ghgs_lit.data.decoding import read_image
+from ghgs_lit.data.decoding import EIGHT_BITS, read_image
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.calibration import StoredCamera, same_ratio
 
@@ -19,7 +19,6 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 MASK_ENDING = "_mask"  #: A mask beside its photograph ends with this
 #: Quarter turns as of ``numpy.rot90`` by EXIF orientation.
 _TURNS = {1: 0, 3: 2, 6: 3, 8: 1}
-_EIGHT_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr")
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ def read_pixels(path: Path) -> Pixels:
     """Decode a photograph of 8 bits a channel and turn it as its EXIF entry says. InputError: it is missing,
     cannot be decoded, has other values, or is mirrored."""
     image = read_image(path)
-    require(image.mode in _EIGHT_BITS, str(path), "a photograph of 8 bits a channel", f"mode {image.mode}")
+    require(image.mode in EIGHT_BITS, str(path), "a photograph of 8 bits a channel", f"mode {image.mode}")
     orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
     found = f"EXIF orientation {orientation}"
     require(orientation in _TURNS, str(path), "a photograph that is not mirrored", found)
@@ -69,6 +68,11 @@ def fits_stored(pixels: Pixels, camera: StoredCamera, exif: str) -> bool:
 def composed(name: str) -> str:
     """A name in its composed spelling (NFC): macOS writes an umlaut as two characters."""
     return unicodedata.normalize("NFC", name)
+
+
+def composed_names(names: Mapping[Any, Any] | None) -> dict[str, str]:
+    """``calibration.names`` as text in its composed spelling: numbers, too, are names of cameras."""
+    return {composed(str(key)): composed(str(name)) for key, name in (names or {}).items()}
 
 
 def images_in(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[str, Path]:

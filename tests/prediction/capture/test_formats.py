@@ -18,7 +18,7 @@ from ghgs_lit.prediction.capture.calibration import (
     quarter_turned,
 )
 from ghgs_lit.prediction.capture.formats import FORMATS, read_cameras
-from ghgs_lit.prediction.capture.formats.json_and_toml import write_json
+from ghgs_lit.prediction.capture.formats.json_and_toml import json_text
 from tests.helpers.rigs import POINTS, SIZE, opencv_pixels, rig
 from tests.helpers.scenes import FIXTURES
 
@@ -156,7 +156,7 @@ def test_json_of_opencv_matrices(tmp_path):
 def test_own_json_comes_back(tmp_path):
     read = read_cameras(FIXTURES / "cameras" / "anipose.toml")
     calibrations = {n: (calibrate(c, read.convention, SIZE), SIZE) for n, c in read.cameras.items()}
-    write_json(tmp_path / "cameras.json", calibrations)
+    (tmp_path / "cameras.json").write_text(json_text(calibrations))
     check(tmp_path / "cameras.json", "ghgs")
     stored = json.loads((tmp_path / "cameras.json").read_text())["cameras"]
     assert {(camera["height"], camera["width"]) for camera in stored.values()} == {SIZE}

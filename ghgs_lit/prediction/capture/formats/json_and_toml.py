@@ -8,7 +8,6 @@ from typing import Any
 
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.errors import require
-from ghgs_lit.files import write_text_atomically
 from ghgs_lit.prediction.capture.calibration import Calibration, Convention, StoredCamera
 from ghgs_lit.prediction.capture.formats import opencv
 from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, check_unread, read_mapping
@@ -75,13 +74,8 @@ def _camera(name: str, origin: str, camera: Mapping[str, Any]) -> StoredCamera:
     return StoredCamera(name, origin, lens, pose, size, distortion, fisheye, gains=gains)
 
 
-def write_json(path: Path, cameras: Mapping[str, tuple[Calibration, tuple[int, int]]]) -> None:
-    """Write cameras and the (height, width) of their photographs as :func:`read_json` reads them."""
-    write_text_atomically(path, json_text(cameras))
-
-
 def json_text(cameras: Mapping[str, tuple[Calibration, tuple[int, int]]]) -> str:
-    """What :func:`write_json` writes."""
+    """Cameras and the (height, width) of their photographs as :func:`read_json` reads them."""
     from ghgs_lit.prediction.export.maps import camera_entry, cameras_json  # here: it imports PyTorch
 
     entries = {

@@ -154,12 +154,11 @@ def camera_from_fields(name: str, origin: str, fields: Mapping[str, Any]) -> Sto
     intrinsics, size = array("intrinsics", (3, 3)), size_from_fields(origin, fields)
     fisheye = find(fields, "fisheye")
     require(fisheye in (None, 0, 1), f"{origin}: fisheye", "true or false", fisheye)
-    single = {
-        camera_file.plain(key): value for key, value in fields.items() if camera_file.plain(key) in _SINGLE
-    }
     if find(fields, "distortion") is not None:
         distortion = array("distortion", (None,), (None, 1), (1, None)).ravel()
     else:
+        spelled = {camera_file.plain(key): value for key, value in fields.items()}
+        single = {key: value for key, value in spelled.items() if key in _SINGLE}
         numbers = {key: camera_file.finite(origin, key, value) for key, value in single.items()}
         distortion = camera_file.coefficients(numbers, "k1 k2 k3 k4" if fisheye else " ".join(_SINGLE))
     camera_file.check_unread(origin, fields, KNOWN)
