@@ -4,15 +4,12 @@ import re
 from pathlib import Path
 from typing import Any
 
-import rich
 from omegaconf import DictConfig
-from rich.markdown import Markdown
 
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation import tables as t
 from ghgs_lit.files import write_text_atomically
-from ghgs_lit.runs.progress import on_terminal
 
 
 def _listed(value: Any) -> tuple | None:
@@ -51,10 +48,6 @@ def run(cfg: DictConfig) -> None:
     latex = "\n".join(t.to_latex(table, label) for table, label in zip(tables, labels, strict=True))
     write_text_atomically(directory / "table.csv", t.to_csv(tables))
     write_text_atomically(directory / "table.tex", t.PREAMBLE + latex)
-    text = "\n".join(map(t.to_markdown, tables))
-    write_text_atomically(directory / "table.md", text)
-    if on_terminal():  # cells are folded to its width
-        rich.print(Markdown(text))
-    else:
-        print(text)
+    write_text_atomically(directory / "table.md", "\n".join(map(t.to_markdown, tables)))
+    print("\n".join(map(t.to_terminal, tables)))
     announce(directory / "table.md")

@@ -1,4 +1,4 @@
-r"""Writers of tables: Markdown, CSV, and LaTeX in the paper's layout.
+r"""Writers of tables: Markdown, terminal, CSV, and LaTeX in the paper's layout.
 
 LaTeX needs ``\usepackage{booktabs,multirow,adjustbox,pifont}``.
 """
@@ -9,6 +9,7 @@ from dataclasses import asdict
 from typing import Any
 
 import pandas as pd
+from tabulate import tabulate
 
 from ghgs_lit.evaluation.tables.layouts import Line, Table, arrow, data_title, decimals, title
 from ghgs_lit.evaluation.tables.notes import MARK
@@ -52,11 +53,7 @@ def heading(table: Table, group: int, metric: str) -> str:
 def to_markdown(table: Table) -> str:
     """The table with its caption above and its notes below."""
 
-    def write(number: str, tail: str, best: bool) -> str:
-        text = number + tail.replace(MARK, rf"\{MARK}")
-        return f"**{text}**" if best else text
-
-    numbers = texts(table, write)
+    numbers = texts(table, lambda number, tail, best: _bold(number + tail.replace(MARK, rf"\{MARK}"), best))
     rows = []
     for block in table.blocks:
         if table.reported_on:
@@ -67,7 +64,27 @@ def to_markdown(table: Table) -> str:
     align = ["center" if len(table.stub) > 1 else "left"] * len(table.stub) + ["right"] * numbers.shape[1]
     frame = pd.DataFrame(rows, columns=pd.Index(names))
     text = frame.to_markdown(index=False, colalign=align, disable_numparse=True)
-    return "\n\n".join((table.caption, text, *table.notes)) + "\n"
+    notes = [rf"\{note}" if note.startswith(f"{MARK} ") else note for note in table.notes]
+    return "\n\n".join((table.caption, text, *notes)) + "\n"
+
+
+def _bold(text: str, best: bool) -> str:
+    return f"**{text}**" if best else text
+
+
+def to_terminal(table: Table) -> str:
+    """The same for a terminal: each group of columns has lines of its own, so that no table is wide."""
+    numbers = texts(table, lambda number, tail, best: _bold(number + tail, best))
+    rows = []
+    for line in (line for block in table.blocks for line in block):
+        first, *more = table.lines[line].stub
+        mark = "† " if table.lines[line].is_reported else ""
+        for number, group in enumerate(table.groups):
+            rows.append([mark + first, *more, group.title, *numbers.loc[line][number]])
+    names = [*table.stub, "", *(f"{title(metric)} {arrow(metric)}" for metric in table.metrics)]
+    text = tabulate(rows, names, disable_numparse=True)
+    said = (each.replace("`", "").replace("**", "") for each in (table.caption, *table.notes))
+    return "\n\n".join((next(said), text, *said)) + "\n"
 
 
 def to_csv(tables: Sequence[Table]) -> str:

@@ -143,7 +143,8 @@ def test_a_clear_difference_is_marked_and_noise_is_not(tmp_path):
     test = table.cells["test"].iloc[0]
     assert test.corrected == pytest.approx(3 * test.p)
     table = table_of(tmp_path / "noise", 0.0, noise=1.0)
-    assert "\\*" not in to_markdown(table)
+    assert "\\* [" not in to_markdown(table)
+    assert not table.cells["marked"].any()
 
 
 def test_the_reference_can_be_the_best_or_none(tmp_path):

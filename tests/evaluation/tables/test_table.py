@@ -7,7 +7,7 @@ import json
 import pytest
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.tables import read_sweep, to_csv, to_markdown
+from ghgs_lit.evaluation.tables import read_sweep, to_csv, to_markdown, to_terminal
 from ghgs_lit.evaluation.tables.notes import FOOTNOTE, ILLUSTRATION, NO_SEMANTICS
 from ghgs_lit.runs.results import read_results, summarize, write_results
 from tests.helpers.tables import body, start_run, tables_of, write_run
@@ -242,6 +242,20 @@ def test_undefined_values_are_null_and_left_out_of_means(tmp_path):
     assert not list(tmp_path.glob(".*"))
 
 
+def test_a_table_fits_a_terminal(tmp_path):
+    """Each number of views has a line of its own, also with marks and missing seeds."""
+    for ablation, psnr in (("full", 20.0), ("neither", 18.0)):
+        for seed in (1, 2):
+            write_run(tmp_path / f"{ablation}{seed}", ablation, psnr + seed / 10, seed=seed)
+    start_run(tmp_path / "going", "neither", seed=3)
+    lines = to_terminal(tables_of(tmp_path)[0]).splitlines()
+    shown = [line for line in lines if line.startswith(("✗", "✓"))]
+    assert len(shown) == 4 * 3
+    assert sum("(2/3)" in line for line in shown) == 3
+    assert max(map(len, shown)) <= 120
+    assert "**23.15 ± 0.07**" in shown[-3]
+
+
 def test_a_row_can_be_told_by_the_checkpoint_that_was_measured(tmp_path):
     """Keys of `ghgs evaluate` tell rows apart, too; keys that no run has are refused."""
     for name, psnr, seed in (("a.ckpt", 20.0, 1), ("b.ckpt", 21.0, 1), ("c.ckpt", 22.0, 2)):
@@ -270,4 +284,5 @@ def test_a_table_of_numbers_of_views_that_nobody_measured_says_so(tmp_path):
         rows, _ = body(to_markdown(table))
         assert {cell for row in rows.values() for cell in row} == {"missing"}
         assert "no subjects" in table.caption
+        assert "missing" in to_terminal(table)
         assert to_csv([table]).count("\n") == 1 + 3 * len(rows)
