@@ -7,6 +7,9 @@ INSTALL = $(BIN)/python -m pip install -qq --no-compile --disable-pip-version-ch
 # Test processes: the suite is limited by the CPU, and small machines have two cores.
 JOBS   ?= 2
 
+# Where it is set, as in many containers, every process would compile PyTorch and Lightning anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test test-pythons test-latest documents lint format bench clean
 
