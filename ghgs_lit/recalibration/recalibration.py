@@ -1,6 +1,7 @@
 """Recalibration of latent embeddings by multi-view semantic consistency (paper, section 3.3)."""
 
 import dataclasses
+import itertools
 from typing import Literal
 
 import torch
@@ -71,6 +72,11 @@ class Recalibration(nn.Module):
         if self.block.similarity != "none":
             semantic = part(tokens.semantic).split(counts)
             cosines = [neighbor_cosines(*pair) for pair in zip(semantic, neighbors, strict=True)]
+        if takes_part.device.type != "cpu" and len({near.shape[1] for near in neighbors}) == 1:
+            # All elements at once: a GPU waits for calls.
+            starts = itertools.accumulate(counts, initial=0)
+            neighbors = [torch.cat([near + start for near, start in zip(neighbors, starts, strict=False)])]
+            cosines = cosines and [torch.cat(cosines)]
         layers = []
         for layer in tokens.latent:
             new = self.block(part(layer), neighbors, cosines).to(layer.dtype)

@@ -118,8 +118,6 @@ def test_the_cache_is_named_after_every_setting(tmp_path):
             {"render": {"size": 28, "samples": 2}},
             {"rig": {"height": 1.8}},
             {"rig": {"height": None, "variation": {"pitch": [-9.0, -9.0]}}},
-            {"motion": 2},
-            {"motion": 3},
         )
     ]
     assert len(set(roots)) == len(roots)
