@@ -34,8 +34,9 @@ class RunProgress(Callback):
         self._last = (time.monotonic(), trainer.global_step, pl_module.used_budget)
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
-        text = "  ".join([f"step {trainer.global_step}", *_numbers(trainer)])
-        self._bar.update(self._task, completed=pl_module.used_budget, description=text)
+        if not self._bar.disable:  # numbers of a step make the host wait for a GPU
+            text = "  ".join([f"step {trainer.global_step}", *_numbers(trainer)])
+            self._bar.update(self._task, completed=pl_module.used_budget, description=text)
         # Nothing is new between two parts of an accumulated step.
         if trainer.is_global_zero and trainer.global_step > self._last[1] and self._lines.due():
             self._say(trainer, pl_module)

@@ -1,7 +1,6 @@
 """The LightningModule, its schedule, checkpoints and callbacks, with a stand-in for the model."""
 
 import dataclasses
-import re
 from datetime import timedelta
 from types import SimpleNamespace
 
@@ -19,7 +18,6 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.metrics.functional import psnr, ssim
 from ghgs_lit.model import GHGS
-from ghgs_lit.runs.progress import Lines, track
 from ghgs_lit.training import DivergedError, GHGSModule, Optimization
 from ghgs_lit.training.callbacks import RunProgress
 from ghgs_lit.training.checkpoints import CheckpointOptions, Checkpoints
@@ -221,47 +219,6 @@ def test_tf32_is_for_networks_alone():
         assert matmul.fp32_precision == "tf32"
     finally:
         torch.set_float32_matmul_precision("highest")
-
-
-def test_lines_say_how_far_the_run_is(tmp_path, capsys, monkeypatch):
-    """A log of a batch job shows step, loss, seconds a step, time left and validation, as does train.log."""
-    monkeypatch.setattr("ghgs_lit.training.callbacks.Lines.due", lambda _: True)
-    trainer(tmp_path, steps=12, callbacks=[RunProgress()]).fit(module(), loader(), loader(1))
-    lines = (tmp_path / "train.log").read_text().splitlines()
-    assert len(lines) == 12
-    assert set(lines) <= set(capsys.readouterr().out.splitlines())
-    assert re.fullmatch(r"\d\d:\d\d:\d\d step 1 of 12  loss/total \S+", lines[0])
-    last = r"step 11 of 12  loss/total \S+  val/psnr \S+  \S+ s a step  0:00:0\d left"
-    assert re.search(last, lines[10])
-
-
-def test_a_bar_shows_how_far_the_run_is(tmp_path, capsys, monkeypatch):
-    """On a terminal there are no lines beside it; the log has them."""
-    monkeypatch.setattr("ghgs_lit.training.callbacks.on_terminal", lambda: True)
-    monkeypatch.setattr("ghgs_lit.training.callbacks.Lines.due", lambda _: True)
-    monkeypatch.setenv("COLUMNS", "120")
-    trainer(tmp_path, steps=12, callbacks=[RunProgress()]).fit(module(), loader(), loader(1))
-    shown = capsys.readouterr().out
-    assert re.search(r"100% \S+ step 12 +loss/total", shown)
-    assert "step 12 of 12" not in shown
-    assert len((tmp_path / "train.log").read_text().splitlines()) == 12
-
-
-def test_the_lines_come_once_a_minute(monkeypatch):
-    """A log of days has thousands of lines, not millions."""
-    now = iter([0.0, 0.0, 30.0, 60.0, 90.0, 125.0])
-    monkeypatch.setattr("ghgs_lit.runs.progress.time.monotonic", lambda: next(now))
-    lines = Lines()
-    assert [lines.due() for _ in range(5)] == [True, False, True, False, True]
-
-
-def test_evaluation_says_how_far_it_is(capsys):
-    """Without a terminal a long evaluation prints lines as well."""
-    assert list(track([1, 2, 3], "measuring", every=0.0)) == [1, 2, 3]
-    assert [line.split(" ", 1)[1] for line in capsys.readouterr().out.splitlines()] == [
-        "measuring: 1 of 3, 0:00:00",
-        "measuring: 2 of 3, 0:00:00",
-    ]
 
 
 def test_frozen_parameters_stay_for_their_share_of_the_run(tmp_path):
