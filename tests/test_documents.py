@@ -14,7 +14,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from ghgs_lit.config import VERSION_BASE
-from tests.helpers.processes import run_block, run_verb
+from tests.helpers.processes import run_block, run_script, run_verb
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CONF = REPOSITORY / "conf"
@@ -195,10 +195,12 @@ def test_fast_commands_run(document, tmp_path, monkeypatch):
     run = check_documents.Reader.run
 
     def prepared(reader, text, is_python=False):
-        """A verb alone and Python need no shell, and a process that has imported all."""
-        if not is_python and (not text.startswith("ghgs ") or re.search(r"[$`|&;<>*\n]", text)):
+        """A verb or script alone and Python need no shell, and a process that has imported all."""
+        if not is_python and (
+            not re.match(r"ghgs |python scripts/", text) or re.search(r"[$`|&;<>*\n]", text)
+        ):
             return run(reader, text)
-        run_prepared = run_block if is_python else run_verb
+        run_prepared = run_block if is_python else run_verb if text.startswith("ghgs ") else run_script
         code, output = run_prepared(text, reader.folder, reader.environment)
         return code, 0.0, output
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import functools
 import gc
 import os
 import resource
@@ -54,10 +55,13 @@ def keep_freed_memory() -> bool:
     return all(mallopt(name, _MOST) == 1 for name in (_MMAP_THRESHOLD, _TRIM_THRESHOLD))
 
 
+#: Asking the collector whether it did so counts millions of objects.
+_freeze_once = functools.cache(gc.freeze)
+
+
 def collect_garbage_again() -> None:
     """Turn the collector on again after ``gc.disable()``, and exclude the imported objects from it. They are
     frozen once in a process: at a later call there are objects that may become garbage."""
     if not gc.isenabled():
-        if not gc.get_freeze_count():
-            gc.freeze()
+        _freeze_once()
         gc.enable()

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import runpy
 import shlex
 import subprocess
 import sys
@@ -52,6 +53,11 @@ def run_block(code: str, folder: Path, environment: Mapping[str, str]) -> tuple[
     return _ended(*_started(folder, environment, _block, code))
 
 
+def run_script(command: str, folder: Path, environment: Mapping[str, str]) -> tuple[int, str]:
+    """The same of ``python <path> ...``."""
+    return _ended(*_started(folder, environment, _script, shlex.split(command)[1:]))
+
+
 def start_verb(command: str, folder: Path, environment: Mapping[str, str]) -> tuple[BaseProcess, Path]:
     """The process of :func:`run_verb`, and the file that its output goes to."""
     return _started(folder, environment, _verb, shlex.split(command))
@@ -75,6 +81,9 @@ def _ended(process: BaseProcess, output: Path) -> tuple[int, str]:
 def _called_in(
     folder: Path, environment: dict[str, str], output: Path, function: Callable, given: object
 ) -> None:
+    # As in a fresh process, whose own processes import nothing more for these tests.
+    multiprocessing.set_start_method(None, force=True)
+    PREPARED.set_forkserver_preload(["__main__"])
     os.environ.clear()
     os.environ.update(environment)
     os.chdir(folder)
@@ -89,6 +98,12 @@ def _verb(argv: list[str]) -> None:
 
     sys.argv = argv
     sys.exit(main())
+
+
+def _script(argv: list[str]) -> None:
+    sys.argv = argv
+    sys.path.insert(0, str(Path(argv[0]).parent.resolve()))
+    runpy.run_path(argv[0], run_name="__main__")
 
 
 def _block(code: str) -> None:
