@@ -19,7 +19,7 @@ from ghgs_lit.skipping import SkipOptions
 from ghgs_lit.stages import HEADS, OPTIONS, STAGES
 from ghgs_lit.surroundings import ModelOptions, computing, surroundings
 from ghgs_lit.types import Batch, DepthBounds, Prediction, Tokens
-from ghgs_lit.weights.checkpoint import load_weights, read_checkpoint
+from ghgs_lit.weights.checkpoint import load_weights, read_config
 from ghgs_lit.weights.reading import SHIPPED
 
 
@@ -117,6 +117,6 @@ class GHGS(nn.Module):
         cls, path: str | Path = SHIPPED, map_location: Any = "cpu", dtype: torch.dtype | None = None
     ) -> "GHGS":
         """The model of a checkpoint in evaluation mode; arguments as of :func:`load_weights`."""
-        model = cls.from_config(read_checkpoint(path)["config"], empty=STAGES)
+        model = cls.from_config(read_config(path), empty=STAGES)
         load_weights(model, path, dtype, map_location)
         return model.to(map_location).eval()

@@ -24,7 +24,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.measure import decisions_of
 from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.types import Batch
-from ghgs_lit.weights.checkpoint import read_checkpoint
+from ghgs_lit.weights.checkpoint import read_config
 
 
 def run(cfg: DictConfig) -> None:
@@ -67,7 +67,7 @@ def configured_cases(config: Mapping[str, Any], device: torch.device) -> list[Ca
     names = dict.fromkeys([YARDSTICK, *config["presets"]])
     presets = read_options("skip", list(names), config["skip"], "presets")
     path = config["checkpoint"]
-    source = Source(config if path is None else read_checkpoint(path)["config"], path)
+    source = Source(config if path is None else read_config(path), path)
     shared = {name: config[name] for name in ("renderer", "precision")}
     return cases_of(source, presets, config["knobs"] or {}, shared, device, config["seed"])
 

@@ -9,7 +9,7 @@ from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.errors import require
 from ghgs_lit.model import GHGS
 from ghgs_lit.rendering import render
-from ghgs_lit.weights.checkpoint import read_checkpoint
+from ghgs_lit.weights.checkpoint import read_config
 from ghgs_lit.weights.exporting import export_weights, write_inference
 from ghgs_lit.weights.reading import file_of
 from ghgs_lit.weights.switches import differences
@@ -39,7 +39,7 @@ def run(cfg: DictConfig) -> None:
     require(bool(paths), "vggt", "vggt=<file>, release=<file> or inference=<file>", None)
     if vggt is not None or release is not None:
         print("\n".join(export_weights(checkpoint, vggt, release)), flush=True)
-        differing = differences(read_checkpoint(checkpoint)["config"])
+        differing = differences(read_config(checkpoint))
         if release is not None and differing:
             print(f"differs from the release: {', '.join(differing)}", flush=True)
     if inference is not None:

@@ -17,7 +17,7 @@ from ghgs_lit.rendering import Renderer
 from ghgs_lit.rendering.api import resolve_backend
 from ghgs_lit.stages import OPTIONS, STAGES
 from ghgs_lit.surroundings import side_multiple
-from ghgs_lit.weights.checkpoint import load_weights, read_checkpoint
+from ghgs_lit.weights.checkpoint import load_weights, read_config
 from ghgs_lit.weights.reading import SHIPPED
 
 if TYPE_CHECKING:  # it would import Lightning, which takes seconds
@@ -75,7 +75,7 @@ def with_trained_data(cfg: DictConfig) -> DictConfig:
     if cfg.checkpoint == SHIPPED:  # its training data would have to be rendered first
         expected = "images=<folder> cameras=<file>, or data=<option>, with the weights of the package"
         raise InputError(f"data: expected {expected}; found neither")
-    trained = read_checkpoint(cfg.checkpoint)["config"]
+    trained = read_config(cfg.checkpoint)
     if not trained.get("data"):
         expected = f"data=<option> for weights that were imported ({cfg.checkpoint})"
         raise InputError(f"data: expected {expected}; found none")
@@ -86,7 +86,7 @@ def with_trained_data(cfg: DictConfig) -> DictConfig:
 def model_of(checkpoint: str, cfg: DictConfig) -> dict[str, Any]:
     """Model nodes of a checkpoint, with the changes of the command line. The options that a verb composes by
     default do not count: they describe another model. InputError: a change that the weights do not allow."""
-    trained = read_checkpoint(checkpoint)["config"]
+    trained = read_config(checkpoint)
     for stage in STAGES:
         place, found = f"{checkpoint}: config.{stage}", trained.get(stage)
         require(isinstance(found, Mapping), place, "a stage of the model", found)

@@ -34,7 +34,7 @@ from ghgs_lit.prediction.export.unseen import GUESSED
 from ghgs_lit.prediction.sequence.temporal import Temporal
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch
-from ghgs_lit.weights.checkpoint import read_checkpoint
+from ghgs_lit.weights.checkpoint import read_config
 
 if TYPE_CHECKING:  # it would import Lightning, which takes seconds
     from ghgs_lit.data.datamodule import PhotographsDataModule
@@ -104,7 +104,7 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         check_cameras(folder)
     device = inputs.pick_device(config["device"])
     renderer, model = inputs.build_renderer(config, device), inputs.load_model(config, device)
-    trained = read_checkpoint(config["checkpoint"])["config"]
+    trained = read_config(config["checkpoint"])
     size = crop_size(config["size"], trained, model)
     write_config(config, directory)
     refining = {name: config[name] for name in ("refine_cameras", "refine_masks", "refine")}

@@ -32,7 +32,7 @@ from ghgs_lit.training import GHGSModule, loggers, start
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO, StopAtStep
 from ghgs_lit.training.cost import TrainingCost
 from ghgs_lit.weights import switches
-from ghgs_lit.weights.checkpoint import read_checkpoint
+from ghgs_lit.weights.checkpoint import read_config
 
 
 def quiet() -> None:
@@ -62,7 +62,7 @@ def prepare_start(config: dict[str, Any], model: GHGS, directory: Path) -> int |
         )
         if rank_zero_only.rank == 0:
             print(start.report(lines, config["init_from"], directory / "init_from.txt"), flush=True)
-            if differing := switches.differences(config, read_checkpoint(config["init_from"])["config"]):
+            if differing := switches.differences(config, read_config(config["init_from"])):
                 print(f"the weights were trained in a different model: {', '.join(differing)}", flush=True)
     return resume_step(config, model)
 

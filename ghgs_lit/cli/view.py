@@ -25,7 +25,7 @@ from ghgs_lit.prediction.viewer.content import Content, read_content
 from ghgs_lit.prediction.viewer.live import Pause, Recording, show_live
 from ghgs_lit.prediction.viewer.server import Viewer
 from ghgs_lit.types import Batch
-from ghgs_lit.weights.checkpoint import read_checkpoint
+from ghgs_lit.weights.checkpoint import read_config
 from ghgs_lit.weights.reading import SHIPPED
 
 
@@ -62,7 +62,7 @@ def _run_live(cfg: DictConfig) -> None:
     config |= model_of(config["checkpoint"], cfg)
     options, device = output_options(config), pick_device(config["device"])
     renderer, model = build_renderer(config, device), load_model(config, device)
-    size = crop_size(config["size"], read_checkpoint(config["checkpoint"])["config"], model)
+    size = crop_size(config["size"], read_config(config["checkpoint"]), model)
     write_config(config, output_dir())
     # To decide at each instant what ``auto`` should refine would take as long as a prediction.
     masks, cameras = (0 if n == "auto" else n for n in (config["refine_masks"], config["refine_cameras"]))

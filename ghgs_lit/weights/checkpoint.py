@@ -1,5 +1,7 @@
 """Checkpoints of this package: plain data with the whole configuration, enough to rebuild the model."""
 
+import copy
+import functools
 import warnings
 import zipfile
 from collections.abc import Mapping
@@ -49,6 +51,19 @@ def read_checkpoint(path: str | Path, whole: bool = False) -> dict[str, Any]:
     checkpoint = joined(path, checkpoint, whole)
     _check_content(path, checkpoint)
     return checkpoint
+
+
+def read_config(path: str | Path) -> dict[str, Any]:
+    """The configuration in a checkpoint, which is read once until the file changes: commands ask several
+    times. Raises as :func:`read_checkpoint` does."""
+    file = file_of(path)
+    known = file.stat() if file.is_file() else None  # None: reading says what is wrong
+    return copy.deepcopy(_config(str(path), known and (known.st_ino, known.st_mtime_ns, known.st_size)))
+
+
+@functools.lru_cache(maxsize=8)
+def _config(path: str, stamp: tuple[int, ...] | None) -> dict[str, Any]:
+    return read_checkpoint(path)["config"]
 
 
 def _check_content(path: str | Path, checkpoint: Mapping[str, Any]) -> None:

@@ -128,7 +128,6 @@ def cast(
             tensors = open_tensors()
         used += tensors[name].nbytes
         result[name] = tensors[name].to(target[name])
-    tensors = {}
-    if len(result) < len(names):
-        tensors = open_tensors()
+    if changed:
+        tensors = open_tensors() if len(result) < len(names) else {}
     return {name: result[name] if name in result else tensors[name] for name in names}

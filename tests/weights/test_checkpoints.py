@@ -15,7 +15,7 @@ from ghgs_lit.config import compose, resolve
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
 from ghgs_lit.training.optimization import Optimization
-from ghgs_lit.weights.checkpoint import FORMAT_VERSION
+from ghgs_lit.weights.checkpoint import FORMAT_VERSION, read_config, write_checkpoint
 from ghgs_lit.weights.frozen import SHARING
 from tests.helpers.models import close, config, make_model
 from tests.helpers.scenes import make_batch
@@ -243,3 +243,17 @@ def test_no_resolver_of_a_checkpoint_is_evaluated(tmp_path, verb):
         ):
             resolve(with_trained_data(compose(verb, [f"checkpoint={path}"])))
     assert called == []
+
+
+def test_a_configuration_is_read_again_where_its_file_has_changed(tmp_path):
+    """Commands ask several times, and a sweep's next run may have replaced the file."""
+    path, found = tmp_path / "a.ckpt", []
+    for width in (32, 32, 48):
+        write_checkpoint(path, {}, {"encoder": {"width": width}})
+        found.append(read_config(path))
+        found[-1]["encoder"]["heads"] = 2  # a caller's own copy
+    assert [each["encoder"]["width"] for each in found] == [32, 32, 48]
+    assert read_config(path) == {"encoder": {"width": 48}}
+    path.unlink()
+    with pytest.raises(FileNotFoundError):
+        read_config(path)

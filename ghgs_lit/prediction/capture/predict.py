@@ -22,7 +22,7 @@ from ghgs_lit.prediction.sequence.temporal import Temporal
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.surroundings import side_multiple
 from ghgs_lit.types import Batch, Gaussians, Prediction
-from ghgs_lit.weights.checkpoint import read_checkpoint
+from ghgs_lit.weights.checkpoint import read_config
 from ghgs_lit.weights.reading import SHIPPED, file_of
 
 
@@ -73,7 +73,7 @@ def predict(
     if not isinstance(model, GHGS):
         path = file_of(model)
         model = _model(path, path.stat().st_mtime_ns)
-        size = crop_size(size, read_checkpoint(path)["config"], model)
+        size = crop_size(size, read_config(path), model)
     require(size is not None, "size", "a size in pixels beside a model that is no checkpoint", size)
     size, seconds, why = image_size("size", size), {}, {}
     if refine_masks == "auto":
