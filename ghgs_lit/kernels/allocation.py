@@ -55,7 +55,7 @@ def keep_freed_memory() -> bool:
     return all(mallopt(name, _MOST) == 1 for name in (_MMAP_THRESHOLD, _TRIM_THRESHOLD))
 
 
-#: Asking the collector whether it did so counts millions of objects.
+#: Asking the collector whether it did so counts all frozen objects, half a million, in 0.04 s.
 _freeze_once = functools.cache(gc.freeze)
 
 
