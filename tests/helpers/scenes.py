@@ -76,6 +76,12 @@ def make_batch(batch=1, views=3, height=56, width=56, **kwargs):
     return Batch(images * masks[:, :, None], masks, cameras, depths=depths)
 
 
+def in_dtype(batch, dtype):
+    """The batch of photographs and cameras, and depths if known, in another precision."""
+    depths = None if batch.depths is None else batch.depths.to(dtype)
+    return replace(batch, images=batch.images.to(dtype), cameras=batch.cameras.to(dtype), depths=depths)
+
+
 def with_soft_rims(batch):
     """The batch with a matte that falls from 1 to 0 over two pixels, which premultiplies its photographs."""
     alpha = torch.nn.functional.avg_pool2d(batch.masks.float(), 3, 1, 1)
