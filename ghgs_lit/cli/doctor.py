@@ -50,7 +50,7 @@ def cameras(cfg: DictConfig) -> None:
     print("\n".join(diagnosis.lines), flush=True)
     views = best.views
     if best.score > 0:
-        images = [folder.photograph(v.name, v.camera, v.pixels, v.mask, v.convention).image for v in views]
+        images = [photograph.image for photograph in best.photographs(folder)]
         save_png(camera_sheet([v.name for v in views], images, best.silhouettes(folder)), picture)
         announce(picture)
     if diagnosis.option:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from imageio_ffmpeg import read_frames
+from PIL import Image
 from plyfile import PlyData
 from scipy.ndimage import binary_dilation
 
@@ -260,6 +261,18 @@ def test_wrong_cameras_are_refused_and_the_doctor_mends_them(here, checkpoint, c
     again = ("images=images", "cameras=found/cameras.json", "hydra.run.dir=again")
     assert ghgs("doctor", "task=cameras", *again) == 0
     assert "cameras and masks agree" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("fisheye", [False, True])
+def test_the_doctor_draws_photographs_of_a_lens(here, fisheye):
+    """Its picture has them without distortion, with masks of files; every lens once ended the report."""
+    figure = Figure()
+    lens = {"distortion": [0.02, 0.001, 0.001, 0.001], "fisheye": fisheye}
+    cameras = figure.write(here / "images", cameras={name: c | lens for name, c in figure.cameras.items()})
+    arguments = ("task=cameras", "images=images", f"cameras={cameras}", "hydra.run.dir=found")
+    assert ghgs("doctor", *arguments) == 0
+    drawn = np.asarray(Image.open(here / "found" / "cameras.png"))
+    assert (drawn == [0, 255, 90]).all(-1).any()  # outlines of masks
 
 
 def test_photographs_without_cameras_are_refused(here, checkpoint, capsys):

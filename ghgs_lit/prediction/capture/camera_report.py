@@ -12,6 +12,7 @@ from ghgs_lit.data.view import area_image, area_mask
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, subject_sphere
 from ghgs_lit.prediction.capture.calibration import AXES, EXTRINSICS, INTRINSICS, Convention, StoredCamera
+from ghgs_lit.prediction.capture.crops import Photograph
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.photographs import Pixels
 
@@ -53,13 +54,17 @@ class Hypothesis:
         """The agreement of the worst view."""
         return min(self.shares.values())
 
-    def silhouettes(self, folder: CaptureFolder) -> list[Silhouette]:
-        """Masks with their cameras in this meaning. InputError: a photograph has another aspect ratio."""
+    def photographs(self, folder: CaptureFolder) -> list[Photograph]:
+        """The small photographs without lens distortion, upright, with their masks as mattes and their
+        cameras in this meaning. InputError: a photograph has another aspect ratio."""
         white = np.uint8(255)
-        upright = [
+        return [
             folder.photograph(v.name, v.camera, v.pixels, v.mask * white, v.convention) for v in self.views
         ]
-        return [Silhouette(p.mask, p.intrinsics, p.extrinsics) for p in upright]
+
+    def silhouettes(self, folder: CaptureFolder) -> list[Silhouette]:
+        """Masks with their cameras in this meaning. InputError: a photograph has another aspect ratio."""
+        return [Silhouette(p.mask, p.intrinsics, p.extrinsics) for p in self.photographs(folder)]
 
     def ranked(self, folder: CaptureFolder) -> "Hypothesis":
         """The same meaning with its :attr:`shares`, all 0 where no camera can have it."""
