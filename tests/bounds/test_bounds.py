@@ -12,6 +12,7 @@ from ghgs_lit.bounds.silhouettes import depths_in_box, dilate, silhouettes
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.types import Batch, DepthBounds
+from tests.helpers.cameras import camera_ring
 from tests.helpers.scenes import CENTER, RADII, ellipsoid, make_batch, ring
 
 STAGES = [SubjectBox, VisualHull]
@@ -222,3 +223,26 @@ def test_the_box_has_a_margin_on_every_side(monkeypatch):
     _, coarse, _, lower, upper = asked[0]
     expected = subject_box(coarse.masks, coarse.cameras, coarse.dilation)
     torch.testing.assert_close(torch.stack((lower + 0.03, upper - 0.03)), torch.stack(expected))
+
+
+@pytest.mark.parametrize("stretch", [(2.0, 1.0), (1.0, 2.0)])
+def test_the_box_of_pixels_that_are_not_square(stretch):
+    """Photographs that are stretched along x or y show the same pole in the same box."""
+    radii = torch.tensor([0.1, 0.8, 0.1])
+    across, down = stretch
+    focal, principal = (45 * across, 45 * down), (28 * across, 28 * down)
+    place = {"center": tuple(CENTER.tolist()), "raised": 0.3, "radius": 2.0}
+    cameras = camera_ring(4, int(56 * down), int(56 * across), 1, focal, principal, **place)
+    lower, upper = subject_box(ellipsoid(cameras, radii=radii)[0], cameras, radius=0)
+    assert (lower <= CENTER - radii + 0.02).all()
+    assert (upper >= CENTER + radii - 0.02).all()
+    assert (lower >= CENTER - radii - 0.25).all()
+    assert (upper <= CENTER + radii + 0.25).all()
+
+
+def test_bounds_that_are_too_close_are_moved_apart_to_the_least_thickness():
+    """By as much on either side, and not past the camera; others stay."""
+    near, far = torch.tensor([[2.0, 2.0, 0.1, torch.nan], [2.004, 2.5, 0.1, torch.inf]])[:, None, None, None]
+    found = SubjectBox()._valid(DepthBounds(near, far))
+    torch.testing.assert_close(found.near.flatten(), torch.tensor([1.992, 2.0, 0.1, 0.1]))
+    torch.testing.assert_close(found.far.flatten(), torch.tensor([2.012, 2.5, 0.12, 1e6]))

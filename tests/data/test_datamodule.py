@@ -9,7 +9,7 @@ from ghgs_lit.data.datamodule import trained_batches
 from ghgs_lit.data.humman.dataset import HuMMan
 from ghgs_lit.errors import InputError
 from ghgs_lit.synthesis.datasets import Scans, Synthetic
-from tests.helpers.people import rendered
+from tests.helpers.people import render_boxes, rendered
 
 
 def test_keys_of_the_data_set_and_of_its_batches_lie_side_by_side():
@@ -53,3 +53,17 @@ def test_a_resumed_run_knows_how_many_batches_it_has_had(step, accumulated, leng
     )
     assert trained_batches(trainer, length) == batches
     assert trained_batches(None, length) == 0
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_each_process_of_several_loads_its_own_samples(tmp_path, rank):
+    """Its number and how many there are come from the trainer; five subjects are two steps of 2 x 2."""
+    render_boxes(tmp_path / "data", tmp_path / "scans", train=5, val=0)
+    data = rendered(tmp_path / "data", batch_size=2)
+    data.trainer = SimpleNamespace(world_size=2, global_rank=rank)
+    batches = data.train_dataloader().dataset
+    assert (batches.rank, batches.world, len(batches)) == (rank, 2, 2)
+    drawn = data.training_sampler()
+    for step in range(2):
+        expected = [sample.subject for sample in drawn.batch(step, rank, 2)]
+        assert list(batches[step].subjects) == expected

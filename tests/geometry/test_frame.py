@@ -114,6 +114,33 @@ def test_one_wrong_mask_does_not_change_the_size(views, wrong):
     assert float(found / right) == pytest.approx(1, abs=0.25)
 
 
+@pytest.mark.parametrize("view", [0, 1])
+def test_of_two_sizes_the_larger_counts(view):
+    """Masks are more often too small than too large."""
+    batch = make_batch(1, 2, 112, 112, spread=180.0)
+    masks = batch.masks.clone()
+    rows = torch.arange(112)
+    masks[0, view] &= ((rows > 40) & (rows < 70))[:, None]  # the middle alone
+    found, right = (Frame.of(b).metre for b in (dataclasses.replace(batch, masks=masks), batch))
+    assert float(found / right) == pytest.approx(1, abs=0.1)
+
+
+def test_a_subject_that_is_wider_than_tall_has_the_size_of_its_width():
+    """Photographs by cameras that are held upright or turned by 90 degrees."""
+    batch = make_batch(1, 3, 112, 112)
+    lying = torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    extrinsics, intrinsics = batch.cameras.extrinsics.clone(), batch.cameras.intrinsics.clone()
+    extrinsics[..., :3, :] = lying @ extrinsics[..., :3, :]
+    intrinsics[..., 0, 2] = batch.cameras.intrinsics[..., 1, 2]
+    intrinsics[..., 1, 2] = 112 - batch.cameras.intrinsics[..., 0, 2]
+    turned = dataclasses.replace(
+        batch,
+        masks=batch.masks.rot90(1, (-2, -1)),
+        cameras=dataclasses.replace(batch.cameras, intrinsics=intrinsics, extrinsics=extrinsics),
+    )
+    torch.testing.assert_close(Frame.of(turned).metre, Frame.of(batch).metre, rtol=1e-6, atol=0)
+
+
 @pytest.mark.parametrize("change", ["mirrored", "upside down", "looking down", "opposed", "degenerate"])
 def test_axes_are_a_rotation_for_any_cameras(change):
     """Mirrored extrinsics, rigs upside down and cameras that look straight down have a frame, too."""

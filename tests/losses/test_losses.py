@@ -223,7 +223,7 @@ def test_subsampled_chamfer_is_unbiased():
     torch.manual_seed(0)
     few = losses_of({"chamfer": 1.0}, chamfer_points=25)
     values = torch.stack([few(prediction, rendering, batch)[1]["chamfer"] for _ in range(200)])
-    assert values.std() > 0
+    assert len(values.unique()) > 100  # each step draws others
     assert values.mean().item() == pytest.approx(full["chamfer"].item(), rel=0.1)
 
 

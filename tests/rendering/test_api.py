@@ -1,5 +1,7 @@
 """Options, errors and configs of the renderer."""
 
+import dataclasses
+
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
@@ -105,6 +107,10 @@ def test_backgrounds(backend):
         Renderer(backend=backend, background=0.5)(gaussians, views, background=1.0).image,
         black.image + behind,
     )
+
+    # Black is a background like any other.
+    shown = Renderer(backend=backend, background=0.5)(gaussians, views, background=0.0).image
+    assert torch.equal(shown, black.image)
     with pytest.raises(InputError, match="background"):
         render(gaussians, views, backend, background=(0.0, 1.0))
 
@@ -144,3 +150,19 @@ def test_gaussians_are_drawn_with_the_constants_that_they_were_made_for():
     assert torch.equal(Renderer()(one, views).image, render(one, views, settings=sharp).image)
     forced = render(one, views, settings=plain).image
     assert not torch.equal(forced, render(one, views).image)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_elements_of_worlds_far_apart_are_drawn_as_near_the_origin(backend):
+    """In float64 each is moved to its own cameras: 1000 km away float32 knows 6 cm."""
+    splats, views = cloud(20, splits=(12, 8)), camera_ring(2, 20, 30, batch=2)
+    expected = render(splats, views, backend)
+    away = torch.tensor([[0.0, 0.0, 0.0], [1e6, -4e5, 3e5]]).double()
+    element = torch.tensor([0] * 12 + [1] * 8)
+    extrinsics = views.extrinsics.double().clone()
+    extrinsics[..., :3, 3] -= (extrinsics[..., :3, :3] @ away[:, None, :, None])[..., 0]
+    far = dataclasses.replace(splats, means=splats.means.double() + away[element])
+    found = render(far, dataclasses.replace(views, extrinsics=extrinsics), backend)
+    # float64 rounds to 1e-10 m there, float32 to 1e-7 of the distance to the camera.
+    torch.testing.assert_close(found.image.float(), expected.image, atol=1e-4, rtol=0)
+    torch.testing.assert_close(found.depth.float(), expected.depth, atol=1e-4, rtol=0)

@@ -12,7 +12,7 @@ from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.rounds.gains import divided, equalized, log_gains
 from ghgs_lit.types import Gaussians
 from tests.helpers.models import make_model
-from tests.helpers.scenes import CENTER, make_batch
+from tests.helpers.scenes import CENTER, RADII, ellipsoid, make_batch, with_soft_rims
 
 
 def waves(points):
@@ -24,9 +24,11 @@ def halves(points):
     return torch.where(points[..., 2:] > CENTER[2], 0.46, 0.4).expand(points.shape)
 
 
-def painted(batch=1, views=4, spread=40.0, paint=waves):
+def painted(batch=1, views=4, spread=40.0, paint=waves, radii=RADII):
     """A surface whose colour is a function of the place in the world, so that all views agree about it."""
     batch = make_batch(batch, views, spread=spread)
+    masks, depths = ellipsoid(batch.cameras, radii=radii)
+    batch = dataclasses.replace(batch, masks=masks, depths=depths)
     colors = paint(unproject_maps(batch.depths, batch.cameras)).movedim(-1, 2)
     return dataclasses.replace(batch, images=colors * batch.masks[:, :, None])
 
@@ -95,6 +97,19 @@ def test_what_a_view_does_not_see_does_not_count():
     gains = drawn(batch)
     dark = seen_with(batch, gains)
     np.testing.assert_allclose(log_gains(splats(dark), dark), np.log(gains), atol=0.02)
+
+
+def test_dark_rims_do_not_count():
+    """Half-covered pixels at the outline of a narrow board are darker in one view than their matte says."""
+    sharp = painted(views=3, spread=20.0, radii=torch.tensor([0.1, 0.8, 0.01]))
+    soft = with_soft_rims(sharp)
+    soft = dataclasses.replace(soft, images=sharp.images * soft.alpha[:, :, None])
+    gains = drawn(soft)
+    dark = seen_with(soft, gains)
+    images = dark.images.clone()
+    images[:, 0] *= torch.where(dark.alpha[:, 0] < 0.9, 0.8, 1.0)[:, None]
+    found = log_gains(splats(soft), dataclasses.replace(dark, images=images))
+    np.testing.assert_allclose(found, np.log(gains), atol=0.03)
 
 
 def test_batch_mates_change_nothing():

@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.errors import InputError
 from ghgs_lit.kernels.precision import exact
-from ghgs_lit.metrics.functional import psnr, ssim
+from ghgs_lit.metrics.functional import box_of, psnr, ssim
 from ghgs_lit.model import GHGS
 from ghgs_lit.training import DivergedError, GHGSModule, Optimization
 from ghgs_lit.training.callbacks import RunProgress
@@ -333,6 +333,8 @@ def test_validation_measures_clamped_renders(tmp_path):
     target = batch.targets.images.flatten(0, 1)
     assert found["val/ssim"] == pytest.approx(float(ssim(image, target).mean()), rel=1e-4)
     assert found["val/psnr"] == pytest.approx(float(psnr(image, target).mean()), rel=1e-4)
+    box = box_of(batch.targets.masks.flatten(0, 1))
+    assert found["val/psnr_box"] == pytest.approx(float(psnr(image, target, box).mean()), rel=1e-4)
 
 
 def test_a_trainer_of_ones_own_needs_no_configuration(tmp_path):

@@ -91,6 +91,16 @@ def whole(tmp_path_factory):
     return folder, fit(folder, cut), cut.validations
 
 
+def test_the_best_checkpoint_has_the_highest_psnr(whole):
+    """Of the four validations, whose values differ."""
+    folder, _, validations = whole
+    found = [float(row["val/psnr"]) for row in rows(folder) if "val/psnr" in row]
+    assert len(set(found)) == len(validations)
+    best, step = score(folder)
+    assert best == pytest.approx(max(found), rel=1e-6)
+    assert step == validations[found.index(max(found))]
+
+
 @pytest.mark.parametrize(("at", "validating"), [(5, False), (8, False), (8, True), (12, True), (13, False)])
 def test_a_cut_run_ends_as_the_whole_one_does(whole, tmp_path, at, validating):
     """Cut within an epoch of 5, at a validation (every 4), within one; saved every 3 steps."""

@@ -3,8 +3,10 @@
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import BASELINES, baseline, nearest_view, splats_at
@@ -46,6 +48,18 @@ def test_the_nearest_view_is_resized_to_the_target():
     large = dataclasses.replace(batch.targets, images=torch.zeros(2, 1, 3, 32, 24), masks=masks)
     batch = dataclasses.replace(batch, targets=large)
     assert nearest_view(batch).image.shape == (2, 1, 3, 32, 24)
+
+
+@pytest.mark.parametrize("size", [(8, 8), (4, 12), (32, 24)])
+def test_the_nearest_view_is_resized_as_photographs_are(size):
+    """As Pillow does it: a smaller copy averages what a pixel covers, a larger one interpolates."""
+    batch = example_batch(subjects=1, views=2, size=16)
+    masks = torch.zeros(1, 1, *size, dtype=torch.bool)
+    targets = dataclasses.replace(batch.targets, images=torch.zeros(1, 1, 3, *size), masks=masks)
+    found = nearest_view(dataclasses.replace(batch, targets=targets)).image[0, 0]
+    for channel, photo in zip(found, batch.images[0, 0], strict=True):
+        expected = Image.fromarray(photo.numpy()).resize(size[::-1], Image.Resampling.BILINEAR)
+        torch.testing.assert_close(channel, torch.from_numpy(np.array(expected)), atol=1e-5, rtol=0)
 
 
 def test_splats_lie_on_their_pixels_with_their_width_in_pixels():
