@@ -19,6 +19,7 @@ from omegaconf import DictConfig
 from ghgs_lit.cli import messages
 from ghgs_lit.cli.usage import VERBS
 from ghgs_lit.config import VERSION_BASE, conf_dir, own_keys
+from ghgs_lit.config.compose import check_ablation
 from ghgs_lit.config.registry import check
 from ghgs_lit.kernels.allocation import collect_garbage_again
 from ghgs_lit.kernels.cores import children_sleep
@@ -56,6 +57,7 @@ class Verb:
         from ghgs_lit.cli.photographs import require_paths  # here: --help needs no NumPy
 
         try:
+            check_ablation(cfg, HydraConfig.get())
             config = own_keys(cfg, self.name)
             require_paths(self.name, config)
             check(config)  # before the verb's module is imported, which takes longer

@@ -82,6 +82,9 @@ def _missing_option(error: MissingConfigException) -> str:
 
 def _composition(error: HydraException, verb: str) -> str:
     """Message for a key that does not exist, with the closest one, or for another error of Hydra."""
+    if chosen := re.match(r"In '([^']+)': Could not override 'ablation'", str(error)):
+        expected = "no choice of an ablation, which composes last (ablation=... on the command line)"
+        return f"{chosen[1]}: expected {expected}; found one"
     named = re.match(r"Could not override '([^']+)'", str(error))
     if named is None:
         return f"{' '.join(sys.argv[1:])}: expected overrides that fit; found {error} {error.__cause__ or ''}"

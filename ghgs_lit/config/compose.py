@@ -8,12 +8,14 @@ from typing import Any
 import hydra
 from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
+from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.config.options import did_you_mean
 from ghgs_lit.config.registry import KINDS, check
 from ghgs_lit.config.verbs import VERBS
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 
 #: Hydra 1.3 asks for the version to be compatible with; later versions do not.
 VERSION_BASE: dict[str, Any] = {"version_base": "1.3"} if hydra.__version__.startswith("1.3") else {}
@@ -69,6 +71,31 @@ def own_keys(cfg: DictConfig, verb: str | None) -> dict[str, Any]:
     if verb is not None:
         VERBS[verb].read({name: value for name, value in data.items() if name not in KINDS}, "")
     return data
+
+
+#: Groups whose files set keys of the whole configuration.
+_GLOBAL = ("experiment", "sweep", "ablation")
+
+
+def check_ablation(cfg: DictConfig, hydra_node: DictConfig) -> None:
+    """Check that each key that the chosen ablation sets has its value in ``cfg``, unless the command line
+    says another. ``hydra_node``: the node ``hydra`` of ``cfg``. InputError: a key has another value, or a
+    file that sets keys of the whole configuration lacks the line that says so."""
+    for group in _GLOBAL:
+        if group in cfg:
+            file = f"{group}/{hydra_node.runtime.choices.get(group)}.yaml"
+            raise InputError(f"{file}: expected the first line '# @package _global_'; found none")
+    loader, name = GlobalHydra.instance().config_loader(), hydra_node.runtime.choices.get("ablation")
+    if name is None:
+        return
+    wanted = flatten(OmegaConf.to_container(loader.repository.load_config(f"ablation/{name}").config))
+    composed = OmegaConf.to_container(cfg)
+    overrides = OverridesParser.create().parse_overrides(list(hydra_node.overrides.task))
+    said = ["hydra", *(part.key_or_group for part in overrides)]
+    for key, value in wanted.items():
+        found = lookup(composed, key)
+        holds = not key or found == value or is_below(key, said)
+        require(holds, key, f"{value!r}, as ablation/{name}.yaml sets it", found)
 
 
 def read_options(

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from tabulate import tabulate
 
 from ghgs_lit.config import resolve
-from ghgs_lit.config.compose import saved_text
+from ghgs_lit.config.compose import check_ablation, saved_text
 from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
@@ -148,10 +148,10 @@ def sweep(sweeper: BasicSweeper, arguments: Sequence[str]) -> list[Sequence[JobR
 
 def _sweep(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> list[Sequence[JobReturn]]:
     config, loader = sweeper.config, sweeper.hydra_context.config_loader
-    planned = plan(
-        combinations(sweeper.params, arguments, loader),
-        lambda overrides: loader.load_sweep_config(config, overrides),
-    )
+    combos = combinations(sweeper.params, arguments, loader)
+    planned = plan(combos, lambda overrides: loader.load_sweep_config(config, overrides))
+    if len(planned) < len(combos):
+        print(f"{len(combos)} combinations, {len(planned)} different configurations", flush=True)
     for item in planned:  # an impossible launcher is refused before anything starts
         check_launcher(item.config, config.hydra.runtime.choices["hydra/launcher"])
     if config.get("dry_run"):
@@ -187,6 +187,7 @@ def plan(combos: Sequence[Sequence[str]], compose: Callable[[list[str]], DictCon
     planned: dict[str, PlannedRun] = {}
     for overrides in combos:
         cfg = compose(list(overrides))
+        check_ablation(cfg, cfg.hydra)
         directory, verb = Path(str(cfg.hydra.sweep.dir)), cfg.hydra.job.name
         with open_dict(cfg):
             del cfg["hydra"]

@@ -13,6 +13,7 @@ from ghgs_lit.config import build, conf_dir
 from ghgs_lit.config.keys import ablation_of, switches_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS, OPTIONS, STAGES
+from tests.cli.test_main import call
 from tests.helpers.configs import composed, verb_with
 
 CONF = conf_dir()
@@ -107,3 +108,97 @@ def test_a_command_line_choice_wins_over_the_models():
         composed("train", "model=paper", "encoder=vggt_small").encoder.width
         != composed("train", "model=paper", "encoder=vggt_nano").encoder.width
     )
+
+
+SETS = """# @package _global_
+defaults:
+  - override /optimizer: release
+loss: {weights: {render_l1: 0.0}}
+optimizer: {lr: 1.0e-5}
+views: {training: uneven}
+"""
+
+
+@pytest.fixture
+def own(tmp_path):
+    """``own(ablation=text)`` writes the file ``mine`` of a group; returns the flags that show its folder."""
+
+    def write(**files):
+        for group, text in files.items():
+            (tmp_path / group).mkdir(exist_ok=True)
+            (tmp_path / group / "mine.yaml").write_text(text)
+        return ["--config-dir", str(tmp_path), f"hydra.sweep.dir={tmp_path / 'sweep'}", "dry_run=true"]
+
+    return write
+
+
+def test_what_an_ablation_sets_holds(monkeypatch, capsys, own):
+    """Loss, optimizer and views composed after it, so that its keys had no effect and two rows were one."""
+    flags = own(ablation=SETS)
+    said = ["experiment=demo", "ablation=mine", "views.training=any"]
+    code, out, _ = call(monkeypatch, capsys, "train", "--cfg", "job", *flags, *said)
+    cfg = OmegaConf.create(out)
+    assert (cfg.loss.weights.render_l1, cfg.optimizer.lr, cfg.optimizer.betas) == (0.0, 1e-5, [0.9, 0.999])
+    assert cfg.views.training == "any"  # the command line wins
+    code, out, _ = call(monkeypatch, capsys, "train", "-m", *flags, "ablation=full,mine", "seed=1,2")
+    assert code == 0
+    assert "4 runs: 4 missing" in out
+    assert "different configurations" not in out
+
+
+def test_combinations_that_are_one_configuration_are_counted(monkeypatch, capsys, own):
+    """A 2 x 2 grid became two runs without a word."""
+    flags = own(ablation=SETS)
+    grid = ["ablation=full,mine", "seed=1,2", "loss.weights.render_l1=1", "optimizer=release"]
+    grid += ["optimizer.lr=1e-5", "views.training=uneven"]
+    code, out, _ = call(monkeypatch, capsys, "train", "-m", *flags, *grid)
+    assert code == 0
+    assert "4 combinations, 2 different configurations" in out
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        (
+            {"ablation": "# @package _global_\noptimizer: {freeze_until: {}}\n"},
+            "optimizer.freeze_until: expected {}, as ablation/mine.yaml sets it; found {'gaussian_head': ",
+        ),
+        (
+            {"ablation": "optimizer: {lr: 1}"},
+            "ablation/mine.yaml: expected the first line '# @package _global_'; found none",
+        ),
+        (
+            {"experiment": "# @package _global_\ndefaults: [{override /ablation: neither}]\n"},
+            "experiment/mine: expected no choice of an ablation, which composes last",
+        ),
+    ],
+)
+@pytest.mark.parametrize("mode", ["-m", "single"])
+def test_a_key_of_an_ablation_that_does_not_hold_is_refused(
+    monkeypatch, capsys, tmp_path, own, files, message, mode
+):
+    """An empty mapping is merged, and keys without the header are below ``ablation``."""
+    flags = own(**files)
+    flags += ["-m"] if mode == "-m" else [f"hydra.run.dir={tmp_path / 'run'}"]
+    chosen = "experiment=mine" if "experiment" in files else "ablation=mine"
+    code, _, err = call(monkeypatch, capsys, "train", *flags, chosen)
+    assert code == 1
+    assert message in err
+    assert err.count("\n") == 1
+
+
+def test_a_primary_configuration_of_ones_own_does_not_hide_an_ablation(monkeypatch, capsys, tmp_path, own):
+    """Its keys compose after everything in its defaults."""
+    flags = own(ablation=SETS)
+    (tmp_path / "primary.yaml").write_text("defaults: [train, _self_]\noptimizer: {lr: 0.5}\n")
+    flags += ["--config-name", "primary", "ablation=mine", f"hydra.run.dir={tmp_path / 'run'}"]
+    code, _, err = call(monkeypatch, capsys, "train", *flags)
+    assert code == 1
+    assert "optimizer.lr: expected 1e-05, as ablation/mine.yaml sets it; found 0.5" in err
+
+
+def test_a_model_may_set_keys_of_loss_and_optimizer(monkeypatch, capsys, own):
+    """As ``model=recurrent`` does; they composed after it."""
+    flags = own(model="# @package _global_\ndefaults: [hull, _self_]\noptimizer: {lr: 0.25}\n")
+    _, out, _ = call(monkeypatch, capsys, "train", "--cfg", "job", *flags, "model=mine")
+    assert OmegaConf.create(out).optimizer.lr == 0.25
