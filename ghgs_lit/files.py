@@ -5,8 +5,9 @@ import errno
 import fcntl
 import os
 import socket
+import stat
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +15,19 @@ from ghgs_lit.errors import InputError, require
 
 # Lock files that this process holds; they are not opened again: closing a second handle would free the lock.
 _HELD: set[Path] = set()
+_OWNER = b"process "  #: How the text of a lock file begins
 
 
 def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
     """Let ``write(temporary)`` write a file beside ``path``, wait for the disk, then rename it to ``path``.
 
-    Readers see the old file or the new one, never a part. Folders are made. A temporary file of a process
-    that was killed is removed by the next write of the same path on the same machine. InputError: ``path`` is
-    a directory. OSError: the disk is full, or the folder cannot be written to; its ``filename`` is ``path``.
+    Readers see the old file or the new one, never a part. Folders are made. A link is replaced, and the file
+    that it points to stays. A temporary file of a process that was killed is removed by the next write of the
+    same path on the same machine. InputError: ``path`` is, or links to, a directory, a device or a pipe.
+    OSError: the disk is full, or the folder cannot be written to; its ``filename`` is ``path``.
     """
     path = Path(path)
-    require(not path.is_dir(), str(path), "a file to write", "a directory")
+    _require_replaceable(path)
     temporary = path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -42,6 +45,25 @@ def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
     finally:
         with contextlib.suppress(OSError):  # a folder that cannot be written to has no such file
             temporary.unlink(missing_ok=True)
+
+
+def _require_replaceable(path: Path) -> None:
+    """Refuse what a new file must not take the place of."""
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        return
+    found = "a directory" if stat.S_ISDIR(mode) else "a device or a pipe"
+    require(stat.S_ISREG(mode), str(path), "a file to write", found)
+
+
+def require_free(path: str | Path, key: str, overwrite: bool) -> None:
+    """The rule for a file that a ``key`` of the command line names: one that exists is replaced only with
+    ``overwrite``. InputError: it exists, or is no file that :func:`write_atomically` would replace."""
+    path = Path(path).expanduser()
+    _require_replaceable(path)
+    taken = os.path.lexists(path) and not overwrite
+    require(not taken, key, "a path where there is no file, or overwrite=true", str(path))
 
 
 @contextlib.contextmanager
@@ -87,13 +109,27 @@ def write_text_atomically(path: str | Path, text: str) -> None:
     write_atomically(path, lambda temporary: temporary.write_text(text))
 
 
+def require_no_links(directory: Path, names: Iterable[str]) -> None:
+    """Refuse links of these names in a run's directory, and in folders of these names: libraries that write
+    there would change the files that the links point to."""
+    for name in names:
+        path = directory / name
+        files = path.iterdir() if path.is_dir() and not path.is_symlink() else ()
+        for each in (path, *files):
+            require(not each.is_symlink(), str(each), "a file or folder of the run", "a link")
+
+
 def append_line(path: Path, text: str) -> None:
     """Append ``text`` as a line of its own, also after an unfinished line of a killed process."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a+b") as file:
+    with open(path, "a+b", opener=_open_no_link) as file:
         file.seek(max(0, file.tell() - 1))
         is_torn = file.read(1) not in (b"", b"\n")
         file.write((("\n" if is_torn else "") + text + "\n").encode())
+
+
+def _open_no_link(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW, 0o664)
 
 
 def _remove_leftovers(path: Path) -> None:
@@ -126,18 +162,40 @@ def _sync(place: Path) -> None:
         os.close(handle)
 
 
+def _place_of_lock(path: str | Path) -> Path:
+    """The path without links in its folders; the file itself must be none."""
+    path = Path(path)
+    return path.parent.resolve() / path.name
+
+
+def _open_lock(path: Path, flags: int) -> int:
+    """Open a lock file without changing it. InputError: it is a link, no file, or holds something else."""
+    try:
+        # Opening a pipe would wait for its other end.
+        handle = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o664)
+    except OSError as error:
+        require(not path.is_symlink(), str(path), "a lock file", "a link")
+        raise error
+    is_file = stat.S_ISREG(os.fstat(handle).st_mode)
+    if not is_file or os.pread(handle, len(_OWNER), 0) not in (b"", _OWNER):
+        os.close(handle)
+        raise InputError(f"{path}: expected a lock file; found {'another file' if is_file else 'no file'}")
+    return handle
+
+
 @contextlib.contextmanager
 def lock(path: str | Path, wait: bool = False) -> Iterator[bool]:
     """Lock the file ``path`` for this process; gives whether that succeeded (False if it holds it already). A
     POSIX record lock: the system frees it however the process ends, forked children do not inherit it, and
     NFS shares it among machines. The file holds the text of :func:`lock_owner`; folders are made. ``wait``:
-    wait until another process frees the lock. InputError: the file system has no locks."""
-    path = Path(path).resolve()
+    wait until another process frees the lock. InputError: the file system has no locks, or the file is a link
+    or holds anything but an owner: it is not emptied."""
+    path = _place_of_lock(path)
     if path in _HELD:
         yield False
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o664)
+    handle = _open_lock(path, os.O_RDWR | os.O_CREAT)
     try:
         locked = _try_lock(handle, fcntl.LOCK_EX, wait, path)
         if not locked:  # is_locked() in another process may have held it for a moment
@@ -146,7 +204,7 @@ def lock(path: str | Path, wait: bool = False) -> Iterator[bool]:
         if locked:
             _HELD.add(path)
             os.ftruncate(handle, 0)
-            os.write(handle, f"process {os.getpid()} on {socket.gethostname()}\n".encode())
+            os.write(handle, _OWNER + f"{os.getpid()} on {socket.gethostname()}\n".encode())
         yield locked
     finally:
         os.close(handle)
@@ -155,12 +213,12 @@ def lock(path: str | Path, wait: bool = False) -> Iterator[bool]:
 
 def is_locked(path: str | Path) -> bool:
     """Whether a process, this one included, holds the lock of the file ``path``."""
-    path = Path(path).resolve()
+    path = _place_of_lock(path)
     if path in _HELD:
         return True
     if not path.exists():
         return False
-    handle = os.open(path, os.O_RDONLY)
+    handle = _open_lock(path, os.O_RDONLY)
     try:
         return not _try_lock(handle, fcntl.LOCK_SH, False, path)
     finally:

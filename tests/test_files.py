@@ -13,7 +13,18 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from ghgs_lit.files import is_locked, lock, lock_owner, naming, write_atomically, write_text_atomically
+from ghgs_lit.errors import InputError
+from ghgs_lit.files import (
+    append_line,
+    is_locked,
+    lock,
+    lock_owner,
+    naming,
+    require_free,
+    require_no_links,
+    write_atomically,
+    write_text_atomically,
+)
 from tests.helpers.processes import PREPARED
 
 
@@ -160,3 +171,94 @@ def test_a_bug_in_the_writer_keeps_its_type(tmp_path):
     """Only what the system refuses is bad input."""
     with pytest.raises(KeyError, match="bug"):
         write_atomically(tmp_path / "x", lambda temporary: {}["bug"])
+
+
+def link(path, content):
+    """A link to a file of that content, which lies elsewhere."""
+    target = path.with_name(f"target-of-{path.name}")
+    target.write_text(content)
+    path.symlink_to(target)
+    return target
+
+
+def hard_link(path, content):
+    target = path.with_name(f"target-of-{path.name}")
+    target.write_text(content)
+    os.link(target, path)
+    return target
+
+
+@pytest.mark.parametrize("act", [lock, is_locked], ids=["lock", "is_locked"])
+@pytest.mark.parametrize("make", [link, hard_link])
+def test_a_lock_file_that_is_another_file_is_refused_and_stays(tmp_path, make, act):
+    """Folders of strangers may hold a ``.lock`` that leads to a file of the user."""
+    target = make(tmp_path / ".lock", "precious")
+    with pytest.raises(InputError, match=r"\.lock: expected a lock file; found .*(link|another file)"):
+        act(tmp_path / ".lock").__enter__()
+    assert target.read_text() == "precious"
+
+
+def test_a_lock_of_an_earlier_process_is_taken_also_through_a_linked_folder(tmp_path):
+    """Results on another disk are linked, and a backup may share the lock file."""
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "runs").symlink_to(tmp_path / "disk")
+    hard_link(tmp_path / "disk" / "lock", "process 4000000 on elsewhere\n")
+    with lock(tmp_path / "runs" / "lock") as locked:
+        assert locked
+        assert is_locked(tmp_path / "disk" / "lock")
+        assert lock_owner(tmp_path / "disk" / "lock") == f"process {os.getpid()} on {socket.gethostname()}"
+
+
+@pytest.mark.parametrize("kind", ["a pipe", "a device", "links in a loop"])
+def test_what_is_no_file_is_never_replaced(tmp_path, kind):
+    """``out=/dev/null`` must not become a file, nor a pipe that another program reads."""
+    path = tmp_path / "it"
+    if kind == "a pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/null" if kind == "a device" else path)
+    before = path.lstat()
+    with pytest.raises((InputError, OSError), match=r"expected a file to write; found|symbolic links"):
+        write_text_atomically(path, "text")
+    assert path.lstat() == before
+    assert names(tmp_path) == ["it"]
+
+
+def test_a_link_is_replaced_and_its_file_stays(tmp_path):
+    target = link(tmp_path / "a.ckpt", "old")
+    write_text_atomically(tmp_path / "a.ckpt", "new")
+    assert target.read_text() == "old"
+    assert not (tmp_path / "a.ckpt").is_symlink()
+    assert (tmp_path / "a.ckpt").read_text() == "new"
+
+
+def test_one_rule_for_files_that_exist(tmp_path):
+    require_free(tmp_path / "new", "out", overwrite=False)
+    (tmp_path / "link").symlink_to(tmp_path / "nothing")
+    (tmp_path / "old").touch()
+    for name in ("old", "link"):
+        with pytest.raises(
+            InputError, match=r"^out: expected a path where there is no file, or overwrite=true"
+        ):
+            require_free(tmp_path / name, "out", overwrite=False)
+        require_free(tmp_path / name, "out", overwrite=True)
+    with pytest.raises(InputError, match="expected a file to write; found 'a directory'"):
+        require_free(tmp_path, "out", overwrite=True)
+
+
+def test_no_line_is_appended_through_a_link(tmp_path):
+    target = link(tmp_path / "sessions.jsonl", "precious")
+    with pytest.raises(OSError, match="symbolic links"):
+        append_line(tmp_path / "sessions.jsonl", "{}")
+    assert target.read_text() == "precious"
+
+
+@pytest.mark.parametrize("place", ["train.log", "csv", "csv/metrics.csv"])
+def test_links_in_a_run_are_refused(tmp_path, place):
+    """Lightning and logging open their files in the run's directory as they are."""
+    (tmp_path / place).parent.mkdir(exist_ok=True)
+    (tmp_path / "checkpoints").symlink_to(tmp_path)
+    require_no_links(tmp_path, ("train.log", "csv"))
+    link(tmp_path / place, "precious")
+    with pytest.raises(InputError, match=f"{place}: expected a file or folder of the run; found 'a link'"):
+        require_no_links(tmp_path, ("train.log", "csv"))

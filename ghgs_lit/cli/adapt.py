@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 
 from ghgs_lit.cli.inputs import build_data, build_renderer, choices, load_model, model_of, pick_device, said
 from ghgs_lit.cli.photographs import capture_folder
-from ghgs_lit.cli.runtime import announce, output_dir
+from ghgs_lit.cli.runtime import announce, files_to_write, output_dir
 from ghgs_lit.cli.train import run_job, train
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.errors import require
@@ -36,9 +36,7 @@ _MINUTES = 3
 def run(cfg: DictConfig) -> float | str | None:
     """Run the verb; return the mean PSNR of validation people in the rig. Interrupted: Ctrl-C or SIGTERM."""
     config = resolve(cfg) | model_of(cfg.checkpoint, cfg)
-    if config["out"] is not None and not config["overwrite"]:
-        taken = Path(config["out"]).expanduser().exists()
-        require(not taken, "out", "a path where there is no file, or overwrite=true", config["out"])
+    files_to_write(config, ["out"])
     return run_job(with_rig(config), RunDirectory(output_dir()), adapt)
 
 

@@ -14,13 +14,14 @@ from pathlib import Path
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.cli import messages
 from ghgs_lit.cli.usage import VERBS
 from ghgs_lit.config import VERSION_BASE, conf_dir, own_keys
 from ghgs_lit.config.compose import check_ablation
 from ghgs_lit.config.registry import check
+from ghgs_lit.files import require_no_links, write_text_atomically
 from ghgs_lit.kernels.allocation import collect_garbage_again
 from ghgs_lit.kernels.cores import children_sleep
 from ghgs_lit.runs.job import register_resolvers
@@ -38,8 +39,22 @@ def discard_unused(directory: Path, verb: str, since: float) -> None:
     """Remove a run's directory that holds nothing but start-up files written after ``since``."""
     begun = {".hydra", ".lock", "config.yaml", "sessions.jsonl", f"{verb}.log"}
     paths = [] if directory == Path.cwd() else list(directory.glob("*"))
-    if paths and all(path.name in begun and path.stat().st_mtime >= since for path in paths):
+    if paths and all(path.name in begun and path.lstat().st_mtime >= since for path in paths):
         shutil.rmtree(directory, ignore_errors=True)
+
+
+#: What a run appends to, or what libraries write as it is, beside the log.
+_WRITTEN_IN_PLACE = (".hydra", "csv", "init_from.txt", "sessions.jsonl", "tensorboard")
+
+
+def write_hydra_files(cfg: DictConfig, directory: Path) -> None:
+    """Write ``.hydra`` as Hydra does, but whole and through no link. InputError: a file that will be written
+    in place is a link."""
+    require_no_links(directory, (*_WRITTEN_IN_PLACE, f"{HydraConfig.get().job.name}.log"))
+    hydra_config = HydraConfig.instance().cfg
+    contents = {"config": cfg, "hydra": hydra_config, "overrides": hydra_config.hydra.overrides.task}
+    for name, content in contents.items():
+        write_text_atomically(directory / ".hydra" / f"{name}.yaml", OmegaConf.to_yaml(content))
 
 
 @dataclass(frozen=True)
@@ -57,6 +72,7 @@ class Verb:
         from ghgs_lit.cli.photographs import require_paths  # here: --help needs no NumPy
 
         try:
+            write_hydra_files(cfg, Path(HydraConfig.get().runtime.output_dir))
             check_ablation(cfg, HydraConfig.get())
             config = own_keys(cfg, self.name)
             require_paths(self.name, config)
@@ -109,7 +125,8 @@ def run(verb: str, argv: list[str]) -> int:
         flags, overrides, found = messages.parsed(argv[2:])
         if found.help:
             return _help(verb, overrides, found.config_dir)
-        sys.argv = [argv[0], *flags, *_for_hydra(verb, overrides)]
+        # Hydra would write .hydra through links; write_hydra_files does not.
+        sys.argv = [argv[0], *flags, "hydra.output_subdir=null", *_for_hydra(verb, overrides)]
         messages.check_deletions(overrides)
         with interruptible():
             hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=verb)(task)()

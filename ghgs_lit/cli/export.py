@@ -3,7 +3,7 @@
 import torch
 from omegaconf import DictConfig
 
-from ghgs_lit.cli.runtime import announce, output_dir, save_config
+from ghgs_lit.cli.runtime import announce, files_to_write, output_dir, save_config
 from ghgs_lit.diagnostics.benchmark.measure import differences as prediction_differences
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.errors import require
@@ -34,8 +34,9 @@ def parity(checkpoint: str, exported: str) -> dict[str, float]:
 def run(cfg: DictConfig) -> None:
     """Run the verb."""
     config = save_config(cfg, output_dir())
-    checkpoint, vggt, release, inference = map(config.get, ("checkpoint", "vggt", "release", "inference"))
-    paths = [path for path in (vggt, release, inference) if path is not None]
+    checkpoint, keys = config["checkpoint"], ("vggt", "release", "inference")
+    paths = files_to_write(config, keys, [file_of(checkpoint)])
+    vggt, release, inference = map(paths.get, keys)
     require(bool(paths), "vggt", "vggt=<file>, release=<file> or inference=<file>", None)
     if vggt is not None or release is not None:
         print("\n".join(export_weights(checkpoint, vggt, release)), flush=True)
@@ -52,4 +53,4 @@ def run(cfg: DictConfig) -> None:
             f" largest relative difference of depth {found['depth']:.1e}, of means {found['means']:.1e}",
             flush=True,
         )
-    announce(paths[-1])
+    announce(paths.popitem()[1])

@@ -8,7 +8,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from ghgs_lit.cli.inputs import MODEL_NODES
-from ghgs_lit.cli.runtime import announce, output_dir, save_config
+from ghgs_lit.cli.runtime import announce, files_to_write, output_dir, save_config
 from ghgs_lit.errors import require
 from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.weights.importing import import_weights
@@ -30,9 +30,10 @@ def run(cfg: DictConfig) -> None:
     require(safe, "compat", "none where there is no release=<file>", config["compat"]["name"])
     L.seed_everything(config["seed"], workers=True, verbose=False)
     model = {key: config[key] for key in MODEL_NODES if key in config}
-    options = (config[key] for key in ("out", "vggt", "release", "dtype"))
-    report = import_weights(initial_state(model, config["release"]), model, *options)
+    sources = (config["vggt"], config["release"])
+    out = files_to_write(config, ["out"], [path for path in sources if path is not None])["out"]
+    report = import_weights(initial_state(model, config["release"]), model, out, *sources, config["dtype"])
     print("\n".join(report), flush=True)
     if config["release"] is not None and (differing := differences(config)):
         print(f"differs from the release: {', '.join(differing)}", flush=True)
-    announce(config["out"])
+    announce(out)

@@ -1,5 +1,6 @@
 """What all verbs share: the run's directory, its saved configuration and the path printed last."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from omegaconf import DictConfig
 from ghgs_lit.config import resolve
 from ghgs_lit.config.compose import HEADER, saved_text
 from ghgs_lit.errors import require
-from ghgs_lit.files import write_text_atomically
+from ghgs_lit.files import require_free, resolved, write_text_atomically
 
 
 def output_dir() -> Path:
@@ -32,6 +33,20 @@ def save_config(cfg: DictConfig, directory: Path) -> dict[str, Any]:
     config = resolve(cfg)
     write_config(config, directory)
     return config
+
+
+def files_to_write(
+    config: dict[str, Any], keys: Sequence[str], read: Sequence[str | Path] = ()
+) -> dict[str, Path]:
+    """Paths of the files that ``keys`` of a verb name, by key, without those that are null. InputError: a
+    file exists and ``overwrite`` is false, it is one of ``read``, or two keys name one."""
+    paths = {key: Path(config[key]).expanduser() for key in keys if config[key] is not None}
+    taken = {resolved(path) for path in read}
+    for key, path in paths.items():
+        require(resolved(path) not in taken, key, "a file of its own", str(path))
+        require_free(path, key, config["overwrite"])
+        taken.add(resolved(path))
+    return paths
 
 
 def announce(path: Path | str) -> None:

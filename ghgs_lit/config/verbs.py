@@ -217,6 +217,8 @@ class Export(Options):
     """File with weights and configuration alone, a checkpoint for ``ghgs predict``; null: not written."""
     dtype: Literal["float16", "bfloat16", "float32"] = "float16"
     """Of the weights in it."""
+    overwrite: bool = False
+    """Replace files that exist."""
 
 
 class Import(Options):
@@ -230,6 +232,8 @@ class Import(Options):
     """File of the checkpoint."""
     dtype: Literal["float32", "bfloat16", "float16"] = "float32"
     """Of the encoder in the checkpoint; the heads are float32."""
+    overwrite: bool = False
+    """Replace a file that exists."""
     seed: Seed = 1
     """Of random weights."""
 

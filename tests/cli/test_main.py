@@ -198,6 +198,8 @@ def test_the_verb_is_in_argv_while_the_task_runs(monkeypatch):
 
     monkeypatch.setattr("sys.argv", ["ghgs", "seed=1"])
     monkeypatch.setitem(sys.modules, application.module_of("train"), Module)
+    monkeypatch.setattr(application, "write_hydra_files", lambda cfg, directory: None)
+    monkeypatch.setattr(HydraConfig, "get", lambda: OmegaConf.create({"runtime": {"output_dir": "."}}))
     application.Verb("train", ("ghgs", "train", "seed=1"))(compose("train"))
     assert seen["argv"] == ["ghgs", "train", "seed=1"]
 
@@ -265,3 +267,28 @@ def test_a_run_with_anything_else_stays(monkeypatch, tmp_path):
     os.utime(file, (0, 0))
     discard_unused(file.parent, "table", 1.0)
     assert file.is_file()
+
+
+def test_hydras_files_are_written_and_through_no_link(tmp_path, monkeypatch, capsys):
+    """A run's folder of a stranger may hold links to files of the user, which Hydra itself would empty."""
+    run, precious = tmp_path / "run", tmp_path / "precious"
+    run.mkdir()
+    precious.write_text("precious")
+    (run / "notes").touch()  # a directory that holds more is kept
+    arguments = ("table", f"runs={tmp_path}", "layout=table2", f"hydra.run.dir={run}")
+    call(monkeypatch, capsys, *arguments)
+    files = {path.stem: OmegaConf.load(path) for path in (run / ".hydra").iterdir()}
+    assert files.keys() == {"config", "hydra", "overrides"}
+    assert files["config"].layout == "table2"
+    assert files["hydra"].hydra.job.name == "table"
+    assert files["overrides"] == [f"runs={tmp_path}", "layout=table2"]
+    for path in (run / ".hydra" / "config.yaml", run / "table.log"):
+        path.unlink(missing_ok=True)
+        path.symlink_to(precious)
+        code, _, err = call(monkeypatch, capsys, *arguments)
+        assert (code, err) == (
+            1,
+            f"ghgs table: {path}: expected a file or folder of the run; found 'a link'\n",
+        )
+        assert precious.read_text() == "precious"
+        path.unlink()

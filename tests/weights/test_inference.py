@@ -44,7 +44,11 @@ def test_the_verb_prints_how_far_predictions_are(checkpoint, tmp_path, capsys):
     text = capsys.readouterr().out
     assert "against the checkpoint, on an ellipsoid: 100.0 dB between renders" in text
     assert text.rstrip().endswith(f"wrote {tmp_path / 'b.ckpt'}")
-    assert ghgs("export", *arguments, f"inference={tmp_path / 'b.ckpt'}") == 0
+    arguments.append(f"inference={tmp_path / 'b.ckpt'}")
+    assert ghgs("export", *arguments) == 1
+    expected = "inference: expected a path where there is no file, or overwrite=true"
+    assert expected in capsys.readouterr().err
+    assert ghgs("export", *arguments, "overwrite=true") == 0
     decibels = float(capsys.readouterr().out.split("ellipsoid: ")[1].split(" dB")[0])
     assert 40 < decibels < 100  # half precision is near, and not the same
 
