@@ -199,6 +199,7 @@ def test_the_verb_is_in_argv_while_the_task_runs(monkeypatch):
     monkeypatch.setattr("sys.argv", ["ghgs", "seed=1"])
     monkeypatch.setitem(sys.modules, application.module_of("train"), Module)
     monkeypatch.setattr(application, "write_hydra_files", lambda cfg, directory: None)
+    monkeypatch.setattr(application, "check_ablation", lambda cfg, hydra_node: None)
     monkeypatch.setattr(HydraConfig, "get", lambda: OmegaConf.create({"runtime": {"output_dir": "."}}))
     application.Verb("train", ("ghgs", "train", "seed=1"))(compose("train"))
     assert seen["argv"] == ["ghgs", "train", "seed=1"]
