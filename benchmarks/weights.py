@@ -19,7 +19,7 @@ from pathlib import Path
 import torch
 from omegaconf import OmegaConf
 
-from ghgs_lit.cli.import_ import initial_state
+from ghgs_lit.cli.import_ import empty_state
 from ghgs_lit.config import compose
 from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.weights import names
@@ -57,7 +57,7 @@ def make(folder: Path, tiny: bool) -> None:
 def import_(folder: Path, tiny: bool, dtype: str = "float32") -> None:
     files = str(folder / "vggt.safetensors"), str(folder / "release.pth")
     settings = config(tiny)
-    state = initial_state(settings, files[1])
+    state = empty_state(settings, files[1])
     print("\n".join(import_weights(state, settings, folder / f"{dtype}.ckpt", *files, dtype)))
 
 

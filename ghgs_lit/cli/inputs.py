@@ -87,6 +87,9 @@ def model_of(checkpoint: str, cfg: DictConfig) -> dict[str, Any]:
     """Model nodes of a checkpoint, with the changes of the command line. The options that a verb composes by
     default do not count: they describe another model. InputError: a change that the weights do not allow."""
     trained = read_config(checkpoint)
+    if trained.keys() & set(STAGES) == {"encoder"}:
+        hint = f"`ghgs train init_from={checkpoint}` starts from it"
+        raise InputError(f"{checkpoint}: expected a whole model; found the encoder alone ({hint})")
     for stage in STAGES:
         place, found = f"{checkpoint}: config.{stage}", trained.get(stage)
         require(isinstance(found, Mapping), place, "a stage of the model", found)

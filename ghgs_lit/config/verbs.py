@@ -58,7 +58,7 @@ class Train(Run):
     init_from: Path | None = None
     """A checkpoint whose weights to start from."""
     init_strict: bool = False
-    """Whether all weights of init_from must fit."""
+    """Whether all weights of init_from must fit, and be all that the model has (or all of its encoder)."""
     allow_random_encoder: bool = False
     """Whether an encoder that does not learn may be random, to try things out."""
     dry_run: bool = False
@@ -227,15 +227,13 @@ class Import(Options):
     vggt: Path | None = None
     """facebook/VGGT-1B, or its file (.safetensors or .pt)."""
     release: Path | None = None
-    """The authors' checkpoint; null: heads start afresh."""
+    """The authors' checkpoint; null: the file holds the encoder alone, for init_from of a training."""
     out: Path
     """File of the checkpoint."""
     dtype: Literal["float32", "bfloat16", "float16"] = "float32"
     """Of the encoder in the checkpoint; the heads are float32."""
     overwrite: bool = False
     """Replace a file that exists."""
-    seed: Seed = 1
-    """Of random weights."""
 
 
 class Prepare(Options):

@@ -10,6 +10,7 @@ from ghgs_lit.config import build
 from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, flatten, is_below, lookup
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import resolved
+from ghgs_lit.stages import STAGES
 from ghgs_lit.training.checkpoints import check_training_state
 from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint, require_finite, shape_of
 
@@ -70,13 +71,17 @@ def initialize(
     """Load the weights at ``path`` that fit into ``model``; returns one line for each tensor.
 
     A line says ``loaded``, ``wrong shape`` or ``missing`` (both stay as initialised) or ``ignored`` (not in
-    the model). ``strict``: every tensor must fit. ``random_frozen``: parameters that are not trained may stay
-    as initialised. InputError: not a checkpoint of this project; nothing fits; a parameter that is not
-    trained would stay as initialised; with ``strict``, a tensor that does not fit or is missing (names it).
+    the model). ``strict``: every tensor must fit, those of other stages apart where the file has the encoder
+    alone. ``random_frozen``: parameters that are not trained may stay as initialised. InputError: not a
+    checkpoint of this project; nothing fits; a parameter that is not trained would stay as initialised; with
+    ``strict``, a tensor that does not fit or is missing (names it).
     """
-    state, own = model_state(read_checkpoint(path, whole=True)), model.state_dict()
+    checkpoint = read_checkpoint(path, whole=True)
+    state, own = model_state(checkpoint), model.state_dict()
     if strict:
-        load_strictly(model, state, path)
+        alone = checkpoint["config"].keys() & set(STAGES) == {"encoder"}
+        others = {name: own[name] for name in own if alone and not name.startswith("encoder.")}
+        load_strictly(model, others | state, path)
     fitting, lines = {}, []
     for key in [*own, *(key for key in state if key not in own)]:
         here, there = (shape_of(s[key]) if key in s else None for s in (own, state))

@@ -29,6 +29,7 @@ def export_weights(checkpoint: str | Path, vggt: str | Path | None, release: str
         (release, heads, names.RELEASE, names.RELEASE_ENTRY),
     ):
         if path is not None:
+            require(bool(own), str(checkpoint), f"tensors for {path}", "the encoder alone")
             named = {names.to_published(name, table): name for name in own}
             if None in named:
                 differing = ", ".join(differences(content["config"]))
@@ -59,6 +60,7 @@ def write_inference(checkpoint: str | Path, path: str | Path, dtype: str) -> Non
     if Path(checkpoint).resolve() == Path(path).resolve():
         raise InputError(f"inference={path}: expected another file than the checkpoint; found the same")
     content = read_checkpoint(checkpoint, whole=True)
+    require("depth_head" in content["config"], str(checkpoint), "a whole model", "the encoder alone")
     state = cast(lambda: model_state(read_checkpoint(checkpoint)), lambda *_: getattr(torch, dtype))
     require_finite(state, f"{checkpoint} as {dtype}")
     # Paths of the machine that trained it are dropped; loading reads ``imported``.

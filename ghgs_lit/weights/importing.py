@@ -139,19 +139,26 @@ def import_weights(
     release: str | None = None,
     dtype: str = "float32",
 ) -> list[str]:
-    """Write a checkpoint with published weights; return a report.
+    """Write a checkpoint with published weights and nothing else; return a report.
 
-    ``state``: the model's tensors; those on the meta device must come from the files, others may keep their
-    values. ``vggt``: a file of VGGT-1B's weights, or a repository of the Hugging Face hub. ``dtype``:
-    precision of the encoder, such as ``bfloat16``; heads are float32. FileNotFoundError: a file is missing.
-    InputError: a tensor does not fit; names the file, the tensor and both shapes.
+    Args:
+        state: Tensors that the files must fill, on the meta device: those of the model, or without
+            ``release`` those of its encoder.
+        config: Nodes of the model. Without ``release`` the checkpoint keeps that of the encoder alone.
+        out: The checkpoint.
+        vggt: A file of VGGT-1B's weights, or a repository of the Hugging Face hub.
+        release: The authors' checkpoint, with all other stages.
+        dtype: Precision of the encoder, such as ``bfloat16``; heads are float32.
+
+    FileNotFoundError: a file is missing. InputError: a tensor does not fit; names the file, the tensor and
+    both shapes.
     """
     files = list(sources(vggt, release))
     for source in files:
         same = Path(out).exists() and Path(out).samefile(source.path)
         require(not same, "out", f"another file than {source.key}", str(out))
-    initial = match_files(state, files)
-    tensors = dict(state)
+    match_files(state, files)
+    tensors: dict[str, Tensor] = {}
 
     def precision(name: str, stored: torch.dtype) -> torch.dtype:
         # Depths and offsets of millimetres need the precision of the heads.
@@ -163,24 +170,21 @@ def import_weights(
             where = f"{source.path}: {source.used[name]}"
             require(bool(tensor.isfinite().all()), where, f"finite numbers in {dtype}", "others")
         tensors |= found
-    config = {**config, "encoder": {**config["encoder"], "weights": files[0].label}}
+    encoder = {"encoder": {**config["encoder"], "weights": files[0].label}}
+    config = encoder if release is None else {**config, **encoder}
     facts = {s.key: {"name": s.label, "sha256": s.checksum, "tensors": len(s.used)} for s in files}
     write_checkpoint(out, tensors, config, imported=facts)
-    report = [source.report() for source in files]
-    stages = ", ".join(dict.fromkeys(name.split(".")[0] for name in initial))
-    return report + [f"{len(initial)} tensors of {stages} start with initial values"] * bool(initial)
+    heads = "the encoder alone: the other stages start afresh in each training, from its seed"
+    return [*(source.report() for source in files), *([heads] if release is None else [])]
 
 
-def match_files(state: Mapping[str, Tensor], files: Sequence[Source]) -> list[str]:
-    """Fill ``Source.used`` by names and shapes; return the names of tensors that are in no file and keep
-    their values. InputError: a tensor on the meta device is in no file, or a file does not fit."""
+def match_files(state: Mapping[str, Tensor], files: Sequence[Source]) -> None:
+    """Fill ``Source.used`` by names and shapes. InputError: a tensor is in no file, or does not fit."""
     for source in files:
         source.match(state)
-    missing = [name for name in state if not any(name in source.used for source in files)]
-    for name in (name for name in missing if state[name].is_meta):
+    for name in (name for name in state if not any(name in source.used for source in files)):
         for source in reversed(files):
             published = names.to_published(name, source.table)
             expected = f"a tensor of shape {tuple(state[name].shape)}"
             require(published is None, f"{source.path}: {published}", expected, "nothing")
         require(False, name, "a model in which every tensor is published", "one of our own")
-    return missing

@@ -261,7 +261,6 @@ NAMES = [
     ("table runs={tmp} test.against=worst", 1, "test.against: expected one of", "'worst'"),
     ("table runs={tmp} test.unit=x", 1, "test.unit: expected a regular expression with a group"),
     ("table runs={tmp} 'test.unit=\"(\"'", 1, "test.unit: expected a regular expression"),
-    ("import out={tmp}/x.ckpt encoder=vggt_nano", 1, "compat: expected none", "found 'release'"),
 ]
 
 FOREIGN = [

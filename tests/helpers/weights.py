@@ -9,7 +9,7 @@ import torch
 from omegaconf import OmegaConf
 from safetensors.torch import save_file
 
-from ghgs_lit.cli.import_ import MODEL_NODES, initial_state
+from ghgs_lit.cli.import_ import MODEL_NODES, empty_state
 from ghgs_lit.config import compose
 from ghgs_lit.model import GHGS
 from ghgs_lit.weights import importing, names
@@ -38,7 +38,7 @@ def _composed(overrides):
 
 def import_weights(config, out, vggt, release=None, *args, **kwargs):
     """Import as the verb does; returns the report."""
-    state = initial_state(config, release)
+    state = empty_state(config, release)
     return importing.import_weights(state, config, out, vggt, release, *args, **kwargs)
 
 

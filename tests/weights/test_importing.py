@@ -1,5 +1,6 @@
 """Published weights are imported strictly, run, and are exported unchanged."""
 
+import itertools
 import re
 import warnings
 
@@ -11,7 +12,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.training import start
 from ghgs_lit.weights import importing, names
-from ghgs_lit.weights.checkpoint import model_state, read_checkpoint
+from ghgs_lit.weights.checkpoint import model_state, read_checkpoint, write_checkpoint
 from ghgs_lit.weights.exporting import export_weights
 from ghgs_lit.weights.importing import Source, match_files
 from ghgs_lit.weights.reading import cast
@@ -54,7 +55,7 @@ def test_the_published_names_and_shapes_are_exactly_the_models(monkeypatch, pref
     ]
     own = GHGS.from_config(config(tiny=False), empty=STAGES).state_dict()
     assert all(tensor.is_meta for tensor in own.values())
-    assert match_files(own, files) == []
+    match_files(own, files)
     assert [len(source.used) for source in files] == [1210, 164]
     assert sum(own[name].numel() for name in files[0].used) == 909_112_320
     assert sum(own[name].numel() for name in files[1].used) == 77_942_669
@@ -104,23 +105,49 @@ def test_the_checkpoint_is_the_published_model_and_says_so(tmp_path, files):
         close(model(batch).gaussians, expected(batch).gaussians, 0)
 
 
-def test_without_the_release_heads_start_with_initial_values(tmp_path, files):
-    """VGGT alone must give a trainable model, with repeatable heads."""
+def test_without_the_release_the_file_holds_the_encoder_alone(tmp_path, files):
+    """It held the heads of one seed, so that the seeds of a table were equal in all 164 tensors of heads."""
     vggt, _, agg, _ = files
-    out = tmp_path / "out.ckpt"
-    settings = config("compat=none")
-    torch.manual_seed(5)
+    out, settings = str(tmp_path / "out.ckpt"), config("compat=none")
     report = import_weights(settings, out, vggt)
-    assert "start with initial values" in report[-1]
-    model = GHGS.from_checkpoint(out)
-    torch.manual_seed(5)
-    again = import_weights(settings, tmp_path / "again.ckpt", vggt)
-    assert again == report
-    state, other = model.state_dict(), GHGS.from_checkpoint(tmp_path / "again.ckpt").state_dict()
-    assert all(torch.equal(state[name], other[name]) for name in state)
-    assert torch.equal(state["encoder.aggregator.camera_token"], agg["aggregator.camera_token"])
-    last = model.depth_head.dpt.scratch.output_conv2[-1]
-    assert last.weight.eq(0).all()  # depth starts where the safe parameterisation says
+    assert report[-1].startswith("the encoder alone")
+    checkpoint = read_checkpoint(out)
+    assert list(checkpoint["config"]) == ["encoder"]
+    used = {names.to_ours(name, names.VGGT): value for name, value in agg.items()}
+    state = model_state(checkpoint)
+    assert state.keys() == {name for name in used if name is not None}
+    assert all(torch.equal(state[name], used[name]) for name in state)
+    starts = []
+    for seed in (1, 2, 3):
+        torch.manual_seed(seed)
+        model = GHGS.from_config(settings)
+        drawn = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+        start.initialize(model, out, strict=True)
+        starts.append(model.state_dict())
+        heads = [name for name in drawn if name not in state]
+        assert all(torch.equal(starts[-1][name], drawn[name]) for name in heads)
+        assert all(torch.equal(starts[-1][name], state[name]) for name in state)
+    random = [name for name in heads if drawn[name].unique().numel() > 1]  # others are constants
+    assert len(random) > 60
+    for one, other in itertools.combinations(starts, 2):
+        assert not any(torch.equal(one[name], other[name]) for name in random)
+
+
+def test_the_encoder_alone_is_no_whole_model(monkeypatch, capsys, tmp_path, files):
+    """It predicts nothing; what fits is exported."""
+    monkeypatch.chdir(tmp_path)
+    import_weights(config("compat=none"), "start.ckpt", files[0])
+    for argv, message in (
+        (["predict", "data=synthetic"], "a whole model; found the encoder alone (`ghgs train init_from="),
+        (["export", "release=back.pth"], "tensors for back.pth; found 'the encoder alone'"),
+        (["export", "inference=small.ckpt"], "a whole model; found 'the encoder alone'"),
+    ):
+        code, _, err = call(monkeypatch, capsys, *argv, "checkpoint=start.ckpt")
+        assert (code, err.count("\n")) == (1, 1)
+        assert f"start.ckpt: expected {message}" in err
+    assert not list(tmp_path.glob("back*")) + list(tmp_path.glob("small*"))
+    export_weights("start.ckpt", "back.safetensors", None)
+    assert set(load_file("back.safetensors")) == {name for name in files[2] if name.startswith("aggregator.")}
 
 
 @pytest.mark.parametrize("dtype", ["bfloat16", "float16"])
@@ -235,15 +262,15 @@ def test_files_in_the_wrong_place_are_refused(tmp_path, files):
 
 def test_our_own_variants_have_no_published_names(tmp_path, files):
     """A model that the authors' code cannot load must not be exported to it."""
-    vggt, *_ = files
-    out = tmp_path / "out.ckpt"
-    import_weights(config("compat=none", "gaussian_head.guide=true"), out, vggt)
+    vggt, release, *_ = files
+    out, settings = tmp_path / "out.ckpt", config("compat=none", "gaussian_head.guide=true")
+    write_checkpoint(out, GHGS.from_config(settings).state_dict(), settings)
     with pytest.raises(InputError, match="guide"):
         export_weights(out, None, tmp_path / "back.pth")
     assert not (tmp_path / "back.pth").exists()
     with pytest.raises(InputError, match="vggt=<file>"):
         export_weights(out, None, None)
-    import_weights(config("compat=none"), out, vggt)
+    import_weights(config(), out, vggt, release)
     with pytest.raises(InputError, match=r"release: expected a PyTorch file"):
         export_weights(out, None, tmp_path / "back.safetensors")
 
@@ -261,7 +288,6 @@ def test_the_verbs(monkeypatch, capsys, tmp_path, files):
     assert code == 0
     assert out.splitlines()[-2:] == [f"back.pth: {len(files[3])} tensors", "wrote back.pth"]
     for argv, message in (
-        (["vggt=vggt.safetensors", "out=b.ckpt"], "compat: expected none where there is no release"),
         (["vggt=none.pt", "compat=none", "out=b.ckpt"], "none.pt: expected a file of weights; found none"),
     ):
         code, _, err = call(monkeypatch, capsys, "import", *argv, *TINY)
@@ -313,7 +339,7 @@ def test_training_from_imported_weights_says_where_they_come_from(tmp_path, file
     import_weights(settings, out, files[0])
     model = GHGS.from_config(settings)
     lines = start.initialize(model, out, strict=True)
-    assert all(line.startswith("loaded") for line in lines)
+    assert all(line.startswith("loaded" if " encoder." in line else "missing") for line in lines)
     run = {**settings, "resume": None, "init_from": out}
     assert start.with_origin(run, model)["encoder"]["weights"] == "vggt.safetensors"
     before = read_checkpoint(out)["config"]
@@ -322,4 +348,5 @@ def test_training_from_imported_weights_says_where_they_come_from(tmp_path, file
     assert start.with_origin({**run, "init_from": None}, model) == {**run, "init_from": None}
     wider = config("compat=none", "encoder.mask_input=true")
     assert start.with_origin({**run, **wider}, GHGS.from_config(wider))["encoder"]["weights"] is None
-    assert differences({**run, **config()}, before) != []
+    assert differences({**run, **config()}, before) == []  # the release has the same encoder
+    assert differences({**run, **config()}, settings) != []
