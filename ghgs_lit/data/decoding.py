@@ -6,18 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import ExifTags, Image
 
+from ghgs_lit.data.images import UPRIGHT, orientation_of, read_image, rgb_of
 from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.readers import read_npy, require_file
+from ghgs_lit.readers import read_npy
 
 # Largest distance of a principal point from the image's centre, as a fraction of the side.
 _OFF_CENTRE = 0.25
 # Largest entry of ``R R^T - I``: allows rounding, but no other unit or axis.
 _ROTATION_TOLERANCE = 1e-3
-#: Modes that convert to RGB without loss of range, and the EXIF orientation of upright images.
-EIGHT_BITS, _UPRIGHT = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr"), 1
 #: Largest coordinate of a vertex: a kilometre in millimetres.
 _FURTHEST = 1e6
 _SAFE_NAME = re.compile(r"[\w.+-]+")
@@ -25,31 +23,19 @@ _SAFE_NAME = re.compile(r"[\w.+-]+")
 Shapes = Sequence[tuple[int | None, ...]]
 
 
-def read_image(path: Path) -> Image.Image:
-    """Decode an image. InputError: it is missing or cannot be decoded."""
-    require_file(path, "an image")
-    try:
-        image = Image.open(path)
-        image.load()
-    except Exception as error:  # broken images raise anything
-        raise InputError(f"{path}: expected a readable image; found {error}") from error
-    return image
-
-
 def read_photograph(path: Path) -> np.ndarray:
-    """Read [h, w, 3] uint8 from an image of 8 bits a channel (grey, palette, RGB or CMYK, alpha ignored).
-    InputError: it is missing or cannot be decoded, has other values, or an EXIF orientation."""
+    """Read [h, w, 3] uint8 in sRGB from an image of 8 bits a channel (grey, palette, RGB or CMYK, alpha
+    ignored). InputError: it is missing or cannot be decoded, has other values, or is turned by its EXIF
+    orientation."""
     image = read_image(path)
-    if image.mode not in EIGHT_BITS:
-        raise InputError(f"{path}: expected a photograph of 8 bits a channel; found mode {image.mode}")
-    turn = image.getexif().get(ExifTags.Base.Orientation, _UPRIGHT)
-    if turn != _UPRIGHT:
+    turn = orientation_of(image, path)
+    if turn != UPRIGHT:
         # Programs disagree on whether a calibration belongs to the stored or to the turned pixels.
         raise InputError(
             f"{path}: expected a photograph that is stored as it is shown (its mask and camera fit these "
             f"pixels); found EXIF orientation {turn}"
         )
-    return np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
+    return rgb_of(image, path)
 
 
 def read_map(path: Path, size: tuple[int, int]) -> np.ndarray:

@@ -7,7 +7,8 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from ghgs_lit.data.decoding import check_extent, read_image, read_vertices
+from ghgs_lit.data.decoding import check_extent, read_vertices
+from ghgs_lit.data.images import listed_formats, read_image
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.readers import require_folder
 from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
@@ -57,7 +58,8 @@ def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
     is_compressed = path.suffix != ".obj" and _COMPRESSION in path.read_bytes()
     require(not is_compressed, str(path), "a mesh without compression", _COMPRESSION.decode())
     try:
-        scene = trimesh.load_scene(path, process=False)
+        with listed_formats():
+            scene = trimesh.load_scene(path, process=False)
     except Exception as error:  # trimesh raises whatever its parsers raise
         raise InputError(f"{path}: expected a readable mesh; found {error!r}") from error
     parts = []

@@ -18,6 +18,7 @@ from ghgs_lit.prediction.capture.photographs import (
     composed,
     image_named,
     images_in,
+    require_all_read,
 )
 from ghgs_lit.prediction.capture.videos import SUFFIXES, Reader, Video, read_video
 from ghgs_lit.readers import read_rows
@@ -96,7 +97,9 @@ def find_frames(
         sync: frames by which a camera began before the others; or a CSV of ``camera,frame,seconds``, by which
             each frame of the first camera gets the nearest one of every other; None: all began together.
         step: of the instants that will be read."""
-    paths = by_camera(folder, images_in(folder, SUFFIXES), cameras, names)
+    found = images_in(folder, SUFFIXES)
+    require_all_read(folder, found, {*cameras, *names}, SUFFIXES)
+    paths = by_camera(folder, found, cameras, names)
     with ThreadPoolExecutor(allowed_cores()) as pool:
         videos = dict(zip(paths, pool.map(read_video, paths.values()), strict=True))
     for name, video in videos.items():

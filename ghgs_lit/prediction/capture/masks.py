@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from ghgs_lit.data.decoding import read_image
+from ghgs_lit.data.images import read_image
 from ghgs_lit.errors import choice, installed, require
 from ghgs_lit.prediction.capture.photographs import MASK_ENDING, Pixels, image_named, read_pixels
 

@@ -3,19 +3,23 @@
 import functools
 import re
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import ExifTags
 
-from ghgs_lit.data.decoding import EIGHT_BITS, read_image
+from ghgs_lit.data.images import orientation_of, read_image, rgb_of
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.calibration import StoredCamera, same_ratio
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
+SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif", ".tif", ".tiff", ".bmp")
+#: Suffixes of pictures that are not read, and of files that are no photographs whatever their name.
+_PICTURES = (
+    "heic heif hif jxl jp2 j2k gif tga ppm pgm exr hdr psd dng cr2 cr3 nef arw raf orf rw2 pef srw raw"
+)
+_COMPANIONS = "json xml xmp txt toml yaml yml csv npy npz pkl aae md log ply obj"
 MASK_ENDING = "_mask"  #: A mask beside its photograph ends with this
 #: Quarter turns as of ``numpy.rot90`` by EXIF orientation.
 _TURNS = {1: 0, 3: 2, 6: 3, 8: 1}
@@ -44,15 +48,14 @@ def read_pixels(path: Path) -> Pixels:
     """Decode a photograph of 8 bits a channel and turn it as its EXIF entry says. InputError: it is missing,
     cannot be decoded, has other values, or is mirrored."""
     image = read_image(path)
-    require(image.mode in EIGHT_BITS, str(path), "a photograph of 8 bits a channel", f"mode {image.mode}")
-    orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
+    orientation = orientation_of(image, path)
     found = f"EXIF orientation {orientation}"
     require(orientation in _TURNS, str(path), "a photograph that is not mirrored", found)
     turns, alpha = _TURNS[orientation], None
+    colors = np.rot90(rgb_of(image, path), turns)
     if image.has_transparency_data:
-        image = image.convert("RGBA")
-        alpha = np.rot90(np.asarray(image.getchannel("A")), turns)
-    return Pixels(np.rot90(np.asarray(image.convert("RGB")), turns), alpha, turns)
+        alpha = np.rot90(np.asarray(image.convert("RGBA").getchannel("A")), turns)
+    return Pixels(colors, alpha, turns)
 
 
 def fits_stored(pixels: Pixels, camera: StoredCamera, exif: str) -> bool:
@@ -95,6 +98,30 @@ def image_named(folder: Path, *names: str, suffixes: tuple[str, ...] = SUFFIXES)
     return next((paths[key] for key in keys if key in paths), None)
 
 
+def require_all_read(
+    folder: Path, read: Collection[str], known: Collection[str], suffixes: tuple[str, ...] = SUFFIXES
+) -> None:
+    """Refuse to leave out a photograph or video without a word. InputError: there is a picture of a kind that
+    is not read, or another file of a known name, such as ``right.heic`` or ``right.jpg.part``.
+
+    Args:
+        folder: of photographs or of videos.
+        read: names of those that are read; what lies beside them under their names is no matter.
+        known: further names: of cameras or instants.
+        suffixes: of what is read, for the message."""
+    for path in sorted(folder.iterdir()):
+        name, kind = composed(path.name), path.suffix.lower().removeprefix(".")
+        begins = {name[:end] for end, letter in enumerate(f"{name}.") if letter == "."}
+        is_other = path.name.startswith(".") or path.is_dir() or path.stem.endswith(MASK_ENDING)
+        if is_other or kind in _COMPANIONS.split() or not begins.isdisjoint(read):
+            continue
+        if kind in _PICTURES.split() or not begins.isdisjoint(known):
+            raise InputError(
+                f"{path}: expected a file that can be read ({', '.join(suffixes)}); found another kind"
+                " (convert it, or move it elsewhere to do without it)"
+            )
+
+
 @functools.lru_cache(maxsize=64)
 def _listed(folder: Path, changed: int) -> dict[tuple[str, str], Path]:
     """Files by composed name and suffix, cached until the folder changes."""
@@ -111,13 +138,20 @@ def find_instants(
     camera's folder) of another name. InputError: there are none, or photographs do not fit the cameras."""
     problem = "a file" if folder.exists() else "no such folder"
     require(folder.is_dir(), str(folder), "a folder of photographs", problem)
-    if photographs := images_in(folder):
+    known = {*cameras, *names}
+    photographs = images_in(folder)
+    require_all_read(folder, photographs, known)
+    if photographs:
         return {folder.resolve().name: by_camera(folder, photographs, cameras, names)}
     below = {
         composed(path.name): images_in(path)
         for path in sorted(folder.iterdir(), key=lambda path: counted(path.name))
         if path.is_dir() and not path.name.startswith(".")
     }
+    for name, paths in below.items():
+        is_camera = names.get(name, name) in cameras
+        instants = {instant for others in below.values() for instant in others}
+        require_all_read(folder / name, paths, instants if is_camera else known)
     folders = {name: paths for name, paths in below.items() if paths}
     require(bool(folders), str(folder), f"photographs ({', '.join(SUFFIXES)})", "none")
     if all(names.get(name, name) in cameras for name in folders):

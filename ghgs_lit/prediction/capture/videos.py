@@ -83,7 +83,7 @@ def _read_video(path: Path, changed: int) -> Video:
     steps = np.diff(seconds)
     usual = max(float(np.median(steps)), 1e-6) if len(steps) else 1.0
     numbers = np.cumsum([0, *np.rint(steps / usual).clip(1)]).astype(np.int64)
-    return Video(path, Image.open(io.BytesIO(first.stdout)).size[::-1], seconds, numbers)
+    return Video(path, Image.open(io.BytesIO(first.stdout), formats=["PPM"]).size[::-1], seconds, numbers)
 
 
 def _source(path: Path, seek: float = 0.0, log: str = "quiet") -> list[str]:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ghgs_lit.bounds import VisualHull
-from ghgs_lit.data.decoding import read_image
+from ghgs_lit.data.images import read_image
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.metrics import flip_map, psnr

@@ -214,3 +214,60 @@ def test_one_line_says_what_is_wrong(place, name):
 def test_the_right_capture_is_read(place):
     """What the rows spoil is right before."""
     assert len(Capture.read(place / "images", place / "images" / "cameras.json").photographs) == 4
+
+
+def another_kind(folder, name):
+    path = folder / "cam1.png"
+    path.rename(folder / name) if name.startswith("cam1") else (folder / name).touch()
+
+
+OTHER_KINDS = ("cam1.HEIC", "cam1.dng", "cam1", "cam1.png.part", "cam1.mp4", "extra.heif", "extra.NEF")
+
+
+@pytest.mark.parametrize("name", OTHER_KINDS)
+def test_a_photograph_of_another_kind_is_named(place, name):
+    """With three others the fourth was left out without a word."""
+    another_kind(place / "images", name)
+    said = (
+        rf"{re.escape(name)}: expected a file that can be read \(\.jpg, .*; found another kind \(convert it"
+    )
+    with pytest.raises(InputError, match=said):
+        Capture.read(place / "images", place / "images" / "cameras.json")
+
+
+@pytest.mark.parametrize("name", ["0001.HEIC", "0001", "0009.heic"])
+def test_a_photograph_of_another_kind_in_a_cameras_folder_is_named(place, name):
+    """All instants of a camera, or one of them."""
+    (place / "images" / "cameras.json").rename(place / "cameras.json")
+    for camera in Figure().names:
+        folder = place / "instants" / camera
+        folder.mkdir(parents=True)
+        (place / "images" / f"{camera}.png").rename(folder / "0001.png")
+    (place / "instants" / "cam1" / "0001.png").rename(place / "instants" / "cam1" / name)
+    with pytest.raises(InputError, match=rf"cam1/{name}: expected a file that can be read"):
+        Capture.read(place / "instants", place / "cameras.json")
+
+
+def test_what_may_lie_beside_photographs(place):
+    """Raw files, thumbnails and notes of photographs that are read, and files of other names."""
+    for name in (
+        "cam1.dng",
+        "cam1.heic",
+        "cam1.json",
+        "cam1.png.txt",
+        "cam1.mp4",
+        "notes",
+        "Thumbs.db",
+        "cam9.json",
+    ):
+        (place / "images" / name).touch()
+    assert len(Capture.read(place / "images", place / "images" / "cameras.json").photographs) == 4
+
+
+@pytest.mark.parametrize("suffix", ["jfif", "jpe", "AVIF"])
+def test_further_suffixes_of_kinds_that_are_read(place, suffix):
+    kind = "AVIF" if suffix == "AVIF" else "JPEG"
+    for path in [path for path in (place / "images").glob("cam?.png")]:
+        Image.open(path).save(path.with_suffix(f".{suffix}"), format=kind, quality=95)
+        path.unlink()
+    assert len(Capture.read(place / "images", place / "images" / "cameras.json").photographs) == 4

@@ -1,0 +1,157 @@
+"""Images as they are meant: formats, colours of profiles, turns by EXIF; for data sets and captures alike."""
+
+import warnings
+
+import numpy as np
+import pytest
+from PIL import EpsImagePlugin, ExifTags, Image
+
+from ghgs_lit.data.decoding import read_map, read_photograph
+from ghgs_lit.data.images import listed_formats, read_image
+from ghgs_lit.errors import InputError
+from ghgs_lit.prediction.capture.photographs import read_pixels
+from ghgs_lit.synthesis.scans import ScanSource
+from tests.helpers.people import write_obj_scan
+from tests.helpers.profiles import DISPLAY_P3, SRGB, in_srgb, profile
+
+READERS = {"data set": read_photograph, "capture": lambda path: read_pixels(path).image}
+read = pytest.mark.parametrize("reader", READERS.values(), ids=READERS.keys())
+
+
+@pytest.fixture
+def pixels():
+    """[16, 16, 3] uint8, colours that are inside sRGB in all profiles of the tests."""
+    return np.random.default_rng(0).integers(90, 200, (16, 16, 3), np.uint8)
+
+
+@read
+@pytest.mark.parametrize("suffix", ["png", "tif", "webp"])
+@pytest.mark.parametrize(
+    ("primaries", "gamma"),
+    [(DISPLAY_P3, None), (SRGB, 1.0), (DISPLAY_P3, 1.0), (SRGB, 1.8)],
+    ids=["Display P3", "linear", "linear P3", "gamma 1.8"],
+)
+def test_the_colours_of_a_profile_are_those_of_its_formula(
+    tmp_path, pixels, reader, primaries, gamma, suffix
+):
+    path = tmp_path / f"a.{suffix}"
+    options = {"lossless": True} if suffix == "webp" else {}
+    Image.fromarray(pixels).save(path, icc_profile=profile(primaries, gamma), **options)
+    expected = in_srgb(pixels, primaries, gamma)
+    assert np.abs(expected - pixels).max() > 10  # the profile matters
+    # LittleCMS rounds light to 15 bits before the curve, and the result to 8 bits.
+    assert np.abs(reader(path) - expected).max() <= 1.5
+
+
+@read
+def test_a_profile_of_srgb_changes_no_bit(tmp_path, reader):
+    """Most cameras embed one; what models were trained on must stay what it is."""
+    pixels = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png", icc_profile=profile(SRGB, None))
+    assert np.array_equal(reader(tmp_path / "a.png"), pixels)
+
+
+@read
+@pytest.mark.parametrize("mode", ["L", "LA", "RGBA", "P"])
+def test_profiles_of_grey_of_palettes_and_beside_alpha(tmp_path, pixels, reader, mode):
+    image = Image.fromarray(pixels).convert(mode)
+    stored, is_grey = np.asarray(image.convert("RGB")), mode[0] == "L"
+    image.save(tmp_path / "a.png", icc_profile=profile(None if is_grey else DISPLAY_P3, 1.0))
+    expected = in_srgb(stored, SRGB if is_grey else DISPLAY_P3, 1.0)
+    assert np.abs(reader(tmp_path / "a.png") - expected).max() <= 1.5
+
+
+def test_alpha_and_masks_have_no_colours(tmp_path, pixels):
+    """A profile says what colours mean, not how much of a pixel the subject covers."""
+    alpha = pixels[..., 0]
+    options = {"icc_profile": profile(None, 1.0)}
+    Image.fromarray(np.dstack((pixels, alpha))).save(tmp_path / "a.png", icc_profile=profile(SRGB, 1.0))
+    Image.fromarray(alpha).save(tmp_path / "mask.png", **options)
+    assert np.array_equal(read_pixels(tmp_path / "a.png").alpha, alpha)
+    assert np.array_equal(read_map(tmp_path / "mask.png", alpha.shape), alpha)
+
+
+@read
+@pytest.mark.parametrize(
+    "damaged",
+    [b"no profile", profile(SRGB, 1.0)[:200], profile(None, 1.0)],
+    ids=["foreign", "cut", "of grey"],
+)
+def test_a_profile_that_cannot_be_read_is_named_and_left_out(tmp_path, pixels, reader, damaged):
+    Image.fromarray(pixels).save(tmp_path / "a.png", icc_profile=damaged)
+    with pytest.warns(UserWarning, match=r"a\.png: expected an ICC profile of its pixels; found .*sRGB$"):
+        found = reader(tmp_path / "a.png")
+    assert np.array_equal(found, pixels)
+
+
+def with_exif(path, pixels, data):
+    Image.fromarray(pixels).save(path, exif=data)
+    return path
+
+
+def orientation(value):
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = value
+    return exif.tobytes()
+
+
+@read
+@pytest.mark.parametrize("value", [0, 9, 255])
+@pytest.mark.parametrize("suffix", ["jpg", "png"])
+def test_an_orientation_that_is_none_is_as_stored(tmp_path, pixels, reader, suffix, value):
+    """0 is how several programs say "unknown"; viewers and OpenCV show such photographs as stored."""
+    path = with_exif(tmp_path / f"a.{suffix}", pixels, orientation(value))
+    Image.fromarray(pixels).save(tmp_path / f"b.{suffix}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.array_equal(reader(path), reader(tmp_path / f"b.{suffix}"))
+
+
+@read
+@pytest.mark.parametrize("suffix", ["png", "webp"])
+@pytest.mark.parametrize("data", [b"Exif\0\0nonsense", b"Exif\0\0II*\0"])
+def test_damaged_exif_is_named_and_as_stored(tmp_path, pixels, reader, data, suffix):
+    options = {"lossless": True} if suffix == "webp" else {}
+    Image.fromarray(pixels).save(tmp_path / f"a.{suffix}", exif=data, **options)
+    with pytest.warns(UserWarning, match=rf"a\.{suffix}: expected EXIF data; found .* shown as it is stored"):
+        assert np.array_equal(reader(tmp_path / f"a.{suffix}"), pixels)
+
+
+@pytest.fixture
+def no_ghostscript(monkeypatch):
+    """Fail where Pillow starts Ghostscript."""
+
+    def start(*arguments, **options):
+        raise AssertionError("Ghostscript was started")
+
+    monkeypatch.setattr(EpsImagePlugin, "Ghostscript", start)
+
+
+def write_eps(path):
+    Image.new("RGB", (4, 4)).save(path, format="EPS")
+
+
+@pytest.mark.usefixtures("no_ghostscript")
+@pytest.mark.parametrize("reader", [*READERS.values(), read_image, lambda path: read_map(path, (4, 4))])
+def test_a_program_of_the_system_is_never_started(tmp_path, reader):
+    """A name says nothing about content: Pillow gives PostScript to Ghostscript, which runs it."""
+    write_eps(tmp_path / "a.png")
+    with pytest.raises(InputError, match=r"a\.png: expected a readable image; found cannot identify"):
+        reader(tmp_path / "a.png")
+
+
+@pytest.mark.usefixtures("no_ghostscript")
+def test_textures_are_opened_by_the_same_list(tmp_path):
+    """trimesh opens the files that a material names."""
+    folder = write_obj_scan(tmp_path, "a").parent
+    texture = next(path for path in folder.iterdir() if path.suffix in (".jpeg", ".jpg", ".png"))
+    write_eps(texture)
+    with pytest.raises(InputError, match=r"a: |a\.obj: |readable image"):
+        ScanSource(tmp_path).load("a")
+
+
+def test_the_list_holds_inside_alone(tmp_path):
+    write_eps(tmp_path / "a.png")
+    with listed_formats(), pytest.raises(OSError, match="cannot identify"):
+        Image.open(tmp_path / "a.png")
+    assert Image.open(tmp_path / "a.png").format == "EPS"
