@@ -4,10 +4,12 @@ import os
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 FIND = "from ghgs_lit.config import conf_dir; print(conf_dir())"
@@ -61,3 +63,32 @@ def test_checkout(tmp_path):
     for name in ("ghgs_lit", "conf"):
         shutil.copytree(REPOSITORY / name, tmp_path / "copy" / name)
     assert found_conf(tmp_path, tmp_path / "copy") == (tmp_path / "copy" / "conf").resolve()
+
+
+def required() -> dict[str, Requirement]:
+    """Every requirement of the package and of its extras, by name."""
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+    lines = [
+        *project["dependencies"],
+        *(line for extra in project["optional-dependencies"].values() for line in extra),
+    ]
+    return {requirement.name: requirement for requirement in map(Requirement, lines)}
+
+
+def test_the_versions_that_make_installs_are_allowed():
+    """``constraints.txt`` must not contradict what pip may choose."""
+    lines = (REPOSITORY / "constraints.txt").read_text().splitlines()
+    exact = dict(line.split("==") for line in lines if not line.startswith("#"))
+    known = {name.replace("_", "-"): each for name, each in required().items()}
+    assert {"torch", "hydra-core", "pillow"} <= known.keys() & exact.keys()
+    for name in known.keys() & exact.keys():
+        assert known[name].specifier.contains(exact[name]), name
+
+
+@pytest.mark.parametrize(
+    ("name", "unsafe", "safe"), [("torch", "2.5.1", "2.6.0"), ("hydra-core", "1.3.5", "1.3.6")]
+)
+def test_versions_that_run_what_a_file_says_are_refused(name, unsafe, safe):
+    """Older ones unpickle code by default, or call whatever a configuration of logging names."""
+    assert not required()[name].specifier.contains(unsafe)
+    assert required()[name].specifier.contains(safe)
