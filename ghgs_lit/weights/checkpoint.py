@@ -18,14 +18,11 @@ from ghgs_lit.files import write_atomically
 from ghgs_lit.kernels.precision import fast_precision
 from ghgs_lit.weights.frozen import SHARING, joined
 from ghgs_lit.weights.names import RELEASE_ENTRY, VGGT
-from ghgs_lit.weights.reading import cast, file_of, open_file
+from ghgs_lit.weights.reading import cast, file_of, open_file, require_dense
 
 FORMAT_VERSION = 2  #: Version of self-contained checkpoints; version 1 is read too
 
 STATE_PREFIX = "model."  #: Prefix of the model's tensors in the state of a LightningModule
-
-
-_FLOATS = (torch.float64, torch.float32, torch.float16, torch.bfloat16)  #: Precisions of weights
 
 
 def read_checkpoint(path: str | Path, whole: bool = False) -> dict[str, Any]:
@@ -75,13 +72,7 @@ def _check_content(path: str | Path, checkpoint: Mapping[str, Any]) -> None:
     # Verbs merge parts of the configuration into their own, where OmegaConf would evaluate resolvers.
     for key, value in flatten(checkpoint["config"]).items():
         require("${" not in repr(value), f"{path}: config.{key}", "a value, no interpolation", value)
-    for name, value in checkpoint["state_dict"].items():
-        require(isinstance(name, str), f"{path}: state_dict", "names of tensors", name)
-        if isinstance(value, Tensor):
-            dense = value.layout is torch.strided and not value.is_meta
-            known = dense and (not value.is_floating_point() or value.dtype in _FLOATS)
-            found = f"{value.dtype}, {value.layout} on {value.device}"
-            require(known, f"{path}: {name}", "a dense tensor of 16, 32 or 64 bits", found)
+    require_dense(checkpoint["state_dict"], path)
 
 
 def _check_sums(path: str | Path, whole: bool) -> None:
@@ -174,8 +165,8 @@ def load_weights(
     """Give a :class:`ghgs_lit.model.GHGS` the weights of a checkpoint, mapped from the file, not copied.
 
     The model's own weights may be on the meta device. ``dtype``: precision of the encoder (None: as in the
-    file, but float32 on a CPU without that half precision); the heads are float32 or wider. ``device``: where
-    the weights will be moved to. FileNotFoundError: there is no such file. InputError: it is not a checkpoint
+    file, but float32 on a CPU without that half precision, and for float64); the heads are float32.
+    ``device``: where the weights will be moved to. FileNotFoundError: there is no such file. InputError: it is not a checkpoint
     of this package, or its weights are not finite or do not fit the model.
     """
     checkpoint = read_checkpoint(path, whole=True)
@@ -183,9 +174,10 @@ def load_weights(
     check_preset(model, checkpoint, path)
 
     def precision(name: str, stored: torch.dtype) -> torch.dtype:
-        if name.startswith("encoder."):
-            return dtype or fast_precision(stored, torch.device(device))
-        return torch.promote_types(stored, torch.float32)
+        if not name.startswith("encoder."):
+            return torch.float32
+        single = torch.float32 if stored == torch.float64 else stored
+        return dtype or fast_precision(single, torch.device(device))
 
     state = cast(lambda: model_state(read_checkpoint(path)), precision)
     require_finite(state, path)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically
-from ghgs_lit.weights.reading import file_of, open_file
+from ghgs_lit.weights.reading import file_of, open_file, require_dense
 
 #: Bytes of frozen weights up to which each checkpoint holds its own.
 OWN = 1 << 26
@@ -83,6 +83,8 @@ def joined(path: str | Path, checkpoint: Mapping[str, Any], whole: bool = False)
         advice = "`ghgs export inference=<file>` makes one file of both"
         raise InputError(f"{place}: expected its frozen weights {name} beside it ({advice}); found none")
     tensors = open_file(file)
+    if isinstance(tensors, Mapping):
+        require_dense(tensors, file)
     fits = isinstance(tensors, Mapping) and all(isinstance(value, Tensor) for value in tensors.values())
     if not fits or list(tensors) != checkpoint.get("frozen") or (whole and digest_of(tensors) != sha256):
         raise InputError(f"{place}: expected {file} with SHA-256 {sha256[:16]}... of weights; found others")

@@ -29,6 +29,8 @@ FAILED_DOWNLOADS = (
 #: Name and file of the checkpoint that comes with the package (docs/model_card.md).
 SHIPPED, SHIPPED_FILE = "shipped", Path(__file__).with_name("shipped.ckpt")
 ZIP, PICKLE = b"PK", b"\x80"
+_ENCRYPTED = 1  # flag of a record
+_FLOATS = ("float64", "float32", "float16", "bfloat16")  # precisions of weights
 
 _CHUNK = 1 << 28  #: Bytes of tensors that are converted before the file is mapped again
 
@@ -47,6 +49,7 @@ def open_file(path: str | Path) -> Any:
     if start.startswith(ZIP):
         if not zipfile.is_zipfile(path):
             raise _unfit(path, "the beginning of a PyTorch file whose end is missing (truncated)")
+        require_stored(path)
         return _open_torch(path, mmap=True)
     if start.startswith(PICKLE):  # files of PyTorch before 1.6 cannot be mapped
         return _open_torch(path, mmap=False)
@@ -75,6 +78,23 @@ def require_weights(path: str | Path) -> bytes:
         if start.lstrip().lower().startswith(magic):
             raise _unfit(path, meaning)
     return start
+
+
+def require_stored(path: Path) -> None:
+    """Refuse a PyTorch file whose records are not stored as they are, as PyTorch writes them: mapped from the
+    disk, compressed ones would be other numbers, and unpacked they may fill the memory."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            records = archive.infolist()
+    except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
+        raise _unfit(path, f"one that cannot be read ({error})") from error
+    for record in records:
+        is_stored = record.compress_type == zipfile.ZIP_STORED and record.compress_size == record.file_size
+        if not is_stored or record.flag_bits & _ENCRYPTED:
+            raise _unfit(path, f"a compressed or encrypted record ({record.filename})")
+    claimed, size = sum(record.file_size for record in records), path.stat().st_size
+    if claimed > size:
+        raise _unfit(path, f"records of {claimed} bytes in a file of {size}")
 
 
 def _open_torch(path: Path, mmap: bool) -> Any:
@@ -108,6 +128,27 @@ def _open_safetensors(path: Path) -> "dict[str, Tensor]":
         cut = "not fully covered" in text or "header length" in text
         why = "the beginning of a safetensors file whose end is missing (truncated)" if cut else text
         raise _unfit(path, why) from error
+
+
+def require_dense(tensors: "Mapping[str, Any]", path: str | Path) -> None:
+    """Refuse tensors that weights never are: sparse, of 8 bits, or of fewer stored numbers than their shape
+    says, which a copy would expand without limit."""
+    import torch
+
+    for name, value in tensors.items():
+        if not isinstance(name, str):
+            raise InputError(f"{path}: state_dict: expected names of tensors; found {name!r}")
+        if not isinstance(value, torch.Tensor):
+            continue
+        dtype = str(value.dtype).removeprefix("torch.")
+        known = value.layout is torch.strided and not value.is_meta
+        known = known and (not value.is_floating_point() or dtype in _FLOATS)
+        if not known:
+            found = f"{value.dtype}, {value.layout} on {value.device}"
+            raise InputError(f"{path}: {name}: expected a dense tensor of 16, 32 or 64 bits; found {found}")
+        if value.nbytes > value.untyped_storage().nbytes():
+            shape, stored = tuple(value.shape), value.untyped_storage().nbytes()
+            raise InputError(f"{path}: {name}: expected as many bytes as {shape} takes; found {stored}")
 
 
 def cast(
