@@ -1,11 +1,13 @@
 """Readers of text files, of limited size and depth, and of arrays; every defect is an :class:`InputError`."""
 
 import csv
+import functools
 import io
 import json
 import os
 import stat
-from collections.abc import Callable, Iterator
+import unicodedata
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +38,63 @@ def require_folder(folder: Path, expected: str = "the folder of the data set") -
     """Refuse a folder that is missing."""
     if not folder.is_dir():
         raise InputError(f"{folder}: expected {expected}; found no such folder")
+
+
+def composed(name: str) -> str:
+    """A name in its composed spelling (NFC): macOS writes an umlaut as two characters."""
+    return unicodedata.normalize("NFC", name)
+
+
+def parts_of(name: str) -> list[str]:
+    """Folders and file of a path as any system writes it: with slashes or backslashes, composed or not."""
+    return composed(name).replace("\\", "/").split("/")
+
+
+def find_path(folder: Path, name: str, suffixes: Sequence[str] = ("",)) -> Path | None:
+    """The file or folder that ``name`` means, as a file, a program or a user of any system spells it.
+
+    A path that exists as it is written counts; otherwise its parts may have backslashes, letters composed of
+    two characters, and upper or lower case where that leaves one path.
+
+    Args:
+        folder: where relative names begin.
+        name: a name or path, without the suffix where ``suffixes`` are given.
+        suffixes: endings, the preferred first.
+
+    Returns:
+        An existing path; None: there is none."""
+    for suffix in suffixes:
+        try:
+            if (exact := folder / f"{name}{suffix}").exists():
+                return exact
+        except (OSError, ValueError):  # too long, a null character, links in a loop
+            continue
+    *folders, last = parts_of(name)
+    for part in folders:
+        below = folder / part if part in ("", ".", "..") else _alike(folder, part)
+        if below is None:
+            return None
+        folder = below
+    return next((path for suffix in suffixes if (path := _alike(folder, f"{last}{suffix}"))), None)
+
+
+def _alike(folder: Path, name: str) -> Path | None:
+    """The only entry of a folder that is spelled as ``name``, or else differs by upper and lower case."""
+    if not folder.is_dir():
+        return None
+    paths = _listed(folder, folder.stat().st_mtime_ns).get(name.casefold(), [])
+    stem = Path(name).stem
+    same = [path for path in paths if composed(path.stem) == stem] or paths
+    return same[0] if len(same) == 1 else None
+
+
+@functools.lru_cache(maxsize=64)
+def _listed(folder: Path, changed: int) -> dict[str, list[Path]]:
+    """Entries of a folder by their composed names in lower case, until the folder changes."""
+    paths: dict[str, list[Path]] = {}
+    for path in sorted(folder.iterdir()):
+        paths.setdefault(composed(path.name).casefold(), []).append(path)
+    return paths
 
 
 def read_text(path: Path, expected: str = "text") -> str:

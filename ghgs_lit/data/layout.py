@@ -35,7 +35,7 @@ from ghgs_lit.data.decoding import (
 from ghgs_lit.data.reader import PHASES, Reader
 from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.readers import read_json, require_folder
+from ghgs_lit.readers import find_path, read_json, require_folder
 
 #: Folder of the renderer's notes.
 FOLDER = "rendering"
@@ -170,22 +170,21 @@ class Layout(Reader):
 
     def views_at(self, name: str, position: int) -> list[int]:
         files = self._folder(name, "img", position).iterdir()
-        return sorted(int(p.stem) for p in files if p.suffix in _IMAGE_SUFFIXES and p.stem.isdecimal())
+        images = [path for path in files if path.suffix.lower() in _IMAGE_SUFFIXES]
+        return sorted(int(path.stem) for path in images if path.stem.isdecimal())
 
     def read_body(self, name: str) -> np.ndarray | None:
         for model in _BODY_MODELS:
-            path = self._folders[name] / model / name / "vertices.npy"
-            if path.exists():
+            path = find_path(self._folders[name], f"{model}/{name}/vertices.npy")
+            if path is not None:
                 return read_vertices(path)
         return None
 
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
-        stem = self._folder(name, "img", position) / str(view)
-        paths = [stem.with_suffix(suffix) for suffix in _IMAGE_SUFFIXES]
-        image = read_photograph(next((path for path in paths if path.exists()), paths[0]))
+        image = read_photograph(self._file(name, "img", position, str(view), _IMAGE_SUFFIXES))
         size = image.shape[:2]
-        mask = read_map(self._folder(name, "mask", position) / f"{view}.png", size)
-        path = self._folder(name, "depth", position) / f"{view}.png"
+        mask = read_map(self._file(name, "mask", position, f"{view}.png"), size)
+        path = self._file(name, "depth", position, f"{view}.png")
         inverse = None
         if depth and path.exists():
             inverse = read_map(path, size)
@@ -198,20 +197,25 @@ class Layout(Reader):
             inverse = inverse.astype(np.uint16)
             seen = inverse.any() or not mask.any()
             require(seen, str(path), "inverse depth above 0 at the subject", "0 everywhere")
-        path, matte = self._folder(name, "alpha", position) / f"{view}.png", None
+        path, matte = self._file(name, "alpha", position, f"{view}.png"), None
         if path.exists():
             matte = read_map(path, size)
             if matte.dtype != np.uint8:
                 raise InputError(f"{path}: expected 8 bits of grey; found {matte.dtype}")
             require(matte.any() or not mask.any(), str(path), "shares above 0 at the subject", "0 everywhere")
-        path = self._folder(name, "parm", position) / f"{view}_intrinsic.npy"
+        path = self._file(name, "parm", position, f"{view}_intrinsic.npy")
         intrinsics = check_intrinsics(path, read_array(path, [(3, 3)]))
-        path = path.with_name(f"{view}_extrinsic.npy")
+        path = self._file(name, "parm", position, f"{view}_extrinsic.npy")
         extrinsics = check_extrinsics(path, read_array(path, [(3, 4), (4, 4)]))
         intrinsics[:2, 2] += self._shift
         matrices = (matrix.astype(np.float32) for matrix in (intrinsics, extrinsics))
         # Half of the maximum reads 0/1, 0/255 and compressed masks alike.
         return View(image, mask > mask.max() / 2, inverse, *matrices, matte)
+
+    def _file(self, name: str, kind: str, position: int, file: str, suffixes: Sequence[str] = ("",)) -> Path:
+        """A file of a position, by any spelling of its name; the usual one where there is none."""
+        folder = self._folder(name, kind, position)
+        return find_path(folder, file, suffixes) or folder / f"{file}{suffixes[0]}"
 
     def _folder(self, name: str, kind: str, position: int) -> Path:
         return self._folders[name] / kind / position_name(name, position)

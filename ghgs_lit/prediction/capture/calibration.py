@@ -3,6 +3,7 @@
 Few files say whether poses map the world to the camera, and with which axes: the format tells, or the user.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -62,6 +63,32 @@ class Convention:
 
 
 @dataclass(frozen=True)
+class PartialIntrinsics:
+    """What a file says of intrinsics that depend on the photograph's size, for x and y; None: nothing."""
+
+    focal: tuple[float | None, float | None]  #: in pixels
+    middle: tuple[float | None, float | None]  #: principal point in pixels; None: the photograph's middle
+    angles: tuple[float | None, float | None]  #: of view in radians, where there is no focal length
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the intrinsics are the same for every size."""
+        return self.focal != (None, None) and None not in self.middle
+
+    def intrinsics(self, size: tuple[int, int]) -> np.ndarray:
+        """The matrix [3, 3] for a photograph of ``size`` (height, width); pixels are square where the file
+        has one focal length or angle."""
+        sides = size[::-1]
+        focal = [
+            side / 2 / math.tan(angle / 2) if pixels is None and angle is not None else pixels
+            for pixels, angle, side in zip(self.focal, self.angles, sides, strict=True)
+        ]
+        fx, fy = (value if value is not None else next(filter(None, focal)) for value in focal)
+        cx, cy = (side / 2 if m is None else m for m, side in zip(self.middle, sides, strict=True))
+        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+@dataclass(frozen=True)
 class StoredCamera:
     """One camera as a file stores it.
 
@@ -73,7 +100,9 @@ class StoredCamera:
         distortion: 0 to 14 numbers: OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty; with ``fisheye`` k1
             to k4 of Kannala and Brandt's model.
         mask: the photograph's mask, where the file names it.
-        gains: [3], of red, green and blue relative to other cameras, where the file says them."""
+        gains: [3], of red, green and blue relative to other cameras, where the file says them.
+        lens: in place of ``intrinsics`` where they depend on the photograph's size and the file has none.
+        unread: keys of the camera in the file that are not read."""
 
     name: str
     origin: str
@@ -84,11 +113,20 @@ class StoredCamera:
     fisheye: bool = False
     mask: Path | None = None
     gains: np.ndarray | None = None
+    lens: PartialIntrinsics | None = None
+    unread: tuple[str, ...] = ()
 
     def has_numbers_of(self, other: "StoredCamera") -> bool:
         """Whether both mean the same camera."""
         both = ((c.intrinsics, c.pose, c.distortion, c.size or (), c.fisheye) for c in (self, other))
-        return all(map(np.array_equal, *both))
+        return self.lens == other.lens and all(map(np.array_equal, *both))
+
+    def sized(self, photograph: tuple[int, int]) -> "StoredCamera":
+        """The camera with a size: that of its ``photograph`` (height, width) where the file has none."""
+        if self.size is not None:
+            return self
+        intrinsics = self.intrinsics if self.lens is None else self.lens.intrinsics(photograph)
+        return replace(self, size=photograph, intrinsics=intrinsics, lens=None)
 
     def __post_init__(self) -> None:
         lens = check_intrinsics(f"{self.origin}: intrinsics", self.intrinsics)
@@ -122,7 +160,8 @@ class Calibration:
 def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[int, int]) -> Calibration:
     """The camera of a photograph in this package's conventions. ``photograph``: (height, width) in pixels;
     intrinsics for another size of the same aspect ratio are scaled. InputError: the aspect ratio differs."""
-    size = camera.size or photograph
+    camera = camera.sized(photograph)
+    size = camera.size
     if not same_ratio(size, photograph):
         shown = tuple(_SHOWN if side == _CODED else side for side in size)
         size = shown if same_ratio(shown, photograph) else size

@@ -134,10 +134,10 @@ def small_views(folder: CaptureFolder, instant: str) -> tuple[StoredView, ...]:
         scale = min(_SIDE / max(height, width), 1)
         size = max(round(height * scale), 1), max(round(width * scale), 1)
         # Without a stored size the intrinsics are for the whole photograph.
-        known = camera.size or pixels.stored_size
+        camera = camera.sized(pixels.stored_size if folder.keeps_stored(camera, pixels) else pixels.size)
         small = Pixels(area_image(np.ascontiguousarray(pixels.image), *size), None, pixels.turns)
         mask = area_mask(np.ascontiguousarray(matte > 127), *size)
-        views.append(StoredView(name, replace(camera, size=known), small, mask, folder.convention))
+        views.append(StoredView(name, camera, small, mask, folder.convention))
     return tuple(views)
 
 

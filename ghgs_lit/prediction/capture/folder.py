@@ -192,12 +192,16 @@ class CaptureFolder:
             raise InputError(f"{path}: {problem}")
         return camera, pixels, matte
 
+    def keeps_stored(self, camera: StoredCamera, pixels: Pixels) -> bool:
+        """Whether a camera was calibrated with the photograph as stored, not as shown."""
+        return fits_stored(pixels, camera, self._said.exif)
+
     def photograph(
         self, name: str, camera: StoredCamera, pixels: Pixels, matte: np.ndarray, convention: Convention
     ) -> Photograph:
         """One view, undistorted and upright, with the camera that a convention gives it."""
         image, turns = pixels.image, 0
-        if fits_stored(pixels, camera, self._said.exif):
+        if self.keeps_stored(camera, pixels):
             turns = pixels.turns
             image, matte = np.rot90(image, -turns), np.rot90(matte, -turns)
         size = image.shape[:2]

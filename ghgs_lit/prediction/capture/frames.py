@@ -15,13 +15,12 @@ from ghgs_lit.prediction.capture.photographs import (
     MASK_ENDING,
     Pixels,
     by_camera,
-    composed,
     image_named,
     images_in,
     require_all_read,
 )
 from ghgs_lit.prediction.capture.videos import SUFFIXES, Reader, Video, read_video
-from ghgs_lit.readers import read_rows
+from ghgs_lit.readers import composed, read_rows
 
 # Coding changes black and white by less than this.
 _CODED = 16

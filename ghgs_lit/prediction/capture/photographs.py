@@ -1,8 +1,6 @@
 """Photographs in a folder: which camera took each, and the pixels that its calibration is for."""
 
-import functools
 import re
-import unicodedata
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +11,11 @@ import numpy as np
 from ghgs_lit.data.images import orientation_of, read_image, rgb_of
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.calibration import StoredCamera, same_ratio
+from ghgs_lit.readers import composed, find_path
 
 SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif", ".tif", ".tiff", ".bmp")
 #: Suffixes of pictures that are not read, and of files that are no photographs whatever their name.
-_PICTURES = (
+PICTURES = (
     "heic heif hif jxl jp2 j2k gif tga ppm pgm exr hdr psd dng cr2 cr3 nef arw raf orf rw2 pef srw raw"
 )
 _COMPANIONS = "json xml xmp txt toml yaml yml csv npy npz pkl aae md log ply obj"
@@ -68,11 +67,6 @@ def fits_stored(pixels: Pixels, camera: StoredCamera, exif: str) -> bool:
     return size is not None and same_ratio(size, pixels.stored_size) and not same_ratio(size, pixels.size)
 
 
-def composed(name: str) -> str:
-    """A name in its composed spelling (NFC): macOS writes an umlaut as two characters."""
-    return unicodedata.normalize("NFC", name)
-
-
 def composed_names(names: Mapping[Any, Any] | None) -> dict[str, str]:
     """``calibration.names`` as text in its composed spelling: numbers, too, are names of cameras."""
     return {composed(str(key)): composed(str(name)) for key, name in (names or {}).items()}
@@ -93,9 +87,7 @@ def images_in(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[str, P
 
 def image_named(folder: Path, *names: str, suffixes: tuple[str, ...] = SUFFIXES) -> Path | None:
     """The image of a folder with one of these names (without suffix), None where there is none."""
-    paths = _listed(folder, folder.stat().st_mtime_ns) if folder.is_dir() else {}
-    keys = ((composed(name), suffix) for name in names for suffix in suffixes)
-    return next((paths[key] for key in keys if key in paths), None)
+    return next((path for name in names if (path := find_path(folder, name, suffixes))), None)
 
 
 def require_all_read(
@@ -115,17 +107,11 @@ def require_all_read(
         is_other = path.name.startswith(".") or path.is_dir() or path.stem.endswith(MASK_ENDING)
         if is_other or kind in _COMPANIONS.split() or not begins.isdisjoint(read):
             continue
-        if kind in _PICTURES.split() or not begins.isdisjoint(known):
+        if kind in PICTURES.split() or not begins.isdisjoint(known):
             raise InputError(
                 f"{path}: expected a file that can be read ({', '.join(suffixes)}); found another kind"
                 " (convert it, or move it elsewhere to do without it)"
             )
-
-
-@functools.lru_cache(maxsize=64)
-def _listed(folder: Path, changed: int) -> dict[tuple[str, str], Path]:
-    """Files by composed name and suffix, cached until the folder changes."""
-    return {(composed(path.stem), path.suffix.lower()): path for path in sorted(folder.iterdir())}
 
 
 def find_instants(

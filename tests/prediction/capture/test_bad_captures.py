@@ -150,7 +150,11 @@ BAD = {
     ),
     "no rotation": (lambda p: camera(p, extrinsics=SKEWED), "cam1: rotation: expected", "found"),
     "three coefficients": (lambda p: camera(p, distortion=[1, 2, 3]), "cam1: expected 0, 4, 5", "found 3"),
-    "unknown key": (lambda p: camera(p, focal=3), "cam1: expected keys among", "focal"),
+    "a flag that is text": (
+        lambda p: camera(p, fisheye="no"),
+        "cam1: fisheye: expected true or false",
+        "'no'",
+    ),
     "calibrated size": (lambda p: camera(p, width=500), "cam1: expected a photograph of 128x500", "128x96"),
     "unknown axes": (
         lambda p: {"calibration": {"axes": "maya"}},
@@ -185,8 +189,8 @@ BAD = {
     "alias of itself": (lambda p: write(p, "c.yml", "a: &a [*a]"), "c.yml: expected YAML", "an alias"),
     "no width": (
         lambda p: write(p, "transforms.json", NARROW),
-        "frames[0]: expected a width and a height above 0",
-        "(128, 0)",
+        "frames[0]: width: expected a whole number above 0",
+        "found 0.0",
     ),
     "a lens that shows nothing": (
         lambda p: camera(p, distortion=[1e6, 0, 0, 0]),

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import unicodedata
 
 import numpy as np
@@ -12,6 +13,7 @@ from PIL import Image
 from ghgs_lit import Capture
 from ghgs_lit.errors import InputError
 from ghgs_lit.prediction.capture.calibration import calibrate
+from ghgs_lit.prediction.capture.camera_report import diagnose
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.formats import read_cameras
 from ghgs_lit.prediction.capture.masks import matte_of_file
@@ -62,9 +64,21 @@ def test_a_lens_of_single_numbers_counts(tmp_path):
             r"a: expected lens distortion as D .*found \['radial_distortion'\]",
         ),
         ({"omni": {"xi": 1.2}}, r"found \['omni'\]"),
-        ({"camera_model": "omnidirectional"}, r"found \['camera_model'\]"),
-        ({"distortion_model": "equidistant"}, r"found \['distortion_model'\]"),
-        ({"fisheye": "yes"}, r"fisheye: expected true or false; found 'yes'"),
+        ({"camera_model": "omnidirectional"}, "a: camera_model: expected a camera model among .*'omnidirec"),
+        ({"distortion_model": "mei"}, "a: distortion_model: expected a camera model among .*; found 'mei'"),
+        ({"model": "double sphere"}, r"found \['model'\]"),
+        ({"latlong": True}, r"found \['latlong'\]"),
+        ({"equirectangular": 1}, r"found \['equirectangular'\]"),
+        ({"k": [-0.35, 0.12]}, r"found \['k'\]"),
+        ({"k": LENS}, r"found \['k'\]"),
+        (
+            {"D": LENS, "dist": [0.1, 0, 0, 0]},
+            "a: expected one distortion; found 'different ones: D and dist'",
+        ),
+        ({"D": LENS, "k1": 0.3}, r"a: expected one distortion, \[-0\.35, .*found \"another: {'k1': 0\.3}"),
+        ({"distortion_model": "equidistant", "fisheye": False, "D": [0.1, 0, 0, 0]}, "expected True beside"),
+        ({"distortion_model": "equidistant", "camera_model": "opencv"}, "a: expected one model of the lens"),
+        ({"distortion_model": "equidistant", "k1": 0.1, "p1": 0.1}, r"k1 k2 k3 k4; found \['p1'\]"),
     ],
 )
 def test_a_lens_that_is_not_read_is_refused(tmp_path, entries, line):
@@ -72,11 +86,106 @@ def test_a_lens_that_is_not_read_is_refused(tmp_path, entries, line):
         one_camera(tmp_path, **entries)
 
 
-def test_other_entries_that_are_not_read_are_named(tmp_path):
-    content = {"cameras": {"a": CAMERA | {"colour": 3}, "b": {}}, "units": "cm"}
-    with pytest.warns(UserWarning, match="cameras: entries that are not read: ") as shown:
+@pytest.mark.parametrize("model", ["equidistant", "fisheye", "KANNALA_BRANDT", "OPENCV_FISHEYE"])
+def test_a_fisheye_is_told_by_its_model(tmp_path, model):
+    """Kalibr and ROS say it so, beside a pinhole."""
+    lens = {"camera_model": "pinhole", "distortion_model": model, "D": [0.1, 0.2, 0.3, 0.4]}
+    camera = one_camera(tmp_path, **lens)
+    assert camera.fisheye
+    np.testing.assert_array_equal(camera.distortion, lens["D"])
+    assert not one_camera(tmp_path, distortion_model="plumb_bob", D=LENS).fisheye
+
+
+def test_entries_that_say_the_same_twice(tmp_path):
+    """A matrix beside coefficients that are 0, one lens in two forms, and sizes that agree."""
+    lens = {"D": LENS, "dist": [LENS], "k1": LENS[0], "k3": LENS[4], "k": [0, 0]}
+    size = {"width": 640, "height": 480, "image_size": [640.0, 480.0]}
+    camera = one_camera(tmp_path, camera_matrix=CAMERA["K"], fisheye=0, is_fisheye=False, **lens, **size)
+    np.testing.assert_array_equal(camera.distortion, LENS)
+    np.testing.assert_array_equal(camera.intrinsics, CAMERA["K"])
+    assert camera.size == (480, 640)
+
+
+OWN = {"intrinsics": CAMERA["K"], "extrinsics": np.eye(4).tolist()}
+
+
+def read_entries(tmp_path, kind, entries):
+    """A camera of one of three formats with further entries."""
+    if kind == "nerfstudio":
+        return next(iter(read_cameras(transforms(tmp_path, frame("a.png", **entries))).cameras.values()))
+    camera = OWN if kind == "ghgs" else CAMERA
+    file = read_cameras(write(tmp_path / "cameras.json", {"a": camera | entries}))
+    assert file.format == kind
+    return file.cameras["a"]
+
+
+KINDS = pytest.mark.parametrize("kind", ["ghgs", "opencv", "nerfstudio"])
+
+
+@KINDS
+@pytest.mark.parametrize("value", ["no", "false", "0", "yes", 2, -1, 0.5, [1], {"on": True}])
+def test_flags_are_true_or_false(tmp_path, kind, value):
+    """Text and 2 once counted as true: a lens of another model, without a word."""
+    for key in ("fisheye", "is_fisheye"):
+        with pytest.raises(
+            InputError, match=rf"{key}: expected true or false; found {re.escape(repr(value))}"
+        ):
+            read_entries(tmp_path, kind, {key: value})
+
+
+@KINDS
+@pytest.mark.parametrize(("value", "found"), [(True, 1), (1, 1), (1.0, 1), (False, 0), (0, 0), (None, 0)])
+def test_flags_that_are_read(tmp_path, kind, value, found):
+    camera = read_entries(tmp_path, kind, {"fisheye": value, "k1": 0.1, "k2": 0, "k3": None})
+    assert camera.fisheye == bool(found)
+    np.testing.assert_array_equal(camera.distortion[:2], [0.1, 0])
+
+
+@KINDS
+@pytest.mark.parametrize(
+    ("entries", "line"),
+    [
+        ({"w": 0, "h": 480}, "width: expected a whole number above 0; found 0"),
+        ({"w": 640.5, "h": 480}, "width: expected a whole number above 0; found 640.5"),
+        ({"w": True, "h": 480}, "w: expected a finite number; found True"),
+        ({"w": "wide", "h": 480}, "w: expected a finite number; found 'wide'"),
+        ({"k1": True}, "k1: expected a finite number; found True"),
+        ({"k1": [0.1]}, r"k1: expected a finite number; found \[0\.1\]"),
+        ({"k1": 10**400}, "k1: expected a finite number; found 1000"),
+        ({"D": [0.1, True, 0, 0]}, r"D: expected numbers; found \[0\.1, True"),
+        ({"D": "none"}, "D: expected an array"),
+        ({"D": {"k1": 0.1}}, "D: expected an array"),
+    ],
+)
+def test_values_have_types(tmp_path, kind, entries, line):
+    with pytest.raises(InputError, match=line):
+        read_entries(tmp_path, kind, entries)
+
+
+@KINDS
+def test_entries_that_are_not_read_are_named_in_one_note(tmp_path, kind):
+    """Of all cameras and of the file; null is nothing."""
+    entries = {"colour": 3, "gain": None, "lens": "Nikkor 35 mm"}
+    if kind == "nerfstudio":
+        path = transforms(tmp_path, frame("a.png", **entries), frame("b.png", **entries), units="cm")
+        named = "colour, lens, units"
+    else:
+        camera = (OWN if kind == "ghgs" else CAMERA) | entries
+        content = {"cameras": {"a": camera, "b": camera, "c": {}}, "units": "cm"}
+        path, named = write(tmp_path / "cameras.json", content), "c, colour, lens, units"
+    with pytest.warns(UserWarning, match="not read") as shown:
+        read_cameras(path)
+    assert [str(warning.message) for warning in shown] == [f"cameras: entries that are not read: {named}"]
+
+
+@pytest.mark.parametrize("place", ["file", "beside"])
+def test_a_lens_beside_cameras_is_refused(tmp_path, place):
+    """Said once for all cameras it was dropped."""
+    content = (
+        {"cameras": {"a": CAMERA}, "fisheye": True} if place == "file" else {"a": CAMERA, "fisheye": True}
+    )
+    with pytest.raises(InputError, match=r"expected lens distortion as D .*found \['fisheye'\]"):
         read_cameras(write(tmp_path / "cameras.json", content))
-    assert [str(warning.message).rpartition(": ")[2] for warning in shown] == ["units", "colour", "b"]
 
 
 def frame(name, **entries):
@@ -126,6 +235,35 @@ def test_a_folder_of_each_camera_names_it(tmp_path):
     # Of a camera that moves every photograph keeps its place.
     frames[1]["fl_x"] += 1
     assert "images/cam0/0000.png" in read_cameras(transforms(tmp_path, *frames)).cameras
+
+
+def test_an_angle_of_view_alone_is_of_the_photograph(tmp_path):
+    """NeRF's and Blender's files have no size: the photographs have one, before and after a quarter turn."""
+    poses = rig()
+    angle, frames = 2 * np.arctan(0.5), []
+    for name, camera in poses.items():
+        pose = np.eye(4)
+        pose[:3, :3] = camera["R"].T @ np.diag([1, -1, -1])
+        pose[:3, 3] = -camera["R"].T @ camera["T"]
+        frames.append(frame(f"./train\\{name}", transform_matrix=pose.tolist()))
+    shared = write(tmp_path / "transforms.json", {"camera_angle_x": angle, "frames": frames})
+    file = read_cameras(shared)
+    assert list(file.cameras) == list(poses)
+    stored = file.cameras["cam_01"]
+    for height, width in (SIZE, SIZE[::-1]):
+        found = calibrate(stored, file.convention, (height, width))
+        expected = [[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]]
+        np.testing.assert_allclose(found.intrinsics, expected, rtol=1e-12)
+        np.testing.assert_allclose(found.extrinsics[:3, :3], poses["cam_01"]["R"], atol=1e-12)
+    assert not stored.has_numbers_of(read_cameras(transforms(tmp_path, frame("cam_01"))).cameras["cam_01"])
+    vertical = {"camera_angle_y": angle, "frames": frames}
+    found = calibrate(read_cameras(write(shared, vertical)).cameras["cam_01"], file.convention, SIZE)
+    assert found.intrinsics[0, 0] == pytest.approx(SIZE[0])
+    for wrong in (0, 4, "wide"):
+        with pytest.raises(InputError, match=r"camera_angle_x: expected (radians between 0 and pi|a finite)"):
+            read_cameras(write(shared, {"camera_angle_x": wrong, "frames": frames}))
+    with pytest.raises(InputError, match=r"frames\[0\]: expected fl_x or camera_angle_x; found"):
+        read_cameras(write(shared, {"cx": 3, "frames": frames}))
 
 
 def test_cameras_of_one_name_are_refused(tmp_path):
@@ -290,6 +428,41 @@ def test_names_of_masks(capture, change):
     """``cam0.PNG`` of Windows, and COLMAP's ``cam0.png.png``."""
     rename(capture, "masks", change)
     assert len(read(capture).photographs) == 4
+
+
+def test_a_capture_with_an_angle_of_view_alone(capture):
+    """Masks and cameras of NeRF's file agree as with a size, also for the report."""
+    own = json.loads((capture / "cameras.json").read_text())["cameras"]
+    flip = np.diag([1.0, -1, -1, 1])
+    frames = [
+        frame(f"images\\{n}.png", transform_matrix=(np.linalg.inv(c["extrinsics"]) @ flip).tolist())
+        for n, c in own.items()
+    ]
+    right = read(capture).photographs
+    focal, width = right[0].intrinsics[0, 0], right[0].image.shape[1]
+    content = {"camera_angle_x": 2 * np.arctan(width / 2 / focal), "frames": frames}
+    write(capture / "cameras.json", content)
+    for one, other in zip(right, read(capture).photographs, strict=True):
+        np.testing.assert_allclose(one.intrinsics, other.intrinsics, atol=1e-9)
+    folder = CaptureFolder(capture / "images", capture / "cameras.json", masks=capture / "masks")
+    assert diagnose(folder).consistent
+
+
+def test_masks_that_a_windows_program_names(capture):
+    """``masks\\cam0.PNG`` beside transforms.json is ``masks/cam0.png``."""
+    own = json.loads((capture / "cameras.json").read_text())["cameras"]
+    frames = [frame(f".\\images\\{n}.png", mask_path=f"masks\\{n}.PNG") for n in own]
+    for entry, camera in zip(frames, own.values(), strict=True):
+        entry["transform_matrix"] = np.linalg.inv(camera["extrinsics"]).tolist()
+    size = next(iter(own.values()))
+    shared = {"fl_x": size["intrinsics"][0][0], "w": size["width"], "h": size["height"], "frames": frames}
+    write(capture / "cameras.json", shared)
+    found = Capture.read(capture / "images", capture / "cameras.json", calibration={"axes": "opencv"})
+    for photograph, mask in zip(found.photographs, Figure().masks, strict=True):
+        np.testing.assert_array_equal(photograph.mask, mask)
+    (capture / "masks" / "cam0.png").unlink()
+    with pytest.raises(InputError, match=r"masks\\cam0\.PNG: expected an image; found no such file"):
+        Capture.read(capture / "images", capture / "cameras.json")
 
 
 def test_numbered_cameras_have_photographs_of_other_names(capture):

@@ -6,7 +6,8 @@ import numpy as np
 
 from ghgs_lit.errors import InputError, installed, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
-from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, coefficients, pinhole
+from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, pinhole
+from ghgs_lit.prediction.capture.formats.entries import FISHEYE, PERSPECTIVE, coefficients
 from ghgs_lit.readers import require_file
 
 #: COLMAP's camera models: order of its parameters; ``f`` is both focal lengths.
@@ -22,7 +23,6 @@ _MODELS = {
     "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
 }
 _FILES = ("cameras", "images", "points3D", "rigs", "frames")
-_ORDER = {False: "k1 k2 p1 p2 k3 k4 k5 k6", True: "k1 k2 k3 k4"}
 
 
 def model_folder(path: Path) -> Path | None:
@@ -73,7 +73,7 @@ def _camera(folder: Path, name: str, image, camera) -> StoredCamera:
     fx, fy = (values.get(name, values.get("f")) for name in ("fx", "fy"))
     intrinsics = pinhole(fx, fy, values["cx"], values["cy"])
     fisheye = "FISHEYE" in model
-    distortion = coefficients(values, _ORDER[fisheye])
+    distortion = coefficients(values, FISHEYE if fisheye else PERSPECTIVE)
     pose = np.eye(4)
     pose[:3] = image.cam_from_world().matrix()
     size = (camera.height, camera.width)

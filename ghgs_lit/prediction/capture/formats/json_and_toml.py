@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ghgs_lit.data.decoding import check_array
+import numpy as np
+
 from ghgs_lit.errors import require
 from ghgs_lit.prediction.capture.calibration import Calibration, Convention, StoredCamera
 from ghgs_lit.prediction.capture.formats import opencv
-from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, check_unread, read_mapping
-
-_KEYS = ("intrinsics", "extrinsics", "width", "height", "distortion", "fisheye", "gains")
+from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, read_mapping
+from ghgs_lit.prediction.capture.formats.entries import Entries
 
 
 def read_json_file(path: Path) -> dict[str, Any]:
@@ -30,10 +30,10 @@ def read_json(path: Path) -> CameraFile:
     named = _cameras_of(path, content)
     with_extrinsics = {n: c for n, c in named.items() if isinstance(c, Mapping) and "extrinsics" in c}
     if not with_extrinsics:
-        return _read_matrices(path, named, "opencv")
-    check_unread(str(path), {n: c for n, c in named.items() if n not in with_extrinsics}, opencv.KNOWN)
+        return _read_matrices(path, content, named, "opencv")
     cameras = [_camera(name, f"{path}: {name}", camera) for name, camera in with_extrinsics.items()]
-    return CameraFile.of(cameras, Convention(), "ghgs")
+    unread = _others(path, content, named, with_extrinsics)
+    return CameraFile.of(cameras, Convention(), "ghgs", unread)
 
 
 def _cameras_of(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
@@ -42,36 +42,44 @@ def _cameras_of(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
     if isinstance(named, list) and all(isinstance(camera, Mapping) for camera in named):
         named = {str(camera.get("name", i)): camera for i, camera in enumerate(named)}
     require(isinstance(named, dict), f"{path}: cameras", "cameras by name", type(named).__name__)
-    if "cameras" in content:
-        check_unread(str(path), content, opencv.KNOWN)
     return named
+
+
+def _others(
+    path: Path, content: Mapping[str, Any], named: Mapping[str, Any], read: Mapping[str, Any]
+) -> list[str]:
+    """Entries beside the cameras that are ``read``, of those ``named`` and of the file. InputError: one says
+    something of the lens."""
+    below = {name: value for name, value in named.items() if name not in read}
+    beside = {key: value for key, value in content.items() if "cameras" in content}
+    return [key for fields in (below, beside) for key in Entries(str(path), fields).unread(opencv.IRRELEVANT)]
 
 
 def read_toml(path: Path) -> CameraFile:
     """Pose2Sim's, Anipose's and Caliscope's TOML: a table for each camera, named by its key ``name``.
     InputError: a camera is missing or wrong."""
-    tables = _cameras_of(path, read_mapping(path, tomllib.loads, "TOML", "TOML"))
-    named = {str(t.get("name", key)): t for key, t in tables.items() if isinstance(t, dict)}
-    return _read_matrices(path, named, "toml")
+    content = read_mapping(path, tomllib.loads, "TOML", "TOML")
+    tables = _cameras_of(path, content)
+    named = {str(t.get("name", key)) if isinstance(t, dict) else key: t for key, t in tables.items()}
+    return _read_matrices(path, content, named, "toml")
 
 
-def _read_matrices(path: Path, named: Mapping[str, Any], name_of_format: str) -> CameraFile:
+def _read_matrices(
+    path: Path, content: Mapping[str, Any], named: Mapping[str, Any], name_of_format: str
+) -> CameraFile:
     expected = "cameras with intrinsics and extrinsics (or K, R and T)"
     with_intrinsics = {name: camera for name, camera in named.items() if opencv.has_intrinsics(camera)}
     cameras = opencv.cameras_from_fields(path, with_intrinsics, expected, sorted(named))
-    check_unread(str(path), {n: c for n, c in named.items() if n not in with_intrinsics}, opencv.KNOWN)
-    return CameraFile.of(cameras, Convention(pixel_centers="integer"), name_of_format)
+    unread = _others(path, content, named, with_intrinsics)
+    return CameraFile.of(cameras, Convention(pixel_centers="integer"), name_of_format, unread)
 
 
 def _camera(name: str, origin: str, camera: Mapping[str, Any]) -> StoredCamera:
-    unknown = sorted(set(camera) - set(_KEYS))
-    require(not unknown, origin, f"keys among {', '.join(_KEYS)}", unknown)
-    require("intrinsics" in camera, origin, "intrinsics", sorted(camera))
-    pose = check_array(f"{origin}: extrinsics", camera["extrinsics"], [(4, 4), (3, 4)])
-    distortion = check_array(f"{origin}: distortion", camera.get("distortion", []), [(None,)])
-    size, fisheye = opencv.size_from_fields(origin, camera), bool(camera.get("fisheye", False))
-    lens, gains = camera["intrinsics"], camera.get("gains")
-    return StoredCamera(name, origin, lens, pose, size, distortion, fisheye, gains=gains)
+    entries = Entries(origin, camera)
+    pose = np.eye(4)
+    extrinsics = entries.needed("extrinsics", (4, 4), (3, 4))
+    pose[: len(extrinsics)] = extrinsics
+    return opencv.camera_of(name, entries, pose)
 
 
 def json_text(cameras: Mapping[str, tuple[Calibration, tuple[int, int]]]) -> str:

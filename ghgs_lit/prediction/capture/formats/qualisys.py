@@ -7,7 +7,8 @@ import numpy as np
 
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
-from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, coefficients, pinhole
+from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, pinhole
+from ghgs_lit.prediction.capture.formats.entries import Entries, coefficients
 from ghgs_lit.readers import require_file
 
 _SUBPIXELS = 64
@@ -40,7 +41,10 @@ def _camera(path: Path, camera: ElementTree.Element) -> StoredCamera:
         numbers[f"{key}{axis}"] / _SUBPIXELS for key in ("focalLength", "centerPoint") for axis in "UV"
     )
     intrinsics = pinhole(fx, fy, cx - numbers["left"], cy - numbers["top"])
-    lens = {name: numbers.get(f"{_DISTORTION[name[0]]}{name[1]}", 0.0) for name in _ORDER.split()}
+    keys = {name: f"{_DISTORTION[name[0]]}{name[1]}" for name in _ORDER.split()}
+    lens = {name: numbers.get(key, 0.0) for name, key in keys.items()}
+    others = {key: value for key, value in numbers.items() if key not in keys.values()}
+    Entries(f"{path}: {name}", others).unread(())  # refuses distortion of other names
     pose = np.eye(4)
     pose[:3, :3] = [[numbers[f"r{row}{column}"] for column in (1, 2, 3)] for row in (1, 2, 3)]
     pose[:3, 3] = -pose[:3, :3] @ [numbers[axis] for axis in "xyz"]
