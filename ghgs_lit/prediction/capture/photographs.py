@@ -15,9 +15,7 @@ from ghgs_lit.readers import composed, find_path
 
 SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif", ".tif", ".tiff", ".bmp")
 #: Suffixes of pictures that are not read, and of files that are no photographs whatever their name.
-PICTURES = (
-    "heic heif hif jxl jp2 j2k gif tga ppm pgm exr hdr psd dng cr2 cr3 nef arw raf orf rw2 pef srw raw"
-)
+PICTURES = "heic heif hif jxl jp2 j2k gif tga ppm pgm exr hdr psd dng cr2 cr3 nef arw raf orf rw2 pef srw raw"
 _COMPANIONS = "json xml xmp txt toml yaml yml csv npy npz pkl aae md log ply obj"
 MASK_ENDING = "_mask"  #: A mask beside its photograph ends with this
 #: Quarter turns as of ``numpy.rot90`` by EXIF orientation.
