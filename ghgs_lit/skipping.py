@@ -61,8 +61,9 @@ class Preset(Options):
     budget_db: float | None = EXACT_LOSS
     """PSNR that may be lost against skip=none, in dB (`ghgs benchmark` checks it); null: no promise."""
     max_rel_diff: Amount | None = 1e-5
-    """Largest difference of an attribute or a render from skip=none, as a share of its largest value, which
-    `ghgs benchmark` checks (1000 times with rounds); null: nothing is promised."""
+    """Largest difference of 99 of 100 values of an attribute or a render from skip=none, as a share of the
+    largest value, times what the model amplifies one rounding of the photographs by; `ghgs benchmark` checks
+    it. null: nothing is promised."""
 
     @property
     def view(self) -> View:

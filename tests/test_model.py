@@ -113,8 +113,8 @@ def test_the_pipeline_matches_the_release(dtype):
     [
         ("model=paper", torch.float32, 1e-5),
         ("model=hull", torch.float32, 1e-5),
-        # Its depth is 1/d of a d that crosses 0 where the subject fills a view: |depth| goes from 2 to 1000, and
-        # rounding grows as much (3e-5 in float32, of the processor's making). In float64 that is below 1e-12.
+        # Its depth is 1/d of a d that crosses 0 where the subject fills a view: |depth| goes from 2 to 1000,
+        # and rounding grows as much (3e-5 in float32 on some processors). In float64 it is below 1e-12.
         ("compat=release", torch.float64, 1e-9),
     ],
     ids=lambda value: str(value).removeprefix("torch."),

@@ -1,9 +1,9 @@
 """Measurement of cases: work, differences from the yardstick, and seconds of each stage."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
@@ -22,17 +22,21 @@ from ghgs_lit.runs.results import Row
 from ghgs_lit.types import Batch, Gaussians, Prediction, Rendering
 
 ATTRIBUTES = ("means", "quaternions", "scales", "opacities", "colors")
+#: Share of the values that budgets judge differences by: where a decision lies within rounding (which of two
+#: points is nearer, whether a splat is drawn at all), single values change as far as they may.
+MOST = 0.99
+_ROUNDINGS = 2  #: Random roundings of photographs that :func:`amplification` takes the larger effect of
 
 
-def relative_difference(found: Tensor, expected: Tensor, norm: float = math.inf) -> float:
-    """``|found - expected| / max|expected|``; infinite if a value is not finite or only ``expected`` is 0
-    everywhere, 0 without values. ``norm`` of the difference: the largest value, or 2 for root mean square."""
+def relative_difference(found: Tensor, expected: Tensor, share: float = 1.0) -> float:
+    """``|found - expected| / max|expected|``, which a ``share`` of the values does not exceed; infinite if a
+    value is not finite or only ``expected`` is 0 everywhere, 0 without values."""
     if found.numel() == 0:
         return 0.0
-    difference = (found - expected).double().abs()
-    difference = (difference.max() if norm == math.inf else difference.square().mean().sqrt()).item()
-    if not math.isfinite(difference):
+    difference = (found - expected).double().abs().flatten()
+    if not difference.isfinite().all():
         return math.inf
+    difference = difference.kthvalue(max(1, math.floor(share * len(difference)))).values.item()
     largest = expected.abs().max().item()
     return difference / largest if largest > 0 else (0.0 if difference == 0 else math.inf)
 
@@ -49,32 +53,57 @@ def partners(found: Gaussians, expected: Gaussians) -> tuple[Int[Tensor, " n"], 
     return tuple(torch.tensor(both[name].to_numpy().copy(), device=device) for name in ("a", "b"))
 
 
+Result = tuple[Prediction, Rendering]
+
+
 def differences(
-    found: tuple[Prediction, Rendering], expected: tuple[Prediction, Rendering], masks: Bool[Tensor, "..."]
+    found: Result, expected: Result, masks: Bool[Tensor, "..."], share: float = 1.0
 ) -> dict[str, float]:
     """Differences of a preset from the yardstick. ``masks``: of the inputs [B, V, H, W].
 
-    Returns :func:`relative_difference` of each attribute of the Gaussians, of the ``render`` (root mean
-    square) and of the subject's ``depth``; their largest, ``max_rel_diff``; ``psnr_to_none`` of the renders
-    in dB; and ``unmatched``, the Gaussians without a partner (of the preset or the yardstick, whichever has
-    more) over the number of the yardstick's.
+    Returns :func:`relative_difference` of each attribute of the Gaussians, of the subject's ``depth`` and of
+    the ``render`` (of :data:`MOST` of its values at most); their largest, ``max_rel_diff``; ``mse_to_none``
+    and ``psnr_to_none`` of the renders, the latter in dB; and ``unmatched``, the Gaussians without a partner
+    (of the preset or the yardstick, whichever has more) over the number of the yardstick's.
     """
     (prediction, rendering), (yardstick, reference) = found, expected
     ours, theirs = prediction.gaussians, yardstick.gaussians
     a, b = partners(ours, theirs)
-    result = {n: relative_difference(getattr(ours, n)[a], getattr(theirs, n)[b]) for n in ATTRIBUTES}
-    # Not the largest: rounding decides whether a Gaussian that covers 1/255 of a pixel is drawn.
-    result["render"] = relative_difference(rendering.image, reference.image, norm=2)
+    result = {n: relative_difference(getattr(ours, n)[a], getattr(theirs, n)[b], share) for n in ATTRIBUTES}
+    result["render"] = relative_difference(rendering.image, reference.image, min(share, MOST))
     valid = prediction.depth_valid & yardstick.depth_valid & masks
-    result["depth"] = relative_difference(prediction.depth[valid], yardstick.depth[valid])
+    result["depth"] = relative_difference(prediction.depth[valid], yardstick.depth[valid], share)
     error = squared_error(rendering.image.flatten(0, 1), reference.image.flatten(0, 1)).mean()
     missing = max(len(theirs), len(ours)) - len(a)
     return {
         **result,
         "max_rel_diff": max(result.values()),
+        "mse_to_none": error.item(),
         "psnr_to_none": decibels(error[None]).item(),
         "unmatched": missing / max(len(theirs), 1),
     }
+
+
+def amplification(case: Case, batch: Batch, result: Result) -> dict[str, float]:
+    """Condition of ``result``, what the case gives for the batch, by the names of :func:`differences`: how
+    far most values move where all photographs are rounded once at random, in units of that rounding; at least
+    1. Another order of summation rounds as much in every layer."""
+    eps = torch.finfo(batch.images.dtype).eps
+    largest: dict[str, float] = {}
+    for seed in range(_ROUNDINGS):
+        signs = 1 - 2 * torch.randint(2, batch.images.shape, generator=torch.Generator().manual_seed(seed))
+        images = (batch.images * (1 + eps * signs.to(batch.images))).clamp(0, 1)
+        moved = forward(case.model, case.renderer, replace(batch, images=images), SecondsProbe(images.device))
+        for name, value in differences(moved, result, batch.masks, MOST).items():
+            largest[name] = max(largest.get(name, 1.0), value / eps)
+    return largest
+
+
+def conditioned(found: Result, expected: Result, batch: Batch, condition: Mapping[str, float]) -> float:
+    """Largest difference of attributes, depth and render of :data:`MOST` values over their condition, from
+    :func:`amplification`."""
+    most = differences(found, expected, batch.masks, MOST)
+    return max(most[name] / condition[name] for name in (*ATTRIBUTES, "render", "depth"))
 
 
 WARMUP = 1  #: Rounds that do not count; the first compiles and fills caches
@@ -184,13 +213,17 @@ def record_cases(
             work, *result = inspect(record.case, batch, device)
             if record.case.is_yardstick:
                 yardstick = result
+                condition = amplification(record.case, batch, result)
             mine.append(work)
-            for name, value in differences(result, yardstick, batch.masks).items():
+            found = differences(result, yardstick, batch.masks)
+            found["rel_diff"] = conditioned(result, yardstick, batch, condition)
+            for name, value in found.items():
                 worst = min if name == "psnr_to_none" else max
                 record.differences[name] = worst(record.differences.get(name, value), value)
             # The error against the truth, as `ghgs evaluate` measures it; its time does not count.
-            found, rendering = result
-            estimate = Estimate(rendering.image, found.depth, found.depth_valid, decisions=found.decisions)
+            prediction, rendering = result
+            depth, decisions = (prediction.depth, prediction.depth_valid), prediction.decisions
+            estimate = Estimate(rendering.image, *depth, decisions=decisions)
             measured = measure(lambda _, known=estimate: known, record.case.label, [batch], metrics, device)
             record.metrics += [{n: value for n, value in row.items() if n != "seconds"} for row in measured]
     times = time_cases(cases, batches, WARMUP, repeats, device)

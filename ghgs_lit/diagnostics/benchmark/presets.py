@@ -21,10 +21,6 @@ YARDSTICK = "none"  #: Preset that all others are compared with
 #: Nodes of a configuration that a model is built from, beside ``skip``.
 MODEL_NODES = (*STAGES, "rounds", "model")
 KNOBS = (*STAGES, "rounds", "skip", "model", "renderer", "precision")  #: Nodes that knobs can change
-#: Factor on the allowed differences of models with rounds, which take normals from differences of depths and
-#: sample photographs at Gaussians: rounding the photographs once changes single attributes by 1e-3 of the
-#: largest one (trained weights, 1 to 3 rounds).
-ROUNDS_AMPLIFY = 1000
 
 
 @dataclass(frozen=True)
@@ -44,7 +40,7 @@ class Case:
     model: GHGS  #: in evaluation mode, on its device
     renderer: Renderer
     budget_db: float | None  #: PSNR that the preset may lose against the yardstick; None: no budget
-    max_rel_diff: float | None  #: allowed difference, times :data:`ROUNDS_AMPLIFY` with rounds; None: any
+    max_rel_diff: float | None  #: allowed difference over its condition; None: any
     is_trained: bool
 
     @property
@@ -105,8 +101,6 @@ def cases_of(
         # Budgets hold for presets without knobs.
         budget_db, max_rel_diff = (None if change else skip.get(key) for key in ("budget_db", "max_rel_diff"))
         renderer = build(config["renderer"], "renderer")
-        if max_rel_diff is not None and model.rounds is not None:
-            max_rel_diff *= ROUNDS_AMPLIFY
         is_trained = source.checkpoint is not None
         cases.append(Case(name, change, model, renderer, budget_db, max_rel_diff, is_trained))
     return cases

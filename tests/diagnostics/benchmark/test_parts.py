@@ -11,7 +11,10 @@ from ghgs_lit import encoder
 from ghgs_lit.diagnostics.benchmark import measure
 from ghgs_lit.diagnostics.benchmark.measure import (
     ATTRIBUTES,
+    MOST,
     Times,
+    amplification,
+    conditioned,
     differences,
     order,
     partners,
@@ -115,6 +118,40 @@ def test_relative_differences_are_always_defined():
     assert relative_difference(one * 0, one * 0) == 0
     assert relative_difference(one, one * 0) == math.inf
     assert relative_difference(one * math.nan, one) == math.inf
+
+
+def test_budgets_look_at_most_values():
+    """A decision within rounding changes one value as much as it may, a defect changes many."""
+    expected = torch.ones(300)
+    found = expected.clone()
+    found[:3] = torch.tensor([9.0, 3.0, 5.0])
+    assert relative_difference(found, expected) == 8
+    assert relative_difference(found, expected, MOST) == 0
+    found[3] = 1.5
+    assert relative_difference(found, expected, MOST) == 0.5
+    found[4] = math.nan
+    assert relative_difference(found, expected, MOST) == math.inf
+
+
+def test_the_condition_is_what_a_rounding_of_the_photographs_changes(model, scene, monkeypatch):
+    """A depth that changes 64 times as much as the photographs has a condition of 64, what is fixed 1."""
+    result = forward(model, Renderer(), scene, SecondsProbe(CPU))
+    place = scene.images.argmax()
+
+    def moved(model, renderer, batch, probe):
+        change = (batch.images.flatten()[place] / scene.images.flatten()[place]).log().item()
+        prediction, rendering = result
+        return dataclasses.replace(prediction, depth=prediction.depth * (1 + 64 * change)), rendering
+
+    monkeypatch.setattr(measure, "forward", moved)
+    found = amplification(case(model, "none", Renderer()), scene, result)
+    # Photographs of 1 at most: between half of eps and eps.
+    assert 30 < found["depth"] < 66
+    assert all(found[name] == 1 for name in (*ATTRIBUTES, "render"))
+    twice = [dataclasses.replace(result[0], depth=result[0].depth * (1 + factor)) for factor in (1e-3, 2e-3)]
+    first, second = (conditioned((one, result[1]), result, scene, found) for one in twice)
+    assert first == pytest.approx(1e-3 / found["depth"], rel=0.1)
+    assert second == pytest.approx(2 * first, rel=1e-3)
 
 
 def test_gaussians_are_compared_by_their_pixel(model, scene):
