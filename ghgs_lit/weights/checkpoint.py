@@ -166,8 +166,8 @@ def load_weights(
 
     The model's own weights may be on the meta device. ``dtype``: precision of the encoder (None: as in the
     file, but float32 on a CPU without that half precision, and for float64); the heads are float32.
-    ``device``: where the weights will be moved to. FileNotFoundError: there is no such file. InputError: it is not a checkpoint
-    of this package, or its weights are not finite or do not fit the model.
+    ``device``: where the weights will be moved to. FileNotFoundError: there is no such file. InputError: it
+    is not a checkpoint of this package, or its weights are not finite or do not fit the model.
     """
     checkpoint = read_checkpoint(path, whole=True)
     require_fit(model, model_state(checkpoint), path)

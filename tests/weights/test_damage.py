@@ -1,5 +1,6 @@
 """Checkpoints that changed since they were written, and what none holds."""
 
+import tracemalloc
 import zipfile
 
 import lightning.pytorch
@@ -12,7 +13,7 @@ from ghgs_lit.training.checkpoints import AtomicCheckpointIO
 from ghgs_lit.training.start import check_resume, initialize
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION, read_checkpoint
 from ghgs_lit.weights.exporting import export_weights, write_inference
-from ghgs_lit.weights.reading import SHIPPED_FILE
+from ghgs_lit.weights.reading import SHIPPED_FILE, open_file
 from tests.helpers.models import config, make_model
 
 TRAINING = {"global_step": 5, "optimizer_states": [], "lr_schedulers": [], "loops": {}, "callbacks": {}}
@@ -68,6 +69,77 @@ def test_the_shipped_file_has_checksums(tmp_path):
             GHGS.from_checkpoint(path)
 
 
+def packed_again(path, compression):
+    """Write the records of a PyTorch file again, as a program that repairs archives does."""
+    with zipfile.ZipFile(path) as archive:
+        records = {record.filename: archive.read(record) for record in archive.infolist()}
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        for name, data in records.items():
+            archive.writestr(name, data)
+
+
+def claim(path, size):
+    """Let the last record of a PyTorch file say that it has ``size`` bytes, in both of its headers."""
+    with zipfile.ZipFile(path) as archive:
+        last = archive.infolist()[-1]
+    data, name = bytearray(path.read_bytes()), last.filename.encode()
+    sizes = 2 * last.file_size.to_bytes(4, "little")
+    for place in (data.index(sizes, last.header_offset), data.index(sizes, data.rindex(name) - 46)):
+        data[place : place + 8] = 2 * size.to_bytes(4, "little")
+    path.write_bytes(data)
+
+
+FILES_OF_WEIGHTS = {**READERS, "any file of weights": open_file}
+
+
+@pytest.mark.parametrize("reader", FILES_OF_WEIGHTS)
+@pytest.mark.parametrize("compression", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_compressed_records_are_refused_by_every_reader(tmp_path, reader, compression):
+    """PyTorch maps records as they lie on the disk: all weights would be other numbers, in silence."""
+    path = tmp_path / "a.ckpt"
+    torch.save(content(), path)
+    packed_again(path, zipfile.ZIP_STORED)
+    assert GHGS.from_checkpoint(path)
+    packed_again(path, compression)
+    with pytest.raises(
+        InputError, match=r"a\.ckpt: expected .*; found a compressed or encrypted record \(a/"
+    ):
+        FILES_OF_WEIGHTS[reader](path)
+
+
+def test_a_file_that_unpacks_without_limit_is_refused_before_it_is_read(tmp_path):
+    path = tmp_path / "a.ckpt"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in ("data.pkl", "version"):
+            archive.writestr(f"a/{name}", bytes(1 << 26))
+    tracemalloc.start()
+    with pytest.raises(InputError, match="found a compressed"):
+        read_checkpoint(path, whole=True)
+    assert tracemalloc.get_traced_memory()[1] < 1 << 24
+    tracemalloc.stop()
+    torch.save(content(), path)
+    claim(path, 1 << 30)
+    with pytest.raises(InputError, match=r"a\.ckpt: expected .*; found"):
+        read_checkpoint(path)
+
+
+def test_weights_in_double_precision_are_read_in_single(tmp_path):
+    """A converter, or a run with ``trainer.precision=64-true``, writes them; the model computes in single."""
+    made = content()
+    double = {key: value.double() for key, value in made["state_dict"].items() if value.is_floating_point()}
+    torch.save({**made, "state_dict": {**made["state_dict"], **double}}, tmp_path / "a.ckpt")
+    model = GHGS.from_checkpoint(tmp_path / "a.ckpt")
+    assert {p.dtype for p in model.parameters()} == {torch.float32}
+    for key, value in model.state_dict().items():
+        assert torch.equal(value, made["state_dict"][f"model.{key}"])
+    initialize(started := make_model(), tmp_path / "a.ckpt")
+    assert {p.dtype for p in started.parameters()} == {torch.float32}
+    too_large = {**double, next(iter(double)): next(iter(double.values())) + 1e300}
+    torch.save({**made, "state_dict": {**made["state_dict"], **too_large}}, tmp_path / "a.ckpt")
+    with pytest.raises(InputError, match=r"a\.ckpt: .*: expected finite numbers"):
+        GHGS.from_checkpoint(tmp_path / "a.ckpt")
+
+
 TENSOR = torch.ones(2, 2)
 
 
@@ -83,6 +155,10 @@ TENSOR = torch.ones(2, 2)
         ({"state_dict": {"model.a": TENSOR.to_sparse()}}, "model.a: expected a dense tensor"),
         ({"state_dict": {"model.a": TENSOR.to("meta")}}, "model.a: expected a dense tensor"),
         ({"state_dict": {"model.a": TENSOR.to(torch.float8_e4m3fn)}}, "model.a: expected .*float8"),
+        (
+            {"state_dict": {"model.a": torch.zeros(1).expand(1 << 40)}},
+            "model.a: expected as many bytes as .*; found 4",
+        ),
         ({"config": {3: {}}}, "config: expected keys of text; found 3"),
     ],
 )
