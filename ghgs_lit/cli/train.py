@@ -158,6 +158,7 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
     quiet()
     cost = TrainingCost()
     trainer = build_trainer(config, directory, cost, StopAtStep())
+    module.lpips = build(config["metrics"], "metrics").to(trainer.strategy.root_device).lpips
     # The last check, because it makes missing photographs.
     check_evaluation(config, data)
     try:
@@ -226,7 +227,8 @@ def measure_last(
         sessions=RunDirectory(directory).sessions(),
     )
     summary = read_results(path)["summary"]
-    values = loggers.hyperparameters(config, choices(), overrides())
+    changes = RunDirectory(directory).swept or overrides()
+    values = loggers.hyperparameters(config, choices(), changes)
     loggers.log_results(trainer.loggers, values, summary, trainer.global_step)
     announce(path)
     return summary[0]["psnr"]

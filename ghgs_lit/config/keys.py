@@ -47,6 +47,16 @@ def lookup(config: Any, key: str) -> Any:
     return config
 
 
+def key_of(override: str) -> str:
+    """The key or group of an override such as ``+data.people=3``."""
+    return override.split("=", 1)[0].lstrip("+~")
+
+
+def is_hyperparameter(key: str) -> bool:
+    """Whether runs are compared by a key or group."""
+    return not is_below(key.replace("/", "."), NOT_HYPERPARAMETERS)
+
+
 def is_below(key: str, parents: Iterable[str]) -> bool:
     """Whether a dotted key is one of ``parents`` or lies below one."""
     return any(key == parent or key.startswith(f"{parent}.") for parent in parents)

@@ -1,6 +1,7 @@
 """Grid sweeper of ``conf/hydra/sweeper/grid.yaml``: launches those runs of a grid that are not done."""
 
 import datetime
+import json
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -17,13 +18,14 @@ from tabulate import tabulate
 
 from ghgs_lit.config import resolve
 from ghgs_lit.config.compose import check_ablation, saved_text
+from ghgs_lit.config.keys import is_hyperparameter, key_of
 from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.job import BUSY, check_config, check_launcher
 from ghgs_lit.runs.progress import clock
 from ghgs_lit.runs.provenance import config_hash
-from ghgs_lit.runs.run import RunDirectory, State
+from ghgs_lit.runs.run import SWEPT, RunDirectory, State
 from ghgs_lit.runs.signals import Interrupted, interruptible, print_how_to_go_on
 
 OUTPUTS = "config.yaml, checkpoints/, metrics.json, metrics.csv, sessions.jsonl, pictures and logs"
@@ -73,8 +75,18 @@ def _budget(config: Mapping[str, Any], seconds: float | None) -> str:
     return f"{config['trainer'].get('max_steps')} steps" if seconds is None else clock(seconds)
 
 
+def _shared(planned: Sequence[PlannedRun]) -> set[str]:
+    """Overrides that all of several runs have."""
+    return set.intersection(*(set(item.shown) for item in planned)) if len(planned) > 1 else set()
+
+
+def _sets_apart(override: str, shared: set[str]) -> bool:
+    key = key_of(override)
+    return is_hyperparameter(key) and (key == "seed" or override not in shared)
+
+
 def _print_table(planned: Sequence[PlannedRun], columns: Mapping[str, Sequence[str]]) -> None:
-    shared = set.intersection(*(set(item.shown) for item in planned)) if len(planned) > 1 else set()
+    shared = _shared(planned)
     overrides = [" ".join(o for o in item.shown if o not in shared) for item in planned]
     table = {"run": [item.name for item in planned], **columns, "overrides": overrides}
     print(tabulate(table, "keys", disable_numparse=True))
@@ -200,11 +212,19 @@ def plan(combos: Sequence[Sequence[str]], compose: Callable[[list[str]], DictCon
 
 
 def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Path) -> None:
-    """Write each run's configuration, by which tables recognise planned runs."""
+    """Write each run's configuration, by which tables recognise planned runs, and what sets it apart."""
+    titles = {RunDirectory(path.parent).title for path in directory.glob(f"*/{SWEPT}")}
+    shared = _shared(planned)
     for item in planned:
         path = item.run.path / "config.yaml"
         if not path.exists():
             write_text_atomically(path, saved_text(item.config))
+        if not item.run.swept:
+            swept = [o for o in item.shown if _sets_apart(o, shared)]
+            write_text_atomically(item.run.path / SWEPT, json.dumps(swept or [f"run={item.name}"]))
+            if item.run.title in titles:  # of a grid with other settings in the same folder
+                write_text_atomically(item.run.path / SWEPT, json.dumps([*swept, f"run={item.name}"]))
+            titles.add(item.run.title)
     write_text_atomically(directory / "multirun.yaml", OmegaConf.to_yaml(config))
 
 

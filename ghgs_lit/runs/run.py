@@ -17,8 +17,11 @@ from typing import Any
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.files import append_line, is_locked, lock, lock_owner
-from ghgs_lit.readers import read_lines_of_json
+from ghgs_lit.readers import read_json, read_lines_of_json
 from ghgs_lit.runs.results import read_results
+
+#: File of a run of a grid that says what sets it apart.
+SWEPT = "swept.json"
 
 
 class State(StrEnum):
@@ -73,6 +76,17 @@ class RunDirectory:
         if sessions and sessions[-1].get("outcome") == "failed":
             return State.FAILED
         return State.PARTIAL if self.checkpoint else State.MISSING
+
+    @property
+    def swept(self) -> list[str]:
+        """Overrides that set a run of a grid apart from the others; none for a run of its own."""
+        path = self.path / SWEPT
+        return read_json(path) if path.is_file() else []
+
+    @property
+    def title(self) -> str:
+        """:attr:`swept` as the name of a folder; of a long one the end."""
+        return ",".join(self.swept).replace(os.sep, "_")[-200:]
 
     @property
     def owner(self) -> str:

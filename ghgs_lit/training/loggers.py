@@ -8,15 +8,21 @@ from typing import Any
 
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, WandbLogger
 from lightning.pytorch.utilities import rank_zero_only
+from tabulate import tabulate
+from torch.utils.tensorboard.summary import hparams
 
-from ghgs_lit.config.keys import NOT_HYPERPARAMETERS, is_below, lookup
+from ghgs_lit.config.keys import is_hyperparameter, key_of, lookup
 from ghgs_lit.config.options import Options
 from ghgs_lit.errors import installed
 from ghgs_lit.readers import read_rows
+from ghgs_lit.runs.run import RunDirectory
 
-#: Final values by which runs are compared: TensorBoard's HParams tab shows the first five of them at once.
-#: ``metrics.json`` has all.
+#: Final values by which runs are compared; ``metrics.json`` has all.
 COMPARED = ("depth_error_mm", "flip", "lpips", "psnr", "psnr_box", "ssim")
+#: Groups of tags that TensorBoard shows first: it sorts them by name.
+_FIRST = ("loss", "val", "values", "view")
+#: Settings that compare runs even where all have the same.
+_ALWAYS = ("seed", "views")
 Value = str | int | float | bool
 
 
@@ -54,8 +60,21 @@ class TensorBoardLog(_StepsTaken, TensorBoardLogger):
         self.experiment.file_writer.add_event(Event(session_log=start), step + 1)
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Log without the epoch that Lightning adds."""
-        super().log_metrics({name: value for name, value in metrics.items() if name != "epoch"}, step)
+        """Log without the epoch that Lightning adds; what is no loss or validation below ``work/``."""
+        shown = {_sorted_last(name): value for name, value in metrics.items() if name != "epoch"}
+        super().log_metrics(shown, step)
+
+    def log_results(self, values: Mapping[str, Value], summary: Sequence[Mapping[str, Any]]) -> None:
+        """Describe the run for the tab HParams, which shows its last validation beside ``values``, and write
+        the final measurement to the tab Text: as scalars, its numbers would be charts of one point."""
+        compared = [f"val/{name}" for name in COMPARED if summary[0].get(name) is not None]
+        for part in hparams(dict(values), dict.fromkeys(compared, 0.0)):
+            self.experiment._get_file_writer().add_summary(part)
+        self.experiment.add_text("measurement", tabulate(summary, "keys", "github"))
+
+
+def _sorted_last(name: str) -> str:
+    return name if name.split("/")[0] in _FIRST else f"work/{name}"
 
 
 class CsvOptions(Options):
@@ -66,10 +85,14 @@ class CsvOptions(Options):
 
 
 class TensorBoardOptions(Options):
-    """TensorBoard's files in ``<run>/tensorboard``."""
+    """TensorBoard's files in ``<run>/tensorboard``; of a run of a grid in ``<sweep>/tensorboard/<what sets it
+    apart>``, since TensorBoard names runs by their folders."""
 
     def build(self, save_dir: str) -> TensorBoardLog:
-        return TensorBoardLog(save_dir, name="tensorboard", version="")
+        run = RunDirectory(Path(save_dir))
+        if not run.title:
+            return TensorBoardLog(save_dir, name="tensorboard", version="")
+        return TensorBoardLog(run.path.parent, name="tensorboard", version=run.title)
 
 
 class WandbLog(_StepsTaken, WandbLogger):
@@ -100,8 +123,8 @@ def log_results(
     of the weights after ``step``. ``summary``: of ``metrics.json``."""
     results = final_numbers(summary)
     for logger in loggers:
-        if isinstance(logger, TensorBoardLogger):
-            logger.log_hyperparams(dict(values), results)
+        if isinstance(logger, TensorBoardLog):
+            logger.log_results(values, summary)
             continue
         if not isinstance(logger, CSVLogger):
             logger.log_hyperparams(dict(values))
@@ -132,19 +155,16 @@ def final_numbers(summary: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 def hyperparameters(
     config: Mapping[str, Any], choices: Mapping[str, str], overrides: Sequence[str]
 ) -> dict[str, Value]:
-    """Settings by which runs are compared: options of config groups, the seed, and every changed value. Keys
-    that do not affect results are left out. ``choices``: the option of each config group."""
-    found: dict[str, Value] = {
-        group: name for group, name in choices.items() if name is not None and _matters(group)
-    }
-    for key in [part.split("=", 1)[0].lstrip("+~") for part in overrides]:
-        value = lookup(config, key)
-        if key not in choices and _matters(key) and value is not None:
+    """Settings by which runs are compared: what ``overrides`` set, seed and views. Keys that do not affect
+    results are left out.
+
+    Args:
+        config: the run's.
+        choices: the option of each config group.
+        overrides: of a run of a grid those that set it apart, else all."""
+    found: dict[str, Value] = {}
+    for key in dict.fromkeys([*map(key_of, overrides), *_ALWAYS]):
+        value = choices[key] if key in choices else lookup(config, key)
+        if is_hyperparameter(key) and value is not None:
             found[key] = value if isinstance(value, (str, int, float, bool)) else str(value)
-    if "seed" in config:
-        found["seed"] = config["seed"]
     return found
-
-
-def _matters(key: str) -> bool:
-    return not is_below(key.replace("/", "."), NOT_HYPERPARAMETERS)

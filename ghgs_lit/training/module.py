@@ -48,7 +48,10 @@ def _depth_error(batch: Batch, maps: DepthMaps) -> Tensor:
 
 class GHGSModule(BudgetedModule):
     """Trains a model through a renderer. ``optimization``, ``config``: as of :class:`BudgetedModule`.
-    ``token_budgets``: budgets for :func:`drawn_budget` in each training step; None: as configured."""
+    ``token_budgets``: budgets for :func:`drawn_budget` in each training step; None: as configured.
+    ``lpips``: of images and targets [n, 3, h, w], n values, measured in validations; None: not measured."""
+
+    lpips: Callable[[Tensor, Tensor], Tensor] | None = None
 
     def __init__(
         self,
@@ -132,6 +135,8 @@ class GHGSModule(BudgetedModule):
         self.log("val/psnr", self.val_psnr, prog_bar=True, on_epoch=True, batch_size=size)
         self.log("val/psnr_box", self.val_psnr_box, on_epoch=True, batch_size=size)
         means = {"val/ssim": ssim(image, target).mean(), **self._rounds(batch, prediction)}
+        if self.lpips is not None:
+            means["val/lpips"] = self.lpips(image, target).mean()
         if batch.depths is not None:
             means["val/depth_error_mm"] = _depth_error(batch, prediction.depth_maps)
         self.log_dict(means, on_epoch=True, batch_size=size, sync_dist=self.trainer.world_size > 1)

@@ -8,6 +8,7 @@ import numpy as np
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 from lightning.pytorch.utilities import rank_zero_only
+from torch import Tensor
 
 from ghgs_lit.config.options import Index, Options
 from ghgs_lit.geometry.padding import pad_to_patches
@@ -41,9 +42,10 @@ class PicturesOptions(Options):
 
 
 class Pictures(Callback):
-    """Logs ``sheet/<subject>``, ``attention/<subject>`` and, in TensorBoard's mesh tab, ``<subject>/points``.
-    A sheet has inputs, depths, targets, renders and errors. Attention is of one token of the recalibration.
-    Clouds are the predicted points and the body's vertices."""
+    """Logs ``view/sheet/<subject>``, ``view/attention/<subject>``, in TensorBoard's tabs of distributions
+    ``values/*`` and in its mesh tab ``<subject>/points``. A sheet has inputs, depths, targets, renders and
+    errors. Attention is of one token of the recalibration. Clouds are the predicted points and the body's
+    vertices."""
 
     def __init__(self, options: PicturesOptions):
         self.options = options
@@ -73,11 +75,12 @@ class Pictures(Callback):
             number = self.options.subjects - self._left
             name = batch.subjects[element] if batch.subjects else f"subject_{number}"
             picture = sheet(batch, image, element, prediction.depth, prediction.depth_valid)
-            _publish(trainer, f"sheet/{name}", picture, name)
+            _publish(trainer, f"view/sheet/{name}", picture, name)
             if number == 0:
                 self._show_attention(trainer, batch, element, name)
                 self._log_other_parts(pl_module, batch)
                 _show_clouds(trainer, batch, prediction, element, name)
+                _show_distributions(trainer, prediction)
             self._left -= 1
         self._forget()
 
@@ -98,7 +101,7 @@ class Pictures(Callback):
         if attention is not None:
             padding = pad_to_patches(batch.masks, tokens.patch_size)
             picture = attention_sheet(padding.pad_batch(batch) if padding else batch, tokens, attention)
-            _publish(trainer, f"attention/{name}", picture, f"{name}_attention")
+            _publish(trainer, f"view/attention/{name}", picture, f"{name}_attention")
 
     def _log_other_parts(self, pl_module: L.LightningModule, batch: Batch) -> None:
         """Log the share of attention on other body parts, for built-in people with true depths."""
@@ -110,8 +113,26 @@ class Pictures(Callback):
         part = token_parts(shares, tokens)
         found = attention_on_other_parts(stage, tokens, points, part)
         pl_module.log(
-            "attention/other_parts", found.mean(), batch_size=len(batch.images), rank_zero_only=True
+            "val/attention_on_other_parts", found.mean(), batch_size=len(batch.images), rank_zero_only=True
         )
+
+
+def distributions(prediction: Prediction) -> dict[str, Tensor]:
+    """Finite values of all Gaussians of a prediction, by name: opacities, standard deviations in millimetres
+    and, where their pixels are known, the distances from these pixels' points, in millimetres."""
+    gaussians = prediction.gaussians
+    found = {"opacity": gaussians.opacities, "scale_mm": 1000 * gaussians.scales}
+    if gaussians.pixel is not None:
+        points = prediction.points.pixels.flatten(0, 1).flatten(1, 2)[gaussians.image, gaussians.pixel]
+        found["offset_mm"] = 1000 * (gaussians.means - points).norm(dim=-1)
+    return {name: values[values.isfinite()] for name, values in found.items()}
+
+
+def _show_distributions(trainer: L.Trainer, prediction: Prediction) -> None:
+    loggers = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
+    for name, values in distributions(prediction).items() if loggers else ():
+        for logger in loggers if len(values) else ():
+            logger.experiment.add_histogram(f"values/{name}", values, trainer.global_step)
 
 
 def _publish(trainer: L.Trainer, tag: str, picture: np.ndarray, file: str) -> None:

@@ -1,6 +1,7 @@
 """What TensorBoard and the CSV get: tags, stages, memory, meshes, HParams; logs that continue."""
 
 import csv
+import dataclasses
 import importlib.util
 import mmap
 import threading
@@ -27,13 +28,15 @@ from ghgs_lit.training.loggers import (
     log_results,
     resume,
 )
-from ghgs_lit.training.validation_pictures import PicturesOptions
+from ghgs_lit.training.validation_pictures import PicturesOptions, distributions
 from tests.helpers.losses import losses_of
-from tests.helpers.training import Standin, StepData, flat_renderer
+from tests.helpers.training import Standin, StepData, example_batch, flat_renderer
 
 
 def events(folder) -> EventAccumulator:
-    found = EventAccumulator(str(folder), size_guidance={"images": 0, "tensors": 0, "scalars": 0})
+    found = EventAccumulator(
+        str(folder), size_guidance={"images": 0, "tensors": 0, "scalars": 0, "histograms": 0}
+    )
     return found.Reload()
 
 
@@ -72,6 +75,7 @@ def run(tmp_path_factory):
         Optimization(lr=0.05, end_factor=0.0),
         {"seed": 1},
     )
+    subject.lpips = lambda image, target: (image - target).abs().mean((1, 2, 3))
     trainer = L.Trainer(
         accelerator="cpu", max_steps=8, max_epochs=-1, default_root_dir=folder, logger=loggers(folder),
         callbacks=[Costs(), PicturesOptions(subjects=1).build()],
@@ -88,26 +92,70 @@ def test_tags_are_grouped_by_what_they_are(run):
     """The tags are those that the documentation lists, no more and no fewer."""
     tags = set(events(run[0] / "tensorboard").Tags()["scalars"])
     stages = ("01_data", "03_encoder", "04_depth_head", "09_render", "10_loss")
-    times = {f"time_ms/{part}" for part in (*stages, "11_backward", "12_optimizer", "step")}
+    times = {f"work/time_ms/{part}" for part in (*stages, "11_backward", "12_optimizer", "step")}
     assert tags == times | {
-        "loss/total", "loss/render_l1", "loss/chamfer", "memory_mb/process",
-        "train/budget", "train/gaussians", "train/gradient_norm", "train/learning_rate",
-        "train/skipped_steps",
-        "val/psnr", "val/psnr_box", "val/ssim", "val/depth_error_mm", "hparam/psnr",
+        "loss/total", "loss/render_l1", "loss/chamfer", "work/memory_mb/process",
+        "work/train/budget", "work/train/gaussians", "work/train/gradient_norm", "work/train/learning_rate",
+        "work/train/skipped_steps",
+        "val/psnr", "val/psnr_box", "val/ssim", "val/depth_error_mm", "val/lpips",
     }  # fmt: skip
+
+
+def test_losses_and_validations_come_first(run):
+    """TensorBoard sorts groups of tags by name, those of pictures and distributions among them."""
+    found = events(run[0] / "tensorboard").Tags()
+    tags = [*found["scalars"], *found["images"], *found["histograms"]]
+    assert sorted({tag.split("/")[0] for tag in tags}) == ["loss", "val", "values", "view", "work"]
+
+
+def test_no_chart_has_a_single_point(run):
+    """Of eight steps, logged every second, and two validations."""
+    found = events(run[0] / "tensorboard")
+    assert {
+        tag: len(found.Scalars(tag)) for tag in found.Tags()["scalars"] if len(found.Scalars(tag)) < 2
+    } == {}
+
+
+def test_distributions_are_of_the_predicted_gaussians(run):
+    """At each validation; opacities and sizes in millimetres are those that the stand-in predicts."""
+    found = events(run[0] / "tensorboard")
+    for name, value in {"opacity": 0.9, "scale_mm": 10.0}.items():
+        drawn = found.Histograms(f"values/{name}")
+        assert [event.step for event in drawn] == [4, 8]
+        histogram = drawn[0].histogram_value
+        assert (histogram.min, histogram.max) == pytest.approx((value, value))
+        assert histogram.num > 100
+    assert "values/offset_mm" not in found.Tags()["histograms"]  # pixels of its Gaussians are not known
+
+
+def test_offsets_are_distances_from_the_pixels_points():
+    """Of what the Gaussian head adds; values that are not finite are left out."""
+    batch = example_batch()
+    prediction = Standin()(batch)
+    image, pixel = batch.masks.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
+    means = prediction.gaussians.means.detach() + torch.tensor([0.003, 0.0, 0.004])
+    means[0] = torch.nan
+    moved = dataclasses.replace(prediction.gaussians, means=means, image=image, pixel=pixel)
+    found = distributions(dataclasses.replace(prediction, gaussians=moved))
+    assert len(found["offset_mm"]) == len(found["opacity"]) - 1
+    torch.testing.assert_close(
+        found["offset_mm"], torch.full_like(found["offset_mm"], 5.0), rtol=1e-3, atol=0
+    )
 
 
 def test_the_numbers_are_those_of_the_steps(run):
     """Values are logged at the steps taken, and a step takes as long as its parts or longer."""
     found = events(run[0] / "tensorboard")
-    rates = {e.step: e.value for e in found.Scalars("train/learning_rate")}
+    rates = {e.step: e.value for e in found.Scalars("work/train/learning_rate")}
     assert sorted(rates) == [2, 4, 6, 8]
     assert rates[8] == pytest.approx(0.05 * Optimization(lr=0.05, end_factor=0.0).factor(7 / 8))
-    assert [e.value for e in found.Scalars("train/budget")] == pytest.approx([1 / 8, 3 / 8, 5 / 8, 7 / 8])
-    parts = [tag for tag in found.Tags()["scalars"] if tag.startswith("time_ms/") and "step" not in tag]
-    for place, whole in enumerate(found.Scalars("time_ms/step")):
+    assert [e.value for e in found.Scalars("work/train/budget")] == pytest.approx(
+        [1 / 8, 3 / 8, 5 / 8, 7 / 8]
+    )
+    parts = [tag for tag in found.Tags()["scalars"] if tag.startswith("work/time_ms/") and "step" not in tag]
+    for place, whole in enumerate(found.Scalars("work/time_ms/step")):
         assert 0 < sum(found.Scalars(p)[place].value for p in parts) <= whole.value
-    assert 10 < found.Scalars("memory_mb/process")[0].value < 1e6
+    assert 10 < found.Scalars("work/memory_mb/process")[0].value < 1e6
 
 
 def test_pictures_and_clouds(run):
@@ -115,7 +163,7 @@ def test_pictures_and_clouds(run):
     folder, _ = run
     found = events(folder / "tensorboard")
     steps = [e.step for e in found.Scalars("val/psnr")]
-    assert [e.step for e in found.Images("sheet/p0")] == steps == [4, 8]
+    assert [e.step for e in found.Images("view/sheet/p0")] == steps == [4, 8]
     assert sorted(path.name for path in (folder / "pictures").iterdir()) == ["step_000004", "step_000008"]
     clouds = [tag for tag in found.Tags()["tensors"] if tag.startswith("p0/")]
     kinds = {tag.removeprefix("p0/").removesuffix("_VERTEX").removesuffix("_COLOR") for tag in clouds}
@@ -132,7 +180,10 @@ def test_the_session_says_what_the_run_is_and_that_it_ended(run):
     assert start.hparams["ablation"].string_value == "full"
     assert start.hparams["lr"].number_value == 0.1
     assert hparams(folder, "_hparams_/session_end_info").session_end_info.status == 1
-    assert events(folder).Scalars("hparam/psnr")[0].value == 30
+    columns = hparams(folder, "_hparams_/experiment").experiment.metric_infos
+    assert [column.name.tag for column in columns] == ["val/psnr"]
+    (written,) = events(folder).Tensors("measurement/text_summary")
+    assert "| release   |     30 |" in written.tensor_proto.string_val[0].decode()
 
 
 def test_nothing_of_the_clock_stays(run):
@@ -167,7 +218,7 @@ def test_logs_resume_where_the_checkpoint_was(tmp_path):
         rows = list(csv.DictReader(file))
     assert [float(row["a"]) for row in rows] == expected
     assert [row["b"] for row in rows] == ["", "1", "", "1", "", "1", "", ""]
-    scalars = events(tmp_path / "tensorboard").Scalars("a")
+    scalars = events(tmp_path / "tensorboard").Scalars("work/a")
     assert [(e.step, e.value) for e in scalars] == list(enumerate(expected, 1))
     assert [int(row["step"]) for row in rows] == list(range(1, 9))
 
@@ -182,7 +233,7 @@ def test_runs_of_a_sweep_leave_no_threads(tmp_path):
             logger.finalize("success")  # as Lightning does when training ends
         log_results(of_run, {"seed": number}, [{"views": 4, "targets": "release", "psnr": 30.0}], 1)
         close(of_run)
-        assert events(tmp_path / str(number) / "tensorboard").Scalars("hparam/psnr")[0].value == 30
+        assert events(tmp_path / str(number) / "tensorboard").Tensors("measurement/text_summary")
     assert threading.active_count() == before
 
 
@@ -196,12 +247,14 @@ def test_hyperparameters_are_choices_and_changes():
         "hydra/output": "ghgs",
         "logger": "csv",
         "encoder": "s",
+        "views": "v4",
     }
     overrides = ["ablation=full", "seed=2", "+data.people.train=3", "optimizer.betas=[0,1]"]
     overrides += ["hydra.run.dir=x", "~data.rig", "callbacks.last.every_n_train_steps=3"]
     assert hyperparameters(config, choices, overrides) == {
-        "ablation": "full", "encoder": "s", "seed": 2, "data.people.train": 3, "optimizer.betas": "[0, 1]",
+        "ablation": "full", "seed": 2, "data.people.train": 3, "optimizer.betas": "[0, 1]", "views": "v4",
     }  # fmt: skip
+    assert hyperparameters(config, choices, []) == {"seed": 2, "views": "v4"}
 
 
 def test_final_numbers_name_their_protocol():

@@ -332,7 +332,7 @@ def test_the_pictures_of_the_checkpoints_own_step_stay(tmp_path):
     assert torch.load(last, weights_only=True)["global_step"] == 8
     fit(tmp_path, Cut(), resume=last, every=4, more=[PicturesOptions(subjects=1).build()])
     found = EventAccumulator(str(tmp_path / "tensorboard"), size_guidance={"images": 0}).Reload()
-    assert [e.step for e in found.Images("sheet/p0")] == [4, 8, 12, 16]
+    assert [e.step for e in found.Images("view/sheet/p0")] == [4, 8, 12, 16]
 
 
 def test_a_longer_budget_is_no_difference():

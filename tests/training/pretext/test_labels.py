@@ -92,7 +92,7 @@ def test_validation_logs_the_share_of_attention_on_other_parts(size):
     pictures._log_other_parts(module, dataclasses.replace(batch, body_vertices=None))
     assert logged == {}
     pictures._log_other_parts(module, batch)
-    assert 0.05 < logged["attention/other_parts"] < 0.95
+    assert 0.05 < logged["val/attention_on_other_parts"] < 0.95
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,57 @@
+"""What a run of a grid is called where runs are compared: by what sets it apart, not by its hash."""
+
+from pathlib import Path
+
+from omegaconf import OmegaConf
+
+from ghgs_lit.runs.grid import PlannedRun, write_plan
+from ghgs_lit.runs.run import RunDirectory
+from ghgs_lit.training.loggers import TensorBoardOptions
+
+SHARED = ("experiment=demo", "data.root=a/b", "evaluation.views=[3,4]")
+
+
+def planned(folder, *grid: str, shared=SHARED) -> list[RunDirectory]:
+    """The runs of a grid, each said as ``ablation=full seed=1``, after its plan is written."""
+    items = []
+    for text in grid:
+        shown, name = (*shared, *text.split()), f"{abs(hash((text, shared))):x}"[:12]
+        items.append(PlannedRun(name, shown, shown, {"seed": 1}, RunDirectory(folder / name)))
+    write_plan(items, OmegaConf.create(), folder)
+    return [item.run for item in items]
+
+
+def test_runs_of_a_grid_have_the_names_of_what_differs(tmp_path):
+    """TensorBoard's files lie in folders of these names, below the sweep's; a seed is always said."""
+    runs = planned(tmp_path, "ablation=full seed=1", "ablation=neither seed=1", "+optimizer.lr=0.1 seed=1")
+    expected = ["ablation=full,seed=1", "ablation=neither,seed=1", "+optimizer.lr=0.1,seed=1"]
+    assert [run.title for run in runs] == expected
+    logs = [TensorBoardOptions().build(str(run.path)).log_dir for run in runs]
+    assert logs == [str(tmp_path / "tensorboard" / name) for name in expected]
+
+
+def test_a_run_keeps_its_name_when_the_grid_grows(tmp_path):
+    """Also where the longer grid says more of it; other settings of the same name get their hash."""
+    (first,) = planned(tmp_path, "seed=1", shared=("ablation=full",))
+    assert first.title == "ablation=full,seed=1"
+    again, other = planned(tmp_path, "seed=1", "seed=2", shared=("ablation=full",))
+    assert (again.title, other.title) == (first.title, "seed=2")
+    (twin,) = planned(tmp_path, "seed=2 trainer=gpu", shared=())
+    (third,) = planned(tmp_path, "seed=2", shared=())
+    assert twin.title == "seed=2,trainer=gpu"
+    assert third.title == f"seed=2,run={third.path.name}"
+
+
+def test_a_run_of_its_own_has_its_files_in_its_folder(tmp_path):
+    logger = TensorBoardOptions().build(str(tmp_path / "mine"))
+    assert Path(logger.log_dir) == tmp_path / "mine" / "tensorboard"
+    assert RunDirectory(tmp_path / "mine").swept == []
+
+
+def test_names_are_those_of_folders(tmp_path):
+    """Of a value that is a path, and of one that is long."""
+    long = "x" * 300
+    runs = planned(tmp_path, "init_from=a/b.ckpt seed=1", f"init_from={long} seed=2", shared=())
+    assert runs[0].title == "init_from=a_b.ckpt,seed=1"
+    assert runs[1].title.endswith("x,seed=2")
+    assert len(runs[1].title) == 200
