@@ -1,0 +1,327 @@
+r"""All that is worth measuring in the first minutes on a GPU: one prepared script for rented ones.
+
+    python benchmarks/gpu.py --dry first second          # rehearse on the pretend device of the tests
+    python benchmarks/gpu.py first                       # 420 s: predictions, steps, graphs, loader
+    python benchmarks/gpu.py second                      # 240 s of training after at most 180 of preparation
+    python benchmarks/gpu.py step prediction             # sections by name
+    python benchmarks/gpu.py --table runs/gpu            # the tables again, from the files alone
+
+Each section is a process of its own with a time limit. Findings are lines of JSON in ``<out>/<run>.jsonl`` as
+soon as they are known; a section that fails or takes too long is a row with its last lines, and the others go
+on. In the background gsplat is compiled (its kernels for up to 9 channels, for this GPU) and built-in people
+are rendered on all cores; they pause while a section measures what a busy host would spoil. Both lie in
+``--work``, where the next call finds them.
+
+A compiled gsplat can travel along. On a machine with nvcc, and with the Python and the PyTorch of the one
+with the GPU (not tried yet):
+
+    TORCH_CUDA_ARCH_LIST="8.0;9.0" pip install --no-build-isolation --no-deps --no-binary gsplat \
+        --target gsplat_built gsplat==1.5.3
+    python benchmarks/gpu.py --gsplat gsplat_built first
+
+``second`` trains ``experiment=shipped`` with batches of eight; further overrides follow its name. With
+``--beside <run>/csv/metrics.csv`` its table has the scores of another run, such as a CPU's, after as many
+samples (``--beside-samples`` a step).
+"""
+
+import argparse
+import importlib.util
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.gpu_call import DRY, Call, Rows, Sizes
+from benchmarks.gpu_data import validations
+from benchmarks.gpu_measure import Gpu, reason, rehearsal
+from benchmarks.gpu_sections import SECTIONS
+
+GSPLAT, PEOPLE = "gsplat", "people"
+CHANNELS = 9  #: Kernels of gsplat for more channels are not compiled.
+LAST_LINES = 12  #: of a section that failed
+
+
+@dataclass(frozen=True)
+class Plan:
+    """When a section runs: its limit in seconds, what it needs, whether the background pauses meanwhile, and
+    how long it waits for more people than the first."""
+
+    seconds: int
+    needs: tuple[str, ...] = ()
+    quiet: bool = False
+    patience: int = 0
+
+
+#: The most valuable first; a section that must wait for its needs lets the next one pass.
+PLANS = {
+    "machine": Plan(40),
+    "step": Plan(75, (GSPLAT,), quiet=True),
+    "prediction": Plan(75, (GSPLAT,), quiet=True),
+    "graphs": Plan(60, (GSPLAT,), quiet=True),
+    "paper": Plan(75),
+    "frozen": Plan(60, (GSPLAT,)),
+    "loader": Plan(75, (GSPLAT, PEOPLE), quiet=True),
+    "kernels": Plan(75, (GSPLAT,)),
+    "check": Plan(75, (GSPLAT,)),
+    "training": Plan(240, (GSPLAT, PEOPLE), patience=150),
+}
+#: Runs: sections, and seconds in total.
+RUNS = {
+    "first": ([name for name in PLANS if name != "training"], 420),
+    "second": (["machine", "training"], 440),
+}
+
+
+class Background:
+    """A process beside the sections, in a session of its own, whose output is kept in a file."""
+
+    def __init__(self, command: list[str], environment: dict[str, str]):
+        self.log = tempfile.TemporaryFile("w+")  # noqa: SIM115
+        self.process = subprocess.Popen(
+            command, env=environment, stdout=self.log, stderr=subprocess.STDOUT, start_new_session=True
+        )
+
+    def is_running(self) -> bool:
+        return self.process.poll() is None
+
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal to the process and its children, if it still runs."""
+        if self.is_running():
+            os.killpg(self.process.pid, number)
+
+    def wait(self, seconds: float) -> bool:
+        """Whether it ended within ``seconds``; it is ended otherwise."""
+        try:
+            self.process.wait(max(seconds, 0))
+        except subprocess.TimeoutExpired:
+            self.stop()
+            return False
+        return True
+
+    def stop(self) -> None:
+        self.send(signal.SIGCONT)
+        self.send(signal.SIGKILL)
+        self.process.wait()
+
+    def last_lines(self) -> list[str]:
+        self.log.seek(0)
+        lines = [line.rstrip()[:300] for line in self.log if line.strip()]
+        return lines[-LAST_LINES:]
+
+
+class Session:
+    """Sections of a run, one after another, beside the background."""
+
+    def __init__(self, options: argparse.Namespace, rows: Rows, plans: dict[str, Plan], seconds: float):
+        self.options, self.rows, self.plans = options, rows, plans
+        self.scale = 10 if options.dry else 1  # processors without a GPU take longer
+        self.started, self.end = time.monotonic(), time.monotonic() + self.scale * seconds
+        self.environment = environment_of(options)
+        needs = {need for plan in plans.values() for need in plan.needs}
+        self.background = {need: Background(self.command(need), self.environment) for need in sorted(needs)}
+
+    def command(self, section: str) -> list[str]:
+        options = self.options
+        if section == GSPLAT:
+            return [sys.executable, "-c", "pass" if options.dry else BUILD, str(options.work)]
+        own = ["--section", section, "--out", str(self.rows.file), "--work", str(options.work)]
+        dry = ["--dry"] if options.dry else []
+        nice = ["nice", "-n", "19"] if section == PEOPLE else []
+        return [*nice, sys.executable, __file__, *own, *dry, *options.overrides]
+
+    def run(self) -> None:
+        waiting = dict(self.plans)
+        try:
+            while waiting and time.monotonic() < self.end:
+                ready = [name for name, plan in waiting.items() if self.is_ready(plan)]
+                if not ready:
+                    time.sleep(0.2)
+                    continue
+                plan = waiting.pop(ready[0])
+                self.measure(ready[0], plan)
+            for name in waiting:
+                self.note(name, "no time was left", 0.0, [])
+        finally:
+            for process in self.background.values():
+                process.stop()
+
+    def is_ready(self, plan: Plan) -> bool:
+        """Whether what a section needs is there, or will never be."""
+        if GSPLAT in plan.needs and self.background[GSPLAT].is_running():
+            return False
+        if PEOPLE not in plan.needs or not self.background[PEOPLE].is_running():
+            return True
+        is_first_there = any(row["section"] == PEOPLE and "numbers" in row for row in self.rows.read())
+        return is_first_there and time.monotonic() - self.started >= plan.patience
+
+    def measure(self, name: str, plan: Plan) -> None:
+        """Run a section; note how it ended."""
+        for need in plan.needs:
+            process = self.background[need]
+            if need == PEOPLE and plan.patience:
+                process.stop()  # its cores are wanted
+            elif not process.is_running() and process.process.returncode:
+                self.note(name, f"{need} failed", 0.0, process.last_lines())
+                return
+        for process in self.background.values():
+            process.send(signal.SIGSTOP if plan.quiet else signal.SIGCONT)
+        begun = time.monotonic()
+        section = Background(self.command(name), self.environment)
+        in_time = section.wait(min(self.scale * plan.seconds, self.end - begun))
+        status = "done" if section.process.returncode == 0 else "failed" if in_time else "took too long"
+        self.note(name, status, time.monotonic() - begun, [] if status == "done" else section.last_lines())
+        for process in self.background.values():
+            process.send(signal.SIGCONT)
+
+    def note(self, section: str, status: str, seconds: float, last_lines: list[str]) -> None:
+        self.rows.add(section=section, status=status, s=seconds, last_lines=last_lines)
+        print(f"{time.monotonic() - self.started:6.0f} s  {section}: {status}", *last_lines[-1:], flush=True)
+
+
+#: Compiles gsplat by importing it.
+BUILD = "from gsplat.cuda._backend import _C; assert _C is not None, 'gsplat found no CUDA compiler'"
+
+
+def environment_of(options: argparse.Namespace) -> dict[str, str]:
+    """Variables of all processes: where gsplat, its build and the people are."""
+    root = str(Path(__file__).resolve().parents[1])
+    paths = [root, *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
+    if options.gsplat is not None:
+        paths.insert(0, str(options.gsplat))
+    elif not options.dry and (found := importlib.util.find_spec("gsplat")) is not None:
+        paths.insert(0, str(fewer_channels(Path(found.origin).parent, options.work / "gsplat_source")))
+    defaults = {"TORCH_EXTENSIONS_DIR": str(options.work / "extensions"), "GHGS_CACHE": str(options.work)}
+    defaults |= {"MAX_JOBS": str(os.cpu_count()), "PYTHONUNBUFFERED": "1"}
+    return {**defaults, **os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
+
+
+def fewer_channels(package: Path, folder: Path) -> Path:
+    """A copy of gsplat in ``folder`` whose kernels for many channels are left out: a third of the time."""
+    if not folder.exists():
+        shutil.copytree(package, folder / package.name)
+        for file in folder.glob("*/cuda/csrc/*.c*"):
+            lines = file.read_text().splitlines()
+            file.write_text("\n".join(line for line in lines if not is_for_many_channels(line)) + "\n")
+    return folder
+
+
+def is_for_many_channels(line: str) -> bool:
+    """Whether a line of gsplat's sources makes or starts a kernel that is left out."""
+    found = re.fullmatch(r"\s*__(?:INS|LAUNCH_KERNEL)__\((\d+)\)", line)
+    return found is not None and int(found[1]) > CHANNELS
+
+
+def run_section(options: argparse.Namespace) -> None:
+    """Run one section in this process."""
+    real = nullcontext(Gpu(torch.device("cuda"), is_real=True))
+    with rehearsal() if options.dry else real as gpu:
+        sizes = DRY if options.dry else Sizes()
+        call = Call(gpu, Rows(options.out), options.section, sizes, options.work, options.overrides)
+        try:
+            SECTIONS[options.section](call)
+        except Exception as error:
+            traceback.print_exc()
+            sys.exit(reason(error))
+
+
+def shown(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    return str(value).replace("|", "/")
+
+
+def table(rows: list[dict[str, Any]]) -> list[str]:
+    """Rows as Markdown, with a column for each of their numbers."""
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
+    return lines + [f"| {' | '.join(shown(row.get(column, '')) for column in columns)} |" for row in rows]
+
+
+def report(found: list[dict[str, Any]], beside: list[dict[str, float]]) -> str:
+    """Tables of all sections, and the kernels that take most of the time of each row that has them."""
+    lines, hidden = [], ("section", "status", "last_lines", "longest", "numbers")
+    for name, section in SECTIONS.items():
+        own = [row for row in found if row["section"] == name]
+        ends, rows = ([row for row in own if ("row" in row) == has] for has in (False, True))
+        title = (
+            f"{section.__doc__.strip()} ({', '.join(row['status'] for row in ends) or 'in the background'})"
+        )
+        if name == "training":
+            rows = [row | compared(row, beside) for row in rows]
+        if own:
+            lines.append(f"\n## {title}\n")
+        if rows:
+            keep = [{key: row[key] for key in row if key not in hidden} for row in rows]
+            lines += table(keep)
+        lines += [f"    {line}" for row in ends for line in row["last_lines"]]
+        for row in rows:
+            if row.get("longest") and ":" not in row["row"]:
+                heads = ("kernel", "calls", "ms")
+                longest = [dict(zip(heads, kernel, strict=True)) for kernel in row["longest"][:10]]
+                lines += [f"\nLongest kernels: {row['row']}\n", *table(longest)]
+    return "\n".join(lines)
+
+
+def compared(row: dict[str, Any], beside: list[dict[str, float]]) -> dict[str, float]:
+    """Scores of the other run at its last validation after at most as many samples."""
+    before = [other for other in beside if other["samples"] <= row["samples"]]
+    return {f"other's {name}": value for name, value in before[-1].items()} if before else {}
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("names", nargs="*", help=f"{', '.join(RUNS)}, sections, overrides of the training")
+    parser.add_argument("--out", type=Path, default=Path(os.environ.get("OUT", "runs/gpu")))
+    parser.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "ghgs_gpu")
+    parser.add_argument("--gsplat", type=Path, help="folder of a compiled gsplat")
+    parser.add_argument("--dry", action="store_true", help="rehearse without a GPU, with small sizes")
+    parser.add_argument("--table", type=Path, metavar="FOLDER", help="print the tables of files, no more")
+    parser.add_argument("--beside", type=Path, help="csv/metrics.csv of another training")
+    parser.add_argument("--beside-samples", type=int, default=2, help="its samples a step")
+    parser.add_argument("--section", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    options.overrides = [name for name in options.names if "=" in name]
+    options.names = [name for name in options.names if "=" not in name]
+    unknown = set(options.names) - set(RUNS) - set(PLANS)
+    if unknown:
+        parser.error(f"expected {', '.join([*RUNS, *PLANS])}; found {', '.join(sorted(unknown))}")
+    return options
+
+
+def main() -> None:
+    options = arguments()
+    if options.section:
+        run_section(options)
+        return
+    folder = options.table or options.out
+    if options.table is None:
+        if not options.dry and not torch.cuda.is_available():
+            sys.exit("device: expected a CUDA device, or --dry; found none")
+        folder.mkdir(parents=True, exist_ok=True)
+        options.work.mkdir(parents=True, exist_ok=True)
+        for name in options.names or ["first"]:
+            sections, seconds = RUNS.get(name) or ([name], PLANS[name].seconds + 180)
+            file = folder / f"{name}.jsonl"
+            file.unlink(missing_ok=True)
+            Session(options, Rows(file), {section: PLANS[section] for section in sections}, seconds).run()
+    beside = [] if options.beside is None else validations(options.beside)
+    beside = [row | {"samples": row["step"] * options.beside_samples} for row in beside]
+    for file in sorted(folder.glob("*.jsonl")):
+        print(f"\n# {file.stem}\n{report(Rows(file).read(), beside)}")
+
+
+if __name__ == "__main__":
+    main()

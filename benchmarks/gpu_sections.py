@@ -1,0 +1,304 @@
+"""What ``benchmarks/gpu.py`` measures: functions of a :class:`Call`; docstrings are titles of tables."""
+
+import contextlib
+import gc
+import importlib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from typing import Any
+from unittest import mock
+
+import torch
+from torch import Tensor, nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
+
+from benchmarks.gpu_call import Call, Config
+from benchmarks.gpu_data import loader, people, training
+from benchmarks.gpu_measure import reason
+from ghgs_lit.config import build
+from ghgs_lit.diagnostics.benchmark.stages import TOTAL, SecondsProbe, inside, top_level, watched
+from ghgs_lit.diagnostics.doctor.selfcheck import PASSED, selfcheck
+from ghgs_lit.diagnostics.machine import machine_facts
+from ghgs_lit.kernels.watching import Inputs, Watcher
+from ghgs_lit.kernels.watching import watched as stages_watched
+from ghgs_lit.model import GHGS
+from ghgs_lit.stages import STAGES
+from ghgs_lit.types import Batch, map_tensors
+
+PRECISIONS = ("float32", "tf32", "bfloat16")
+
+
+@contextlib.contextmanager
+def products(tf32: bool) -> Iterator[None]:
+    """Products and convolutions of float32 numbers in TF32, or not."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high" if tf32 else "highest")
+    try:
+        with torch.backends.cudnn.flags(allow_tf32=tf32):
+            yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+def machine(call: Call) -> None:
+    """The machine, and what it can do at best"""
+    gpu, sizes = call.gpu, call.sizes
+    facts = machine_facts(gpu.device if gpu.is_real else torch.device("cpu"))
+    call.add("versions", **{name: str(value) for name, value in facts.items()})
+    source = torch.rand(sizes.copied, device=gpu.device)
+    target = torch.empty_like(source)
+    ms = gpu.milliseconds(lambda: target.copy_(source), sizes.repeats)
+    call.add("copy", ms=ms, gb_s=2 * source.nbytes / ms / 1e6)
+    for name in PRECISIONS:
+        dtype = torch.bfloat16 if name == "bfloat16" else torch.float32
+        a, b = (torch.rand(sizes.product, sizes.product, device=gpu.device).to(dtype) for _ in range(2))
+        with products(name == "tf32"):
+            ms = gpu.milliseconds(partial(torch.mm, a, b), sizes.repeats)
+        call.add(f"product, {name}", ms=ms, tflop_s=2 * sizes.product**3 / ms / 1e9)
+
+
+def check(call: Call) -> None:
+    """Self-check: what did not pass"""
+    count, passed = 0, 0
+    for outcome in selfcheck(call.config("encoder=vggt_nano", "model=hull"), call.gpu.device):
+        count, passed = count + 1, passed + (outcome.status == PASSED)
+        if outcome.status != PASSED:
+            call.add(outcome.check, outcome=outcome.status, found=outcome.found)
+    call.add("all", outcome=f"{passed} of {count} pass")
+
+
+def _built(call: Call, config: Config) -> GHGS:
+    """A model with fresh weights, made on the device."""
+    with call.gpu.device:
+        return GHGS.from_config(config).to(call.gpu.device)
+
+
+def _predicted(call: Call, name: str, model: GHGS, batch: Batch) -> None:
+    """Rows of a prediction in each precision."""
+    for precision in PRECISIONS:
+        model.precision = "float32" if precision == "tf32" else precision
+        with products(precision == "tf32"), torch.no_grad():
+            run = partial(model, batch)
+            ms = call.gpu.milliseconds(run, call.sizes.repeats)
+            probe = SecondsProbe(call.gpu.device)
+            with watched(model, probe), inside(TOTAL, probe):
+                run()
+            seconds = probe.seconds()
+            stages = {f"{stage}_ms": 1e3 * seconds[stage] for stage in top_level(seconds)}
+            call.add(f"{name}, {precision}", ms=ms, **call.gpu.work(run), **stages)
+
+
+def prediction(call: Call) -> None:
+    """A prediction of the weights that come with the package, eager"""
+    model = GHGS.from_checkpoint().to(call.gpu.device)
+    for size in call.sizes.batches:
+        batch = replace(call.batch(size, call.sizes.side), targets=None).to(call.gpu.device)
+        _predicted(call, f"{call.sizes.side}², batch of {size}", model, batch)
+
+
+def paper(call: Call) -> None:
+    """A prediction of a large encoder, model=paper"""
+    model = _built(call, call.config(f"encoder={call.sizes.encoder}", "model=paper")).eval()
+    batch = replace(call.batch(1, call.sizes.large), targets=None).to(call.gpu.device)
+    _predicted(call, f"{call.sizes.encoder}, {call.sizes.large}²", model, batch)
+
+
+class _FirstInputs(Watcher):
+    """What each stage is called with first."""
+
+    def __init__(self) -> None:
+        self.inputs: dict[str, Inputs] = {}
+
+    def begin(self, stage: str, inputs: Inputs = ((), {})) -> None:
+        self.inputs.setdefault(stage, inputs)
+
+
+#: Parts of a prediction that are recorded by themselves, by their path in the model.
+PIECES = (*STAGES, "gaussian_head.activate", "rounds")
+
+
+@torch.no_grad()
+def graphs(call: Call) -> None:
+    """CUDA graphs: each piece of a prediction, then the whole"""
+    model = GHGS.from_checkpoint().to(call.gpu.device)
+    for size in call.sizes.batches:
+        batch = replace(call.batch(size, call.sizes.side), targets=None).to(call.gpu.device)
+        seen = _FirstInputs()
+        with stages_watched(model, {piece: piece for piece in PIECES}, seen):
+            model(batch)
+        for piece, (arguments, options) in seen.inputs.items():
+            stage = model
+            for name in piece.split("."):
+                stage = getattr(stage, name)
+            _recorded(call, f"batch of {size}, {piece}", partial(stage, *arguments, **options))
+        _recorded(call, f"batch of {size}, all", partial(model, batch))
+
+
+def _recorded(call: Call, name: str, run: Callable[[], Any]) -> None:
+    """Row of a recording: eager and played back, or why it cannot be recorded."""
+    eager = call.gpu.milliseconds(run, call.sizes.repeats)
+    try:
+        play, _ = call.gpu.recorded(run)
+        ms = call.gpu.milliseconds(play, call.sizes.repeats)
+    except RuntimeError as error:
+        call.add(name, eager_ms=eager, refused=reason(error))
+    else:
+        call.add(name, eager_ms=eager, graph_ms=ms, busy_ms=call.gpu.work(play)["busy_ms"])
+
+
+class _Step:
+    """A training step on a batch in page-locked memory, in parts."""
+
+    def __init__(self, call: Call, config: Config, batch: Batch, autocast: bool = False):
+        self.device, self.host, self.autocast = call.gpu.device, batch, autocast
+        self.model = _built(call, config).train()
+        if self.model.rounds is not None:
+            self.model.rounds._drawn = lambda: 2
+        self.renderer, self.losses = (build(config[name], name) for name in ("renderer", "loss"))
+        self.options = build(config["optimizer"], "optimizer")
+        self.optimizer = self.options.optimizer(self.model)
+
+    def data(self) -> None:
+        self.batch = self.host.to(self.device, non_blocking=True)
+
+    def forward(self) -> None:
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast):
+            self.prediction = self.model(self.batch)
+
+    def render(self) -> None:
+        self.rendering = self.renderer(self.prediction.gaussians, self.batch.targets.cameras)
+
+    def loss(self) -> None:
+        self.total = self.losses(self.prediction, self.rendering, self.batch)[0]
+
+    def backward(self) -> None:
+        self.total.backward()
+
+    def optimize(self) -> None:
+        nn.utils.clip_grad_norm_(self.model.parameters(), self.options.clip, foreach=True)
+        self.optimizer.step()
+        self.optimizer.zero_grad()
+
+    @property
+    def parts(self) -> list[Callable[[], None]]:
+        return [self.data, self.forward, self.render, self.loss, self.backward, self.optimize]
+
+    def __call__(self) -> None:
+        for part in self.parts:
+            part()
+
+
+def _stepped(call: Call, name: str, step: _Step) -> None:
+    """Rows of a step: as a whole, and of each part by itself."""
+    torch.cuda.reset_peak_memory_stats()
+    ms = call.gpu.milliseconds(step, call.sizes.repeats)
+    call.add(name, ms=ms, peak_gb=torch.cuda.max_memory_allocated() / 1e9, **call.gpu.work(step, 2))
+    together = call.gpu.milliseconds_of_each(step.parts, call.sizes.repeats)
+    for part, ms in zip(step.parts, together, strict=True):
+        call.add(f"{name}: {part.__name__}", ms=ms, **call.gpu.work(part, 1))
+
+
+def step(call: Call) -> None:
+    """A training step of experiment=shipped on a batch that is ready, two rounds; parts by themselves"""
+    for size in reversed(call.sizes.batches):
+        made = _Step(call, call.config(*call.shipped), call.batch(size, call.sizes.side))
+        _stepped(call, f"batch of {size}", made)
+        del made
+        gc.collect()
+
+
+def frozen(call: Call) -> None:
+    """A training step of a large frozen encoder within 24 GB, model=paper, loss=paper, bf16-mixed"""
+    total = torch.cuda.get_device_properties(call.gpu.device).total_memory
+    torch.cuda.set_per_process_memory_fraction(min(24e9 / total, 1.0))
+    encoder = [f"encoder={call.sizes.encoder}", "encoder.trainable=none", "model=paper", "loss=paper"]
+    for size in call.sizes.large_batches:
+        try:
+            made = _Step(call, call.config(*encoder), call.batch(size, call.sizes.large), autocast=True)
+            _stepped(call, f"batch of {size}", made)
+        except torch.cuda.OutOfMemoryError as error:
+            call.add(f"batch of {size}", refused=reason(error))
+        made = None
+        gc.collect()
+        torch.cuda.empty_cache()
+
+
+#: Functions whose operators are pointwise chains, where they are looked up.
+CHAINS = (
+    "ghgs_lit.heads.gaussian.surface_axes",
+    "ghgs_lit.rounds.observation.looked_up",
+    "ghgs_lit.rounds.rounds.consistency_of",
+    "ghgs_lit.bounds.box.subject_box",
+    "ghgs_lit.bounds.hull._march",
+)
+
+
+def kernels(call: Call) -> None:
+    """Chains of small operators: eager and compiled, beside the rate of a copy; attention by backend"""
+    model = GHGS.from_checkpoint().to(call.gpu.device)
+    batch = replace(call.batch(max(call.sizes.batches), call.sizes.side), targets=None).to(call.gpu.device)
+    for chain in CHAINS:
+        module, _, name = chain.rpartition(".")
+        function = getattr(importlib.import_module(module), name, None)
+        if function is None:
+            call.add(name, refused=f"{module} has no {name}")
+            continue
+        with mock.patch(chain, side_effect=function) as watching, torch.no_grad():
+            model(batch)
+        if not watching.called:
+            call.add(name, refused="not called")
+            continue
+        run = partial(function, *watching.call_args.args, **watching.call_args.kwargs)
+        moved = _bytes((watching.call_args.args, watching.call_args.kwargs)) + _bytes(run())
+        _chain(call, name, "eager", run, moved)
+        compiled = torch.compile(function, dynamic=False)
+        run = partial(compiled, *watching.call_args.args, **watching.call_args.kwargs)
+        _chain(call, name, "compiled", run, moved)
+    _attention(call)
+
+
+@torch.no_grad()
+def _chain(call: Call, name: str, kind: str, run: Callable[[], Any], moved: int) -> None:
+    """Row of a chain, whose rate is by the bytes that it must read and write at least."""
+    try:
+        ms, work = call.gpu.milliseconds(run, call.sizes.repeats), call.gpu.work(run)
+        call.add(f"{name}, {kind}", ms=ms, gb_s=moved / max(work["busy_ms"], 1e-6) / 1e6, **work)
+    except Exception as error:
+        call.add(f"{name}, {kind}", refused=reason(error))
+
+
+def _bytes(value: Any) -> int:
+    found: list[int] = []
+
+    def note(tensor: Tensor) -> Tensor:
+        found.append(tensor.nbytes)
+        return tensor
+
+    map_tensors(value, note)
+    return sum(found)
+
+
+@torch.no_grad()
+def _attention(call: Call) -> None:
+    """Rows of the global attention of ``vggt_1b`` in bfloat16."""
+    tokens = call.sizes.views * ((call.sizes.large // 14) ** 2 + 5)
+    q, k, v = torch.rand(3, 1, 16, tokens, 64, device=call.gpu.device, dtype=torch.bfloat16)
+    for backend in (SDPBackend.FLASH_ATTENTION, SDPBackend.CUDNN_ATTENTION, SDPBackend.EFFICIENT_ATTENTION):
+        name = f"attention, {tokens} tokens, {backend.name.lower()}"
+        try:
+            with sdpa_kernel(backend):
+                run = partial(nn.functional.scaled_dot_product_attention, q, k, v)
+                ms = call.gpu.milliseconds(run, call.sizes.repeats)
+            call.add(name, ms=ms, tflop_s=4 * 16 * tokens**2 * 64 / ms / 1e9)
+        except RuntimeError as error:
+            call.add(name, refused=reason(error))
+
+
+SECTIONS: dict[str, Callable[[Call], None]] = {
+    section.__name__: section
+    for section in (
+        *(machine, step, prediction, graphs, check, paper, frozen, kernels, loader),
+        *(people, training),
+    )
+}

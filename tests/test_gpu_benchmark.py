@@ -1,0 +1,83 @@
+"""The benchmark of a GPU: its sections run in a rehearsal, and none stops the others."""
+
+import argparse
+import dataclasses
+import sys
+
+import pytest
+import torch
+
+from benchmarks import gpu
+from benchmarks.gpu_call import DRY, Call, Rows
+from benchmarks.gpu_measure import rehearsal
+from benchmarks.gpu_sections import SECTIONS
+
+TINY = dataclasses.replace(DRY, side=28, batches=(1,), large_batches=(1,), large=28)
+
+
+@pytest.fixture
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.filterwarnings("ignore:CUDA is not available")
+@pytest.mark.parametrize("section", ["machine", "step"])
+def test_a_section_runs_in_a_rehearsal(section, tmp_path, one_thread):
+    """Without a GPU, so that no minute on one is lost to a mistake."""
+    with rehearsal() as device:
+        call = Call(device, Rows(tmp_path / "rows.jsonl"), section, TINY, tmp_path)
+        SECTIONS[section](call)
+    found = call.rows.read()
+    names = [row["row"] for row in found]
+    if section == "machine":
+        assert names == [
+            "versions",
+            "copy",
+            *(f"product, {name}" for name in ("float32", "tf32", "bfloat16")),
+        ]
+    if section == "step":
+        parts = ("data", "forward", "render", "loss", "backward", "optimize")
+        assert names == ["batch of 1", *(f"batch of 1: {part}" for part in parts)]
+        assert all(row["ms"] > 0 and row["launches"] > 0 and len(row["longest"]) <= 40 for row in found)
+
+
+def test_a_section_that_fails_or_hangs_stops_no_other(tmp_path, monkeypatch, capsys):
+    """Its last lines are reported, what it has found stays, and the tables come from the files alone."""
+    file = tmp_path / "first.jsonl"
+    line = '{"section": "step", "row": "batch of 8", "ms": 12.5}'
+    codes = {
+        "gsplat": "pass",
+        "step": f"open({str(file)!r}, 'a').write({line + chr(10)!r}); raise ValueError('no memory')",
+        "graphs": "import time; time.sleep(60)",
+        "paper": "pass",
+    }
+    monkeypatch.setattr(gpu.Session, "command", lambda _, name: [sys.executable, "-c", codes[name]])
+    plans = {
+        "step": gpu.Plan(30, ("gsplat",)),
+        "graphs": gpu.Plan(1, ("gsplat",), quiet=True),
+        "paper": gpu.Plan(30),
+    }
+    options = argparse.Namespace(dry=False, gsplat=tmp_path, work=tmp_path, overrides=[])
+    gpu.Session(options, Rows(file), plans, 60).run()
+    ends = {row["section"]: row["status"] for row in Rows(file).read() if "status" in row}
+    assert ends == {"step": "failed", "graphs": "took too long", "paper": "done"}
+    capsys.readouterr()
+    monkeypatch.setattr(sys, "argv", ["gpu.py", "--table", str(tmp_path)])
+    gpu.main()
+    printed = capsys.readouterr().out
+    assert "| batch of 8 | 12.5 |" in printed
+    assert "ValueError: no memory" in printed
+
+
+def test_a_section_whose_needs_failed_is_not_run(tmp_path, monkeypatch):
+    """gsplat that does not compile is said once for each section, with the compiler's last lines."""
+    code = "import sys; sys.exit('nvcc: not found')"
+    monkeypatch.setattr(gpu.Session, "command", lambda _, name: [sys.executable, "-c", code])
+    options = argparse.Namespace(dry=False, gsplat=tmp_path, work=tmp_path, overrides=[])
+    rows = Rows(tmp_path / "first.jsonl")
+    gpu.Session(options, rows, {"step": gpu.Plan(30, ("gsplat",))}, 60).run()
+    [row] = rows.read()
+    assert (row["status"], row["last_lines"]) == ("gsplat failed", ["nvcc: not found"])
