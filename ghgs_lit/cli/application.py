@@ -20,6 +20,7 @@ from ghgs_lit.cli import messages
 from ghgs_lit.cli.usage import VERBS
 from ghgs_lit.config import VERSION_BASE, conf_dir, own_keys
 from ghgs_lit.config.compose import check_ablation
+from ghgs_lit.config.outside import check_outside_files
 from ghgs_lit.config.registry import check
 from ghgs_lit.files import require_no_links, write_text_atomically
 from ghgs_lit.kernels.allocation import collect_garbage_again
@@ -28,6 +29,7 @@ from ghgs_lit.runs.job import register_resolvers
 from ghgs_lit.runs.signals import Interrupted, interruptible
 
 register_resolvers()  # on import, so that the processes of a launcher have them too
+check_outside_files()
 
 
 def module_of(verb: str) -> str:

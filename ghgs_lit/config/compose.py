@@ -90,11 +90,11 @@ def check_ablation(cfg: DictConfig, hydra_node: DictConfig) -> None:
         return
     wanted = flatten(OmegaConf.to_container(loader.repository.load_config(f"ablation/{name}").config))
     composed = OmegaConf.to_container(cfg)
-    overrides = OverridesParser.create().parse_overrides(list(hydra_node.overrides.task))
-    said = ["hydra", *(part.key_or_group for part in overrides)]
+    overrides = OmegaConf.to_container(hydra_node.overrides.task)  # with interpolations as they were typed
+    said = [part.key_or_group for part in OverridesParser.create().parse_overrides(overrides)]
     for key, value in wanted.items():
         found = lookup(composed, key)
-        holds = not key or found == value or is_below(key, said)
+        holds = not key or found == value or is_below(key, ["hydra", *said])
         require(holds, key, f"{value!r}, as ablation/{name}.yaml sets it", found)
 
 

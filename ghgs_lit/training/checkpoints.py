@@ -5,7 +5,7 @@ import time
 from collections.abc import Mapping
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import lightning.pytorch as L
 import torch
@@ -13,7 +13,7 @@ from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from pydantic import Field
 
-from ghgs_lit.config.options import Index, Options, Text
+from ghgs_lit.config.options import Index, Options, Text, Words
 from ghgs_lit.errors import require
 from ghgs_lit.files import write_atomically
 from ghgs_lit.runs.signals import Interrupted, handle, handlers
@@ -66,12 +66,20 @@ def validates_now(trainer: L.Trainer) -> bool:
     return (trainer.fit_loop.total_batch_idx + 1) % every == 0
 
 
+#: A name in which Lightning fills in logged values, and which leaves its folder by none of them.
+FileName = Annotated[
+    str,
+    Field(pattern=r"^([^/\\{}\x00-\x1f]|\{[\w/]+(:[\w.]*)?\})+$"),
+    Words("a name without folders, such as best or {step}"),
+]
+
+
 class CheckpointOptions(Options):
     """A checkpoint in ``<run>/checkpoints`` at intervals of steps or minutes, or of the best validation. List
     callbacks with a monitor before those without, so that the best checkpoint is chosen first."""
 
     group = "callbacks.checkpoints"
-    filename: Text
+    filename: FileName
     """Name of the file, without .ckpt; with {step} in it all are kept, unless there is a monitor."""
     monitor: Text | None = None
     """Logged value that is compared at each validation, the higher the better; null: none."""

@@ -1,0 +1,125 @@
+"""Files of ``--config-dir`` say to Hydra only what a list allows; the rest is the command line's."""
+
+import os
+
+import pytest
+from omegaconf import OmegaConf
+
+from tests.cli.test_main import call
+
+GLOBAL = "# @package _global_\n"
+#: Hydra's own words that call, by the file that says them: {file: text}, and what is named.
+REFUSED = {
+    "environment": ({"experiment/x": GLOBAL + "hydra: {job: {env_set: {A: b}}}"}, "hydra.job.env_set.A='b'"),
+    "callbacks": (
+        {"experiment/x": GLOBAL + "hydra: {callbacks: {a: {_target_: CALL}}}"},
+        "hydra.callbacks.a._target_=",
+    ),
+    "logging": (
+        {"experiment/x": GLOBAL + "hydra: {job_logging: {handlers: {a: {(): CALL}}}}"},
+        "hydra.job_logging.handlers.a.()=",
+    ),
+    "a sampler": (
+        {"experiment/x": GLOBAL + "hydra: {sweeper: {sampler: {_target_: CALL}}}"},
+        "hydra.sweeper.sampler._target_=",
+    ),
+    "a value of the grid": (
+        {"experiment/x": GLOBAL + "hydra: {sweeper: {params: {seed: {_target_: CALL}}}}"},
+        "hydra.sweeper.params.seed._target_=",
+    ),
+    "a list of the grid": (
+        {"experiment/x": GLOBAL + "hydra: {sweeper: {params: {seed: [{_target_: CALL}]}}}"},
+        "hydra.sweeper.params.seed=[",
+    ),
+    "a reference": (
+        {"experiment/x": GLOBAL + "seed: {_target_: CALL}\nhydra: {sweeper: {params: {seed: '${seed}'}}}"},
+        "hydra.sweeper.params.seed='${seed}'",
+    ),
+    "a reference for all": ({"experiment/x": GLOBAL + "hydra: {callbacks: '${data}'}"}, "hydra.callbacks="),
+    "commands of a queue": (
+        {"experiment/x": GLOBAL + "hydra: {launcher: {setup: [touch CALLED]}}"},
+        "hydra.launcher.setup=",
+    ),
+    "a second line for a queue": (
+        {"experiment/x": GLOBAL + 'hydra: {launcher: {partition: "a\\ntouch CALLED"}}'},
+        "hydra.launcher.partition=",
+    ),
+    "a search path": ({"experiment/x": GLOBAL + "hydra: {searchpath: [pkg://x]}"}, "hydra.searchpath="),
+    "a package": ({"experiment/x": "# @package hydra.job\nenv_set: {A: b}"}, "hydra.job.env_set.A="),
+    "a group of Hydra": (
+        {
+            "experiment/x": GLOBAL + "defaults: [{override /hydra/callbacks: y}]",
+            "hydra/callbacks/y": "a: {_target_: CALL}",
+        },
+        "hydra.callbacks.a._target_=",
+    ),
+    "a moved group": (
+        {"experiment/x": GLOBAL + "defaults: [{/views@hydra.job.env_set: y}]", "views/y": "A: b"},
+        "defaults: expected nothing that is moved into hydra; found '/views@hydra.job.env_set'",
+    ),
+    "a file that is moved": (
+        {
+            "experiment/x": GLOBAL + "defaults: [{/views@_global_: y}]",
+            "views/y": "hydra: {job: {env_set: {A: b}}}",
+        },
+        "views/y.yaml: hydra: ",
+    ),
+}
+
+
+def written(folder, files):
+    for name, text in files.items():
+        path = folder / "conf" / f"{name}.yaml"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text.replace("CALLED", str(folder / "called")).replace("CALL", "os.getcwd"))
+    return ["--config-dir", str(folder / "conf")]
+
+
+@pytest.mark.parametrize("mode", ["single", "grid"])
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_a_file_says_to_hydra_is_held_to_a_list(monkeypatch, capsys, tmp_path, case, mode):
+    """``env_set: {GHGS_PLUGINS: ...}`` of a file ran its code, and callbacks called functions."""
+    files, message = REFUSED[case]
+    flags = [*written(tmp_path, files), f"hydra.run.dir={tmp_path / 'run'}"]
+    # A file that only the second job chooses is read when the grid is planned.
+    grid = ["-m", "experiment=demo,x", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
+    chosen = ["experiment=x"] if mode == "single" else grid
+    before = dict(os.environ)
+    code, _, err = call(monkeypatch, capsys, "train", *flags, *chosen, "dry_run=true")
+    assert code == 1
+    assert err.startswith(f"ghgs train: {tmp_path / 'conf'}")
+    assert message in err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "called").exists()
+    assert "A" not in os.environ.keys() - before.keys()
+
+
+def test_a_file_may_say_where_what_and_how_many(monkeypatch, capsys, tmp_path):
+    """Sweeps and launchers of one's own must not need the command line."""
+    sweep = """hydra:
+  mode: MULTIRUN
+  sweep: {dir: FOLDER/sweep}
+  sweeper: {params: {seed: "1,2", data.root: "x/${data.name}"}}
+"""
+    launcher = "defaults: [joblib, _self_]\nn_jobs: 2\n"
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="the extra cluster is not installed")
+    files = {"sweep/x": GLOBAL + sweep.replace("FOLDER", str(tmp_path)), "hydra/launcher/y": launcher}
+    flags = written(tmp_path, files)
+    data = ["data=scans", "hydra/launcher=y", "+hydra.job.env_set.A=b"]
+    code, out, err = call(monkeypatch, capsys, "train", *flags, *data, "sweep=x", "dry_run=true")
+    assert (code, err) == (0, "")
+    assert "2 runs: 2 missing" in out
+    assert f"outputs: {tmp_path}/sweep/" in out
+    _, out, _ = call(monkeypatch, capsys, "train", *flags, *data, "sweep=x", "--cfg", "hydra")
+    hydra = OmegaConf.create(out).hydra
+    assert (hydra.launcher.n_jobs, hydra.job.env_set.A) == (2, "b")  # the command line may set all
+
+
+def test_a_searched_folder_is_a_file_from_outside_too(monkeypatch, capsys, tmp_path):
+    """``hydra.searchpath`` and ``--config-path`` are other ways to the same files."""
+    files, message = REFUSED["environment"]
+    folder = written(tmp_path, files)[1]
+    flags = [f"hydra.searchpath=[{folder}]", f"hydra.run.dir={tmp_path / 'run'}"]
+    code, _, err = call(monkeypatch, capsys, "train", *flags, "experiment=x")
+    assert code == 1
+    assert message in err
