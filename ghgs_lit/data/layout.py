@@ -35,7 +35,7 @@ from ghgs_lit.data.decoding import (
 from ghgs_lit.data.reader import PHASES, Reader
 from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.readers import find_path, read_json, require_folder
+from ghgs_lit.readers import composed, find_path, read_json, require_folder
 
 #: Folder of the renderer's notes.
 FOLDER = "rendering"
@@ -148,7 +148,7 @@ class Layout(Reader):
             for name in sorted(stored[phase].keys() & other.keys()):
                 self.problem(f"{self.root}: expected each subject in train or in val; found {name!r} in both")
         planned = self._complete.plan.get(phase, [])
-        wanted = (sorted({*stored[phase], *planned}) if names is None else list(names))[:limit]
+        wanted = (sorted({*stored[phase], *planned}) if names is None else list(map(composed, names)))[:limit]
         homes = {name: next((p for p in phases if name in stored[p]), phase) for name in wanted}
         half = self._complete.missing
         missing = [name for name, home in homes.items() if name not in stored[home] or half(home, [name])]
@@ -218,7 +218,8 @@ class Layout(Reader):
         return find_path(folder, file, suffixes) or folder / f"{file}{suffixes[0]}"
 
     def _folder(self, name: str, kind: str, position: int) -> Path:
-        return self._folders[name] / kind / position_name(name, position)
+        name_of_position = f"{kind}/{position_name(name, position)}"
+        return find_path(self._folders[name], name_of_position) or self._folders[name] / name_of_position
 
 
 def position_name(name: str, position: int) -> str:
@@ -229,6 +230,6 @@ def position_name(name: str, position: int) -> str:
 def _positions(images: Path) -> dict[str, list[int]]:
     positions: dict[str, list[int]] = {}
     for entry in images.iterdir() if images.is_dir() else ():
-        if match := _POSITION.fullmatch(entry.name):
+        if match := _POSITION.fullmatch(composed(entry.name)):
             positions.setdefault(match[1], []).append(int(match[2]))
     return positions

@@ -1,7 +1,10 @@
 """Scans: textured meshes, as ``.obj`` like those of THuman2.0, or as ``.glb`` with several parts."""
 
+import io
+import json
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 import trimesh
@@ -10,12 +13,11 @@ from PIL import Image
 from ghgs_lit.data.decoding import check_extent, read_vertices
 from ghgs_lit.data.images import listed_formats, read_image
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.readers import require_folder
+from ghgs_lit.readers import find_path, parts_of, require_folder
+from ghgs_lit.synthesis.gltf import posed
 from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
 
 _MESH_SUFFIXES = (".glb", ".gltf", ".obj")
-# A compression of glTF that trimesh does not support.
-_COMPRESSION = b"EXT_meshopt_compression"
 _IMAGE_SUFFIXES = (".jpeg", ".jpg", ".png")
 
 
@@ -50,16 +52,34 @@ class ScanSource:
 
 
 def _mesh_file(folder: Path) -> Path | None:
-    return next((p for s in _MESH_SUFFIXES if (p := folder / f"{folder.name}{s}").is_file()), None)
+    path = find_path(folder, folder.name, _MESH_SUFFIXES)
+    return path if path is not None and path.is_file() else None
+
+
+class _Beside(trimesh.resolvers.FilePathResolver):
+    """Files that a mesh names, as any system spells them: an MTL file, textures, buffers."""
+
+    def get(self, key: str) -> bytes:
+        """The content of a file; one that is named with folders of another machine lies beside the mesh.
+        FileNotFoundError: there is none."""
+        name, folder = str(key).strip().strip('"'), Path(self.parent)
+        # Escapes of a URI, folders of another machine, and options of map_Kd, which stand before the name.
+        for spelling in (name, unquote(name), parts_of(name)[-1], *name.split()[-1:]):
+            path = find_path(folder, spelling) if spelling else None
+            if path is not None and path.is_file():
+                return path.read_bytes()
+        raise FileNotFoundError(name)
 
 
 def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
-    """All textured meshes of a file, in its world frame."""
-    is_compressed = path.suffix != ".obj" and _COMPRESSION in path.read_bytes()
-    require(not is_compressed, str(path), "a mesh without compression", _COMPRESSION.decode())
+    """All textured meshes of a file in its world frame, where joints and morph targets put them."""
+    kind = path.suffix.lower()[1:]
+    tree = None if kind == "obj" else posed(path)
+    content = path.read_bytes() if tree is None else json.dumps(tree).encode()
     try:
         with listed_formats():
-            scene = trimesh.load_scene(path, process=False)
+            file, kind = io.BytesIO(content), kind if tree is None else "gltf"
+            scene = trimesh.load_scene(file, kind, _Beside(str(path)), process=False)
     except Exception as error:  # trimesh raises whatever its parsers raise
         raise InputError(f"{path}: expected a readable mesh; found {error!r}") from error
     parts = []
@@ -67,14 +87,16 @@ def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
         transform, geometry = scene.graph[node]
         mesh = scene.geometry[geometry]
         if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
-            parts.append(_part(path, geometry, mesh, transform))
+            parts.append(_part(path, geometry, mesh, transform, len(scene.geometry) == 1))
     if not parts:
         raise InputError(f"{path}: expected triangles; found none")
     return tuple(parts)
 
 
-def _part(path: Path, name: str, mesh: trimesh.Trimesh, transform: np.ndarray) -> TexturedMesh:
-    texture = _texture(path, getattr(mesh.visual, "material", None))
+def _part(
+    path: Path, name: str, mesh: trimesh.Trimesh, transform: np.ndarray, is_alone: bool
+) -> TexturedMesh:
+    texture = _texture(path, getattr(mesh.visual, "material", None), is_alone)
     if texture is None:
         raise InputError(f"{path}: expected a texture for the mesh {name!r}; found none")
     uv = getattr(mesh.visual, "uv", None)
@@ -88,15 +110,16 @@ def _part(path: Path, name: str, mesh: trimesh.Trimesh, transform: np.ndarray) -
     return TexturedMesh(*arrays, texture)
 
 
-def _texture(path: Path, material: object) -> np.ndarray | None:
-    """Texture [h, w, 3] uint8 of a material, None if it has none. InputError: its alpha cuts parts away."""
+def _texture(path: Path, material: object, is_alone: bool) -> np.ndarray | None:
+    """Texture [h, w, 3] uint8 of a material, None if it has none. ``is_alone``: of the file's only mesh,
+    which may be that of an image beside it. InputError: its alpha cuts parts away."""
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is not None and image.format is None:  # not from a file: trimesh replaced a missing material
         image = None
     factor = getattr(material, "baseColorFactor", None)
     if image is None and factor is not None:  # one plain colour, as buttons and eyes often have
         return np.asarray(factor, np.uint8).reshape(1, 1, -1)[..., :3]
-    if image is None and path.suffix == ".obj":
+    if image is None and is_alone and path.suffix.lower() == ".obj":
         image = _image_beside(path)
     if image is None:
         return None
@@ -111,6 +134,6 @@ def _texture(path: Path, material: object) -> np.ndarray | None:
 def _image_beside(path: Path) -> Image.Image | None:
     """The texture of a scan without its ``.mtl``: ``material0.*``, or the only image."""
     images = sorted(p for p in path.parent.iterdir() if p.suffix.lower() in _IMAGE_SUFFIXES)
-    named = [p for p in images if p.stem == "material0"]
+    named = [p for p in images if p.stem.lower() == "material0"]
     chosen = named[:1] or (images if len(images) == 1 else [])
     return read_image(chosen[0]) if chosen else None

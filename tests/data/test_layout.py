@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import unicodedata
 
 import numpy as np
 import pytest
@@ -60,6 +61,22 @@ def on_box(view: View, person) -> np.ndarray:
     outside = np.maximum(np.maximum(low - points, points - high), 0)
     inside = np.minimum(points - low, high - points).min(-1)
     return np.linalg.norm(outside, axis=-1) + np.maximum(inside, 0)
+
+
+def test_names_of_other_systems(tmp_path):
+    """Folders and files that Windows or macOS renamed, all of them, hold what they held."""
+    write_person(tmp_path, "K\u00e4the")
+    right = photographs(tmp_path).view("K\u00e4the", 4, 0)
+    for path in sorted(tmp_path.rglob("*"), key=lambda path: -len(path.parts)):
+        upper = path.with_suffix(path.suffix.upper()) if path.suffix else path
+        path.rename(upper.with_name(unicodedata.normalize("NFD", upper.name)))
+    layout = photographs(tmp_path)
+    assert layout.reader.views_at("K\u00e4the", 0) == [0]
+    found = layout.view("K\u00e4the", 4, 0)
+    for name in ("image", "mask", "inverse_depth", "matte", "intrinsics", "extrinsics"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(right, name))
+    assert layout.body("K\u00e4the").shape == (8, 3)
+    assert photographs(tmp_path, names=["K\u00e4the"]).reader.subjects == {"K\u00e4the": (0, 4)}
 
 
 def test_round_trip(tmp_path):

@@ -32,6 +32,44 @@ def test_obj_scans_are_loaded_as_they_are(tmp_path):
     assert ScanSource(tmp_path).load("a").parts[0].texture.shape == (4, 4, 3)
 
 
+def test_names_of_windows_programs(tmp_path):
+    """Upper case, backslashes, folders of another machine, options of map_Kd, names with spaces."""
+    write_obj_scan(tmp_path, "a", (200, 90, 30))
+    folder = tmp_path / "a"
+    (folder / "textures").mkdir()
+    (folder / "material0.jpeg").rename(folder / "textures" / "My Skin.JPEG")
+    Image.new("RGB", (4, 4)).save(folder / "black.png")  # beside the mesh, so that nothing is guessed
+    Image.new("RGB", (4, 4)).save(folder / "white.png")
+    (folder / "material0.mtl").rename(folder / "Material0.MTL")
+    (folder / "a.obj").rename(folder / "a.OBJ")
+    for said in (
+        "textures\\My Skin.jpeg",
+        "textures/my skin.jpeg",
+        ".\\textures\\My Skin.JPEG",
+        "textures\\My%20Skin.JPEG",
+    ):
+        (folder / "Material0.MTL").write_text(f"newmtl material0\nmap_Kd {said}\n")
+        texture = ScanSource(tmp_path).load("a").parts[0].texture
+        assert np.abs(texture.reshape(-1, 3).mean(0) - [200, 90, 30]).max() < 3
+    (folder / "textures" / "My Skin.JPEG").rename(folder / "skin.JPEG")
+    for said in ("C:\\Users\\me\\skin.jpeg", "-s 1 1 1 skin.jpeg", '"skin.jpeg"'):
+        (folder / "Material0.MTL").write_text(f"newmtl material0\nmap_Kd {said}\n")
+        assert np.abs(ScanSource(tmp_path).load("a").parts[0].texture[0, 0] - [200.0, 90, 30]).max() < 3
+    assert ScanSource(tmp_path).names() == ["a"]
+
+
+def test_a_lost_texture_of_several_is_not_guessed(tmp_path):
+    """The image beside the mesh is that of its only material, not of whichever lost its own."""
+    path = write_obj_scan(tmp_path, "a")
+    lines = path.read_text().splitlines()
+    second = next(i for i, line in enumerate(lines) if line.startswith("f ")) + 4
+    path.write_text("\n".join([*lines[:second], "usemtl other", *lines[second:]]))
+    mtl = "newmtl material0\nmap_Kd material0.jpeg\nnewmtl other\nmap_Kd lost.png\n"
+    (tmp_path / "a" / "material0.mtl").write_text(mtl)
+    with pytest.raises(InputError, match=r"a\.obj: expected a texture for the mesh .*; found none"):
+        ScanSource(tmp_path).load("a")
+
+
 def test_glb_scans_keep_parts_and_frames(tmp_path):
     """Parts keep their transforms; a mesh without texture, or with one that cuts parts away, is refused."""
     scene = trimesh.Scene()
@@ -58,14 +96,16 @@ def test_glb_scans_keep_parts_and_frames(tmp_path):
         ScanSource(tmp_path).load("g")
 
 
-def test_compression_that_is_not_read_is_named(tmp_path):
+@pytest.mark.parametrize(
+    "required", [["EXT_meshopt_compression", "KHR_mesh_quantization"], ["KHR_draco_mesh_compression"]]
+)
+def test_compression_that_is_not_read_is_named_with_its_cure(tmp_path, required):
     (tmp_path / "g").mkdir()
-    content = json.dumps(
-        {"extensionsRequired": ["EXT_meshopt_compression", "KHR_mesh_quantization"]}
-    ).encode()
+    content = json.dumps({"extensionsRequired": ["KHR_materials_unlit", *required]}).encode()
     header = b"glTF" + np.array([2, 20 + len(content), len(content)], "<u4").tobytes() + b"JSON"
     (tmp_path / "g" / "g.glb").write_bytes(header + content)
-    line = r"g\.glb: expected a mesh without compression; found 'EXT_meshopt_compression'"
+    cure = r"g\.glb: expected a mesh without extensions \(npx @gltf-transform/cli dequantize "
+    line = rf"{cure}.*; found '{', '.join(required)}'"
     with pytest.raises(InputError, match=line):
         ScanSource(tmp_path).load("g")
 

@@ -33,7 +33,7 @@ from ghgs_lit.data.humman.smpl import Body, read_parameters
 from ghgs_lit.data.reader import FrameReader
 from ghgs_lit.data.view import View, opencv_view
 from ghgs_lit.errors import InputError
-from ghgs_lit.readers import read_json
+from ghgs_lit.readers import find_path, read_json
 
 log = logging.getLogger(__name__)
 
@@ -77,7 +77,8 @@ class _Frame:
     number: int
 
     def file(self, kind: str, kinect: int) -> Path:
-        return self.folder / kind / f"kinect_{kinect:03d}" / f"{self.number:06d}.png"
+        folder, name = self.folder / kind / f"kinect_{kinect:03d}", f"{self.number:06d}.png"
+        return find_path(folder, name) or folder / name
 
 
 class HuMManReader(FrameReader):
@@ -140,7 +141,7 @@ class HuMManReader(FrameReader):
 def _frames_of(folder: Path) -> set[int]:
     if not folder.is_dir():
         return set()
-    return {int(p.stem) for p in folder.iterdir() if p.suffix == ".png" and p.stem.isdecimal()}
+    return {int(p.stem) for p in folder.iterdir() if p.suffix.lower() == ".png" and p.stem.isdecimal()}
 
 
 class SequenceNames(Options):

@@ -23,6 +23,7 @@ from ghgs_lit.data.view import View, half_centers, opencv_view
 from ghgs_lit.data.zju_mocap.annotations import Annotations, frame_field, frame_number, read_annotations
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.undistortion import undistort, undistorting_grid
+from ghgs_lit.readers import find_path
 
 log = logging.getLogger(__name__)
 
@@ -134,9 +135,9 @@ class ZJUMoCapReader(FrameReader):
 
 def _find(folder: Path, photograph: PurePosixPath, suffix: str) -> Path:
     """File of a photograph, under its name or its frame field alone (renamed files of 313 and 315)."""
-    path = folder / photograph.with_suffix(suffix)
-    renamed = path.with_name(frame_field(photograph) + suffix)
-    return renamed if not path.exists() and renamed.exists() else path
+    usual = photograph.with_suffix(suffix)
+    renamed = usual.with_name(frame_field(photograph) + suffix)
+    return find_path(folder, str(usual)) or find_path(folder, str(renamed)) or folder / usual
 
 
 # Assumed number of cameras if all are used; some sequences have 23.
