@@ -20,6 +20,11 @@ MAY_CHANGE_ON_RESUME = (
 #: Keys that loggers do not list as hyperparameters: those without influence, the sweep, and the evaluation.
 NOT_HYPERPARAMETERS = (*WITHOUT_INFLUENCE, "evaluation", "sweep")
 
+#: Keys of views and targets by which models are trained differently.
+OF_TRAINING = ("views.training_counts", "views.training", "targets.training_views", "targets.per_step")
+#: Keys by which a protocol of one name has other targets.
+OF_TARGETS = ("targets.kind", "targets.view", "targets.positions", "targets.per_subject")
+
 #: Keys that may differ between the runs of a table: those without influence, the seed, the switches of the
 #: ablation, and views, targets and metrics, which tables keep apart themselves.
 EXPECTED_TO_DIFFER = (

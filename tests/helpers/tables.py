@@ -36,10 +36,11 @@ def config_of(row, seed=1, data="synthetic", weights=None, **changes) -> dict:
 def write_run(
     folder: Path, row, psnr, seed=1, views=(3, 4, 5), targets="release", lpips=None, weights=None,
     shifts=SHIFTS, data="synthetic", protocol="correct", method="model", git=None, verb="train",
-    training=None, measured=None, **changes,
+    training=None, measured=None, nodes=None, **changes,
 ):  # fmt: skip
-    """A run whose mean PSNR at n views is ``psnr + n``; each subject differs from it by its shift."""
-    config = config_of(row, seed, data, weights, **changes)
+    """A run whose mean PSNR at n views is ``psnr + n``; each subject differs from it by its shift. ``nodes``
+    of its configuration are those whose names are arguments here, such as ``views``."""
+    config = config_of(row, seed, data, weights, **changes, **(nodes or {}))
     rows = [
         {
             "method": method, "subject": subject, "views": n, "targets": targets, "target": "000/3",

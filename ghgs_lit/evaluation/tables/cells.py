@@ -126,10 +126,11 @@ def _refuse_rivals(table: Table, values: pd.DataFrame) -> None:
         of_models = [table.configs[source] for source in sources if source in table.configs]
         keys = differing(of_models)
         apart = ",".join(telling_apart(of_models, keys))
-        rows = f"; they differ in {differing_text(keys)}: by=[{apart}] gives each a row" if keys else ""
+        rows = f"they differ in {differing_text(keys)}: by=[{apart}] gives each a row"
+        rows = rows if keys else "their configurations are equal"
         raise InputError(
             f"runs: expected one run for {what}, {table.groups[group].views} views, seed {seed}; found"
-            f" {' and '.join(sources)}{rows}; runs=[...] lists those to show"
+            f" {' and '.join(sources)}; {rows}; runs=[...] lists those to show"
         )
 
 

@@ -142,7 +142,8 @@ def _about_runs(table: Table) -> list[str]:
         row = (variant.model, variant.encoder, variant.switches, data)
         groups.setdefault(() if table.layout.rows == "ablation" else row, []).append(table.configs[source])
     keys = {key: values for group in groups.values() for key, values in differing(group).items()}
-    keys.pop("checkpoint", None)
+    for shown in ("checkpoint", *(key for line in table.ours for key, _ in line.variant.extra)):
+        keys.pop(shown, None)
     if keys:
         said.append(f"Runs side by side differ also in {differing_text(keys)}.")
     states = sorted(table.rows["git"].dropna().unique()) if "git" in table.rows else []

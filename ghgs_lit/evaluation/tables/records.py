@@ -23,7 +23,16 @@ import pandas as pd
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from ghgs_lit.config import conf_dir
-from ghgs_lit.config.keys import ABLATIONS, EXPECTED_TO_DIFFER, flatten, is_below, lookup, switches_of
+from ghgs_lit.config.keys import (
+    ABLATIONS,
+    EXPECTED_TO_DIFFER,
+    OF_TARGETS,
+    OF_TRAINING,
+    flatten,
+    is_below,
+    lookup,
+    switches_of,
+)
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.readers import read_json, read_yaml
 from ghgs_lit.runs.results import KEYS, METHOD, read_results, validated
@@ -165,13 +174,18 @@ class _Provenance(_Strict):
     training: _Training | None = None
 
 
-def _read_run(path: Path, by: Sequence[str]) -> tuple[pd.DataFrame, dict[str, Any]]:
-    """Rows of a ``metrics.json``, and the configuration of its model as trained and measured."""
+def _read_run(path: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
+    """Rows of a ``metrics.json``, without ``variant``, and the configuration of its model as trained and
+    measured."""
     content = read_results(path)
     source = validated(_Provenance, content["provenance"], f"{path}: provenance")
     trained = (source.checkpoint_config or source.config) | (source.changed_model or {})
     kept = (*_OF_EVALUATION, "data", "metrics")
     config = trained | {key: source.config.get(key) for key in kept if key in {*source.config, *trained}}
+    measured = source.config.get("targets")
+    if isinstance(measured, Mapping) and isinstance(trained.get("targets"), Mapping):
+        of_training = {key: trained["targets"].get(key) for key in ("training_views", "per_step")}
+        config["targets"] = {**measured, **of_training}
     seed = trained.get("seed", source.seed)
     require(isinstance(seed, int), f"{path}: provenance.seed", "a whole number", seed)
     rows = pd.DataFrame(content["rows"])
@@ -186,10 +200,8 @@ def _read_run(path: Path, by: Sequence[str]) -> tuple[pd.DataFrame, dict[str, An
         for name, value in zip(TRAINING, (training.steps, training.seconds, peak), strict=True):
             if value is not None:
                 rows.loc[is_model, name] = value
-    model = model_variant(config, str(path), by) if is_model.any() else None
     git = source.git and source.git.commit[:9] + " with changes" * source.git.changed
     facts = {
-        "variant": [model if m == METHOD else Variant("baseline", m) for m in rows.pop("method")],
         "data": source.data.name,
         "split": source.data.split,
         "protocol": source.protocol.metrics,
@@ -201,8 +213,16 @@ def _read_run(path: Path, by: Sequence[str]) -> tuple[pd.DataFrame, dict[str, An
     return rows.assign(**facts), config
 
 
-def _planned(path: Path, by: Sequence[str]) -> Planned | None:
-    """The training run of a ``config.yaml``; None if it is another verb's or incomplete."""
+def _with_variants(rows: pd.DataFrame, config: Mapping[str, Any], by: Sequence[str]) -> pd.DataFrame:
+    """Rows of a run whose ``method`` is replaced by their ``variant``."""
+    variants = {name: Variant("baseline", name) for name in rows["method"]}
+    if METHOD in variants:
+        variants[METHOD] = model_variant(config, rows["source"].iloc[0], by)
+    return rows.drop(columns="method").assign(variant=[variants[name] for name in rows["method"]])
+
+
+def _training_config(path: Path) -> dict[str, Any] | None:
+    """The configuration of a training run in a ``config.yaml``; None: it is another verb's or incomplete."""
     try:
         config = read_yaml(path)
     except InputError:
@@ -210,10 +230,27 @@ def _planned(path: Path, by: Sequence[str]) -> Planned | None:
     needed = ("trainer", "data", "recalibration")
     if not isinstance(config, Mapping) or not all(key in config for key in needed):
         return None
-    data, done = str(lookup(config, "data.name")), (path.parent / "metrics.json").exists()
-    seed = config.get("seed", 0)
-    require(isinstance(seed, int), f"{path}: seed", "a whole number", seed)
-    return Planned(model_variant(config, str(path), by), data, seed, done)
+    require(isinstance(config.get("seed", 0), int), f"{path}: seed", "a whole number", config.get("seed"))
+    return config
+
+
+def _planned(path: Path, config: Mapping[str, Any], by: Sequence[str]) -> Planned:
+    done = (path.parent / "metrics.json").exists()
+    variant, data = model_variant(config, str(path), by), str(lookup(config, "data.name"))
+    return Planned(variant, data, config.get("seed", 0), done)
+
+
+def keys_of_rows(configs: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Keys of views and targets in which runs that could share a row differ: runs on the same data by how
+    they were trained, those with a protocol of the same name by its targets."""
+    values: dict[tuple[str, ...], set[str]] = {}
+    for config in configs:
+        data, protocol = (str(lookup(config, key)) for key in ("data.name", "targets.name"))
+        for key in OF_TRAINING:
+            values.setdefault((key, data), set()).add(str(lookup(config, key)))
+        for key in OF_TARGETS:
+            values.setdefault((key, data, protocol), set()).add(str(lookup(config, key)))
+    return list(dict.fromkeys(key for (key, *_), found in values.items() if len(found) > 1))
 
 
 def files_below(folders: Sequence[Path], name: str) -> list[Path]:
@@ -227,21 +264,22 @@ def files_below(folders: Sequence[Path], name: str) -> list[Path]:
 
 def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
     """All runs below folders, finished or not. ``by``: configuration keys that distinguish rows beside model,
-    encoder and ablation. FileNotFoundError: a folder is missing. InputError: there is no finished run, a
-    ``metrics.json`` is damaged, or no run has a key of ``by``."""
-    runs = {str(path): _read_run(path, by) for path in files_below(folders, "metrics.json")}
-    planned = [p for path in files_below(folders, "config.yaml") if (p := _planned(path, by)) is not None]
+    encoder, ablation and the views and targets of the training. FileNotFoundError: a folder is missing.
+    InputError: there is no finished run, a ``metrics.json`` is damaged, or no run has a key of ``by``."""
+    runs = {str(path): _read_run(path) for path in files_below(folders, "metrics.json")}
+    found = {path: _training_config(path) for path in files_below(folders, "config.yaml")}
+    trainings = {path: config for path, config in found.items() if config is not None}
     if not runs:
         names = ", ".join(map(str, folders))
-        begun = f"{len(planned)} runs without one" if planned else "none"
+        begun = f"{len(trainings)} runs without one" if trainings else "none"
         raise InputError(f"{names}: expected runs with a metrics.json below it; found {begun}")
-    configs = {source: config for source, (_, config) in runs.items()}
-    known = {key for config in configs.values() for key in flatten(config)}
+    models = {source: config for source, (rows, config) in runs.items() if METHOD in set(rows["method"])}
+    known = {key for _, config in runs.values() for key in flatten(config)}
     for key in by:
         require(any(is_below(k, [key]) for k in known), "by", "keys of the runs' configurations", key)
-    rows = pd.concat([rows for rows, _ in runs.values()], ignore_index=True)
-    models = {s for s, v in zip(rows["source"], rows["variant"], strict=True) if v.kind == "model"}
-    return Sweep(rows, planned, {s: config for s, config in configs.items() if s in models})
+    by = list(dict.fromkeys([*by, *keys_of_rows([*models.values(), *trainings.values()])]))
+    rows = pd.concat([_with_variants(*run, by) for run in runs.values()], ignore_index=True)
+    return Sweep(rows, [_planned(path, config, by) for path, config in trainings.items()], models)
 
 
 def person_of(subject: str, unit: re.Pattern[str] | None) -> str:

@@ -286,3 +286,70 @@ def test_a_table_of_numbers_of_views_that_nobody_measured_says_so(tmp_path):
         assert "no subjects" in table.caption
         assert "missing" in to_terminal(table)
         assert to_csv([table]).count("\n") == 1 + 3 * len(rows)
+
+
+def views(*counts, **changes) -> dict:
+    return {"training_counts": list(counts), "training": "any", "evaluation_count": counts[0], **changes}
+
+
+def test_models_trained_with_other_views_have_rows_of_their_own(tmp_path):
+    """Seed 1 of three views and seed 2 of four were averaged as two seeds of one model."""
+    for number, (count, seed) in enumerate([(3, 1), (4, 2), (4, 1)]):
+        write_run(
+            tmp_path / str(number), "full", 20.0 + number, seed, views=(count,), nodes={"views": views(count)}
+        )
+    start_run(tmp_path / "9", "full", 2, views=views(3))
+    (table,) = tables_of(tmp_path, "table2", reported=False, metrics=("psnr",))
+    rows, _ = body(to_markdown(table))
+    assert rows == {
+        "Ours (views.training_counts=[3])": ["23.00 (1/2)", "missing", "missing"],
+        "Ours (views.training_counts=[4])": ["missing", "25.50 ± 0.71", "missing"],
+    }
+    assert not any("differ also" in note for note in table.notes)
+    three, four = tables_of(tmp_path, views=(3, 4), metrics=("psnr",))
+    assert "`views.training_counts=[3]`" in three.caption
+    assert body(to_markdown(four))[0]["✓", "✓"] == ["missing", "25.50 ± 0.71"]
+
+
+@pytest.mark.parametrize(
+    ("key", "values"),
+    [
+        ("views.training", ["any", "even"]),
+        ("targets.training_views", [[0], [2, 3]]),
+        ("targets.per_step", [1, 2]),
+        ("targets.view", [3, 2]),
+        ("targets.per_subject", [1, "all"]),
+    ],
+)
+@pytest.mark.parametrize("seeds", [(1, 2), (1, 1)])
+@pytest.mark.parametrize("verb", ["train", "evaluate"])
+def test_other_views_and_targets_of_a_training_are_other_rows(tmp_path, key, values, seeds, verb):
+    """They change the model, or what its protocol measures, as much as another learning rate."""
+    group, _, name = key.partition(".")
+    for number, value in enumerate(values):
+        nodes = {"views": views(4), "targets": {"name": "release", "training_views": [2], "per_step": 3}}
+        nodes["targets"] |= {"view": 3, "per_subject": 1}
+        nodes[group][name] = value
+        about = {"seed": seeds[number], "nodes": nodes, "measured": {"targets": nodes["targets"]}}
+        write_run(tmp_path / str(number), "full", 20.0 + number, verb=verb, **about)
+    (table,) = tables_of(tmp_path, "table2", reported=False, metrics=("psnr",))
+    rows, _ = body(to_markdown(table))
+    assert list(rows) == [f"Ours ({key}={value})" for value in values]
+    assert [row[0].strip("*") for row in rows.values()] == ["23.00", "24.00"]
+
+
+def test_data_sets_with_other_targets_share_a_row(tmp_path):
+    """Rings and static cameras have protocols of their own; the method is one."""
+    for number, (data, name, numbers) in enumerate([("zju_mocap", "cameras", [0]), ("humman", "x", [2])]):
+        targets = {"name": name, "training_views": numbers, "view": number}
+        write_run(tmp_path / data, "full", 20.0, data=data, views=(4,), nodes={"targets": targets})
+    (table,) = tables_of(tmp_path, "table1", reported=False, metrics=("psnr",))
+    assert body(to_markdown(table))[0] == {"Ours": ["24.00", "24.00"]}
+
+
+def test_a_refusal_says_that_configurations_are_equal(tmp_path):
+    """Without a key that differs there is none to name."""
+    for name, psnr in (("first", 20.0), ("again", 21.0)):
+        write_run(tmp_path / name, "full", psnr)
+    with pytest.raises(InputError, match="their configurations are equal; runs="):
+        tables_of(tmp_path)
