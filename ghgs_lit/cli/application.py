@@ -4,7 +4,6 @@ import importlib
 import keyword
 import os
 import re
-import shutil
 import signal
 import sys
 import time
@@ -24,8 +23,9 @@ from ghgs_lit.config.outside import check_outside_files
 from ghgs_lit.config.registry import check
 from ghgs_lit.files import require_no_links, write_text_atomically
 from ghgs_lit.kernels.allocation import collect_garbage_again
-from ghgs_lit.kernels.cores import children_sleep
+from ghgs_lit.kernels.cores import children_sleep, use_known_start_method
 from ghgs_lit.runs.job import register_resolvers
+from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.runs.signals import Interrupted, interruptible
 
 register_resolvers()  # on import, so that the processes of a launcher have them too
@@ -39,10 +39,7 @@ def module_of(verb: str) -> str:
 
 def discard_unused(directory: Path, verb: str, since: float) -> None:
     """Remove a run's directory that holds nothing but start-up files written after ``since``."""
-    begun = {".hydra", ".lock", "config.yaml", "sessions.jsonl", f"{verb}.log"}
-    paths = [] if directory == Path.cwd() else list(directory.glob("*"))
-    if paths and all(path.name in begun and path.lstat().st_mtime >= since for path in paths):
-        shutil.rmtree(directory, ignore_errors=True)
+    RunDirectory(directory).discard({".hydra", f"{verb}.log"}, since)
 
 
 #: What a run appends to, or what libraries write as it is, beside the log.
@@ -71,6 +68,7 @@ class Verb:
     def __call__(self, cfg: DictConfig) -> object:
         # Lightning runs sys.argv again for the other processes of a DDP job; it must contain the verb.
         sys.argv = list(self.argv)
+        use_known_start_method()
         from ghgs_lit.cli.photographs import require_paths  # here: --help needs no NumPy
 
         try:

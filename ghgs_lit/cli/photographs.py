@@ -82,7 +82,7 @@ def require_paths(verb: str, config: Mapping[str, Any]) -> None:
     """Check that the files of a verb exist, with the messages of their readers, and start decoding
     photographs. FileNotFoundError, InputError: a file or folder is missing or wrong."""
     for key in _WEIGHTS.get(verb, ()):
-        if config[key] is not None:
+        if config[key] not in (None, "auto"):
             require_weights(config[key])
     has_photographs = config.get("images") is not None and config.get("cameras") is not None
     if has_photographs and (verb == "predict" or config.get("task") == "cameras"):

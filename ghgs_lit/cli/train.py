@@ -10,7 +10,7 @@ from typing import Any
 
 import lightning.pytorch as L
 from hydra.core.hydra_config import HydraConfig
-from lightning.fabric.plugins.environments import LightningEnvironment
+from lightning.fabric.plugins.environments import ClusterEnvironment, LightningEnvironment, SLURMEnvironment
 from lightning.pytorch.callbacks import Callback, Checkpoint
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig
@@ -19,12 +19,13 @@ from torch import nn
 from ghgs_lit.cli.inputs import build_data, check_size, choices, overrides, said
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import build, resolve
-from ghgs_lit.errors import require
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.protocols import check_evaluation
 from ghgs_lit.evaluation.report import measure_and_write
 from ghgs_lit.model import GHGS
 from ghgs_lit.runs import job
+from ghgs_lit.runs.processes import in_srun, queue_again, settle_rank
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.runs.signals import Interrupted, interruptible, print_how_to_go_on
@@ -40,7 +41,7 @@ def quiet() -> None:
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
     messages = ("LeafSpec", "smaller than the logging interval", "num_workers", "dataloader is not resumable")
-    messages += ("The dirpath has changed", "overridden `transfer_batch", "exists and is not empty")
+    messages += ("overridden `transfer_batch", "exists and is not empty")
     for message in messages:
         warnings.filterwarnings("ignore", f".*{message}.*")
 
@@ -85,7 +86,7 @@ def build_trainer(config: dict[str, Any], directory: Path, *further: Callback) -
         config["trainer"],
         "trainer",
         logger=logs or False,
-        plugins=[AtomicCheckpointIO(), *_environment()],
+        plugins=[AtomicCheckpointIO(), *environments()],
         callbacks=callbacks,
         default_root_dir=str(directory),
         enable_checkpointing=any(isinstance(c, Checkpoint) for c in callbacks),
@@ -93,11 +94,15 @@ def build_trainer(config: dict[str, Any], directory: Path, *further: Callback) -
     )
 
 
-def _environment() -> list[LightningEnvironment]:
-    """Plugin for a SLURM job without ``srun``, whose tasks are not the processes of a training."""
-    starters = ("SLURM_STEP_ID", "SRUN_DEBUG", "TORCHELASTIC_RUN_ID")
-    is_alone = "SLURM_NTASKS" in os.environ and not any(name in os.environ for name in starters)
-    return [LightningEnvironment()] if is_alone else []
+def environments() -> list[ClusterEnvironment]:
+    """Plugins for a job of SLURM: tasks of ``srun`` are the processes of a training, those of a batch script
+    are not. InputError: ``srun`` was asked for other tasks."""
+    if "SLURM_NTASKS" not in os.environ or "TORCHELASTIC_RUN_ID" in os.environ:
+        return []
+    try:  # this package stops, saves and queues again: Lightning's own checkpoint may lie within a step
+        return [SLURMEnvironment(auto_requeue=False) if in_srun() else LightningEnvironment()]
+    except RuntimeError as error:
+        raise InputError(f"trainer: {error}") from None
 
 
 def run(cfg: DictConfig) -> float | str | None:
@@ -111,31 +116,19 @@ def run(cfg: DictConfig) -> float | str | None:
 
 
 def run_job(config: dict[str, Any], run_directory: RunDirectory, train: job.Train) -> float | str | None:
-    """Return what ``train`` returns. On Ctrl-C and SIGTERM print how to go on and raise Interrupted."""
+    """Return what ``train`` returns. On Ctrl-C and signals of batch systems print how to go on and raise
+    Interrupted."""
+    is_first = settle_rank(config["trainer"]) == 0
     with interruptible():
         try:
-            return _run(config, run_directory, train)
+            return (job.train_once if is_first else job.train_beside)(run_directory, config, train)
         except Interrupted as stop:
             if rank_zero_only.rank == 0 and not stop.explained:
-                print_how_to_go_on(stop, str(run_directory.path), _changes_to_go_on(run_directory))
+                place = f"hydra.run.dir={run_directory.path}"
+                if job.in_sweep():
+                    place = f"hydra.sweep.dir={HydraConfig.get().sweep.dir}"
+                print_how_to_go_on(stop, str(run_directory.path), place, queue_again(stop.number))
             raise
-
-
-def _changes_to_go_on(run_directory: RunDirectory) -> str:
-    if job.in_sweep():
-        return f"hydra.sweep.dir={HydraConfig.get().sweep.dir}"
-    if run_directory.checkpoint is None:
-        return "another hydra.run.dir, or overwrite=true (there was no checkpoint yet)"
-    return f"hydra.run.dir={run_directory.path} resume={run_directory.checkpoint}"
-
-
-def _run(config: dict[str, Any], run_directory: RunDirectory, train: job.Train) -> float | str | None:
-    if rank_zero_only.rank == 0:
-        return job.train_once(run_directory, config, train)
-    # The first process has locked the run for all of them.
-    if job.in_sweep() and run_directory.done:
-        return None
-    return train(job.with_resume(config, run_directory), run_directory.path, {})
 
 
 def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float | None:
@@ -210,6 +203,7 @@ def measure_last(
 ) -> float:
     """Measure the last weights and write the results; return the mean PSNR of the first protocol."""
     model, device = module.model, trainer.strategy.root_device
+    identity = RunDirectory(directory).marker
     path = measure_and_write(
         {"model": ModelMethod(model.to(device).eval(), module.renderer)},
         data,
@@ -224,6 +218,7 @@ def measure_last(
             "trained": sum(p.numel() for p in model.parameters() if p.requires_grad),
         },
         training=training,
+        run=identity and {"id": identity.id, "config_hash": identity.config_hash},
         sessions=RunDirectory(directory).sessions(),
     )
     summary = read_results(path)["summary"]

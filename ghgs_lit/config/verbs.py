@@ -43,8 +43,8 @@ class Run(Options):
 
     seed: Seed = 1
     """Of weights, of samples and of their order."""
-    resume: Path | None = None
-    """A checkpoint to go on from."""
+    resume: Literal["auto"] | Path | None = "auto"
+    """A checkpoint to go on from; auto: where the run in the directory stands; null: begins anew."""
     overwrite: bool = False
     """Delete the run that is in the directory already."""
 

@@ -1,6 +1,7 @@
-"""The number of cores that this process may use, and how its threads wait for one another."""
+"""The cores that this process may use, how its threads wait for one another, and how it starts others."""
 
 import fcntl
+import multiprocessing
 import os
 import tempfile
 from collections.abc import Sequence
@@ -34,6 +35,14 @@ def children_sleep() -> None:
     """Let child processes that start from now on not spin; see :func:`spin_if_alone`."""
     if _spins:
         os.environ.pop("GOMP_SPINCOUNT", None)
+
+
+def use_known_start_method() -> None:
+    """Let this process start others as a fresh one does. joblib's workers have a start method of their own,
+    by which data loaders cannot start."""
+    known = multiprocessing.get_all_start_methods()  # the platform's default comes first
+    if multiprocessing.get_start_method() not in known:
+        multiprocessing.set_start_method(known[0], force=True)
 
 
 def allowed_cores(cgroups: Path = Path("/sys/fs/cgroup")) -> int:

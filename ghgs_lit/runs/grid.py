@@ -3,6 +3,7 @@
 import datetime
 import json
 import logging
+import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.job import BUSY, check_config, check_launcher
+from ghgs_lit.runs.processes import queue_again
 from ghgs_lit.runs.progress import clock
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import SWEPT, RunDirectory, State
@@ -56,7 +58,7 @@ def time_budget(config: Mapping[str, Any]) -> float | None:
 def step_seconds(directory: Path) -> tuple[float, int] | None:
     """Mean seconds of a training step over the finished runs in ``directory``, and their number."""
     steps = seconds = count = 0
-    for path in sorted(directory.glob("*/metrics.json")):
+    for path in sorted(directory.rglob("metrics.json")):
         sessions = [s for s in RunDirectory(path.parent).sessions() if s.get("steps")]
         steps += sum(s["steps"] for s in sessions)
         seconds += sum(s["seconds"] for s in sessions)
@@ -154,7 +156,9 @@ def sweep(sweeper: BasicSweeper, arguments: Sequence[str]) -> list[Sequence[JobR
             return _sweep(sweeper, arguments, directory)
         except Interrupted as stop:
             if not stop.explained:
-                print_how_to_go_on(stop, "the sweep", f"hydra.sweep.dir={directory}")
+                print_how_to_go_on(
+                    stop, "the sweep", f"hydra.sweep.dir={directory}", queue_again(stop.number)
+                )
             raise
 
 
@@ -166,6 +170,7 @@ def _sweep(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> 
         print(f"{len(combos)} combinations, {len(planned)} different configurations", flush=True)
     for item in planned:  # an impossible launcher is refused before anything starts
         check_launcher(item.config, config.hydra.runtime.choices["hydra/launcher"])
+    check_directories(planned)
     if config.get("dry_run"):
         print_plan(planned, directory)
         return []
@@ -200,15 +205,34 @@ def plan(combos: Sequence[Sequence[str]], compose: Callable[[list[str]], DictCon
     for overrides in combos:
         cfg = compose(list(overrides))
         check_ablation(cfg, cfg.hydra)
-        directory, verb = Path(str(cfg.hydra.sweep.dir)), cfg.hydra.job.name
         with open_dict(cfg):
+            cfg.hydra.job.num = len(planned)
+            sweep, verb = cfg.hydra.sweep, cfg.hydra.job.name
+            directory, subdirectory = str(sweep.dir), str(sweep.subdir)
             del cfg["hydra"]
         config = resolve(cfg, verb if verb in VERBS else None)
-        name = config_hash(config)
-        shown = tuple(filter_overrides(overrides))
-        run = RunDirectory(directory / name)
-        planned.setdefault(name, PlannedRun(name, tuple(overrides), shown, config, run))
+        name, shown = config_hash(config), tuple(filter_overrides(overrides))
+        # The job writes to the planned directory, whatever number a launcher gives it.
+        fixed = (*overrides, f"hydra.sweep.subdir={_quoted(subdirectory)}")
+        run = RunDirectory(Path(directory, subdirectory), name)
+        planned.setdefault(name, PlannedRun(name, fixed, shown, config, run))
     return list(planned.values())
+
+
+def _quoted(text: str) -> str:
+    """``text`` as a value of an override."""
+    return "'" + re.sub(r"(\\*)('|$)", lambda found: 2 * found[1] + ("\\'" if found[2] else ""), text) + "'"
+
+
+def check_directories(planned: Sequence[PlannedRun]) -> None:
+    """Check that each run has a directory of its own. InputError: two share one, or it has another run."""
+    runs = {}
+    for item in planned:
+        other = runs.setdefault(item.run.path, item)
+        found = f"{item.run.path} for {' '.join(other.shown)} and {' '.join(item.shown)}"
+        require(other is item, "hydra.sweep.subdir", "a directory for each configuration", found)
+        if not item.run.done:
+            item.run.start(item.config)
 
 
 def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Path) -> None:

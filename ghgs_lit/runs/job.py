@@ -1,6 +1,6 @@
 """Jobs that train: lock a run that is free and not done, then train or resume it."""
 
-import shutil
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,12 @@ from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.config.keys import lookup
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.files import resolved
+from ghgs_lit.runs.processes import process_count
 from ghgs_lit.runs.provenance import config_hash
-from ghgs_lit.runs.run import RunDirectory
+from ghgs_lit.runs.run import AUTO, RunDirectory
 
 BUSY = "busy"  #: Return value of a job whose run another process works on
+_PATIENCE = 300.0  # seconds in which the first of several processes begins
 SWEEPER = "hydra_plugins.ghgs_lit_sweeper.GridSweeper"
 
 Train = Callable[[dict[str, Any], Path, dict[str, Any]], float | None]
@@ -55,42 +56,43 @@ def register_resolvers() -> None:
         register(name, resolver, replace=True)
 
 
-def with_resume(config: dict[str, Any], run: RunDirectory) -> dict[str, Any]:
-    """``config``, which in a sweep resumes from the run's last checkpoint."""
-    if not in_sweep() or config["resume"] is not None or run.checkpoint is None:
-        return config
-    return {**config, "resume": str(run.checkpoint)}
-
-
 def train_once(run: RunDirectory, config: dict[str, Any], train: Train) -> float | str | None:
-    """Train ``run``; in a sweep, return ``BUSY`` if another process works on it, its metric if it is done.
-    InputError: outside of a sweep, another process works on it or its directory holds a run."""
+    """Train ``run`` from where it stands, and return its metric, also if it is done. ``BUSY``: in a sweep,
+    another process works on it. InputError: outside of a sweep, another process works on it; its directory
+    holds another run or other files."""
+    run = run.of(config)
     with run.claim(wait=_waits()) as claimed:
         if not claimed and in_sweep():
             print(f"skipped: {run.owner} works on {run.path}", flush=True)
             return BUSY
         if not claimed:
             raise InputError(f"{run.path}: expected a directory that no process works in; found {run.owner}")
-        if in_sweep() and run.done:
+        if run.done and (in_sweep() or run.goes_on(config)):
             print(f"done before: {run.path}", flush=True)
             return run.metric
-        config = with_resume(config, run)
-        if not in_sweep():
-            check_directory(run.path, config)
-        with run.session(resumed=config["resume"]) as stats:
+        config = run.begin(config)
+        with run.session(config["resume"]) as stats:
             return train(config, run.path, stats)
+
+
+def train_beside(run: RunDirectory, config: dict[str, Any], train: Train) -> float | str | None:
+    """Train ``run`` as one of several processes, the first of which is in :func:`train_once`. InputError:
+    there is no such process."""
+    run, end = run.of(config), time.monotonic() + _PATIENCE
+    while (session := run.session_beside()) is None:
+        if run.done and (in_sweep() or run.goes_on(config)):
+            return run.metric
+        waits = time.monotonic() < end
+        require(waits, str(run.path), "the first process of this training to work in it", run.owner)
+        time.sleep(0.2)
+    return train({**config, "resume": session["resumed"]}, run.path, {})
 
 
 def check_launcher(config: Mapping[str, Any], launcher: str) -> None:
     """Check that a job of a sweep can train in several processes. InputError: only SLURM starts these."""
-    devices = config["trainer"].get("devices", 1)
-    fits = devices in (1, "1", [0]) or "slurm" in launcher
-    require(fits, "trainer.devices", "1 in a sweep, or hydra/launcher=slurm, which starts processes", devices)
-
-
-#: What training writes into a run's directory, beside the logs of Hydra.
-WRITTEN = ("checkpoints", "csv", "init_from.txt", "metrics.csv", "metrics.json", "pictures")
-WRITTEN += ("sessions.jsonl", "tensorboard")
+    fits = "slurm" in launcher or process_count(config["trainer"]) == 1
+    expected = "1 in a sweep, or hydra/launcher=slurm, which starts processes"
+    require(fits, "trainer.devices", expected, config["trainer"].get("devices"))
 
 
 def check_config(config: Mapping[str, Any]) -> None:
@@ -102,7 +104,7 @@ def check_config(config: Mapping[str, Any]) -> None:
 
 def _require_weights(config: Mapping[str, Any]) -> None:
     trainable = lookup(config, "encoder.trainable")
-    starts = config.get("init_from") is not None or config.get("resume") is not None
+    starts = config.get("init_from") is not None or config.get("resume") not in (None, AUTO)
     if starts or config.get("allow_random_encoder"):
         return
     if lookup(config, "encoder.semantic") is not None:
@@ -117,25 +119,3 @@ def _require_weights(config: Mapping[str, Any]) -> None:
         " such as that of `ghgs import vggt=facebook/VGGT-1B compat=none out=vggt.ckpt`; found none:"
         " the encoder would stay random (allow_random_encoder=true to try things out)"
     )
-
-
-def check_directory(directory: Path, config: Mapping[str, Any]) -> None:
-    """Check that no earlier run would be lost; with ``overwrite`` delete it. InputError: there is a run that
-    this one does not resume."""
-    kept = [*(directory / "checkpoints").glob("*.ckpt"), directory / "csv" / "metrics.csv"]
-    earlier = next((path for path in [*kept, directory / "metrics.json"] if path.exists()), None)
-    resume = config.get("resume")
-    if resume is not None and resolved(resume).is_relative_to(directory.resolve()):
-        return
-    if config.get("overwrite"):
-        source = config.get("init_from")
-        safe = source is None or not resolved(source).is_relative_to(directory.resolve())
-        require(safe, "init_from", "a file outside the run that overwrite=true deletes", source)
-        for path in (directory / name for name in WRITTEN):
-            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
-    elif earlier is not None:
-        last = directory / "checkpoints" / "last.ckpt"
-        raise InputError(
-            f"{directory}: expected a directory without a run; found {earlier.relative_to(directory)}"
-            f" (resume={last} goes on with it, overwrite=true deletes it, hydra.run.dir=... is another)"
-        )

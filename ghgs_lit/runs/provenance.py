@@ -6,7 +6,7 @@ import importlib.metadata
 import json
 import platform
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,20 @@ from ghgs_lit.config.keys import WITHOUT_INFLUENCE, flatten, is_below
 PACKAGES = ("ghgs-lit", "torch", "lightning", "torchmetrics", "kornia", "numpy", "scipy", "gsplat")
 
 
-def config_hash(config: Mapping[str, Any]) -> str:
-    """Twelve hexadecimal digits of a configuration, without ``WITHOUT_INFLUENCE`` and the order of keys."""
-    hashed = {key: value for key, value in flatten(config).items() if not is_below(key, WITHOUT_INFLUENCE)}
+def config_hash(config: Mapping[str, Any], without: Sequence[str] = WITHOUT_INFLUENCE) -> str:
+    """Twelve hexadecimal digits of a configuration, not of the keys ``without`` and of the order of keys."""
+    hashed = {key: value for key, value in flatten(config).items() if not is_below(key, without)}
     text = json.dumps(hashed, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def differences(
+    before: Mapping[str, Any], now: Mapping[str, Any], without: Sequence[str] = WITHOUT_INFLUENCE
+) -> list[str]:
+    """Lines ``key: old value -> new value`` of what differs between configurations, but for ``without``."""
+    old, new = flatten(before), flatten(now)
+    keys = (key for key in sorted(old.keys() | new.keys()) if not is_below(key, without))
+    return [f"{key}: {old.get(key)} -> {new.get(key)}" for key in keys if old.get(key) != new.get(key)]
 
 
 def version_of(name: str) -> str | None:

@@ -1,24 +1,61 @@
-"""A run on disk: its state, the process that works on it, and its sessions.
+"""A run on disk: whose configuration it has, how it goes on, the process that works on it, and its sessions.
 
-A run is done when it has ``metrics.json``, which is written last. The process that works on it locks
-``.lock``. ``sessions.jsonl`` has a line for the start of each process and one for its end, which a killed
-process lacks.
+``run.json`` says that a folder is a run's, and of which configuration; only in such a folder, and only by the
+process that has locked ``.lock``, anything is deleted. A run is done when it has the ``metrics.json`` of its
+configuration, which is written last. ``sessions.jsonl`` has a line for the start of each process and one for
+its end, which a killed process lacks. No file names the folder, so that a run can be moved.
 """
 
 import contextlib
 import datetime
 import json
 import os
+import shutil
 import socket
-from collections.abc import Iterator
+import uuid
+from collections.abc import Iterable, Iterator, Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from ghgs_lit.errors import InputError
-from ghgs_lit.files import append_line, is_locked, lock, lock_owner
-from ghgs_lit.readers import read_json, read_lines_of_json
-from ghgs_lit.runs.results import read_results
+from pydantic import BaseModel, ConfigDict
+
+from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, lookup
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import append_line, is_locked, lock, lock_owner, resolved, write_text_atomically
+from ghgs_lit.readers import read_json, read_lines_of_json, read_yaml
+from ghgs_lit.runs.processes import is_queued_again, launch, slurm_job
+from ghgs_lit.runs.provenance import config_hash, differences
+from ghgs_lit.runs.results import read_results, validated
+
+AUTO = "auto"  #: Value of ``resume``: as the directory stands
+MARKER = "run.json"
+#: What training writes into a run's directory and a new one deletes, beside the logs of Hydra.
+WRITTEN = (
+    "checkpoints",
+    "csv",
+    "faults",
+    "init_from.txt",
+    "metrics.csv",
+    "metrics.json",
+    "pictures",
+    "tensorboard",
+)
+SESSIONS = "sessions.jsonl"
+
+
+class Identity(BaseModel):
+    """Content of ``run.json``. ``id``: of the run, wherever it is moved, also for loggers elsewhere.
+    ``settings_hash``: of the configuration without what may change while it trains. ``resume``: the value
+    that it began with. ``job``: of SLURM, which worked on it last."""
+
+    model_config = ConfigDict(strict=True)
+    id: str
+    config_hash: str
+    settings_hash: str
+    resume: str | None
+    job: str | None
+
 
 #: File of a run of a grid that says what sets it apart.
 SWEPT = "swept.json"
@@ -35,20 +72,32 @@ class State(StrEnum):
 
 
 class RunDirectory:
-    """Directory of a run; it need not exist."""
+    """Directory of a run; it need not exist. ``config_hash``: results of another configuration are none of
+    this run; None: whatever its configuration is."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, config_hash: str | None = None) -> None:
         self.path = Path(path).resolve()
+        self.config_hash = config_hash
         self._lock = self.path / ".lock"
+        self._is_mine = False
+
+    def of(self, config: Mapping[str, Any]) -> "RunDirectory":
+        """The directory as one of the run of ``config``."""
+        return RunDirectory(self.path, config_hash(config))
 
     @property
     def results(self) -> dict[str, Any] | None:
-        """Content of ``metrics.json``; None if it is missing or unreadable."""
+        """Content of ``metrics.json``; None if it is missing, unreadable or of another configuration."""
         path = self.path / "metrics.json"
         try:
-            return read_results(path) if path.is_file() else None
+            found = read_results(path) if path.is_file() else None
         except InputError:
             return None
+        if found is None or self.config_hash is None:
+            return found
+        # A verb may complete the configuration of its command, whose hash is that of the run.
+        hashes = [lookup(found["provenance"], key) for key in ("config_hash", "run.config_hash")]
+        return found if self.config_hash in hashes else None
 
     @property
     def done(self) -> bool:
@@ -93,13 +142,120 @@ class RunDirectory:
         """Process that worked on the run last, for messages."""
         return lock_owner(self._lock)
 
-    def claim(self, wait: bool = False) -> contextlib.AbstractContextManager[bool]:
+    @contextlib.contextmanager
+    def claim(self, wait: bool = False) -> Iterator[bool]:
         """Lock the run for this process; yields whether that succeeded (:func:`ghgs_lit.files.lock`)."""
-        return lock(self._lock, wait)
+        with lock(self._lock, wait) as self._is_mine:
+            try:
+                yield self._is_mine
+            finally:
+                self._is_mine = False
+
+    @property
+    def marker(self) -> Identity | None:
+        """Content of ``run.json``; None: the folder is no run's. InputError: it is another file."""
+        path = self.path / MARKER
+        if not path.is_file():
+            return None
+        return validated(Identity, read_json(path, "a run's identity"), str(path))
+
+    def start(self, config: Mapping[str, Any]) -> str | None:
+        """The checkpoint that the run of ``config`` starts from in this directory; None: from the first step.
+        Nothing is written. InputError: what another run wrote is there, or files of somebody else."""
+        resume = config.get("resume")
+        if self._has(resume) or self.goes_on(config):
+            own = resume if self._has(resume) else self.checkpoint
+            return str(own) if own is not None else _given(resume)
+        owned = self.marker is not None
+        there = self._there(*WRITTEN) if owned else self._there(*WRITTEN, SESSIONS)
+        if not there:
+            return _given(resume)
+        if not (config.get("overwrite") and owned):
+            raise InputError(f"{self.path}: {self._refusal(config, there[0], owned)}")
+        for key in ("init_from", "resume"):
+            source = config.get(key)
+            require(not self._has(source), key, "a file outside the run that overwrite=true deletes", source)
+        return _given(resume)
+
+    def goes_on(self, config: Mapping[str, Any]) -> bool:
+        """Whether the directory has the run that the same command began; only the length of a run that is not
+        complete, and what is measured after it, may differ."""
+        marker, resume = self.marker, config.get("resume")
+        if marker is None or resume is None or marker.resume != resume:
+            return False
+        if config.get("overwrite") and not (is_queued_again() and marker.job == slurm_job()):
+            return False
+        if marker.config_hash == config_hash(config):
+            return True
+        is_complete = RunDirectory(self.path).done
+        return not is_complete and marker.settings_hash == config_hash(config, MAY_CHANGE_ON_RESUME)
+
+    def _there(self, *names: str) -> list[str]:
+        return [name for name in names if os.path.lexists(self.path / name)]
+
+    def _has(self, path: str | None) -> bool:
+        """Whether ``path`` is a file of this run."""
+        return path not in (None, AUTO) and resolved(path).is_relative_to(self.path)
+
+    def _refusal(self, config: Mapping[str, Any], there: str, owned: bool) -> str:
+        ways = "hydra.run.dir or hydra.sweep.subdir name another"
+        if self.checkpoint is not None:
+            ways += f", resume={self.checkpoint} goes on with its weights"
+        if not owned:
+            return f"expected a directory without a run or other files of these names; found {there} ({ways})"
+        with contextlib.suppress(InputError, FileNotFoundError):
+            changed = differences(read_yaml(self.path / "config.yaml"), config)
+            if changed:
+                there = f"{there} of another configuration: {', '.join(changed[:3])}"
+        return (
+            f"expected a directory without a run; found {there} ({ways}, overwrite=true deletes a single run)"
+        )
+
+    def begin(self, config: Mapping[str, Any]) -> dict[str, Any]:
+        """Make the directory that of the run of ``config``; returns it with the checkpoint to start from as
+        ``resume``. Where there is none, what was written is trained again, and deleted. Call it where the run
+        is claimed. InputError: as for :meth:`start`."""
+        start, marker, is_same = self.start(config), self.marker, self.goes_on(config)
+        if not self._has(start):
+            self._clear(with_sessions=not is_same)
+        known = marker if is_same or self._has(start) else None
+        identity = Identity(
+            id=known.id if known else uuid.uuid4().hex[:8],
+            config_hash=config_hash(config),
+            settings_hash=config_hash(config, MAY_CHANGE_ON_RESUME),
+            resume=known.resume if known else config.get("resume"),
+            job=slurm_job(),
+        )
+        write_text_atomically(self.path / MARKER, identity.model_dump_json(indent=1) + "\n")
+        return {**config, "resume": start}
+
+    def _clear(self, with_sessions: bool) -> None:
+        """Delete what training wrote; only in a run's folder that this process has claimed."""
+        there = self._there(*WRITTEN, SESSIONS) if with_sessions else self._there(*WRITTEN)
+        if there and not (self._is_mine and self.marker is not None):
+            raise RuntimeError(f"{self.path}: files are deleted in a run that this process has claimed only")
+        for path in (self.path / name for name in there):
+            is_folder = path.is_dir() and not path.is_symlink()
+            shutil.rmtree(path) if is_folder else path.unlink()
+
+    def discard(self, others: Iterable[str], since: float) -> None:
+        """Remove a directory in which nothing was begun: it holds only files of a start after ``since``
+        (seconds), those of a run and ``others``, and no process works in it."""
+        known = {".lock", MARKER, "config.yaml", SESSIONS, *others}
+
+        def is_unused() -> bool:
+            paths = list(self.path.glob("*"))
+            return bool(paths) and all(p.name in known and p.lstat().st_mtime >= since for p in paths)
+
+        if self.path == Path.cwd() or not is_unused():
+            return
+        with self.claim() as mine:
+            if mine and is_unused():
+                shutil.rmtree(self.path, ignore_errors=True)
 
     def sessions(self) -> list[dict[str, Any]]:
         """An entry for each process that worked on the run; a killed one has no ``outcome``."""
-        path = self.path / "sessions.jsonl"
+        path = self.path / SESSIONS
         found: list[dict[str, Any]] = []
         for entry in read_lines_of_json(path) if path.exists() else ():
             if "started" in entry:
@@ -109,10 +265,14 @@ class RunDirectory:
         return found
 
     @contextlib.contextmanager
-    def session(self, **facts: Any) -> Iterator[dict[str, Any]]:
-        """Log start and end of this process in ``sessions.jsonl``. Yields a dict for numbers such as steps
-        and seconds, which are logged at the end."""
-        self._log({"started": _now(), "host": socket.gethostname(), "pid": os.getpid(), **facts})
+    def session(self, resumed: str | None = None) -> Iterator[dict[str, Any]]:
+        """Log start and end of this process in ``sessions.jsonl``, and the checkpoint that it ``resumed``
+        (relative to the run if it is its own). Yields a dict for numbers such as steps and seconds, which are
+        logged at the end."""
+        if self._has(resumed):
+            resumed = str(resolved(resumed).relative_to(self.path))
+        process = {"host": socket.gethostname(), "pid": os.getpid(), "launch": launch()}
+        self._log({"started": _now(), **process, "resumed": resumed})
         stats: dict[str, Any] = {}
         try:
             yield stats
@@ -122,9 +282,22 @@ class RunDirectory:
             raise
         self._log({"ended": _now(), "outcome": "done", **stats})
 
+    def session_beside(self) -> dict[str, Any] | None:
+        """The present session of the first of the processes that were started together with this one, with
+        the path of the checkpoint that it ``resumed``; None: there is none yet."""
+        last = (self.sessions() or [{}])[-1]
+        if last.get("launch") != launch() or "outcome" in last or not is_locked(self._lock):
+            return None
+        resumed = last["resumed"]
+        return {**last, "resumed": resumed and str(self.path / resumed)}
+
     def _log(self, entry: dict[str, Any]) -> None:
-        append_line(self.path / "sessions.jsonl", json.dumps(entry))
+        append_line(self.path / SESSIONS, json.dumps(entry))
 
 
 def _now() -> str:
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
+
+
+def _given(resume: str | None) -> str | None:
+    return None if resume == AUTO else resume

@@ -1,4 +1,4 @@
-"""Handling of Ctrl-C and SIGTERM, which end a process with exit code 130 or 143."""
+"""Handling of Ctrl-C and of the signals of batch systems, which end a process with 128 + their number."""
 
 import contextlib
 import os
@@ -9,7 +9,8 @@ from collections.abc import Callable, Iterator, Mapping
 from types import FrameType
 from typing import Any
 
-STOP = (signal.SIGINT, signal.SIGTERM)
+#: SIGUSR1 and SIGUSR2 are what ``sbatch --signal`` is asked to send before the end of a job's time.
+STOP = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 
 
 class Interrupted(SystemExit):
@@ -43,7 +44,7 @@ def interrupt(number: int) -> None:
 
 
 def handlers() -> dict[int, Any]:
-    """Present handlers of both signals, without those that were not set from Python."""
+    """Present handlers of these signals, without those that were not set from Python."""
     found = {number: signal.getsignal(number) for number in STOP}
     return {number: handler for number, handler in found.items() if handler is not None}
 
@@ -60,7 +61,7 @@ def handle(act: Callable[[int], Any], before: Mapping[int, Any]) -> None:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise :class:`Interrupted` on Ctrl-C and SIGTERM unless others handle them."""
+    """Raise :class:`Interrupted` on the signals :data:`STOP` unless others handle them."""
     before = handlers()
     handle(interrupt, before)
     try:
@@ -71,8 +72,10 @@ def interruptible() -> Iterator[None]:
                 signal.signal(number, handler)
 
 
-def print_how_to_go_on(stop: Interrupted, what: str, change: str) -> None:
-    """Print to stderr what was stopped, and how to change the command to go on with it."""
+def print_how_to_go_on(stop: Interrupted, what: str, place: str, is_queued: bool) -> None:
+    """Print to stderr what was stopped, and the key ``place`` with which the same command goes on with it;
+    ``is_queued``: SLURM will run it again."""
     stop.explained = True
     name = signal.Signals(stop.number).name
-    print(f"ghgs: {what} was interrupted ({name}); to go on, the same command with {change}", file=sys.stderr)
+    how = "SLURM queues its job again" if is_queued else f"to go on, the same command with {place}"
+    print(f"ghgs: {what} was interrupted ({name}); {how}", file=sys.stderr)

@@ -29,7 +29,7 @@ from ghgs_lit.data.sampling import RING_VIEW, ViewNumber, subject_rng
 from ghgs_lit.data.view import View, encode_depth
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import naming
-from ghgs_lit.kernels.cores import allowed_cores
+from ghgs_lit.kernels.cores import allowed_cores, use_known_start_method
 from ghgs_lit.synthesis import people
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import Lights, Studio
@@ -201,9 +201,7 @@ def _run(jobs: list[_Job], workers: int | None) -> Iterator[_Job]:
     if workers < 2:
         yield from map(render_subject, jobs)
         return
-    if multiprocessing.get_start_method() not in multiprocessing.get_all_start_methods():
-        # A worker of joblib inherits the name of a start method that a fresh process does not know.
-        multiprocessing.set_start_method("spawn", force=True)
+    use_known_start_method()
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, context, initializer=start_worker) as pool:
         try:

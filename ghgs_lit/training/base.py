@@ -58,6 +58,10 @@ class BudgetedModule(L.LightningModule):
             group.update(option, lr=rate, initial_lr=option["lr"])
             schedule.base_lrs[number] = option["lr"]
 
+    def on_train_batch_start(self, *args: Any) -> None:
+        # Lightning's own count is one ahead in a run that goes on from the end of another session.
+        self.trainer.fit_loop.epoch_loop._batches_that_stepped = self.global_step
+
     def step_seed(self, batch_idx: int) -> int:
         """Seed of the random numbers of this step: the same after an interruption, and in all processes, so
         that none waits for one that has drawn more rounds."""

@@ -1,8 +1,9 @@
 """Checkpoints, written atomically, also when a run is killed or asked to stop."""
 
 import os
+import signal
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import timedelta
 from pathlib import Path
 from typing import Annotated, Any
@@ -136,10 +137,24 @@ class Checkpoints(ModelCheckpoint):
         elif not trainer.sanity_checking:
             super().on_train_batch_end(trainer, pl_module, None, None, 0)
 
+    def state_dict(self) -> dict[str, Any]:
+        """Lightning's state with names of files in place of their paths, so that the folder can be moved."""
+        return _with_paths(super().state_dict(), lambda path: Path(path).name) | {"dirpath": ""}
+
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Continue with the best checkpoint so far, unless it is gone; Lightning: or in another folder."""
-        if all(Path(path).exists() for path in state_dict["best_k_models"]):
-            super().load_state_dict(state_dict)
+        """Continue with the best checkpoint so far, unless it is not in this run's folder."""
+        here = Path(self.dirpath)
+        if all((here / Path(path).name).exists() for path in state_dict["best_k_models"]):
+            state = _with_paths(state_dict, lambda path: str(here / Path(path).name))
+            super().load_state_dict(state | {"dirpath": self.dirpath})
+
+
+def _with_paths(state: dict[str, Any], change: Callable[[str], str]) -> dict[str, Any]:
+    """A state of ModelCheckpoint in which each path that is not empty is changed."""
+    names = ("best_model_path", "kth_best_model_path", "last_model_path")
+    paths = {name: change(state[name]) if state[name] else "" for name in names}
+    scores = {change(path): score for path, score in state["best_k_models"].items()}
+    return {**state, **paths, "best_k_models": scores}
 
 
 #: Seconds within which a second signal counts as the same one: a terminal sends it to all processes, which
@@ -148,9 +163,10 @@ _SAME = 1.0
 
 
 class StopAtStep(Checkpoint):
-    """On Ctrl-C or SIGTERM: finishes the step and its validation, writes ``last.ckpt`` and stops. A second
-    signal stops at once. Several processes stop after the same step. As the last ``Checkpoint``, Lightning
-    calls it after all other callbacks, whose state is saved. ``received``: the signal or 0."""
+    """On Ctrl-C or a signal of a batch system: finishes the step and its validation, writes ``last.ckpt`` and
+    stops. The same signal again, or Ctrl-C, stops at once. Several processes stop after the same step. As the
+    last ``Checkpoint``, Lightning calls it after all other callbacks, whose state is saved. ``received``: the
+    signal or 0."""
 
     def __init__(self) -> None:
         self.received = 0
@@ -165,7 +181,9 @@ class StopAtStep(Checkpoint):
         handle(self._note, self._before)
 
     def _note(self, number: int) -> None:
-        if self.received and time.monotonic() - self._since > _SAME:
+        # SIGTERM after SIGUSR1 comes from a batch system that waits, not from somebody who does not.
+        insists = number in (self.received, signal.SIGINT)
+        if self.received and insists and time.monotonic() - self._since > _SAME:
             raise Interrupted(number)
         if not self.received:
             self.received, self._since = number, time.monotonic()

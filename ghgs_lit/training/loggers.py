@@ -14,6 +14,7 @@ from torch.utils.tensorboard.summary import hparams
 from ghgs_lit.config.keys import is_hyperparameter, key_of, lookup
 from ghgs_lit.config.options import Options
 from ghgs_lit.errors import installed
+from ghgs_lit.files import write_atomically
 from ghgs_lit.readers import read_rows
 from ghgs_lit.runs.run import RunDirectory
 
@@ -50,19 +51,23 @@ class CsvLog(_StepsTaken, CSVLogger):
 
 
 class TensorBoardLog(_StepsTaken, TensorBoardLogger):
-    """TensorBoard's event files."""
+    """TensorBoard's event files, continued by a run that resumes in the same folder."""
 
     def resume(self, step: int) -> None:
-        """Make TensorBoard drop values logged after ``step``."""
+        """Drop what was logged after ``step``: from the files, and from a TensorBoard that has read them."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
+        for path in sorted(Path(self.log_dir).glob("events.out.tfevents.*")):
+            _drop_events_after(path, step)
         start = SessionLog(status=SessionLog.START)
         self.experiment.file_writer.add_event(Event(session_log=start), step + 1)
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Log without the epoch that Lightning adds; what is no loss or validation below ``work/``."""
+        """Log without the epoch that Lightning adds; what is no loss or validation below ``work/``. A
+        killed process loses nothing that it logged."""
         shown = {_sorted_last(name): value for name, value in metrics.items() if name != "epoch"}
         super().log_metrics(shown, step)
+        self.experiment.flush()
 
     def log_results(self, values: Mapping[str, Value], summary: Sequence[Mapping[str, Any]]) -> None:
         """Describe the run for the tab HParams, which shows its last validation beside ``values``, and write
@@ -77,11 +82,26 @@ def _sorted_last(name: str) -> str:
     return name if name.split("/")[0] in _FIRST else f"work/{name}"
 
 
+def _drop_events_after(path: Path, step: int) -> None:
+    from tensorboard.backend.event_processing.event_file_loader import RawEventFileLoader
+    from tensorboard.compat.proto.event_pb2 import Event
+    from tensorboard.summary.writer.record_writer import RecordWriter
+
+    def write(temporary: Path) -> None:
+        with open(temporary, "wb") as file:
+            writer = RecordWriter(file)
+            for record in RawEventFileLoader(str(path)).Load():
+                if Event.FromString(record).step <= step:
+                    writer.write(record)
+
+    write_atomically(path, write)
+
+
 class CsvOptions(Options):
     """Logged values in ``<run>/csv/metrics.csv``."""
 
     def build(self, save_dir: str) -> CsvLog:
-        return CsvLog(save_dir, name="csv", version="")
+        return CsvLog(save_dir, name="csv", version="", flush_logs_every_n_steps=1)
 
 
 class TensorBoardOptions(Options):
@@ -95,8 +115,14 @@ class TensorBoardOptions(Options):
         return TensorBoardLog(run.path.parent, name="tensorboard", version=run.title)
 
 
-class WandbLog(_StepsTaken, WandbLogger):
-    """Weights & Biases."""
+class WandbLog(WandbLogger):
+    """Weights & Biases: one run there for each run here, however often it is interrupted or moved."""
+
+    @rank_zero_only
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Log at the number of steps taken, by which steps that are trained again replace nothing."""
+        taken = None if step is None else step + 1
+        self.experiment.log({**metrics, "trainer/global_step": taken}, step=taken)
 
 
 class WandbOptions(Options):
@@ -104,7 +130,9 @@ class WandbOptions(Options):
 
     def build(self, save_dir: str) -> WandbLog:
         installed("wandb", "wandb", "logger.wandb")
-        return WandbLog(project=os.environ.get("WANDB_PROJECT", "ghgs_lit"), save_dir=save_dir)
+        project = os.environ.get("WANDB_PROJECT", "ghgs_lit")
+        identity = RunDirectory(Path(save_dir)).marker
+        return WandbLog(project=project, save_dir=save_dir, id=identity and identity.id)
 
 
 @rank_zero_only

@@ -7,9 +7,10 @@ from typing import Any
 from torch import nn
 
 from ghgs_lit.config import build
-from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, flatten, is_below, lookup
+from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, lookup
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import resolved
+from ghgs_lit.runs.provenance import differences
 from ghgs_lit.stages import STAGES
 from ghgs_lit.training.checkpoints import check_training_state
 from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint, require_finite, shape_of
@@ -38,7 +39,7 @@ def check_resume(path: str | Path, model: nn.Module, config: Mapping[str, Any]) 
     check_training_state(path, checkpoint)
     load_strictly(model, model_state(checkpoint), path)
     _check_optimizer(path, checkpoint, model, config)
-    return checkpoint["global_step"], differences(checkpoint["config"], config)
+    return checkpoint["global_step"], differences(checkpoint["config"], config, MAY_CHANGE_ON_RESUME)
 
 
 def _check_optimizer(
@@ -56,13 +57,6 @@ def _check_optimizer(
             found = [len(group.get("params", ())) for group in state["param_groups"]]
             place = f"{path}: optimizer_states.param_groups"
             require(found == own, place, f"as many groups and parameters as this run has, {own}", found)
-
-
-def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Lines ``key: old value -> new value`` of changed settings that the weights depend on."""
-    old, new = flatten(before), flatten(now)
-    keys = (key for key in sorted(old.keys() | new.keys()) if not is_below(key, MAY_CHANGE_ON_RESUME))
-    return [f"{key}: {old.get(key)} -> {new.get(key)}" for key in keys if old.get(key) != new.get(key)]
 
 
 def initialize(

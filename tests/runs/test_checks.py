@@ -1,11 +1,11 @@
-"""What is refused before anything starts: random frozen encoders, useless caches, directories with a run."""
+"""What is refused before anything starts: random frozen encoders, presets that depend on the training."""
 
 import pytest
 
 from ghgs_lit.cli import train as train_verb
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.errors import InputError
-from ghgs_lit.runs.job import check_config, check_directory
+from ghgs_lit.runs.job import check_config
 from tests.cli.test_main import call
 from tests.helpers.jobs import executed, record_execution
 
@@ -68,49 +68,6 @@ def test_training_needs_a_preset():
     """What ``skip=auto`` chooses depends on what the training has shown."""
     with pytest.raises(InputError, match=r"skip: expected the preset to train with.*token_budgets.*auto"):
         check_config(config("skip=auto"))
-
-
-@pytest.mark.parametrize("file", ["checkpoints/best.ckpt", "csv/metrics.csv", "metrics.json"])
-def test_a_directory_with_a_run_is_not_used_again(verb, tmp_path, file):
-    """The same ``hydra.run.dir`` a second time deleted the logs and replaced the checkpoint."""
-    run = tmp_path / "run"
-    (run / file).parent.mkdir(parents=True)
-    (run / file).write_text("precious")
-    where = f"hydra.run.dir={run}"
-    code, _, err = verb(where)
-    assert code == 1
-    assert f"expected a directory without a run; found {file}" in err
-    assert "resume=" in err
-    assert "overwrite=true" in err
-    other = tmp_path / "other.ckpt"
-    other.touch()
-    code, _, err = verb(where, f"resume={other}")
-    assert code == 1  # going on with another run here would destroy this one as well
-    assert (run / file).read_text() == "precious"
-    assert not executed(tmp_path)
-    code, _, _ = verb(where, "overwrite=true")
-    assert code == 0
-    assert len(executed(tmp_path)) == 1
-    assert file == "metrics.json" or not (run / file).exists()
-
-
-def test_a_run_goes_on_in_its_own_directory(tmp_path):
-    """``resume`` of the run's own checkpoint is no new run."""
-    last = tmp_path / "checkpoints" / "last.ckpt"
-    last.parent.mkdir()
-    last.touch()
-    check_directory(tmp_path, {"resume": str(last)})
-    assert last.exists()
-
-
-def test_overwriting_never_deletes_what_the_run_starts_from(tmp_path):
-    """``init_from`` may point into the directory that is deleted."""
-    best = tmp_path / "checkpoints" / "best.ckpt"
-    best.parent.mkdir()
-    best.touch()
-    with pytest.raises(InputError, match="init_from: expected a file outside the run"):
-        check_directory(tmp_path, {"resume": None, "overwrite": True, "init_from": str(best)})
-    assert best.exists()
 
 
 def test_a_sweep_overwrites_nothing(verb, tmp_path):

@@ -8,13 +8,15 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME
 from ghgs_lit.errors import InputError
+from ghgs_lit.runs.provenance import differences
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO, CheckpointOptions
 from ghgs_lit.training.cost import TrainingCost
 from ghgs_lit.training.loggers import CsvLog, TensorBoardLog
 from ghgs_lit.training.loggers import resume as resume_logs
-from ghgs_lit.training.start import check_resume, check_start, differences
+from ghgs_lit.training.start import check_resume, check_start
 from ghgs_lit.training.validation_pictures import PicturesOptions
 from ghgs_lit.weights import frozen
 from ghgs_lit.weights.checkpoint import read_checkpoint
@@ -339,7 +341,7 @@ def test_a_longer_budget_is_no_difference():
     """Only settings that the weights depend on are reported when a run resumes."""
     before = {"trainer": {"max_steps": 10, "precision": 32}, "logger": {"csv": {"name": "a"}}}
     now = {"trainer": {"max_steps": 20, "precision": 16}, "logger": {}}
-    assert differences(before, now) == ["trainer.precision: 32 -> 16"]
+    assert differences(before, now, MAY_CHANGE_ON_RESUME) == ["trainer.precision: 32 -> 16"]
 
 
 def test_one_way_to_start(tmp_path):

@@ -1,0 +1,280 @@
+"""A directory is that of one configuration: what goes on in it, what is refused, and what may be deleted."""
+
+import json
+import os
+import shutil
+import time
+
+import pytest
+
+from ghgs_lit.cli import train as train_verb
+from ghgs_lit.config import compose, resolve
+from ghgs_lit.config.compose import saved_text
+from ghgs_lit.errors import InputError
+from ghgs_lit.runs import job
+from ghgs_lit.runs.provenance import config_hash
+from ghgs_lit.runs.run import MARKER, RunDirectory, State
+from tests.cli.test_main import call
+from tests.helpers.jobs import hold_run, record_execution, write_finished_run
+from tests.helpers.processes import PREPARED
+
+CONFIG = {"seed": 1, "resume": "auto", "init_from": None, "overwrite": False, "optimizer": {"lr": 0.5}}
+CONFIG |= {"trainer": {"max_steps": 4}}
+
+
+class Killed(BaseException):
+    pass
+
+
+def train_to(checkpoint: bool, seen: list):
+    """A training that is killed, after its first checkpoint or before."""
+
+    def train(config, directory, stats):
+        seen.append(config["resume"])
+        for name in ("csv/metrics.csv", "tensorboard/events", *["checkpoints/last.ckpt"] * checkpoint):
+            (directory / name).parent.mkdir(exist_ok=True)
+            (directory / name).write_text("seed 1")
+        raise Killed
+
+    return train
+
+
+def killed(path, config=CONFIG, checkpoint=True) -> list:
+    """Train in a directory until a kill; the checkpoint that was resumed."""
+    seen = []
+    with pytest.raises(Killed):
+        job.train_once(RunDirectory(path), dict(config), train_to(checkpoint, seen))
+    return seen
+
+
+def finished(path, config=CONFIG) -> float:
+    return job.train_once(RunDirectory(path), dict(config), record_execution)
+
+
+@pytest.fixture
+def verb(monkeypatch, capsys):
+    """``verb("seed=1")`` runs ``ghgs train`` without training."""
+    monkeypatch.setattr(train_verb, "train", record_execution)
+    return lambda *overrides: call(monkeypatch, capsys, "train", *overrides)
+
+
+def test_a_single_run_goes_on_with_the_same_command(tmp_path, capsys):
+    """A batch system that queues a job again runs its command again: nothing is refused, nothing is lost."""
+    path = tmp_path / "run"
+    last = str(path / "checkpoints" / "last.ckpt")
+    assert killed(path, checkpoint=False) == [None]
+    assert killed(path) == [None]
+    identity = RunDirectory(path).marker
+    assert killed(path) == [last]
+    assert finished(path) == 20.5
+    assert [s["resumed"] for s in RunDirectory(path).sessions()] == [
+        None,
+        None,
+        *["checkpoints/last.ckpt"] * 2,
+    ]
+    assert "done before" not in capsys.readouterr().out
+    assert finished(path) == 20.5  # and is not trained again
+    assert f"done before: {path}" in capsys.readouterr().out
+    assert len(RunDirectory(path).sessions()) == 4
+    assert RunDirectory(path).marker == identity
+
+
+def test_what_is_trained_again_leaves_no_logs_of_before(tmp_path):
+    """A kill before the first checkpoint left event files, beside which the same steps stood again."""
+    killed(tmp_path / "run", checkpoint=False)
+    (tmp_path / "run" / "tensorboard" / "events").rename(tmp_path / "run" / "tensorboard" / "events.1")
+    killed(tmp_path / "run", checkpoint=False)
+    assert os.listdir(tmp_path / "run" / "tensorboard") == ["events"]
+
+
+def test_a_moved_run_goes_on(tmp_path):
+    """No file of a run names its directory."""
+    killed(tmp_path / "run")
+    shutil.move(tmp_path / "run", tmp_path / "moved")
+    assert killed(tmp_path / "moved") == [str(tmp_path / "moved" / "checkpoints" / "last.ckpt")]
+    named = [
+        p for p in (tmp_path / "moved").rglob("*") if p.is_file() and str(tmp_path).encode() in p.read_bytes()
+    ]
+    assert named == []
+
+
+@pytest.mark.parametrize("is_done", [False, True])
+def test_two_configurations_do_not_share_a_directory(tmp_path, is_done):
+    """The second was "done before", and never trained."""
+    finished(tmp_path / "run") if is_done else killed(tmp_path / "run")
+    before = sorted((p, p.stat().st_mtime_ns) for p in (tmp_path / "run").rglob("*") if p.name != ".lock")
+    with pytest.raises(
+        InputError, match=r"run: expected a directory without a run; found .* \(.*overwrite=true"
+    ):
+        killed(tmp_path / "run", CONFIG | {"seed": 2})
+    after = sorted((p, p.stat().st_mtime_ns) for p in (tmp_path / "run").rglob("*") if p.name != ".lock")
+    assert after == before
+    other = RunDirectory(tmp_path / "run").of(CONFIG | {"seed": 2})
+    assert (other.done, other.metric) == (False, None)
+
+
+def test_the_refusal_names_what_differs(verb, tmp_path):
+    """Seconds of reading two configurations are saved."""
+    where = f"hydra.run.dir={tmp_path / 'run'}"
+    assert verb(where)[0] == 0
+    (tmp_path / "run" / "config.yaml").write_text(saved_text(resolve(compose("train", ["resume=null"]))))
+    code, _, err = verb(where, "seed=2")
+    assert code == 1
+    assert len(err.splitlines()) == 1
+    assert "found metrics.csv of another configuration: seed: 1 -> 2 (" in err
+
+
+def test_the_length_of_a_run_may_change_until_it_is_complete(tmp_path):
+    """A shorter budget lets a run end; the results of a complete one are not replaced unasked."""
+    longer = CONFIG | {"trainer": {"max_steps": 8}}
+    killed(tmp_path / "run")
+    assert killed(tmp_path / "run", longer) == [str(tmp_path / "run" / "checkpoints" / "last.ckpt")]
+    assert finished(tmp_path / "run", longer) == 20.5
+    with pytest.raises(InputError, match="expected a directory without a run"):
+        finished(tmp_path / "run")
+    assert RunDirectory(tmp_path / "run").of(longer).done
+
+
+def test_a_checkpoint_of_the_run_itself_goes_on_with_other_settings(tmp_path):
+    """``resume=`` is how a finished run is trained on."""
+    finished(tmp_path / "run")
+    killed(tmp_path / "run", CONFIG | {"resume": str(tmp_path / "run" / "checkpoints" / "last.ckpt")})
+    best = str(tmp_path / "run" / "checkpoints" / "best.ckpt")
+    changed = CONFIG | {"optimizer": {"lr": 0.1}}
+    assert killed(tmp_path / "run", changed | {"resume": best}) == [best]
+    assert RunDirectory(tmp_path / "run").marker.config_hash == config_hash(changed)
+
+
+def test_a_run_that_began_elsewhere_goes_on_here(tmp_path):
+    """The same command with a checkpoint of another run must not begin from it a second time."""
+    other = tmp_path / "other.ckpt"
+    other.touch()
+    from_other = CONFIG | {"resume": str(other)}
+    assert killed(tmp_path / "run", from_other) == [str(other)]
+    assert killed(tmp_path / "run", from_other) == [str(tmp_path / "run" / "checkpoints" / "last.ckpt")]
+    killed(tmp_path / "second")
+    with pytest.raises(InputError, match="expected a directory without a run"):
+        killed(tmp_path / "second", from_other)
+    with pytest.raises(InputError, match="expected a directory without a run"):
+        killed(tmp_path / "second", CONFIG | {"resume": None})
+
+
+@pytest.mark.parametrize(
+    "file", ["checkpoints/other.pth", "csv/table.csv", "metrics.json", "pictures/holiday.jpg"]
+)
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_files_of_others_are_neither_deleted_nor_mixed_with_a_run(verb, tmp_path, file, overwrite):
+    """``overwrite=true hydra.run.dir=.`` deleted a user's pictures."""
+    (tmp_path / file).parent.mkdir(exist_ok=True)
+    (tmp_path / file).write_text("mine")
+    code, _, err = verb(f"hydra.run.dir={tmp_path}", f"overwrite={overwrite}")
+    assert code == 1
+    assert (
+        f"expected a directory without a run or other files of these names; found {file.split('/')[0]}" in err
+    )
+    assert (tmp_path / file).read_text() == "mine"
+    assert not (tmp_path / MARKER).exists()
+
+
+def test_overwriting_deletes_a_run_and_nothing_else(verb, tmp_path):
+    """A link in the run is removed, not what it points to; notes of the user stay; the run has a new name."""
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "a.png").touch()
+    killed(tmp_path / "run")
+    before = RunDirectory(tmp_path / "run").marker.id
+    (tmp_path / "run" / "pictures").symlink_to(outside)
+    (tmp_path / "run" / "notes.txt").touch()
+    killed(tmp_path / "run", CONFIG | {"seed": 2, "overwrite": True}, checkpoint=False)
+    assert (outside / "a.png").exists()
+    assert (tmp_path / "run" / "notes.txt").exists()
+    assert not (tmp_path / "run" / "pictures").exists()
+    assert not (tmp_path / "run" / "checkpoints").exists()
+    assert RunDirectory(tmp_path / "run").marker.id != before
+    assert len(RunDirectory(tmp_path / "run").sessions()) == 1
+
+
+@pytest.mark.parametrize("key", ["init_from", "resume"])
+def test_overwriting_never_deletes_what_the_run_starts_from(tmp_path, key):
+    killed(tmp_path)
+    last = tmp_path / "checkpoints" / "last.ckpt"
+    config = CONFIG | {"overwrite": True, key: str(last)}
+    if key == "init_from":
+        with pytest.raises(InputError, match="init_from: expected a file outside the run"):
+            killed(tmp_path, config)
+    else:
+        assert killed(tmp_path, config) == [str(last)]
+    assert last.exists()
+
+
+def test_nothing_is_deleted_without_the_lock(tmp_path):
+    """Two processes that were started together decide one after the other."""
+    killed(tmp_path)
+    with pytest.raises(RuntimeError, match="claimed"):
+        RunDirectory(tmp_path).begin(CONFIG | {"overwrite": True})
+    assert (tmp_path / "checkpoints" / "last.ckpt").exists()
+
+
+def test_a_job_that_is_queued_again_does_not_overwrite_itself(tmp_path, monkeypatch):
+    """Its command has ``overwrite=true`` still."""
+    config = CONFIG | {"overwrite": True}
+    monkeypatch.setenv("SLURM_JOB_ID", "77")
+    assert killed(tmp_path, config) == [None]
+    assert killed(tmp_path, config) == [None]
+    monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
+    assert killed(tmp_path, config) == [str(tmp_path / "checkpoints" / "last.ckpt")]
+    monkeypatch.setenv("SLURM_JOB_ID", "78")
+    assert killed(tmp_path, config) == [None]
+
+
+@pytest.mark.parametrize("text", ["[]", "{", '{"id": "a"}'])
+def test_a_marker_of_another_program_is_refused(tmp_path, text):
+    (tmp_path / MARKER).write_text(text)
+    (tmp_path / "pictures").mkdir()
+    with pytest.raises(InputError, match=r"run\.json"):
+        killed(tmp_path, CONFIG | {"overwrite": True})
+    assert (tmp_path / "pictures").exists()
+
+
+def test_the_loser_of_two_starts_leaves_the_winner_alone(verb, tmp_path):
+    """It deleted the directory that the winner had begun."""
+    run, ready = tmp_path / "run", PREPARED.Event()
+    holder = PREPARED.Process(target=hold_run, args=(run, ready))
+    holder.start()
+    try:
+        assert ready.wait(30)
+        (run / "config.yaml").write_text("of the winner")
+        os.utime(run / "config.yaml", (time.time() + 60,) * 2)
+        code, _, err = verb(f"hydra.run.dir={run}")
+        assert code == 1
+        assert f"found process {holder.pid} on" in err
+        assert (run / "config.yaml").read_text() == "of the winner"
+        assert RunDirectory(run).state == State.RUNNING
+    finally:
+        holder.kill()
+        holder.join()
+
+
+@pytest.mark.parametrize("name", ["LOCAL_RANK", "RANK", "SLURM_PROCID"])
+def test_numbers_of_processes_that_were_left_over_do_not_count(verb, tmp_path, monkeypatch, name):
+    """A run was "done" without configuration, sessions or lock."""
+    from lightning.pytorch.utilities import rank_zero_only
+
+    monkeypatch.setenv(name, "1")
+    monkeypatch.setattr(rank_zero_only, "rank", 1)
+    assert verb(f"hydra.run.dir={tmp_path / 'run'}")[0] == 0
+    run = RunDirectory(tmp_path / "run")
+    assert (run.done, len(run.sessions()), run.marker is None) == (True, 1, False)
+    assert rank_zero_only.rank == 0
+
+
+def test_results_are_those_of_the_configuration(tmp_path):
+    write_finished_run(tmp_path, CONFIG)
+    assert RunDirectory(tmp_path).of(CONFIG).metric == 20
+    assert RunDirectory(tmp_path).of(CONFIG | {"resume": None}).done
+    assert not RunDirectory(tmp_path).of(CONFIG | {"seed": 2}).done
+    # A verb may complete the configuration of its command.
+    content = json.loads((tmp_path / "metrics.json").read_text())
+    content["provenance"]["run"] = {"config_hash": config_hash(CONFIG | {"seed": 2})}
+    (tmp_path / "metrics.json").write_text(json.dumps(content))
+    assert RunDirectory(tmp_path).of(CONFIG | {"seed": 2}).done
