@@ -194,13 +194,8 @@ def lock(path: str | Path, wait: bool = False) -> Iterator[bool]:
     if path in _HELD:
         yield False
         return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle = _open_lock(path, os.O_RDWR | os.O_CREAT)
+    handle, locked = _locked_file(path, wait)
     try:
-        locked = _try_lock(handle, fcntl.LOCK_EX, wait, path)
-        if not locked:  # is_locked() in another process may have held it for a moment
-            time.sleep(0.05)
-            locked = _try_lock(handle, fcntl.LOCK_EX, wait, path)
         if locked:
             _HELD.add(path)
             os.ftruncate(handle, 0)
@@ -209,6 +204,25 @@ def lock(path: str | Path, wait: bool = False) -> Iterator[bool]:
     finally:
         os.close(handle)
         _HELD.discard(path)
+
+
+def _locked_file(path: Path, wait: bool) -> tuple[int, bool]:
+    """Handle of the file, and whether it is locked now."""
+    while True:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle = _open_lock(path, os.O_RDWR | os.O_CREAT)
+        try:
+            locked = _try_lock(handle, fcntl.LOCK_EX, wait, path)
+            if not locked:  # is_locked() in another process may have held it for a moment
+                time.sleep(0.05)
+                locked = _try_lock(handle, fcntl.LOCK_EX, wait, path)
+        except BaseException:
+            os.close(handle)
+            raise
+        with contextlib.suppress(FileNotFoundError):
+            if not locked or os.path.samestat(os.fstat(handle), os.stat(path)):
+                return handle, locked
+        os.close(handle)  # the process that held it has removed the file with its folder
 
 
 def is_locked(path: str | Path) -> bool:

@@ -278,3 +278,12 @@ def test_results_are_those_of_the_configuration(tmp_path):
     content["provenance"]["run"] = {"config_hash": config_hash(CONFIG | {"seed": 2})}
     (tmp_path / "metrics.json").write_text(json.dumps(content))
     assert RunDirectory(tmp_path).of(CONFIG | {"seed": 2}).done
+
+
+def test_a_refused_command_changes_no_file_of_the_run(verb, tmp_path):
+    """``.hydra`` said another seed than the run had."""
+    where = f"hydra.run.dir={tmp_path / 'run'}"
+    assert verb(where)[0] == 0
+    before = {p: p.read_bytes() for p in (tmp_path / "run").rglob("*") if p.is_file()}
+    assert verb(where, "seed=2")[0] == 1
+    assert {p: p.read_bytes() for p in (tmp_path / "run").rglob("*") if p.is_file()} == before
