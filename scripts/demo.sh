@@ -26,6 +26,6 @@ Table:        $out/table/table.md
 Attention:    $full/pictures/step_*/*_attention.png (of an elbow, by layer, with s and with s = 1)
 Pictures:     $out/*/pictures
 Splat:        ghgs predict checkpoint=$full/checkpoints/last.ckpt
-TensorBoard:  tensorboard --logdir $out
+TensorBoard:  tensorboard --logdir $out/tensorboard
 (the commands are in .venv/bin: source .venv/bin/activate)
 TEXT

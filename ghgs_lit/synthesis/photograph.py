@@ -9,12 +9,13 @@ Embree casts ``samples`` x ``samples`` rays on a regular grid through each pixel
 * depth: z of the hit nearest to the pixel's centre (at the centre itself when ``samples`` is odd), 0 where
   there is none. It is no mean of samples, so that no depth lies between two surfaces."""
 
+import importlib
+import platform
 from dataclasses import dataclass
+from types import ModuleType
 
 import numpy as np
 import trimesh
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.synthesis.people.mesh import Person, sample_texture
@@ -23,6 +24,18 @@ from ghgs_lit.types import Cameras
 
 # Rays traced at once: they fit the processor's cache, which is three times as fast as a whole photograph.
 _CHUNK = 1 << 14
+
+
+def _embree() -> tuple[ModuleType, ModuleType]:
+    """Modules of Embree, which some machines lack. InputError: it is not installed."""
+    try:
+        return tuple(map(importlib.import_module, ("embreex.rtcore_scene", "embreex.mesh_construction")))
+    except ImportError:
+        found = f"none ({platform.system()} {platform.machine()} may have no wheel)"
+        message = (
+            "rendering of meshes: expected the package embreex, or photographs that are rendered elsewhere"
+        )
+        raise InputError(f"{message}; found {found}") from None
 
 
 @dataclass(frozen=True)
@@ -105,8 +118,9 @@ class Studio:
         self._textures = [part.texture for part in parts]
         corners = self._vertices[self._faces].astype(np.float64)
         self._face_normals = trimesh.unitize(trimesh.triangles.cross(corners)).astype(np.float32)
-        self._scene = EmbreeScene(robust=True)
-        TriangleMesh(self._scene, self._vertices, self._faces)
+        scenes, meshes = _embree()
+        self._scene = scenes.EmbreeScene(robust=True)
+        meshes.TriangleMesh(self._scene, self._vertices, self._faces)
 
     def shoot(self, cameras: Cameras) -> Photographs:
         """Photographs from ``cameras`` [n]. InputError: a camera is not finite or has a focal length <= 0."""

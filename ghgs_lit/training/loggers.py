@@ -72,7 +72,8 @@ class TensorBoardLog(_StepsTaken, TensorBoardLogger):
     def log_results(self, values: Mapping[str, Value], summary: Sequence[Mapping[str, Any]]) -> None:
         """Describe the run for the tab HParams, which shows its last validation beside ``values``, and write
         the final measurement to the tab Text: as scalars, its numbers would be charts of one point."""
-        compared = [f"val/{name}" for name in COMPARED if summary[0].get(name) is not None]
+        validated = [name for name in COMPARED if name != "flip" and summary[0].get(name) is not None]
+        compared = [f"val/{name}" for name in validated]
         for part in hparams(dict(values), dict.fromkeys(compared, 0.0)):
             self.experiment._get_file_writer().add_summary(part)
         self.experiment.add_text("measurement", tabulate(summary, "keys", "github"))

@@ -1,10 +1,15 @@
 """Photographs of analytic shapes: depth, silhouettes, antialiasing, light."""
 
+import re
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 import trimesh
 
+import ghgs_lit
 from ghgs_lit.data.sampling import subject_rng
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import pixel_centers, project, unproject_maps
@@ -259,3 +264,12 @@ def test_placing_scales_and_moves_body_and_clothes_alike():
     np.testing.assert_allclose(placed.body_vertices, placed.parts[0].vertices[::2], atol=1e-6)
     kept = Rig(height=None).place(person, subject_rng(0, "b"))
     np.testing.assert_allclose(np.ptp(kept.parts[0].vertices[:, 1]), 3.0, atol=1e-5)
+
+
+def test_without_embree_only_rendering_is_refused(monkeypatch):
+    """Some machines have no wheel of it: what renders no mesh works there: nothing imports it before."""
+    monkeypatch.setitem(sys.modules, "embreex.rtcore_scene", None)
+    with pytest.raises(InputError, match="expected the package embreex, or photographs that are rendered"):
+        Studio(Person("p", (quad(),), None), LIGHT)
+    sources = [path.read_text() for path in Path(ghgs_lit.__file__).parent.rglob("*.py")]
+    assert not [text for text in sources if re.search(r"^(?:import|from) embreex", text, re.M)]

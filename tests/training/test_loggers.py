@@ -84,7 +84,12 @@ def run(tmp_path_factory):
     )  # fmt: skip
     trainer.fit(subject, StepData())
     values = {"ablation": "full", "seed": 1, "lr": 0.1}
-    log_results(trainer.loggers, values, [{"views": 4, "targets": "release", "psnr": 30.0, "ssim": None}], 8)
+    log_results(
+        trainer.loggers,
+        values,
+        [{"views": 4, "targets": "release", "psnr": 30.0, "ssim": None, "flip": 0.1}],
+        8,
+    )
     return folder, subject
 
 
@@ -183,7 +188,7 @@ def test_the_session_says_what_the_run_is_and_that_it_ended(run):
     columns = hparams(folder, "_hparams_/experiment").experiment.metric_infos
     assert [column.name.tag for column in columns] == ["val/psnr"]
     (written,) = events(folder).Tensors("measurement/text_summary")
-    assert "| release   |     30 |" in written.tensor_proto.string_val[0].decode()
+    assert "| release   |     30 |        |    0.1 |" in written.tensor_proto.string_val[0].decode()
 
 
 def test_nothing_of_the_clock_stays(run):
