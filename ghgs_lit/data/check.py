@@ -15,6 +15,7 @@ from rich.table import Table
 from torch.utils.data import DataLoader, Dataset
 
 from ghgs_lit.data.datamodule import PhotographsDataModule
+from ghgs_lit.data.layout import Completeness
 from ghgs_lit.data.overlap import Tile, draw_tile, overlap, save_sheet
 from ghgs_lit.data.reader import PHASES, Photographs, Reader
 from ghgs_lit.data.sampling import CAMERAS, RING_VIEW, TargetProtocol
@@ -43,7 +44,8 @@ Photograph = tuple[str, int, int]
 class Seen:
     """Result of reading one photograph. ``iou``: of body and mask (:func:`overlap`). Without a body to
     compare: ``agreement``, the share of the mask that the other masks allow, and ``silhouette``, the coarse
-    mask. ``tall``: the subject's largest side in world units, by body or masks."""
+    mask. ``tall``: the subject's largest side in world units, by body or masks. ``bright``: the mean of the
+    photograph in its mask, 1 for white."""
 
     name: str
     position: int
@@ -52,6 +54,7 @@ class Seen:
     agreement: float | None = None
     body: bool = False
     tall: float | None = None
+    bright: float | None = None
     digest: str | None = None
     problem: str | None = None
     silhouette: Silhouette | None = None
@@ -75,18 +78,19 @@ class Phase:
         return len({one.name for one in self.seen if one.body})
 
     def known(self, key: str) -> list[float]:
-        """All known values of ``iou``, ``agreement`` or ``tall``."""
+        """All known values of ``iou``, ``agreement``, ``tall`` or ``bright``."""
         return [value for one in self.seen if (value := getattr(one, key)) is not None]
 
 
 @dataclass
 class Report:
     """Result of a check. ``problems``: lines ``<place>: expected ...; found ...`` that prevent training;
-    ``notes``: lines that do not."""
+    ``notes``: lines that do not. ``lights``: of renders that this package made, ``studio`` or ``none``."""
 
     phases: dict[str, Phase] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    lights: str | None = None
 
 
 @dataclass(frozen=True)
@@ -113,6 +117,7 @@ class _Readings(Dataset):
             return seen
         seen.digest = hashlib.blake2b(view.image.tobytes(), digest_size=16).hexdigest()
         seen.tile = draw_tile(view, body) if wanted else None
+        seen.bright = float(view.image[view.mask].mean() / 255)
         if body is not None:
             seen.body, seen.tall, seen.iou = True, float(np.ptp(body, axis=0).max()), overlap(body, view)
         if (problem := self._problem(view, seen.iou)) is not None:
@@ -157,6 +162,9 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
         report.phases[phase] = found
         report.problems += reader.problems + [seen.problem for seen in found.seen if seen.problem]
         report.notes += _notes(dataset.published.get(phase), phase, found)
+        if (wanted := getattr(getattr(dataset, "render", None), "lights", None)) is not None:
+            report.lights = Completeness(dataset.folder).lights
+            report.notes += _notes_on_lights(wanted, report.lights, phase, found)
     report.problems += _in_both(str(dataset.root), report.phases)
     if not report.problems:
         report.problems += _cannot_sample(data, targets, "train" in report.phases)
@@ -247,6 +255,18 @@ def _notes(published: int | None, phase: str, found: Phase) -> list[str]:
     return notes
 
 
+def _notes_on_lights(wanted: str, stored: str | None, phase: str, found: Phase) -> list[str]:
+    """A note where renders of this package have other lights than the configuration says."""
+    if stored in (None, wanted):
+        return []
+    bright = np.mean(found.known("bright") or [0.0])
+    why = "lit again where textures have light of their own" if stored == "studio" else "not lit"
+    return [
+        f"{phase}: expected renders with data.render.lights={wanted}; found {stored} ({why}), subjects of"
+        f" {bright:.3f} of full brightness (errors of darker ones count less in dB)"
+    ]
+
+
 def _in_both(root: str, phases: dict[str, Phase]) -> list[str]:
     """Problems: subjects, or photographs under different names, in both ``train`` and ``val``."""
     if set(phases) != set(PHASES):
@@ -289,14 +309,20 @@ def _counts(phase: Phase) -> dict[str, int]:
 
 def show(report: Report) -> None:
     """Print the report as tables."""
-    table = Table("phase", "people", "subjects", "photos", "broken", "bodies", "mean IoU", "min IoU", "agree")
+    table = Table(
+        "phase", "people", "subjects", "photos", "broken", "bodies", "mean IoU", "min IoU", "agree", "bright"
+    )
     for name, phase in report.phases.items():
         iou, agreement = phase.known("iou"), phase.known("agreement")
         numbers = [f"{np.mean(iou):.3f}", f"{min(iou):.3f}"] if iou else ["-", "-"]
         numbers.append(f"{min(agreement):.3f}" if agreement else "-")
+        bright = phase.known("bright")
+        numbers.append(f"{np.mean(bright):.3f}" if bright else "-")
         table.add_row(name, *map(str, _counts(phase).values()), *numbers)
     if report.phases:
         rich.print(table)
+    if report.lights is not None:
+        print(f"rendered with data.render.lights={report.lights}")
     for title, lines in (("problem", report.problems), ("note", report.notes)):
         if lines:
             table = Table(title, "expected", "found")
@@ -313,6 +339,7 @@ def write(report: Report, folder: Path) -> Path:
     content = {
         "problems": [dict(zip(keys, split_line(line), strict=True)) for line in report.problems],
         "notes": report.notes,
+        "lights": report.lights,
         "phases": {},
     }
     for name, phase in report.phases.items():

@@ -17,9 +17,10 @@ and ``done/<phase>/<subject>`` (an empty file for each complete subject, written
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -57,6 +58,14 @@ class Completeness:
         return self.folder.is_dir()
 
     @property
+    def lights(self) -> str | None:
+        """``data.render.lights`` of the renders: ``studio`` or ``none``; None: they were made elsewhere."""
+        path = self.folder / "settings.json"
+        settings = read_json(path) if path.exists() else {}
+        render = settings.get("render") if isinstance(settings, dict) else None
+        return None if not isinstance(render, dict) else lights_of(render)
+
+    @property
     def plan(self) -> dict[str, list[str]]:
         """Requested subjects of each phase, complete or not."""
         path = self.folder / "plan.json"
@@ -78,6 +87,11 @@ class Completeness:
         """Those of ``names`` that are completely rendered."""
         missing = set(self.missing(phase, names))
         return [name for name in names if name not in missing]
+
+
+def lights_of(render: Mapping[str, Any]) -> str:
+    """``studio`` or ``none``, of the stored settings of renders, which hold the lights themselves."""
+    return "none" if render.get("lights") == "none" else "studio"
 
 
 _IMAGE_SUFFIXES = (".jpg", ".png", ".jpeg")

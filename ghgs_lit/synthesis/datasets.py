@@ -216,6 +216,7 @@ class Scans(DataSet, _OnRing):
 
     name: Text = "scans"
     size: Size = (140, 140)
+    render: RenderOptions = RenderOptions(lights="none")
     source: options.Path | None = None
     """Folder of textured meshes, <id>/<id>.obj or .glb; only for rendering."""
     split: options.Path | dict[str, tuple[Text | Index, ...] | None] | None = None

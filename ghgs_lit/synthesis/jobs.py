@@ -4,6 +4,7 @@ are spawned (a fork of a process that runs threads may hang): each imports the s
 process that holds the lock moves finished subjects to their place."""
 
 import contextlib
+import logging
 import multiprocessing
 import os
 import signal
@@ -14,7 +15,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 import torch
@@ -35,6 +36,8 @@ from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import Lights, Studio
 from ghgs_lit.synthesis.progress import Progress
 from ghgs_lit.synthesis.rig import STILL, Poses, Rig
+
+log = logging.getLogger(__name__)
 
 _GUARD = 'if __name__ == "__main__":'
 # Part of every cache key: to be increased when photographs of the same settings change.
@@ -85,6 +88,9 @@ class RenderOptions(Options):
     Targets need 0, 2, 3 and 4, stereo methods need 1."""
     quality: int = Field(98, ge=1, le=100)
     """Of the JPEG files."""
+    lights: Literal["studio", "none"] = "studio"
+    """studio: white lights around each person, for textures without light; none: textures as they are, for
+    scans, whose textures are photographs with the light of their day."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +107,8 @@ class _Job:
 def everything(rig: Rig, settings: RenderOptions) -> dict:
     """All settings besides the seed that photographs of a person depend on, as plain data."""
     cameras = {**asdict(rig), "variation": rig.variation.model_dump()}
-    return {"rig": cameras, "render": {**settings.model_dump(), "lights": asdict(LIGHTS)}}
+    lights = asdict(LIGHTS) if settings.lights == "studio" else settings.lights
+    return {"rig": cameras, "render": {**settings.model_dump(), "lights": lights}}
 
 
 def identity(rig: Rig, settings: RenderOptions, seed: int) -> dict:
@@ -116,11 +123,21 @@ def identity(rig: Rig, settings: RenderOptions, seed: int) -> dict:
     return {"version": RENDER_VERSION, "seed": seed, "rig": cameras, "render": render}
 
 
-def render_subject(job: _Job) -> _Job:
-    """Render one person into its workspace."""
+def render_subject(job: _Job) -> tuple[_Job, str]:
+    """Render one person into its workspace. Returns the job, and why the person is bad (empty: it is not)."""
+    try:
+        _render(job)
+    except InputError as error:
+        return job, str(error)
+    return job, ""
+
+
+def _render(job: _Job) -> None:
     rng = subject_rng(job.seed, job.name)
     person = job.rig.place(job.source.load(job.name), rng)
     yaws, lights = job.rig.yaws(rng) + job.source.facing(job.name), LIGHTS.draw(rng)
+    if job.settings.lights == "none":
+        lights = None
     height, width = job.settings.size
     # A separate generator: heights, yaws and lights do not depend on what is varied.
     rig, poses = job.rig.drawn(person, yaws, width / height, rng.spawn(1)[0])
@@ -129,7 +146,6 @@ def render_subject(job: _Job) -> _Job:
         write_view(job.workspace, position_name(job.name, position), number, view, job.settings.quality)
     if person.body_vertices is not None:
         write_body(job.workspace, job.name, person.body_vertices)
-    return job
 
 
 def photographs(
@@ -167,8 +183,8 @@ def render_people(
 
     It is safe to kill, to repeat, and to start twice at once: a second process waits for the first.
     ``names``: people of each phase. ``workers``: number of processes (None: one for each core; 0: only this
-    one). ``shown``: whether there is a progress bar. InputError: ``root`` holds something else, a person is
-    bad, or the script has no main guard."""
+    one). ``shown``: whether there is a progress bar. InputError: ``root`` holds something else, the script
+    has no main guard, or people are bad: the others are rendered, then these are named."""
     _check_main_guard()
     positions = settings.positions
     fits = positions is None or set(positions) <= set(range(rig.positions))
@@ -186,17 +202,27 @@ def render_people(
             for phase, listed in names.items()
             for name in progress.missing(phase, listed)
         ]
-        console, label = Console(stderr=True), f"rendering into {root}"
+        console, label, bad = Console(stderr=True), f"rendering into {root}", []
         try:
             with contextlib.closing(_run(todo, workers)) as finished:
-                for job in track(finished, label, total=len(todo), console=console, disable=not shown):
-                    progress.publish(job.workspace, job.phase, job.name)
+                for job, why in track(finished, label, total=len(todo), console=console, disable=not shown):
+                    if why:
+                        bad.append(why)
+                        log.warning("%s is not rendered: %s", job.name, why)
+                    else:
+                        progress.publish(job.workspace, job.phase, job.name)
         finally:
             progress.clear_workspaces()
+    if bad:
+        others = f" (and {len(bad) - 1} more, named above)" if len(bad) > 1 else ""
+        rest = (
+            f"; the other {len(todo) - len(bad)} of {len(todo)} are rendered" if len(todo) > len(bad) else ""
+        )
+        raise InputError(f"{sorted(bad)[0]}{others}{rest}")
     return len(todo)
 
 
-def _run(jobs: list[_Job], workers: int | None) -> Iterator[_Job]:
+def _run(jobs: list[_Job], workers: int | None) -> Iterator[tuple[_Job, str]]:
     workers = min(len(jobs), allowed_cores() if workers is None else workers)
     if workers < 2:
         yield from map(render_subject, jobs)

@@ -100,9 +100,10 @@ class Photographs:
 
 class Studio:
     """A person under fixed lights, photographed from any number of cameras. Surfaces are double-sided:
-    normals are flipped towards the camera. ``samples``: 1 to 16. InputError: the person has no faces."""
+    normals are flipped towards the camera. ``lights``: None leaves textures as they are. ``samples``: 1 to
+    16. InputError: the person has no faces."""
 
-    def __init__(self, person: Person, lights: LightRig, samples: int = 3) -> None:
+    def __init__(self, person: Person, lights: LightRig | None, samples: int = 3) -> None:
         parts = [part for part in person.parts if len(part.faces)]
         if not parts:
             raise InputError(f"{person.name}: expected a mesh with faces; found none")
@@ -192,6 +193,8 @@ class Studio:
             index = np.flatnonzero(part == k)
             uv = np.einsum("nk,nkc->nc", weights[index], self._uv[self._faces[face[index]]])
             colors[index] = sample_texture(self._textures[k], uv)
+        if self.lights is None:
+            return colors
         flat = self._face_normals[face]
         smooth = trimesh.unitize(np.einsum("nk,nkc->nc", weights, self._normals[self._faces[face]]))
         cancelled = np.square(smooth).sum(-1, keepdims=True) < 0.5

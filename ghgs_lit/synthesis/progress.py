@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from ghgs_lit.config.keys import flatten
-from ghgs_lit.data.layout import Completeness
+from ghgs_lit.data.layout import Completeness, lights_of
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import is_locked, lock, lock_owner, write_text_atomically
 from ghgs_lit.readers import read_json
@@ -34,6 +34,12 @@ class Progress(Completeness):
                     f"{self.root}: expected an empty folder or one rendered here before; found other files"
                 )
             _write_json(path, settings)
+        wanted, stored = lights_of(settings["render"]), self.lights
+        if wanted != stored:
+            raise InputError(
+                f"{path}: expected data.render.lights={wanted}; found {stored} (render into another folder,"
+                f" or data.render.lights={stored} goes on with this one)"
+            )
         found = flatten(read_json(path))
         settings = flatten(json.loads(json.dumps(settings)))  # tuples to lists, as they were stored
         for key in sorted(settings.keys() | found.keys()):

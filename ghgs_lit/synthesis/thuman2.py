@@ -101,7 +101,9 @@ class THuman2(Scans):
     name: Text = "thuman2"
     size: Size = (512, 512)
     workers: Workers = 8
-    render: RenderOptions = RenderOptions(size=1024, samples=2, views=(0, 1, 2, 3, 4), quality=95)
+    render: RenderOptions = RenderOptions(
+        size=1024, samples=2, views=(0, 1, 2, 3, 4), quality=95, lights="none"
+    )
     val_fraction: Share = 0.19
     pixel_centers: Literal["half", "integer", "auto"] = "auto"
     fits: options.Path | None = None

@@ -30,7 +30,9 @@ def rendered(
     root: Path, views=V4, targets=RELEASE, seed=0, augmentation=None, **options
 ) -> PhotographsDataModule:
     """Batches of what :func:`render_boxes` has written."""
-    return Scans(root=root, **{"size": 28, **options}).build(views, targets, seed, augmentation)
+    return Scans(root=root, **{"size": 28, "render": TINY, **options}).build(
+        views, targets, seed, augmentation
+    )
 
 
 def box_person(name: str = "box", color=(200, 90, 30), extents=(0.5, 1.7, 0.3)) -> Person:

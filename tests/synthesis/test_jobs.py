@@ -1,6 +1,7 @@
 """Rendering jobs: killed half-way, started twice, in several processes, with other settings."""
 
 import errno
+import json
 import os
 import signal
 import subprocess
@@ -34,12 +35,12 @@ class Counting:
 
     source: ScanSource
     log: Path
-    fail: str = ""
+    fail: tuple[str, ...] = ()
 
     def load(self, name):
         with open(self.log, "a") as file:
             file.write(f"{name}\n")
-        if name == self.fail:
+        if name in self.fail:
             raise InputError(f"{name}: expected a person; found a test")
         return self.source.load(name)
 
@@ -206,15 +207,53 @@ def test_people_are_rendered_inside_a_worker_of_joblib(scans, reference, tmp_pat
     assert contents(tmp_path / "out") == reference
 
 
-def test_a_bad_person_stops_the_run_and_the_good_ones_stay(scans, reference, tmp_path):
-    """An error loses no finished work and leaves no half subject."""
+@pytest.mark.parametrize("workers", [0, 2])
+def test_bad_people_are_named_when_the_others_are_rendered(scans, reference, tmp_path, workers, caplog):
+    """An error loses no finished work, no work to come, and leaves no half subject."""
     root = tmp_path / "out"
     names = {"train": ["s0", "s1", "s2"], "val": ["s3"]}
-    source = Counting(ScanSource(scans), tmp_path / "log", fail="s1")
-    with pytest.raises(InputError, match="s1: expected a person; found a test"):
-        render_people(root, names, source, RIG, SMALL, 0, workers=0)
+    source = Counting(ScanSource(scans), tmp_path / "log", fail=("s0", "s2"))
+    line = r"^s0: expected a person; found a test \(and 1 more, named above\); the other 2 of 4 are rendered$"
+    with pytest.raises(InputError, match=line):
+        render_people(root, names, source, RIG, SMALL, 0, workers=workers)
+    assert "s2 is not rendered: s2: expected a person; found a test" in caplog.text
     assert not list((root / "rendering").glob("tmp/*"))
-    assert render_people(root, names, ScanSource(scans), RIG, SMALL, 0, workers=0) == 3
+    assert sorted(path.name for path in root.glob("rendering/done/*/*")) == ["s1", "s3"]
+    assert set(contents(root).items()) < set(reference.items())
+    assert render_people(root, names, ScanSource(scans), RIG, SMALL, 0, workers=0) == 2
+    assert contents(root) == reference
+
+
+def test_textures_without_lights_come_back_as_they_are(scans, reference, tmp_path):
+    """Light that is in a texture was there twice. Geometry and cameras are those of the lit photographs."""
+    root, unlit = tmp_path / "out", SMALL.replace(lights="none")
+    render_boxes(root, scans, 1, 0, settings=unlit)
+    files = contents(root)
+    for name in (name for name in files if not name.startswith("train/img")):
+        assert files[name] == reference[name]
+    layout = Layout(root, "train")
+    for position in (0, 4, 8):
+        view = layout.read_view("s0", position, 0, depth=False)
+        inside = view.image[view.matte == 255]
+        assert np.abs(inside.mean(0) - [40, 90, 200]).max() < 2
+    with pytest.raises(InputError) as caught:
+        render_boxes(root, scans, 2, 0, settings=SMALL)
+    assert "expected data.render.lights=studio; found none (" in str(caught.value)
+    assert "data.render.lights=none goes on with this one" in str(caught.value)
+
+
+def test_lit_renders_of_before_go_on(scans, reference, tmp_path):
+    """Their stored settings are those of the lights themselves, as ever."""
+    root = tmp_path / "out"
+    render_boxes(root, scans, 1, 0, settings=SMALL)
+    stored = json.loads((root / "rendering" / "settings.json").read_text())["render"]
+    lights = {"count": 6, "ambient": 0.5, "softness": 0.3, "exposure": 0.6, "elevation": 30.0, "jitter": 0.25}
+    assert stored["lights"] == lights
+    with pytest.raises(
+        InputError, match=r"lights=none; found studio \(.*data\.render\.lights=studio goes on"
+    ):
+        render_boxes(root, scans, 3, 1, settings=SMALL.replace(lights="none"))
+    render_boxes(root, scans, 3, 1, settings=SMALL)
     assert contents(root) == reference
 
 
