@@ -1,9 +1,8 @@
 """What ``benchmarks/gpu.py`` measures: functions of a :class:`Call`; docstrings are titles of tables."""
 
-import contextlib
 import gc
 import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -20,6 +19,7 @@ from ghgs_lit.config import build
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL, SecondsProbe, inside, top_level, watched
 from ghgs_lit.diagnostics.doctor.selfcheck import PASSED, selfcheck
 from ghgs_lit.diagnostics.machine import machine_facts
+from ghgs_lit.kernels.precision import precision_of
 from ghgs_lit.kernels.watching import Inputs, Watcher
 from ghgs_lit.kernels.watching import watched as stages_watched
 from ghgs_lit.model import GHGS
@@ -27,18 +27,6 @@ from ghgs_lit.stages import STAGES
 from ghgs_lit.types import Batch, map_tensors
 
 PRECISIONS = ("float32", "tf32", "bfloat16")
-
-
-@contextlib.contextmanager
-def products(tf32: bool) -> Iterator[None]:
-    """Products and convolutions of float32 numbers in TF32, or not."""
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("high" if tf32 else "highest")
-    try:
-        with torch.backends.cudnn.flags(allow_tf32=tf32):
-            yield
-    finally:
-        torch.set_float32_matmul_precision(before)
 
 
 def machine(call: Call) -> None:
@@ -53,7 +41,7 @@ def machine(call: Call) -> None:
     for name in PRECISIONS:
         dtype = torch.bfloat16 if name == "bfloat16" else torch.float32
         a, b = (torch.rand(sizes.product, sizes.product, device=gpu.device).to(dtype) for _ in range(2))
-        with products(name == "tf32"):
+        with precision_of("tf32" if name == "tf32" else "float32", torch.device("cuda")):
             ms = gpu.milliseconds(partial(torch.mm, a, b), sizes.repeats)
         call.add(f"product, {name}", ms=ms, tflop_s=2 * sizes.product**3 / ms / 1e9)
 
@@ -77,8 +65,8 @@ def _built(call: Call, config: Config) -> GHGS:
 def _predicted(call: Call, name: str, model: GHGS, batch: Batch) -> None:
     """Rows of a prediction in each precision."""
     for precision in PRECISIONS:
-        model.precision = "float32" if precision == "tf32" else precision
-        with products(precision == "tf32"), torch.no_grad():
+        model.precision = precision
+        with torch.no_grad():
             run = partial(model, batch)
             ms = call.gpu.milliseconds(run, call.sizes.repeats)
             probe = SecondsProbe(call.gpu.device)

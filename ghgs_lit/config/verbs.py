@@ -20,7 +20,7 @@ from ghgs_lit.config.options import (
 )
 
 Device = Literal["auto", "cpu", "cuda"]
-Precision = Literal["inherit", "float32", "bfloat16", "float16", "auto"]
+Precision = Literal["inherit", "float32", "tf32", "bfloat16", "float16", "auto"]
 Axis = Literal["y", "-y", "z"]
 #: One entry of ``token_budgets``.
 Budget = Literal["all", "window"] | Patches

@@ -2,12 +2,15 @@
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import torch
 
 from ghgs_lit.errors import choice, require
 
-PRECISIONS = ("inherit", "float32", "bfloat16", "float16", "auto")
+PRECISIONS = ("inherit", "float32", "tf32", "bfloat16", "float16", "auto")
 
 
 def has_bfloat16(device: torch.device) -> bool:
@@ -29,9 +32,13 @@ def fast_precision(stored: torch.dtype, device: torch.device) -> torch.dtype:
 
 
 def precision_of(name: str, device: torch.device) -> AbstractContextManager:
-    """The autocast context of a forward pass. ``name``: one of :data:`PRECISIONS`; ``inherit``: the caller's;
-    ``auto``: bfloat16 if the device has it, else float16 on CUDA and float32 on a CPU. InputError: float16 on
-    a CPU, or bfloat16 on a device without it."""
+    """The context of a forward pass in a precision. InputError: TF32 or float16 on a CPU, or bfloat16 on a
+    device without it.
+
+    Args:
+        name: one of :data:`PRECISIONS`. ``inherit``: the caller's, by PyTorch's default convolutions in TF32
+            on CUDA; ``float32``: :func:`exact`; ``tf32``: all products and convolutions; ``auto``: bfloat16
+            if the device has it, else float16 on CUDA and float32 on a CPU."""
     choice("precision", name, PRECISIONS)
     if name == "inherit":
         return nullcontext()
@@ -40,27 +47,91 @@ def precision_of(name: str, device: torch.device) -> AbstractContextManager:
         name = "bfloat16" if has_bfloat16(device) else slow
     if name == "bfloat16":
         require(has_bfloat16(device), "precision", "float32 on a device without bfloat16", name)
-    require(name != "float16" or device.type == "cuda", "precision", "float16 on CUDA only", device.type)
-    if name == "float32":
-        return torch.autocast(device.type, enabled=False)
+    if name in ("tf32", "float16"):
+        require(device.type == "cuda", "precision", f"{name} on CUDA only", device.type)
+    if name in ("float32", "tf32"):
+        return _float32(device.type, rounding=name == "tf32")
     return torch.autocast(device.type, getattr(torch, name))
 
 
+def exact(device: str) -> AbstractContextManager[None]:
+    """Full float32: no autocast, and no products or convolutions with factors rounded to TF32 or bfloat16, as
+    ``torch.set_float32_matmul_precision`` allows, and PyTorch's default for convolutions on CUDA (TF32 has 11
+    bits: 1 mm at 2 m). ``device``: its type."""
+    return _float32(device, rounding=False)
+
+
 @contextmanager
-def exact(device: str) -> Iterator[None]:
-    """Full float32: no autocast, and no products with factors rounded to TF32 or bfloat16, as
-    ``torch.set_float32_matmul_precision`` allows (TF32 has 11 bits: 1 mm at 2 m). ``device``: its type."""
-    backends = [b.matmul for b in (torch.backends.cuda, torch.backends.mkldnn) if hasattr(b, "matmul")]
-    before = {b: getattr(b, "fp32_precision", "ieee") for b in backends}  # PyTorch 2.9 and later
-    rounding = [b for b, value in before.items() if value not in ("ieee", "none")]
-    for backend in rounding:
-        backend.fp32_precision = "ieee"
+def _float32(device: str, rounding: bool) -> Iterator[None]:
+    before = _Rounding.now(device)
+    changes = rounding or before.is_any
+    if changes:
+        round_products(rounding, device, before.of_older is not None)
     try:
         with torch.autocast(device, enabled=False):
             yield
     finally:
-        for backend in rounding:
-            backend.fp32_precision = before[backend]
+        if changes:
+            before.restore(device)
+
+
+def round_products(rounding: bool, device: str = "cuda", also_older: bool = True) -> None:
+    """Whether products and convolutions of float32 numbers round their factors to TF32 from now on.
+    ``device``: its type. ``also_older``: by the switches that PyTorch had before 2.9, too."""
+    if also_older:
+        torch.set_float32_matmul_precision("high" if rounding else "highest")
+        torch.backends.cudnn.allow_tf32 = rounding
+    for module in _modules(device):
+        module.fp32_precision = "tf32" if rounding else "ieee"
+
+
+def rounds_products(device: str) -> bool:
+    """Whether products or convolutions of float32 numbers round their factors now on a type of device."""
+    return _Rounding.now(device).is_any
+
+
+@dataclass(frozen=True)
+class _Rounding:
+    """State of PyTorch's switches. ``of_older``: for products, and for convolutions on CUDA; None where
+    PyTorch refuses to read them, since newer ones were set to what these cannot express."""
+
+    of_modules: list[str]
+    of_older: tuple[str, bool] | None
+
+    @classmethod
+    def now(cls, device: str) -> "_Rounding":
+        try:
+            older = torch.get_float32_matmul_precision(), torch.backends.cudnn.allow_tf32
+        except RuntimeError:
+            older = None
+        return cls([module.fp32_precision for module in _modules(device)], older)
+
+    @property
+    def is_any(self) -> bool:
+        """Whether some products or convolutions round."""
+        if not self.of_modules:
+            return self.of_older != ("highest", False)
+        products = self.of_older is not None and self.of_older[0] != "highest"
+        return products or any(value not in ("ieee", "none") for value in self.of_modules)
+
+    def restore(self, device: str) -> None:
+        if self.of_older is not None:
+            torch.set_float32_matmul_precision(self.of_older[0])
+            torch.backends.cudnn.allow_tf32 = self.of_older[1]
+        for module, value in zip(_modules(device), self.of_modules, strict=True):
+            module.fp32_precision = value
+
+
+@cache
+def _modules(device: str) -> list[Any]:
+    """What decides whether products and convolutions round on a type of device, in PyTorch 2.9 and later."""
+    matmul, cudnn, mkldnn = torch.backends.cuda.matmul, torch.backends.cudnn, torch.backends.mkldnn
+    if not hasattr(matmul, "fp32_precision"):
+        return []
+    if device == "cpu":
+        return [matmul, mkldnn.matmul, mkldnn.conv]
+    # Recurrent layers have one older switch with convolutions.
+    return [matmul, mkldnn.matmul, cudnn.conv, cudnn.rnn]
 
 
 def without_float16(device: str) -> AbstractContextManager:

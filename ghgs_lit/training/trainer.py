@@ -3,12 +3,12 @@
 from typing import Annotated, Any, Literal
 
 import lightning.pytorch as L
-import torch
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from pydantic import Field
 
 from ghgs_lit.config.options import Count, Index, Options, Share, Text, Words
 from ghgs_lit.errors import InputError
+from ghgs_lit.kernels.precision import round_products
 
 #: Limits that keep every duration in Python's range.
 Duration = Annotated[
@@ -28,7 +28,7 @@ class TrainerOptions(Options):
     """Number of processes, or a list of GPUs; several are DDP, in which each has all parameters. At most 64,
     as each starts at once on a CPU."""
     precision: Text | Literal[16, 32, 64] = "32-true"
-    """32-true (the paper's), tf32, bf16-mixed or 16-mixed; geometry is float32 in each."""
+    """32-true (the paper's; convolutions too), tf32, bf16-mixed or 16-mixed; geometry is float32 in each."""
     max_steps: int = Field(200000, ge=-1)
     """Steps of the optimizer (the paper's 200000); -1: no limit."""
     max_time: Duration | None = None
@@ -46,10 +46,8 @@ class TrainerOptions(Options):
 
     def build(self, **arguments: Any) -> L.Trainer:
         """The Trainer with further ``arguments``. InputError: it refuses its options."""
-        precision = self.precision
-        if precision == "tf32":
-            precision = "32-true"
-            torch.set_float32_matmul_precision("high")
+        precision = "32-true" if self.precision == "tf32" else self.precision
+        round_products(self.precision == "tf32")  # also back, after another run of the process
         alone = self.devices == 1 or (isinstance(self.devices, tuple) and len(self.devices) == 1)
         try:
             return L.Trainer(

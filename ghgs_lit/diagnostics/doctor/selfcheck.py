@@ -1,7 +1,6 @@
 """Comparison of a device with the CPU in float64: renderer, stages, gradient of all weights."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +10,7 @@ from torch import Tensor
 from ghgs_lit.diagnostics.benchmark.measure import ATTRIBUTES
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch, random_model
 from ghgs_lit.errors import InputError
-from ghgs_lit.kernels.precision import has_bfloat16
+from ghgs_lit.kernels.precision import exact, has_bfloat16, rounds_products
 from ghgs_lit.kernels.watching import Results, watched
 from ghgs_lit.model import GHGS
 from ghgs_lit.rendering import RasterSettings, render
@@ -27,6 +26,8 @@ IMAGE_LIMIT, IMAGE_GRADIENT_LIMIT = 1e-4, 1e-3
 #: every product: 8 times one rounding (2^-8 in bfloat16, 2^-11 in float16 and TF32); 1.6 times in bfloat16 on
 #: a CPU.
 LIMITS = {"float32": 1e-4, "tf32": 2.0**-8, "bfloat16": 2.0**-5, "float16": 2.0**-8}
+#: What is checked: ``precision`` as of the verbs, in the order in which it is most used.
+PRECISIONS = ("inherit", *LIMITS)
 #: Largest error of the gradient of all weights in float32, and number of models that are tried. It jumps if
 #: rounding moves a unit across 0 or a token to another neighbour: 2e-6 to 4e-2 on a CPU. At least one of
 #: three models has no such jump; a wrong kernel affects all.
@@ -141,18 +142,20 @@ def _rendered(
 
 
 def stages(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]:
-    """Check each stage in each precision that the device has; the first that fails is the one to examine."""
+    """Check each stage in each precision that the device has, set as a user sets it; the first that fails is
+    the one to examine. ``inherit`` may round as the process does."""
     batch = _small_batch(config)
     expected = _results(random_model(config).double(), _in_float64(batch))
-    for precision, limit in LIMITS.items():
+    for precision in PRECISIONS:
         reason = _unsupported(precision, device)
         if reason is not None:
             yield Outcome(f"model, {precision}", SKIPPED, reason)
             continue
         model = random_model(config).to(device)
-        model.precision = "float32" if precision == "tf32" else precision
-        with _products(tf32=precision == "tf32"):
-            found = _results(model, batch.to(device))
+        model.precision = precision
+        found = _results(model, batch.to(device))
+        inherited = "tf32" if rounds_products(device.type) else "float32"
+        limit = LIMITS[inherited if precision == "inherit" else precision]
         for stage, value in expected.items():
             # Geometry is always float32.
             allowed = LIMITS["float32"] if stage == "bounds" else limit
@@ -160,11 +163,12 @@ def stages(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]
 
 
 def gradient(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]:
-    """Check the gradient of all weights in float32; one of :data:`_MODELS` random models must pass."""
+    """Check the gradient of all weights in float32, as ``trainer.precision=32-true`` has it; one of
+    :data:`_MODELS` random models must pass."""
     batch, outcomes = _small_batch(config), []
     for seed in range(_MODELS):
         expected = _gradients(random_model(config, seed).double(), _in_float64(batch))
-        with _products(tf32=False):
+        with exact(device.type):
             found = _gradients(random_model(config, seed).to(device), batch.to(device))
         outcomes.append(compared("gradient of the weights, float32", found, expected, GRADIENT_LIMIT))
         if outcomes[-1].status == PASSED:
@@ -190,18 +194,6 @@ def _unsupported(precision: str, device: torch.device) -> str | None:
     if precision == "bfloat16" and not has_bfloat16(device):
         return f"{device.type} has no bfloat16 instructions here"
     return None
-
-
-@contextmanager
-def _products(tf32: bool) -> Iterator[None]:
-    """Switch TF32 on or off for products and convolutions of float32 numbers on CUDA."""
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("high" if tf32 else "highest")
-    try:
-        with torch.backends.cudnn.flags(allow_tf32=tf32):
-            yield
-    finally:
-        torch.set_float32_matmul_precision(before)
 
 
 @torch.no_grad()

@@ -20,6 +20,8 @@ from ghgs_lit.diagnostics.doctor.selfcheck import (
     table,
 )
 from ghgs_lit.geometry.unprojection import Unprojection
+from ghgs_lit.kernels.precision import rounds_products
+from ghgs_lit.model import GHGS
 from ghgs_lit.recalibration import Recalibration
 from ghgs_lit.rendering.cpu import backend as cpu
 from tests.helpers.models import TINY
@@ -67,6 +69,26 @@ def test_it_runs_on_the_pretend_device():
     assert failures(found) == []
     assert statuses(found)["model, float16"] == SKIPPED
     assert statuses(found)["model, float32: gaussian_head, means"] == PASSED
+
+
+def test_it_checks_what_a_user_has(monkeypatch):
+    """``inherit`` leaves the process as it is, with convolutions in TF32, and may round as much; the gradient
+    is that of a training in float32."""
+    right, seen = GHGS._predict, []
+
+    def noted(self, batch, kept):
+        if batch.images.dtype == torch.float32:
+            seen.append((self.precision, self.training, rounds_products("cuda")))
+        return right(self, batch, kept)
+
+    monkeypatch.setattr(GHGS, "_predict", noted)
+    with pretend_device():
+        found = [*stages(settings(), DEVICE), *gradient(settings(), DEVICE)]
+    assert failures(found) == []
+    assert seen[:2] == [("inherit", False, True), ("float32", False, False)]
+    assert seen[2] == ("inherit", False, False)
+    limits = {o.check: o.found.split("limit ")[1] for o in found if "encoder" in o.check}
+    assert limits == {"model, inherit: encoder": "4e-03", "model, float32: encoder": "1e-04"}
 
 
 def test_a_stage_that_is_wrong_fails_and_none_before_it(monkeypatch):
