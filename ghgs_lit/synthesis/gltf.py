@@ -173,9 +173,8 @@ def _skinned(
         for name in ("JOINTS", "WEIGHTS")
     )
     weights = weights.astype(np.float64)
+    weights[weights.sum(1) <= 0, 0] = 1  # a vertex without weights goes with its first joint, as in viewers
     total = weights.sum(1, keepdims=True)
-    if not (total > 0).all():
-        raise ValueError("a vertex without joints")
     points = np.concatenate((vertices, np.ones((len(vertices), 1))), 1)
     moved = np.zeros_like(vertices)
     for column in range(chosen.shape[1]):

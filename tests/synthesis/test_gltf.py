@@ -16,6 +16,7 @@ RNG = np.random.default_rng(0)
 VERTICES = RNG.uniform(-1, 1, (9, 3)).astype("<f4")
 JOINTS = RNG.integers(0, 2, (9, 4)).astype("u1")
 WEIGHTS = RNG.integers(1, 255, (9, 4)).astype("u1")
+WEIGHTS[8] = 0  # goes with its first joint
 TARGET = RNG.uniform(-0.1, 0.1, (9, 3)).astype("<f4")
 KINDS = {"u1": 5121, "u2": 5123, "f4": 5126}
 
@@ -76,6 +77,7 @@ def rigged(
     }
     if skinned:
         attributes |= {"JOINTS_0": file.add(JOINTS, "VEC4"), "WEIGHTS_0": file.add(WEIGHTS, "VEC4")}
+        file.tree["accessors"][-1]["normalized"] = True
     primitive = {
         "attributes": attributes,
         "indices": file.add(np.arange(9, dtype="<u2"), "SCALAR"),
@@ -110,10 +112,11 @@ def rigged(
     expected = []
     for n, vertex in enumerate(vertices):
         point, place = np.array([*vertex, 1]), np.zeros(4)
+        weights = WEIGHTS[n] / WEIGHTS[n].sum() if n < 8 else [1.0, 0, 0, 0]
         if not skinned:
             place = root_matrix @ body_matrix @ point
         else:
-            for joint, weight in zip(JOINTS[n], WEIGHTS[n] / WEIGHTS[n].sum(), strict=True):
+            for joint, weight in zip(JOINTS[n], weights, strict=True):
                 place += weight * (joints[joint] @ (inverse[joint] if bind else np.eye(4)) @ point)
         expected.append(place[:3])
     return file, np.array(expected)
