@@ -14,11 +14,11 @@ from ghgs_lit.config.registry import build, read_node
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.padding import bounds_of
 from ghgs_lit.kernels.precision import PRECISIONS
-from ghgs_lit.rounds import Rounds, State, prediction_of, replaced
+from ghgs_lit.rounds import CoarseDepths, Rounds, State, coarse_depths, prediction_of, replaced
 from ghgs_lit.skipping import SkipOptions
 from ghgs_lit.stages import HEADS, OPTIONS, STAGES
 from ghgs_lit.surroundings import ModelOptions, computing, surroundings
-from ghgs_lit.types import Batch, DepthBounds, Prediction, Tokens
+from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Prediction, Tokens
 from ghgs_lit.weights.checkpoint import load_weights, read_config
 from ghgs_lit.weights.reading import SHIPPED
 
@@ -67,25 +67,47 @@ class GHGS(nn.Module):
         for layer in around:
             batch = layer.enter(batch)
         with computing(self.precision, self.auto, self.encoder, batch.masks) as (decisions, kept):
-            prediction = self._predict(batch, kept)
+            prediction = self._predict(batch, kept, self._coarse(batch))
         for layer in reversed(around):
             prediction = layer.leave(prediction)
         return dataclasses.replace(prediction, decisions=decisions)
 
-    def _predict(self, batch: Batch, kept: Tensor | None) -> Prediction:
-        # If all tokens are recalibrated, all need a depth.
-        wanted = "all" if self.recalibration.tokens == "all" else self.skip.pixels
+    def _predict(self, batch: Batch, kept: Tensor | None, coarse: CoarseDepths | None = None) -> Prediction:
         bounds = bounds_of(self.bounds, batch)
         tokens = self._encode(batch, bounds, kept)
-        depth_maps = self.depth_head(tokens, batch, bounds, wanted)
+        depth_maps = self._depths(tokens, batch, bounds, coarse)
         points = self.unprojection(depth_maps, tokens, batch)
         tokens = self.recalibration(tokens, points)
         raw = self.gaussian_head(tokens, batch, points, depth_maps, self.skip.pixels)
         activate = self.gaussian_head.activate
         first = replaced(activate, self.training) if self.rounds else activate
         state = State(raw, first(raw, batch, points, depth_maps), points, depth_maps)
-        states = self.rounds(state, activate, batch) if self.rounds else (state,)
+        step = 1.0 if coarse is None else coarse.step
+        states = self.rounds(state, activate, batch, step) if self.rounds else (state,)
         return prediction_of(states, self.keeps_drafts and not self.training)
+
+    def _depths(
+        self, tokens: Tokens, batch: Batch, bounds: DepthBounds | None, coarse: CoarseDepths | None
+    ) -> DepthMaps:
+        """Depths of the depth head, but the coarse ones of elements that have them."""
+        if coarse is not None and coarse.are_all:
+            return coarse.maps(batch, bounds)
+        # If all tokens are recalibrated, all need a depth.
+        wanted = "all" if self.recalibration.tokens == "all" else self.skip.pixels
+        maps = self.depth_head(tokens, batch, bounds, wanted)
+        return maps if coarse is None else coarse.maps(batch, bounds, maps)
+
+    def _coarse(self, batch: Batch) -> CoarseDepths | None:
+        """Depths from smaller copies of photographs with subjects that are taller than the rounds know."""
+        if self.rounds is None or self.rounds.options.height is None:
+            return None
+
+        def predict(small: Batch) -> DepthMaps:
+            kept = None if self.auto is None else self.auto.decide(self.encoder, small.masks)[1]
+            return self._predict(small, kept).depth_maps
+
+        sizes = (self.rounds.options.height, self.encoder.patch_size)
+        return coarse_depths(batch, *sizes, self.options.matte, predict)
 
     def _encode(self, batch: Batch, bounds: DepthBounds | None, kept: Tensor | None) -> Tokens:
         """Tokens in the precision of the heads, which may differ from that of the encoder."""

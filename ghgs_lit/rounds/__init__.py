@@ -1,5 +1,6 @@
 """Rounds of refinement: Gaussians are compared with the photographs and corrected."""
 
+from ghgs_lit.rounds.coarse import CoarseDepths, coarse_depths
 from ghgs_lit.rounds.rounds import Rounds, RoundsOptions, State, prediction_of, replaced
 
-__all__ = ["Rounds", "RoundsOptions", "State", "prediction_of", "replaced"]
+__all__ = ["CoarseDepths", "Rounds", "RoundsOptions", "State", "coarse_depths", "prediction_of", "replaced"]

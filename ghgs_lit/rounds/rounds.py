@@ -170,6 +170,10 @@ class RoundsOptions(Options):
 
     slopes: bool = False
     """Whether a round is shown the gradient of the inputs' error with respect to each Gaussian."""
+    height: Annotated[int, Field(ge=14, le=16384)] | None = 200
+    """Pixels of the subject's height, or of its width if larger, that the weights know (252 x 252 photographs
+    that it fills to four fifths). Where it is taller, depths of smaller copies are refined at full size
+    (:mod:`ghgs_lit.rounds.coarse`); null: never."""
 
     def build(self, channels: int) -> "Rounds":
         return Rounds(self, channels)
@@ -202,18 +206,28 @@ class Rounds(nn.Module):
         nn.init.zeros_(self.change[-1].weight)
         nn.init.zeros_(self.change[-1].bias)
 
-    def forward(self, state: State, activate: Activate, batch: Batch) -> tuple[State, ...]:
-        """The states before the first round and after each. ``state``: the prediction of the stages, with
-        bounds of depths. ``batch``: photographs, masks and cameras are read."""
+    def forward(
+        self, state: State, activate: Activate, batch: Batch, step: float | Float[Tensor, " B"] = 1.0
+    ) -> tuple[State, ...]:
+        """The states before the first round and after each.
+
+        Args:
+            state: the prediction of the stages, with bounds of depths.
+            activate: gives Gaussians from their raw attributes.
+            batch: photographs, masks and cameras are read.
+            step: size of the first step, in those after a depth head; one for all elements or one for
+                each."""
         if self.options.gains and batch.log_gains is None:
             gaussians, batch = equalized(state.gaussians, batch)
             state = dataclasses.replace(state, gaussians=gaussians)
         states, memory = [state], torch.tanh(self.start(state.raw.descriptors))
         windows = None if self.exchange is None else Windows.of(state.raw, batch)
         rays = Rays.of(state.raw, batch)
+        if isinstance(step, Tensor):
+            step = step[state.raw.image // batch.masks.shape[1]]
         count = self._drawn() if self.training else self.count
         for number in range(count):
-            change, memory = self._round(states[-1], batch, rays, memory, windows, 0.5**number)
+            change, memory = self._round(states[-1], batch, rays, memory, windows, step * 0.5**number)
             shown = activate if number == count - 1 else replaced(activate, self.training)
             states.append(_moved(states[-1], shown, batch, rays, *change))
         return tuple(states)
@@ -223,9 +237,16 @@ class Rounds(nn.Module):
         return counts[int(torch.randint(len(counts), ()))]
 
     def _round(
-        self, state: State, batch: Batch, rays: Rays, memory: Tensor, windows: Windows | None, size: float
+        self,
+        state: State,
+        batch: Batch,
+        rays: Rays,
+        memory: Float[Tensor, "N h"],
+        windows: Windows | None,
+        size: float | Float[Tensor, " N"],
     ) -> tuple[tuple[Tensor, Tensor], Tensor]:
-        """Changes of depths and of raw attributes, and the memory for the next round."""
+        """Changes of depths and of raw attributes, and the memory for the next round. ``size``: of the step,
+        as a share of the largest one; one for all Gaussians or one for each."""
         gaussians = state.gaussians.detach()
         drawn, steep = None, []
         if self.options.slopes:
@@ -236,6 +257,7 @@ class Rounds(nn.Module):
         memory, change = self._looked(*rows, windows)
         step = bounded_tanh(change[:, 0])
         moved = torch.where(step > 0, search.up, search.down) * step
+        size = size[:, None] if isinstance(size, Tensor) else size
         return (moved, size * change[:, 1:]), memory
 
     def _looked(
@@ -272,7 +294,7 @@ class Rounds(nn.Module):
         return torch.tanh(memory + self.memory(self.update(torch.cat((*seen, known, memory), -1))))
 
     @torch.no_grad()
-    def _search(self, state: State, batch: Batch, rays: Rays, reach: float) -> Search:
+    def _search(self, state: State, batch: Batch, rays: Rays, reach: float | Tensor) -> Search:
         maps = state.depth_maps
         depth, near, far = (
             at_least_float32(values).detach().flatten()[rays.place]

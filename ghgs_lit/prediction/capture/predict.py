@@ -158,13 +158,15 @@ def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:
 
 def crop_size(size: int | tuple[int, int] | None, config: Mapping[str, Any], model: GHGS) -> tuple[int, int]:
     """(height, width) of the crops that a checkpoint's model sees; None: as it was trained. Warns of larger
-    ones, which make results worse, not sharper. InputError: the model cannot take this size."""
+    ones, which make results worse, not sharper, where the model does not work from coarse to fine
+    (``rounds.height``). InputError: the model cannot take this size."""
     trained, patch = image_size("size", trained_size(config)), model.encoder.patch_size
     height, width = trained if size is None else image_size("size", size)
     multiple = side_multiple(model.options, patch)
     expected = f"sides divisible by the patch size {multiple}"
     require(height % multiple == width % multiple == 0, "size", expected, (height, width))
-    if height > trained[0] or width > trained[1]:
+    is_coarse_to_fine = model.rounds is not None and model.rounds.options.height is not None
+    if not is_coarse_to_fine and (height > trained[0] or width > trained[1]):
         below = ", ".join(str(n * patch) for n in range(max(trained) // patch, 0, -3)[:3])
         warnings.warn(
             f"size: {height} x {width} is larger than the {trained[0]} x {trained[1]} of the training, which"

@@ -1,0 +1,148 @@
+"""Coarse to fine: which photographs have smaller copies, and how their depths start the rounds."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from ghgs_lit.geometry.projection import project, unproject_maps
+from ghgs_lit.rounds.coarse import CoarseDepths, coarse_sizes, enlarged, shrunk
+from ghgs_lit.types import DepthBounds, DepthMaps
+from tests.helpers.models import ATTRIBUTES, close, make_model
+from tests.helpers.scenes import in_dtype, make_batch, with_soft_rims
+
+SIDE = 112  #: of photographs that are too large for weights that know a subject of ``HEIGHT`` pixels
+HEIGHT = 40
+
+
+def recurrent(height, *overrides):
+    """A model with rounds that change something, which knows subjects of ``height`` pixels."""
+    small = ("rounds.hidden=16", "rounds.depths=4", f"rounds.height={height}")
+    model = make_model("model=recurrent", "skip=exact", *small, *overrides).eval()
+    torch.nn.init.normal_(model.rounds.change[-1].weight, std=0.5)
+    return model
+
+
+def stacked(*batches):
+    """One batch of the elements of several, without depths."""
+    matrices = {
+        name: torch.cat([getattr(batch.cameras, name) for batch in batches])
+        for name in ("intrinsics", "extrinsics")
+    }
+    parts = {name: torch.cat([getattr(batch, name) for batch in batches]) for name in ("images", "masks")}
+    cameras = dataclasses.replace(batches[0].cameras, **matrices)
+    return dataclasses.replace(batches[0], **parts, cameras=cameras, depths=None)
+
+
+def test_the_height_of_each_subject_decides():
+    """Its tallest view, or the widest, in the pixels of its own photographs; sides are whole patches."""
+    tall, small = make_batch(1, 3, SIDE, SIDE), make_batch(1, 3, SIDE, SIDE, zoom=0.3)
+    pair = stacked(tall, small)
+    rows = tall.masks[0].any(-1).sum(-1).max().item()
+    expected = round(SIDE * HEIGHT / rows / 14) * 14
+    assert coarse_sizes(pair, HEIGHT, 14) == [(expected, expected), None]
+    assert coarse_sizes(pair, rows, 14) == [None, None]
+    lying = dataclasses.replace(tall, masks=tall.masks.mT)
+    assert coarse_sizes(lying, HEIGHT, 14) == [(expected, expected)]
+    nobody = dataclasses.replace(tall, masks=torch.zeros_like(tall.masks))
+    assert coarse_sizes(nobody, HEIGHT, 14) == [None]
+
+
+def test_smaller_copies_show_the_same_scene():
+    """Points of the surface have the same place in the picture, colours and shares stay where they are."""
+    batch = with_soft_rims(make_batch(1, 3, 112, 84))
+    batch = dataclasses.replace(batch, images=batch.alpha[:, :, None].expand(-1, -1, 3, -1, -1) / 2)
+    found = shrunk(batch, (56, 42), 0.125)
+    assert found.masks.shape[2:] == (found.cameras.height, found.cameras.width) == (56, 42)
+    points = unproject_maps(batch.depths, batch.cameras).flatten(2, 3)
+    pixels = [
+        project(points, c.intrinsics[:, :, None], c.extrinsics[:, :, None])[0]
+        for c in (batch.cameras, found.cameras)
+    ]
+    torch.testing.assert_close(pixels[1], pixels[0] / 2)
+    torch.testing.assert_close(found.images[:, :, 0], found.alpha / 2)
+    assert torch.equal(found.masks, found.alpha > 0.125)
+    # Shares are means over areas: their sum is that of the pixels.
+    torch.testing.assert_close(4 * found.alpha.sum((2, 3)), batch.alpha.sum((2, 3)), rtol=1e-3, atol=0)
+
+
+def test_enlarged_depths_lie_on_planes_up_to_a_pixel_beyond_what_is_known():
+    def plane(side):
+        """Depths of a plane, whose inverse is linear in the picture."""
+        along = (torch.arange(side, dtype=torch.float64) + 0.5) / side
+        return 1 / (0.4 + 0.1 * along[:, None] + 0.05 * along).expand(1, 1, side, side)
+
+    found = enlarged(DepthMaps(plane(24), plane(24) > 0, plane(24)), (60, 60))
+    inner = (..., slice(2, -2), slice(2, -2))  # beyond the outermost centres nothing is interpolated
+    torch.testing.assert_close(found[inner], plane(60)[inner], rtol=1e-12, atol=0)
+    known = torch.ones(1, 1, 24, 24, dtype=torch.bool)
+    known[..., :6] = False
+    wrong = torch.where(known, 2.5, 9.0).double()
+    found = enlarged(DepthMaps(wrong, known, wrong), (48, 48))
+    torch.testing.assert_close(found[..., 10:], torch.full_like(found[..., 10:], 2.5))
+    assert (found[..., :9] == 0).all()
+
+
+def test_coarse_depths_stay_within_bounds():
+    near, far = torch.full((2, 1, 2, 2), 1.0), torch.full((2, 1, 2, 2), 3.0)
+    bounds, batch = DepthBounds(near, far), make_batch(2, 1, 2, 2)
+    depth = torch.tensor([[0.0, 0.5], [2.5, 9.0]]).expand(2, 1, 2, 2)
+    coarse = CoarseDepths(depth, torch.ones_like(depth), (True, False))
+    others = DepthMaps(near + 0.5, batch.masks, near, bounds)
+    found = coarse.maps(batch, bounds, others)
+    assert found.depth[0].flatten().tolist() == [2.0, 1.0, 2.5, 3.0]
+    assert torch.equal(found.depth[1], others.depth[1])
+    assert coarse.step.tolist() == [0.5, 1.0]
+
+
+def test_rounds_start_from_the_depths_of_a_smaller_copy():
+    """The depth head sees the copy alone; the final depths of the copy are those that rounds start from."""
+    batch, seen = make_batch(1, 3, SIDE, SIDE), []
+    model = recurrent(HEIGHT, "model.frame=world")  # one frame for both sizes
+    model.depth_head.register_forward_hook(lambda head, inputs, maps: seen.append(inputs[1]))
+    with torch.no_grad():
+        found = model(batch)
+        (copy,) = seen
+        size = coarse_sizes(batch, HEIGHT, model.encoder.patch_size)[0]
+        assert tuple(copy.masks.shape[2:]) == size
+        alone = model(shrunk(batch, size, None))
+    start, bounds = found.rounds[0].depth, found.rounds[0].bounds
+    expected = enlarged(alone.depth_maps, (SIDE, SIDE)).clamp(bounds.near, bounds.far)
+    known = batch.masks & (enlarged(alone.depth_maps, (SIDE, SIDE)) > 0)
+    assert known.sum() > 0.95 * batch.masks.sum()
+    torch.testing.assert_close(start[known], expected[known], rtol=1e-5, atol=1e-5)
+    assert not torch.equal(found.depth[known], start[known])
+    assert len(found.rounds) == model.rounds.count + 1
+
+
+def test_photographs_of_the_size_of_the_training_have_no_copy():
+    batch = make_batch(1, 3)
+    with torch.no_grad():
+        found, expected = recurrent(HEIGHT * 2)(batch), recurrent("null")(batch)
+    for name in ATTRIBUTES:
+        assert torch.equal(getattr(found.gaussians, name), getattr(expected.gaussians, name)), name
+
+
+@pytest.mark.parametrize("pad", ["none", "multiple"])
+def test_elements_with_and_without_a_copy_do_not_touch_one_another(pad):
+    side = SIDE if pad == "none" else SIDE - 5
+    batches = [make_batch(1, 3, side, side, zoom=zoom) for zoom in (0.8, 0.3, 0.6)]
+    batches = [in_dtype(dataclasses.replace(batch, depths=None), torch.float64) for batch in batches]
+    model = recurrent(HEIGHT, f"model.pad={pad}").double()
+    with torch.no_grad():
+        together = model(stacked(*batches))
+        for element, batch in enumerate(batches):
+            alone = model(batch)
+            close(together.gaussians[element], alone.gaussians, 1e-7)
+            valid = alone.depth_valid[0]
+            torch.testing.assert_close(
+                together.depth[element][valid], alone.depth[0][valid], rtol=1e-7, atol=0
+            )
+
+
+def test_training_reaches_the_depth_head_through_the_copy():
+    model = recurrent(HEIGHT).train()
+    model(make_batch(1, 3, SIDE, SIDE)).depth.square().mean().backward()
+    slopes = [parameter.grad for parameter in model.depth_head.parameters() if parameter.requires_grad]
+    assert all(slope is not None and slope.isfinite().all() for slope in slopes)
+    assert any(slope.abs().max() > 0 for slope in slopes)
