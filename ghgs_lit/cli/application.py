@@ -73,11 +73,11 @@ class Verb:
 
         try:
             directory = Path(HydraConfig.get().runtime.output_dir)
+            check_ablation(cfg, HydraConfig.get())
             config = own_keys(cfg, self.name)
             if self.name in ("train", "pretext"):  # before a run of others gets files of this one
                 RunDirectory(directory).start(config)
             write_hydra_files(cfg, directory)
-            check_ablation(cfg, HydraConfig.get())
             require_paths(self.name, config)
             check(config)  # before the verb's module is imported, which takes longer
             module = importlib.import_module(module_of(self.name))

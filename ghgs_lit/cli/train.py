@@ -13,6 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from lightning.fabric.plugins.environments import ClusterEnvironment, LightningEnvironment, SLURMEnvironment
 from lightning.pytorch.callbacks import Callback, Checkpoint
 from lightning.pytorch.utilities import rank_zero_only
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 from torch import nn
 
@@ -186,6 +187,8 @@ def fit(
     started = time.perf_counter()
     try:
         trainer.fit(module, data, ckpt_path=config["resume"])
+    except MisconfigurationException as error:  # of options that do not fit the data
+        raise InputError(f"trainer: {error}") from None
     finally:
         stats |= {
             "steps": max(trainer.global_step - (step or 0), 0),

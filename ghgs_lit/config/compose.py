@@ -1,12 +1,11 @@
 """Find and compose the Hydra configuration of a verb, and turn it into plain data."""
 
-from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
@@ -37,16 +36,30 @@ def conf_dir() -> Path:
 HEADER = "# The configuration of this run, by ghgs."
 
 
-def compose(verb: str, overrides: Sequence[str] = (), with_hydra: bool = False) -> DictConfig:
-    """The configuration of ``ghgs <verb> <overrides>``, with or without the node ``hydra``."""
-    # A running verb has initialized Hydra already.
+@contextmanager
+def _application() -> Iterator[None]:
+    """A Hydra application over ``conf``; one that runs already is put aside meanwhile."""
     running = GlobalHydra.instance().hydra
     GlobalHydra.instance().hydra = None
     try:
         with hydra.initialize_config_dir(str(conf_dir()), **VERSION_BASE):
-            return hydra.compose(verb, overrides=list(overrides), return_hydra_config=with_hydra)
+            yield
     finally:
         GlobalHydra.instance().hydra = running
+
+
+def _is_own() -> bool:
+    """Whether the Hydra application that runs, if any, searches ``conf``: another program's does not."""
+    if not GlobalHydra.instance().is_initialized():
+        return False
+    searched = GlobalHydra.instance().config_loader().get_search_path().get_path()
+    return any(entry.path == f"file://{conf_dir()}" for entry in searched)
+
+
+def compose(verb: str, overrides: Sequence[str] = (), with_hydra: bool = False) -> DictConfig:
+    """The configuration of ``ghgs <verb> <overrides>``, with or without the node ``hydra``."""
+    with _application():
+        return hydra.compose(verb, overrides=list(overrides), return_hydra_config=with_hydra)
 
 
 def saved_text(config: dict[str, Any]) -> str:
@@ -107,11 +120,10 @@ def read_options(
 
 
 def read_option(group: str, name: str, key: str | None = None) -> dict[str, Any]:
-    """The values of ``<group>/<name>.yaml``, including its own defaults, as plain data. A running Hydra
-    application also searches the user's ``--config-dir``. InputError: the group has no such option; the
+    """The values of ``<group>/<name>.yaml``, including its own defaults, as plain data. An application
+    of the package also searches the user's ``--config-dir``. InputError: the group has no such option; the
     message begins with ``key`` or the group."""
-    inside = GlobalHydra.instance().is_initialized()
-    with nullcontext() if inside else initialize_config_dir(str(conf_dir()), **VERSION_BASE):
+    with nullcontext() if _is_own() else _application():
         known = sorted(GlobalHydra.instance().config_loader().get_group_options(group))
         if name in known:
             node = OmegaConf.select(hydra.compose(f"{group}/{name}"), group.replace("/", "."))

@@ -8,7 +8,7 @@ WITHOUT_INFLUENCE = (
     "hydra", "allow_random_encoder", "dry_run", "overwrite", "resume", "logger", "callbacks",
     "data.cache_dir", "data.cache_images_mb", "data.render_workers", "data.workers",
     "encoder.weights",  # repeats the origin of init_from's weights, which counts
-    "evaluation.pictures", "trainer.log_every_n_steps",
+    "evaluation.pictures", "trainer.log_every_n_steps", "trainer.profiler",
 )  # fmt: skip
 
 #: Keys that may change when a run is resumed without being reported: those without influence, the length of

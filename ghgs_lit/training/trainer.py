@@ -3,10 +3,11 @@
 from typing import Annotated, Any, Literal
 
 import lightning.pytorch as L
+from lightning.pytorch.profilers import AdvancedProfiler, PyTorchProfiler, SimpleProfiler
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from pydantic import Field
 
-from ghgs_lit.config.options import Count, Index, Options, Share, Text, Words
+from ghgs_lit.config.options import Count, Index, Options, Share, Words
 from ghgs_lit.errors import InputError
 from ghgs_lit.kernels.precision import round_products
 
@@ -18,22 +19,39 @@ Duration = Annotated[
 ]
 
 
+#: Lightning's other numbers compute elsewhere (``bf16-true``) or need another library.
+Precision = Annotated[
+    Literal["32-true", "tf32", "bf16-mixed", "16-mixed", "32", "bf16", "16", 32, 16],
+    Words("32-true, tf32, bf16-mixed or 16-mixed"),
+]
+#: Batches of an epoch, as a number or a share.
+Batches = Count | Annotated[float, Field(gt=0, le=1)]
+
+_PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler, "pytorch": PyTorchProfiler}
+
+
 class TrainerOptions(Options):
     """Duration and devices of a training, and intervals of validation and logging."""
 
     group = "trainer"
-    accelerator: Text = "gpu"
+    accelerator: Literal["gpu", "cpu", "auto", "cuda"] = "gpu"
     """gpu, cpu or auto."""
     devices: Annotated[int, Field(ge=1, le=64)] | tuple[Index, ...] | Literal[-1, "auto"] = 1
     """Number of processes, or a list of GPUs; several are DDP, in which each has all parameters. At most 64,
     as each starts at once on a CPU."""
-    precision: Text | Literal[16, 32, 64] = "32-true"
+    num_nodes: int = Field(1, ge=1, le=1024)
+    """Machines, each with devices processes; SLURM or torchrun starts them."""
+    strategy: Literal[
+        "auto", "ddp", "ddp_find_unused_parameters_true", "ddp_find_unused_parameters_false"
+    ] = "auto"
+    """Of several processes; auto: DDP that allows parameters without a gradient, as ablations have."""
+    precision: Precision = "32-true"
     """32-true (the paper's; convolutions too), tf32, bf16-mixed or 16-mixed; geometry is float32 in each."""
     max_steps: int = Field(200000, ge=-1)
     """Steps of the optimizer (the paper's 200000); -1: no limit."""
     max_time: Duration | None = None
     """days:hours:minutes:seconds; the learning rate follows the budget that ends first; null: no limit."""
-    val_check_interval: Count | Annotated[float, Field(gt=0, le=1)] = 5000
+    val_check_interval: Batches = 5000
     """Steps between two validations."""
     limit_val_batches: Index | Share = 8
     """Batches of each validation; 0: none."""
@@ -43,17 +61,32 @@ class TrainerOptions(Options):
     """Batches of each step."""
     deterministic: bool | Literal["warn"] = False
     """true: only deterministic operations, where PyTorch has them."""
+    limit_train_batches: Batches | None = None
+    """Batches of an epoch, or their share; null: all."""
+    overfit_batches: Index | Share = 0.0
+    """The first so many batches of the training, or their share, again and again; 0: all."""
+    fast_dev_run: bool | Count = False
+    """true, or a number of steps: so few, a validation of as many batches, no logs: whether all runs."""
+    profiler: Literal["simple", "advanced", "pytorch"] | None = None
+    """Times of Lightning's hooks, written to <run>/fit-profile.txt."""
 
     def build(self, **arguments: Any) -> L.Trainer:
         """The Trainer with further ``arguments``. InputError: it refuses its options."""
-        precision = "32-true" if self.precision == "tf32" else self.precision
+        options = dict(self)
+        if self.precision == "tf32":
+            options["precision"] = "32-true"
         round_products(self.precision == "tf32")  # also back, after another run of the process
         alone = self.devices == 1 or (isinstance(self.devices, tuple) and len(self.devices) == 1)
+        if self.strategy == "auto" and not (alone and self.num_nodes == 1):
+            # Not every parameter has a gradient in every step (ablations, skipped work).
+            options["strategy"] = "ddp_find_unused_parameters_true"
+        if self.profiler is not None:
+            # Into files: its log lines are silenced with Lightning's others.
+            folder = arguments.get("default_root_dir")
+            options["profiler"] = _PROFILERS[self.profiler](dirpath=folder, filename="profile")
         try:
             return L.Trainer(
-                **(dict(self) | {"precision": precision}),
-                # Not every parameter has a gradient in every step (ablations, skipped work).
-                strategy="auto" if alone else "ddp_find_unused_parameters_true",
+                **options,
                 max_epochs=-1,
                 check_val_every_n_epoch=None,  # validations are counted in steps
                 num_sanity_val_steps=0,

@@ -4,12 +4,15 @@ import functools
 import importlib.util
 import itertools
 
+import hydra
 import pytest
 import torch
+from hydra import initialize_config_dir
 from omegaconf import OmegaConf
 
 from ghgs_lit.cli.usage import VERBS
-from ghgs_lit.config import build, conf_dir
+from ghgs_lit.config import VERSION_BASE, build, compose, conf_dir
+from ghgs_lit.config.compose import read_option
 from ghgs_lit.config.keys import ablation_of, switches_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS, OPTIONS, STAGES
@@ -202,3 +205,17 @@ def test_a_model_may_set_keys_of_loss_and_optimizer(monkeypatch, capsys, own):
     flags = own(model="# @package _global_\ndefaults: [hull, _self_]\noptimizer: {lr: 0.25}\n")
     _, out, _ = call(monkeypatch, capsys, "train", "--cfg", "job", *flags, "model=mine")
     assert OmegaConf.create(out).optimizer.lr == 0.25
+
+
+def test_options_are_read_inside_another_hydra_application(tmp_path):
+    """Its search path has none of the package's files: ``targets: expected one of ; found 'midway'``."""
+    (tmp_path / "theirs.yaml").write_text("lr: 1\n")
+    with initialize_config_dir(str(tmp_path), **VERSION_BASE):
+        their = hydra.compose("theirs")
+        assert read_option("targets", "midway")["name"] == "midway"
+        assert compose("train", ["seed=3"]).seed == 3
+        with pytest.raises(
+            InputError, match=r"targets: expected one of cameras, .*; found 'midwai' \(did you"
+        ):
+            read_option("targets", "midwai")
+        assert hydra.compose("theirs") == their

@@ -72,14 +72,14 @@ def test_every_field_has_a_meaning(group, kind):
 UNLIMITED = {
     "there are no more": """
         subjects subject limit.train limit.val pictures k tolerance chamfer_points limit_val_batches
-        start stop step split frames cameras""",
+        limit_train_batches overfit_batches start stop step split frames cameras""",
     "refused where there are fewer": """
         evaluation_positions positions views evaluation_count training_counts per_subject per_step layers
         token sequences""",
     "how seldom something comes": """
         every every_n_train_steps log_every_n_steps val_check_interval exact_from""",
     "the end of a run or epoch comes first, or Ctrl-C": """
-        max_steps steps_per_epoch accumulate_grad_batches skip_nonfinite""",
+        max_steps fast_dev_run steps_per_epoch accumulate_grad_batches skip_nonfinite""",
     "of a list": "devices",
 }
 
@@ -132,6 +132,14 @@ def with_value(config, key, value):
         ("trainer.max_time", "10 minutes", "days:hours:minutes:seconds such as 00:00:10:00 or null"),
         ("trainer.max_time", 10, "days:hours:minutes:seconds such as 00:00:10:00 or null"),
         ("trainer.devices", True, "an integer >= 1"),
+        ("trainer.accelerator", "tpu", "one of gpu, cpu, auto, cuda"),
+        ("trainer.strategy", "fsdp", "one of auto, ddp, "),
+        ("trainer.profiler", "xla", "one of simple, advanced, pytorch or null"),
+        ("trainer.limit_train_batches", 0, "an integer >= 1 or a number > 0 and <= 1 or null"),
+        *(
+            ("trainer.precision", value, "32-true, tf32, bf16-mixed or 16-mixed")
+            for value in ("bf16-true", "16-true", "64-true", "transformer-engine", 64)
+        ),
         ("data.batch_size", 1.5, "an integer >= 1"),
         ("data.size", 100000, "<= 8192"),
         ("data.size", [140], "a list of 2 values"),

@@ -1,0 +1,112 @@
+"""Habits of Lightning's users act: few batches or steps, equal batches, profiles, strategies, precisions."""
+
+import lightning.pytorch as L
+import pytest
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.training import GHGSModule, Optimization
+from ghgs_lit.training.checkpoints import AtomicCheckpointIO, CheckpointOptions
+from ghgs_lit.training.cost import TrainingCost
+from ghgs_lit.training.trainer import TrainerOptions
+from tests.helpers.losses import losses_of
+from tests.helpers.training import Standin, StepData, flat_renderer
+
+CONFIG = {"seed": 3, "resume": None, "init_from": None, "optimizer": {"lr": 0.05}}
+
+
+class Seen(L.Callback):
+    """Steps' first photographs, and numbers of validated batches."""
+
+    def __init__(self):
+        self.trained, self.validated = [], 0
+
+    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
+        self.trained.append(float(batch.images.sum()))
+
+    def on_validation_batch_end(self, *_):
+        self.validated += 1
+
+
+def fit(folder, **options) -> tuple[L.Trainer, Seen]:
+    """A training of 6 steps with ``options``."""
+    seen = Seen()
+    best = CheckpointOptions(filename="best", monitor="val/psnr").build()
+    chosen = {"accelerator": "cpu", "max_steps": 6, "val_check_interval": 6, **options}
+    trainer = TrainerOptions(**chosen).build(
+        default_root_dir=str(folder),
+        logger=False,
+        plugins=[AtomicCheckpointIO()],
+        callbacks=[seen, TrainingCost(), best],
+        enable_progress_bar=False,
+    )
+    losses = losses_of({"render_l1": 1.0, "chamfer": 0.0, "depth": 0.0})
+    module = GHGSModule(Standin(), flat_renderer, losses, Optimization(lr=0.05), CONFIG)
+    trainer.fit(module, StepData())
+    return trainer, seen
+
+
+def test_an_epoch_of_fewer_batches_goes_on_with_the_next(tmp_path):
+    """``limit_train_batches`` makes epochs shorter, and the samples of a step stay those of the step."""
+    (whole, all_of_them), (trainer, seen) = fit(tmp_path), fit(tmp_path, limit_train_batches=2)
+    assert (whole.current_epoch, trainer.current_epoch) == (2, 3)
+    assert trainer.global_step == len(seen.trained) == 6
+    assert seen.trained == all_of_them.trained
+    assert len(set(seen.trained)) == 6
+
+
+@pytest.mark.parametrize("batches", [2, 0.5])
+def test_the_same_batches_again_and_again(tmp_path, batches):
+    """A model that cannot overfit two batches is wrong."""
+    _, whole = fit(tmp_path)
+    trainer, seen = fit(tmp_path, overfit_batches=batches)
+    assert trainer.global_step == 6
+    assert seen.trained == whole.trained[:2] * 3
+
+
+@pytest.mark.parametrize(("value", "steps"), [(True, 1), (3, 3)])
+def test_a_few_steps_for_trying_out(tmp_path, value, steps):
+    trainer, seen = fit(tmp_path, fast_dev_run=value, max_steps=100)
+    assert trainer.global_step == len(seen.trained) == steps
+    assert seen.validated == min(steps, 2)  # there are two
+    assert not list(tmp_path.rglob("*.ckpt"))
+
+
+@pytest.mark.parametrize("profiler", ["simple", "advanced"])
+def test_a_profile_is_a_file_of_the_run(tmp_path, profiler):
+    """Its log lines are silenced with Lightning's others."""
+    fit(tmp_path, profiler=profiler, max_steps=2)
+    assert "optimizer_step" in (tmp_path / "fit-profile.txt").read_text()
+
+
+def test_options_of_lightning_reach_it(monkeypatch):
+    """Whatever a key is called, it must arrive; several processes allow parameters without a gradient."""
+    seen = []
+    monkeypatch.setattr(L, "Trainer", lambda **arguments: seen.append(arguments))
+    for options in (
+        {"precision": "tf32"},
+        {"num_nodes": 2},
+        {"devices": (0, 1)},
+        {"devices": 2, "strategy": "ddp"},
+        {"precision": "bf16-mixed", "devices": (1,)},
+    ):
+        TrainerOptions(**options).build()
+    assert [arguments["strategy"] for arguments in seen] == [
+        "auto", "ddp_find_unused_parameters_true", "ddp_find_unused_parameters_true", "ddp", "auto"
+    ]  # fmt: skip
+    assert [arguments["num_nodes"] for arguments in seen] == [1, 2, 1, 1, 1]
+    assert [seen[0]["precision"], seen[4]["precision"]] == ["32-true", "bf16-mixed"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"precision": "bf16-true"}, "expected 32-true, tf32, bf16-mixed or 16-mixed; found 'bf16-true'"),
+        ({"accelerator": "tpu"}, "accelerator: expected one of gpu, cpu, auto, cuda; found 'tpu'"),
+        ({"accelerator": "cpu", "devices": (0, 1)}, "trainer: "),
+    ],
+)
+def test_what_it_cannot_do_is_one_line(options, message):
+    """Tracebacks of frozen dataclasses and of packages that are not installed."""
+    with pytest.raises(InputError) as caught:
+        TrainerOptions(**options).build()
+    assert message in str(caught.value)
