@@ -1,0 +1,76 @@
+"""What a GPU is asked for may not grow: launches, and waits of the host, counted on the pretend device.
+
+Counts are exact and the same on every machine; each limit is the count of today. Whoever needs fewer lowers
+it: a failing test prints the line to write. Other versions of PyTorch may divide an operator otherwise, so
+that they are held to waits alone."""
+
+from typing import NamedTuple
+
+import pytest
+import torch
+
+from benchmarks import device
+from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
+from ghgs_lit.model import GHGS
+from ghgs_lit.training import Optimization
+from ghgs_lit.types import Batch
+from tests.helpers.models import make_model
+from tests.helpers.pretend_device import DEVICE, pretend_device
+
+
+class Asked(NamedTuple):
+    """Of a prediction, and of a training step with two rounds where there are any."""
+
+    launches: int
+    waits: int
+    step_launches: int
+    step_waits: int
+
+
+#: Of PyTorch, whose launches are counted.
+_VERSION = "2.13."
+
+LIMITS = {
+    ("model=paper", 1): Asked(1877, 4, 4489, 6),
+    ("model=paper", 8): Asked(1944, 4, 4714, 6),
+    ("model=hull", 1): Asked(2177, 4, 4999, 6),
+    ("model=hull", 8): Asked(2314, 4, 5224, 6),
+    ("model=recurrent", 1): Asked(3669, 11, 6993, 13),
+    ("model=recurrent", 8): Asked(4788, 32, 8182, 34),
+    ("shipped", 1): Asked(4177, 13, 7059, 13),
+    ("shipped", 8): Asked(5589, 41, 8248, 34),
+}
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def asked(kind: str, size: int) -> Asked:
+    """Counts for four views of 28 x 28 pixels, or 56 x 56 with the weights that come with the package."""
+    model = GHGS.from_checkpoint() if kind == "shipped" else make_model(kind)
+    batch = ellipsoid_batch(0.15, 4, 28, size)
+    batch = Batch(batch.images, batch.masks, batch.cameras, batch.targets, depths=2.0 * batch.masks)
+    with pretend_device() as log, device.drawing_nothing():
+        model, batch = model.to(DEVICE), batch.to(DEVICE)
+        log.clear()
+        _, launches, waits = device.forward(model.eval(), batch, log)["total"]
+        if model.rounds is not None:
+            model.rounds._drawn = lambda: 2
+        parts = device.second_step(model.train(), Optimization(lr=1e-3, matrix_scale=1.0), batch, log)
+    step = [sum(numbers) for numbers in zip(*parts.values(), strict=True)]
+    return Asked(launches, waits, *step[1:])
+
+
+@pytest.mark.parametrize(("kind", "size"), LIMITS)
+def test_a_gpu_is_asked_for_no_more_than_before(kind, size):
+    """Each launch costs the host some 15 microseconds, each wait the time until the GPU has caught up."""
+    found, limit = asked(kind, size), LIMITS[kind, size]
+    counted = Asked._fields if torch.__version__.startswith(_VERSION) else ("waits", "step_waits")
+    grown = [name for name in counted if getattr(found, name) > getattr(limit, name)]
+    print(f'    ("{kind}", {size}): {found},')
+    assert not grown
