@@ -307,6 +307,14 @@ def _counts(phase: Phase) -> dict[str, int]:
     return dict(zip(("people", "subjects", "photos", "broken", "bodies"), counts, strict=True))
 
 
+def _light(report: Report) -> str:
+    """A line on the lights of the renders and on how bright subjects are, 1 for white."""
+    known = {name: phase.known("bright") for name, phase in report.phases.items()}
+    bright = ", ".join(f"{name} {np.mean(values):.3f}" for name, values in known.items() if values)
+    lights = "" if report.lights is None else f"rendered with data.render.lights={report.lights}; "
+    return f"{lights}mean brightness of subjects (1 is white): {bright or 'unknown'}"
+
+
 def show(report: Report) -> None:
     """Print the report as tables."""
     table = Table(
@@ -316,13 +324,10 @@ def show(report: Report) -> None:
         iou, agreement = phase.known("iou"), phase.known("agreement")
         numbers = [f"{np.mean(iou):.3f}", f"{min(iou):.3f}"] if iou else ["-", "-"]
         numbers.append(f"{min(agreement):.3f}" if agreement else "-")
-        bright = phase.known("bright")
-        numbers.append(f"{np.mean(bright):.3f}" if bright else "-")
         table.add_row(name, *map(str, _counts(phase).values()), *numbers)
     if report.phases:
         rich.print(table)
-    if report.lights is not None:
-        print(f"rendered with data.render.lights={report.lights}")
+        print(_light(report))
     for title, lines in (("problem", report.problems), ("note", report.notes)):
         if lines:
             table = Table(title, "expected", "found")

@@ -2,6 +2,7 @@
 
 import io
 import json
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import unquote
@@ -17,6 +18,8 @@ from ghgs_lit.readers import find_path, parts_of, require_folder
 from ghgs_lit.synthesis.gltf import posed
 from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
 
+log = logging.getLogger(__name__)
+
 _MESH_SUFFIXES = (".glb", ".gltf", ".obj")
 _IMAGE_SUFFIXES = (".jpeg", ".jpg", ".png")
 
@@ -30,7 +33,17 @@ class ScanSource:
     def names(self) -> list[str]:
         """Ids of all scans, sorted. InputError: the folder is missing or holds no scans."""
         require_folder(self.folder, "a folder of scans")
-        names = sorted(p.name for p in self.folder.iterdir() if p.is_dir() and _mesh_file(p) is not None)
+        folders = [p for p in self.folder.iterdir() if p.is_dir() and not p.name.startswith(".")]
+        names = sorted(p.name for p in folders if _mesh_file(p) is not None)
+        others = sorted(p.name for p in folders if p.name not in names and _has_meshes(p))
+        if others:
+            example = f"{others[0]}/{others[0]}.obj"
+            log.warning(
+                "%s: no scans, since their meshes are not named as %s: %s",
+                self.folder,
+                example,
+                ", ".join(others),
+            )
         if not names:
             raise InputError(f"{self.folder}: expected <id>/<id>.obj or <id>/<id>.glb; found none")
         return names
@@ -42,8 +55,8 @@ class ScanSource:
         path = _mesh_file(folder) if folder.is_dir() else None
         if path is None:
             raise InputError(f"{folder}: expected {name}.obj or {name}.glb; found neither")
-        body_path = folder / "body_vertices.npy"
-        body = read_vertices(body_path) if body_path.exists() else None
+        body_path = find_path(folder, "body_vertices.npy")
+        body = None if body_path is None else read_vertices(body_path)
         return Person(name=name, parts=load_parts(path), body_vertices=body)
 
     def facing(self, name: str) -> float:
@@ -54,6 +67,10 @@ class ScanSource:
 def _mesh_file(folder: Path) -> Path | None:
     path = find_path(folder, folder.name, _MESH_SUFFIXES)
     return path if path is not None and path.is_file() else None
+
+
+def _has_meshes(folder: Path) -> bool:
+    return any(path.suffix.lower() in (*_MESH_SUFFIXES, ".ply", ".fbx", ".stl") for path in folder.iterdir())
 
 
 class _Beside(trimesh.resolvers.FilePathResolver):

@@ -21,7 +21,7 @@ from ghgs_lit.config.options import Share, Size, Text, Workers
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.data.pickles import load_pickle
 from ghgs_lit.errors import InputError
-from ghgs_lit.readers import read_text, require_folder
+from ghgs_lit.readers import find_path, read_text, require_folder
 from ghgs_lit.synthesis.datasets import Scans
 from ghgs_lit.synthesis.jobs import RenderOptions
 from ghgs_lit.synthesis.people.mesh import Person
@@ -53,7 +53,7 @@ class THuman2Source(ScanSource):
         scan = super().load(name)
         if self.fits is None:
             return scan
-        path = self._fit(name) / "mesh_smplx.obj"
+        path = self._fit(name, "mesh_smplx.obj")
         lines = read_text(path, "the fitted mesh").splitlines()
         body = check_array(path, [line.split()[1:4] for line in lines if line.startswith("v ")], [(None, 3)])
         _check_body(path.parent, scan, body)
@@ -64,7 +64,7 @@ class THuman2Source(ScanSource):
         pickle is read without executing it. InputError: it is bad."""
         if self.fits is None:
             return 0.0
-        path = self._fit(name) / "smplx_param.pkl"
+        path = self._fit(name, "smplx_param.pkl")
         content = load_pickle(path)
         if not isinstance(content, dict) or "global_orient" not in content:
             found = sorted(map(str, content)) if isinstance(content, dict) else type(content).__name__
@@ -73,10 +73,11 @@ class THuman2Source(ScanSource):
         forward = Rotation.from_rotvec(turn).as_matrix()[:, 2]
         return float(np.degrees(np.arctan2(forward[0], forward[2])))
 
-    def _fit(self, name: str) -> Path:
-        folder = self.fits / name
+    def _fit(self, name: str, file: str) -> Path:
+        """A file of a scan's fit. InputError: there is no folder of it."""
+        folder = find_path(self.fits, name) or self.fits / name
         require_folder(folder, "the scan's SMPL-X fit")
-        return folder
+        return find_path(folder, file) or folder / file
 
 
 def _check_body(folder: Path, scan: Person, body: np.ndarray) -> None:

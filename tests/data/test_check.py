@@ -169,7 +169,8 @@ def test_lights_of_renders_and_how_bright_they_are_is_said(root, capsys, tmp_pat
     lit = report(root)
     assert not [note for note in lit.notes if "lights" in note]
     show(lit)
-    assert "rendered with data.render.lights=studio\n" in capsys.readouterr().out
+    line = f"lights=studio; mean brightness of subjects (1 is white): train {mean:.3f}, val "
+    assert f"rendered with data.render.{line}" in capsys.readouterr().out
     write(lit, tmp_path / "check")
     content = json.loads((tmp_path / "check" / "check.json").read_text())
     assert content["lights"] == "studio"

@@ -58,6 +58,17 @@ def test_names_of_windows_programs(tmp_path):
     assert ScanSource(tmp_path).names() == ["a"]
 
 
+def test_folders_with_meshes_of_other_names_are_named(tmp_path, caplog):
+    """They were left out without a word; folders without meshes, and hidden ones, are no scans."""
+    for name in ("a", "b", "fits", ".c"):
+        write_obj_scan(tmp_path, name)
+    (tmp_path / "b" / "b.obj").rename(tmp_path / "b" / "scan.FBX")
+    (tmp_path / "fits" / "fits.obj").unlink()
+    assert ScanSource(tmp_path).names() == ["a"]
+    (line,) = caplog.messages
+    assert line.endswith("no scans, since their meshes are not named as b/b.obj: b")
+
+
 def test_a_lost_texture_of_several_is_not_guessed(tmp_path):
     """The image beside the mesh is that of its only material, not of whichever lost its own."""
     path = write_obj_scan(tmp_path, "a")

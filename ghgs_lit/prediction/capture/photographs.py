@@ -75,7 +75,7 @@ def images_in(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[str, P
     paths: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         is_image = path.suffix.lower() in suffixes and not path.name.startswith(".") and not path.is_dir()
-        if not is_image or path.stem.endswith(MASK_ENDING):
+        if not is_image or path.stem.lower().endswith(MASK_ENDING):
             continue
         name = composed(path.stem)
         require(name not in paths, str(path), "one file for each photograph", str(paths.get(name)))
@@ -102,7 +102,7 @@ def require_all_read(
     for path in sorted(folder.iterdir()):
         name, kind = composed(path.name), path.suffix.lower().removeprefix(".")
         begins = {name[:end] for end, letter in enumerate(f"{name}.") if letter == "."}
-        is_other = path.name.startswith(".") or path.is_dir() or path.stem.endswith(MASK_ENDING)
+        is_other = path.name.startswith(".") or path.is_dir() or path.stem.lower().endswith(MASK_ENDING)
         if is_other or kind in _COMPANIONS.split() or not begins.isdisjoint(read):
             continue
         if kind in PICTURES.split() or not begins.isdisjoint(known):

@@ -272,6 +272,19 @@ def test_cameras_of_one_name_are_refused(tmp_path):
         read_cameras(path)
 
 
+def test_a_camera_that_json_has_twice(tmp_path):
+    """The second one won, and two of three cameras were read."""
+    text = ", ".join(f'"{name}": {json.dumps(CAMERA)}' for name in "aba")
+    with pytest.raises(InputError, match=r"cameras\.json: expected JSON; found the key 'a' twice"):
+        read_cameras(write(tmp_path / "cameras.json", f"{{{text}}}"))
+
+
+@pytest.mark.parametrize("name", ["A.YML", "b.Yaml"])
+def test_endings_of_calibrations(tmp_path, name):
+    write(tmp_path / name, json.dumps({"a": CAMERA}))
+    assert list(read_cameras(tmp_path).cameras) == list(read_cameras(tmp_path / name).cameras) == ["a"]
+
+
 def test_numbers_are_names_of_yaml(tmp_path):
     text = "\n".join(f"{n}: {json.dumps(CAMERA)}" for n in ("0", "1", "08", "010"))
     assert list(read_cameras(write(tmp_path / "a.yaml", text)).cameras) == ["0", "1", "08", "010"]

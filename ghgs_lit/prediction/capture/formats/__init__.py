@@ -8,8 +8,9 @@ from ghgs_lit.prediction.capture.formats.camera_file import CameraFile
 from ghgs_lit.prediction.capture.formats.colmap import model_folder, read_colmap
 from ghgs_lit.prediction.capture.formats.json_and_toml import read_json, read_json_file, read_toml
 from ghgs_lit.prediction.capture.formats.nerfstudio import read_nerfstudio
-from ghgs_lit.prediction.capture.formats.opencv import EASYMOCAP, read_easymocap, read_opencv
+from ghgs_lit.prediction.capture.formats.opencv import EASYMOCAP, read_easymocap, read_opencv, yaml_files
 from ghgs_lit.prediction.capture.formats.qualisys import read_qualisys
+from ghgs_lit.readers import find_path
 
 __all__ = ["FORMATS", "CameraFile", "read_cameras"]
 
@@ -39,12 +40,12 @@ def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
 
 def _format_of(path: Path) -> str:
     suffix, folder = path.suffix.lower(), path if path.is_dir() else path.parent
-    if path.name in EASYMOCAP or (path.is_dir() and (path / EASYMOCAP[0]).exists()):
+    if path.name.lower() in EASYMOCAP or (path.is_dir() and find_path(path, EASYMOCAP[0]) is not None):
         return "easymocap"
     if path.is_dir():
         if model_folder(path) is not None:
             return "colmap"
-        if any(path.glob("*.y*ml")):
+        if yaml_files(path):
             return "opencv"
     elif suffix in (".yml", ".yaml"):
         return "opencv"
@@ -52,7 +53,7 @@ def _format_of(path: Path) -> str:
         return "toml"
     elif suffix == ".json":
         return "nerfstudio" if "frames" in read_json_file(path) else "ghgs"
-    elif path.name.endswith(".qca.txt"):
+    elif path.name.lower().endswith(".qca.txt"):
         return "qualisys"
     elif suffix in (".bin", ".txt") and model_folder(folder) is not None:
         return "colmap"

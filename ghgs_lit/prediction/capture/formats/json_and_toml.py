@@ -16,8 +16,16 @@ from ghgs_lit.prediction.capture.formats.entries import Entries
 
 
 def read_json_file(path: Path) -> dict[str, Any]:
-    """The object of a JSON file. InputError: it is none."""
-    return read_mapping(path, json.loads, "JSON", "a JSON object")
+    """The object of a JSON file. InputError: it is none, or has a key twice, of which JSON keeps the last."""
+    return read_mapping(path, lambda text: json.loads(text, object_pairs_hook=_once), "JSON", "a JSON object")
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        names = [key for key, _ in pairs]
+        raise ValueError(f"the key {next(key for key in names if names.count(key) > 1)!r} twice")
+    return content
 
 
 def read_json(path: Path) -> CameraFile:

@@ -16,7 +16,7 @@ from ghgs_lit.errors import require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
 from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, read_mapping
 from ghgs_lit.prediction.capture.formats.entries import FISHEYE, PERSPECTIVE, Entries
-from ghgs_lit.readers import check_yaml
+from ghgs_lit.readers import check_yaml, find_path
 
 EASYMOCAP = ("intri.yml", "extri.yml")  #: The files of EasyMocap: intrinsics and poses
 #: Entries of a camera, or beside cameras, that do not matter, as :func:`plain` spells them.
@@ -49,9 +49,14 @@ for _name in ("opencv-matrix", "opencv-nd-matrix"):
     _Loader.add_constructor(f"tag:yaml.org,2002:{_name}", _matrix)
 
 
+def yaml_files(folder: Path) -> list[Path]:
+    """The YAML files of a folder."""
+    return [path for path in sorted(folder.iterdir()) if path.suffix.lower() in (".yml", ".yaml")]
+
+
 def read_opencv(path: Path) -> CameraFile:
     """Cameras of a YAML file, or of all YAML files of a folder. InputError: a camera is missing or wrong."""
-    files = sorted([*path.glob("*.yml"), *path.glob("*.yaml")]) if path.is_dir() else [path]
+    files = yaml_files(path) if path.is_dir() else [path]
     cameras: list[StoredCamera] = []
     unread: list[str] = []
     for file in files:
@@ -74,8 +79,9 @@ def read_easymocap(path: Path) -> CameraFile:
     one of the files is missing, or a camera is wrong."""
     folder = path if path.is_dir() else path.parent
     fields: dict[str, Any] = {}
-    for file in (folder / name for name in EASYMOCAP):
-        require(file.exists(), str(file), "EasyMocap's file beside the other", "no such file")
+    for name in EASYMOCAP:
+        file = find_path(folder, name)
+        require(file is not None, str(folder / name), "EasyMocap's file beside the other", "no such file")
         fields |= _read_yaml(file)
     named, others = _by_name(fields)
     require(bool(named), str(folder / EASYMOCAP[0]), "camera matrices K_<name>", sorted(fields))
