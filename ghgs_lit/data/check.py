@@ -317,9 +317,7 @@ def _light(report: Report) -> str:
 
 def show(report: Report) -> None:
     """Print the report as tables."""
-    table = Table(
-        "phase", "people", "subjects", "photos", "broken", "bodies", "mean IoU", "min IoU", "agree", "bright"
-    )
+    table = Table("phase", "people", "subjects", "photos", "broken", "bodies", "mean IoU", "min IoU", "agree")
     for name, phase in report.phases.items():
         iou, agreement = phase.known("iou"), phase.known("agreement")
         numbers = [f"{np.mean(iou):.3f}", f"{min(iou):.3f}"] if iou else ["-", "-"]
