@@ -37,14 +37,15 @@ NOT_RUN = [
     (r"make (?!demo$|bench$)", "sets up an environment, or is what continuous integration runs"),
     (r"\w+=\S+ make demo", NETWORK),
     (r"pip install", NETWORK),
+    (r"git clone|python3 -m venv", "makes a checkout and its environment"),
     (r"source ", "the commands run in the environment of this script"),
     (r"ghgs import", PUBLISHED),
     (r"ghgs \w+ checkpoint=release\.ckpt", PUBLISHED),
     (r"ghgs train (?!.*dry_run).*encoder=vggt_1b", PUBLISHED),
-    (r"ghgs train (?!.*dry_run).*trainer=gpu", "needs a GPU"),
     (r"ghgs train .*hydra/launcher=slurm", "needs a cluster"),
     (r"ghgs train .*hydra/launcher=ray", "needs the extra `ray`"),
     (r"ghgs train .*hydra/sweeper=optuna", "needs the extra `optuna`"),
+    (r"ghgs adapt (cameras=<|data\.size=518)", "renders the people of a rig, for minutes"),
     (r"ghgs stress dump=", "needs a training step that was not finite"),
     (r"ghgs (train|evaluate|benchmark) .*split=bench", "renders forty people"),
     (r"(ghgs table|python benchmarks/when_recalibration\.py) .*runs/ablation", "needs twelve runs"),
@@ -69,6 +70,8 @@ TRAIN = r"^(ghgs train (?!.*(?:dry_run|-help))"  # begins the pattern of a comma
 # A pattern, what is put in its place, and why.
 SMALL = [
     (r"^make demo$", f"bash scripts/demo.sh {TINY} {SHORT}", "without the set-up, two steps"),
+    (r"^bash scripts/demo\.sh$", f"bash scripts/demo.sh {TINY} {SHORT}", "two steps"),
+    (r"\btrainer=gpu\b", "trainer=cpu", "no GPU"),
     (r"^make bench$", "python benchmarks/rasterizer.py --quick", "without the set-up"),
     (r"^(ghgs benchmark (?!.*-help).*)", r"\1 timing.repeats=1 subjects=1", "one round"),
     (r"^(ghgs benchmark data=synthetic .*)", rf"\1 {TINY}", "two people of 56 x 56 pixels"),
@@ -98,7 +101,9 @@ SMALL = [
      rf"\1\2 --steps 12 --kill-at 6 --every 3 {TINY}", "twelve steps"),
     (r"^(ghgs train (?!.*dry_run).*sweep=table\d.*)", r"\1 dry_run=true", "needs a GPU: planned only"),
     (r"(?<=seed=1,2),3(,4)?", "", "two seeds"),
-    (TRAIN + r".*(?:experiment=demo|data=synthetic).*)", rf"\1 {TINY}", "two people of 56 x 56 pixels"),
+    (TRAIN + r".*(?:experiment=(?:demo|shipped)|data=synthetic).*)", rf"\1 {TINY}",
+     "two people of 56 x 56 pixels"),
+    (TRAIN + r".*experiment=shipped.*)", r"\1 data.active.train=1 augmentation=none trainer=cpu", "small"),
     (TRAIN + r".*data.root=rendered.*)", r"\1 data.size=56", "56 x 56 pixels"),
     (TRAIN + r"(?!.*vggt_nano).*experiment=(?:thuman2|zju_mocap|humman).*)", rf"\1 {CPU}", "no GPU"),
     (TRAIN + r".*experiment=zju_mocap.*)", r"\1 data.size=112", "112 x 112 pixels"),
@@ -195,7 +200,8 @@ cameras = Cameras(torch.tensor([[[[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]]]), tor
 # Beginnings of the commands of a document that end within seconds, and of those that they need.
 FAST = {
     "README.md": r"ghgs \S*--help|ghgs train --help|.*dry_run=true|.*data\.source=my_scans|"
-    r"ghgs prepare .*rendered|ghgs train experiment=scans .*runs/mine|ghgs predict|#python",
+    r"ghgs prepare .*rendered|ghgs train experiment=scans .*runs/mine|"
+    r"ghgs train .*trainer=gpu|ghgs predict|#python",
     "docs/first_day.md": r".*dry_run=true",
     "docs/rasterizer.md": r"#python",
     "docs/sweeps.md": r".*dry_run=true",

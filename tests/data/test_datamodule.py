@@ -55,11 +55,44 @@ def test_a_resumed_run_knows_how_many_batches_it_has_had(step, accumulated, leng
     assert trained_batches(None, length) == 0
 
 
+@pytest.fixture(scope="module")
+def boxes(tmp_path_factory):
+    """Four people of training and two of validation."""
+    folder = tmp_path_factory.mktemp("boxes")
+    render_boxes(folder / "data", folder / "scans", train=4, val=2)
+    return folder / "data"
+
+
+def test_targets_have_their_own_size(boxes):
+    """Inputs stay small where photographs are compared at twice their size."""
+    data = rendered(boxes, size=14, target_size=28)
+    batch = data.training_batch(0)
+    assert batch.images.shape[-2:] == batch.masks.shape[-2:] == (14, 14)
+    assert batch.targets.images.shape[-2:] == batch.targets.masks.shape[-2:] == (28, 28)
+    assert (batch.targets.cameras.height, batch.targets.cameras.width) == (28, 28)
+
+
+def test_depths_are_read_where_something_compares_with_them(boxes):
+    """Training without a term of depths reads none; evaluation measures depths all the same."""
+    data = rendered(boxes)
+    assert data.training_batch(0).depths is not None
+    data.trains_on_depths = False
+    assert data.training_batch(0).depths is None
+    assert data.evaluation_batch("s4").depths is not None
+
+
+def test_evaluation_has_the_batches_that_are_asked_for(boxes):
+    """Of the data set's size unless another is given, as for measuring one subject at a time."""
+    data = rendered(boxes, batch_size=2)
+    assert [len(batch.images) for batch in data.evaluation_loader()] == [2]
+    assert [len(batch.images) for batch in data.evaluation_loader(batch_size=1)] == [1, 1]
+    assert [batch.images.shape[1] for batch in data.evaluation_loader(views=3)] == [3]
+
+
 @pytest.mark.parametrize("rank", [0, 1])
-def test_each_process_of_several_loads_its_own_samples(tmp_path, rank):
-    """Its number and how many there are come from the trainer; five subjects are two steps of 2 x 2."""
-    render_boxes(tmp_path / "data", tmp_path / "scans", train=5, val=0)
-    data = rendered(tmp_path / "data", batch_size=2)
+def test_each_process_of_several_loads_its_own_samples(boxes, rank):
+    """Its number and how many there are come from the trainer: four subjects, two steps."""
+    data = rendered(boxes, batch_size=1)
     data.trainer = SimpleNamespace(world_size=2, global_rank=rank)
     batches = data.train_dataloader().dataset
     assert (batches.rank, batches.world, len(batches)) == (rank, 2, 2)

@@ -2,6 +2,7 @@
 
 import os
 import signal
+from datetime import timedelta
 
 import pytest
 import torch
@@ -49,6 +50,13 @@ def test_minutes_are_positive(minutes):
     """An impossible interval is refused with its key."""
     with pytest.raises(InputError, match="minutes"):
         CheckpointOptions(filename="last", minutes=minutes)
+
+
+def test_minutes_are_minutes():
+    """Lightning has the interval as a timedelta, beside the steps."""
+    saver = CheckpointOptions(filename="last", minutes=2.5, every_n_train_steps=7).build()
+    assert saver._train_time_interval == timedelta(seconds=150)
+    assert saver._every_n_train_steps == 7
 
 
 def test_a_best_checkpoint_that_is_gone_is_found_again(tmp_path):

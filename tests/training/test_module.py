@@ -1,5 +1,6 @@
 """The LightningModule, its schedule, checkpoints and callbacks, with a stand-in for the model."""
 
+import csv
 import dataclasses
 from datetime import timedelta
 from types import SimpleNamespace
@@ -24,7 +25,7 @@ from ghgs_lit.training.checkpoints import CheckpointOptions, Checkpoints
 from ghgs_lit.training.cost import Costs
 from ghgs_lit.training.trainer import TrainerOptions
 from ghgs_lit.training.validation_pictures import PicturesOptions
-from ghgs_lit.types import Targets
+from ghgs_lit.types import DepthMaps, Targets
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION, write_checkpoint
 from tests.helpers.losses import losses_of
 from tests.helpers.models import config, make_model
@@ -260,6 +261,9 @@ def test_callbacks_write_pictures_and_numbers(tmp_path):
         "val/psnr",
     }
     assert expected <= set(header)
+    with open(tmp_path / "csv" / "metrics.csv", newline="") as file:
+        found = {row["train/gaussians"] for row in csv.DictReader(file) if row["train/gaussians"]}
+    assert found == {"144.0"}  # of one of two subjects, in three views of 8 x 6 pixels
 
 
 @pytest.mark.parametrize(
@@ -335,6 +339,40 @@ def test_validation_measures_clamped_renders(tmp_path):
     assert found["val/psnr"] == pytest.approx(float(psnr(image, target).mean()), rel=1e-4)
     box = box_of(batch.targets.masks.flatten(0, 1))
     assert found["val/psnr_box"] == pytest.approx(float(psnr(image, target, box).mean()), rel=1e-4)
+
+
+def test_depth_error_is_of_pixels_with_a_prediction(tmp_path):
+    """Where the model says that a depth is not valid, it has none that could be wrong."""
+
+    class Half(Standin):
+        def forward(self, batch):
+            found = super().forward(batch)
+            valid = batch.masks & (torch.arange(batch.masks.shape[-1]) < 8)
+            depth = torch.where(valid, 2.15, 9.0)
+            return dataclasses.replace(found, depth_maps=DepthMaps(depth, valid, torch.ones_like(depth)))
+
+    subject = GHGSModule(Half(), flat_renderer, losses_of({"render_l1": 1.0}), Optimization(lr=0.05), CONFIG)
+    (found,) = trainer(tmp_path, steps=1).validate(subject, loader(1), verbose=False)
+    assert found["val/depth_error_mm"] == pytest.approx(50, abs=0.01)  # the truth is 2.1 m
+
+
+def test_rounds_are_measured_as_the_result_is(tmp_path):
+    """Renders of the Gaussians before each round are clamped, too, and depths are those before it."""
+
+    def brighter(gaussians, cameras):
+        drawn = flat_renderer(gaussians, cameras)
+        return dataclasses.replace(drawn, image=drawn.image + torch.linspace(-1, 2, drawn.image.shape[-1]))
+
+    class Twice(Standin):
+        def forward(self, batch):
+            found = super().forward(batch)
+            maps = DepthMaps(torch.full_like(found.depth, 2.2), batch.masks, torch.ones_like(found.depth))
+            return dataclasses.replace(found, drafts=(found.gaussians,), rounds=(maps, found.depth_maps))
+
+    subject = GHGSModule(Twice(), brighter, losses_of({"render_l1": 1.0}), Optimization(lr=0.05), CONFIG)
+    (found,) = trainer(tmp_path, steps=1).validate(subject, loader(1), verbose=False)
+    assert found["val/psnr_before_round_1"] == pytest.approx(found["val/psnr"], rel=1e-6)
+    assert found["val/depth_error_mm_before_round_1"] == pytest.approx(100, abs=0.01)
 
 
 def test_a_trainer_of_ones_own_needs_no_configuration(tmp_path):
