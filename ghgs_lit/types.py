@@ -315,6 +315,15 @@ class Gaussians(_TensorStruct):
         }
         return dataclasses.replace(self, **changes, splits=splits)
 
+    def with_more(self, others: "Gaussians") -> "Gaussians":
+        """These and then others; both of one element, with the same optional fields."""
+        both = {
+            f.name: torch.cat((getattr(self, f.name), getattr(others, f.name)))
+            for f in dataclasses.fields(self)
+            if f.name != "metre" and isinstance(getattr(self, f.name), Tensor)
+        }
+        return dataclasses.replace(self, **both, splits=(len(self) + len(others),))
+
     def __getitem__(self, element: int) -> "Gaussians":
         """The Gaussians of one batch element."""
         if not -len(self.splits) <= element < len(self.splits):

@@ -4,6 +4,7 @@ well masks and cameras agree (:mod:`ghgs_lit.geometry.silhouettes`)."""
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,10 @@ from ghgs_lit.prediction.capture.photographs import Pixels
 
 #: Least agreement of every view of a right calibration, and by how much a better meaning must win.
 AGREES, BETTER = 0.9, 0.05
+#: Agreement below which a view is sought that disagrees, and how much of the disagreement it may leave.
+_SOUND, _REST = 0.97, 1 / 3
+_SAME = 0.01  # Difference of agreement that tells nothing
+_BESIDE = 3  # Pixels beside a mask in which it may lack a part
 _SIDE = 320  # Longer side of the photographs that are compared, in pixels
 _MIDDLE = (0.3, 0.7)  # Shares of a photograph between which a principal point is plausible
 PERSON = (0.5, 2.5)  #: A person's largest extent in metres
@@ -93,7 +98,7 @@ class Diagnosis:
     option: str  #: of the command line, for the best meaning; empty: none
     ranking: tuple[Hypothesis, ...]  #: all meanings that were tried, the best first
     size: float  #: the subject's largest extent in the user's unit, by the best meaning
-    suspects: tuple[str, ...] = ()  #: cameras that disagree with the others
+    suspects: tuple[str, ...] = ()  #: views that disagree with the others; a few may also if consistent
 
 
 def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
@@ -105,11 +110,11 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
         line = f"{' and '.join(same)} have the same pose: one of them is a copy"
         return Diagnosis(False, (line,), "", (given,), given.size(folder), same)
     if given.score >= AGREES:
-        size, agree = (
-            given.size(folder),
-            f"{given.score:.0%} of each mask or more lies in the hull of the others",
-        )
-        return Diagnosis(True, (f"cameras and masks agree ({agree})", _size_line(size)), "", (given,), size)
+        size = given.size(folder)
+        agree = f"{given.score:.0%} of each mask or more lies in the hull of the others"
+        lines = [f"cameras and masks agree ({agree})", _size_line(size)]
+        suspects, *said = _suspected(given, folder) if given.score < _SOUND else ((),)
+        return Diagnosis(True, (*lines, *said), "", (given,), size, suspects)
     tried = [given, *(hypothesis.ranked(folder) for hypothesis in _for_all(views))]
     best = max(tried, key=lambda hypothesis: hypothesis.score)
     if best.score < AGREES:
@@ -237,10 +242,16 @@ def _mistakes(view: StoredView) -> Iterator[tuple[str, StoredView]]:
 
 def _contrast(view: StoredView, mask: np.ndarray) -> float:
     """Mean gradient of the photograph on the outline of a mask, largest for the right mask."""
-    grey = view.pixels.image.astype(np.float64).mean(-1)
-    gradient = np.hypot(*np.gradient(grey))
-    outline = np.hypot(*np.gradient(mask.astype(np.float64))) > 0
-    return float(gradient[outline].mean()) if outline.any() else 0.0
+    on_outline = _gradient(view.pixels.image)[_outline(mask)]
+    return float(on_outline.mean()) if len(on_outline) else 0.0
+
+
+def _gradient(image: np.ndarray) -> np.ndarray:
+    return np.hypot(*np.gradient(image.astype(np.float64).mean(-1)))
+
+
+def _outline(mask: np.ndarray) -> np.ndarray:
+    return np.hypot(*np.gradient(mask.astype(np.float64))) > 0
 
 
 def _size_line(size: float) -> str:
@@ -254,21 +265,75 @@ def _size_line(size: float) -> str:
 
 
 def _unexplained(folder: CaptureFolder, given: Hypothesis, tried: list[Hypothesis]) -> Diagnosis:
-    """The diagnosis where no meaning fits: the camera without which the others agree, if there is one."""
+    """The diagnosis where no meaning fits: the view without which the others agree, if there is one."""
     base = max((h for h in tried if not h.blames), key=lambda h: h.score)
     base = base if base.score > given.score + BETTER else given
-    views = base.views
-    without = {}
-    for left_out in views if len(views) > 2 else ():
-        rest = tuple(view for view in views if view is not left_out)
-        without[left_out.name] = replace(base, views=rest).ranked(folder)
-    fitting = [name for name, others in without.items() if others.score >= AGREES]
-    best = max(without, key=lambda name: without[name].score, default=None)
+    suspects, *lines = _suspected(base, folder)
     shares = ", ".join(f"{name} {share:.0%}" for name, share in base.shares.items())
-    lines = [f"masks and cameras disagree (share of each mask in the hull of the others: {shares})"]
-    if fitting and len(views) > 3:
-        lines.append(f"{best} disagrees with the others, which agree by {without[best].score:.0%} without it")
-    elif fitting:
-        lines.append(f"{' or '.join(fitting)} disagrees with the others (three cameras cannot tell for sure)")
-    suspects = () if not fitting else (best,) if len(views) > 3 else tuple(fitting)
+    if not suspects:
+        lines = [f"masks and cameras disagree (share of each mask in the hull of the others: {shares})"]
     return Diagnosis(False, tuple(lines), "", tuple(tried), base.size(folder), suspects)
+
+
+def _suspected(found: Hypothesis, folder: CaptureFolder) -> tuple[Any, ...]:
+    """The views that explain by themselves most of the disagreement, and a line about them; () if none does.
+
+    A mask that lacks a part lies in the hull of the others, and theirs do not lie in that with it: what is
+    compared are the others with and without it."""
+    least = max(AGREES, 1 - (1 - found.score) * _REST)
+    without = {
+        left_out.name: replace(found, views=tuple(v for v in found.views if v is not left_out)).ranked(folder)
+        for left_out in (found.views if len(found.views) > 2 else ())
+    }
+    fitting = {name: others.score for name, others in without.items() if others.score >= least}
+    readings = {name: _reading(found, name) for name in fitting}
+    if len(found.views) == 3 and any(readings.values()):  # two views alone agree nearly always
+        fitting = {name: share for name, share in fitting.items() if readings[name]}
+    if not fitting:
+        return ((),)
+    best = max(fitting.values())
+    names = tuple(name for name, share in fitting.items() if share >= best - _SAME)
+    line = f"{' or '.join(names)} disagrees with the others, which agree by {best:.0%} without it"
+    if len(names) == 1:
+        return names, f"{line} and by {found.score:.0%} with it{readings[names[0]]}"
+    if len(names) == 2 and len(found.views) > 3:
+        names = tuple(sorted(names, key=_edges(found, names, folder).__getitem__))
+        return names, f"{line}: rather {names[0]}, by the edges of the photographs (silhouettes cannot tell)"
+    return names, f"{line} (silhouettes cannot tell for sure)"
+
+
+def _edges(found: Hypothesis, names: tuple[str, str], folder: CaptureFolder) -> dict[str, float]:
+    """Contrast of two photographs, of which one's mask has a part that the other's lacks, at that part of the
+    mask's outline, compared with the rest of it: the wrong mask's outline follows no edge there."""
+    from scipy import ndimage  # here: it takes time to import
+
+    photographs = found.photographs(folder)
+    silhouettes = [Silhouette(p.mask, p.intrinsics, p.extrinsics) for p in photographs]
+    more, sphere, edges = min(names, key=found.shares.__getitem__), subject_sphere(silhouettes), {}
+    for place, view in enumerate(found.views):
+        if view.name not in names:
+            continue
+        one, others = silhouettes[place], silhouettes[:place] + silhouettes[place + 1 :]
+        close, around = (ndimage.binary_dilation(one.mask, iterations=n * _BESIDE) for n in (1, 2))
+        cells = np.argwhere(one.mask if view.name == more else around & ~close)
+        meets = HullSearch().meets(one, cells[:, ::-1] + 0.5, others, *sphere)
+        part = np.zeros_like(one.mask)
+        part[tuple(cells[meets != (view.name == more)].T)] = True
+        near, outline = ndimage.binary_dilation(part, iterations=2 * _BESIDE), _outline(one.mask)
+        gradient = _gradient(photographs[place].image)
+        here, elsewhere = (gradient[outline & which] for which in (near, ~near))
+        edges[view.name] = (
+            here.sum() / max(len(here), 1) / max(elsewhere.sum() / max(len(elsewhere), 1), 1e-6)
+        )
+    return edges
+
+
+def _reading(found: Hypothesis, name: str) -> str:
+    """What may be wrong with a view, by whether its own mask or those of the others lie outside a hull."""
+    own = 1 - found.shares[name]
+    others = 1 - min(share for other, share in found.shares.items() if other != name)
+    if own <= _REST * others:
+        return ": its mask lacks a part that theirs have, or its focal length is too long"
+    if others <= _REST * own:
+        return ": its mask has a part that theirs lack, or its focal length is too short"
+    return ""

@@ -130,3 +130,40 @@ def test_the_picture_has_the_hull_on_the_mask_and_lines_through_the_body(tmp_pat
     assert (hull & near).sum() > 0.3 * hull.sum()
     line = (picture[14 + 130 + 14 :][:128, 98 : 98 + 96] == (160, 255, 120)).all(-1)  # of the middle point
     assert (line & figure.masks[1]).any()
+
+
+#: Parts of a mask: the first and the last of its rows, as shares of its height.
+LACKING = {"the head": (0.0, 0.15), "the feet": (0.8, 1.0), "a piece": (0.4, 0.6)}
+
+
+def without_part(figure, view, part):
+    """The figure, whose mask of one view lacks a part."""
+    rows = np.flatnonzero(figure.masks[view].any(1))
+    first, end = (rows[0] + round(share * len(rows)) for share in LACKING[part])
+    figure.masks[view][first:end] = False
+    return figure
+
+
+@pytest.mark.parametrize("view", range(4))
+@pytest.mark.parametrize("part", LACKING)
+@pytest.mark.parametrize("seed", [0, 3, 7])
+def test_a_mask_that_lacks_a_part_is_named_and_the_complete_ones_are_not(tmp_path, view, part, seed):
+    """The others lie outside the hull, and it does not: leaving each out tells."""
+    figure = without_part(Figure(seed=seed, jitter=0.02), view, part)
+    found = examine(tmp_path, figure=figure)
+    assert found.suspects == (f"cam{view}",)
+    assert found.lines[-1].startswith(f"cam{view} disagrees with the others, which agree by")
+    assert "its mask lacks a part" in found.lines[-1]
+    assert found.consistent == (found.ranking[0].score >= 0.9)
+
+
+def test_where_two_views_may_be_wrong_both_are_named(tmp_path):
+    """A part that its opposite alone shows beside the trunk: one mask lacks it or the other has too much. The
+    photograph has no edge where the mask ends, and one where the other does."""
+    figure = Figure(seed=4, jitter=0.02)
+    left, right = np.flatnonzero(figure.masks[2].any(0))[[0, -1]]
+    figure.masks[2][:, : left + 3 * (right + 1 - left) // 10] = False
+    found = examine(tmp_path, figure=figure)
+    assert found.suspects == ("cam2", "cam0")
+    assert found.lines[-1].startswith("cam0 or cam2 disagrees with the others")
+    assert "rather cam2" in found.lines[-1]

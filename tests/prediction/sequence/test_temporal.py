@@ -1,6 +1,7 @@
 """Instants that start from the last: they follow, and begin anew where they must."""
 
 import dataclasses
+import itertools
 
 import pytest
 import torch
@@ -200,3 +201,52 @@ def test_a_camera_that_is_black_for_three_instants():
     numbers = [[torch.equal(one.images, b.images) for one in batches].index(True) for b in asked]
     assert numbers == [0, 2, 3, 5, 6]
     assert quality(found, steps(8)[7]) > quality(at_true_depth(batches[7]), steps(8)[7]) - 1.0
+
+
+def with_brightness(brightness):
+    """A prediction whose colours are off by the next of some values each time."""
+    values = iter(brightness)
+
+    def predict(batch):
+        found, off = at_true_depth(batch), next(values)
+        colors = found.gaussians.colors + off
+        return dataclasses.replace(found, gaussians=dataclasses.replace(found.gaussians, colors=colors))
+
+    return predict
+
+
+def brightness_of(gaussians, moved):
+    """Mean difference of a render's colours from the photograph's."""
+    photographs, masks, _ = photographed(BETWEEN, moved)
+    drawn = RENDERER(gaussians, BETWEEN).image[0]
+    return float((drawn - photographs[0])[masks[0, :, None].expand_as(drawn)].mean())
+
+
+def test_a_new_prediction_takes_the_place_of_the_last_one_over_some_instants():
+    """None of them shows more than half of the difference; those of before are gone after four."""
+    temporal = Temporal(with_brightness((0.1, -0.1)), 6, RENDERER)
+    found = [temporal(instant(moved)).gaussians for moved in steps(11)]
+    before, *errors = [brightness_of(found[number], steps(11)[number]) for number in range(5, 11)]
+    at_once = Temporal(with_brightness((-0.1,)), 6, RENDERER)(instant(steps(7)[6])).gaussians
+    counts = [int(instant(moved).masks.sum()) for moved in steps(7)]
+    assert temporal.anew == 2
+    assert [len(gaussians) for gaussians in found[6:]] == [counts[6] + counts[0]] * 4 + [counts[6]]
+    pop = before - brightness_of(at_once, steps(7)[6])
+    changes = [first - second for first, second in itertools.pairwise([before, *errors])]
+    assert max(changes) < 0.5 * pop
+
+
+@pytest.mark.parametrize("every", [2, 3])
+def test_predictions_that_follow_one_another_quickly_do_not_pile_up(every):
+    temporal = Temporal(at_true_depth, every, RENDERER)
+    counts = [len(temporal(instant(moved)).gaussians) for moved in steps(3 * every)]
+    whole = int(instant(steps(1)[0]).masks.sum())
+    assert max(counts) == pytest.approx(2 * whole, rel=0.05)
+    assert counts[every - 1 :: every] == pytest.approx([whole] * 3, rel=0.05)
+
+
+def test_a_jump_when_a_new_prediction_is_due_leaves_nothing_behind():
+    temporal = Temporal(at_true_depth, 3, RENDERER)
+    for shift in (0.0, 0.005, 0.01, 0.5):
+        found = temporal(instant(motion((shift, 0.0, 0.0))))
+    assert len(found.gaussians) == int(instant(motion((0.5, 0.0, 0.0))).masks.sum())
