@@ -11,13 +11,21 @@ class InputError(ValueError):
 def choice(key: str, value: object, allowed: tuple) -> None:
     """Refuse the ``value`` of a configuration's ``key`` unless it is one of ``allowed``."""
     if value not in allowed:
-        raise InputError(f"{key}: expected one of {', '.join(map(str, allowed))}; found {value!r}")
+        raise InputError(f"{key}: expected one of {', '.join(map(str, allowed))}; found {shown(value)}")
 
 
 def require(condition: bool, key: str, expected: str, found: object) -> None:
     """Refuse the value ``found`` of ``key`` unless ``condition`` holds; ``expected`` describes it."""
     if not condition:
-        raise InputError(f"{key}: expected {expected}; found {found!r}")
+        raise InputError(f"{key}: expected {expected}; found {shown(found)}")
+
+
+def shown(value: object) -> str:
+    """A value in a message: as Python writes it, if it can (numbers of more than 4300 digits it cannot)."""
+    try:
+        return repr(value)
+    except ValueError:
+        return f"a {type(value).__name__} that is too long to show"
 
 
 def installed(package: str, extra: str, key: str) -> ModuleType:

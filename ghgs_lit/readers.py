@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # runs and --help read no arrays
 
 #: Largest size of a text file in bytes, and the most levels of nested mappings and lists.
 LARGEST, DEEPEST = 1 << 28, 64
+_NO_TEXT = (yaml.YAMLError, csv.Error)
 
 
 def require_file(path: str | os.PathLike, expected: str) -> None:
@@ -151,7 +152,9 @@ def read_npy(path: Path, expected: str = "a readable .npy file") -> "np.ndarray"
 
 def _plain_yaml(text: str) -> Any:
     check_yaml(text, aliases=False)
-    return yaml.safe_load(text)
+    content = yaml.safe_load(text)
+    _require_plain(content)
+    return content
 
 
 def check_yaml(text: str, aliases: bool = True) -> None:
@@ -190,11 +193,23 @@ def read_parsed(path: Path, expected: str, parse: Callable[[str], Any]) -> Any:
             raise ValueError(f"more than {DEEPEST} levels")
     except InputError:
         raise
-    except (ValueError, KeyError, TypeError, RecursionError, yaml.YAMLError, csv.Error) as error:
+    except (LookupError, ValueError, TypeError, ArithmeticError, RecursionError, *_NO_TEXT) as error:
         raise InputError(f"{path}: expected {expected}; found {error}") from error
     return value
 
 
 def _levels(value: Any) -> int:
+    """Levels of nested mappings and lists. ValueError: a whole number that no float can hold."""
+    if isinstance(value, int) and value.bit_length() > 1023:
+        raise ValueError(f"a number of {value.bit_length()} bits")
     children = value.values() if isinstance(value, dict) else value
     return 1 + max(map(_levels, children), default=0) if isinstance(value, dict | list) else 0
+
+
+def _require_plain(value: Any) -> None:
+    """Refuse what JSON does not have, such as the dates, sets and bytes of YAML."""
+    if isinstance(value, dict | list):
+        for child in value if isinstance(value, list) else (*value, *value.values()):
+            _require_plain(child)
+    elif not isinstance(value, str | int | float | None):
+        raise ValueError(f"a value of type {type(value).__name__}")

@@ -80,7 +80,7 @@ def check_array(place: Path | str, array: Any, shapes: Shapes) -> np.ndarray:
         if array.dtype.kind in "cmM":
             raise TypeError(f"numbers of type {array.dtype}")
         array = array.astype(np.float64)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise InputError(f"{place}: expected an array {_describe(shapes)}; found {error}") from error
     fits = any(
         array.ndim == len(shape) and all(s in (None, a) for s, a in zip(shape, array.shape, strict=True))
