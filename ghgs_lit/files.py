@@ -59,11 +59,15 @@ def _require_replaceable(path: Path) -> None:
 
 def require_free(path: str | Path, key: str, overwrite: bool) -> None:
     """The rule for a file that a ``key`` of the command line names: one that exists is replaced only with
-    ``overwrite``. InputError: it exists, or is no file that :func:`write_atomically` would replace."""
+    ``overwrite``. InputError: it exists, is none that :func:`write_atomically` would replace, or its folder
+    cannot be written to, which is said before hours of work, not after them."""
     path = Path(path).expanduser()
     _require_replaceable(path)
     taken = os.path.lexists(path) and not overwrite
     require(not taken, key, "a path where there is no file, or overwrite=true", str(path))
+    folder = next(parent for parent in path.absolute().parents if parent.exists())
+    fits = folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
+    require(fits, key, f"a folder that can be written to for {path}", str(folder))
 
 
 @contextlib.contextmanager

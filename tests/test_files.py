@@ -279,3 +279,13 @@ def test_links_in_a_run_are_refused(tmp_path, place):
     link(tmp_path / place, "precious")
     with pytest.raises(InputError, match=f"{place}: expected a file or folder of the run; found 'a link'"):
         require_no_links(tmp_path, ("train.log", "csv"))
+
+
+def test_a_folder_that_cannot_be_written_to_is_said_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        os, "access", lambda path, mode: str(path) != str(tmp_path)
+    )  # root may write anywhere
+    with pytest.raises(
+        InputError, match=rf"^out: expected a folder that can be written to .*; found '{tmp_path}'"
+    ):
+        require_free(tmp_path / "new" / "a.ckpt", "out", overwrite=False)

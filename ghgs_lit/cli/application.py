@@ -128,8 +128,7 @@ def run(verb: str, argv: list[str]) -> int:
         flags, overrides, found = messages.parsed(argv[2:])
         if found.help:
             return _help(verb, overrides, found.config_dir)
-        # Hydra would write .hydra through links; write_hydra_files does not.
-        sys.argv = [argv[0], *flags, "hydra.output_subdir=null", *_for_hydra(verb, overrides)]
+        sys.argv = [argv[0], *flags, messages.NO_FILES_OF_HYDRA, *_for_hydra(verb, overrides)]
         messages.check_deletions(overrides)
         with interruptible():
             hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=verb)(task)()

@@ -24,6 +24,13 @@ def _command(argv: list[str]) -> int:
         hint = did_you_mean(argv[1], VERBS)
         print(f"ghgs: expected a verb ({', '.join(VERBS)}); found {argv[1]!r}{hint}", file=sys.stderr)
         return 2
+    try:
+        os.getcwd()
+    except OSError as error:
+        print(
+            f"ghgs: .: expected a working directory (cd to another); found {error.strerror}", file=sys.stderr
+        )
+        return 1
     from ghgs_lit.cli.application import run  # here: it loads Hydra
 
     return run(argv[1], argv)

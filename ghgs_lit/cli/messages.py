@@ -27,6 +27,9 @@ BAD_INPUT = (InputError, OSError, HydraException, OmegaConfBaseException)
 
 _EXTRAS = {"joblib": "cluster", "submitit": "cluster", "ray": "ray", "optuna": "optuna"}
 
+#: Hydra would write .hydra through links; :func:`ghgs_lit.cli.application.write_hydra_files` does not.
+NO_FILES_OF_HYDRA = "hydra.output_subdir=null"
+
 #: Nodes of Lightning's classes, whose keys have defaults and so may be deleted.
 _LIGHTNING = ("trainer", "callbacks", "logger")
 
@@ -48,8 +51,12 @@ def one_line(error: Exception, verb: str) -> str:
     elif isinstance(error, InputError):
         text = str(error)
     else:  # an error of Hydra that does not name the override
-        text = f"{' '.join(sys.argv[1:])}: expected overrides that Hydra can apply; found {error}"
+        text = f"{_command_line()}: expected overrides that Hydra can apply; found {error}"
     return " ".join(text.split())
+
+
+def _command_line() -> str:
+    return " ".join(word for word in sys.argv[1:] if word != NO_FILES_OF_HYDRA)
 
 
 def _unread_override(error: OverrideParseException) -> str:
@@ -87,7 +94,7 @@ def _composition(error: HydraException, verb: str) -> str:
         return f"{chosen[1]}: expected {expected}; found one"
     named = re.match(r"Could not override '([^']+)'", str(error))
     if named is None:
-        return f"{' '.join(sys.argv[1:])}: expected overrides that fit; found {error} {error.__cause__ or ''}"
+        return f"{_command_line()}: expected overrides that fit; found {error} {error.__cause__ or ''}"
     key, keys = named[1], list(flatten(OmegaConf.to_container(compose(verb), resolve=False)))
     # A key without its group is close, too: lr for optimizer.lr.
     whole = {known.rpartition(".")[2]: known for known in keys}.get(key)

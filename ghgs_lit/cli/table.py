@@ -9,11 +9,15 @@ from omegaconf import DictConfig
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation import tables as t
-from ghgs_lit.files import write_text_atomically
+from ghgs_lit.files import resolved, write_text_atomically
 
 
-def _listed(value: Any) -> tuple | None:
-    return (value,) if isinstance(value, str | int) else tuple(value or ()) or None
+def _listed(config: dict[str, Any], key: str) -> tuple | None:
+    """The values of a key that holds one or a list; None: none. InputError: one is there twice."""
+    value = config[key.rpartition(".")[2]]
+    values = (value,) if isinstance(value, str | int) else tuple(value or ())
+    require(len(set(values)) == len(values), key, "different values", list(values))
+    return values or None
 
 
 def _options(config: dict[str, Any]) -> t.TableOptions:
@@ -25,9 +29,9 @@ def _options(config: dict[str, Any]) -> t.TableOptions:
     require(unit.groups >= 1, "test.unit", "a regular expression with a group", unit.pattern)
     return t.TableOptions(
         layout=t.LAYOUTS[config["layout"]],
-        views=_listed(evaluation["views"]),
-        targets=_listed(evaluation["targets"]),
-        metrics=_listed(config["columns"]),
+        views=_listed(evaluation, "evaluation.views"),
+        targets=_listed(evaluation, "evaluation.targets"),
+        metrics=_listed(config, "columns"),
         reported=config["reported"],
         test=t.PairedTest.read(config["test"], "test"),
         unit=unit,
@@ -40,9 +44,10 @@ def run(cfg: DictConfig) -> None:
     directory = output_dir()
     config = save_config(cfg, directory)
     options = _options(config)
-    folders = [Path(p).expanduser() for p in _listed(config["runs"]) or ()]
-    others = [t.read_others(Path(p).expanduser()) for p in _listed(config["others"]) or ()]
-    sweep = t.read_sweep(folders, _listed(config["by"]) or ())
+    # Resolved: a run that is found by two paths counts once.
+    folders = [resolved(path) for path in _listed(config, "runs") or ()]
+    others = [t.read_others(Path(p).expanduser()) for p in _listed(config, "others") or ()]
+    sweep = t.read_sweep(folders, _listed(config, "by") or ())
     tables = t.build_tables(sweep, others, options)
     labels = [f"table:{options.layout.name}" + (f"-{i}" if i else "") for i in range(len(tables))]
     latex = "\n".join(t.to_latex(table, label) for table, label in zip(tables, labels, strict=True))

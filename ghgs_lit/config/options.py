@@ -27,7 +27,7 @@ from pydantic import (
 )
 from pydantic.fields import FieldInfo
 
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.errors import InputError, require, shown
 
 _NOUNS = {type(None): "null", bool: "true or false", int: "an integer", float: "a number"}
 _NOUNS |= {str: "a text", tuple: "a list", dict: "a mapping"}
@@ -133,7 +133,7 @@ CropSize = Annotated[CropSide | tuple[CropSide, CropSide], AfterValidator(_pair)
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
     """`` (did you mean ...?)`` with the closest of ``known``, or an empty string."""
-    close = difflib.get_close_matches(str(name), list(known), 1)
+    close = difflib.get_close_matches(name if isinstance(name, str) else shown(name), list(known), 1)
     return f" (did you mean {close[0]}?)" if close else ""
 
 
@@ -176,7 +176,7 @@ class Options(BaseModel, metaclass=_Checked):
         if OmegaConf.is_config(values):
             values = OmegaConf.to_container(values, resolve=True)
         if not isinstance(values, Mapping):
-            raise InputError(f"{key}: expected a mapping of its keys; found {values!r}")
+            raise InputError(f"{key}: expected a mapping of its keys; found {shown(values)}")
         try:
             return cls.model_validate(dict(values))
         except ValidationError as error:
@@ -189,7 +189,7 @@ class Options(BaseModel, metaclass=_Checked):
     def require(self, condition: bool, name: str, expected: str) -> None:
         """Refuse the value of field ``name`` unless ``condition``; for use in a ``model_validator``."""
         if not condition:
-            raise InputError(f"{name}: expected {expected}; found {_plain(getattr(self, name))!r}")
+            raise InputError(f"{name}: expected {expected}; found {shown(_plain(getattr(self, name)))}")
 
     def build(self) -> Any:
         """Build what the options describe; by default the options themselves."""
@@ -237,7 +237,7 @@ def _input_error(cls: type[Options], key: str, values: Mapping, error: Validatio
     if first["type"] == "missing" and first["loc"][-1] in cls.model_fields:
         return InputError(f"{dotted}: expected a value; found none")
     wanted = str(own) if own is not None else expected(field) if field is not None else first["msg"]
-    return InputError(f"{dotted}: expected {wanted}; found {_plain(values)!r}")
+    return InputError(f"{dotted}: expected {wanted}; found {shown(_plain(values))}")
 
 
 def image_size(key: str, size: int | Sequence[int]) -> tuple[int, int]:

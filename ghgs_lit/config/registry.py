@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 from omegaconf import OmegaConf
 
 from ghgs_lit.config.options import Options, did_you_mean
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, shown
 
 VARIABLE, GROUP = "GHGS_PLUGINS", "ghgs_lit.plugins"
 
@@ -173,7 +173,7 @@ def class_of(group: str, kind: Any, key: str) -> type[Options]:
         names = sorted(name for name in kinds_of(group) if name)
         expected = "one of " * (len(names) > 1) + ", ".join(names)
         raise InputError(
-            f"{key}.kind: expected {expected}; found {kind!r}{did_you_mean(kind, names)}"
+            f"{key}.kind: expected {expected}; found {shown(kind)}{did_you_mean(kind, names)}"
             f" ({VARIABLE}=file.py adds kinds of your own)"
         )
     module, _, name = known[kind].rpartition(".")
@@ -186,7 +186,7 @@ def read_node(node: Any, key: str) -> Options:
     what was expected and what was found."""
     group = key.split(".")[0]
     if not isinstance(node, Mapping):
-        raise InputError(f"{key}: expected a mapping of its keys; found {node!r}")
+        raise InputError(f"{key}: expected a mapping of its keys; found {shown(node)}")
     values = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else dict(node)
     kind = None if None in KINDS[group] else values.pop("kind", None)
     return class_of(group, kind, key).read(values, key)

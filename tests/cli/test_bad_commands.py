@@ -108,7 +108,7 @@ def test_a_disk_that_refuses_a_file_is_one_line_with_its_path(
     verb = command.split()[0]
     assert code == 1, text
     assert text == (
-        f"ghgs {verb}: {tmp_path}/run/config.yaml: expected a file that can be read or written;"
+        f"ghgs {verb}: {tmp_path}/run/.hydra/config.yaml: expected a file that can be read or written;"
         f" found {os.strerror(number)}\n"
     )
 
@@ -152,3 +152,19 @@ def test_a_signal_is_an_exit_code_and_one_line(tmp_path, number, expected):
     assert process.exitcode == expected, text
     assert "Traceback" not in text
     assert text.strip().splitlines()[-1].startswith("ghgs prepare: ")
+
+
+def test_a_working_directory_that_is_gone(monkeypatch, capfd, tmp_path):
+    """A job whose folder was deleted meanwhile; help needs none."""
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    for arguments, code in (
+        (["doctor", "task=machine"], 1),
+        (["train", "-m", "seed=1,2"], 1),
+        (["--help"], 0),
+    ):
+        monkeypatch.setattr("sys.argv", ["ghgs", *arguments])
+        assert cli.main() == code
+        expected = "ghgs: .: expected a working directory (cd to another); found No such file or directory\n"
+        assert capfd.readouterr().err == (expected if code else "")

@@ -128,3 +128,10 @@ def test_bodies_with_nan_are_refused():
     body = np.zeros((5, 3), np.float32)
     body[2, 1] = np.nan
     refused("a: body: expected finite numbers", lambda: Photographs(OneView(SOUND, body)).body("a"))
+
+
+@pytest.mark.parametrize("number", [10**400, float("inf"), float("nan"), "inf", None, True + 0j])
+def test_numbers_that_no_camera_has(number):
+    """JSON allows 400 digits and Infinity; NumPy converts the first with an error of its own."""
+    intrinsics = [[5, 0, 3], [0, number, 2], [0, 0, 1]]
+    refused("cam: expected (an array 3x3|finite numbers); found", lambda: check_intrinsics("cam", intrinsics))
