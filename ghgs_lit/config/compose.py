@@ -53,7 +53,7 @@ def _is_own() -> bool:
     if not GlobalHydra.instance().is_initialized():
         return False
     searched = GlobalHydra.instance().config_loader().get_search_path().get_path()
-    return any(entry.path == f"file://{conf_dir()}" for entry in searched)
+    return any(entry.path.removeprefix("file://") == str(conf_dir()) for entry in searched)
 
 
 def compose(verb: str, overrides: Sequence[str] = (), with_hydra: bool = False) -> DictConfig:
