@@ -165,7 +165,7 @@ def test_batches_are_copied_there_without_a_wait():
 def test_everything_is_measured_there(tmp_path, monkeypatch):
     """The model, refined too, and all baselines, with all metrics and pictures: rows are those of the CPU."""
     monkeypatch.setattr("ghgs_lit.prediction.refinement.cameras._STEPS", 3)
-    metrics = MetricsOptions(regions=("image", "box", "subject"), lpips="off").build()
+    metrics = MetricsOptions(regions=("image", "box", "subject", "edge"), lpips="off").build()
 
     def rows(device):
         def build():

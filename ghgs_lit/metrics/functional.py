@@ -19,13 +19,16 @@ from ghgs_lit.geometry.projection import at_least_float32, project, sample
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.types import Cameras
 
-REGIONS = ("image", "box", "subject", "crop")
+REGIONS = ("image", "box", "subject", "crop", "edge")
 PADDINGS = ("valid", "reflect", "zeros")
 PSNR_CAP = 100.0
 """PSNR in dB of equal images, and the largest value reported: float32 resolves no smaller errors."""
 CROP = (1000 / 1024, 500 / 1024)
 """Height and width of the region ``crop`` as shares of the image's: 1000 x 500 of 1024 x 1024, as published
 scripts of GHG and LIFe-GoM crop."""
+EDGE, BESIDE, INNER = 2, 3, 4
+"""Pixels from the subject's outline, in rows and columns: of the region ``edge`` at most, of what
+:func:`spill` and :func:`sharpness` count more than and at least."""
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 """Side and standard deviation, in pixels, of SSIM's Gaussian window."""
 
@@ -70,6 +73,11 @@ def crop_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
     return span(mask.any(-1), height)[:, :, None] & span(mask.any(-2), width)[:, None, :]
 
 
+def grown(mask: Bool[Tensor, "n h w"], pixels: int) -> Bool[Tensor, "n h w"]:
+    """Each mask with all pixels at most so many rows and columns away."""
+    return F.max_pool2d(mask[:, None].float(), 2 * pixels + 1, 1, pixels)[:, 0].bool()
+
+
 def region_of(mask: Bool[Tensor, "n h w"], name: str) -> Bool[Tensor, "n h w"] | None:
     """The pixels of one of :data:`REGIONS` (None: all), from the subject's mask."""
     choice("region", name, REGIONS)
@@ -77,6 +85,8 @@ def region_of(mask: Bool[Tensor, "n h w"], name: str) -> Bool[Tensor, "n h w"] |
         return None
     if name == "crop":
         return crop_of(mask)
+    if name == "edge":
+        return grown(mask, EDGE) & grown(~mask, EDGE)
     return box_of(mask) if name == "box" else mask
 
 
@@ -156,6 +166,34 @@ def ssim(
 ) -> Float[Tensor, " n"]:
     """Mean of :func:`ssim_map` over the channels and over the pixels of ``region`` that the map covers."""
     return mean_inside(ssim_map(image, target, padding).mean(1), region)
+
+
+def spill(
+    image: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"], mask: Bool[Tensor, "n h w"]
+) -> Float[Tensor, " n"]:
+    """Light that is drawn beside the subject, farther than :data:`BESIDE` pixels from its mask, per mille of
+    the subject's light in the target; nan where that has none. Images lie on black."""
+    drawn, true = at_least_float32(image).clamp(min=0).mean(1), at_least_float32(target).mean(1)
+    light = torch.where(mask, true, 0).sum((-2, -1))
+    beside = torch.where(grown(mask, BESIDE), 0, drawn).sum((-2, -1))
+    return torch.where(light > 0, 1000 * beside / torch.where(light > 0, light, 1), torch.nan)
+
+
+def sharpness(
+    image: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"], mask: Bool[Tensor, "n h w"]
+) -> Float[Tensor, " n"]:
+    """Energy of the Laplacian inside the subject, :data:`INNER` pixels or more from its outline, over the
+    target's: 1 is right, less is blurred, more is ragged. nan where the target has none."""
+    inner = (mask & ~grown(~mask, INNER))[:, 1:-1, 1:-1]
+    with exact(image.device.type):
+        energies = []
+        for picture in (at_least_float32(image), at_least_float32(target)):
+            around = picture[..., :-2, 1:-1] + picture[..., 2:, 1:-1]
+            around = around + picture[..., 1:-1, :-2] + picture[..., 1:-1, 2:]
+            laplacian = around - 4 * picture[..., 1:-1, 1:-1]
+            energies.append(torch.where(inner, laplacian.square().sum(1), 0).sum((-2, -1)))
+    drawn, true = energies
+    return torch.where(true > 0, drawn / torch.where(true > 0, true, 1), torch.nan)
 
 
 def depth_error_mm(

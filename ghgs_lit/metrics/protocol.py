@@ -11,16 +11,27 @@ from ghgs_lit.config.options import Options
 from ghgs_lit.errors import InputError, installed
 from ghgs_lit.metrics.flip import PIXELS_PER_DEGREE, flip_map
 from ghgs_lit.metrics.functional import (
+    BESIDE,
+    EDGE,
+    INNER,
     PSNR_CAP,
     decibels,
     mean_inside,
     mean_over,
     region_of,
+    sharpness,
+    spill,
     squared_error,
     ssim_map,
 )
 
 NETWORK = "vgg"
+
+_ALL = ("psnr", "ssim", "flip")
+#: Metrics of each region; SSIM and FLIP look at windows, which single pixels of a region do not fill.
+MEASURED = {"image": _ALL, "box": _ALL, "crop": _ALL, "subject": ("psnr", "ssim"), "edge": ("psnr",)}
+#: Further metrics, named without a region, that come with the region ``edge``.
+OUTLINE = {"spill": spill, "sharpness": sharpness}
 
 
 class LPIPS:
@@ -57,9 +68,15 @@ class MetricsOptions(Options):
     """correct: renders clamped to [0, 1], SSIM as in torchmetrics, LPIPS on [-1, 1], for which it was
     calibrated. release: no clamp, SSIM padded with zeros, LPIPS on [0, 1]. files: as correct, of renders and
     targets rounded to 8 bits, SSIM without padding. Reported with every number."""
-    regions: tuple[Literal["image", "box", "subject", "crop"], ...] = ("image", "box", "subject")
+    regions: tuple[Literal["image", "box", "subject", "crop", "edge"], ...] = (
+        "image",
+        "box",
+        "subject",
+        "edge",
+    )
     """Where PSNR, SSIM and FLIP are measured: all pixels, the box of the mask, its pixels (without FLIP), the
-    window around the box that GHG and LIFe-GoM crop (1000 x 500 of 1024 x 1024)."""
+    window around the box that GHG and LIFe-GoM crop (1000 x 500 of 1024 x 1024), its outline (PSNR alone,
+    with light beside the subject and sharpness inside it)."""
     lpips: Literal["auto", "require", "off"] = "auto"
     """auto: left out, with a message, where torchvision or its weights are missing; require: an error."""
 
@@ -80,10 +97,10 @@ class MetricsOptions(Options):
 class ImageMetrics:
     """All metrics of a protocol: ``metrics(image, target, mask)`` gives one value per image by name.
 
-    The names are ``psnr``, ``ssim``, ``flip`` and ``lpips`` for the whole image, with ``_box``, ``_subject``
-    or ``_crop`` added for the other regions (no FLIP for the subject's pixels alone, since it blurs; LPIPS
-    for the whole image only). ``protocol`` is reported with every number; ``left_out`` has the reason for
-    each missing metric."""
+    The names are ``psnr``, ``ssim``, ``flip`` and ``lpips`` for the whole image, with ``_box``, ``_subject``,
+    ``_crop`` or ``_edge`` added for the other regions (those of :data:`MEASURED`; LPIPS for the whole image
+    only), and those of :data:`OUTLINE`. ``protocol`` is reported with every number; ``left_out`` has the
+    reason for each missing metric."""
 
     def __init__(self, options: MetricsOptions):
         self.options, self.protocol = options, options.protocol
@@ -107,8 +124,8 @@ class ImageMetrics:
         """The names of the values, in order."""
         values = []
         for region in self.options.regions:
-            metrics = ("psnr", "ssim") if region == "subject" else ("psnr", "ssim", "flip")
-            values += [name if region == "image" else f"{name}_{region}" for name in metrics]
+            values += [name if region == "image" else f"{name}_{region}" for name in MEASURED[region]]
+        values += list(OUTLINE) * ("edge" in self.options.regions)
         return values + ["lpips"] * (self.lpips is not None)
 
     @property
@@ -122,9 +139,10 @@ class ImageMetrics:
             "psnr": f"-10 log10(MSE) of each image, at most {PSNR_CAP:g} dB (equal images)",
             "depth_error_mm": "mean |z - true z| over a subject's input pixels with predicted and true depth",
         }
-        if options.regions:
+        measured = {metric for region in options.regions for metric in MEASURED[region]}
+        if "ssim" in measured:
             said["ssim"] = f"11x11 Gaussian window, sigma 1.5, padding {options.ssim_padding}"
-        if set(options.regions) - {"subject"}:
+        if "flip" in measured:
             said["flip"] = f"FLIP at {PIXELS_PER_DEGREE:.2f} pixels a degree"
         if "box" in options.regions:
             said["box"] = "the smallest upright box of the subject's mask in the target"
@@ -132,6 +150,10 @@ class ImageMetrics:
             said["subject"] = "the pixels of the subject's mask in the target"
         if "crop" in options.regions:
             said["crop"] = "1000/1024 of the height and 500/1024 of the width, around the mask's box"
+        if "edge" in options.regions:
+            said["edge"] = f"pixels at most {EDGE} rows and columns from the outline of the subject's mask"
+            said["spill"] = f"light farther than {BESIDE} pixels from the mask, per mille of the subject's"
+            said["sharpness"] = f"energy of the Laplacian over the target's, {INNER} pixels inside the mask"
         if self.lpips is not None:
             said["lpips"] = f"{NETWORK} on {'[0, 1]' if options.is_release else '[-1, 1]'}, whole image"
         return said
@@ -145,16 +167,20 @@ class ImageMetrics:
         if options.protocol == "files":
             image, target = ((255 * values).round() / 255 for values in (image, target))
         errors = squared_error(image, target)
-        similarity = ssim_map(image, target, options.ssim_padding).mean(1)
-        difference = flip_map(image, target) if set(options.regions) - {"subject"} else None
+        measured = {metric for region in options.regions for metric in MEASURED[region]}
+        similarity = ssim_map(image, target, options.ssim_padding).mean(1) if "ssim" in measured else None
+        difference = flip_map(image, target) if "flip" in measured else None
         values = {}
         for name in options.regions:
             suffix = "" if name == "image" else f"_{name}"
             region = region_of(mask, name)
             values[f"psnr{suffix}"] = decibels(mean_over(errors, region))
-            values[f"ssim{suffix}"] = mean_inside(similarity, region)
-            if name != "subject":
+            if "ssim" in MEASURED[name]:
+                values[f"ssim{suffix}"] = mean_inside(similarity, region)
+            if "flip" in MEASURED[name]:
                 values[f"flip{suffix}"] = mean_over(difference, region)
+        if "edge" in options.regions:
+            values |= {name: function(image, target, mask) for name, function in OUTLINE.items()}
         if self.lpips is not None:
             values["lpips"] = self.lpips(image, target)
         return values

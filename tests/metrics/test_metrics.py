@@ -18,7 +18,7 @@ from torchmetrics.functional.image import (
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.metrics import PSNR_CAP, MetricsOptions, depth_error_mm, flip_map, psnr, ssim
-from ghgs_lit.metrics.functional import box_of, crop_of, ssim_map
+from ghgs_lit.metrics.functional import box_of, crop_of, region_of, sharpness, spill, ssim_map
 from ghgs_lit.training.base import image_mean
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
@@ -258,6 +258,7 @@ def test_a_protocol_reports_its_metrics_by_name():
     assert list(values) == metrics.names
     assert set(values) == {
         "psnr", "ssim", "flip", "psnr_box", "ssim_box", "flip_box", "psnr_subject", "ssim_subject",
+        "psnr_edge", "spill", "sharpness",
     }  # fmt: skip
     assert torch.equal(values["psnr"], psnr((image * 1.5).clamp(0, 1), target))
     release = RELEASE.build()(image * 1.5, target, mask)
@@ -355,3 +356,26 @@ def test_depth_error_is_in_millimetres_on_known_subject_pixels():
     truth = torch.tensor([[[2.01, 2.03, 0.0], [2.0, 5.0, 2.0]]])
     region = torch.tensor([[[True, True, True], [False, False, True]]])
     assert depth_error_mm(depth, truth, region).item() == pytest.approx((10 + 30 + 0) / 3, abs=1e-3)
+
+
+def test_light_beside_the_subject_and_sharpness_inside_it():
+    """Light on a ring of known size; a blur of known effect on a grating; the band of the outline."""
+    mask = torch.zeros(1, 40, 40, dtype=torch.bool)
+    mask[:, 10:30, 10:30] = True
+    target = 0.5 * mask[:, None].expand(-1, 3, -1, -1).float()
+    image = target.clone()
+    image[..., 10:30, 33] = 0.25  # four columns beside the outermost pixel: counts
+    image[..., 10:30, 32] = 1.0  # three: does not
+    assert spill(image, target, mask).item() == pytest.approx(1000 * 20 * 0.25 / (400 * 0.5))
+    assert spill(image, target, ~mask & mask).isnan().all()
+    phase = torch.pi * torch.arange(40.0) / 2
+    grating = (0.5 + 0.2 * torch.cos(phase)).expand(1, 3, 40, 40)
+    blurred = (grating.roll(1, -1) + grating.roll(-1, -1) + 2 * grating) / 4  # halves this frequency
+    assert sharpness(blurred, grating, mask).item() == pytest.approx(0.25, rel=1e-4)
+    assert sharpness(grating, grating, mask).item() == 1
+    assert sharpness(grating, torch.ones_like(grating), mask).isnan().all()
+    outside = torch.where(mask[:, None], grating, torch.rand(1, 3, 40, 40))
+    assert sharpness(outside, grating, mask).item() == 1
+    band = region_of(mask, "edge")
+    assert band.sum().item() == 24 * 24 - 16 * 16
+    assert not band[:, 12:28, 12:28].any()

@@ -16,7 +16,18 @@ from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.results import Row, plain, summarize
 
 #: Metrics beside PSNR in the row ``total`` of a case, if known.
-ERRORS = ("psnr_box", "ssim", "ssim_box", "flip", "flip_box", "lpips", "depth_error_mm")
+ERRORS = (
+    "psnr_box",
+    "ssim",
+    "ssim_box",
+    "flip",
+    "flip_box",
+    "lpips",
+    "psnr_edge",
+    "spill",
+    "sharpness",
+    "depth_error_mm",
+)
 
 #: Columns and formats of the table of cases, by heading.
 _COLUMNS = {
