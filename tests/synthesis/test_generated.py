@@ -40,6 +40,7 @@ def test_configuration_groups_build(views, targets, tmp_path):
     )
     synthetic = built(f"views={views}", f"targets={targets}", f"data.cache_dir={tmp_path}")
     assert isinstance(synthetic.dataset, Synthetic)
+    assert synthetic.dataset.render.lights == "studio"
 
 
 def test_configuration_of_the_rig_is_the_rigs_default():
@@ -47,7 +48,7 @@ def test_configuration_of_the_rig_is_the_rigs_default():
     data = built("data=scans")
     assert isinstance(data.dataset, Scans)
     assert data.dataset.rig.build() == RIG
-    assert data.dataset.render == RenderOptions()
+    assert data.dataset.render == Scans.model_fields["render"].default == RenderOptions(lights="none")
     with pytest.raises(InputError, match=r"data\.rig key: expected one of .*; found 'hieght'"):
         built("data=scans", "+data.rig.hieght=3")
     with pytest.raises(InputError, match=r"data\.rig\.variation key"):
