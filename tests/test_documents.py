@@ -14,6 +14,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from ghgs_lit.config import VERSION_BASE
+from ghgs_lit.runs.results import read_results
 from tests.helpers.processes import run_block, run_script, run_verb
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -206,3 +207,43 @@ def test_fast_commands_run(document, tmp_path, monkeypatch):
 
     monkeypatch.setattr(check_documents.Reader, "run", prepared)
     assert check_documents.main(["--fast", document, "--folder", str(tmp_path)]) == 0
+
+
+#: Decibels by which a figure may differ on another processor: two in the last digit that is printed.
+ROUNDING = 0.02
+
+
+def figures(document: str) -> dict[tuple[str, str], list[tuple[float, float]]]:
+    """PSNR and PSNR of the box in the tables of a document, by the first two columns."""
+    found: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for first, second, *numbers in re.findall(
+        r"^\| (\w+) \| (\w+) \| ([\d.]+) \| ([\d.]+) \|", document, re.M
+    ):
+        found.setdefault((first, second), []).append(tuple(map(float, numbers)))
+    return found
+
+
+def test_figures_of_the_first_day_are_those_of_a_run(tmp_path):
+    """Of what is not trained, measured again on the people that the page holds out; its model's are the same
+    in both tables, and lie as far below a perfect depth as the page says."""
+    page = (REPOSITORY / "docs" / "first_day.md").read_text()
+    printed, reader = figures(page), check_documents.Reader(tmp_path, "docs/first_day.md")
+    for command in (
+        "python scripts/miniature.py data=thuman2 data.source=my_scans --train 0",
+        "ghgs prepare task=render data=scans data.source=my_scans data.root=rendered data.render.size=140",
+        "ghgs evaluate data=scans data.root=rendered 'evaluation.views=[4]' "
+        "'baselines=[nearest_view,true_depth]' hydra.run.dir=measured",
+    ):
+        run = run_verb if command.startswith("ghgs ") else run_script
+        code, output = run(command, reader.folder, reader.environment)
+        assert code == 0, output
+    summary = read_results(reader.folder / "measured" / "metrics.json")["summary"]
+    assert len(summary) == 4
+    for row in summary:
+        (expected,) = printed[row["method"], row["targets"]]
+        assert (row["psnr"], row["psnr_box"]) == pytest.approx(expected, abs=ROUNDING)
+    for targets in ("release", "midway"):
+        (trained,), (again,) = printed["4", targets], printed["model", targets]
+        ((perfect, _),) = printed["true_depth", targets]
+        assert trained == again
+        assert f"{perfect - trained[0]:.1f} dB" in page

@@ -11,8 +11,8 @@ from ghgs_lit.bounds.silhouettes import silhouettes
 from tests.helpers.scenes import make_batch
 
 
-def voting(batch):
-    stage = SubjectBox()
+def voting(batch, **options):
+    stage = SubjectBox(**options)
     coarse = silhouettes(batch.masks, batch.cameras, RESOLUTION, stage.dilation)
     return stage._voting(coarse).tolist()
 
@@ -63,3 +63,10 @@ def test_an_empty_mask_has_no_vote_and_takes_none_away():
 def test_of_two_views_none_loses_its_vote(wrong):
     """Nobody can tell which one is wrong."""
     assert voting(spoil(make_batch(1, 2, 112, 112), wrong)) == [[True, True]]
+
+
+def test_a_wrong_mask_that_is_outvoted_keeps_its_vote():
+    """With a tolerance its word alone carves nothing; without its vote the others would have to agree."""
+    spoiled = spoil(make_batch(1, 5, 112, 112), "half")
+    assert voting(spoiled) == [[True] * 4 + [False]]
+    assert voting(spoiled, tolerance=1) == [[True] * 5]

@@ -261,6 +261,9 @@ def test_a_protocol_reports_its_metrics_by_name():
         "psnr_edge", "spill", "sharpness",
     }  # fmt: skip
     assert torch.equal(values["psnr"], psnr((image * 1.5).clamp(0, 1), target))
+    difference = flip_map((image * 1.5).clamp(0, 1), target)
+    torch.testing.assert_close(values["flip"], difference.mean((1, 2)))
+    torch.testing.assert_close(values["flip_box"], difference[:, 8:20, 10:30].mean((1, 2)))
     release = RELEASE.build()(image * 1.5, target, mask)
     assert set(release) == {"psnr", "ssim", "flip"}
     assert torch.equal(release["psnr"], psnr(image * 1.5, target))

@@ -166,3 +166,36 @@ def test_elements_of_worlds_far_apart_are_drawn_as_near_the_origin(backend):
     # float64 rounds to 1e-10 m there, float32 to 1e-7 of the distance to the camera.
     torch.testing.assert_close(found.image.float(), expected.image, atol=1e-4, rtol=0)
     torch.testing.assert_close(found.depth.float(), expected.depth, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_the_worlds_unit_changes_no_image(backend):
+    """Gaussians that know how long a metre is: in millimetres the image is the same, depth is 1000 times."""
+    splats, views = cloud(20, splits=(12, 8)), camera_ring(2, 20, 30, batch=2)
+    expected = render(splats, views, backend, near=2.5, far=3.2)
+    units = torch.tensor([1.0, 1000.0])
+    lengths = torch.tensor([1.0] * 12 + [1000.0] * 8)[:, None]
+    extrinsics = views.extrinsics.clone()
+    extrinsics[..., :3, 3] *= units[:, None, None]
+    large = dataclasses.replace(
+        splats, means=splats.means * lengths, scales=splats.scales * lengths, metre=units
+    )
+    found = render(large, dataclasses.replace(views, extrinsics=extrinsics), backend, near=2.5, far=3.2)
+    torch.testing.assert_close(found.image, expected.image, atol=1e-4, rtol=0)
+    unit = units[:, None, None, None, None]
+    torch.testing.assert_close(found.depth / unit, expected.depth, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize(("near", "far", "drawn"), [(0.5, 2.0, 0), (1.5, 4.0, 1), (1.0, 3.0, 2)])
+def test_near_and_far_are_depths_of_centres(backend, near, far, drawn):
+    """Of two splats beside each other, 1 m and 3 m away: those within the range, its ends included."""
+    views = Cameras(
+        torch.tensor([[[[20.0, 0, 10], [0, 20, 10], [0, 0, 1]]]]), torch.eye(4)[None, None], 20, 20
+    )
+    two = Gaussians(
+        torch.tensor([[-0.2, 0, 1.0], [0.6, 0, 3.0]]), torch.tensor([[1.0, 0, 0, 0]] * 2),
+        torch.full((2, 3), 0.05), torch.ones(2), torch.eye(3)[:2], (2,),
+    )  # fmt: skip
+    found = render(two, views, backend, near=near, far=far).image[0, 0].flatten(1).sum(1)
+    assert (found[:2] > 0.5).tolist() == [drawn in (0, 2), drawn in (1, 2)]
