@@ -1,7 +1,7 @@
 """The whole method as one module, from photographs to Gaussians (paper, section 3)."""
 
 import dataclasses
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -116,14 +116,15 @@ class GHGS(nn.Module):
         return tokens.in_precision(next(heads, tokens.semantic).dtype)
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any], empty: Collection[str] = ()) -> "GHGS":
-        """The model of a configuration; stages in ``empty`` are built on the meta device."""
+    def from_config(cls, config: Mapping[str, Any], empty: bool = False) -> "GHGS":
+        """The model of a configuration; with ``empty`` on the meta device, to be given weights: a strange
+        configuration then takes no memory before they are compared with it."""
         for name in STAGES:
             require(name in config, name, "a stage of the model", "nothing")
         skip, options = (read_node(config.get(name) or {}, name) for name in ("skip", "model"))
 
         def stage(name: str, **extra: Any) -> Any:
-            with torch.device("meta") if name in empty else nullcontext():
+            with torch.device("meta") if empty else nullcontext():
                 return build(config[name], name, **extra)
 
         encoder = stage("encoder", tokens=skip.tokens, margin=skip.margin)
@@ -139,6 +140,6 @@ class GHGS(nn.Module):
         cls, path: str | Path = SHIPPED, map_location: Any = "cpu", dtype: torch.dtype | None = None
     ) -> "GHGS":
         """The model of a checkpoint in evaluation mode; arguments as of :func:`load_weights`."""
-        model = cls.from_config(read_config(path), empty=STAGES)
+        model = cls.from_config(read_config(path), empty=True)
         load_weights(model, path, dtype, map_location)
         return model.to(map_location).eval()

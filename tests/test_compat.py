@@ -9,7 +9,7 @@ from ghgs_lit.config import compose, conf_dir
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.heads.depth import BOUNDED, DepthHeadOptions
-from ghgs_lit.model import GHGS, STAGES
+from ghgs_lit.model import GHGS
 from ghgs_lit.types import Batch, Cameras, DepthMaps, Tokens
 from ghgs_lit.weights import names
 from ghgs_lit.weights.switches import release_switches
@@ -50,7 +50,7 @@ def test_every_quirk_is_a_switch_that_is_off_by_default(key, values):
 def test_the_releases_model_has_the_releases_tensors_and_no_others(model):
     """The authors' checkpoint must fit whatever `model` is chosen."""
     overrides = [f"model={model}", "compat=release"]
-    state = GHGS.from_config(imported_config(*overrides, tiny=False), empty=STAGES).state_dict()
+    state = GHGS.from_config(imported_config(*overrides, tiny=False), empty=True).state_dict()
     found = {
         names.to_published(name, names.RELEASE): list(tensor.shape)
         for name, tensor in state.items()

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ghgs_lit.cli.inputs import MODEL_NODES
 from ghgs_lit.cli.runtime import announce, files_to_write, output_dir, save_config
-from ghgs_lit.model import GHGS, STAGES
+from ghgs_lit.model import GHGS
 from ghgs_lit.weights.importing import import_weights
 from ghgs_lit.weights.switches import differences
 
@@ -16,7 +16,7 @@ from ghgs_lit.weights.switches import differences
 def empty_state(config: Mapping[str, Any], release: str | None) -> dict[str, Tensor]:
     """Tensors that published weights fill, on the meta device: the model's, or without the authors'
     ``release`` those of the encoder."""
-    state = GHGS.from_config(config, empty=STAGES).state_dict()
+    state = GHGS.from_config(config, empty=True).state_dict()
     return {name: tensor for name, tensor in state.items() if release or name.startswith("encoder.")}
 
 

@@ -1,6 +1,7 @@
 """Data, renderer, model of a checkpoint and device, as a verb's configuration asks for them."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -25,6 +26,9 @@ if TYPE_CHECKING:  # it would import Lightning, which takes seconds
 
 #: Nodes of the configuration that describe the model.
 MODEL_NODES = (*STAGES, *OPTIONS, "compat")
+
+#: Keys of ``data`` that describe the machine that trained, not the data.
+OF_MACHINE = ("cache_dir", "cache_images_mb", "render_workers", "workers")
 
 #: Keys that may change in a trained model: they change neither shape nor meaning of any tensor.
 FREE = ("bounds", "model.pad", "rounds.count", "skip", "unprojection", "recalibration.k")
@@ -51,7 +55,7 @@ def build_renderer(config: Mapping[str, Any], device: torch.device) -> Renderer:
 
 def load_model(config: Mapping[str, Any], device: torch.device) -> GHGS:
     """The model of ``config["checkpoint"]`` in evaluation mode and the configured precision."""
-    model = GHGS.from_config(config, empty=STAGES)
+    model = GHGS.from_config(config, empty=True)
     load_weights(model, config["checkpoint"], device=device)
     model.precision = config["precision"]
     return model.to(device).eval()
@@ -66,8 +70,8 @@ def check_size(data: "PhotographsDataModule", model: GHGS) -> None:
 
 def with_trained_data(cfg: DictConfig) -> DictConfig:
     """Fill in the data that the checkpoint was trained on, unless ``data=<option>`` was chosen. Given keys
-    such as ``data.root=...`` change it; ``data.cache_dir`` is reset to this machine's default. InputError:
-    there is no checkpoint, or it stores no training data."""
+    such as ``data.root=...`` change it; keys of the machine that trained (:data:`OF_MACHINE`) have their
+    defaults. InputError: there is no checkpoint, it stores no training data, or its folder is not here."""
     if "kind" in (cfg.get("data") or {}):
         return cfg
     if cfg.checkpoint is None:
@@ -79,8 +83,13 @@ def with_trained_data(cfg: DictConfig) -> DictConfig:
     if not trained.get("data"):
         expected = f"data=<option> for weights that were imported ({cfg.checkpoint})"
         raise InputError(f"data: expected {expected}; found none")
-    data = {key: None if key == "cache_dir" else value for key, value in trained["data"].items()}
-    return OmegaConf.merge({"data": data}, cfg)
+    data = {key: value for key, value in trained["data"].items() if key not in OF_MACHINE}
+    merged = OmegaConf.merge({"data": data}, cfg)
+    root = merged.data.get("root")
+    if "root" in data and root == data["root"] and isinstance(root, str) and not Path(root).is_dir():
+        expected = f"data.root=<folder>, as the data of {cfg.checkpoint} is not where it was trained"
+        raise InputError(f"data.root: expected {expected}; found no such folder {root!r}")
+    return merged
 
 
 def model_of(checkpoint: str, cfg: DictConfig) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from ghgs_lit.config import compose, conf_dir
+from ghgs_lit.config import compose, conf_dir, resolve
 from ghgs_lit.config.keys import flatten, is_below
 from ghgs_lit.config.options import did_you_mean
 from ghgs_lit.config.verbs import VERBS
@@ -95,14 +95,46 @@ def _composition(error: HydraException, verb: str) -> str:
     named = re.match(r"Could not override '([^']+)'", str(error))
     if named is None:
         return f"{_command_line()}: expected overrides that fit; found {error} {error.__cause__ or ''}"
-    key, keys = named[1], list(flatten(OmegaConf.to_container(compose(verb), resolve=False)))
+    return f"{named[1]}: expected a key or group of this verb; found none of that name{_hint(verb, named[1])}"
+
+
+def _hint(verb: str, key: str) -> str:
+    """What the user may have meant by a key that does not exist, after trying it; or an empty string."""
+    overrides = sys.argv[1:]
+    folders = {str(path.relative_to(conf_dir())) for path in conf_dir().rglob("*") if path.is_dir()}
+    chosen = [text for text in overrides if text.partition("=")[0] in folders and "," not in text]
+    keys, group = _keys(verb, chosen) or _keys(verb), key.partition(".")[0]
+    if any(key in options.model_fields for options in VERBS.values()):
+        return ""  # a key of another verb
+    for of in (group, "model") if "." in key else ():  # a model chooses groups of its own
+        options = [path.stem for path in sorted((conf_dir() / of).glob("*.yaml"))]
+        if holding := [name for name in options if key in _keys(verb, [*chosen, f"{of}={name}"])]:
+            return f" ({of}={' or '.join(holding)} has it)"
     # A key without its group is close, too: lr for optimizer.lr.
     whole = {known.rpartition(".")[2]: known for known in keys}.get(key)
-    groups = [str(path.relative_to(conf_dir())) for path in conf_dir().rglob("*") if path.is_dir()]
-    hint = f" (did you mean {whole}?)" if whole else did_you_mean(key, (*keys, *groups))
-    if any(key in options.model_fields for options in VERBS.values()):
-        hint = ""  # a key of another verb
-    return f"{key}: expected a key or group of this verb; found none of that name{hint}; +{key}=... adds it"
+    own = [known for known in keys if known.startswith(f"{group}.")]
+    meant = f" (did you mean {whole}?)" if whole else did_you_mean(key, own or (*keys, *folders))
+    added = next((f"+{text}" for text in overrides if text.partition("=")[0] == key), "")
+    return f"{meant}; +{key}=... adds it" if _can_add(verb, chosen, key, added) else meant
+
+
+def _keys(verb: str, overrides: Sequence[str] = ()) -> list[str]:
+    """All keys of a verb; none where it cannot be composed so."""
+    try:
+        return list(flatten(OmegaConf.to_container(compose(verb, overrides), resolve=False)))
+    except (HydraException, OmegaConfBaseException):
+        return []
+
+
+def _can_add(verb: str, chosen: Sequence[str], key: str, override: str) -> bool:
+    """Whether the verb accepts a new key: groups know theirs, some of their values are mappings."""
+    if not override or (key.count(".") < 2 and not key.startswith("hydra.")):
+        return False
+    try:
+        cfg = compose(verb, [*chosen, override], with_hydra=key.startswith("hydra."))
+        return key.startswith("hydra.") or bool(resolve(cfg, verb))
+    except (HydraException, OmegaConfBaseException, InputError):
+        return False
 
 
 def _system(error: OSError) -> str:

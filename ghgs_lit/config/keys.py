@@ -3,6 +3,8 @@
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from ghgs_lit.errors import require
+
 #: Keys that no result depends on: where a run writes, what it shows and how it shares the machine.
 WITHOUT_INFLUENCE = (
     "hydra", "allow_random_encoder", "dry_run", "overwrite", "resume", "logger", "callbacks",
@@ -41,6 +43,30 @@ def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
     for name, value in config.items():
         flat |= flatten(value, f"{prefix}.{name}" if prefix else str(name))
     return flat
+
+
+#: More than any configuration has; a file of a few kilobytes can refer to one list a billion times.
+_MOST_VALUES, _MOST_LEVELS = 100_000, 32
+
+
+def require_plain(config: Any, where: str) -> None:
+    """Refuse a configuration that YAML could not have said: other types than mappings with keys of text,
+    lists, texts and numbers, or containers that hold themselves. ``where``: for messages."""
+    left, count = [(where, config, 0)], 0
+    while left:
+        key, value, level = left.pop()
+        count += 1
+        small = level < _MOST_LEVELS and count < _MOST_VALUES
+        require(small, key, f"less than {_MOST_LEVELS} levels and {_MOST_VALUES} values, no loops", "more")
+        if isinstance(value, Mapping):
+            for name, item in value.items():
+                require(isinstance(name, str), key, "keys of text", name)
+                left.append((f"{key}.{name}", item, level + 1))
+        elif isinstance(value, list | tuple):
+            left += [(key, item, level + 1) for item in value]
+        else:
+            known = value is None or isinstance(value, str | int | float)
+            require(known, key, "mappings, lists, texts and numbers", type(value).__name__)
 
 
 def lookup(config: Any, key: str) -> Any:

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ghgs_lit.config.keys import flatten
+from ghgs_lit.config.keys import flatten, require_plain
 from ghgs_lit.config.registry import KINDS
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically
@@ -65,8 +65,8 @@ def _config(path: str, stamp: tuple[int, ...] | None) -> dict[str, Any]:
 
 def _check_content(path: str | Path, checkpoint: Mapping[str, Any]) -> None:
     """Refuse nodes and tensors of impossible types; values of nodes are checked where they are used."""
+    require_plain(checkpoint["config"], f"{path}: config")
     for name, node in checkpoint["config"].items():
-        require(isinstance(name, str), f"{path}: config", "keys of text", name)
         fits = name not in KINDS or node is None or isinstance(node, Mapping)
         require(fits, f"{path}: config.{name}", "a mapping of its keys", node)
     # Verbs merge parts of the configuration into their own, where OmegaConf would evaluate resolvers.

@@ -12,7 +12,8 @@ from ghgs_lit.cli.application import _for_hydra
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.config.keys import lookup
 from ghgs_lit.errors import InputError
-from ghgs_lit.weights.checkpoint import write_checkpoint
+from ghgs_lit.model import GHGS
+from ghgs_lit.weights.checkpoint import read_config, write_checkpoint
 from tests.helpers.models import config
 
 TRAINED = ("model=hull", "skip=balanced")
@@ -109,6 +110,33 @@ def test_data_that_moved_are_one_override(composed, checkpoint, verb):
     assert chosen["data"]["name"] == "scans"
     with pytest.raises(InputError, match="data: expected data=<option> where there is no checkpoint"):
         inputs.with_trained_data(composed("evaluate", "data.root=new"))
+
+
+@pytest.mark.parametrize("verb", ["evaluate", "predict"])
+def test_data_that_are_not_here_are_named_by_their_key(composed, checkpoint, monkeypatch, tmp_path, verb):
+    """``old: expected the folder of the data set`` did not say where that name came from."""
+    monkeypatch.chdir(tmp_path)
+    expected = (
+        r"data\.root: expected data\.root=<folder>, .*a\.ckpt is not where .*; found no such folder 'old'"
+    )
+    with pytest.raises(InputError, match=expected):
+        inputs.with_trained_data(composed(verb, f"checkpoint={checkpoint}"))
+    (tmp_path / "old").mkdir()
+    assert inputs.with_trained_data(composed(verb, f"checkpoint={checkpoint}")).data.root == "old"
+
+
+def test_a_strange_size_of_rounds_takes_no_memory(tmp_path):
+    """``rounds.hidden=65536`` of a checkpoint allocated 150 GB before it was compared with the weights."""
+    path, settings = tmp_path / "a.ckpt", config("model=recurrent")
+    state = GHGS.from_config(settings).state_dict()
+    write_checkpoint(path, state, {**settings, "rounds": {**settings["rounds"], "hidden": 65536}})
+    with pytest.raises(InputError, match=r"a\.ckpt: rounds\..*: expected shape \(65536, .* found \("):
+        inputs.load_model({**read_config(path), "checkpoint": path, "precision": "inherit"}, "cpu")
+    with pytest.raises(InputError, match=r"a\.ckpt: rounds\..*: expected shape"):
+        GHGS.from_checkpoint(path)
+    write_checkpoint(path, state, settings)
+    model = GHGS.from_checkpoint(path)
+    assert not any(tensor.is_meta for tensor in (*model.parameters(), *model.buffers()))
 
 
 def test_targets_on_the_command_line_are_measured_alone(composed):

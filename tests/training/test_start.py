@@ -84,11 +84,15 @@ def test_what_does_not_learn_needs_weights(tmp_path):
 
 
 def test_a_checkpoint_does_not_say_where_this_machine_writes(tmp_path):
-    """A checkpoint of somebody else must not make folders here; the command line may."""
-    data = {"name": "synthetic", "cache_dir": str(tmp_path / "theirs"), "size": 56}
-    path = checkpoint(tmp_path / "a.ckpt", Other(), config={"data": data})
-    found = with_trained_data(OmegaConf.create({"checkpoint": str(path)}))
-    assert found.data == {**data, "cache_dir": None}
+    """A checkpoint of somebody else must not make folders or processes here; the command line may."""
+    machine = {"cache_dir": str(tmp_path / "theirs"), "workers": 1024, "cache_images_mb": 1e9}
+    data = {"name": "synthetic", "size": 56}
+    path = checkpoint(
+        tmp_path / "a.ckpt", Other(), config={"data": {**data, **machine, "render_workers": 64}}
+    )
+    assert with_trained_data(OmegaConf.create({"checkpoint": str(path)})).data == data
+    said = {"checkpoint": str(path), "data": {"workers": 2}}
+    assert with_trained_data(OmegaConf.create(said)).data == {**data, "workers": 2}
 
 
 def test_a_long_report_ends(tmp_path):

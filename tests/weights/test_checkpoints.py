@@ -245,6 +245,38 @@ def test_no_resolver_of_a_checkpoint_is_evaluated(tmp_path, verb):
     assert called == []
 
 
+def loop():
+    """A mapping that holds itself."""
+    node = {"kind": "scans"}
+    node["split"] = [node]
+    return node
+
+
+def doubled(levels=40):
+    """A few hundred bytes that are a billion values when they are written out."""
+    node = {"a": 1}
+    for _ in range(levels):
+        node = {"a": node, "b": node}
+    return node
+
+
+@pytest.mark.parametrize("many", [loop(), {"kind": "scans", "x": doubled(20)}, doubled(60)])
+def test_a_configuration_without_end_is_refused(tmp_path, many):
+    """PyTorch's files may hold references; recursion and memory ended in tracebacks, or not at all."""
+    path = tmp_path / "a.ckpt"
+    checkpoint(path, config={**config(), "data": many})
+    with pytest.raises(InputError, match=r"a\.ckpt: config\.data.*: expected less than 32 levels and 100000"):
+        read_config(path)
+
+
+def test_a_configuration_of_other_things_than_yaml_says_is_refused(tmp_path):
+    path = tmp_path / "a.ckpt"
+    for value, said in ((torch.ones(2), "Tensor"), ({1: 2}, "keys of text; found 1")):
+        checkpoint(path, config={**config(), "data": {"x": [value]}})
+        with pytest.raises(InputError, match=rf"a\.ckpt: config\.data\.x: expected .*{said}"):
+            read_config(path)
+
+
 def test_a_configuration_is_read_again_where_its_file_has_changed(tmp_path):
     """Commands ask several times, and a sweep's next run may have replaced the file."""
     path, found = tmp_path / "a.ckpt", []

@@ -112,7 +112,7 @@ def _model(
     """A model with the tensors of ``state``, or, if that is empty, with the source's own."""
     if not state and source.checkpoint is None:
         return random_model(config, seed)
-    model = GHGS.from_config(config, empty=STAGES)
+    model = GHGS.from_config(config, empty=True)
     if not state:
         load_weights(model, source.checkpoint, device=device)
         return model
