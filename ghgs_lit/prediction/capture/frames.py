@@ -15,6 +15,7 @@ from ghgs_lit.prediction.capture.photographs import (
     MASK_ENDING,
     Pixels,
     by_camera,
+    camera_named,
     image_named,
     images_in,
     require_all_read,
@@ -73,7 +74,7 @@ def has_videos(folder: Path, cameras: Mapping[str, StoredCamera], names: Mapping
     if not folder.is_dir() or images_in(folder):
         return False
     videos = images_in(folder, SUFFIXES)
-    is_known = any(names.get(name, name) in cameras for name in videos)
+    is_known = any(camera_named(name, cameras, names) in cameras for name in videos)
     return is_known or (bool(videos) and not any(path.is_dir() for path in folder.iterdir()))
 
 

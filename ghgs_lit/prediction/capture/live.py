@@ -15,7 +15,13 @@ from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import ENOUGH, CaptureFolder
 from ghgs_lit.prediction.capture.formats import CameraFile, read_cameras
 from ghgs_lit.prediction.capture.frames import Frame
-from ghgs_lit.prediction.capture.photographs import by_camera, composed_names, counted, images_in
+from ghgs_lit.prediction.capture.photographs import (
+    by_camera,
+    camera_named,
+    composed_names,
+    counted,
+    images_in,
+)
 from ghgs_lit.prediction.capture.videos import SUFFIXES
 
 #: Seconds between looks for a frame and for a folder, and of waiting for a camera at the end.
@@ -144,7 +150,8 @@ def live_frames(
         return Capture(name, found.photographs(found.instants[0]))
 
     def is_whole(name: str) -> bool:
-        return stored.cameras.keys() <= {names.get(found, found) for found in images_in(folder / name)}
+        photographs = images_in(folder / name)
+        return stored.cameras.keys() <= {camera_named(n, stored.cameras, names) for n in photographs}
 
     return _arriving(places, is_whole, read, idle, clock, sleep)
 

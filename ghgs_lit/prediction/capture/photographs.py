@@ -127,18 +127,19 @@ def find_instants(
     require_all_read(folder, photographs, known)
     if photographs:
         return {folder.resolve().name: by_camera(folder, photographs, cameras, names)}
-    below = {
-        composed(path.name): images_in(path)
+    places = {
+        composed(path.name): path
         for path in sorted(folder.iterdir(), key=lambda path: counted(path.name))
         if path.is_dir() and not path.name.startswith(".")
     }
+    below = {name: images_in(path) for name, path in places.items()}
     for name, paths in below.items():
-        is_camera = names.get(name, name) in cameras
+        is_camera = camera_named(name, cameras, names) in cameras
         instants = {instant for others in below.values() for instant in others}
-        require_all_read(folder / name, paths, instants if is_camera else known)
+        require_all_read(places[name], paths, instants if is_camera else known)
     folders = {name: paths for name, paths in below.items() if paths}
     require(bool(folders), str(folder), f"photographs ({', '.join(SUFFIXES)})", "none")
-    if all(names.get(name, name) in cameras for name in folders):
+    if all(camera_named(name, cameras, names) in cameras for name in folders):
         return _by_instant(folder, by_camera(folder, folders, cameras, names))
     least = 2 if len(folders) == 1 else 1
     return {name: by_camera(folder / name, paths, cameras, names, least) for name, paths in folders.items()}
@@ -163,6 +164,14 @@ def _by_instant(folder: Path, by_camera: Mapping[str, dict[str, Path]]) -> dict[
     }
 
 
+def camera_named(name: str, cameras: Collection[str], names: Mapping[str, str]) -> str:
+    """The camera of a photograph: what ``names`` says, or the one of its name, or the only one whose name
+    differs by upper and lower case alone; the name itself where there is none."""
+    said = names.get(name, name)
+    alike = [camera for camera in cameras if camera.casefold() == said.casefold()]
+    return alike[0] if said not in cameras and len(alike) == 1 else said
+
+
 def by_camera(
     folder: Path,
     values: Mapping[str, Any],
@@ -172,13 +181,14 @@ def by_camera(
 ) -> dict[str, Any]:
     """Values by camera instead of by name of a photograph, of a video or of a camera's folder. InputError: a
     name is that of no camera, two are of one, or there are fewer than ``least``."""
-    unknown = [name for name in values if names.get(name, name) not in cameras]
+    named = {name: camera_named(name, cameras, names) for name in values}
+    unknown = [name for name, camera in named.items() if camera not in cameras]
     if unknown:
         raise InputError(
             f"{folder}: expected photographs named after cameras ({', '.join(cameras)}), or"
             f" calibration.names={{photograph: camera}}; found {', '.join(unknown)}"
         )
     require(len(values) >= least, str(folder), f"{least} photographs or more", len(values))
-    found = {names.get(name, name): value for name, value in values.items()}
+    found = {named[name]: value for name, value in values.items()}
     require(len(found) == len(values), "calibration.names", "one photograph for each camera", dict(names))
     return found

@@ -67,7 +67,8 @@ def test_a_lens_of_single_numbers_counts(tmp_path):
         ({"camera_model": "omnidirectional"}, "a: camera_model: expected a camera model among .*'omnidirec"),
         ({"distortion_model": "mei"}, "a: distortion_model: expected a camera model among .*; found 'mei'"),
         ({"model": "double sphere"}, r"found \['model'\]"),
-        ({"latlong": True}, r"found \['latlong'\]"),
+        ({"type": "fisheye", "D": [0.1, 0, 0, 0]}, r"found \['type'\]"),
+        ({"latlong": True}, r"and no other camera model; found \['latlong'\]"),
         ({"equirectangular": 1}, r"found \['equirectangular'\]"),
         ({"k": [-0.35, 0.12]}, r"found \['k'\]"),
         ({"k": LENS}, r"found \['k'\]"),
@@ -151,7 +152,6 @@ def test_flags_that_are_read(tmp_path, kind, value, found):
         ({"w": "wide", "h": 480}, "w: expected a finite number; found 'wide'"),
         ({"k1": True}, "k1: expected a finite number; found True"),
         ({"k1": [0.1]}, r"k1: expected a finite number; found \[0\.1\]"),
-        ({"k1": 10**400}, "k1: expected a finite number; found 1000"),
         ({"D": [0.1, True, 0, 0]}, r"D: expected numbers; found \[0\.1, True"),
         ({"D": "none"}, "D: expected an array"),
         ({"D": {"k1": 0.1}}, "D: expected an array"),
@@ -461,6 +461,38 @@ def test_a_capture_with_an_angle_of_view_alone(capture):
     assert diagnose(folder).consistent
 
 
+def test_a_turned_photograph_of_a_calibration_without_size(capture):
+    """As shown, as OpenCV turns photographs: the report took it as stored, and accused the cameras."""
+    own = json.loads((capture / "cameras.json").read_text())["cameras"]
+    without = {n: {k: c[k] for k in ("intrinsics", "extrinsics")} for n, c in own.items()}
+    write(capture / "cameras.json", {"cameras": without})
+    for path in (capture / "images").iterdir():
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        Image.fromarray(np.rot90(np.asarray(Image.open(path)))).save(path, exif=exif)
+    for photograph, mask in zip(read(capture).photographs, Figure().masks, strict=True):
+        np.testing.assert_array_equal(photograph.mask, mask)
+    assert diagnose(
+        CaptureFolder(capture / "images", capture / "cameras.json", masks=capture / "masks")
+    ).consistent
+
+
+@pytest.mark.parametrize("change", [str.upper, str.title, lambda n: n.replace("cam", "Cam")])
+def test_names_in_another_case(capture, change):
+    """``CAM0.PNG`` of Windows is of the camera ``cam0``."""
+    for folder in ("images", "masks"):
+        rename(capture, folder, change)
+    assert [photograph.name for photograph in read(capture).photographs] == Figure().names
+
+
+def test_cameras_that_differ_by_case_alone(capture):
+    """Exact names count, and no other is guessed."""
+    renamed(capture, lambda name: {"cam2": "CAM1"}.get(name, name))
+    rename(capture, "images", lambda n: n.replace("cam1", "Cam1").replace("cam2", "CAM1"))
+    with pytest.raises(InputError, match=r"expected photographs named after cameras .*; found Cam1$"):
+        read(capture)
+
+
 def test_masks_that_a_windows_program_names(capture):
     """``masks\\cam0.PNG`` beside transforms.json is ``masks/cam0.png``."""
     own = json.loads((capture / "cameras.json").read_text())["cameras"]
@@ -492,6 +524,17 @@ def test_letters_of_macos(capture):
     for folder, form in (("images", "NFD"), ("masks", "NFC")):
         rename(capture, folder, lambda n, form=form: unicodedata.normalize(form, n.replace("cam", "Käthe")))
     assert len(read(capture).photographs) == 4
+
+
+def test_a_folder_of_macos(capture):
+    """An instant, and a camera's folder, whose name has an umlaut of two characters."""
+    name = unicodedata.normalize("NFD", "K\u00e4the")
+    for folder in ("images", "masks"):
+        (capture / folder).rename(capture / name)
+        (capture / folder).mkdir()
+        (capture / name).rename(capture / folder / name)
+    folder = CaptureFolder(capture / "images", capture / "cameras.json", masks=capture / "masks")
+    assert [len(folder.photographs(instant)) for instant in folder.instants] == [4]
 
 
 def test_hidden_folders_are_no_instants(capture):

@@ -194,8 +194,11 @@ class Entries:
             for key, value in self.fields.items()
             if key not in self._read and plain(key) not in irrelevant
         }
-        lens = [key for key, value in left.items() if _LENS.search(plain(key)) and _bends(value)]
-        expected = "lens distortion as D or dist: k1 k2 p1 p2 k3 k4 k5 k6, with fisheye k1 k2 k3 k4"
+        lens = [key for key, value in left.items() if _bends(plain(key), value)]
+        expected = (
+            "lens distortion as D or dist: k1 k2 p1 p2 k3 k4 k5 k6, with fisheye k1 k2 k3 k4, and no other"
+            " camera model"
+        )
         require(not lens, self.origin, expected, lens)
         return tuple(left)
 
@@ -206,11 +209,14 @@ def coefficients(numbers: Mapping[str, float], names: str) -> np.ndarray:
     return values if values.any() else np.zeros(0)
 
 
-def _bends(value: Any) -> bool:
-    """Whether an entry about the lens matters: numbers other than 0, or a model of another kind."""
+def _bends(key: str, value: Any) -> bool:
+    """Whether an entry says something of the lens: numbers other than 0, or a model of another kind, which
+    may be the value of any key, such as ``type``. ``key``: spelled as :func:`plain` does."""
     if isinstance(value, str):
-        return bool(_MODELS.search(plain(value)))
-    return bool(np.any(np.asarray(value, object)))
+        model = plain(value)
+        is_model = bool(_MODELS.match(model)) and len(value.split()) == 1
+        return is_model or bool(_LENS.search(key) and _MODELS.search(model))
+    return bool(_LENS.search(key)) and bool(np.any(np.asarray(value, object)))
 
 
 def _fits(value: Any, shape: tuple[int | None, ...]) -> bool:
