@@ -161,6 +161,15 @@ def test_a_mesh_that_two_skins_move(tmp_path):
     assert np.abs(one.vertices - other.vertices).max() > 0.1
 
 
+def test_a_rigged_mesh_that_no_scene_shows(tmp_path):
+    """Such as another level of detail."""
+    file, expected = rigged()
+    file.tree["nodes"].append({"mesh": 0, "skin": 0, "translation": [9, 9, 9]})
+    file.write(tmp_path / "g" / "g.glb", True)
+    (part,) = ScanSource(tmp_path).load("g").parts
+    np.testing.assert_allclose(part.vertices, expected, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("spoil", "line"),
     [
