@@ -1,0 +1,35 @@
+"""Calibrations on disk, as other programs write them."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ghgs_lit.prediction.capture.calibration import StoredCamera
+from ghgs_lit.prediction.capture.formats import read_cameras
+
+CAMERA = {"K": [[1000, 0, 320], [0, 1000, 240], [0, 0, 1]], "R": np.eye(3).tolist(), "T": [0, 0, 3]}
+LENS = [-0.35, 0.12, 0.001, -0.0005, 0.01]
+
+
+def write(path: Path, content: Any) -> Path:
+    """Write text, or anything else as JSON."""
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+def one_camera(tmp_path: Path, **entries: Any) -> StoredCamera:
+    """A camera of OpenCV's matrices with further entries, as it is read."""
+    return read_cameras(write(tmp_path / "cameras.json", {"a": CAMERA | entries})).cameras["a"]
+
+
+def frame(name: str, **entries: Any) -> dict[str, Any]:
+    """A frame of transforms.json."""
+    return {"file_path": name, "transform_matrix": np.eye(4).tolist()} | entries
+
+
+def transforms(tmp_path: Path, *frames: dict[str, Any], **entries: Any) -> Path:
+    """A file transforms.json."""
+    content = {"fl_x": 500, "cx": 320, "cy": 240, "w": 640, "h": 480, "frames": frames} | entries
+    return write(tmp_path / "transforms.json", content)
