@@ -41,8 +41,9 @@ from ghgs_lit.types import (
 
 Attributes = tuple[Tensor, Tensor, Tensor, Tensor]
 
-#: The largest offset of a Gaussian from its pixel's point along each axis, in metres.
-OFFSET_LIMIT = 0.05
+#: Offset of a Gaussian from its pixel's point along each axis, in metres, for a raw value of 1 where there is
+#: no limit; and the limit where none is said.
+OFFSET_UNIT = 0.05
 #: The largest scale in footprints: a splat as large as a limb would hide errors beneath it.
 SCALE_CAP = 4.0
 #: Opacity at the start of training: high, since transparent splats do not recover.
@@ -146,11 +147,13 @@ class FootprintAttributes(Options):
         """Bias of raw opacities, so that 0 gives the start."""
         return _logit((OPACITY_START - self.opacity_floor) / (1 - self.opacity_floor))
 
-    def constants(self, color_limit: float) -> tuple[float, ...]:
-        """Constants of :func:`ghgs_lit.heads.cpu.activate`: limit of offsets, distance inwards, smallest
-        scale, log range and biases of scales, smallest opacity and its bias, limit of colour changes."""
+    def constants(self, offset_limit: float | None, color_limit: float) -> tuple[float, ...]:
+        """Constants of :func:`ghgs_lit.heads.cpu.activate`: limit of offsets (0: none) and their unit,
+        distance inwards, smallest scale, log range and biases of scales, smallest opacity and its bias, limit
+        of colour changes."""
+        offsets = (offset_limit or 0.0, OFFSET_UNIT, self.inward)
         size = (self.scale_floor, self.scale_range, *self.scale_biases)
-        return OFFSET_LIMIT, self.inward, *size, self.opacity_floor, self.opacity_bias, color_limit
+        return *offsets, *size, self.opacity_floor, self.opacity_bias, color_limit
 
     def __call__(
         self,
@@ -159,14 +162,25 @@ class FootprintAttributes(Options):
         rotation: Float[Tensor, "N 4"],
         opacity: Float[Tensor, " N"],
         footprint: Float[Tensor, " N"],
+        offset_limit: float | None = OFFSET_UNIT,
     ) -> Attributes:
+        """Offsets in metres, scales in metres, quaternions and opacities.
+
+        Args:
+            offset: raw, as are all but the last two.
+            scale: raw.
+            rotation: raw.
+            opacity: raw.
+            footprint: side of a pixel at each Gaussian's depth, in metres.
+            offset_limit: of ``gaussian_head``."""
         identity = F.pad(rotation.new_ones(1), (0, 3))
         across, thickness = self.scale_biases
         scale = torch.cat((scale[:, :2] + across, scale[:, 2:] + thickness), 1)
         scale = self.scale_floor * torch.exp(self.scale_range * bounded_sigmoid(scale))
         shown = bounded_sigmoid(opacity + self.opacity_bias)
+        moved = OFFSET_UNIT * offset if offset_limit is None else offset_limit * bounded_tanh(offset)
         return (
-            OFFSET_LIMIT * bounded_tanh(offset) + F.pad(self.inward * footprint[:, None], (2, 0)),
+            moved + F.pad(self.inward * footprint[:, None], (2, 0)),
             footprint[:, None] * scale,
             unit(identity + rotation, _SHORTEST),
             self.opacity_floor + (1 - self.opacity_floor) * shown,
@@ -198,6 +212,9 @@ class GaussianHeadOptions(Options):
     color_limit: Share = 0.0
     """Largest change of a colour from its pixel's, in each channel, which makes up for the blur of splats and
     for dark rims; 0: none (the paper)."""
+    offset_limit: Positive | None = OFFSET_UNIT
+    """Largest offset of a Gaussian from its pixel's point along each axis, in metres; null: none, as
+    published. With parameterization=footprint; release has none."""
     low_pass: Amount = 0.3
     """px^2 that splats are made to be widened by when they are drawn; gsplat's default."""
     antialiased: bool = False
@@ -283,7 +300,8 @@ class GaussianHead(nn.Module):
         photo, share, options = batch.once(surface_colors), batch.alpha, self.options
         inputs = (*numbers, photo, share, depth_maps.depth, points.pixels, batch.cameras.extrinsics)
         if isinstance(self.attributes, FootprintAttributes) and cpu.is_supported(*inputs):
-            constants, on_surface = self.attributes.constants(options.color_limit), options.axes == "surface"
+            constants = self.attributes.constants(options.offset_limit, options.color_limit)
+            on_surface = options.axes == "surface"
             given = (raw.image, raw.pixel, depth_maps, points, photo, share, batch.cameras)
             found = cpu.activate(numbers, *given, constants, on_surface)
         else:
@@ -299,8 +317,9 @@ class GaussianHead(nn.Module):
         depth = depth_maps.depth.flatten(0, 1).flatten(1)[image, pixel]
         # No gradient: a splat that is too large must not move nearer to become smaller.
         footprint = depth.detach() / focal
+        limit = () if self.attributes is release_attributes else (self.options.offset_limit,)
         offset, scales, quaternions, opacities = self.attributes(
-            raw.offset, raw.scale, raw.rotation, raw.opacity, footprint
+            raw.offset, raw.scale, raw.rotation, raw.opacity, footprint, *limit
         )
         if self.options.axes == "surface":
             axes = surface_axes(depth_maps, batch.cameras, image, pixel)

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ghgs_lit.recalibration.neighbors import nearest_neighbors
-from ghgs_lit.recalibration.recalibration import Recalibration, neighbor_cosines
+from ghgs_lit.recalibration.recalibration import Recalibration, neighbor_cosines, neighbor_count
 from ghgs_lit.types import Points, Tokens
 
 
@@ -67,7 +67,8 @@ def _weights(
     """Neighbours of the ``chosen`` tokens of an element, as indices among them, and weights of ``rows``."""
     places, positions = recalibration.places(tokens), recalibration.positions(tokens, points)
     places = None if places is None else places[chosen]
-    near = nearest_neighbors(positions[chosen], tokens.image[chosen], recalibration.k, places)
+    k = neighbor_count(recalibration.k, len(chosen))
+    near = nearest_neighbors(positions[chosen], tokens.image[chosen], k, places)
     block = recalibration.block
     plain |= block.similarity == "none"
     cosines = None if plain else neighbor_cosines(tokens.semantic[chosen], near)

@@ -2,10 +2,11 @@
 
 import dataclasses
 import itertools
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
+from pydantic import Field
 from torch import Tensor, nn
 
 from ghgs_lit.config.options import Count, Options, Width
@@ -26,8 +27,9 @@ class RecalibrationOptions(Options):
     """Tokens to tokens by multi-view semantic consistency (paper, Eqs. 3 to 5)."""
 
     group = "recalibration"
-    k: Count = 64
-    """Neighbours of each token; all tokens where there are fewer. 64 in the authors' release."""
+    k: Count | Annotated[float, Field(gt=0, lt=1)] = 64
+    """Neighbours of each token: a number (64 in the authors' release; all tokens where there are fewer), or a
+    share of the subject's tokens that take part, such as 0.1, which means the same at every size."""
     num_heads: Width = 8
     """Attention heads; they divide a quarter of the token width. 8 in the release."""
     similarity: Similarity = "product"
@@ -67,7 +69,10 @@ class Recalibration(nn.Module):
         places = [None] * batch_size if places is None else part(places).split(counts)
         pairs = (part(values).split(counts) for values in (self.positions(tokens, points), tokens.image))
         elements = zip(*pairs, places, strict=True)
-        neighbors = [nearest_neighbors(where, view, self.k, number) for where, view, number in elements]
+        neighbors = [
+            nearest_neighbors(where, view, neighbor_count(self.k, len(where)), number)
+            for where, view, number in elements
+        ]
         cosines = None
         if self.block.similarity != "none":
             semantic = part(tokens.semantic).split(counts)
@@ -100,6 +105,11 @@ class Recalibration(nn.Module):
             return None
         # Twice the columns, so that places at equal distances from a query differ in their numbers.
         return tokens.row * 2 * tokens.grid[3] + tokens.column
+
+
+def neighbor_count(k: int | float, tokens: int) -> int:
+    """Neighbours of each of an element's ``tokens``: ``k``, or a share of them below 1, and one at least."""
+    return max(round(k * tokens), 1) if k < 1 else int(k)
 
 
 @torch.no_grad()

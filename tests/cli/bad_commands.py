@@ -208,7 +208,11 @@ NUMBERS = [
     ("train encoder.layers=all", 1, "encoder.layers: expected a list", "found 'all'"),
     ("train encoder.depth=4.0", 1, "encoder.depth: expected an integer", "found 4.0"),
     ("train encoder.mask_input=some", 1, "encoder.mask_input: expected true or false"),
-    ("train recalibration.k=0", 1, "recalibration.k: expected an integer >= 1; found 0"),
+    (
+        "train recalibration.k=0",
+        1,
+        "recalibration.k: expected an integer >= 1 or a number > 0 and < 1; found 0",
+    ),
     ("train bounds.samples=100000", 1, "bounds.samples: expected", "<= 4096"),
     ("train bounds.dilation=wide", 1, "bounds.dilation: expected a number", "found 'wide'"),
     ("train depth_head.start=1", 1, "depth_head.start: expected", "< 1", "found 1"),

@@ -42,6 +42,14 @@ def test_a_saturated_depth_recovers(name, raw):
     assert x.abs() < 10
 
 
+def test_offsets_go_as_far_as_their_limit():
+    """Without one, as published, as far as the network says: 5 cm for a raw value of 1."""
+    raws = [torch.full(shape, 40.0) for shape in ((1, 3), (1, 3), (1, 4), (1,), (1,))]
+    for limit, expected in ((0.05, 0.05), (0.2, 0.2), (None, 2.0)):
+        offset = FootprintAttributes()(*raws, limit)[0]
+        torch.testing.assert_close(offset, torch.full((1, 3), expected), rtol=0.03, atol=0)
+
+
 @pytest.mark.parametrize("raw", FAR_OUT)
 def test_saturated_attributes_keep_a_gradient(raw):
     """Offsets had none from 10 on, scales and opacities none from 20 on."""

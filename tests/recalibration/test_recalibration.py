@@ -11,7 +11,7 @@ import ghgs_lit.recalibration.recalibration as stage
 from ghgs_lit.errors import InputError
 from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
 from ghgs_lit.recalibration.attention import S_MIN, Similarity
-from ghgs_lit.recalibration.recalibration import neighbor_cosines
+from ghgs_lit.recalibration.recalibration import RecalibrationOptions, neighbor_cosines, neighbor_count
 from tests.helpers.scenes import CASES, fixture
 from tests.helpers.tokens import literal_neighbors, make_stage, scene
 
@@ -124,6 +124,23 @@ def test_elements_of_a_batch_do_not_mix():
     torch.testing.assert_close(found.latent[0][second], together.latent[0][second])
 
 
+def test_a_share_of_the_tokens_is_a_number_for_each_element():
+    """A tenth of 40 and of 25 tokens; one at least. A number means the same whatever the size."""
+    assert [neighbor_count(0.1, count) for count in (40, 25, 3, 0)] == [4, 2, 1, 1]
+    assert [neighbor_count(64, count) for count in (40, 1000)] == [64, 64]
+    assert RecalibrationOptions(k=0.1).k == 0.1
+    assert isinstance(RecalibrationOptions(k=3).k, int)
+    tokens, points = scene()
+    share, sizes = (
+        make_stage(k=0.3)(tokens, points),
+        [int(points.tokens_valid[tokens.image // 3 == b].sum()) for b in (0, 1)],
+    )
+    for element, size in enumerate(sizes):
+        own = tokens.image // 3 == element
+        number = make_stage(k=round(0.3 * size))(tokens, points)
+        assert torch.equal(share.latent[0][own], number.latent[0][own])
+
+
 def test_order_of_the_views_does_not_matter():
     """Permuting the views only permutes the tokens."""
     tokens, points = scene(((5, 6, 4),))
@@ -203,6 +220,7 @@ def test_autocast_keeps_neighbors_and_the_kind_of_the_tokens():
     ("options", "key"),
     [
         ({"k": 0}, "recalibration.k"),
+        ({"k": 1.5}, "recalibration.k"),
         ({"similarity": "cosine"}, "recalibration.similarity: expected one of product"),
         ({"neighborhood": "feature"}, "recalibration.neighborhood: expected one of xyz, image_plane"),
         ({"neighbors": "all"}, "recalibration key: expected one of .*found 'neighbors'"),

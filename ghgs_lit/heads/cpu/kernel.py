@@ -27,7 +27,7 @@ DEPTH, POINT, PHOTO, SHARE, AROUND, LINES = 14, 15, 18, 21, 22, 26
 PLACES, MASKS = types.Array(types.int64, 1, "C"), types.Array(types.boolean, 3, "C")
 FLAGS, _EACH = types.Array(types.boolean, 1, "C"), [FLOATS[2], FLOATS[2], FLOATS[2], FLOATS[1], FLOATS[2]]
 _MAPS = [FLOATS[3], MASKS, FLOATS[4], FLOATS[4], FLOATS[3], FLOATS[3], FLOATS[2]]
-_CONSTANTS = (types.UniTuple(types.float32, 9), types.boolean)
+_CONSTANTS = (types.UniTuple(types.float32, 10), types.boolean)
 
 
 @helper
@@ -146,7 +146,7 @@ def activate(
     constants, on_surface, means, quaternions, scales, opacities, colors, image, first, last,
 ):  # fmt: skip
     """Write Gaussians ``first`` to ``last`` of ``image``; see :func:`ghgs_lit.heads.cpu.activate`."""
-    limit, inward, floor, span, across, thickness, least, bias, change = constants
+    limit, unit, inward, floor, span, across, thickness, least, bias, change = constants
     camera, width, values = intrinsics[image], depth.shape[2], simd.aligned(LINES * LANES)
     rows, columns = simd.aligned(LANES), simd.aligned(LANES)
     focal = np.sqrt(camera[0, 0] * camera[1, 1])
@@ -161,10 +161,11 @@ def activate(
             _line(values, ROTATION) + ONE, _line(values, ROTATION + 1), _line(values, ROTATION + 2),
             _line(values, ROTATION + 3),
         )  # fmt: skip
-        moved = (
-            _tanh(_line(values, OFFSET)) * limit, _tanh(_line(values, OFFSET + 1)) * limit,
-            _tanh(_line(values, OFFSET + 2)) * limit + footprint * inward,
-        )  # fmt: skip
+        right, up, back = _line(values, OFFSET), _line(values, OFFSET + 1), _line(values, OFFSET + 2)
+        if limit > 0:
+            moved = (_tanh(right) * limit, _tanh(up) * limit, _tanh(back) * limit + footprint * inward)
+        else:
+            moved = (right * unit, up * unit, back * unit + footprint * inward)
         if on_surface:
             for lane in range(LANES):
                 place = pixel[min(start + lane, last - 1)]
