@@ -135,7 +135,7 @@ def test_foreign_content_of_files_of_this_program(tmp_path, content):
     folder.mkdir()
     readers = {
         folder / "plan.json": lambda: Completeness(tmp_path).plan,
-        folder / "settings.json": lambda: Progress(tmp_path).check_settings({"size": 3}),
+        folder / "settings.json": lambda: Progress(tmp_path).check_settings({"render": {"lights": "none"}}),
         tmp_path / "metrics.json": lambda: read_results(tmp_path / "metrics.json"),
         tmp_path / "other.json": lambda: read_others(tmp_path / "other.json"),
     }

@@ -78,4 +78,4 @@ def attributes(
     bends = np.array([isinstance(network[1], nn.Tanh) for network in networks])
     given = (rows.numpy(), layers, widths, bends, found.numpy())
     pool.run_rows(compiled(), given, [(0, len(rows))], _ROWS, _WORK * len(rows))
-    return torch.split(found.view(*descriptors.shape[:-1], -1), outputs, -1)
+    return torch.split(found.view(*descriptors.shape[:-1], sum(outputs)), outputs, -1)
