@@ -7,6 +7,7 @@ import torch
 
 from ghgs_lit.evaluation.measure import Estimate, ModelMethod, measure, not_finite
 from ghgs_lit.metrics import MetricsOptions, psnr
+from ghgs_lit.rendering import render
 from ghgs_lit.runs.provenance import config_hash
 from tests.helpers.models import make_model
 from tests.helpers.scenes import make_batch
@@ -65,6 +66,20 @@ def test_what_is_not_finite_is_counted_and_named():
     prediction.depth_valid[1][batch.masks[1]] &= torch.arange(int(batch.masks[1].sum())) > 2
     with pytest.warns(UserWarning, match="not finite: ben: 5"):
         assert not_finite(batch, prediction) == (0, 5)
+
+
+@pytest.mark.parametrize("model", ["model=hull", "model=paper", "model=recurrent"])
+def test_a_model_without_any_finite_depth_is_measured(model):
+    """One broken subject must not lose the metrics of all others."""
+    broken, batch = make_model(model).eval(), make_batch(1, 3)
+    batch = dataclasses.replace(batch, subjects=("anna",), targets=example_batch(subjects=1).targets)
+    for parameter in broken.depth_head.parameters():
+        parameter.data.fill_(torch.nan)
+    with pytest.warns(UserWarning, match="not finite: anna: "):
+        [row, *_] = measure(ModelMethod(broken, render), "model", [batch], OFF)
+    assert row["gaussians"] == 0
+    assert row["psnr"] > 0
+    assert row["not_finite"] == int(batch.masks.sum())
 
 
 def test_the_hash_of_a_configuration_ignores_the_order_of_keys():

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ghgs_lit.errors import InputError
 from ghgs_lit.prediction.export.ply import ply_bytes, stored_values
 from ghgs_lit.types import Gaussians
 
@@ -18,12 +19,13 @@ the rotation (w, x, y, z), of which 128 is zero."""
 
 
 def converted(name: str, gaussians: Gaussians) -> bytes:
-    """The content of a file in format ``name`` of ``CONVERTED``. RuntimeError: gaussforge refuses."""
+    """The content of a file in format ``name`` of ``CONVERTED``. InputError: it cannot be, such as of none."""
     from gaussforge import GaussForge
 
     answer = GaussForge().convert(ply_bytes(gaussians), "ply", CONVERTED[name])
     if answer.get("error"):
-        raise RuntimeError(f"{name}: gaussforge: {answer['error']}")
+        expected = "formats: expected Gaussians that gaussforge converts to"
+        raise InputError(f"{expected} {name}; found {len(gaussians)}: {answer['error']}")
     return answer["data"]
 
 

@@ -170,6 +170,10 @@ def test_a_subject_without_gaussians_is_written(subject, tmp_path):
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["gaussians"] == 0
     assert set(report["psnr_box_of_inputs"].values()) == {None}
+    with pytest.raises(
+        InputError, match="formats: expected Gaussians that gaussforge converts to spz; found 0: "
+    ):
+        write_prediction(tmp_path, batch, Standin()(batch), Renderer(), OutputOptions(("spz",)))
 
 
 @pytest.mark.parametrize(
