@@ -13,6 +13,7 @@ from ghgs_lit import stages
 from ghgs_lit.config.registry import build, read_node
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.padding import bounds_of
+from ghgs_lit.heads.dpt import LEVELS, DPTHead
 from ghgs_lit.kernels.precision import PRECISIONS
 from ghgs_lit.rounds import CoarseDepths, Rounds, State, coarse_depths, prediction_of, replaced
 from ghgs_lit.skipping import SkipOptions
@@ -129,6 +130,10 @@ class GHGS(nn.Module):
 
         encoder = stage("encoder", tokens=skip.tokens, margin=skip.margin)
         heads = {name: stage(name, dim_latent=encoder.dim_latent) for name in HEADS}
+        layers = config["encoder"].get("layers")  # a plug-in's may not say
+        fused = any(isinstance(part, DPTHead) for head in heads.values() for part in head.modules())
+        fits = layers is None or not fused or len(layers) == LEVELS
+        require(fits, "encoder.layers", f"{LEVELS} layers, which the dense heads fuse", list(layers or ()))
         rounds = stage("rounds", channels=heads["gaussian_head"].channels) if "rounds" in config else None
         others = {name: stage(name) for name in ("bounds", "unprojection")}
         model = cls(encoder=encoder, **heads, **others, rounds=rounds, skip=skip, options=options)

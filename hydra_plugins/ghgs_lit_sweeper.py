@@ -5,10 +5,17 @@ from typing import Any
 from hydra._internal.core_plugins import basic_sweeper
 
 
+def rehearse(configs: list[Any]) -> Any:
+    """What a dry run tries, of a room above that of sweeps."""
+    from ghgs_lit.cli import rehearsal  # here: other commands need no PyTorch yet
+
+    return rehearsal.rehearse(configs)
+
+
 class GridSweeper(basic_sweeper.BasicSweeper):
     """Runs every combination of values once, and skips runs that are done."""
 
     def sweep(self, arguments: list[str]) -> Any:
         from ghgs_lit.runs.grid import sweep  # Hydra imports its plugins for every application
 
-        return sweep(self, arguments)
+        return sweep(self, arguments, rehearse)

@@ -100,6 +100,7 @@ SMALL = [
     (r"^(python scripts/check_resume\.py)(?: --steps 40 --kill-at 20)?(.*)",
      rf"\1\2 --steps 12 --kill-at 6 --every 3 {TINY}", "twelve steps"),
     (r"^(ghgs train (?!.*dry_run).*sweep=table\d.*)", r"\1 dry_run=true", "needs a GPU: planned only"),
+    (r"^(ghgs train .*sweep=table\d.*dry_run=true.*)", r"\1 || [ $? = 1 ]", "says what it lacks here"),
     (r"(?<=seed=1,2),3(,4)?", "", "two seeds"),
     (TRAIN + r".*(?:experiment=(?:demo|shipped)|data=synthetic).*)", rf"\1 {TINY}",
      "two people of 56 x 56 pixels"),

@@ -21,7 +21,7 @@ from ghgs_lit.config import resolve
 from ghgs_lit.config.compose import check_ablation, saved_text
 from ghgs_lit.config.keys import is_hyperparameter, key_of
 from ghgs_lit.config.verbs import VERBS
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.errors import require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.job import BUSY, check_config, check_launcher
 from ghgs_lit.runs.processes import queue_again
@@ -104,33 +104,45 @@ def _print_states(
     return states
 
 
-def print_plan(planned: Sequence[PlannedRun], directory: Path) -> None:
-    """Print the runs with their states, the training time of the remaining ones and the output paths."""
+@dataclass(frozen=True)
+class Rehearsal:
+    """What a dry run has found. ``reasons``: why runs would be refused. ``notes``: what else they should
+    know. ``step``: seconds of a training step, None where it was not taken."""
+
+    reasons: Sequence[str] = ()
+    notes: Sequence[str] = ()
+    step: float | None = None
+
+
+#: Tries what configurations need.
+Rehearse = Callable[[Sequence[Mapping[str, Any]]], Rehearsal]
+
+
+def print_plan(planned: Sequence[PlannedRun], directory: Path, rehearse: Rehearse) -> None:
+    """Print the runs with their states, the training time of the remaining ones, the output paths and what
+    is missing. InputError: something is missing."""
+    found = rehearse([item.config for item in planned if not item.run.done])
     measured = step_seconds(directory)
-    times = [expected_seconds(item.config, measured and measured[0]) for item in planned]
+    step = measured[0] if measured else found.step
+    times = [expected_seconds(item.config, step) for item in planned]
     budgets = [_budget(item.config, seconds) for item, seconds in zip(planned, times, strict=True)]
     states = _print_states(planned, {"trains for": budgets}, "; nothing was run")
     left = [t for t, state in zip(times, states, strict=True) if state != State.DONE]
     basis = ["trainer.max_time"] if any(time_budget(item.config) is not None for item in planned) else []
     if measured:
         basis.append(f"{measured[0]:.3g} s a step, measured in {measured[1]} finished runs")
+    elif step:
+        basis.append(f"{step:.3g} s a step, tried with the first run")
     known = "unknown" if None in left else clock(sum(left))
-    reason = "; ".join(basis) or "no trainer.max_time, and no finished run to measure a step in"
+    reason = "; ".join(basis) or "no trainer.max_time, and no step was measured or tried"
     print(f"expected training time of the remaining runs, one after another: {known} ({reason})")
     print(f"outputs: {directory}/<run>/ with {OUTPUTS}", flush=True)
-    _print_refusals([item.config for item in planned])
-
-
-def _print_refusals(configs: Sequence[Mapping[str, Any]]) -> None:
-    """Print why configured runs would be refused, each reason once."""
-    reasons = {}
-    for config in configs:
-        try:
-            check_config(config)
-        except InputError as error:
-            reasons[str(error)] = None
-    for reason in reasons:
+    for note in found.notes:
+        print(f"note: {note}")
+    for reason in found.reasons:
         print(f"would be refused: {reason}", flush=True)
+    count = len(found.reasons)
+    require(count == 0, "dry_run", "runs that lack nothing", f"{count} reasons why they would be refused")
 
 
 def print_results(planned: Sequence[PlannedRun], directory: Path) -> None:
@@ -147,13 +159,13 @@ _POLL = 2.0  # seconds between checks of runs that other processes work on
 Launch = Callable[[Sequence[Sequence[str]], int], Sequence[JobReturn]]
 
 
-def sweep(sweeper: BasicSweeper, arguments: Sequence[str]) -> list[Sequence[JobReturn]]:
-    """Run the grid of ``arguments`` and the sweeper's parameters, or print it with ``dry_run``. Interrupted:
-    Ctrl-C or SIGTERM; no further run is started."""
+def sweep(sweeper: BasicSweeper, arguments: Sequence[str], rehearse: Rehearse) -> list[Sequence[JobReturn]]:
+    """Run the grid of ``arguments`` and the sweeper's parameters, or with ``dry_run`` :func:`print_plan`
+    after ``rehearse``. Interrupted: Ctrl-C or SIGTERM; no further run is started."""
     directory = Path(str(sweeper.config.hydra.sweep.dir)).resolve()
     with interruptible():
         try:
-            return _sweep(sweeper, arguments, directory)
+            return _sweep(sweeper, arguments, directory, rehearse)
         except Interrupted as stop:
             if not stop.explained:
                 print_how_to_go_on(
@@ -162,7 +174,9 @@ def sweep(sweeper: BasicSweeper, arguments: Sequence[str]) -> list[Sequence[JobR
             raise
 
 
-def _sweep(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> list[Sequence[JobReturn]]:
+def _sweep(
+    sweeper: BasicSweeper, arguments: Sequence[str], directory: Path, rehearse: Rehearse
+) -> list[Sequence[JobReturn]]:
     config, loader = sweeper.config, sweeper.hydra_context.config_loader
     combos = combinations(sweeper.params, arguments, loader)
     planned = plan(combos, lambda overrides: loader.load_sweep_config(config, overrides))
@@ -172,7 +186,7 @@ def _sweep(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> 
         check_launcher(item.config, config.hydra.runtime.choices["hydra/launcher"])
     check_directories(planned)
     if config.get("dry_run"):
-        print_plan(planned, directory)
+        print_plan(planned, directory, rehearse)
         return []
     require(not config.get("overwrite"), "overwrite", "false in a sweep, which goes on with its runs", True)
     for item in planned:

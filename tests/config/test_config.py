@@ -18,6 +18,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS, OPTIONS, STAGES
 from tests.cli.test_main import call
 from tests.helpers.configs import composed, verb_with
+from tests.helpers.jobs import rehearse_nothing
 
 CONF = conf_dir()
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
@@ -123,8 +124,10 @@ views: {training: uneven}
 
 
 @pytest.fixture
-def own(tmp_path):
+def own(monkeypatch, tmp_path):
     """``own(ablation=text)`` writes the file ``mine`` of a group; returns the flags that show its folder."""
+
+    rehearse_nothing(monkeypatch)
 
     def write(**files):
         for group, text in files.items():

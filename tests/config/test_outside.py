@@ -6,6 +6,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from tests.cli.test_main import call
+from tests.helpers.jobs import rehearse_nothing
 
 GLOBAL = "# @package _global_\n"
 #: Hydra's own words that call, by the file that says them: {file: text}, and what is named.
@@ -65,6 +66,11 @@ REFUSED = {
         "views/y.yaml: hydra: ",
     ),
 }
+
+
+@pytest.fixture(autouse=True)
+def plans_alone(monkeypatch):
+    rehearse_nothing(monkeypatch)
 
 
 def written(folder, files):

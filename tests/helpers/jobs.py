@@ -10,7 +10,7 @@ import hydra
 from ghgs_lit.cli.runtime import output_dir
 from ghgs_lit.config import VERSION_BASE, conf_dir, own_keys
 from ghgs_lit.runs import job as job_module
-from ghgs_lit.runs.grid import PlannedRun, run_all
+from ghgs_lit.runs.grid import PlannedRun, Rehearsal, run_all
 from ghgs_lit.runs.job import register_resolvers, train_once
 from ghgs_lit.runs.provenance import config_hash, provenance
 from ghgs_lit.runs.results import write_results
@@ -32,6 +32,11 @@ def record_execution(config: dict[str, Any], directory: Path, stats: dict[str, A
         file.write(f"{directory.name} {os.getpid()} {config['resume']}\n")
     stats |= {"steps": 10, "seconds": 5.0}
     return write_finished_run(directory, config, 20.0 + config["optimizer"]["lr"])
+
+
+def rehearse_nothing(monkeypatch) -> None:
+    """Let ``dry_run`` try nothing, for tests of plans alone."""
+    monkeypatch.setattr("ghgs_lit.cli.rehearsal.rehearse", lambda configs: Rehearsal())
 
 
 def executed(sweep: Path) -> list[str]:

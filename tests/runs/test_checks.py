@@ -31,7 +31,7 @@ def test_a_frozen_encoder_without_weights_is_refused(verb, tmp_path):
         assert "ghgs import" in err
     assert not executed(tmp_path / "sweep")
     code, out, _ = verb("sweep=table4", f"hydra.sweep.dir={tmp_path / 'sweep'}", "dry_run=true")
-    assert code == 0
+    assert code == 1
     assert out.count("would be refused: init_from: expected") == 1
 
 

@@ -22,9 +22,15 @@ from tests.helpers.jobs import (
     hold_run,
     plan_seeds,
     record_execution,
+    rehearse_nothing,
     work_through,
 )
 from tests.helpers.processes import PREPARED
+
+
+@pytest.fixture(autouse=True)
+def plans_alone(monkeypatch):
+    rehearse_nothing(monkeypatch)
 
 
 @pytest.fixture

@@ -1,0 +1,137 @@
+"""What ``dry_run`` tries of the runs of a sweep: everything that they need, and the time of one step."""
+
+import json
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lightning.pytorch.callbacks import Callback
+
+from ghgs_lit.cli.inputs import build_data, build_renderer, check_size
+from ghgs_lit.cli.train import build_trainer, quiet
+from ghgs_lit.config import build
+from ghgs_lit.config.keys import WITHOUT_INFLUENCE, flatten, is_below, lookup
+from ghgs_lit.errors import InputError
+from ghgs_lit.evaluation.protocols import check_evaluation
+from ghgs_lit.model import GHGS
+from ghgs_lit.runs import job
+from ghgs_lit.runs.grid import Rehearsal
+from ghgs_lit.training import GHGSModule, start
+from ghgs_lit.types import Batch
+from ghgs_lit.weights.checkpoint import read_checkpoint
+
+if TYPE_CHECKING:
+    from ghgs_lit.data.datamodule import PhotographsDataModule
+
+_STEPS = 3  #: Steps that are taken for the time of the last one
+
+
+class _Clock(Callback):
+    """Seconds of the last step, waiting for its batch included."""
+
+    def __init__(self) -> None:
+        self.seconds, self._since = 0.0, 0.0
+
+    def on_train_batch_end(self, *_: Any) -> None:
+        now = time.perf_counter()
+        self.seconds, self._since = now - self._since, now
+
+
+class _Rehearsed:
+    """What one configuration needs; ``reasons``: why it would be refused, as keys in order of appearance."""
+
+    def __init__(self, config: Mapping[str, Any], reasons: dict[str, None], notes: dict[str, None]) -> None:
+        self.config, self.reasons, self.notes = dict(config), reasons, notes
+
+    def attempt(self, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+        """The result of a call; None where it refuses its input, which is noted."""
+        try:
+            return function(*arguments, **named)
+        except (InputError, OSError) as error:
+            self.reasons[" ".join(str(error).split())] = None
+            return None
+
+    def check(self, folder: Path) -> "PhotographsDataModule | None":
+        """Check everything but the step; the data, if it can be trained on. ``folder``: for files of
+        loggers."""
+        config = self.config
+        self.attempt(job.check_config, config)
+        model = self.attempt(GHGS.from_config, config, empty=True)
+        if model is not None and config["init_from"] is not None:
+            options = (config["init_from"], config["init_strict"], config["allow_random_encoder"])
+            self.attempt(start.initialize, model, *options)
+        if config["resume"] not in (None, "auto"):
+            self.attempt(read_checkpoint, config["resume"])
+        trainer = self.attempt(build_trainer, config, folder)
+        if trainer is not None:
+            self.attempt(build_renderer, config, trainer.strategy.root_device)
+        for group in ("loss", "optimizer"):
+            self.attempt(build, config[group], group)
+        metrics = self.attempt(build, config["metrics"], "metrics")
+        for name, reason in getattr(metrics, "left_out", {}).items():
+            self.notes[f"{name} will be left out: {reason}"] = None
+        data = self.attempt(build_data, config)
+        return data if data is not None and self._check_data(data, model) else None
+
+    def _check_data(self, data: "PhotographsDataModule", model: GHGS | None) -> bool:
+        if model is not None:
+            self.attempt(check_size, data, model)
+        split = self.config["evaluation"]["split"]
+        if hasattr(data.dataset, "render_first") and not _is_rendered(data, {"train", "val", split}):
+            self.notes[f"data={data.dataset.name}: people are rendered before the first step"] = None
+            return False
+        batch = self.attempt(data.training_batch, 0)
+        self.attempt(check_evaluation, self.config, data)
+        return batch is not None and self._check_bodies(batch)
+
+    def _check_bodies(self, batch: Batch) -> bool:
+        wants = bool(lookup(self.config, "loss.weights.chamfer"))
+        if wants and batch.body_vertices is None:
+            expected = "loss.weights.chamfer: expected 0 for data without body vertices"
+            self.reasons[f"{expected}; found {lookup(self.config, 'loss.weights.chamfer')}"] = None
+        return not wants or batch.body_vertices is not None
+
+    def step_seconds(self, data: "PhotographsDataModule", folder: Path) -> float | None:
+        """Seconds of a training step of one process, which reads its own photographs."""
+        config, clock = self.config, _Clock()
+        few = {"max_steps": _STEPS, "max_time": None, "limit_val_batches": 0, "devices": 1, "num_nodes": 1}
+        trainer = {**config["trainer"], **few, "strategy": "auto", "profiler": None}
+        quick = {**config, "trainer": trainer, "logger": {}, "callbacks": {}}
+        model = GHGS.from_config(config)
+        parts = (build(config[group], group) for group in ("renderer", "loss", "optimizer"))
+        module = GHGSModule(model, *parts, quick, config.get("token_budgets"))
+        self.attempt(build_trainer(quick, folder, clock).fit, module, data)
+        return clock.seconds or None
+
+
+def _is_rendered(data: "PhotographsDataModule", splits: Iterable[str]) -> bool:
+    try:
+        return all(bool(data.subjects(split)) for split in splits)
+    except (InputError, OSError):
+        return False
+
+
+def rehearse(configs: Sequence[Mapping[str, Any]]) -> Rehearsal:
+    """Try what the runs of ``configs`` need, each different need once, and time a step of the first run if
+    nothing is missing; nothing is rendered or written."""
+    reasons: dict[str, None] = {}
+    notes: dict[str, None] = {}
+    tried, seconds = set(), None
+    quiet()
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for config in configs:
+            flat = flatten({**config, "data": {**config["data"], "workers": 0}, "seed": 0})
+            needs = {k: v for k, v in flat.items() if not is_below(k, WITHOUT_INFLUENCE)}
+            key = json.dumps(needs, sort_keys=True, default=str)
+            if key in tried:
+                continue
+            run = _Rehearsed({**config, "data": {**config["data"], "workers": 0}}, reasons, notes)
+            data = run.check(Path(folder))
+            if not tried and data is not None and not reasons:
+                seconds = run.step_seconds(data, Path(folder))
+            tried.add(key)
+    return Rehearsal(list(reasons), list(notes), seconds)

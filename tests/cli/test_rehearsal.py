@@ -1,0 +1,108 @@
+"""A dry run says all that is missing at once, and how long a step takes."""
+
+import re
+import shutil
+import sys
+
+import pytest
+import torch
+
+from ghgs_lit.cli import rehearsal
+from ghgs_lit.config import compose, resolve
+from ghgs_lit.weights.checkpoint import write_checkpoint
+from tests.cli.test_main import call
+from tests.helpers.models import config
+from tests.helpers.people import render_boxes
+
+SMALL = ("data=scans", "data.size=42", "encoder.width=32", "encoder.heads=2", "trainer.max_steps=100")
+SMALL += ("evaluation.views=[4]", "loss=depth", "data.workers=1")
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("boxes")
+    render_boxes(folder / "rendered", folder / "scans", train=3, val=2)
+    return str(folder / "rendered")
+
+
+def rehearsed(*overrides):
+    return rehearsal.rehearse([resolve(compose("train", [*SMALL, *overrides]))])
+
+
+def test_all_that_is_missing_is_said_at_once(monkeypatch, tmp_path):
+    """Each was found by another run, hours after the plan was green."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setitem(sys.modules, "torchvision", None)
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    found = rehearsed(
+        "init_from=none.ckpt", "resume=gone.ckpt", f"data.root={tmp_path / 'none'}", "trainer=gpu",
+        "encoder.layers=[1,2,3]", "metrics.lpips=require", "logger=wandb",
+    )  # fmt: skip
+    expected = [
+        r"encoder\.layers: expected 4 layers, which the dense heads fuse; found \[1, 2, 3\]",
+        r"gone\.ckpt: expected",
+        r"ghgs-lit\[wandb\]",
+        r"ghgs-lit\[lpips\]",
+        r"none: expected the folder of the data set; found no such folder",
+    ]
+    for text in expected:
+        assert any(re.search(text, reason) for reason in found.reasons), (text, found.reasons)
+    assert found.step is None
+
+
+@pytest.mark.parametrize(
+    ("overrides", "expected"),
+    [
+        (["trainer=gpu"], r"trainer: .*gpu"),
+        (["init_from=none.ckpt"], r"none\.ckpt: expected"),
+        (["init_from=other.ckpt"], r"init_from: expected weights that fit the model; found none in other"),
+        (
+            ["loss=paper", "data.root=bare"],
+            r"loss\.weights\.chamfer: expected 0 for data without body vertices; found 1\.0",
+        ),
+        (["encoder.trainable=none"], r"init_from: expected a checkpoint with the encoder's weights"),
+        (["evaluation.split=bench"], r"evaluation\.split: expected one of train, val; found 'bench'"),
+        (["data.size=43"], r"data\.size: expected sides divisible by the patch size 14"),
+    ],
+)
+def test_one_thing_that_is_missing_is_the_one_that_is_said(
+    monkeypatch, tmp_path, rendered, overrides, expected
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    shutil.copytree(rendered, "bare", ignore=shutil.ignore_patterns("bodies", "smpl*"))
+    write_checkpoint("other.ckpt", {"encoder.nothing": torch.ones(2)}, config())
+    found = rehearsed(f"data.root={rendered}", *overrides)
+    assert len(found.reasons) == 1
+    assert re.search(expected, found.reasons[0]), found.reasons
+    assert found.step is None
+
+
+def test_a_step_is_timed_where_nothing_is_missing(monkeypatch, capsys, tmp_path, rendered):
+    """Without a finished run the expected time was unknown; nothing is written."""
+    monkeypatch.chdir(tmp_path)
+    command = ["-m", *SMALL, f"data.root={rendered}", "seed=1,2", "dry_run=true", "hydra.sweep.dir=sweep"]
+    code, out, err = call(monkeypatch, capsys, "train", *command)
+    assert (code, err) == (0, "")
+    assert "would be refused" not in out
+    assert re.search(r"one after another: \d+:\d\d:\d\d \([\d.e-]+ s a step, tried with the first run\)", out)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_a_sweep_lacks_ends_its_dry_run_with_an_error(monkeypatch, capsys, tmp_path):
+    """A plan that was green started jobs that failed; each reason is said once."""
+    command = ["-m", *SMALL, f"data.root={tmp_path / 'none'}", "seed=1,2", "ablation=full,neither"]
+    command += ["dry_run=true", "encoder.layers=[1,2,3]", f"hydra.sweep.dir={tmp_path / 'sweep'}"]
+    code, out, err = call(monkeypatch, capsys, "train", *command)
+    assert code == 1
+    assert out.count("would be refused: ") == 2
+    assert "dry_run: expected runs that lack nothing; found '2 reasons why they would be refused'" in err
+    assert not list(tmp_path.iterdir())
+
+
+def test_people_that_are_not_rendered_are_not_rendered_by_a_plan(tmp_path):
+    """They take minutes."""
+    found = rehearsal.rehearse([resolve(compose("train", [f"data.cache_dir={tmp_path}", "loss=depth"]))])
+    assert (found.reasons, found.step) == ([], None)
+    assert any("people are rendered before the first step" in note for note in found.notes)
+    assert not list(tmp_path.iterdir())
