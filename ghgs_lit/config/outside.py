@@ -10,13 +10,14 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra._internal.core_plugins import file_config_source
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.plugins.config_source import ConfigResult
 from omegaconf import OmegaConf
 
 from ghgs_lit.config.compose import conf_dir
-from ghgs_lit.config.keys import flatten, is_below
+from ghgs_lit.config.keys import flatten, is_below, require_plain
 from ghgs_lit.errors import InputError
 
 #: Of launchers: names and numbers for the queue and the processes, no commands.
@@ -50,9 +51,13 @@ class FileConfigSource(file_config_source.FileConfigSource):
     # Hydra's registry takes a class of this name for its own, and then does not replace it.
 
     def load_config(self, config_path: str) -> ConfigResult:
+        file = Path(self.path, self._normalize_file_name(config_path))
+        is_outside = Path(self.path) != conf_dir()
+        if is_outside and file.is_file():
+            with file.open(encoding="utf-8") as stream:  # references are not written out yet
+                require_plain(yaml.load(stream, yaml.BaseLoader), str(file))
         result = super().load_config(config_path)
-        if Path(self.path) != conf_dir() and OmegaConf.is_dict(result.config):
-            file = Path(self.path) / f"{config_path.removesuffix('.yaml')}.yaml"
+        if is_outside and OmegaConf.is_dict(result.config):
             package = result.header.get("package") or ""
             check_file(file, config_path, package, OmegaConf.to_container(result.config))
         return result

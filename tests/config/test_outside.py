@@ -129,3 +129,27 @@ def test_a_searched_folder_is_a_file_from_outside_too(monkeypatch, capsys, tmp_p
     code, _, err = call(monkeypatch, capsys, "train", *flags, "experiment=x")
     assert code == 1
     assert message in err
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "a: &a {b: *a}",
+            "x.yaml, line 2: expected YAML of plain data; found found unconstructable recursive",
+        ),
+        (
+            "a0: &a0 [1]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 30)),
+            "expected less than 32 levels and 100000 values, no loops; found 'more'",
+        ),
+    ],
+)
+def test_a_file_without_end_is_refused(monkeypatch, capsys, tmp_path, text, message):
+    """References of YAML to themselves, and some hundred bytes that are a billion values."""
+    flags = written(tmp_path, {"experiment/x": GLOBAL + text})
+    code, _, err = call(
+        monkeypatch, capsys, "train", *flags, "experiment=x", f"hydra.run.dir={tmp_path / 'r'}"
+    )
+    assert code == 1
+    assert message in err
+    assert err.count("\n") == 1
