@@ -13,7 +13,8 @@ from lightning.pytorch import LightningDataModule
 from torch import Tensor, nn
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.metrics import ImageMetrics, depth_error_mm
+from ghgs_lit.geometry.unprojection import seen_surfaces
+from ghgs_lit.metrics import ImageMetrics, depth_error_mm, surface_error_mm
 from ghgs_lit.prediction.refinement import CameraRefinement, Refinement
 from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
@@ -26,14 +27,14 @@ Renderer = Callable[[Gaussians, Cameras], Rendering]
 @dataclass(frozen=True)
 class Estimate:
     """Prediction of a method for a batch; None: not predicted. ``image``: renders [B, T, 3, h, w] of the
-    targets. ``depth``: of the inputs [B, V, H, W], metres, defined where ``depth_valid``. For each element:
-    number of ``gaussians``; of Gaussians and subject depths that are ``not_finite``; ``decisions`` of
-    ``skip=auto``."""
+    targets. ``depth``: of the inputs [B, V, H, W], metres, defined where ``depth_valid``. ``gaussians``: what
+    was drawn. For each element: number of Gaussians and subject depths that are ``not_finite``; ``decisions``
+    of ``skip=auto``."""
 
     image: Tensor
     depth: Tensor | None = None
     depth_valid: Tensor | None = None
-    gaussians: tuple[int, ...] | None = None
+    gaussians: Gaussians | None = None
     not_finite: tuple[int, ...] | None = None
     decisions: tuple[Decision, ...] = ()
 
@@ -59,8 +60,8 @@ class ModelMethod:
         if self.refinement is not None:
             gaussians, depth = self.refinement(gaussians, batch), None
         image, valid = self.renderer(gaussians, batch.targets.cameras).image, prediction.depth_valid
-        counts = prediction.gaussians.splits, not_finite(batch, prediction)
-        return Estimate(image, depth, valid, *counts, prediction.decisions)
+        lost = not_finite(batch, prediction)
+        return Estimate(image, depth, valid, gaussians, lost, prediction.decisions)
 
 
 def not_finite(batch: Batch, prediction: Prediction) -> tuple[int, ...]:
@@ -82,6 +83,14 @@ def _depth_error(batch: Batch, estimate: Estimate, element: int) -> float | None
     return depth_error_mm(estimate.depth[element], batch.depths[element], valid).item()
 
 
+def _surface_error(batch: Batch, estimate: Estimate, element: int) -> float | None:
+    """Error of the drawn Gaussians against the true surface that the inputs show."""
+    if batch.depths is None or estimate.gaussians is None:
+        return None
+    splats = estimate.gaussians[element]
+    return surface_error_mm(splats.means, splats.opacities, seen_surfaces(batch)[element]).item()
+
+
 def _rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[Row]:
     targets, (b, t) = batch.targets, batch.targets.images.shape[:2]
     flat = metrics(estimate.image.flatten(0, 1), targets.images.flatten(0, 1), targets.masks.flatten(0, 1))
@@ -92,7 +101,8 @@ def _rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[Row]:
         about["inputs"] = list(batch.views[element]) if batch.views else []
         shared = {"depth_error_mm": _depth_error(batch, estimate, element)}
         if estimate.gaussians is not None:
-            shared["gaussians"] = estimate.gaussians[element]
+            shared["surface_mm"] = _surface_error(batch, estimate, element)
+            shared["gaussians"] = estimate.gaussians.splits[element]
         if estimate.not_finite is not None and estimate.not_finite[element]:
             shared["not_finite"] = estimate.not_finite[element]
         if estimate.decisions:

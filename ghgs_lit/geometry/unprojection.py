@@ -74,3 +74,10 @@ def subject_tokens(
     )
     means = sums / torch.where(any_valid, count, 1)[:, :, None]
     return means[:, :, 1:].permute(0, 1, 3, 4, 2), means[:, :, 0], any_valid
+
+
+def seen_surfaces(batch: Batch) -> list[Float[Tensor, "_ 3"]]:
+    """Points of the true surface of each element in the world, in metres: one for each of the subject's input
+    pixels whose depth is known (``batch.depths``, which must be there)."""
+    points, known = unproject_maps(batch.depths, batch.cameras), batch.masks & (batch.depths > 0)
+    return [own[seen] for own, seen in zip(points, known, strict=True)]

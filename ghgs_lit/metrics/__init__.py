@@ -1,7 +1,16 @@
 """Metrics: pure functions, and protocols that name what is reported."""
 
 from ghgs_lit.metrics.flip import flip_map
-from ghgs_lit.metrics.functional import PSNR_CAP, depth_error_mm, psnr, ssim
+from ghgs_lit.metrics.functional import PSNR_CAP, depth_error_mm, psnr, ssim, surface_error_mm
 from ghgs_lit.metrics.protocol import ImageMetrics, MetricsOptions
 
-__all__ = ["PSNR_CAP", "ImageMetrics", "MetricsOptions", "depth_error_mm", "flip_map", "psnr", "ssim"]
+__all__ = [
+    "PSNR_CAP",
+    "ImageMetrics",
+    "MetricsOptions",
+    "depth_error_mm",
+    "flip_map",
+    "psnr",
+    "ssim",
+    "surface_error_mm",
+]

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.errors import choice, require
+from ghgs_lit.geometry.chamfer import nearest
 from ghgs_lit.geometry.masks import between, first_and_last
 from ghgs_lit.geometry.projection import at_least_float32, project, sample
 from ghgs_lit.kernels.precision import exact
@@ -204,6 +205,32 @@ def depth_error_mm(
     region = region & (truth > 0)
     require(depth.shape == truth.shape, "depth", f"shape {tuple(truth.shape)}", tuple(depth.shape))
     return 1000 * (at_least_float32(depth)[region] - at_least_float32(truth)[region]).abs().mean()
+
+
+#: Opacity from which on a Gaussian stands for the surface.
+_OPAQUE = 0.5
+
+
+def surface_error_mm(
+    means: Float[Tensor, "n 3"], opacities: Float[Tensor, " n"], surface: Float[Tensor, "m 3"]
+) -> Float[Tensor, ""]:
+    """Distance in millimetres of Gaussians to the surface, weighted by opacity, and of the surface to the
+    nearest Gaussian of opacity 0.5 or more; the mean of both. It sees where Gaussians end, after all offsets,
+    where :func:`depth_error_mm` ends before them; points of the surface are about a pixel apart, and so is
+    the least value. nan without Gaussians or surface; infinite without opaque ones. ``means``, ``surface``:
+    in metres."""
+    finite = means.isfinite().all(1) & opacities.isfinite()
+    means, opacities = at_least_float32(means[finite]), at_least_float32(opacities[finite])
+    surface = at_least_float32(surface)
+    if len(means) == 0 or len(surface) == 0 or not bool(opacities.sum() > 0):
+        return surface.new_tensor(torch.nan)
+    there = (means - surface[nearest(means, surface)]).norm(dim=1)
+    there = (there * opacities).sum() / opacities.sum()
+    opaque = means[opacities >= _OPAQUE]
+    if len(opaque) == 0:
+        return surface.new_tensor(torch.inf)
+    back = (surface - opaque[nearest(surface, opaque)]).norm(dim=1).mean()
+    return 500 * (there + back)
 
 
 #: Largest distance in metres of a visible point from the depth map.

@@ -11,8 +11,9 @@ from torch import Tensor, nn
 
 from ghgs_lit.config import build
 from ghgs_lit.errors import require
+from ghgs_lit.geometry.unprojection import seen_surfaces
 from ghgs_lit.losses import Losses
-from ghgs_lit.metrics import depth_error_mm
+from ghgs_lit.metrics import depth_error_mm, surface_error_mm
 from ghgs_lit.metrics.functional import box_of, psnr, ssim
 from ghgs_lit.model import GHGS
 from ghgs_lit.skipping import View, seeing
@@ -44,6 +45,14 @@ def token_budget(model: GHGS, budget: str | int | None) -> AbstractContextManage
 def _depth_error(batch: Batch, maps: DepthMaps) -> Tensor:
     valid = batch.masks & maps.valid
     return depth_error_mm(maps.depth.flatten(0, 1), batch.depths.flatten(0, 1), valid.flatten(0, 1))
+
+
+def _surface_error(batch: Batch, gaussians: Gaussians) -> Tensor:
+    errors = []
+    for element, surface in enumerate(seen_surfaces(batch)):
+        own = gaussians[element]
+        errors.append(surface_error_mm(own.means, own.opacities, surface))
+    return torch.stack(errors).nanmean()
 
 
 class GHGSModule(BudgetedModule):
@@ -139,6 +148,7 @@ class GHGSModule(BudgetedModule):
             means["val/lpips"] = self.lpips(image, target).mean()
         if batch.depths is not None:
             means["val/depth_error_mm"] = _depth_error(batch, prediction.depth_maps)
+            means["val/surface_mm"] = _surface_error(batch, prediction.gaussians)
         self.log_dict(means, on_epoch=True, batch_size=size, sync_dist=self.trainer.world_size > 1)
         return {"prediction": prediction, "rendering": rendering}
 

@@ -31,6 +31,7 @@ def test_rows_say_what_they_are_about_and_hold_the_metrics(tmp_path):
     # the stand-in says 2.5 m, the truth is 2.1 m
     assert rows[0]["depth_error_mm"] == pytest.approx(400, abs=1e-2)
     assert rows[0]["gaussians"] == 144
+    assert rows[0]["surface_mm"] > 100
     assert [p.name for p in tmp_path.iterdir()] == ["model_v3_midway_p0.png"]
 
 

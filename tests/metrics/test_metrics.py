@@ -17,7 +17,7 @@ from torchmetrics.functional.image import (
 )
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.metrics import PSNR_CAP, MetricsOptions, depth_error_mm, flip_map, psnr, ssim
+from ghgs_lit.metrics import PSNR_CAP, MetricsOptions, depth_error_mm, flip_map, psnr, ssim, surface_error_mm
 from ghgs_lit.metrics.functional import box_of, crop_of, region_of, sharpness, spill, ssim_map
 from ghgs_lit.training.base import image_mean
 
@@ -382,3 +382,27 @@ def test_light_beside_the_subject_and_sharpness_inside_it():
     band = region_of(mask, "edge")
     assert band.sum().item() == 24 * 24 - 16 * 16
     assert not band[:, 12:28, 12:28].any()
+
+
+def test_the_surface_error_sees_where_gaussians_end():
+    """A plane of points: Gaussians 10 mm above it, a transparent one far away, a hole that nothing covers."""
+    grid = torch.stack(torch.meshgrid(torch.arange(20.0), torch.arange(20.0), indexing="ij"), -1).flatten(
+        0, 1
+    )
+    surface = torch.cat((grid / 100, torch.zeros(400, 1)), 1)
+    above = surface + torch.tensor([0.0, 0.0, 0.01])
+    opaque = torch.ones(400)
+    assert surface_error_mm(above, opaque, surface).item() == pytest.approx(10, rel=1e-5)
+    far = torch.cat((above, torch.tensor([[0.0, 0.0, 5.0]])))
+    there = (400 * 10 + 0.01 * 5000) / 400.01
+    found = surface_error_mm(far, torch.cat((opaque, torch.tensor([0.01]))), surface).item()
+    assert found == pytest.approx((there + 10) / 2, rel=1e-5)
+    half = grid[:, 0] < 10
+    back = (10 * 200 + sum((10**2 + (10 * k) ** 2) ** 0.5 * 20 for k in range(1, 11))) / 400
+    found = surface_error_mm(above[half], opaque[half], surface).item()
+    assert found == pytest.approx((10 + back) / 2, rel=1e-5)
+    assert surface_error_mm(above, 0.2 * opaque, surface).item() == torch.inf
+    assert surface_error_mm(above[:0], opaque[:0], surface).isnan()
+    assert surface_error_mm(above, 0 * opaque, surface).isnan()
+    broken = torch.cat((above, torch.full((1, 3), torch.nan)))
+    assert surface_error_mm(broken, torch.ones(401), surface).item() == pytest.approx(10, rel=1e-5)

@@ -139,7 +139,7 @@ def splatted(batch: Batch, depth_of: Callable[[Batch], Tensor], renderer: Render
     valid = batch.masks & (depth > 0)
     gaussians = discs_at(batch, depth, valid)
     image = renderer(gaussians, batch.targets.cameras).image
-    return Estimate(image, depth, valid, gaussians.splits)
+    return Estimate(image, depth, valid, gaussians)
 
 
 #: Limits and rates of the fitted attributes, tuned for novel views on four people with 3 to 5 views. A limit
@@ -177,4 +177,4 @@ class PerScene:
     def __call__(self, batch: Batch) -> Estimate:
         gaussians = self.fitting(self.begin(batch), batch)
         image = self.renderer(gaussians, batch.targets.cameras).image
-        return Estimate(image, gaussians=gaussians.splits)
+        return Estimate(image, gaussians=gaussians)

@@ -13,12 +13,15 @@ from ghgs_lit.config.nodes import PairedTest
 from ghgs_lit.evaluation.tables.records import Planned, Variant
 from ghgs_lit.readers import read_yaml
 
-DECIMALS = {"psnr": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1, "gaussians": 0}
-DECIMALS |= {"spill": 1, "sharpness": 2, "prediction_seconds": 3, "steps": 0, "seconds": 0, "peak_gb": 1}
+DECIMALS = {"psnr": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1, "surface_mm": 1}
+DECIMALS |= {"gaussians": 0, "spill": 1, "sharpness": 2}
+DECIMALS |= {"prediction_seconds": 3, "steps": 0, "seconds": 0, "peak_gb": 1}
 HIGHER_IS_BETTER = ("psnr", "ssim")
-LOWER_IS_BETTER = ("lpips", "flip", "spill", "depth_error_mm", "prediction_seconds", "seconds", "peak_gb")
+LOWER_IS_BETTER = ("lpips", "flip", "spill", "depth_error_mm", "surface_mm")
+LOWER_IS_BETTER += ("prediction_seconds", "seconds", "peak_gb")
 TITLES = {
     "depth_error_mm": "Depth error (mm)",
+    "surface_mm": "Surface error (mm)",
     "gaussians": "Gaussians",
     "spill": "Spill (‰)",
     "sharpness": "Sharpness",

@@ -19,7 +19,7 @@ the rotation (w, x, y, z), of which 128 is zero."""
 
 
 def converted(name: str, gaussians: Gaussians) -> bytes:
-    """The content of a file in format ``name`` of ``CONVERTED``. InputError: it cannot be, such as of none."""
+    """The content of a file in format ``name`` of ``CONVERTED``. InputError: it cannot be, as of none."""
     from gaussforge import GaussForge
 
     answer = GaussForge().convert(ply_bytes(gaussians), "ply", CONVERTED[name])

@@ -114,7 +114,7 @@ def test_black_and_untrained():
     assert named("black", nothing)(batch).image.abs().max() == 0
     estimate = named("untrained", flat_renderer)(batch)
     assert estimate.image.shape == batch.targets.images.shape
-    assert estimate.gaussians == (144, 144)
+    assert estimate.gaussians.splits == (144, 144)
 
 
 @pytest.mark.parametrize(("name", "field"), [("body_depth", "body_vertices"), ("true_depth", "depths")])

@@ -28,7 +28,7 @@ def test_the_photographs_are_fitted():
     fitted = method(batch)
     before, after = (psnr(i[0].clamp(0, 1), batch.targets.images[0]).item() for i in (begin, fitted.image))
     assert after > before + 8
-    assert fitted.gaussians == (int(batch.masks.sum()),)
+    assert fitted.gaussians.splits == (int(batch.masks.sum()),)
 
 
 def test_every_gaussian_begins_on_its_pixel_and_may_become_another():
