@@ -54,6 +54,7 @@ NOT_RUN = [
     (r"python benchmarks/(protocols|attention_on_parts|semantic_consistency)", "renders many people"),
     (r"ghgs evaluate .*per_scene", "fits Gaussians to each person, for minutes"),
     (r"ghgs stress$", "takes a quarter of an hour"),
+    (r"python scripts/drill\.py", "trains twelve runs, killed ten times"),
     (r"python benchmarks/half_precision", "takes an hour"),
     (r"SMPL_MODEL=…", "needs the licensed body model and both data sets"),
     (r"python benchmarks/(weights|attention)\.py", "measures models of the published size"),

@@ -23,7 +23,7 @@ from ghgs_lit.config.outside import check_outside_files
 from ghgs_lit.config.registry import check
 from ghgs_lit.files import require_no_links, write_text_atomically
 from ghgs_lit.kernels.allocation import collect_garbage_again
-from ghgs_lit.kernels.cores import children_sleep, use_known_start_method
+from ghgs_lit.kernels.cores import children_sleep
 from ghgs_lit.runs.job import register_resolvers
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.runs.signals import Interrupted, interruptible
@@ -68,7 +68,6 @@ class Verb:
     def __call__(self, cfg: DictConfig) -> object:
         # Lightning runs sys.argv again for the other processes of a DDP job; it must contain the verb.
         sys.argv = list(self.argv)
-        use_known_start_method()
         from ghgs_lit.cli.photographs import require_paths  # here: --help needs no NumPy
 
         try:

@@ -23,6 +23,7 @@ from ghgs_lit.data.silhouettes import SEARCH, height, implausible, silhouette, t
 from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.silhouettes import Silhouette
+from ghgs_lit.kernels.cores import use_known_start_method
 
 _LINE = re.compile(r"(?P<place>.*?): expected (?P<expected>.*); found (?P<found>.*)", re.DOTALL)
 # Rows of a table on the terminal; check.json has all.
@@ -183,6 +184,7 @@ def _read(
     if not listed:
         return []
     items = _Readings(photographs, listed, _pictured(reader), min_iou)
+    use_known_start_method()
     loader = DataLoader(items, batch_size=None, num_workers=min(workers, len(items)))
     return list(track(loader, label, total=len(items), console=Console(stderr=True)))
 

@@ -23,6 +23,7 @@ from ghgs_lit.data.sampling import (
     evaluation_samples,
 )
 from ghgs_lit.errors import InputError, choice
+from ghgs_lit.kernels.cores import use_known_start_method
 from ghgs_lit.types import Batch
 
 if TYPE_CHECKING:  # its options build this class
@@ -171,6 +172,7 @@ class PhotographsDataModule(LightningDataModule):
         return targets
 
     def _loader(self, batches: TorchDataset, **options: Any) -> DataLoader:
+        use_known_start_method()
         with warnings.catch_warnings():
             # Each loader would warn of more workers than cores, which were asked for.
             warnings.filterwarnings("ignore", "This DataLoader will create")

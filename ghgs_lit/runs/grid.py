@@ -27,7 +27,7 @@ from ghgs_lit.runs.job import BUSY, check_config, check_launcher
 from ghgs_lit.runs.processes import queue_again
 from ghgs_lit.runs.progress import clock
 from ghgs_lit.runs.provenance import config_hash
-from ghgs_lit.runs.run import SWEPT, RunDirectory, State
+from ghgs_lit.runs.run import PLAN, SWEPT, RunDirectory, State
 from ghgs_lit.runs.signals import Interrupted, interruptible, print_how_to_go_on
 
 OUTPUTS = "config.yaml, checkpoints/, metrics.json, metrics.csv, sessions.jsonl, pictures and logs"
@@ -179,7 +179,7 @@ def _sweep(
 ) -> list[Sequence[JobReturn]]:
     config, loader = sweeper.config, sweeper.hydra_context.config_loader
     combos = combinations(sweeper.params, arguments, loader)
-    planned = plan(combos, lambda overrides: loader.load_sweep_config(config, overrides))
+    planned = plan(combos, lambda overrides: loader.load_sweep_config(config, overrides), directory)
     if len(planned) < len(combos):
         print(f"{len(combos)} combinations, {len(planned)} different configurations", flush=True)
     for item in planned:  # an impossible launcher is refused before anything starts
@@ -212,24 +212,26 @@ def combinations(
     return batch
 
 
-def plan(combos: Sequence[Sequence[str]], compose: Callable[[list[str]], DictConfig]) -> list[PlannedRun]:
-    """Distinct runs of the jobs, in order; ``compose`` makes the configuration of a job's overrides.
-    InputError: a configuration is bad or lacks a value."""
+def plan(
+    combos: Sequence[Sequence[str]], compose: Callable[[list[str]], DictConfig], directory: Path
+) -> list[PlannedRun]:
+    """Distinct runs of the jobs in the sweep's directory, in order; ``compose`` makes the configuration of a
+    job's overrides. InputError: a configuration is bad or lacks a value."""
     planned: dict[str, PlannedRun] = {}
     for overrides in combos:
         cfg = compose(list(overrides))
         check_ablation(cfg, cfg.hydra)
         with open_dict(cfg):
             cfg.hydra.job.num = len(planned)
-            sweep, verb = cfg.hydra.sweep, cfg.hydra.job.name
-            directory, subdirectory = str(sweep.dir), str(sweep.subdir)
+            subdirectory, verb = str(cfg.hydra.sweep.subdir), cfg.hydra.job.name
             del cfg["hydra"]
         config = resolve(cfg, verb if verb in VERBS else None)
         name, shown = config_hash(config), tuple(filter_overrides(overrides))
         # The job writes to the planned directory, whatever number a launcher gives it.
-        fixed = (*overrides, f"hydra.sweep.subdir={_quoted(subdirectory)}")
-        run = RunDirectory(Path(directory, subdirectory), name)
-        planned.setdefault(name, PlannedRun(name, fixed, shown, config, run))
+        places = {"dir": str(directory), "subdir": subdirectory}
+        fixed = (f"hydra.sweep.{key}={_quoted(place)}" for key, place in places.items())
+        run = RunDirectory(directory / subdirectory, name)
+        planned.setdefault(name, PlannedRun(name, (*overrides, *fixed), shown, config, run))
     return list(planned.values())
 
 
@@ -263,7 +265,7 @@ def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Pat
             if item.run.title in titles:  # of a grid with other settings in the same folder
                 write_text_atomically(item.run.path / SWEPT, json.dumps([*swept, f"run={item.name}"]))
             titles.add(item.run.title)
-    write_text_atomically(directory / "multirun.yaml", OmegaConf.to_yaml(config))
+    write_text_atomically(directory / PLAN, OmegaConf.to_yaml(config))
 
 
 def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = None) -> list[JobReturn]:

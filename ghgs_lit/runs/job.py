@@ -12,12 +12,14 @@ from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.config.keys import lookup
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.runs.processes import process_count
+from ghgs_lit.readers import read_yaml
+from ghgs_lit.runs.processes import is_queued_again, process_count
 from ghgs_lit.runs.provenance import config_hash
-from ghgs_lit.runs.run import AUTO, RunDirectory
+from ghgs_lit.runs.run import AUTO, MARKER, PLAN, RunDirectory, begun_by_job
 
 BUSY = "busy"  #: Return value of a job whose run another process works on
 _PATIENCE = 300.0  # seconds in which the first of several processes begins
+_TASK = "hydra.overrides.task"  # key of the overrides of a sweep's command
 SWEEPER = "hydra_plugins.ghgs_lit_sweeper.GridSweeper"
 
 Train = Callable[[dict[str, Any], Path, dict[str, Any]], float | None]
@@ -36,11 +38,26 @@ def _waits() -> bool:
 
 def register_resolvers() -> None:
     """Register resolvers of configurations: ``${config_hash:}``, the name of a run's directory;
+    ``${run_of_job:name}``, the name of a directory that a job of SLURM goes on in, else ``name``;
     ``${sqlite:path}``, a database's URL; ``${folder:first,second}``, the second if the first is null."""
 
     def hash_of_run(*, _root_: DictConfig) -> str:
         keys = [key for key in _root_ if key != "hydra"]
         return config_hash(OmegaConf.to_container(OmegaConf.masked_copy(_root_, keys), resolve=True))
+
+    def run_of_job(name: str, *, _root_: DictConfig) -> str:
+        if not is_queued_again():
+            return name
+        runs = Path("runs", _root_.hydra.job.name)
+        if name.startswith("sweep_"):
+            command = list(_root_.hydra.overrides.task)
+            sweeps = {run.path.parent for run in begun_by_job(runs, f"sweep_*/*/{MARKER}")}
+            found = [sweep for sweep in sweeps if lookup(read_yaml(sweep / PLAN), _TASK) == command]
+        else:
+            own = hash_of_run(_root_=_root_)
+            begun = begun_by_job(runs, f"*/{MARKER}")
+            found = [run.path for run in begun if run.marker.config_hash == own]
+        return max((path.name for path in found), default=name)
 
     def sqlite(path: str) -> str:
         place = Path(path).resolve()
@@ -52,7 +69,8 @@ def register_resolvers() -> None:
 
     is_old = omegaconf.__version__.startswith("2.3")
     register = OmegaConf.register_new_resolver if is_old else OmegaConf.register_resolver
-    for name, resolver in (("folder", folder), ("config_hash", hash_of_run), ("sqlite", sqlite)):
+    resolvers = {"folder": folder, "config_hash": hash_of_run, "sqlite": sqlite, "run_of_job": run_of_job}
+    for name, resolver in resolvers.items():
         register(name, resolver, replace=True)
 
 

@@ -42,6 +42,7 @@ WRITTEN = (
     "tensorboard",
 )
 SESSIONS = "sessions.jsonl"
+PLAN = "multirun.yaml"  #: Configuration of a sweep's last command, beside its runs
 
 
 class Identity(BaseModel):
@@ -138,6 +139,16 @@ class RunDirectory:
         return ",".join(self.swept).replace(os.sep, "_")[-200:]
 
     @property
+    def curves(self) -> Path:
+        """Folder of TensorBoard's files, by which TensorBoard names the run: for a run of a grid beside the
+        runs, called :attr:`title`. ``.run`` in it says whose it is."""
+        if not (self.title and (self.path.parent / PLAN).is_file()):
+            return self.path / "tensorboard"
+        folder, marker = self.path.parent / "tensorboard" / self.title, self.marker
+        is_free = marker is None or _owner_of(folder) in (None, marker.id)
+        return folder if is_free else folder.with_name(f"{self.title},run={marker.id}")
+
+    @property
     def owner(self) -> str:
         """Process that worked on the run last, for messages."""
         return lock_owner(self._lock)
@@ -227,14 +238,19 @@ class RunDirectory:
             job=slurm_job(),
         )
         write_text_atomically(self.path / MARKER, identity.model_dump_json(indent=1) + "\n")
+        if self.curves.parent != self.path:
+            write_text_atomically(self.curves / ".run", identity.id)
         return {**config, "resume": start}
 
     def _clear(self, with_sessions: bool) -> None:
         """Delete what training wrote; only in a run's folder that this process has claimed."""
-        there = self._there(*WRITTEN, SESSIONS) if with_sessions else self._there(*WRITTEN)
-        if there and not (self._is_mine and self.marker is not None):
+        names = self._there(*WRITTEN, SESSIONS) if with_sessions else self._there(*WRITTEN)
+        paths, marker = [self.path / name for name in names], self.marker
+        if marker is not None and _owner_of(self.curves) == marker.id:
+            paths.append(self.curves)
+        if paths and not (self._is_mine and marker is not None):
             raise RuntimeError(f"{self.path}: files are deleted in a run that this process has claimed only")
-        for path in (self.path / name for name in there):
+        for path in paths:
             is_folder = path.is_dir() and not path.is_symlink()
             shutil.rmtree(path) if is_folder else path.unlink()
 
@@ -297,6 +313,17 @@ class RunDirectory:
 
 def _now() -> str:
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
+
+
+def _owner_of(curves: Path) -> str | None:
+    path = curves / ".run"
+    return path.read_text() if path.is_file() else None
+
+
+def begun_by_job(folder: Path, pattern: str) -> list[RunDirectory]:
+    """Runs with ``run.json`` at ``pattern`` below ``folder`` that the present job of SLURM has worked on."""
+    runs = [RunDirectory(path.parent) for path in folder.glob(pattern)]
+    return [run for run in runs if slurm_job() is not None and run.marker.job == slurm_job()]
 
 
 def _given(resume: str | None) -> str | None:

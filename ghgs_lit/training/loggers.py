@@ -110,10 +110,7 @@ class TensorBoardOptions(Options):
     apart>``, since TensorBoard names runs by their folders."""
 
     def build(self, save_dir: str) -> TensorBoardLog:
-        run = RunDirectory(Path(save_dir))
-        if not run.title:
-            return TensorBoardLog(save_dir, name="tensorboard", version="")
-        return TensorBoardLog(run.path.parent, name="tensorboard", version=run.title)
+        return TensorBoardLog(RunDirectory(Path(save_dir)).curves, name="", version="")
 
 
 class WandbLog(WandbLogger):

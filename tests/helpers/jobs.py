@@ -3,6 +3,7 @@
 import os
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import hydra
@@ -46,8 +47,19 @@ def executed(sweep: Path) -> list[str]:
 
 
 def job(cfg) -> float | str | None:
-    """The job of a launcher: the verb without its training, and without the checks that import PyTorch."""
-    return train_once(RunDirectory(output_dir()), own_keys(cfg, None), record_execution)
+    """The job of a launcher: the verb without its training, and without the checks that import PyTorch. With
+    ``data.workers`` it loads data, as training does."""
+    return train_once(RunDirectory(output_dir()), own_keys(cfg, None), load_and_record)
+
+
+def load_and_record(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float:
+    """:func:`record_execution` after two batches."""
+    if workers := config["data"]["workers"]:
+        from ghgs_lit.data.datamodule import PhotographsDataModule
+
+        data = SimpleNamespace(dataset=SimpleNamespace(workers=workers))
+        assert list(PhotographsDataModule._loader(data, [1, 2])) == [1, 2]
+    return record_execution(config, directory, stats)
 
 
 def hydra_app(monkeypatch, *overrides: str) -> None:

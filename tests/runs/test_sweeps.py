@@ -1,5 +1,6 @@
 """Sweeps run everything once: when they grow, are interrupted, or are shared by processes."""
 
+import contextlib
 import json
 import os
 import signal
@@ -59,6 +60,36 @@ def test_a_grid_that_grows_runs_what_is_missing(sweep):
     for name in names:
         source = read_results(sweep.directory / name / "metrics.json")["provenance"]
         assert name == source["config_hash"] == config_hash(source["config"])
+
+
+def test_directories_of_a_users_own_hold_one_configuration_each(sweep):
+    """A grid in directories that are numbered was "done before" and never trained, for numbers begin anew."""
+    numbered = "hydra.sweep.subdir=${hydra.job.num}"
+    code, out, _ = sweep(numbered, "seed=1,2")
+    assert (code, executed(sweep.directory)) == (0, ["0", "1"])
+    code, out, err = sweep(numbered, "seed=2")
+    assert (code, len(err.splitlines())) == (1, 1)
+    assert f"{sweep.directory / '0'}: expected a directory without a run; found metrics.csv of another" in err
+    code, out, _ = sweep(numbered, "seed=1,2")
+    assert "2 runs: 2 done before" in out
+    assert executed(sweep.directory) == ["0", "1"]
+
+
+def test_two_runs_in_one_directory_are_refused_before_any_is_trained(sweep):
+    for dry in ("dry_run=true", "dry_run=false"):
+        code, _, err = sweep("hydra.sweep.subdir=same", "seed=1,2", dry)
+        assert code == 1
+        assert "hydra.sweep.subdir: expected a directory for each configuration; found" in err
+    assert not sweep.directory.exists()
+
+
+def test_directories_may_say_what_sets_them_apart(sweep):
+    """Hydra's own idiom, whose names need quotes."""
+    grid = ("hydra.sweep.subdir=${hydra.job.override_dirname}", "seed=1,2", "evaluation.views=[4]")
+    for _ in range(2):
+        code, _, err = sweep(*grid)
+        assert code == 0, err
+    assert executed(sweep.directory) == [f"evaluation.views=[4],seed={seed}" for seed in (1, 2)]
 
 
 def test_dry_run_runs_nothing_and_says_what_it_would(sweep):
@@ -158,6 +189,30 @@ def test_an_impossible_job_fails_before_any_is_launched(sweep):
     assert code == 1
     assert "trainer.devices: expected 1 in a sweep, or hydra/launcher=slurm" in err
     assert not executed(sweep.directory)
+
+
+@pytest.mark.parametrize(
+    ("trainer", "fits"),
+    [
+        ({"devices": 1}, True),
+        ({"devices": [1]}, True),
+        ({"devices": [0, 1]}, False),
+        ({"devices": 2}, False),
+        ({"devices": "auto", "accelerator": "cpu"}, True),
+        ({"devices": -1, "accelerator": "cpu"}, True),
+        ({"devices": "auto", "accelerator": "gpu"}, False),
+        ({"devices": "auto", "accelerator": "auto"}, False),
+        ({"devices": 1, "num_nodes": 2}, False),
+    ],
+)
+def test_one_process_may_be_said_in_several_ways(monkeypatch, trainer, fits):
+    """``[1]`` is the second GPU alone; ``auto`` is one on a CPU. Here with two GPUs."""
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
+    job.check_launcher({"trainer": trainer}, "submitit_slurm")
+    with (
+        contextlib.nullcontext() if fits else pytest.raises(InputError, match=r"trainer\.devices: expected 1")
+    ):
+        job.check_launcher({"trainer": trainer}, "basic")
 
 
 def test_two_processes_share_a_sweep_and_both_see_all_of_it(tmp_path):

@@ -71,3 +71,34 @@ def test_a_best_checkpoint_that_is_gone_is_found_again(tmp_path):
     path.touch()
     after.load_state_dict(before.state_dict())
     assert (after.best_model_path, after.best_model_score) == (str(path), 30)
+
+
+def test_a_moved_run_knows_its_best_checkpoint(tmp_path, recwarn):
+    """The first, worse validation after a move replaced it. States name files, never folders."""
+    old, new = tmp_path / "old" / "checkpoints", tmp_path / "new" / "checkpoints"
+    before, after = (CheckpointOptions(filename="best", monitor="val/psnr").build() for _ in range(2))
+    before.dirpath, after.dirpath = str(old), str(new)
+    path, score = str(old / "best.ckpt"), torch.tensor(30.0)
+    before.best_model_path = before.kth_best_model_path = path
+    before.best_model_score = before.kth_value = score
+    before.best_k_models = {path: score}
+    state = before.state_dict()
+    assert str(tmp_path) not in str(state)
+    new.mkdir(parents=True)
+    (new / "best.ckpt").touch()
+    after.load_state_dict(state)
+    assert after.best_model_path == after.kth_best_model_path == str(new / "best.ckpt")
+    assert (after.best_k_models, after.best_model_score) == ({str(new / "best.ckpt"): score}, score)
+    assert not recwarn.list
+
+
+def test_a_state_names_no_file_of_other_folders(tmp_path):
+    """Lightning deletes what a state calls the worst checkpoint."""
+    subject = CheckpointOptions(filename="best", monitor="val/psnr").build()
+    subject.dirpath = str(tmp_path / "run" / "checkpoints")
+    (tmp_path / "run" / "checkpoints").mkdir(parents=True)
+    (tmp_path / "run" / "checkpoints" / "a.ckpt").touch()
+    state = subject.state_dict() | {"best_k_models": {"../../a.ckpt": torch.tensor(1.0)}}
+    subject.load_state_dict(state | {"kth_best_model_path": "/etc/a.ckpt", "best_model_path": "../a.ckpt"})
+    own = str(tmp_path / "run" / "checkpoints" / "a.ckpt")
+    assert {subject.kth_best_model_path, subject.best_model_path, *subject.best_k_models} == {own}

@@ -20,11 +20,14 @@ class Signal(L.Callback):
 
     def __init__(self, at: int, number: int, validating: bool = False, times: int = 1):
         self.at, self.number, self.validating, self.times = at, number, validating, times
+        self.also: int | None = None
 
     def on_train_batch_start(self, trainer, *_):
         if trainer.global_step + 1 == self.at and not self.validating:
             for _ in range(self.times):
                 os.kill(os.getpid(), self.number)
+            if self.also is not None:
+                os.kill(os.getpid(), self.also)
 
     def on_validation_batch_start(self, trainer, *_):
         if trainer.global_step == self.at and self.validating:
@@ -58,6 +61,8 @@ def whole(tmp_path_factory):
         (signal.SIGTERM, 8, False, 1),
         (signal.SIGINT, 8, True, 1),
         (signal.SIGTERM, 6, False, 2),
+        (signal.SIGUSR1, 5, False, 1),
+        (signal.SIGUSR2, 8, True, 1),
     ],
 )
 def test_a_run_that_is_stopped_goes_on_as_if_it_had_not_been(
@@ -89,6 +94,15 @@ def test_a_second_signal_stops_at_once(tmp_path, monkeypatch):
     monkeypatch.setattr("ghgs_lit.training.checkpoints._SAME", -1.0)
     assert stopped(tmp_path / "now", Signal(2, signal.SIGTERM, times=2)) == 143
     assert not (tmp_path / "now" / "checkpoints" / "last.ckpt").exists()
+
+
+def test_a_batch_system_that_announces_and_then_asks_gets_a_checkpoint(tmp_path, monkeypatch):
+    """SIGTERM after SIGUSR1 does not mean that nobody waits for the step."""
+    monkeypatch.setattr("ghgs_lit.training.checkpoints._SAME", -1.0)
+    sender = Signal(5, signal.SIGUSR1)
+    sender.also = signal.SIGTERM
+    assert stopped(tmp_path, sender) == 128 + signal.SIGUSR1
+    assert torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)["global_step"] == 5
 
 
 def test_signals_that_a_batch_system_handles_stay_its_own(tmp_path):

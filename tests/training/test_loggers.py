@@ -12,11 +12,13 @@ import lightning.pytorch as L
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 from tensorboard.plugins.hparams import plugin_data_pb2
 
 from ghgs_lit.config import build
 from ghgs_lit.errors import InputError
 from ghgs_lit.kernels.allocation import resident_bytes
+from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.cost import Costs
 from ghgs_lit.training.loggers import (
@@ -38,6 +40,12 @@ def events(folder) -> EventAccumulator:
         str(folder), size_guidance={"images": 0, "tensors": 0, "scalars": 0, "histograms": 0}
     )
     return found.Reload()
+
+
+def steps_in_files(folder, tag) -> list[int]:
+    """Steps of a tag as the files have them, without what TensorBoard would leave out."""
+    found = [e for path in folder.glob("events.*") for e in EventFileLoader(str(path)).Load()]
+    return sorted(e.step for e in found for value in e.summary.value if value.tag == tag)
 
 
 def hparams(folder, tag) -> plugin_data_pb2.HParamsPluginData:
@@ -224,9 +232,40 @@ def test_logs_resume_where_the_checkpoint_was(tmp_path):
         rows = list(csv.DictReader(file))
     assert [float(row["a"]) for row in rows] == expected
     assert [row["b"] for row in rows] == ["", "1", "", "1", "", "1", "", ""]
+    assert steps_in_files(tmp_path / "tensorboard", "work/a") == list(range(1, 9))
     scalars = events(tmp_path / "tensorboard").Scalars("work/a")
     assert [(e.step, e.value) for e in scalars] == list(enumerate(expected, 1))
     assert [int(row["step"]) for row in rows] == list(range(1, 9))
+
+
+def test_a_kill_loses_nothing_that_was_logged(tmp_path):
+    """What came before the checkpoint is not trained, nor logged, again."""
+    csv_log, curves = (
+        build({"kind": kind}, f"logger.{kind}", save_dir=str(tmp_path)) for kind in ("csv", "tensorboard")
+    )
+    for logger in (csv_log, curves):
+        for step in range(3):
+            logger.log_metrics({"loss/total": 1.0}, step)
+    assert (tmp_path / "csv" / "metrics.csv").read_text().splitlines()[1:] == ["1.0,1", "1.0,2", "1.0,3"]
+    assert steps_in_files(tmp_path / "tensorboard", "loss/total") == [1, 2, 3]
+    close([curves])
+
+
+def test_wandb_has_one_run_for_each_run_here(tmp_path, monkeypatch):
+    """Resumed runs were several there, moved ones too; another run in the same directory is another one."""
+    seen = []
+    monkeypatch.setattr("ghgs_lit.training.loggers.installed", lambda *_: None)
+    monkeypatch.setattr("ghgs_lit.training.loggers.WandbLog", lambda **options: seen.append(options["id"]))
+    config = {"seed": 1, "resume": "auto"}
+    for folder, overwrite in (("a", False), ("a", False), ("b", False), ("b", True)):
+        if folder == "b" and not overwrite:
+            (tmp_path / "a").rename(tmp_path / "b")
+        run = RunDirectory(tmp_path / folder)
+        with run.claim():
+            run.begin(config | {"overwrite": overwrite})
+        build({"kind": "wandb"}, "logger.wandb", save_dir=str(run.path))
+    assert seen[0] == seen[1] == seen[2] != seen[3]
+    assert len(seen[0]) == 8
 
 
 def test_runs_of_a_sweep_leave_no_threads(tmp_path):

@@ -203,6 +203,19 @@ def test_a_run_with_frozen_weights_resumes_from_one_file_of_them(tmp_path, monke
         }
 
 
+def test_a_finished_run_that_is_trained_on_counts_on(whole, tmp_path, monkeypatch):
+    """Steps 5 to 8 stood as 6 to 9 in the logs."""
+    monkeypatch.setattr("tests.training.test_resume.STEPS", 6)
+    subject = fit(tmp_path, Cut())
+    last = tmp_path / "checkpoints" / "last.ckpt"
+    subject.trainer.save_checkpoint(last)
+    monkeypatch.setattr("tests.training.test_resume.STEPS", 9)
+    fit(tmp_path, Cut(), resume=last)
+    assert [int(row["step"]) for row in rows(tmp_path) if "loss/total" in row] == list(range(1, 10))
+    found = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert [e.step for e in found.Scalars("loss/total")] == list(range(1, 10))
+
+
 def test_time_that_was_used_stays_used(tmp_path):
     """With a budget of time the learning rate continues where it was."""
     seen = []

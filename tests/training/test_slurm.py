@@ -1,10 +1,18 @@
-"""Jobs of SLURM."""
+"""Jobs of SLURM: their processes, and that they go on when they are queued again."""
+
+import os
+import signal
 
 import pytest
 
+from ghgs_lit.cli import train as train_verb
 from ghgs_lit.cli.train import build_trainer
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.errors import InputError
+from ghgs_lit.runs import processes
+from ghgs_lit.runs.run import RunDirectory
+from tests.cli.test_main import call
+from tests.helpers.jobs import record_execution
 
 BATCH = {
     "SLURM_JOB_ID": "1234",
@@ -29,3 +37,114 @@ def test_tasks_of_a_batch_script_are_no_processes(monkeypatch, tmp_path):
     monkeypatch.setenv("SLURM_STEP_ID", "0")
     with pytest.raises(InputError, match=r"trainer: .*--ntasks-per-node=4"):
         build_trainer(config, tmp_path)
+
+
+@pytest.fixture
+def task(monkeypatch, tmp_path):
+    """The environment of ``srun``, in a new working directory; the file that requests to SLURM go to."""
+    for name, value in (BATCH | {"SLURM_NTASKS": "1", "SLURM_STEP_ID": "0"}).items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.delenv("SLURM_RESTART_COUNT", raising=False)
+    requests, program = tmp_path / "requests", tmp_path / "bin" / "scontrol"
+    program.parent.mkdir()
+    program.write_text(f'#!/bin/bash\necho "$@" >> {requests}\n')
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{program.parent}:{os.environ['PATH']}")
+    monkeypatch.chdir(tmp_path)
+    return requests
+
+
+def stopped_by(number):
+    def train(config, directory, stats):
+        (directory / "checkpoints").mkdir()
+        (directory / "checkpoints" / "last.ckpt").write_text(str(config["seed"]))
+        os.kill(os.getpid(), number)
+
+    return train
+
+
+@pytest.mark.parametrize("places", [("seed=3",), ("-m", "seed=3,4"), ("seed=3", "hydra.run.dir=mine")])
+@pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGTERM])
+def test_a_job_that_is_queued_again_goes_on(monkeypatch, capsys, task, places, number):
+    """The same command began anew in another directory, or was refused. A job that ends early is queued again
+    by SLURM, one whose time is up (SIGUSR1) on request."""
+    monkeypatch.setattr(train_verb, "train", stopped_by(number))
+    code, _, err = call(monkeypatch, capsys, "train", *places)
+    assert code == 128 + number
+    assert ("SLURM queues its job again" in err) == task.exists() == (number == signal.SIGUSR1)
+    assert not task.exists() or task.read_text() == "requeue 1234\n"
+    monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
+    monkeypatch.setattr(train_verb, "train", record_execution)
+    code, _, err = call(monkeypatch, capsys, "train", *places)
+    assert code == 0, err
+    (begun,) = (path.parents[1] for path in task.parent.rglob("last.ckpt"))
+    outcomes = [s["outcome"] for s in RunDirectory(begun).sessions()]
+    assert outcomes == ["interrupted", "done"]
+    assert RunDirectory(begun).sessions()[1]["resumed"] == "checkpoints/last.ckpt"
+    assert len(list(task.parent.rglob("metrics.json"))) == (2 if "-m" in places else 1)
+
+
+def test_a_job_that_was_not_queued_again_begins_anew(monkeypatch, capsys, task):
+    """A second command of an interactive job is a run of its own."""
+    monkeypatch.setattr(train_verb, "train", stopped_by(signal.SIGTERM))
+    assert call(monkeypatch, capsys, "train", "hydra.run.dir=runs/train/1")[0] == 143
+    monkeypatch.setattr(train_verb, "train", record_execution)
+    assert call(monkeypatch, capsys, "train")[0] == 0
+    assert not (task.parent / "runs" / "train" / "1" / "metrics.json").exists()
+    monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
+    monkeypatch.setenv("SLURM_JOB_ID", "1235")
+    assert call(monkeypatch, capsys, "train", "seed=3")[0] == 0
+    assert not (task.parent / "runs" / "train" / "1" / "metrics.json").exists()
+
+
+def test_only_tasks_of_srun_are_queued_again(monkeypatch, task):
+    """A batch script without ``srun`` is stopped, with a checkpoint; jobs of arrays have two numbers."""
+    monkeypatch.setenv("SLURM_ARRAY_JOB_ID", "1230")
+    monkeypatch.setenv("SLURM_ARRAY_TASK_ID", "4")
+    assert processes.queue_again(signal.SIGUSR1)
+    assert not processes.queue_again(signal.SIGTERM)
+    monkeypatch.setenv("SLURM_JOB_NAME", "interactive")
+    assert not processes.queue_again(signal.SIGUSR1)
+    monkeypatch.delenv("SLURM_JOB_NAME")
+    monkeypatch.delenv("SLURM_STEP_ID")
+    assert not processes.queue_again(signal.SIGUSR1)
+    assert task.read_text() == "requeue 1230_4\n"
+    monkeypatch.setenv("SLURM_STEP_ID", "0")
+    monkeypatch.setenv("PATH", "")
+    assert not processes.queue_again(signal.SIGUSR1)
+
+
+def test_lightning_queues_nothing_again_itself(task):
+    """Its handler writes a checkpoint within a step."""
+    (environment,) = train_verb.environments()
+    assert environment.world_size() == 1
+    assert environment.auto_requeue is False
+
+
+def test_processes_that_start_together_take_the_start_of_the_first(monkeypatch, tmp_path):
+    """The others read whether the first resumes; they wait for it, and not for one of an earlier start."""
+    from ghgs_lit.runs import job
+
+    monkeypatch.setattr(job, "_PATIENCE", 0.3)
+    monkeypatch.setenv("SLURM_STEP_ID", "0")
+    config = {"seed": 1, "resume": "auto", "trainer": {}}
+    seen = []
+
+    def first(config, directory, stats):
+        monkeypatch.setattr(job, "_PATIENCE", 0.0)
+        job.train_beside(run, {**config, "resume": "auto"}, lambda config, *_: seen.append(config["resume"]))
+        monkeypatch.setenv("SLURM_STEP_ID", "1")
+        with pytest.raises(InputError, match="the first process of this training to work in it"):
+            job.train_beside(run, config, lambda *_: seen.append("wrong"))
+        monkeypatch.setenv("SLURM_STEP_ID", "0")
+        (directory / "checkpoints").mkdir(exist_ok=True)
+        (directory / "checkpoints" / "last.ckpt").touch()
+        raise KeyboardInterrupt
+
+    run = RunDirectory(tmp_path)
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            job.train_once(run, dict(config), first)
+    with pytest.raises(InputError, match="the first process of this training"):
+        job.train_beside(run, dict(config), lambda *_: seen.append("wrong"))
+    assert seen == [None, str(tmp_path / "checkpoints" / "last.ckpt")]
