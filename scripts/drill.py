@@ -199,7 +199,10 @@ def main() -> int:
     tensors = differing(undisturbed, drill.sweep / undisturbed.name)
     faults += [f"{len(tensors)} tensors differ from those of an undisturbed run"] * bool(tensors)
     table = drill.ghgs("table", f"runs={drill.sweep}", f"hydra.run.dir={arguments.out / 'table'}").wait()
-    faults += ["no table"] * (table != 0 or "missing" in (arguments.out / "table" / "table.md").read_text())
+    said = (arguments.out / "table" / "table.md").read_text() if table == 0 else "No results yet"
+    faults += ["expected a table of all seeds"] * (
+        "No results yet" in said or f"{len(SEEDS)} seeds" not in said
+    )
     sessions = sum(path.read_text().count('"started"') for path in drill.sweep.glob("*/sessions.jsonl"))
     print("\n".join(faults))
     print(f"{len(runs)} runs in {sessions} sessions, {len(faults)} faults, {time.monotonic() - begin:.0f} s")
