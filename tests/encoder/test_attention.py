@@ -29,6 +29,14 @@ def error(found, q, k, v):
     return ((found.double() - expected).square().mean() / expected.square().mean()).sqrt()
 
 
+def limit(q, k, v):
+    """A hundred times what rounding the arguments once changes, and one rounding: the budget of a kernel in
+    ``ghgs stress``. How near PyTorch comes is the luck of a processor's order of summation."""
+    g, eps = torch.Generator().manual_seed(1), torch.finfo(torch.float32).eps
+    moved = [x.double() * (1 + eps * torch.randn(x.shape, generator=g).sign()) for x in (q, k, v)]
+    return 100 * (eps + error(F.scaled_dot_product_attention(*moved).transpose(1, 2), q, k, v))
+
+
 def pytorch(q, k, v):
     return F.scaled_dot_product_attention(q, k, v).transpose(1, 2)
 
@@ -48,15 +56,15 @@ def pytorch(q, k, v):
 )
 @pytest.mark.parametrize("scale", [0.0, 1.0, 4.0])
 def test_attention_is_as_near_as_pytorchs(n, heads, tokens, width, dtype, scale):
-    """The kernel is as accurate as PyTorch for all sizes around its block sizes."""
+    """The kernel is as accurate as its condition allows for all sizes around its block sizes."""
     q, k, v = scene(n, heads, tokens, width, dtype, scale)
     found = cpu.attend(q, k, v)
     assert found.dtype == dtype
     assert found.shape == (n, tokens, heads, width)
-    # A logit of standard deviation scale^2 is rounded by that times 2^-24, and its weight repeats this error:
-    # which of both is luckier depends on the processor.
-    least = max(2e-7, scale**2 * 2.0**-24) if dtype == torch.float32 else 2e-3
-    assert error(found, q, k, v) < max(1.5 * error(pytorch(q, k, v), q, k, v), least)
+    if dtype == torch.float32:
+        assert error(found, q, k, v) < limit(q, k, v)
+    else:  # one rounding of the result
+        assert error(found, q, k, v) < max(1.5 * error(pytorch(q, k, v), q, k, v), 2.0**-9)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -65,7 +73,7 @@ def test_fewer_queries_than_keys_and_more(dtype):
     q, k, v = scene(1, 2, 300, 64, dtype)
     for queries, keys in ((5, 300), (300, 7), (1, 1)):
         args = q[:, :, :queries], k[:, :, :keys], v[:, :, :keys]
-        assert error(cpu.attend(*args), *args) < (1e-6 if dtype == torch.float32 else 1e-2)
+        assert error(cpu.attend(*args), *args) < (limit(*args) if dtype == torch.float32 else 1e-2)
 
 
 def test_scores_that_rise_and_fall_by_hundreds():
@@ -75,7 +83,7 @@ def test_scores_that_rise_and_fall_by_hundreds():
     q = torch.ones_like(v)
     for keys in (slope, -slope, slope.sin() * 300):
         args = q, keys.expand(-1, 32)[None, None] / 32**0.5, v
-        assert error(cpu.attend(*args), *args) < 1.5 * error(pytorch(*args), *args)
+        assert error(cpu.attend(*args), *args) < limit(*args)
 
 
 def test_weights_below_the_smallest_float_count_for_nothing():
@@ -117,17 +125,22 @@ def test_the_same_bits_with_any_number_of_threads(dtype, heads, tokens):
 
 
 def test_types_may_differ_and_that_of_the_values_is_taken():
-    """Queries and keys in another dtype than the values are converted."""
+    """Queries and keys in another dtype than the values are converted, and the result is in theirs."""
     q, k, v = scene(1, 2, 50, 32, torch.float32)
     halves = [x.bfloat16() for x in (q, k)]
-    assert error(cpu.attend(*halves, v), *halves, v) < 1e-6
+    found = cpu.attend(*halves, v)
+    assert found.dtype == torch.float32
+    assert error(found, *halves, v) < limit(*halves, v)
+    found = cpu.attend(q, k, v.bfloat16())
+    assert found.dtype == torch.bfloat16
+    assert error(found, q, k, v.bfloat16()) < 1e-2
 
 
 def test_inputs_whose_numbers_lie_apart():
     """Inputs whose channels are not contiguous are copied, not misread."""
     q, k, v = (x.transpose(2, 3).contiguous().transpose(2, 3) for x in scene(1, 2, 50, 32, torch.float32))
     assert q.stride(-1) != 1
-    assert error(cpu.attend(q, k, v), q, k, v) < 1e-6
+    assert error(cpu.attend(q, k, v), q, k, v) < limit(q, k, v)
 
 
 def test_what_the_kernel_is_asked_for(monkeypatch):

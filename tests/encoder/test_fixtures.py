@@ -48,12 +48,15 @@ def _options(name: str) -> dict:
 def _compare(name: str, groups: dict, dtype: torch.dtype, found: dict[str, torch.Tensor]) -> None:
     expected = groups[DTYPES[dtype]]
     assert set(found) == set(expected)
+    # Position tables of another size are interpolated in float32, also for float64: each entry is a sum whose
+    # order is the processor's, as is that of their effect on tokens.
+    is_interpolated = "interp" in name or "same_count" in name
+    share = 4 * torch.finfo(torch.float32).eps if is_interpolated else 1e-9
     for key, value in found.items():
         assert value.dtype == expected[key].dtype
         error = (value.reshape(expected[key].shape) - expected[key]).abs().max().item()
-        bound = (
-            CASES[name]["bounds"][key] if dtype == torch.float32 else 1e-9 * expected[key].abs().max().item()
-        )
+        largest = expected[key].abs().max().item()
+        bound = CASES[name]["bounds"][key] if dtype == torch.float32 else share * largest
         assert error <= bound, f"{name}/{key}: {error:.3g} > {bound:.3g}"
 
 

@@ -12,12 +12,14 @@ import pytest
 from ghgs_lit.bounds.agreement import trusted_views
 from ghgs_lit.diagnostics.stress.measure import measure
 from ghgs_lit.diagnostics.stress.stages import STAGES, heads
-from ghgs_lit.geometry import projection, rotations
+from ghgs_lit.geometry import projection, rotations, undistortion
 from ghgs_lit.geometry.padding import Padding
 from ghgs_lit.metrics import functional
+from ghgs_lit.prediction.refinement import refinement
 from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
 from ghgs_lit.rendering import reference
 from ghgs_lit.rendering.cpu import backend
+from ghgs_lit.rounds import gains
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,22 @@ DEFECTS = (
     Defect(
         "a Jacobian without its clamp", reference.project,
         "torch.minimum(torch.maximum(tangents, low), high)", "tangents", "compositing", "beside",
+    ),
+    Defect(
+        "a lens half a pixel beside its place", undistortion.undistorting_grid,
+        "torch.linspace(0.5, side - 0.5,", "torch.linspace(0.0, side - 1.0,", "undistortion", "ordinary",
+    ),
+    Defect(
+        "the logarithm of black", gains._compared, "color.clamp(min=_DARK / 8).log()", "color.log()", "gains",
+        "black",
+    ),
+    Defect(
+        "gains of the rounds that nothing holds", gains._solved, "_PRIOR * identity", "1e-9 * identity",
+        "pipeline shipped", "ordinary",
+    ),
+    Defect(
+        "colours that move beyond their limit", refinement.Descent._changed, "c.limit * torch.tanh",
+        "torch.tanh", "refinement", "ordinary",
     ),
 )  # fmt: skip
 

@@ -16,24 +16,30 @@ from ghgs_lit.losses import Losses
 from ghgs_lit.model import GHGS
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Batch, Cameras, DepthBounds, Prediction, Targets
+from ghgs_lit.weights.reading import SHIPPED
 
 _SIZE = 28
+_ROUNDS = ("recurrent", SHIPPED)  #: Models that draw the number of their rounds in training
 _TINY = ("encoder.width=16", "encoder.heads=2", "encoder.depth=4", "encoder.layers=[0,1,2,3]")
 _TINY += ("encoder.vit.channels=8", "recalibration.k=4", "recalibration.num_heads=2")
 
 
 @cache
 def _models(name: str, kicked: bool) -> dict[torch.dtype, GHGS]:
-    """A tiny model in both precisions, without the zero layers of its initialisation."""
+    """A model in both precisions: the weights of the package, or a tiny one without the zero layers of its
+    initialisation."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(3)
-        model = GHGS.from_config(resolve(compose("train", [f"model={name}", *_TINY])))
+        if name == SHIPPED:
+            model = GHGS.from_checkpoint()
+        else:
+            model = GHGS.from_config(resolve(compose("train", [f"model={name}", *_TINY])))
         for parameter in model.parameters():
             if kicked:  # as Adam moves every weight by the learning rate in its first step
                 parameter.data += 10.0 * torch.randn_like(parameter).sign()
             elif not parameter.any():
                 nn.init.normal_(parameter, std=0.1)
-    model.train(name != "recurrent")  # rounds draw their number in training
+    model.requires_grad_()
     exact = copy.deepcopy(model).double()
     exact.bounds = partial(_in_float32, model.bounds)
     return {torch.float32: model, torch.float64: exact}
@@ -62,28 +68,30 @@ def _dense(prediction: Prediction, batch: Batch) -> Values:
     return {"depth": depth, "means": maps[..., :3], "scales": maps[..., 3:6], "rest": maps[..., 6:]}
 
 
-def _model(name: str, v: Values) -> GHGS:
-    return _models(name, bool(v["kicked"].any()))[v["images"].dtype]
+def _model(name: str, v: Values, training: bool) -> GHGS:
+    return _models(name, bool(v["kicked"].any()))[v["images"].dtype].train(training)
 
 
 def _predict(name: str, v: Values) -> Values:
     batch = batch_of(v)
-    return _dense(_model(name, v)(batch), batch)
+    return _dense(_model(name, v, training=name not in _ROUNDS)(batch), batch)
 
 
 _LOSSES = Losses(weights={"chamfer": 0.0, "depth": 1.0})  # Chamfer has a stage of its own
 
 
 @torch.enable_grad()
-def _step(v: Values) -> Values:
+def _step(name: str, v: Values) -> Values:
     one = {name: value[None] for name, value in v.items()}
-    model, exact = _model("hull", one), v["images"].dtype == torch.float64
+    model, exact = _model(name, one, training=True), v["images"].dtype == torch.float64
     cameras = Cameras(*inputs.matrices(one["target_lenses"], one["target_poses"]), _SIZE, _SIZE)
     masks = torch.ones(1, 1, _SIZE, _SIZE, dtype=torch.bool)
     surface = one["middle"] + 0.5 * inputs.directions(Generator().manual_seed(1), 40, 3).to(one["middle"])
     targets = Targets(one["target"], masks, cameras)
     batch = replace(batch_of(one), targets=targets, body_vertices=[surface], depths=one["truth"])
-    prediction = model(batch)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(1)  # of which the number of rounds is drawn
+        prediction = model(batch)
     rendering = render(prediction.gaussians, cameras, "reference" if exact else "cpu")
     total, values = _LOSSES(prediction, rendering, batch)
     slopes = torch.autograd.grad(total, list(model.parameters()), allow_unused=True)
@@ -127,13 +135,16 @@ STAGES = (
             steady=_FRAME,
             silent="what the model does not read is not in its output",
         )
-        for name in ("paper", "hull", "recurrent")
+        for name in ("paper", "hull", "recurrent", SHIPPED)
     ),
-    _stage(
-        "training step",
-        run=case_by_case(_step),
-        reason=f"{_NETWORK}, forward and backward, and the losses'",
-        steady=("middle",),
-        silent="what the step does not read is not in its loss",
+    *(
+        _stage(
+            f"training step {name}",
+            run=case_by_case(partial(_step, name)),
+            reason=f"{_NETWORK}, forward and backward, and the losses'",
+            steady=("middle",),
+            silent="what the step does not read is not in its loss",
+        )
+        for name in ("hull", "recurrent")
     ),
 )

@@ -1,0 +1,177 @@
+"""Stages around photographs: undistortion, gains of cameras, refinement."""
+
+from dataclasses import replace
+from functools import partial
+
+import torch
+from torch import Generator, Tensor
+
+from ghgs_lit.diagnostics.stress import inputs
+from ghgs_lit.diagnostics.stress.stage import FAMILIES, FLOAT32_ONLY, Stage, Values, case_by_case
+from ghgs_lit.diagnostics.stress.stages.geometry import batch_of, cameras_of, scene
+from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.geometry.undistortion import undistorting_grid
+from ghgs_lit.metrics.functional import ssim
+from ghgs_lit.prediction.refinement.refinement import Refinement
+from ghgs_lit.rendering import Renderer, render
+from ghgs_lit.rounds.gains import log_gains
+from ghgs_lit.types import Batch, Gaussians
+
+_LENS, _STEP = 17, 8  #: Side of a photograph with a lens; pixels between evaluations of its model
+
+
+def _lens_inputs(family: str, g: Generator) -> Values:
+    lenses, _ = inputs.cameras(family, g, 1, _LENS, inputs.place(family, g))
+    return {
+        "lens": lenses[0],
+        "radial": inputs.uniform(g, -0.1, 0.1, 4),
+        "p": inputs.uniform(g, -0.02, 0.02, 2),
+    }
+
+
+def _lens(v: Values) -> Values:
+    """Where the pixels of the undistorted image lie in the photograph, for OpenCV's and a fisheye's model."""
+    matrices, (k1, k2, k3, _) = inputs.intrinsics(v["lens"]).numpy(), v["radial"].mT
+    opencv = torch.stack((k1, k2, *v["p"].mT, k3), -1).numpy()
+    models = {"opencv": (opencv, False), "fisheye": (v["radial"].numpy(), True)}
+    return {
+        name: torch.cat(
+            [undistorting_grid(k, d, _LENS, _LENS, fisheye) for k, d in zip(matrices, lens, strict=True)]
+        )
+        for name, (lens, fisheye) in models.items()
+    }
+
+
+def _lens_slowly(v: Values) -> Values:
+    knots = torch.linspace(0.5, _LENS - 0.5, -(-_LENS // _STEP) + 1, dtype=torch.float64)
+    fx, fy, cx, cy = (value[:, None, None] for value in v["lens"].mT)
+    x, y = torch.broadcast_tensors((knots - cx) / fx, (knots[:, None] - cy) / fy)
+    k1, k2, k3, k4 = (value[:, None, None] for value in v["radial"].mT)
+    p1, p2 = (value[:, None, None] for value in v["p"].mT)
+    r = x * x + y * y
+    radial = 1 + k1 * r + k2 * r**2 + k3 * r**3
+    opencv = (
+        x * radial + 2 * p1 * x * y + p2 * (r + 2 * x * x),
+        y * radial + p1 * (r + 2 * y * y) + 2 * p2 * x * y,
+    )
+    angle = r.sqrt().atan()
+    bent = angle * (1 + k1 * angle**2 + k2 * angle**4 + k3 * angle**6 + k4 * angle**8)
+    share = torch.where(r > 0, bent / r.sqrt(), 1.0)
+    return {
+        name: _between_knots(torch.stack((fx * across + cx, fy * down + cy), 1))
+        for name, (across, down) in {"opencv": opencv, "fisheye": (share * x, share * y)}.items()
+    }
+
+
+def _between_knots(pixels: Tensor) -> Tensor:
+    grid = 2 * pixels / _LENS - 1
+    dense = torch.nn.functional.interpolate(grid, (_LENS, _LENS), mode="bilinear", align_corners=True)
+    return dense.permute(0, 2, 3, 1)
+
+
+def _surface_inputs(views: int, size: int, family: str, g: Generator) -> Values:
+    """A sphere with the same colours in all views, where the family is none of images, up to their gains."""
+    found = scene(family, g, views, size)
+    if FAMILIES[family].ingredient != "images":
+        cameras = cameras_of({name: value[None] for name, value in found.items()}, size)
+        around = unproject_maps(found["truth"][None], cameras)[0] - found["middle"]
+        found["images"] = (0.5 + 0.4 * torch.sin(9 * around)).movedim(-1, 1) * (found["truth"] > 0)[:, None]
+        found["images"] = found["images"].contiguous()
+    opacities = inputs.opacities(family, g, views * size * size).view(views, size, size)
+    return {**found, "gains": inputs.uniform(g, 0.7, 1.0, views, 3), "opacities": opacities}
+
+
+def _seen(v: Values) -> tuple[Gaussians, Batch]:
+    """Splats of a pixel's size on the true surface of one case, and its photographs, darker by gains."""
+    one = {name: value[None] for name, value in v.items()}
+    one["images"] = one["images"] * one["gains"][..., None, None]
+    batch = batch_of(one)
+    subject = batch.masks & (one["truth"] > 0)
+    image, pixel = subject.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
+    means = unproject_maps(one["truth"], batch.cameras)[subject]
+    size = (one["truth"] / batch.cameras.intrinsics[..., 0, 0, None, None])[subject]
+    quaternions = means.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(len(means), 4)
+    opacities, colors = one["opacities"][subject], batch.images.movedim(2, -1)[subject]
+    scales = 0.5 * size[:, None].expand(-1, 3)
+    return Gaussians(means, quaternions, scales, opacities, colors, (len(means),), image, pixel), batch
+
+
+def _gains(v: Values) -> Values:
+    return {"logs": log_gains(*_seen(v))[0]}
+
+
+_STEPS = 2
+
+
+def _refined(v: Values) -> Values:
+    """Renders after some steps: what no photograph shows moves by the sign of rounding."""
+    gaussians, batch = _seen(v)
+    backend = "reference" if v["images"].dtype == torch.float64 else "cpu"
+    return _renders(Refinement(_STEPS, Renderer(backend=backend))(gaussians, batch), batch, backend)
+
+
+def _renders(gaussians: Gaussians, batch: Batch, backend: str) -> Values:
+    drawn = render(gaussians, batch.cameras, backend)
+    return {"image": drawn.image[0], "alpha": drawn.alpha[0]}
+
+
+def _refined_slowly(v: Values) -> Values:
+    """The same with Adam (Kingma and Ba, 2015, Algorithm 1) and all changes written out."""
+    start, batch = _seen(v)
+    own = start.image
+    photographs = batch.images * batch.masks[:, :, None]
+    focal = batch.cameras.intrinsics[0, :, [0, 1], [0, 1]].prod(-1).sqrt()[own]
+    axes, shifts = batch.cameras.extrinsics[0, :, 2, :3], batch.cameras.extrinsics[0, :, 2, 3]
+    side = (((axes[own] * start.means).sum(-1) + shifts[own]) / focal)[:, None]
+    odds = (start.opacities.clamp(1e-4, 1 - 1e-4) / (1 - start.opacities.clamp(1e-4, 1 - 1e-4))).log()
+    fields = (start.means, start.scales, odds, start.colors)
+    raw, means, squares = ([torch.zeros_like(field) for field in fields] for _ in range(3))
+
+    def changed(raw: list[Tensor]) -> Gaussians:
+        move, grow, more, tint = (c * (x / c).tanh() for c, x in zip((1, 1, 2, 0.05), raw, strict=True))
+        opacities = 1 / (1 + (-odds - more).exp())
+        parts = {"scales": start.scales * grow.exp(), "opacities": opacities, "colors": start.colors + tint}
+        return replace(start, means=start.means + side * move, **parts)
+
+    for number in range(1, _STEPS + 1):
+        leaves = [x.detach().requires_grad_() for x in raw]
+        with torch.enable_grad():
+            drawn = render(changed(leaves), batch.cameras, "reference")
+            error = (drawn.image - photographs).abs().mean()
+            outline = (drawn.alpha[:, :, 0] - batch.masks.double()).abs().mean()
+            alike = ssim(drawn.image.flatten(0, 1), photographs.flatten(0, 1), padding="valid").mean()
+            slopes = torch.autograd.grad(0.8 * error + 0.2 * (1 - alike) + 0.1 * outline, leaves)
+        means = [0.9 * m + 0.1 * slope for m, slope in zip(means, slopes, strict=True)]
+        squares = [0.95 * s + 0.05 * slope**2 for s, slope in zip(squares, slopes, strict=True)]
+        for x, m, s, rate in zip(raw, means, squares, (0.02, 0.02, 0.04, 0.001), strict=True):
+            x -= rate * m / (1 - 0.9**number) / ((s / (1 - 0.95**number)).sqrt() + 1e-15)
+    return _renders(changed(raw), batch, "reference")
+
+
+_EXCLUDED = {
+    "wide": "the subject is smaller than a pixel",
+    "degenerate": "nothing is in the frame",
+    "large small": "these stages see the subject in metres",
+    "stacked": "one splat a pixel",
+}
+
+STAGES = (
+    Stage(
+        "undistortion", ("cameras",), _lens_inputs, _lens, 50,
+        "a polynomial of degree 9 and its division by the focal length", _lens_slowly, dtypes=FLOAT32_ONLY,
+    ),
+    Stage(
+        "gains", ("cameras", "images", "masks"), partial(_surface_inputs, 5, 32), case_by_case(_gains), 100,
+        "logarithms of samples at projected places, weighted by depths of a render, five times",
+        steady=("middle", "truth"), seeds=24, quick=1, excluded=_EXCLUDED,
+        silent="what no other view sees says nothing",
+    ),
+    Stage(
+        "refinement", ("cameras", "images", "masks", "opacities"), partial(_surface_inputs, 2, 14),
+        case_by_case(_refined), 100,
+        "two renders and their gradients, and steps that divide them by their size",
+        case_by_case(_refined_slowly),
+        steady=("middle", "truth"), seeds=24, quick=1, excluded=_EXCLUDED,
+        silent="what is not drawn does not show",
+    ),
+)  # fmt: skip
