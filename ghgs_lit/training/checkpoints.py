@@ -3,7 +3,7 @@
 import os
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,22 +15,11 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from pydantic import Field
 
 from ghgs_lit.config.options import Index, Options, Text, Words
-from ghgs_lit.errors import require
 from ghgs_lit.files import write_atomically
 from ghgs_lit.runs.signals import Interrupted, handle, handlers
+from ghgs_lit.training.restoring import check_restored
 from ghgs_lit.weights import frozen
-
-
-def check_training_state(path: str | Path, checkpoint: Mapping[str, Any]) -> None:
-    """Refuse a checkpoint whose training state does not have Lightning's form."""
-    kinds = {"epoch": int, "global_step": int, "loops": Mapping, "callbacks": Mapping}
-    kinds |= {"optimizer_states": list, "lr_schedulers": list}
-    for key in kinds.keys() & checkpoint.keys():
-        value, kind = checkpoint[key], kinds[key]
-        require(isinstance(value, kind), f"{path}: {key}", f"a {kind.__name__}", value)
-    for state in checkpoint["optimizer_states"]:
-        fits = isinstance(state, Mapping) and isinstance(state.get("param_groups"), list)
-        require(fits, f"{path}: optimizer_states", "states with param_groups", type(state).__name__)
+from ghgs_lit.weights.reading import open_file
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -53,8 +42,8 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def load_checkpoint(
         self, path: str | os.PathLike, map_location: Any = "cpu", weights_only: bool | None = True
     ) -> dict[str, Any]:
-        """Load tensors and plain data only; ``weights_only`` is not used."""
-        content = frozen.joined(path, torch.load(path, map_location=map_location, weights_only=True))
+        """Load tensors, mapped from the disk, and plain data only; the other arguments are not used."""
+        content = frozen.joined(path, open_file(path))
         content.setdefault("pytorch-lightning_version", L.__version__)
         return content
 
@@ -174,6 +163,12 @@ class StopAtStep(Checkpoint):
         self._step = 0
         self._saved = 0  # the signal, once the checkpoint is written
         self._before = handlers()
+
+    def on_load_checkpoint(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Check the states of loops and callbacks, which Lightning loads next."""
+        check_restored(trainer, checkpoint)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Replace Lightning's signal handlers, which save no checkpoint; it restores all at the end."""

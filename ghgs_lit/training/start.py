@@ -12,7 +12,7 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import resolved
 from ghgs_lit.runs.provenance import differences
 from ghgs_lit.stages import STAGES
-from ghgs_lit.training.checkpoints import check_training_state
+from ghgs_lit.training.restoring import check_optimizer_state, check_schedules, check_training_state
 from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint, require_finite, shape_of
 
 
@@ -52,11 +52,10 @@ def _check_optimizer(
     scale = lookup(config, key)
     require(by_muon == (scale is not None), key, f"{'a number' if by_muon else 'null'}, as in {path}", scale)
     if "kind" in (node := config.get("optimizer") or {}):
-        own = [len(group["params"]) for group in build(node, "optimizer").optimizer(model).param_groups]
+        groups = build(node, "optimizer").optimizer(model).param_groups
         for state in states:
-            found = [len(group.get("params", ())) for group in state["param_groups"]]
-            place = f"{path}: optimizer_states.param_groups"
-            require(found == own, place, f"as many groups and parameters as this run has, {own}", found)
+            check_optimizer_state(path, state, groups)
+        check_schedules(path, checkpoint.get("lr_schedulers"), len(groups))
 
 
 def initialize(
