@@ -229,7 +229,7 @@ def test_figures_of_the_first_day_are_those_of_a_run(tmp_path):
     page = (REPOSITORY / "docs" / "first_day.md").read_text()
     printed, reader = figures(page), check_documents.Reader(tmp_path, "docs/first_day.md")
     for command in (
-        "python scripts/miniature.py data=thuman2 data.source=my_scans --train 0",
+        "python scripts/miniature.py data=thuman2 data.source=my_scans --train 1",
         "ghgs prepare task=render data=scans data.source=my_scans data.root=rendered data.render.size=140",
         "ghgs evaluate data=scans data.root=rendered 'evaluation.views=[4]' "
         "'baselines=[nearest_view,true_depth]' hydra.run.dir=measured",
@@ -246,4 +246,4 @@ def test_figures_of_the_first_day_are_those_of_a_run(tmp_path):
         (trained,), (again,) = printed["4", targets], printed["model", targets]
         ((perfect, _),) = printed["true_depth", targets]
         assert trained == again
-        assert f"{perfect - trained[0]:.1f} dB" in page
+        assert f"{perfect - trained[0]:.2f} dB" in page

@@ -13,7 +13,7 @@ from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Batch
 from tests.helpers.models import make_model
-from tests.helpers.scenes import CENTER, make_batch, ring
+from tests.helpers.scenes import CENTER, ellipsoid, make_batch, ring
 
 
 def moved(cameras, scale=1.0, turn=None, shift=(0.0, 0.0, 0.0)):
@@ -161,6 +161,24 @@ def test_axes_are_a_rotation_for_any_cameras(change):
     axes = Frame.of(dataclasses.replace(batch, cameras=cameras)).axes
     torch.testing.assert_close(axes @ axes.mT, torch.eye(3).double()[None], atol=1e-9, rtol=0)
     assert float(torch.linalg.det(axes)) == pytest.approx(1)
+
+
+def test_the_origin_is_where_the_subject_stands():
+    """Not where the cameras look: half a metre beside it."""
+    cameras, place = ring(1, 4, 112, 112, zoom=0.6), CENTER + torch.tensor([0.3, 0.0, -0.4])
+    masks, depths = ellipsoid(cameras, place)
+    batch = Batch(torch.zeros(1, 4, 3, 112, 112), masks, cameras, depths=depths)
+    assert (Frame.of(batch).origin - place).abs().max() < 0.06  # as for one in the middle
+
+
+def test_a_shared_frame_is_that_of_all():
+    """Of instants of one sequence: mean origin, the first axes, and the size that most have."""
+    axes = quaternion_to_matrix(torch.randn(3, 4, generator=torch.Generator().manual_seed(0)).double())
+    origin, metre = torch.tensor([[0.0, 0, 0], [1, 2, 3], [5, 1, 0]]), torch.tensor([5.0, 1.0, 2.0])
+    shared = Frame(origin.double(), axes, metre.double()).shared
+    assert shared.metre.tolist() == [2.0] * 3
+    assert shared.origin.tolist() == [[2.0, 1.0, 1.0]] * 3
+    assert torch.equal(shared.axes, axes[:1].expand(3, 3, 3))
 
 
 def test_an_element_has_the_same_frame_alone():

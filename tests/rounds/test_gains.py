@@ -112,6 +112,19 @@ def test_dark_rims_do_not_count():
     np.testing.assert_allclose(found, np.log(gains), atol=0.03)
 
 
+@pytest.mark.parametrize("kind", ["white", "black"])
+def test_colours_without_a_ratio_do_not_count(kind):
+    """Clipped highlights, and shadows that lie on a sensor's black level, on most of the surface."""
+    value = {"white": 0.97, "black": 0.01}[kind]
+    batch = painted(paint=lambda p: torch.where(p[..., 1:2] > 1.1, 0.4, value).expand(p.shape))
+    gains = drawn(batch)
+    dark = seen_with(batch, gains)
+    level = torch.tensor([0.0025 * (kind == "black"), 0, 0, 0])[:, None, None, None]
+    images = (dark.images + level).clamp(max=1) * batch.masks[:, :, None]
+    found = log_gains(splats(batch), dataclasses.replace(dark, images=images))
+    np.testing.assert_allclose(found, np.log(gains), atol=0.03)
+
+
 def test_batch_mates_change_nothing():
     both = painted(2)
     dark = seen_with(both, drawn(both))
