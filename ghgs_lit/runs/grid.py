@@ -21,7 +21,7 @@ from ghgs_lit.config import resolve
 from ghgs_lit.config.compose import check_ablation, saved_text
 from ghgs_lit.config.keys import is_hyperparameter, key_of
 from ghgs_lit.config.verbs import VERBS
-from ghgs_lit.errors import require
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.job import BUSY, check_config, check_launcher
 from ghgs_lit.runs.processes import queue_again
@@ -142,7 +142,8 @@ def print_plan(planned: Sequence[PlannedRun], directory: Path, rehearse: Rehears
     for reason in found.reasons:
         print(f"would be refused: {reason}", flush=True)
     count = len(found.reasons)
-    require(count == 0, "dry_run", "runs that lack nothing", f"{count} reasons why they would be refused")
+    if count:
+        raise InputError(f"dry_run: expected runs that lack nothing; found {count} missing, as said above")
 
 
 def print_results(planned: Sequence[PlannedRun], directory: Path) -> None:

@@ -37,8 +37,8 @@ class TrainerOptions(Options):
     accelerator: Literal["gpu", "cpu", "auto", "cuda"] = "gpu"
     """gpu, cpu or auto."""
     devices: Annotated[int, Field(ge=1, le=64)] | tuple[Index, ...] | Literal[-1, "auto"] = 1
-    """Number of processes, or a list of GPUs; several are DDP, in which each has all parameters. At most 64,
-    as each starts at once on a CPU."""
+    """Number of processes, or a list of GPUs (of a CPU: as many processes); several are DDP, in which each
+    has all parameters. At most 64, as each starts at once on a CPU."""
     num_nodes: int = Field(1, ge=1, le=1024)
     """Machines, each with devices processes; SLURM or torchrun starts them."""
     strategy: Literal[
@@ -76,6 +76,8 @@ class TrainerOptions(Options):
         if self.precision == "tf32":
             options["precision"] = "32-true"
         round_products(self.precision == "tf32")  # also back, after another run of the process
+        if self.accelerator == "cpu" and isinstance(self.devices, tuple):
+            options["devices"] = len(self.devices)
         alone = self.devices == 1 or (isinstance(self.devices, tuple) and len(self.devices) == 1)
         if self.strategy == "auto" and not (alone and self.num_nodes == 1):
             # Not every parameter has a gradient in every step (ablations, skipped work).

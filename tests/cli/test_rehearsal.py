@@ -83,7 +83,7 @@ def test_a_step_is_timed_where_nothing_is_missing(monkeypatch, capsys, tmp_path,
     monkeypatch.chdir(tmp_path)
     command = ["-m", *SMALL, f"data.root={rendered}", "seed=1,2", "dry_run=true", "hydra.sweep.dir=sweep"]
     code, out, err = call(monkeypatch, capsys, "train", *command)
-    assert (code, err) == (0, "")
+    assert code == 0, err  # which may say that kernels are compiled
     assert "would be refused" not in out
     assert re.search(r"one after another: \d+:\d\d:\d\d \([\d.e-]+ s a step, tried with the first run\)", out)
     assert not list(tmp_path.iterdir())
@@ -96,7 +96,7 @@ def test_what_a_sweep_lacks_ends_its_dry_run_with_an_error(monkeypatch, capsys, 
     code, out, err = call(monkeypatch, capsys, "train", *command)
     assert code == 1
     assert out.count("would be refused: ") == 2
-    assert "dry_run: expected runs that lack nothing; found '2 reasons why they would be refused'" in err
+    assert "dry_run: expected runs that lack nothing; found 2 missing, as said above" in err
     assert not list(tmp_path.iterdir())
 
 

@@ -88,12 +88,14 @@ def test_options_of_lightning_reach_it(monkeypatch):
         {"devices": (0, 1)},
         {"devices": 2, "strategy": "ddp"},
         {"precision": "bf16-mixed", "devices": (1,)},
+        {"accelerator": "cpu", "devices": (1,)},
     ):
         TrainerOptions(**options).build()
     assert [arguments["strategy"] for arguments in seen] == [
-        "auto", "ddp_find_unused_parameters_true", "ddp_find_unused_parameters_true", "ddp", "auto"
+        "auto", "ddp_find_unused_parameters_true", "ddp_find_unused_parameters_true", "ddp", "auto", "auto"
     ]  # fmt: skip
-    assert [arguments["num_nodes"] for arguments in seen] == [1, 2, 1, 1, 1]
+    assert [arguments["num_nodes"] for arguments in seen] == [1, 2, 1, 1, 1, 1]
+    assert [seen[4]["devices"], seen[5]["devices"]] == [(1,), 1]  # a CPU has no list of devices
     assert [seen[0]["precision"], seen[4]["precision"]] == ["32-true", "bf16-mixed"]
 
 
@@ -102,7 +104,7 @@ def test_options_of_lightning_reach_it(monkeypatch):
     [
         ({"precision": "bf16-true"}, "expected 32-true, tf32, bf16-mixed or 16-mixed; found 'bf16-true'"),
         ({"accelerator": "tpu"}, "accelerator: expected one of gpu, cpu, auto, cuda; found 'tpu'"),
-        ({"accelerator": "cpu", "devices": (0, 1)}, "trainer: "),
+        ({"accelerator": "cpu", "devices": -1}, "trainer: "),
     ],
 )
 def test_what_it_cannot_do_is_one_line(options, message):
