@@ -150,7 +150,7 @@ def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) 
         table = pd.DataFrame(rows, columns=list(columns)).astype(columns)
         if not np.isfinite(table.seconds).all():
             raise ValueError("no time")
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: expected camera,frame,seconds with numbers; found {error}") from None
     cameras = table.camera.map(lambda name: names.get(composed(name), composed(name)))
     times = {name: found.sort_values("seconds") for name, found in table.groupby(cameras)}

@@ -240,6 +240,7 @@ WRONG = {
     "no number": ([*ROWS, ("cam0", "x", 0.0)], "camera,frame,seconds with numbers; found"),
     "no time": ([*ROWS, ("cam0", 3, "nan")], "camera,frame,seconds with numbers; found"),
     "no frame": ([*ROWS, ("cam0", "", 0.3)], "camera,frame,seconds with numbers; found"),
+    "400 digits": ([*ROWS, ("cam0", "9" * 400, 0.3)], "camera,frame,seconds with numbers; found"),
     "a part of a line": ([*ROWS, ("cam0",)], "camera,frame,seconds with numbers; found"),
     "nothing": ([], "the times of cam0, cam1, cam2, cam3; found ''"),
     "no shared time": ([(c, n, t + 9 * (c == "cam1")) for c, n, t in ROWS], "times that all cameras share"),
