@@ -78,6 +78,11 @@ class Cameras(_TensorStruct):
         # Written out: a product of matrices would run in half precision under autocast.
         return -(rotation * translation[..., :, None]).sum(-2)
 
+    @cached_property
+    def has_skew(self) -> bool:
+        """Whether any ``K[0, 1]`` is not 0; the host waits for a GPU at the first use."""
+        return bool((self.intrinsics[..., 0, 1] != 0).any())
+
     def __getitem__(self, index) -> "Cameras":
         return dataclasses.replace(self, intrinsics=self.intrinsics[index], extrinsics=self.extrinsics[index])
 
@@ -142,6 +147,13 @@ class Batch(_TensorStruct):
         parts = {name: value[:, views] for name in names if (value := getattr(self, name)) is not None}
         said = tuple(tuple(row[view] for view in views) for row in self.views)
         return dataclasses.replace(self, **parts, views=said)
+
+    def recolored(self, **changes: Tensor) -> "Batch":
+        """The batch with other colours and the same masks, whose extents stay known."""
+        changed = dataclasses.replace(self, **changes)
+        known = {name: self.__dict__[name] for name in ("extents", "pixels") if name in self.__dict__}
+        changed.__dict__.update(known)
+        return changed
 
     def once(self, function: Callable[["Batch"], _T]) -> _T:
         """``function`` of this batch, computed once and kept for other stages."""

@@ -31,14 +31,14 @@ class Asked(NamedTuple):
 _VERSION = "2.13."
 
 LIMITS = {
-    ("model=paper", 1): Asked(1877, 4, 4489, 6),
-    ("model=paper", 8): Asked(1944, 4, 4714, 6),
-    ("model=hull", 1): Asked(2177, 4, 4999, 6),
-    ("model=hull", 8): Asked(2314, 4, 5224, 6),
-    ("model=recurrent", 1): Asked(3669, 11, 6993, 13),
-    ("model=recurrent", 8): Asked(4788, 32, 8182, 34),
-    ("shipped", 1): Asked(4177, 13, 7059, 13),
-    ("shipped", 8): Asked(5589, 41, 8248, 34),
+    ("model=paper", 1): Asked(1778, 4, 4387, 5),
+    ("model=paper", 8): Asked(1845, 4, 4612, 5),
+    ("model=hull", 1): Asked(2078, 4, 4897, 5),
+    ("model=hull", 8): Asked(2215, 4, 5122, 5),
+    ("model=recurrent", 1): Asked(3393, 5, 6714, 6),
+    ("model=recurrent", 8): Asked(3609, 5, 7000, 6),
+    ("shipped", 1): Asked(3846, 5, 6780, 6),
+    ("shipped", 8): Asked(4054, 5, 7066, 6),
 }
 
 

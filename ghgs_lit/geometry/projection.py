@@ -71,14 +71,17 @@ def world_to_camera(
     points: Float[Tensor, "*batch 3"], extrinsics: Float[Tensor, "*#batch 4 4"]
 ) -> Float[Tensor, "*batch 3"]:
     """World points in camera axes, ``R x + t``."""
-    return torch.stack(_camera_axes(points, extrinsics), -1)
+    return _camera_axes(points, extrinsics).movedim(0, -1).contiguous()
 
 
-def _camera_axes(points: Tensor, extrinsics: Tensor) -> list[Tensor]:
-    """Coordinates of :func:`world_to_camera`; written out as in :func:`unproject`."""
+def _camera_axes(points: Tensor, extrinsics: Tensor) -> Tensor:
+    """Coordinates [3, ...] of :func:`world_to_camera`; written out as in :func:`unproject`."""
     x, y, z = at_least_float32(points).unbind(-1)
-    rows = at_least_float32(extrinsics)[..., :3, :].unbind(-2)
-    return [row[..., 0] * x + row[..., 1] * y + row[..., 2] * z + row[..., 3] for row in rows]
+    matrices = at_least_float32(extrinsics)[..., :3, :]
+    # The results come first; before them are the dimensions that broadcasting would add.
+    matrices = matrices[(None,) * (x.dim() + 2 - matrices.dim())].movedim(-2, 0)
+    a, b, c, shift = matrices.unbind(-1)
+    return a * x + b * y + c * z + shift
 
 
 def project(

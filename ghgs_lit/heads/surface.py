@@ -29,26 +29,18 @@ def surface_axes(
     height, width = maps.depth.shape[-2:]
     depth = at_least_float32(maps.depth)
     own = depth.flatten(0, 1).flatten(1)[image, pixel]
-    intrinsics = at_least_float32(cameras.intrinsics).flatten(0, 1)
-    fx, skew, cx, fy, cy = (intrinsics[:, i, j][image] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
+    intrinsics = at_least_float32(cameras.intrinsics).flatten(0, 1)[image]
+    fx, skew, cx, fy, cy = (intrinsics[:, i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
     row, column = pixel // width, pixel % width
     # Invalid pixels and those beyond the border are infinitely far away.
     around = F.pad(depth.masked_fill(~maps.valid, inf), (1, 1, 1, 1), value=inf).flatten()
     place = (image * (height + 2) + row + 1) * (width + 2) + column + 1
-    footprint = own / fx
-
-    def neighbor(step: int) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
-        """Weighted difference of a neighbour's depth from the pixel's, and the weight from 0 to 1."""
-        deeper = around[place + step] - own
-        near = ((OTHER - deeper.abs() / footprint) / (OTHER - SAME)).clamp(0, 1)
-        return near * torch.where(near > 0, deeper, 0), near
-
-    def slope(step: int) -> Float[Tensor, " N"]:
-        """Relative change of depth from one pixel to the next."""
-        (after, near_after), (before, near_before) = neighbor(step), neighbor(-step)
-        return (after - before) / ((1 + near_after * near_before) * own + after + before)
-
-    right, down = slope(1), slope(width + 2)
+    # Of the neighbours to the right, below, to the left and above: how much deeper, and a weight from 0 to 1.
+    deeper = around[torch.stack([place + step for step in (1, width + 2, -1, -width - 2)])] - own
+    near = ((OTHER - deeper.abs() / (own / fx)) / (OTHER - SAME)).clamp(0, 1)
+    after, before = (near * torch.where(near > 0, deeper, 0)).split(2)
+    # Relative changes of depth from one pixel to the next.
+    right, down = (after - before) / ((1 + near[:2] * near[2:]) * own + after + before)
     # The cross product of the tangents d(z K^-1 [u v 1]) / du and / dv, multiplied by fx fy / z^2.
     toward = 1 + right * (column + 0.5 - cx) + down * (row + 0.5 - cy)
     x, y = -fx * right, -skew * right - fy * down

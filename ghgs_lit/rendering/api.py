@@ -128,8 +128,7 @@ def _check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
     require(len(found) == 2 and found[0] == len(gaussians.splits), "cameras", expected, found)
     size = (cameras.height, cameras.width)
     require(min(size) > 0, "cameras", "a positive image size", size)
-    is_skew = bool((cameras.intrinsics[..., 0, 1] != 0).any())
-    require(not is_skew, "cameras.intrinsics", "no skew: K[0, 1] = 0", "another value")
+    require(not cameras.has_skew, "cameras.intrinsics", "no skew: K[0, 1] = 0", "another value")
 
 
 def _in_one_dtype(gaussians: Gaussians) -> Gaussians:

@@ -41,7 +41,7 @@ def equalized(gaussians: Gaussians, batch: Batch) -> tuple[Gaussians, Batch]:
 def divided(batch: Batch, logs: Float[Tensor, "B V 3"]) -> Batch:
     """The batch with photographs divided by the gains whose logarithms are given."""
     images = (at_least_float32(batch.images) * torch.exp(-logs)[..., None, None]).clamp(0, 1)
-    return dataclasses.replace(batch, images=images, log_gains=logs)
+    return batch.recolored(images=images, log_gains=logs)
 
 
 @torch.no_grad()

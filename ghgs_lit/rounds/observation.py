@@ -1,11 +1,13 @@
 """Values of photographs and renders at the positions of Gaussians, without a gradient."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from ghgs_lit.geometry.masks import coverage, on_black
 from ghgs_lit.geometry.projection import at_least_float32, project
@@ -41,7 +43,9 @@ def slopes(
         for name in ("means", "scales", "opacities", "colors")
     ]
     quaternions = gaussians.quaternions.detach().clone()
-    cameras = map_tensors(batch.cameras, Tensor.clone)
+    cameras = batch.cameras
+    if cameras.extrinsics.is_inference():
+        cameras = map_tensors(cameras, Tensor.clone)
     shown = dataclasses.replace(
         gaussians, means=means, scales=scales, quaternions=quaternions, opacities=opacities, colors=colors
     )
@@ -53,7 +57,8 @@ def slopes(
     with torch.no_grad():
         of_means = of_means * footprints
         along = (of_means * directions).sum(-1, keepdim=True) / directions.norm(dim=-1, keepdim=True)
-        across = rotate(unit(quaternions * quaternions.new_tensor([1, -1, -1, -1])), of_means)
+        inverse = torch.cat((quaternions[:, :1], -quaternions[:, 1:]), -1)
+        across = rotate(unit(inverse), of_means)
         logits = of_opacities * opacities * (1 - opacities)
         values = torch.cat((along, across, of_scales * scales, logits[:, None], of_colors), -1)
         parts = (drawn.image.detach(), drawn.alpha.detach(), drawn.depth.detach())
@@ -90,20 +95,22 @@ def looked_up(
     gaussians: Gaussians, cameras: Cameras, maps: Float[Tensor, "B V c H W"]
 ) -> tuple[Float[Tensor, "N V c"], Float[Tensor, "N V 1"], Bool[Tensor, "N V 1"]]:
     """Values of maps at projected means in each view, z-depths, and whether the view can see the means."""
-    means = gaussians.means.split(gaussians.splits)
-    each = [_in_element(own, cameras[b], maps[b]) for b, own in enumerate(means)]
-    return tuple(torch.cat(values) for values in zip(*each, strict=True))
-
-
-def _in_element(
-    means: Float[Tensor, "n 3"], cameras: Cameras, maps: Float[Tensor, "V c H W"]
-) -> tuple[Float[Tensor, "n V c"], Float[Tensor, "n V 1"], Bool[Tensor, "n V 1"]]:
-    size = means.new_tensor([cameras.width, cameras.height])
-    pixels, z = project(
-        means.expand(len(maps), -1, -1), cameras.intrinsics[:, None], cameras.extrinsics[:, None]
-    )
+    b, views, channels = maps.shape[:3]
+    # One row of points for each element; those with fewer have points at 0 at the end.
+    means = pad_sequence(gaussians.means.split(gaussians.splits), batch_first=True)
+    means = means[:, None].expand(-1, views, -1, -1)
+    pixels, z = project(means, cameras.intrinsics[:, :, None], cameras.extrinsics[:, :, None])
+    size = pixels.new_full((2,), cameras.width)
+    size[1] = cameras.height
     # Pixels far outside are clamped: large numbers are not exact.
-    grid = (2 / size * pixels - 1).clamp(-3, 3)
-    found = F.grid_sample(maps, grid[:, None], align_corners=False)[:, :, 0]
+    grid = (2 / size * pixels - 1).clamp(-3, 3).flatten(0, 1)[:, None]
+    found = F.grid_sample(maps.flatten(0, 1), grid, align_corners=False)[:, :, 0]
     can_see = (z > 0) & ((pixels >= 0) & (pixels <= size)).all(-1)
-    return found.permute(2, 0, 1), z.mT[..., None], can_see.mT[..., None]
+    of_image = found.view(b, views, channels, -1).permute(0, 3, 1, 2)
+    each = (of_image, z.mT[..., None], can_see.mT[..., None])
+    return tuple(_packed(values, gaussians.splits) for values in each)
+
+
+def _packed(values: Tensor, splits: Sequence[int]) -> Tensor:
+    """Rows of all elements one after another, without those that pad."""
+    return torch.cat([own[:count] for own, count in zip(values, splits, strict=True)])

@@ -129,10 +129,15 @@ class GHGSModule(BudgetedModule):
         size = len(batch.images)
         self.log("loss/total", total.detach(), prog_bar=True, batch_size=size)
         self.log_dict({f"loss/{name}": v.detach() for name, v in values.items()}, batch_size=size)
-        rate = self.optimizers().param_groups[0]["lr"]
-        self.log_dict({"train/learning_rate": rate, "train/budget": self.used_budget}, batch_size=size)
-        self.log("train/skipped_steps", float(self.guard.skipped), batch_size=size)
-        self.log("train/gaussians", float(len(prediction.gaussians)) / size, batch_size=size)
+        numbers = {
+            "learning_rate": self.optimizers().param_groups[0]["lr"],
+            "budget": self.used_budget,
+            "skipped_steps": float(self.guard.skipped),
+            "gaussians": len(prediction.gaussians) / size,
+        }
+        # Made where the model is: a number that is copied to a GPU makes the host wait.
+        filled = {f"train/{n}": torch.full((), value, device=self.device) for n, value in numbers.items()}
+        self.log_dict(filled, batch_size=size)
         return total
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:

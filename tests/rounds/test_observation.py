@@ -11,7 +11,7 @@ from ghgs_lit.geometry.projection import project, unproject_maps
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.rendering import render
 from ghgs_lit.rounds import observation
-from ghgs_lit.rounds.observation import CHANNELS, SLOPES, observe, slopes
+from ghgs_lit.rounds.observation import CHANNELS, SLOPES, looked_up, observe, slopes
 from ghgs_lit.types import Batch, Gaussians
 from tests.helpers.scenes import make_batch, with_soft_rims
 
@@ -204,3 +204,18 @@ def test_slopes_of_inference_are_those_of_training():
     one = Batch(batch.images[:1], batch.masks[:1], batch.cameras[:1])
     _, alone = slopes(first, one, torch.ones(len(first), 3), torch.full((len(first), 1), 0.02))
     torch.testing.assert_close(alone, expected[: len(first)], rtol=1e-4, atol=1e-6)
+
+
+def test_elements_of_different_sizes_are_looked_up_as_one_by_one():
+    """Elements are padded to one number of Gaussians: what pads is in no result, also beside one of none."""
+    batch = make_batch(3, 3, 42, 56)
+    whole = splats(batch)
+    first, _, last = (whole[i] for i in range(3))
+    few = torch.cat((torch.arange(7), len(first) + len(whole[1]) + torch.arange(len(last))))
+    gaussians = whole.select(few, (7, 0, len(last)))
+    found = looked_up(gaussians, batch.cameras, batch.images)
+    alone = [looked_up(gaussians[i], batch.cameras[i : i + 1], batch.images[i : i + 1]) for i in (0, 2)]
+    for values, each in zip(found, zip(*alone, strict=True), strict=True):
+        assert torch.equal(values, torch.cat(each))
+    nothing = looked_up(gaussians[1], batch.cameras[:1], batch.images[:1])
+    assert [tuple(values.shape) for values in nothing] == [(0, 3, 3), (0, 3, 1), (0, 3, 1)]
