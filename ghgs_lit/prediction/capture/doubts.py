@@ -15,6 +15,8 @@ _REACH = 6  #: Pixels beside an outline in which contrast is measured
 _OFF = 0.35
 #: Mean pixels by which rays near outlines miss other silhouettes, above which cameras are off.
 _MISSED = 4e-3
+_MISSED_BY_FEW = 1.5e-3  #: The same where the others agree without one camera, or without either of two
+_REST = 0.25  #: Share of the distance that the others have where one camera may be to blame
 
 
 def doubt_of_masks(capture: Capture, size: tuple[int, int]) -> str:
@@ -26,12 +28,20 @@ def doubt_of_masks(capture: Capture, size: tuple[int, int]) -> str:
 
 
 def doubt_of_cameras(capture: Capture, batch: Batch) -> str:
-    """By how much silhouettes of its crops miss one another, if cameras are off; else ""."""
-    missed = float(contradiction(Frame.of(batch).enter(batch)))
+    """By how much silhouettes of its crops miss one another, if cameras are off, and without which of them
+    they do not: one, or two that are nearly exchangeable, as opposite ones are; else ""."""
+    missed, without = (distances[0].tolist() for distances in contradiction(Frame.of(batch).enter(batch)))
     focal = [photograph.intrinsics[0, 0] for photograph in capture.photographs]
     # An enlarged photograph has larger pixels, and larger steps of outlines.
     larger = max(1.0, *(batch.cameras.intrinsics[0, :, 0, 0].numpy() / focal))
-    return f"silhouettes miss one another by {missed:.4f} pixels" if missed > larger**2 * _MISSED else ""
+    rest = {
+        name: share for name, share in zip(batch.views[0], without, strict=True) if share < _REST * missed
+    }
+    is_of_few = 0 < 2 * len(rest) <= len(without)
+    if missed <= larger**2 * (_MISSED_BY_FEW if is_of_few else _MISSED):
+        return ""
+    beside = f", without {' or '.join(rest)} by {max(rest.values()):.4f}" if is_of_few else ""
+    return f"silhouettes miss one another by {missed:.4f} pixels{beside}"
 
 
 def _outline(photograph: Photograph, size: tuple[int, int]) -> float:

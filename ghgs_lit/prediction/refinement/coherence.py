@@ -6,7 +6,7 @@ outlines have none: Gauss-Newton steps minimise how far outside the other silhou
 This needs no model and no surface that two photographs share."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import reduce
 from itertools import combinations
@@ -37,12 +37,11 @@ _COHERENT = 5e-4
 #: Weight of the squared steps, in pixels, relative to the mean squared distance; and the factor of it for
 #: zooms: lenses are known better than poses.
 _STAY, _KNOWN = 1e-3, 5.0
-#: Moving a few cameras is enough if it leaves less than ``_AS_WELL`` times the distance that moving all
-#: leaves, or less than ``_COHERENT`` (a tenth of it with fewer than ``_TELLING`` silhouettes, which tell
-#: less). It is tried where the given distance is above ``_BUMPED``, that of one camera off by 2.5 pixels. One
-#: camera alone may leave ``_REST`` of the given distance, as with rough masks; moving the opposite camera
-#: leaves 0.04.
-_AS_WELL, _TELLING, _BUMPED, _REST = 1.5, 4, 2e-3, 0.02
+#: Cameras are wrong by themselves if the others, as given, miss one another by less than ``_CLEARLY`` times
+#: what they do without any other ones (opposite cameras are nearly exchangeable), counted from ``_EXACT``
+#: pixels, which exact cameras reach. They move alone if that leaves less than ``_COHERENT``, ``_AS_WELL``
+#: times the distance that moving all leaves, or ``_REST`` of the given distance, as with rough masks.
+_CLEARLY, _EXACT, _AS_WELL, _REST = 0.25, 5e-5, 1.5, 0.02
 
 
 @dataclass(frozen=True)
@@ -88,27 +87,30 @@ class _Alignment:
             found = _Alignment(*moved, self.free, (*found.distances, equations.distance))
         return found
 
-    def shows_motions_from(self, start: "_Alignment") -> bool:
-        """Whether the subject moves more than it grows in each free camera's image: growth alone may be a
-        zoom of the other cameras, since only relative focal lengths can be known."""
-        scale, before = (each.lens[0, :, 0, 0] / each.pose[:, 2, 3] for each in (self, start))
-        seen, was = (s[:, None] * each.pose[:, :2, 3] for s, each in ((scale, self), (before, start)))
-        growth = HEIGHT / 2 * before * (scale / before).log().abs()
-        return bool(((seen - was).norm(dim=-1) > growth)[self.free].all())
-
 
 @torch.no_grad()
-def contradiction(batch: Batch) -> Float[Tensor, " B"]:
-    """Mean distance in pixels by which rays near outlines miss other silhouettes; a quick check.
+def contradiction(batch: Batch) -> tuple[Float[Tensor, " B"], Float[Tensor, "B V"]]:
+    """Mean distances in pixels by which rays near outlines miss other silhouettes: of all views, and of the
+    others without each (0 for three views or fewer: two nearly always agree); a quick check.
 
-    With exact cameras it is up to 0.0025, with ones off by 1.5 pixels 0.007 to 0.09. ``batch``: as for
-    :func:`coherent_cameras`."""
-    found = []
+    With exact cameras that of all is up to 0.0025, with ones off by 1.5 pixels 0.007 to 0.09; where one is
+    off, the others' is that of exact cameras. ``batch``: as for :func:`coherent_cameras`."""
+    found, without = [], []
     for mattes, lens, pose in zip(*_on_cpu(batch), strict=True):
-        outlines = Outlines.of(mattes, QUICK)
-        depth = _best_points(outlines, lens, pose, outlines.view, outlines.pixels)[2]
-        found.append(-depth.clamp(max=0).sum() / max(len(depth), 1))
-    return torch.stack(found)
+        silhouettes = _Silhouettes((Outlines.of(mattes, QUICK),), pose.new_zeros(1, 3))
+        found.append(silhouettes.distance(lens[None], pose))
+        views = range(len(pose))
+        each = [silhouettes.distance(lens[None], pose, (v,)) if len(pose) > 3 else 0.0 for v in views]
+        without.append(each)
+    return torch.tensor(found), torch.tensor(without)
+
+
+def culprit(without: Sequence[float]) -> int | None:
+    """Which of several views, or sets of them, is wrong by itself, where it is clear: the others agree
+    without it alone. ``without``: mean distances of the others, in pixels."""
+    first, second = sorted(range(len(without)), key=without.__getitem__)[:2]
+    is_clear = without[first] + _EXACT < _CLEARLY * (without[second] + _EXACT)
+    return first if is_clear else None
 
 
 def _on_cpu(batch: Batch) -> list[Tensor]:
@@ -158,26 +160,26 @@ def _coherent(
         return lens, pose, every, given.distance
     start = _Alignment(lens, pose, every)
     found = start.after(_MEET, silhouettes)
-    is_telling = len(pose) >= _TELLING
-    enough = max(_AS_WELL * found.distances[-1], _COHERENT if is_telling else 0.1 * _COHERENT)
-    for free in _minorities(given, len(pose)) if given.distance > _BUMPED else ():
-        few = _Alignment(lens, pose, free).after(_MEET, silhouettes)
-        rest = _REST * given.distance if is_telling and free.sum() == 1 else 0.0
-        if few.distances[-1] < max(enough, rest) and few.shows_motions_from(start):
-            found = few
-            break
+    few = _minority(silhouettes, lens, pose)
+    if few is not None:
+        alone = _Alignment(lens, pose, few).after(_MEET, silhouettes)
+        # Two of three views nearly always agree.
+        rest = 0.1 * _COHERENT if len(pose) == 3 else max(_COHERENT, _REST * given.distance)
+        enough = max(_AS_WELL * found.distances[-1], rest)
+        found = alone if alone.distances[-1] < enough else found
     found = found.after(_LIE, silhouettes)
     return found.lens, found.pose, found.free, given.distance
 
 
-def _minorities(equations: "_Equations", count: int) -> Iterator[Which]:
-    """The camera that alone explains most when it moves, the best two, and so on below half of ``count``."""
+def _minority(silhouettes: "_Silhouettes", lens: Lenses, pose: Pose) -> Which | None:
+    """The camera, or the fewest of less than half of them, without which alone the others agree."""
+    count = len(pose)
     for size in range(1, (count + 1) // 2):
-        sets = [
-            torch.zeros(count, dtype=torch.bool).index_fill(0, torch.tensor(views), True)
-            for views in combinations(range(count), size)
-        ]
-        yield max(sets, key=equations.gain)
+        sets = list(combinations(range(count), size))
+        which = culprit([silhouettes.distance(lens, pose, views) for views in sets])
+        if which is not None:
+            return torch.zeros(count, dtype=torch.bool).index_fill(0, torch.tensor(sets[which]), True)
+    return None
 
 
 @dataclass(frozen=True)
@@ -203,10 +205,6 @@ class _Equations:
         steps = torch.linalg.solve(self.normal[index][:, index], self.right[index])
         return torch.zeros_like(self.right).index_copy(0, index, steps).view(-1, 7)
 
-    def gain(self, free: Which) -> float:
-        """First-order decrease of the squared distances by the free cameras' step."""
-        return float((self.solved(free).flatten() * self.right).sum())
-
 
 @dataclass(frozen=True)
 class _Silhouettes:
@@ -214,6 +212,17 @@ class _Silhouettes:
 
     outlines: tuple[Outlines, ...]
     middle: Middles
+
+    def distance(self, lens: Lenses, pose: Pose, views: Sequence[int] = ()) -> float:
+        """Mean distance by which rays miss other silhouettes, without those of ``views``."""
+        kept = [view for view in range(len(pose)) if view not in views]
+        missed, rays = 0.0, 0
+        for outlines, each, middle in zip(self.outlines, lens, self.middle, strict=True):
+            some = outlines.of_views(kept)
+            placed = _placed(pose[kept], middle)
+            depth = _best_points(some, each[kept], placed, some.view, some.pixels)[2]
+            missed, rays = missed - float(depth.clamp(max=0).sum()), rays + len(depth)
+        return missed / max(rays, 1)
 
     def equations(self, lens: Lenses, pose: Pose, phase: _Phase) -> "_Equations":
         pixel = _pixel(lens, pose)
@@ -226,8 +235,7 @@ def _equations(
 ) -> _Equations:
     """Unknowns: motions about the frame's origin and zooms of all cameras, in about a pixel."""
     count = len(pose)
-    # Rays are searched around the subject's middle.
-    pose = after_motions(pose, F.pad(middle, (3, 0)).expand(count, 6), pose.new_zeros(3))
+    pose = _placed(pose, middle)
     near = outlines.depth <= phase.to
     view, depth_at_home = outlines.view[near], outlines.depth[near]
     points, other, depth = _best_points(outlines, lens, pose, view, outlines.pixels[near])
@@ -243,6 +251,11 @@ def _equations(
     stay = _STAY * rays * torch.tensor([*[1.0] * 6, _KNOWN]).to(gradients).repeat(count)
     normal = weighted.mT @ jacobian + stay.diag()
     return _Equations(normal, -(weighted.mT @ distances), len(distances), float(distances.abs().sum()))
+
+
+def _placed(pose: Pose, middle: Float[Tensor, " 3"]) -> Pose:
+    """Poses around the subject's middle, where rays are searched."""
+    return after_motions(pose, F.pad(middle, (3, 0)).expand(len(pose), 6), pose.new_zeros(3))
 
 
 def _pixel(lens: Lenses, pose: Pose) -> Float[Tensor, ""]:

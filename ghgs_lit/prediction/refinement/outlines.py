@@ -1,6 +1,7 @@
 """Distance maps of the outlines of one instant's silhouettes, and the rays that pass near them."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -43,6 +44,17 @@ class Outlines:
         depth = sample(maps, view, finer * pixels)[..., 0]
         near = (depth >= _FROM) & (depth <= to)
         return cls(maps, *(each[near][::every] for each in (view, pixels, depth)), size, finer)
+
+    def of_views(self, kept: Sequence[int]) -> "Outlines":
+        """Those of some silhouettes, ascending."""
+        if len(kept) == len(self.maps):
+            return self
+        numbers = torch.tensor(kept)
+        near = torch.isin(self.view, numbers)
+        view = torch.searchsorted(numbers, self.view[near])
+        return replace(
+            self, maps=self.maps[kept], view=view, pixels=self.pixels[near], depth=self.depth[near]
+        )
 
     def at(self, view: Int[Tensor, "*n"], pixels: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
         """Distances at pixels; beyond the photograph those at its border, where a subject may go on."""
