@@ -178,6 +178,16 @@ def test_commands_are_read_whole(tmp_path, monkeypatch):
     ]
 
 
+def test_commands_for_a_gpu_are_run_on_a_cpu():
+    """A wrong or missing key is found without one; README's is among those that every test run runs."""
+    found = [
+        c for document in DOCUMENTS for c in check_documents.commands(document) if "trainer=gpu" in c.text
+    ]
+    assert [c.text for c in found if c.reason is not None] == []
+    assert all("trainer=gpu" not in c.script()[0] and "trainer=cpu" in c.script()[0] for c in found)
+    assert any(c.is_fast for c in found if c.document == "README.md")
+
+
 def test_a_command_that_fails_is_reported(tmp_path, monkeypatch, capsys):
     """A script that hides failures would pass every document."""
     (tmp_path / "README.md").write_text("```bash\ntrue\nghgs no_such_verb\n```\n")
