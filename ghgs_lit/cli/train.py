@@ -31,6 +31,7 @@ from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.runs.signals import Interrupted, interruptible, print_how_to_go_on
 from ghgs_lit.training import GHGSModule, loggers, start
+from ghgs_lit.training.callbacks import NeighborsAtStart
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO, StopAtStep
 from ghgs_lit.training.cost import TrainingCost
 from ghgs_lit.weights import switches
@@ -151,7 +152,7 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
     )
     quiet()
     cost = TrainingCost()
-    trainer = build_trainer(config, directory, cost, StopAtStep())
+    trainer = build_trainer(config, directory, cost, StopAtStep(), NeighborsAtStart())
     module.lpips = build(config["metrics"], "metrics").to(trainer.strategy.root_device).lpips
     # The last check, because it makes missing photographs.
     check_evaluation(config, data)

@@ -16,6 +16,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.unprojection import seen_surfaces
 from ghgs_lit.metrics import ImageMetrics, depth_error_mm, surface_error_mm
 from ghgs_lit.prediction.refinement import CameraRefinement, Refinement
+from ghgs_lit.recalibration.inspection import Neighborhood, seen_neighborhoods
 from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
 from ghgs_lit.types import Batch, Cameras, Decision, Gaussians, Prediction, Rendering
@@ -29,7 +30,7 @@ class Estimate:
     """Prediction of a method for a batch; None: not predicted. ``image``: renders [B, T, 3, h, w] of the
     targets. ``depth``: of the inputs [B, V, H, W], metres, defined where ``depth_valid``. ``gaussians``: what
     was drawn. For each element: number of Gaussians and subject depths that are ``not_finite``; ``decisions``
-    of ``skip=auto``."""
+    of ``skip=auto``; ``neighborhoods`` of its recalibration."""
 
     image: Tensor
     depth: Tensor | None = None
@@ -37,6 +38,7 @@ class Estimate:
     gaussians: Gaussians | None = None
     not_finite: tuple[int, ...] | None = None
     decisions: tuple[Decision, ...] = ()
+    neighborhoods: tuple[Neighborhood, ...] = ()
 
 
 Method = Callable[[Batch], Estimate]
@@ -55,13 +57,16 @@ class ModelMethod:
     def __call__(self, batch: Batch) -> Estimate:
         if self.cameras is not None:
             batch = self.cameras(batch)
-        prediction = self.model(batch)
+        with seen_neighborhoods(getattr(self.model, "recalibration", None)) as seen:
+            prediction = self.model(batch)
         gaussians, depth = prediction.gaussians, prediction.depth
         if self.refinement is not None:
             gaussians, depth = self.refinement(gaussians, batch), None
         image, valid = self.renderer(gaussians, batch.targets.cameras).image, prediction.depth_valid
         lost = not_finite(batch, prediction)
-        return Estimate(image, depth, valid, gaussians, lost, prediction.decisions)
+        # Smaller copies of photographs (coarse to fine) go through the stages first.
+        seen = tuple(seen[-len(batch.images) :])
+        return Estimate(image, depth, valid, gaussians, lost, prediction.decisions, seen)
 
 
 def not_finite(batch: Batch, prediction: Prediction) -> tuple[int, ...]:
@@ -105,6 +110,10 @@ def _rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[Row]:
             shared["gaussians"] = estimate.gaussians.splits[element]
         if estimate.not_finite is not None and estimate.not_finite[element]:
             shared["not_finite"] = estimate.not_finite[element]
+        if estimate.neighborhoods:
+            shared["tokens"] = estimate.neighborhoods[element].tokens
+            shared["neighbors"] = estimate.neighborhoods[element].neighbors
+            shared["shared_neighbors"] = estimate.neighborhoods[element].shared
         if estimate.decisions:
             about["skip"] = estimate.decisions[element].preset
             shared["encoder_products"] = estimate.decisions[element].products

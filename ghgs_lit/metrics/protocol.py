@@ -138,6 +138,7 @@ class ImageMetrics:
             "image": f"renders {renders}, RGB, data range 1",
             "psnr": f"-10 log10(MSE) of each image, at most {PSNR_CAP:g} dB (equal images)",
             "depth_error_mm": "mean |z - true z| over a subject's input pixels with predicted and true depth",
+            "shared_neighbors": "share of neighbours that the other recalibration.neighborhood has, too",
             "surface_mm": "mean distance of Gaussians (by opacity) to the surface of the inputs, and back",
         }
         measured = {metric for region in options.regions for metric in MEASURED[region]}

@@ -1,10 +1,13 @@
-"""Attention weights for inspection; training does not use them."""
+"""Attention weights and neighbours for inspection; training does not use them."""
 
+import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from ghgs_lit.recalibration.neighbors import nearest_neighbors
 from ghgs_lit.recalibration.recalibration import Recalibration, neighbor_cosines, neighbor_count
@@ -56,6 +59,60 @@ def attention_on_other_parts(
     return torch.cat(found)
 
 
+def _near(
+    recalibration: Recalibration, tokens: Tokens, points: Points, chosen: Int[Tensor, " n"]
+) -> Int[Tensor, "n k"]:
+    """Neighbours of the ``chosen`` tokens of an element, as indices among them."""
+    places, positions = recalibration.places(tokens), recalibration.positions(tokens, points)
+    places = None if places is None else places[chosen]
+    k = neighbor_count(recalibration.k, len(chosen))
+    return nearest_neighbors(positions[chosen], tokens.image[chosen], k, places)
+
+
+@dataclass(frozen=True)
+class Neighborhood:
+    """Whom the tokens of an element attend to. ``tokens``: that take part. ``neighbors``: of each, itself
+    included. ``shared``: share of the neighbours that stay the same in the other setting of
+    ``recalibration.neighborhood``; with nearly all tokens as neighbours that is nearly 1, and the ablation of
+    3D unprojection hardly changes anything."""
+
+    tokens: int
+    neighbors: int
+    shared: float
+
+
+@torch.no_grad()
+def neighborhoods(recalibration: Recalibration, tokens: Tokens, points: Points) -> list[Neighborhood]:
+    """The neighbourhood of each element. ``tokens``, ``points``: inputs of the stage."""
+    other = copy.copy(recalibration)
+    other.neighborhood = "image_plane" if recalibration.neighborhood == "xyz" else "xyz"
+    takes_part, element, found = recalibration.takes_part(points), tokens.image // tokens.grid[1], []
+    for number in range(tokens.grid[0]):
+        chosen = (takes_part & (element == number)).nonzero()[:, 0]
+        near, changed = (_near(stage, tokens, points, chosen) for stage in (recalibration, other))
+        same = (near[:, :, None] == changed[:, None]).any(-1).float()
+        shared = same.mean().item() if len(chosen) else 1.0
+        found.append(Neighborhood(len(chosen), near.shape[1], shared))
+    return found
+
+
+@contextmanager
+def seen_neighborhoods(recalibration: nn.Module | None) -> Iterator[list[Neighborhood]]:
+    """A list that gets the neighbourhoods of each element that the stage works on while the context lasts; it
+    stays empty for None and a stage without neighbours."""
+    found: list[Neighborhood] = []
+    if not isinstance(recalibration, Recalibration):
+        yield found
+        return
+    hook = recalibration.register_forward_pre_hook(
+        lambda stage, inputs: found.extend(neighborhoods(stage, *inputs))
+    )
+    try:
+        yield found
+    finally:
+        hook.remove()
+
+
 def _weights(
     recalibration: Recalibration,
     tokens: Tokens,
@@ -65,10 +122,7 @@ def _weights(
     plain: bool = False,
 ) -> tuple[Int[Tensor, "n k"], Float[Tensor, "L m k a"]]:
     """Neighbours of the ``chosen`` tokens of an element, as indices among them, and weights of ``rows``."""
-    places, positions = recalibration.places(tokens), recalibration.positions(tokens, points)
-    places = None if places is None else places[chosen]
-    k = neighbor_count(recalibration.k, len(chosen))
-    near = nearest_neighbors(positions[chosen], tokens.image[chosen], k, places)
+    near = _near(recalibration, tokens, points, chosen)
     block = recalibration.block
     plain |= block.similarity == "none"
     cosines = None if plain else neighbor_cosines(tokens.semantic[chosen], near)

@@ -1,7 +1,9 @@
-"""Callback that says how far a run is."""
+"""Callbacks that say how far a run is, and whom its tokens attend to."""
 
 import time
+from contextlib import ExitStack
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import lightning.pytorch as L
@@ -9,6 +11,7 @@ from lightning.pytorch.callbacks import Callback
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from ghgs_lit.config.options import Options
+from ghgs_lit.recalibration.inspection import seen_neighborhoods
 from ghgs_lit.runs.progress import Lines, clock, on_terminal
 
 
@@ -65,3 +68,28 @@ class RunProgress(Callback):
 
 def _numbers(trainer: L.Trainer) -> list[str]:
     return [f"{name} {value:.4g}" for name, value in trainer.progress_bar_metrics.items()]
+
+
+class NeighborsAtStart(Callback):
+    """Says in the first step how many tokens take part in the recalibration, how many neighbours they have,
+    and how many of these would be the same in the other setting of ``recalibration.neighborhood``."""
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        self._stack = ExitStack()
+        stage = getattr(pl_module.model, "recalibration", None)
+        self._seen = self._stack.enter_context(seen_neighborhoods(stage))
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
+        self._stack.close()
+        if self._seen and trainer.is_global_zero:
+            tokens, count, shared = (
+                fmean(getattr(one, name) for one in self._seen) for name in ("tokens", "neighbors", "shared")
+            )
+            other = "without" if pl_module.model.recalibration.neighborhood == "xyz" else "with"
+            said = f"{tokens:.0f} tokens take part, {count:.0f} neighbours each, {shared:.0%} of them"
+            print(f"recalibration: {said} the same {other} 3D unprojection", flush=True)
+        self._seen = []
+
+    def on_exception(self, *args: Any) -> None:
+        if hasattr(self, "_stack"):
+            self._stack.close()

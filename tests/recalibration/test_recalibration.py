@@ -11,6 +11,7 @@ import ghgs_lit.recalibration.recalibration as stage
 from ghgs_lit.errors import InputError
 from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
 from ghgs_lit.recalibration.attention import S_MIN, Similarity
+from ghgs_lit.recalibration.inspection import seen_neighborhoods
 from ghgs_lit.recalibration.recalibration import RecalibrationOptions, neighbor_cosines, neighbor_count
 from tests.helpers.scenes import CASES, fixture
 from tests.helpers.tokens import literal_neighbors, make_stage, scene
@@ -253,3 +254,23 @@ def test_gathered_neighbors_give_what_a_product_of_all_tokens_gives(similarity, 
         monkeypatch.setattr("ghgs_lit.recalibration.attention._GATHERED", most)
         for a, b in zip(results(), expected, strict=True):
             torch.testing.assert_close(a, b)
+
+
+@pytest.mark.parametrize("neighborhood", ["xyz", "image_plane"])
+def test_neighbors_that_the_ablation_keeps_are_counted(neighborhood):
+    """Against sets of the nearest tokens in space and on the image plane."""
+    tokens, points = scene()
+    with seen_neighborhoods(stage_of := make_stage(k=5, neighborhood=neighborhood)) as seen:
+        stage_of(tokens, points)
+    stage_of(tokens, points)  # no longer seen
+    assert [one.tokens for one in seen] == [12, 13]
+    assert {one.neighbors for one in seen} == {5}
+    for element, one in enumerate(seen):
+        chosen = ((tokens.image // 3 == element) & points.tokens_valid).nonzero()[:, 0]
+        near = nearest_neighbors(points.tokens[chosen], tokens.image[chosen], 5)
+        other = make_stage(k=5, neighborhood="image_plane")
+        places = other.places(tokens)[chosen]
+        flat = nearest_neighbors(other.positions(tokens, points)[chosen], tokens.image[chosen], 5, places)
+        same = [len(set(a) & set(b)) / 5 for a, b in zip(near.tolist(), flat.tolist(), strict=True)]
+        assert one.shared == pytest.approx(sum(same) / len(same), abs=1e-6)
+        assert 0.1 < one.shared < 0.9

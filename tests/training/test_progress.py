@@ -1,9 +1,18 @@
 """How far a run is: lines, a bar on a terminal."""
 
+import dataclasses
 import re
 
+from torch.utils.data import DataLoader
+
+from ghgs_lit.rendering import render
 from ghgs_lit.runs.progress import Lines, track
-from ghgs_lit.training.callbacks import RunProgress
+from ghgs_lit.training import GHGSModule, Optimization
+from ghgs_lit.training.callbacks import NeighborsAtStart, RunProgress
+from ghgs_lit.types import Targets
+from tests.helpers.losses import losses_of
+from tests.helpers.models import make_model
+from tests.helpers.scenes import make_batch
 from tests.training.test_module import loader, module, trainer
 
 
@@ -29,6 +38,23 @@ def test_a_bar_shows_how_far_the_run_is(tmp_path, capsys, monkeypatch):
     assert re.search(r"100% \S+ step 12 +loss/total", shown)
     assert "step 12 of 12" not in shown
     assert len((tmp_path / "train.log").read_text().splitlines()) == 12
+
+
+def test_the_first_step_says_whom_tokens_attend_to(tmp_path, capsys):
+    """With more neighbours than tokens the other setting has the same: the ablation would compare nothing."""
+    batch = make_batch(1, 3)
+    own = Targets(batch.images[:, :1], batch.masks[:, :1], batch.cameras[:, :1])
+    batches = DataLoader(
+        [dataclasses.replace(batch, targets=own)] * 2, batch_size=None, collate_fn=lambda b: b
+    )
+    losses, optimization = losses_of({"render_l1": 1.0}), Optimization(lr=1e-3, warmup=0.1, end_factor=0.0)
+    learned = GHGSModule(make_model("recalibration.k=1000"), render, losses, optimization)
+    callbacks = [NeighborsAtStart()]
+    trainer(tmp_path, steps=2, callbacks=callbacks, val_check_interval=None).fit(learned, batches)
+    (line,) = re.findall("recalibration: .*", capsys.readouterr().out)
+    said = r"recalibration: (\d+) tokens take part, \1 neighbours each, 100% of them the same without .*"
+    assert re.fullmatch(said, line)
+    assert not learned.model.recalibration._forward_pre_hooks
 
 
 def test_the_lines_come_once_a_minute(monkeypatch):

@@ -34,6 +34,19 @@ def test_rows_of_different_steps_are_said(tmp_path):
     assert said in table.notes
 
 
+def test_a_switch_that_hardly_switches_is_said(tmp_path):
+    """With nearly all tokens as neighbours both rows of an ablation are one method."""
+    for name, share, said in (("near", 0.95, True), ("apart", 0.6, False)):
+        for number, row in enumerate(("full", "no_unprojection")):
+            path = write_run(tmp_path / name / str(number), row, 20.0)
+            content = json.loads(path.read_text())
+            for measured in content["rows"]:
+                measured["shared_neighbors"] = share - 0.1 * number
+            path.write_text(json.dumps(content))
+        (table,) = tables_of(tmp_path / name, views=(4,))
+        assert any("95% of a token's neighbours are the same" in note for note in table.notes) == said
+
+
 def test_a_row_is_what_the_model_does(tmp_path):
     """A label that says something else than the model must not choose the row."""
     changed = {"neighborhood": "image_plane", "similarity": "log"}
