@@ -173,7 +173,7 @@ def test_closed_output_is_no_error():
 
 
 def test_a_prediction_goes_where_out_says():
-    """A working directory that is read-only is no obstacle."""
+    """Else into a folder of its own."""
     for overrides, expected in ((["out=/a b/c"], "/a b/c"), ([], "runs/predict/")):
         directory = compose("predict", overrides, with_hydra=True).hydra.run.dir
         assert directory.startswith(expected)

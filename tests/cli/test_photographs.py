@@ -45,11 +45,17 @@ def inside_the_figure(path: Path, scale: float = 1.0) -> float:
     return float(np.any(boxes, 0).mean())
 
 
-def test_photographs_become_a_splat_where_the_subject_is(here, checkpoint, capsys):
-    """In the user's world and unit, with what was done in the report."""
+def test_photographs_become_a_splat_where_the_subject_is(here, checkpoint, capsys, monkeypatch):
+    """In the user's world and unit, with what was done in the report; a read-only working directory is no
+    obstacle, as nothing is written there."""
     cameras = Figure(scale=1000.0).write(here / "images")
+    closed = here / "closed"
+    closed.mkdir(mode=0o555)
+    monkeypatch.chdir(closed)
     common = (f"checkpoint={checkpoint}", "formats=[ply]", "turntable.frames=0", "device=cpu")
-    assert ghgs("predict", "images=images", f"cameras={cameras}", "out=splat", *common) == 0
+    places = (f"images={here / 'images'}", f"cameras={cameras}", f"out={here / 'splat'}")
+    assert ghgs("predict", *places, *common) == 0
+    assert not list(closed.iterdir())
     out = capsys.readouterr().out
     assert "calibration.unit=0.001" in out
     assert inside_the_figure(here / "splat" / "gaussians.ply", 1000.0) > 0.95

@@ -129,7 +129,12 @@ def test_evaluation_takes_evenly_spaced_inputs_and_all_other_targets(root):
     samples = list(data.evaluation_loader(views=3))
     assert len(samples) == 3
     assert samples[0].views == (("000/0", "003/0", "006/0"),)
-    assert samples[0].targets.images.shape == (1, 7, 3, 36, 64)
+    targets, others = samples[0].targets, (1, 2, 4, 5, 7, 8, 9)
+    assert targets.names == (tuple(f"{k:03}/0" for k in others),)
+    views = [photographs(root, size=(36, 64)).view(f"{TEST}_000000", k) for k in others]
+    images = (255 * targets.images[0].movedim(1, -1)).round()
+    np.testing.assert_array_equal(images, [view.image for view in views])
+    np.testing.assert_array_equal(targets.cameras.extrinsics[0], [view.extrinsics for view in views])
     assert data.dataset.reader("val").people == 1
 
 

@@ -1,10 +1,13 @@
 """Target protocols, and the verbs from end to end on rendered boxes."""
 
 import csv
+import fnmatch
 import json
 import os
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,6 +29,7 @@ from tests.helpers.people import rendered
 from tests.helpers.training import Standin
 from tests.helpers.verbs import ghgs
 
+TRAINING = Path(__file__).parents[2] / "docs" / "training.md"
 OFF = MetricsOptions(lpips="off").build()
 
 
@@ -48,11 +52,17 @@ def data_of(root) -> list[str]:
 def test_train_writes_everything_that_it_promises(trained):
     """The files of a run are those of the documentation, with the provenance of the numbers."""
     files = {p.relative_to(trained).as_posix() for p in trained.rglob("*") if p.is_file()}
-    expected = {
-        "metrics.json", "metrics.csv", "config.yaml", "checkpoints/last.ckpt", "checkpoints/best.ckpt",
-        "csv/metrics.csv", "pictures/model_v3_release_s3.png", "pictures/model_v4_midway_s3.png",
-    }  # fmt: skip
-    assert expected <= files
+    rows = re.findall(
+        r"^\| (`.*) \|", TRAINING.read_text().split("\n\nThe measurement uses")[0], re.MULTILINE
+    )
+    documented = [
+        name.replace("<n>", "*") for row in rows for name in re.findall("`([^`]+)`", row.split(" | ")[0])
+    ]
+    patterns = {name + "*" * name.endswith("/") for name in documented}
+    assert {"metrics.json", "checkpoints/best.ckpt", "csv/metrics.csv", "pictures/*.png"} <= patterns
+    assert not [name for name in files if not any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)]
+    assert not [pattern for pattern in patterns if not fnmatch.filter(files, pattern)]
+    assert {"pictures/model_v3_release_s3.png", "pictures/model_v4_midway_s3.png"} <= files
     assert any(name.startswith("tensorboard/events") for name in files)
     assert not [name for name in files if "=" in name or name.endswith(".tmp")]
     content = json.loads((trained / "metrics.json").read_text())
