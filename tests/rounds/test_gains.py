@@ -164,10 +164,11 @@ def test_photographs_that_are_divided_already_are_not_equalized_again():
     """To the bit what a model without the option predicts of them, also of some views alone."""
     batch = painted()
     dark, logs = seen_with(batch, drawn(batch)), torch.zeros(1, 4, 3)
-    logs[0, 1] = 0.1
+    logs[0, 1], logs[0, 3] = 0.1, -2.0
     known = divided(dark, logs)
     torch.testing.assert_close(known.images[0, 1], dark.images[0, 1] * math.exp(-0.1))
     assert torch.equal(known.images[0, 2], dark.images[0, 2])
+    torch.testing.assert_close(known.images[0, 3], (dark.images[0, 3] * math.exp(2)).clamp(max=1))
     plain, equal = (
         make_model("model=recurrent", "skip=exact", f"rounds.gains={on}").eval() for on in ("false", "true")
     )

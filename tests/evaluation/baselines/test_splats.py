@@ -64,6 +64,17 @@ def test_discs_draw_the_surface_better_than_round_splats():
         assert found[1] > found[0] + 3
 
 
+def test_pixels_that_show_little_of_the_subject_have_discs_too():
+    """Their opacity is the matte: without them outlines would end at half a pixel."""
+    batch = with_soft_rims(make_batch(1, 2))
+    own = Targets(batch.images[:, :1], batch.masks[:, :1], batch.cameras[:, :1])
+    deep = torch.where(batch.depths > 0, batch.depths, 2.0)
+    found = splatted(dataclasses.replace(batch, targets=own, depths=deep), true_depth, RENDERER)
+    expected = batch.alpha > 0.125
+    assert torch.equal(found.depth_valid, expected)
+    assert expected.sum() > (batch.masks & expected).sum()
+
+
 @pytest.mark.parametrize("splatting", [splats_at, discs_at])
 def test_sizes_are_of_each_views_own_focal_length(splatting):
     """A lens of one view that is twice as long makes its splats half as wide, and no others."""
