@@ -318,7 +318,9 @@ def test_geometry_is_wide_under_autocast():
     assert prediction.depth.dtype == prediction.points.pixels.dtype == prediction.gaussians.means.dtype
     assert prediction.depth.dtype == torch.float32
     assert torch.equal(prediction.depth_maps.bounds.near, expected.depth_maps.bounds.near)
-    assert (prediction.depth - expected.depth).abs()[batch.masks].max() < 0.002
+    depth = expected.depth[batch.masks]
+    # Tokens are rounded, and move a depth within its bounds; a rounded depth is off by 8 mm.
+    assert (prediction.depth[batch.masks] - depth).abs().max() < (depth.bfloat16() - depth).abs().max() / 2
     again = Unprojection()(
         prediction.depth_maps,
         model.encoder(batch.images, batch.masks, model.bounds(batch)),
