@@ -169,7 +169,7 @@ def _sync(place: Path) -> None:
 def _place_of_lock(path: str | Path) -> Path:
     """The path without links in its folders; the file itself must be none."""
     path = Path(path)
-    return path.parent.resolve() / path.name
+    return resolved(path.parent) / path.name
 
 
 def _open_lock(path: Path, flags: int) -> int:

@@ -1,5 +1,7 @@
 """``ghgs doctor``: diagnose cameras, this machine or a device; one function for each task."""
 
+import os
+
 import rich
 from omegaconf import DictConfig
 from rich.console import Console
@@ -35,11 +37,11 @@ def cameras(cfg: DictConfig) -> None:
     require(cfg.images is not None, "images", tasks, None)
     directory = output_dir()
     folder = capture_folder(save_config(cfg, directory))
-    inputs = {path.resolve() for path in folder.input_files}
+    inputs = {os.path.realpath(path) for path in folder.input_files}
     picture, calibration = directory / "cameras.png", directory / "cameras.json"
     for path in (picture, calibration):
         expected = "a folder (hydra.run.dir) without inputs"
-        require(path.resolve() not in inputs, str(path), expected, "an input")
+        require(os.path.realpath(path) not in inputs, str(path), expected, "an input")
     diagnosis = diagnose(folder)
     best = diagnosis.ranking[0]
     listing = Table("meaning", "worst agreement", *best.shares)

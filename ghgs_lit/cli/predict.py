@@ -21,6 +21,7 @@ from ghgs_lit.cli.photographs import capture_folder, check_cameras
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import resolved
 from ghgs_lit.model import GHGS
 from ghgs_lit.prediction import export
 from ghgs_lit.prediction.capture.backgrounds import Backgrounds
@@ -49,7 +50,7 @@ OTHER_RIG = 5.0
 @torch.no_grad()
 def run(cfg: DictConfig) -> None:
     """Run the verb."""
-    directory = output_dir() if cfg.out is None else Path(cfg.out).expanduser().resolve()
+    directory = output_dir() if cfg.out is None else resolved(cfg.out)
     is_capture = cfg.images is not None or cfg.cameras is not None
     config = resolve(cfg if is_capture else inputs.with_trained_data(cfg))
     config |= inputs.model_of(cfg.checkpoint, cfg)

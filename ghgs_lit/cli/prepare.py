@@ -11,6 +11,7 @@ from ghgs_lit.data.check import inspect, show, write
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.reader import PHASES
 from ghgs_lit.errors import InputError
+from ghgs_lit.files import resolved
 from ghgs_lit.synthesis.datasets import Scans
 
 log = logging.getLogger(__name__)
@@ -19,7 +20,7 @@ log = logging.getLogger(__name__)
 def run(cfg: DictConfig) -> None:
     """Run the task of the verb."""
     data = build(cfg.data, key="data", views=cfg.views, targets=cfg.targets, seed=cfg.seed)
-    root = Path(data.dataset.root or ".").expanduser().resolve()
+    root = resolved(data.dataset.root or ".")
     if cfg.task == "render":
         render(data)
         announce(root)

@@ -15,7 +15,7 @@ from ghgs_lit.files import require_free, resolved, write_text_atomically
 
 def output_dir() -> Path:
     """Absolute path of this run's directory, which Hydra makes."""
-    return Path(HydraConfig.get().runtime.output_dir).resolve()
+    return resolved(HydraConfig.get().runtime.output_dir)
 
 
 def write_config(config: dict[str, Any], directory: Path) -> None:

@@ -4,7 +4,6 @@ import ipaddress
 import math
 import time
 from functools import partial
-from pathlib import Path
 
 import torch
 from omegaconf import DictConfig
@@ -15,6 +14,7 @@ from ghgs_lit.cli.photographs import sources_of
 from ghgs_lit.cli.runtime import output_dir, save_config, write_config
 from ghgs_lit.config import resolve
 from ghgs_lit.errors import require
+from ghgs_lit.files import resolved
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.live import live_frames
 from ghgs_lit.prediction.capture.predict import crop_size, in_frame, predict_batch
@@ -75,7 +75,7 @@ def _run_live(cfg: DictConfig) -> None:
         return exported_subject(result.batch, result.prediction, renderer, options)
 
     crop = partial(Capture.batch, size=size, refine_masks=masks)
-    recording = None if config["out"] is None else Recording(Path(config["out"]).expanduser().resolve())
+    recording = None if config["out"] is None else Recording(resolved(config["out"]))
     print(f"waiting for an instant in {config['images']}", flush=True)
     page = partial(_opened, cfg, layers=False)
     until, delay = cfg.seconds or math.inf, cfg.delay or math.inf

@@ -46,7 +46,7 @@ def _module_of(entry: str) -> str:
     entry = entry.strip()
     if not entry.endswith(".py"):
         return entry
-    path = Path(entry).expanduser().resolve()
+    path = Path(os.path.realpath(os.path.expanduser(entry)))
     if not path.is_file():
         raise InputError(f"{VARIABLE}: expected a Python file; found no {path}")
     if not path.stem.isidentifier():

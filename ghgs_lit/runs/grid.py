@@ -22,7 +22,7 @@ from ghgs_lit.config.compose import check_ablation, saved_text
 from ghgs_lit.config.keys import is_hyperparameter, key_of
 from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.files import write_text_atomically
+from ghgs_lit.files import resolved, write_text_atomically
 from ghgs_lit.runs.job import BUSY, check_config, check_launcher
 from ghgs_lit.runs.processes import queue_again
 from ghgs_lit.runs.progress import clock
@@ -163,7 +163,7 @@ Launch = Callable[[Sequence[Sequence[str]], int], Sequence[JobReturn]]
 def sweep(sweeper: BasicSweeper, arguments: Sequence[str], rehearse: Rehearse) -> list[Sequence[JobReturn]]:
     """Run the grid of ``arguments`` and the sweeper's parameters, or with ``dry_run`` :func:`print_plan`
     after ``rehearse``. Interrupted: Ctrl-C or SIGTERM; no further run is started."""
-    directory = Path(str(sweeper.config.hydra.sweep.dir)).resolve()
+    directory = resolved(str(sweeper.config.hydra.sweep.dir))
     with interruptible():
         try:
             return _sweep(sweeper, arguments, directory, rehearse)

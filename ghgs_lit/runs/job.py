@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.config.keys import lookup
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import resolved
 from ghgs_lit.readers import read_yaml
 from ghgs_lit.runs.processes import is_queued_again, process_count
 from ghgs_lit.runs.provenance import config_hash
@@ -60,7 +61,7 @@ def register_resolvers() -> None:
         return max((path.name for path in found), default=name)
 
     def sqlite(path: str) -> str:
-        place = Path(path).resolve()
+        place = resolved(path)
         place.parent.mkdir(parents=True, exist_ok=True)  # SQLite does not
         return f"sqlite:///{place}"
 

@@ -77,7 +77,7 @@ class RunDirectory:
     this run; None: whatever its configuration is."""
 
     def __init__(self, path: Path, config_hash: str | None = None) -> None:
-        self.path = Path(path).resolve()
+        self.path = resolved(path)
         self.config_hash = config_hash
         self._lock = self.path / ".lock"
         self._is_mine = False

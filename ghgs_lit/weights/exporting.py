@@ -7,7 +7,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.files import write_atomically
+from ghgs_lit.files import resolved, write_atomically
 from ghgs_lit.weights import names
 from ghgs_lit.weights.checkpoint import model_state, read_checkpoint, require_finite, write_checkpoint
 from ghgs_lit.weights.reading import cast
@@ -57,7 +57,7 @@ def write_tensors(path: str | Path, tensors: dict[str, Tensor], entry: str | Non
 def write_inference(checkpoint: str | Path, path: str | Path, dtype: str) -> None:
     """Write the model of ``checkpoint`` without optimizer, losses and progress. ``dtype`` of all weights:
     ``float16``, ``bfloat16`` or ``float32``. InputError: a weight overflows it, or both are one file."""
-    if Path(checkpoint).resolve() == Path(path).resolve():
+    if resolved(checkpoint) == resolved(path):
         raise InputError(f"inference={path}: expected another file than the checkpoint; found the same")
     content = read_checkpoint(checkpoint, whole=True)
     require("depth_head" in content["config"], str(checkpoint), "a whole model", "the encoder alone")

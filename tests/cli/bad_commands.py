@@ -247,6 +247,7 @@ NUMBERS = [
     ("table runs={tmp} evaluation.views=[4,4]", 1, "evaluation.views: expected different values", "[4, 4]"),
     ("table runs={tmp} evaluation.targets=[a,a]", 1, "evaluation.targets: expected different values"),
     ("table runs={tmp} by=[seed,seed]", 1, "by: expected different values"),
+    ("prepare task=check data=scans data.root={loop}", 1, "{loop}: expected", "links in a loop"),
     ("table runs={loop}", 1, "{loop}: expected", "links in a loop"),
     ("predict images={empty} cameras={loop}", 1, "{loop}: expected"),
     ("predict out={loop} images={empty} cameras={text}", 1, "{loop}: expected"),

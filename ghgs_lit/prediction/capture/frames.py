@@ -1,5 +1,6 @@
 """Frames of a folder with one video for each camera, by instant."""
 
+import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -174,7 +175,7 @@ def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict
     """The masks of a video by frame number; empty if there are none beside it."""
     name, place = composed(video.path.stem), folder if masks is None else masks
     marked = f"{name}{MASK_ENDING}"
-    names = (marked,) if place.resolve() == folder.resolve() else (name, marked)
+    names = (marked,) if os.path.realpath(place) == os.path.realpath(folder) else (name, marked)
     path = image_named(place, *names, suffixes=SUFFIXES)
     if path is not None:
         drawn = read_video(path)

@@ -3,6 +3,7 @@
 A matte [h, w] uint8 is 255 times the share of each pixel that shows the subject; a mask has only 0 and 255.
 """
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -86,6 +87,6 @@ def mask_path(photograph: Path, images: Path, masks: Path) -> Path | None:
     folder = masks / photograph.parent.relative_to(images)
     marked = f"{photograph.stem}{MASK_ENDING}"
     # Beside the photograph, the image of its name is the photograph itself.
-    beside = folder.resolve() == photograph.parent.resolve()
+    beside = os.path.realpath(folder) == os.path.realpath(photograph.parent)
     # COLMAP's masks keep the suffix of the photograph: front.jpg.png.
     return image_named(folder, *([marked] if beside else [photograph.stem, photograph.name, marked]))

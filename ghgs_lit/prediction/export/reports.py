@@ -1,6 +1,7 @@
 """``report.json`` of a directory lists the files of predictions; only those are replaced later."""
 
 import json
+import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -16,12 +17,12 @@ REPORT = "report.json"  #: The file that lists the others
 
 def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] = ()) -> None:
     """Refuse to replace inputs, or ``names`` and a report of other origin. InputError: names the first."""
-    read = {path.resolve() for path in inputs}
+    read = {os.path.realpath(path) for path in inputs}
     written = _written_before(directory)
     for name in (*names, REPORT):
         path = directory / name
         expected = "another folder (out=...) than that of an input"
-        require(path.resolve() not in read, str(path), expected, "the input")
+        require(os.path.realpath(path) not in read, str(path), expected, "the input")
         expected = "no file, or one that an earlier prediction wrote (out=... names another folder)"
         require(name in written or not path.exists(), str(path), expected, "another file")
 

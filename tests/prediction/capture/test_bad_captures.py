@@ -12,6 +12,8 @@ from PIL import Image
 
 from ghgs_lit import Capture
 from ghgs_lit.errors import InputError
+from ghgs_lit.prediction.capture.folder import CaptureFolder
+from ghgs_lit.prediction.export.reports import require_free
 from tests.helpers.captures import truncate
 from tests.helpers.figures import Figure
 
@@ -275,3 +277,14 @@ def test_further_suffixes_of_kinds_that_are_read(place, suffix):
         Image.open(path).save(path.with_suffix(f".{suffix}"), format=kind, quality=95)
         path.unlink()
     assert len(Capture.read(place / "images", place / "images" / "cameras.json").photographs) == 4
+
+
+def test_links_in_a_loop_beside_photographs_are_no_matter(place):
+    """A stray link, and a folder that is linked into itself, as backups have."""
+    (place / "images" / "loop").symlink_to("loop")
+    (place / "images" / "again").symlink_to(place / "images")
+    folder = CaptureFolder(place / "images", place / "images" / "cameras.json")
+    assert len(folder.photographs(folder.instants[0])) == 4
+    require_free(place, ["out.ply"], folder.input_files)
+    with pytest.raises(InputError, match="the input"):
+        require_free(place / "images" / "again", ["cam0.png"], folder.input_files)
