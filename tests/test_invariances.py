@@ -97,7 +97,7 @@ HALF = pytest.mark.skipif("avx512bf16" not in processor_features(), reason="no p
 
 @pytest.mark.parametrize("case", [pytest.param(attention, marks=HALF), recalibration, sweep, similarity])
 def test_mixed_precision_costs_at_most_twice_what_it_costs_pytorch(case):
-    """``|out - ref|`` of the same function in plain PyTorch at that dtype, and 1e-5 of ``|ref|``; as root mean
+    """``|out - ref|`` of the same function in plain PyTorch at that dtype, and 1e-5 of ``|ref|``; root mean
     squares, since the largest rounding is the luck of a processor's order of summation."""
     ours, plain = case(torch.Generator().manual_seed(0))
     expected = plain(torch.float32)
