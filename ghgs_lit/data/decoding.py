@@ -117,8 +117,9 @@ def check_extrinsics(place: Path | str, extrinsics: Any) -> np.ndarray:
     _check_last_row(place, extrinsics)
     rotation = extrinsics[:3, :3]
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
-        found = np.round(rotation, 3).tolist()
+    is_mirrored = np.linalg.det(rotation) < 0
+    if error > _ROTATION_TOLERANCE or is_mirrored:
+        found = f"{'a mirrored axis in ' if is_mirrored else ''}{np.round(rotation, 3).tolist()}"
         raise InputError(f"{place}: expected a rotation in the first three columns; found {found}")
     return extrinsics
 

@@ -16,6 +16,7 @@ from ghgs_lit.prediction.capture.calibration import AXES, EXTRINSICS, INTRINSICS
 from ghgs_lit.prediction.capture.crops import Photograph
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.photographs import Pixels
+from ghgs_lit.prediction.capture.placement import copies, placement_lines
 
 #: Least agreement of every view of a right calibration, and by how much a better meaning must win.
 AGREES, BETTER = 0.9, 0.05
@@ -109,12 +110,18 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
     if same is not None:
         line = f"{' and '.join(same)} have the same pose: one of them is a copy"
         return Diagnosis(False, (line,), "", (given,), given.size(folder), same)
+    photographs = given.photographs(folder) if given.score > 0 else []
+    same = copies(photographs)
+    if same is not None:
+        line = f"{' and '.join(same)} are the same photograph: one of them is a copy"
+        return Diagnosis(False, (line,), "", (given,), given.size(folder), same)
     if given.score >= AGREES:
         size = given.size(folder)
         agree = f"{given.score:.0%} of each mask or more lies in the hull of the others"
         lines = [f"cameras and masks agree ({agree})", _size_line(size)]
         suspects, *said = _suspected(given, folder) if given.score < _SOUND else ((),)
-        return Diagnosis(True, (*lines, *said), "", (given,), size, suspects)
+        lines += [*said, *placement_lines(photographs, [view.camera.pose for view in views])]
+        return Diagnosis(True, tuple(lines), "", (given,), size, suspects)
     tried = [given, *(hypothesis.ranked(folder) for hypothesis in _for_all(views))]
     best = max(tried, key=lambda hypothesis: hypothesis.score)
     if best.score < AGREES:

@@ -15,7 +15,7 @@ from ghgs_lit.errors import require
 from ghgs_lit.geometry.masks import coverage, on_black
 from ghgs_lit.geometry.projection import world_to_camera
 from ghgs_lit.kernels.precision import exact
-from ghgs_lit.metrics.functional import psnr, ssim
+from ghgs_lit.metrics.functional import box_of, psnr, ssim
 from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering
 
 Renderer = Callable[..., Rendering]
@@ -44,14 +44,15 @@ WEIGHTS: Weights = (0.8, 0.2, 0.1)
 
 @dataclass(frozen=True)
 class Report:
-    """PSNR in dB before and after: of the inputs, and (of four or more) of one held out."""
+    """PSNR in dB in the subject's box before and after: of the inputs, and (of four or more) of one held
+    out."""
 
     steps: int
     inputs: tuple[float, float]
     held_out: tuple[float, float] | None
 
     def __str__(self) -> str:
-        line = f"refine: {self.steps} steps; inputs {{:.2f}} -> {{:.2f}} dB".format(*self.inputs)
+        line = f"refine: {self.steps} steps; in the box, inputs {{:.2f}} -> {{:.2f}} dB".format(*self.inputs)
         if self.held_out is None:
             return line
         return line + "; an input held out, from the others, {:.2f} -> {:.2f} dB".format(*self.held_out)
@@ -151,7 +152,8 @@ class Refinement:
     def _psnr(self, gaussians: Gaussians, batch: Batch) -> float:
         photographs, _, cameras = seen_by(batch)
         drawn = self.renderer(gaussians, cameras, background=0.0).image
-        return float(psnr(drawn.flatten(0, 1).clamp(0, 1), photographs.flatten(0, 1)).mean())
+        images = drawn.flatten(0, 1).clamp(0, 1), photographs.flatten(0, 1)
+        return float(psnr(*images, box_of(batch.masks.flatten(0, 1))).mean())
 
 
 def seen_by(batch: Batch) -> Seen:

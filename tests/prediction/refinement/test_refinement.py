@@ -8,7 +8,7 @@ import torch
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import splats_at
 from ghgs_lit.geometry.projection import world_to_camera
-from ghgs_lit.metrics.functional import psnr
+from ghgs_lit.metrics.functional import box_of, psnr
 from ghgs_lit.prediction.refinement import Refinement
 from ghgs_lit.prediction.refinement.refinement import _footprints
 from ghgs_lit.rendering import Renderer
@@ -32,8 +32,10 @@ def at_true_depth(batch):
     return dataclasses.replace(splats, colors=0.95 * splats.colors)
 
 
-def quality(gaussians, cameras, images):
-    return float(psnr(RENDERER(gaussians, cameras).image.flatten(0, 1), images.flatten(0, 1)).mean())
+def quality(gaussians, cameras, images, masks=None):
+    """PSNR, of the masks' boxes where there are any."""
+    region = None if masks is None else box_of(masks.flatten(0, 1))
+    return float(psnr(RENDERER(gaussians, cameras).image.flatten(0, 1), images.flatten(0, 1), region).mean())
 
 
 def test_a_view_that_nobody_saw_gets_better():
@@ -44,12 +46,14 @@ def test_a_view_that_nobody_saw_gets_better():
     refined = refinement(splats, inputs)
     assert quality(refined, between, target) > quality(splats, between, target) + 2
     report = refinement.report(splats, refined, inputs, at_true_depth)
-    found = [quality(gaussians, inputs.cameras, inputs.images) for gaussians in (splats, refined)]
+    found = [
+        quality(gaussians, inputs.cameras, inputs.images, inputs.masks) for gaussians in (splats, refined)
+    ]
     assert report.inputs == pytest.approx(found, abs=1e-3)
     assert found[1] > found[0] + 2
     assert report.held_out[1] > report.held_out[0] + 1
     assert str(report).startswith(
-        f"refine: 15 steps; inputs {found[0]:.2f} -> {found[1]:.2f} dB; an input held"
+        f"refine: 15 steps; in the box, inputs {found[0]:.2f} -> {found[1]:.2f} dB; an input held"
     )
 
 
@@ -81,7 +85,7 @@ def test_the_input_that_is_held_out_takes_no_part():
     (others,) = given
     assert torch.equal(others.images, inputs.images[:, :3])
     before = at_true_depth(others)
-    hidden = inputs.cameras[:, 3:], inputs.images[:, 3:]
+    hidden = inputs.cameras[:, 3:], inputs.images[:, 3:], inputs.masks[:, 3:]
     found = [quality(gaussians, *hidden) for gaussians in (before, refinement(before, others))]
     assert report.held_out == pytest.approx(found, abs=1e-3)
     assert report.held_out[1] > report.held_out[0]
