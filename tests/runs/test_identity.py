@@ -244,7 +244,8 @@ def test_the_loser_of_two_starts_leaves_the_winner_alone(verb, tmp_path):
     try:
         assert ready.wait(30)
         (run / "config.yaml").write_text("of the winner")
-        os.utime(run / "config.yaml", (time.time() + 60,) * 2)
+        for name in (".lock", "config.yaml"):  # the winner started later
+            os.utime(run / name, (time.time() + 60,) * 2)
         code, _, err = verb(f"hydra.run.dir={run}")
         assert code == 1
         assert f"found process {holder.pid} on" in err
