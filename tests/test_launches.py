@@ -57,8 +57,9 @@ def asked(kind: str, size: int) -> Asked:
     batch = Batch(batch.images, batch.masks, batch.cameras, batch.targets, depths=2.0 * batch.masks)
     with pretend_device() as log, device.drawing_nothing():
         model, batch = model.to(DEVICE), batch.to(DEVICE)
-        log.clear()
-        _, launches, waits = device.forward(model.eval(), batch, log)["total"]
+        for _ in range(2):  # the first fills caches, which depend on the size of photographs alone
+            log.clear()
+            _, launches, waits = device.forward(model.eval(), batch, log)["total"]
         if model.rounds is not None:
             model.rounds._drawn = lambda: 2
         parts = device.second_step(model.train(), Optimization(lr=1e-3, matrix_scale=1.0), batch, log)

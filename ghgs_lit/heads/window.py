@@ -109,18 +109,33 @@ def _interpolate(maps: Tensor, axis: int, source: Span, target: Span) -> Tensor:
     return torch.lerp(below, above, weight) if torch.is_grad_enabled() else below.lerp_(above, weight)
 
 
-@lru_cache(maxsize=256)
-@torch.inference_mode(False)  # the cached tensors may be used with a gradient later
 def _sources(
     source: Span, target: Span, dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor]:
     """For each cell of the target, the two cells of the source around it, and the weight of the second."""
+    numbers, place, low, high, weight = _of_whole_maps(source.full, target.full, dtype, device)
+    wanted = slice(target.start, target.stop)
+    low, high, weight = low[wanted], high[wanted], weight[wanted]
+    first, last = numbers[target.start], min(numbers[target.stop - 1] + 1, source.full - 1)
+    if first < source.start or last >= source.stop:  # the window ends before its neighbours do
+        low = low.clamp(source.start, source.stop - 1)
+        high, weight = (low + 1).clamp(max=source.stop - 1), place[wanted] - low
+    return (low - source.start, high - source.start, weight) if source.start else (low, high, weight)
+
+
+@lru_cache(maxsize=256)
+@torch.inference_mode(False)  # the cached tensors may be used with a gradient later
+def _of_whole_maps(
+    source: int, target: int, dtype: torch.dtype, device: torch.device
+) -> tuple[list[int], Tensor, Tensor, Tensor, Tensor]:
+    """For each of ``target`` cells: its place among ``source`` cells, the two cells around it, the weight of
+    the second; the first of the two also as numbers, which are known without waiting for a GPU."""
     # A division and a product, both rounded to the precision of the maps, as in PyTorch.
-    step = torch.tensor((source.full - 1) / max(target.full - 1, 1), dtype=dtype, device="cpu").item()
-    place = torch.arange(target.start, target.stop, dtype=dtype, device=device) * step
-    low = place.long().clamp(source.start, source.stop - 1)
-    high = (low + 1).clamp(max=source.stop - 1)
-    return low - source.start, high - source.start, place - low
+    step = torch.tensor((source - 1) / max(target - 1, 1), dtype=dtype, device="cpu").item()
+    numbers = (torch.arange(target, dtype=dtype, device="cpu") * step).long().tolist()
+    place = torch.arange(target, dtype=dtype, device=device) * step
+    low = place.long().clamp(max=source - 1)
+    return numbers, place, low, (low + 1).clamp(max=source - 1), place - low
 
 
 def subject_windows(extents: Sequence[Extent], size: tuple[int, int]) -> list[Window | None]:
