@@ -182,6 +182,12 @@ class Extent(NamedTuple):
     left: int
     right: int
 
+    def cells(self, stride: int) -> int:
+        """Number of cells of ``stride`` x ``stride`` pixels that the bounding box touches."""
+        rows, columns = ((self.top, self.bottom), (self.left, self.right))
+        sides = [(end - 1) // stride - start // stride + 1 for start, end in (rows, columns)]
+        return sides[0] * sides[1] if self.count else 0
+
 
 def extents(masks: Bool[Tensor, "n H W"]) -> list[Extent]:
     """Extent of each mask; the host waits for a GPU once."""
@@ -191,14 +197,16 @@ def extents(masks: Bool[Tensor, "n H W"]) -> list[Extent]:
     return [Extent(*numbers) for numbers in torch.stack(found, dim=1).tolist()]
 
 
-def true_places(mask: Bool[Tensor, "..."], count: int) -> Int[Tensor, " count"]:
-    """Flat indices of the ``count`` True values, as ``nonzero`` but without waiting for a GPU."""
+def true_places(mask: Bool[Tensor, "..."], count: int, repeats: bool = False) -> Int[Tensor, " n"]:
+    """Flat indices of the ``count`` True values, as ``nonzero`` but without waiting for a GPU. ``repeats``:
+    there may be fewer; the first is repeated there."""
     flat = mask.flatten()
     if flat.device.type == "cpu":
         return flat.nonzero()[:, 0]
     index = torch.arange(len(flat), device=flat.device)
     target = torch.where(flat, flat.cumsum(0) - 1, count)  # all others go to the last place
-    return index.new_empty(count + 1).scatter_(0, target, index)[:count]
+    found = flat.to(torch.uint8).argmax().repeat(count + 1) if repeats else index.new_empty(count + 1)
+    return found.scatter_(0, target, index)[:count]
 
 
 @dataclass(frozen=True)

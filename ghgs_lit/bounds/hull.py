@@ -19,7 +19,7 @@ from ghgs_lit.bounds.silhouettes import (
     votes_outside,
 )
 from ghgs_lit.kernels.pool import even_parts, is_supported
-from ghgs_lit.types import Batch, Cameras, DepthBounds
+from ghgs_lit.types import Batch, Cameras, DepthBounds, true_places
 
 #: Depths in memory at once.
 _DEPTHS = 1 << 23
@@ -39,8 +39,9 @@ class VisualHull(SubjectBox):
         start = box if coarse.stride == 1 else self._valid(depths_in_box(coarse.cameras, lower, upper))
         # At least one cell: the rays of a cell's pixels run beside the ray of its centre.
         radius, rays = max(coarse.dilation, 1), batch.pixels if coarse.stride == 1 else None
+        count = sum(extent.cells(coarse.stride) for extent in batch.extents)
         hull = hull_bounds(
-            coarse.masks, coarse.cameras, start, radius, self.tolerance, self.samples, rays, voting
+            coarse.masks, coarse.cameras, start, radius, self.tolerance, self.samples, rays, voting, count
         )
         near, far = (_enlarge(x, coarse.stride, batch.masks.shape[-2:]) for x in (hull.near, hull.far))
         return self._valid(DepthBounds(torch.maximum(box.near, near), torch.minimum(box.far, far)))
@@ -55,6 +56,7 @@ def hull_bounds(
     samples: int = 48,
     rays: Int[Tensor, " r"] | None = None,
     voting: Bool[Tensor, "B V"] | None = None,
+    count: int | None = None,
 ) -> DepthBounds:
     """First and last depth within ``start`` that the dilated masks of the other views allow.
 
@@ -65,7 +67,8 @@ def hull_bounds(
         tolerance: how many other views may say "outside" of a depth that is allowed.
         samples: depths that are tried along each ray.
         rays: indices of the masks' pixels, if known.
-        voting: views that may say "outside"; None: those whose mask is not empty."""
+        voting: views that may say "outside"; None: those whose mask is not empty.
+        count: the masks have no more pixels than this, so that a GPU need not be asked; None: unknown."""
     voting = masks.flatten(2).any(-1) if voting is None else voting
     outside = votes_outside(dilate(masks, radius), voting)
     near, far = (bound.clone(memory_format=torch.contiguous_format) for bound in (start.near, start.far))
@@ -74,9 +77,11 @@ def hull_bounds(
     if is_supported(near, directions, matrices):
         cpu.march(outside, masks, matrices, directions, cameras.centers, near, far, steps, tolerance)
         return DepthBounds(near, far)
-    rays = masks.flatten().nonzero()[:, 0] if rays is None else rays
+    if rays is None:
+        known = count is not None
+        rays = true_places(masks, count, repeats=True) if known else masks.flatten().nonzero()[:, 0]
     for part in even_parts(len(rays), _DEPTHS // (samples * (masks.shape[1] - 1))):
-        _march(rays[part], outside, matrices, directions, cameras.centers, near, far, steps, tolerance)
+        _march(rays[part], outside, matrices, directions, cameras.centers, start, near, far, steps, tolerance)
     return DepthBounds(near, far)
 
 
@@ -86,15 +91,17 @@ def _march(
     matrices: Float[Tensor, "B V 3 4"],
     directions: Float[Tensor, "B V h w 3"],
     centers: Float[Tensor, "B V 3"],
+    start: DepthBounds,
     near: Float[Tensor, "B V h w"],
     far: Float[Tensor, "B V h w"],
     steps: Float[Tensor, " s"],
     tolerance: int,
 ) -> None:
-    """:func:`ghgs_lit.bounds.cpu.march` in PyTorch, for the pixels ``rays`` of all images."""
+    """:func:`ghgs_lit.bounds.cpu.march` in PyTorch, for the pixels ``rays`` of all images. ``start`` is read,
+    since a ray may be listed more than once."""
     views, samples = outside.shape[1], len(steps)
     image = rays // outside[0, 0].numel()
-    begin, end = (bound.view(-1)[rays] for bound in (near, far))
+    begin, end = (bound.reshape(-1)[rays] for bound in (start.near, start.far))
     length = end - begin
     depth = begin[:, None] + steps * length[:, None]
     direction, center = directions.reshape(-1, 1, 3)[rays], centers.reshape(-1, 1, 3)[image]
