@@ -93,15 +93,24 @@ class CameraRefinement:
         cameras, free, distance = coherent_cameras(batch, self.shared)
         are_right = (distance < _EXACT) & (batch.masks.shape[1] >= _TELLING)
         first = torch.where(are_right, _DOUBTED, _FIRST)
-        moved = (cameras.extrinsics != batch.cameras.extrinsics).flatten(1).any(1)
-        if not bool(moved.any()):
-            return batch, moved, free, first
-        proposal = replace(batch, cameras=cameras)
-        before, after = map(self._disagreement, (batch, proposal))
-        is_better = moved & (after < (1 - _FIRST) * before)
+        is_better = self._confirmed(batch, cameras)
+        shared = ~is_better & ~free.all(1)
+        if bool(shared.any()):  # no camera that is wrong by itself, as it seemed
+            together, _, _ = coherent_cameras(batch, self.shared, alone=False)
+            cameras = _chosen(shared[:, None], together, cameras)
+            free = free | shared[:, None]
+            is_better = torch.where(shared, self._confirmed(batch, cameras), is_better)
         free = free | ~is_better[:, None]
         cameras = _chosen(is_better[:, None] & free, cameras, batch.cameras)
         return replace(batch, cameras=cameras), is_better, free, first
+
+    def _confirmed(self, batch: Batch, cameras: Cameras) -> Bool[Tensor, " B"]:
+        """Which elements' predictions agree better with other cameras; false where these are the same."""
+        moved = (cameras.extrinsics != batch.cameras.extrinsics).flatten(1).any(1)
+        if not bool(moved.any()):
+            return moved
+        before, after = map(self._disagreement, (batch, replace(batch, cameras=cameras)))
+        return moved & (after < (1 - _FIRST) * before)
 
     def _disagreement(self, batch: Batch) -> Numbers:
         views = _views(self.predict(batch), batch)

@@ -42,6 +42,7 @@ _STAY, _KNOWN = 1e-3, 5.0
 #: pixels, which exact cameras reach. They move alone if that leaves less than ``_COHERENT``, ``_AS_WELL``
 #: times the distance that moving all leaves, or ``_REST`` of the given distance, as with rough masks.
 _CLEARLY, _EXACT, _AS_WELL, _REST = 0.25, 5e-5, 1.5, 0.02
+_BUMPED = 1e-3  #: Given distance from which it is tried: that of one camera off by a pixel
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,7 @@ def _on_cpu(batch: Batch) -> list[Tensor]:
 
 @torch.no_grad()
 def coherent_cameras(
-    batch: Batch, shared: bool = False
+    batch: Batch, shared: bool = False, alone: bool = True
 ) -> tuple[Cameras, Bool[Tensor, "B V"], Float[Tensor, " B"]]:
     """Cameras with consistent silhouettes; those of an element whose silhouettes are consistent stay.
 
@@ -131,14 +132,15 @@ def coherent_cameras(
     silhouettes with the given cameras, on average: 0 to 0.00014 with exact cameras and mattes; with four
     cameras 0.0001 to 0.0004 if off by up to half a pixel, 0.002 by one, 0.04 to 0.08 by three; infinite where
     no silhouette has an outline. ``batch``: in the subject's frame (:class:`ghgs_lit.geometry.frame.Frame`).
-    ``shared``: the elements are instants of one rig, in one frame; its cameras move and zoom alike in all."""
+    ``shared``: the elements are instants of one rig, in one frame; its cameras move and zoom alike in all.
+    ``alone``: a minority of the cameras may move by itself."""
     cameras = batch.cameras
     # On a CPU: many short steps, and distances to outlines are computed there anyway.
     mattes, lens, pose = _on_cpu(batch)
     middle = subject_center(batch.masks, cameras).float().cpu() if shared else pose.new_zeros(len(pose), 3)
     each = [slice(None)] if shared else [slice(b, b + 1) for b in range(len(pose))]
     with exact("cpu"):
-        rigs = [_coherent(mattes[part], lens[part], pose[part][0], middle[part]) for part in each]
+        rigs = [_coherent(mattes[part], lens[part], pose[part][0], middle[part], alone) for part in each]
     lenses, poses, free, distances = zip(*rigs, strict=True)
     count, device = len(pose) // len(rigs), batch.masks.device
     poses, free = (torch.stack(found).repeat_interleave(count, 0) for found in (poses, free))
@@ -148,7 +150,7 @@ def coherent_cameras(
 
 
 def _coherent(
-    mattes: Float[Tensor, "K V H W"], lens: Lenses, pose: Pose, middle: Middles
+    mattes: Float[Tensor, "K V H W"], lens: Lenses, pose: Pose, middle: Middles, alone: bool
 ) -> tuple[Lenses, Pose, Which, float]:
     """Intrinsics and extrinsics of one rig, which were free, and the mean distance with the given ones."""
     silhouettes = _Silhouettes(tuple(Outlines.of(each) for each in mattes), middle)
@@ -160,13 +162,13 @@ def _coherent(
         return lens, pose, every, given.distance
     start = _Alignment(lens, pose, every)
     found = start.after(_MEET, silhouettes)
-    few = _minority(silhouettes, lens, pose)
+    few = _minority(silhouettes, lens, pose) if alone and given.distance > _BUMPED else None
     if few is not None:
-        alone = _Alignment(lens, pose, few).after(_MEET, silhouettes)
+        apart = _Alignment(lens, pose, few).after(_MEET, silhouettes)
         # Two of three views nearly always agree.
         rest = 0.1 * _COHERENT if len(pose) == 3 else max(_COHERENT, _REST * given.distance)
         enough = max(_AS_WELL * found.distances[-1], rest)
-        found = alone if alone.distances[-1] < enough else found
+        found = apart if apart.distances[-1] < enough else found
     found = found.after(_LIE, silhouettes)
     return found.lens, found.pose, found.free, given.distance
 
