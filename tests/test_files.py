@@ -215,6 +215,16 @@ def test_a_lock_whose_file_was_removed_meanwhile_is_taken_anew(tmp_path, monkeyp
         assert path.read_text().endswith(f"{os.getpid()} on {socket.gethostname()}\n")
 
 
+def test_a_lock_is_not_made_where_a_link_leads(tmp_path):
+    """An empty file, or one that does not exist yet, would become a lock."""
+    (tmp_path / ".lock").symlink_to(tmp_path / "target")
+    for _ in range(2):
+        with pytest.raises(InputError, match=r"\.lock: expected a lock file; found 'a link'"):
+            lock(tmp_path / ".lock").__enter__()
+        assert not (tmp_path / "target").exists() or not (tmp_path / "target").read_text()
+        (tmp_path / "target").touch()
+
+
 def test_a_lock_of_an_earlier_process_is_taken_also_through_a_linked_folder(tmp_path):
     """Results on another disk are linked, and a backup may share the lock file."""
     (tmp_path / "disk").mkdir()
