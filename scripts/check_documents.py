@@ -204,7 +204,6 @@ FAST = {
     "README.md": r"ghgs \S*--help|ghgs train --help|.*dry_run=true|.*data\.source=my_scans|"
     r"ghgs prepare .*rendered|ghgs train experiment=scans .*runs/mine|"
     r"ghgs train .*trainer=gpu|ghgs predict|#python",
-    "docs/first_day.md": r".*dry_run=true",
     "docs/rasterizer.md": r"#python",
     "docs/sweeps.md": r".*dry_run=true",
     "docs/tables.md": r"ghgs table",

@@ -377,7 +377,7 @@ EARLY = [
     ("train evaluation.split=foo", 1, "evaluation.split: expected", "'foo'"),
     ("train data.size=150", 1, "data.size: expected", "150"),
     ("train encoder.trainable=none", 1, "init_from", "ghgs import"),
-    ("train hydra.run.dir={broken}/run", 1, "{broken}/run", "resume=", "overwrite=true"),
+    ("train hydra.run.dir={broken}/run", 1, "{broken}/run", "found metrics.json", "hydra.run.dir"),
     ("evaluate checkpoint={ckpt} data=synthetic device=cuda", 1, "device: expected", "cuda"),
 ]
 
