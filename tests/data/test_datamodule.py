@@ -9,13 +9,13 @@ from ghgs_lit.data.datamodule import trained_batches
 from ghgs_lit.data.humman.dataset import HuMMan
 from ghgs_lit.errors import InputError
 from ghgs_lit.synthesis.datasets import Scans, Synthetic
-from tests.helpers.people import render_boxes, rendered
+from tests.helpers.people import TINY, render_boxes, rendered
 
 
 def test_keys_of_the_data_set_and_of_its_batches_lie_side_by_side():
     """Documented commands set data.root and data.batch_size in one node; a path may be one of Python's."""
     data = rendered(Path("x"), batch_size=3, limit={"val": 2}, workers=1).dataset
-    assert data == Scans(root="x", size=[28, 28], batch_size=3, limit={"val": 2}, workers=1)
+    assert data == Scans(root="x", size=[28, 28], batch_size=3, limit={"val": 2}, workers=1, render=TINY)
     assert [data.limit.of(phase) for phase in ("train", "val", "bench")] == [None, 2, None]
     assert (data.size, data.target_size) == ((28, 28), None)
     assert (data.batch_size, data.workers) == (3, 1)

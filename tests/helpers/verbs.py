@@ -1,5 +1,6 @@
 """The command line in the process of the tests."""
 
+import logging
 import os
 import sys
 
@@ -18,3 +19,8 @@ def ghgs(*arguments: str) -> int:
         return exit.code
     finally:
         sys.argv = before
+        # The log of the verb is opened at its first line, which another test would write, elsewhere.
+        for handler in list(logging.getLogger().handlers):
+            if isinstance(handler, logging.FileHandler):
+                logging.getLogger().removeHandler(handler)
+                handler.close()

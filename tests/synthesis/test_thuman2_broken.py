@@ -122,7 +122,7 @@ RENDERED = {
     ),
     "R and T swapped": (
         lambda f: camera(f, lambda pose: np.concatenate((pose[:, 3:], pose[:, :3]), 1)),
-        r"3_extrinsic\.npy: expected a rotation in the first three columns; found \[\[",
+        r"3_extrinsic\.npy: expected a rotation in the first three columns; found a mirrored axis in \[\[",
     ),
     "camera to world": (
         lambda f: camera(f, camera_to_world),

@@ -76,10 +76,10 @@ def test_it_checks_what_a_user_has(monkeypatch):
     is that of a training in float32."""
     right, seen = GHGS._predict, []
 
-    def noted(self, batch, kept):
+    def noted(self, batch, kept, coarse=None):
         if batch.images.dtype == torch.float32:
             seen.append((self.precision, self.training, rounds_products("cuda")))
-        return right(self, batch, kept)
+        return right(self, batch, kept, coarse)
 
     monkeypatch.setattr(GHGS, "_predict", noted)
     with pretend_device():

@@ -63,8 +63,8 @@ DEFECTS = (
         "depth = depth.half().to(depth)\n    x, y, z = x * depth", "unprojection", "ordinary",
     ),
     Defect(
-        "a product that autocast catches", projection._camera_axes, "return [row",
-        "return list((extrinsics[..., :3, :3] @ points[..., None])[..., 0].unbind(-1))\n    return [row",
+        "a product that autocast catches", projection._camera_axes, "return a * x",
+        "return (extrinsics[..., :3, :3] @ points[..., None])[..., 0].movedim(-1, 0)\n    return a * x",
         "projection", "ordinary", "bfloat16",
     ),
     Defect(

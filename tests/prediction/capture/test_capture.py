@@ -14,7 +14,7 @@ from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.geometry.masks import on_black
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.geometry.undistortion import undistorting_grid
-from ghgs_lit.metrics.functional import psnr
+from ghgs_lit.metrics.functional import box_of, psnr
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.masks import matte_of_file
 from ghgs_lit.prediction.capture.photographs import Pixels
@@ -96,7 +96,7 @@ def test_python_refines_as_the_command_line_does(tmp_path):
     alone = frame.leave(model(frame.enter(others)), others.cameras.extrinsics.dtype).gaussians
     hidden = plain.batch.of_views([plain.batch.images.shape[1] - 1])
     drawn = Renderer()(alone, hidden.cameras).image[0].clamp(0, 1)
-    wanted = float(psnr(drawn.detach(), on_black(hidden)[0]))
+    wanted = float(psnr(drawn.detach(), on_black(hidden)[0], box_of(hidden.masks[0])))
     assert refined.refined.held_out[0] == pytest.approx(wanted, abs=1e-3)
 
 
