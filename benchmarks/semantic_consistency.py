@@ -33,7 +33,7 @@ from ghgs_lit.config import build, compose, resolve
 from ghgs_lit.config.compose import read_option
 from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.encoder.packing import KeptPatches
-from ghgs_lit.evaluation.tables.cells import compare
+from ghgs_lit.evaluation.tables.significance import compare
 from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.geometry.padding import bounds_of
 from ghgs_lit.metrics.functional import box_of, psnr

@@ -27,7 +27,7 @@ from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.config.compose import read_option
 from ghgs_lit.errors import require
-from ghgs_lit.evaluation.tables.cells import compare
+from ghgs_lit.evaluation.tables.significance import compare
 from ghgs_lit.synthesis.bench import definition, names
 from ghgs_lit.synthesis.jobs import SyntheticSource
 from ghgs_lit.synthesis.people.body import load_body

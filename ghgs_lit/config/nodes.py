@@ -93,6 +93,8 @@ class PairedTest(Options):
     """full: the row of the whole method | best: the best row of each column | none: no test."""
     alpha: float = Field(0.05, gt=0, lt=1)
     """Significance level."""
+    metrics: Texts | None = None
+    """Columns that are tested, all together corrected; null: the first. Others are printed only."""
     unit: Text | None = None
     """Where subjects are frames of people: a regular expression whose group is the person's name."""
 

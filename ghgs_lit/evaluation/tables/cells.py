@@ -1,75 +1,18 @@
-"""Cells of a table: means, deviations, the best value, and significant differences.
+"""Cells of a table: means, deviations, the best value, and significant differences."""
 
-Seeds and subjects of a row are both random samples. The squared standard errors over seeds and over subjects
-are added (min F', Clark 1973), and the degrees of freedom are those of the smaller sample (Mickey and Brown
-1966), so that the level holds whichever of the two varies more.
-"""
-
-import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations, product
 from typing import Any
 
-import numpy as np
 import pandas as pd
-from scipy import stats
 
 from ghgs_lit.config.nodes import PairedTest
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.tables.layouts import CELL, Table, arrow, data_title, decimals
 from ghgs_lit.evaluation.tables.records import TRAINING, differing, differing_text, person_of, telling_apart
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """Comparison of a row with the reference row of its column, on the seeds and subjects that both have.
-    ``difference``: mean of row minus reference; None without pairs. ``low``, ``high``: its interval at level
-    1 - alpha, not corrected. ``p``: two-sided p-value, ``corrected`` by Holm. Interval and p-values are None
-    with fewer than two seeds or subjects."""
-
-    seeds: int
-    subjects: int
-    difference: float | None = None
-    low: float | None = None
-    high: float | None = None
-    p: float | None = None
-    corrected: float | None = None
-
-
-def compare(row: pd.DataFrame, reference: pd.DataFrame, alpha: float = 0.05) -> Comparison:
-    """Compare two rows of values by seed (index) and subject (columns); ``alpha``: level of the interval."""
-    row, reference = row.align(reference, join="inner")
-    differences = (row - reference).dropna(axis="columns")
-    seeds, subjects = differences.shape
-    if not differences.size:
-        return Comparison(seeds, subjects)
-    mean = float(differences.to_numpy().mean())
-    freedom = min(seeds, subjects) - 1
-    if freedom < 1:
-        return Comparison(seeds, subjects, mean)
-    variance = differences.mean(axis="columns").var() / seeds + differences.mean().var() / subjects
-    error = math.sqrt(variance)
-    errors = abs(mean) / error if error > 0 else math.inf if mean else 0.0
-    p = float(2 * stats.t.sf(errors, freedom))
-    half = needed_errors(alpha, freedom + 1) * error
-    return Comparison(seeds, subjects, mean, mean - half, mean + half, p)
-
-
-def needed_errors(alpha: float, count: int, comparisons: int = 1) -> float:
-    """Standard errors by which rows must differ so that the smallest p of ``comparisons`` is significant at
-    level ``alpha`` of all together. ``count``: number of seeds or subjects, the smaller one, at least 2."""
-    return float(stats.t.isf(alpha / 2 / comparisons, count - 1))
-
-
-def holm(values: Sequence[float]) -> list[float]:
-    """Holm's correction of the p-values of a table."""
-    order = np.argsort(values, kind="stable")
-    scaled = np.asarray(values, dtype=np.float64)[order] * np.arange(len(values), 0, -1)
-    corrected = np.empty(len(values))
-    corrected[order] = np.minimum(np.maximum.accumulate(scaled), 1)
-    return corrected.tolist()
+from ghgs_lit.evaluation.tables.significance import Comparison, compare, holm, pool, smallest_difference
 
 
 def fill(table: Table, figures: Sequence[Mapping[str, Any]]) -> None:
@@ -175,22 +118,25 @@ def _test(table: Table, people: pd.DataFrame, test: PairedTest) -> None:
     """Test each row against the reference of its column, corrected over all comparisons of the table. If the
     reference was chosen by its figures, every pair of rows of the column counts as a comparison."""
     tested: list[tuple[tuple | None, Comparison]] = []
-    for column in product(*_columns(table)):
+    for column in product(range(len(table.groups)), table.tested):
         means = _competing(table, column)
         means = means[[(line, *column) in people.index.droplevel("seed") for line in means.index]]
         reference, chosen = _reference(table, means, column[1], test.against)
         if reference is None:
             continue
-        for one, other in combinations(means.index, 2):
+        rows = {line: people.loc[(line, *column)] for line in means.index}
+        pooled = pool(list(rows.values()))
+        for one, other in combinations(rows, 2):
             if reference in (one, other) or chosen:
                 row, against = (other, one) if one == reference else (one, other)
-                frames = [people.loc[(line, *column)] for line in (row, against)]
                 cell = (row, *column) if against == reference else None
-                tested.append((cell, compare(*frames, test.alpha)))
+                tested.append((cell, compare(rows[row], rows[against], test.alpha, pooled)))
     known = [i for i, (_, comparison) in enumerate(tested) if comparison.p is not None]
     table.comparisons = len(known)
     for i, p in zip(known, holm([tested[i][1].p for i in known]), strict=True):
-        tested[i] = (tested[i][0], replace(tested[i][1], corrected=p))
+        cell, comparison = tested[i]
+        smallest = smallest_difference(comparison, test.alpha, len(known))
+        tested[i] = (cell, replace(comparison, corrected=p, smallest=smallest))
     for cell, comparison in tested:
         if cell is not None:
             table.cells.at[cell, "test"] = comparison

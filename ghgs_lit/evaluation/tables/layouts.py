@@ -10,7 +10,8 @@ from typing import Any
 import pandas as pd
 
 from ghgs_lit.config.nodes import PairedTest
-from ghgs_lit.evaluation.tables.records import Planned, Variant
+from ghgs_lit.errors import choice
+from ghgs_lit.evaluation.tables.records import TRAINING, Planned, Variant
 from ghgs_lit.readers import read_yaml
 
 DECIMALS = {"psnr": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1, "surface_mm": 1}
@@ -159,6 +160,17 @@ class Table:
     @property
     def layout(self) -> Layout:
         return self.options.layout
+
+    @property
+    def tested(self) -> list[str]:
+        """Metrics that are tested: the option's, else the first that subjects have. InputError: others."""
+        chosen = self.options.test.metrics
+        if chosen is None:
+            return [name for name in self.metrics if name not in TRAINING][:1]
+        names = (chosen,) if isinstance(chosen, str) else chosen
+        for name in names:
+            choice("test.metrics", name, tuple(self.metrics))
+        return list(names)
 
     @property
     def ours(self) -> list[Line]:

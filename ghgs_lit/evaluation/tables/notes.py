@@ -2,9 +2,9 @@
 
 import pandas as pd
 
-from ghgs_lit.evaluation.tables.cells import needed_errors
-from ghgs_lit.evaluation.tables.layouts import Table, data_title, reported_source
+from ghgs_lit.evaluation.tables.layouts import Table, data_title, decimals, reported_source, title
 from ghgs_lit.evaluation.tables.records import differing, differing_text
+from ghgs_lit.evaluation.tables.significance import POWER, RATIO
 
 FOOTNOTE = (
     "All four combinations are listed. The paper's Table 4 prints three and has (✗, ✓) among them, while its"
@@ -102,14 +102,32 @@ def _about_test(table: Table) -> list[str]:
         full = [line for line in table.ours if line.variant.ablation == "full"]
         against = "the row of the whole method" if len(full) == 1 else against
     seeds, subjects = [c.seeds for c in known], [c.subjects for c in known]
-    fewest = min(max(seeds), max(subjects))
-    needed = needed_errors(test.alpha, fewest, table.comparisons)
+    names, sizes = (
+        " or ".join(map(title, table.tested)),
+        f"{_range(seeds)} seeds and {_range(subjects)} subjects",
+    )
+    comparisons = f"{table.comparisons} comparison{'s' if table.comparisons > 1 else ''}"
+    others = "; other metrics are not tested" if len(table.tested) < len(table.metrics) else ""
     return [
-        f"{MARK} differs beyond chance from {against}: two-sided t test over {_range(seeds)} seeds and"
-        f" {_range(subjects)} subjects together, Holm's correction over the {table.comparisons} comparisons"
-        f" of this table, p < {test.alpha:g}; in brackets the {100 * (1 - test.alpha):g} % interval of the"
-        f" difference. With {fewest} seeds or subjects a difference must be {needed:.3g} standard errors."
+        f"{MARK} {names} differs beyond chance from {against}: two-sided t test over {sizes} together, the"
+        f" variance over seeds pooled over rows, whose deviations may differ by a factor of {RATIO:g}, Holm's"
+        f" correction over the {comparisons} of this table, p < {test.alpha:g}{others}."
+        f" In brackets the {100 * (1 - test.alpha):g} % interval of the difference, each alone.",
+        f"{sizes} could have shown {'; '.join(_could_show(table))} (with {100 * POWER:g} % power).",
     ]
+
+
+def _could_show(table: Table) -> list[str]:
+    """The smallest differences that comparisons find, by metric, such as ``0.21 to 0.25 dB of PSNR``."""
+    texts = []
+    for metric in table.tested:
+        tests = table.cells["test"].xs(metric, level="metric").dropna()
+        values = [test.smallest for test in tests if test.smallest is not None]
+        if values:
+            ends = dict.fromkeys(f"{value:.{decimals(metric)}f}" for value in (min(values), max(values)))
+            unit = " dB" if metric.startswith("psnr") else ""
+            texts.append(f"{' to '.join(ends)}{unit} of {title(metric)}")
+    return texts
 
 
 def _about_training(table: Table) -> list[str]:

@@ -18,21 +18,23 @@ COLUMNS = (
     "table", "kind", "method", "model", "encoder", "ablation", "unprojection", "semantic", "extra", "data",
     "split", "targets", "protocol", "views", "metric", "mean", "deviation", "seeds", "seeds_lacking",
     "subjects", "best", "test_seeds", "test_subjects", "test_difference", "test_low", "test_high", "test_p",
-    "test_p_holm", "runs",
+    "test_p_holm", "test_smallest", "runs",
 )  # fmt: skip
 Write = Callable[[str, str, bool], str]
 """Writes a cell of its number, what follows it, and whether it is best."""
 
 
 def _cell(cell: Any, line: Line, write: Write) -> str:
-    """A cell as printed: number, deviation over seeds, mark with its interval, missing seeds."""
+    """A cell as printed: number, deviation over seeds, mark, interval of its difference, missing seeds."""
     if pd.isna(cell.mean):
         return write(line.absent, "", False)
     digits, tail = decimals(cell.Index[2]), ""
     if pd.notna(cell.deviation):
         tail = f" ± {cell.deviation:.{digits}f}"
     if cell.marked:
-        tail += f"{MARK} [{cell.test.low:+.{digits}f}, {cell.test.high:+.{digits}f}]"
+        tail += MARK
+    if cell.test is not None and cell.test.low is not None:
+        tail += f" [{cell.test.low:+.{digits}f}, {cell.test.high:+.{digits}f}]"
     if cell.lacking:
         tail += f" ({len(cell.seeds)}/{len(cell.seeds) + len(cell.lacking)})"
     return write(f"{cell.mean:.{digits}f}", tail, cell.best)

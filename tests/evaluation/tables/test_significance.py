@@ -7,10 +7,11 @@ import pandas as pd
 import pytest
 from scipy import stats
 
+from benchmarks import table_power
 from ghgs_lit.config.nodes import PairedTest
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.tables import to_markdown
-from ghgs_lit.evaluation.tables.cells import compare, holm, needed_errors
+from ghgs_lit.evaluation.tables.significance import POWER, RATIO, Pool, compare, holm, needed_errors, pool
 from tests.helpers.tables import body, tables_of, write_run
 
 RNG = np.random.default_rng(0)
@@ -78,6 +79,64 @@ def test_the_interval_holds_the_difference():
     assert inside >= stats.binom.ppf(0.001, trials, 0.95)
 
 
+@pytest.mark.parametrize(
+    ("ratios", "seeds"),
+    [((1, 1, 1, 1), 3), ((2, 1, 1, 1), 3), ((2, 2, 1, 1), 5), ((1,) * 6, 6), ((2, 1, 1, 1, 1, 1), 3)],
+)
+def test_tables_of_equal_rows_have_a_star_at_most_at_the_level(ratios, seeds):
+    """Also where the deviations of rows differ by a factor of two."""
+    trials = 150
+    marks, _ = table_power.tables([0] * len(ratios), ratios, seeds, "pooled", trials, 0.01)
+    assert marks.any(axis=1).sum() <= stats.binom.ppf(0.999, trials, table_power.ALPHA)
+
+
+def test_a_pooled_variance_finds_what_pairs_of_rows_do_not():
+    """The paper's differences with three seeds; what is said to be found is found."""
+    trials, alike = 100, [1] * 4
+    pairs, pooled = (
+        table_power.tables(table_power.PAPER, alike, 3, way, trials)[0] for way in ("pairs", "pooled")
+    )
+    for before, after in zip(pairs.sum(axis=0), pooled.sum(axis=0), strict=True):
+        counts = [[after, trials - after], [before, trials - before]]
+        assert stats.fisher_exact(counts, alternative="greater").pvalue < 0.001
+    _, said = table_power.tables([0] * 4, alike, 3, "pooled", trials)
+    found = table_power.tables([0, said, 0, 0], alike, 3, "pooled", trials, start=1)[0][:, 0].sum()
+    assert found >= stats.binom.ppf(0.001, trials, POWER)
+
+
+def test_the_pooled_variance_is_that_of_a_regression_on_rows_and_seeds():
+    """Also where rows lack seeds, and a subject that a row lacks at one of them does not count."""
+    rows = [pd.DataFrame(RNG.normal(size=(4, 5)), index=[1, 2, 3, 4]) for _ in range(4)]
+    rows[1], rows[2] = rows[1].drop(index=2), rows[2].drop(index=[1, 4])
+    rows[3].loc[3, 0] = np.nan
+    means = pd.concat([*(row.mean(axis=1) for row in rows[:3]), rows[3][[1, 2, 3, 4]].mean(axis=1)], axis=1)
+    cells = means.stack().dropna()
+    seed, row = (pd.get_dummies(cells.index.get_level_values(i)).to_numpy(float) for i in (0, 1))
+    _, (squares,), rank, _ = np.linalg.lstsq(np.hstack([row, seed[:, 1:]]), cells.to_numpy())
+    pooled = pool(rows)
+    assert (pooled.freedom, pooled.rows) == (len(cells) - rank, 4)
+    assert pooled.variance == pytest.approx(squares / pooled.freedom)
+
+
+def test_seeds_of_one_row_alone_say_nothing_about_their_variance():
+    """Rows of other seeds have no residuals."""
+    rows = [pd.DataFrame(RNG.normal(size=(2, 3)), index=seeds) for seeds in ([1, 2], [3, 4])]
+    assert pool(rows).freedom == 0
+
+
+@pytest.mark.parametrize("rows", [2, 3, 4, 6])
+def test_the_reference_may_vary_twice_as_much(rows):
+    """Largest ratio of the variance of a difference to what the pooled one expects; 1 for two rows."""
+    variances = np.array([RATIO**2] + [1] * (rows - 1))
+    expected = variances[:2].sum() / (2 * variances.mean())
+    pooled = Pool(0.3, 8, rows)
+    assert pooled.allowance == pytest.approx(expected)
+    values = pd.DataFrame(np.zeros((3, 20)))
+    comparison = compare(values + 1, values, pooled=pooled)
+    assert comparison.error == pytest.approx(np.sqrt(2 * 0.3 * expected / 3))
+    assert comparison.freedom == 8
+
+
 def test_the_statistic_is_a_paired_t_test_where_seeds_decide():
     """Of the means of seeds: SciPy's number where people agree."""
     a, b = RNG.normal(size=5), RNG.normal(size=5)
@@ -101,7 +160,7 @@ def test_equal_rows_and_constant_differences_are_defined():
     """No division by zero where all differences are equal."""
     values = pd.DataFrame(np.arange(6.0).reshape(2, 3))
     assert compare(values, values).p == 1
-    assert compare(values + 1, values).p == 0
+    assert compare(values + 1, values).p < 1e-9
 
 
 def test_holm_is_the_textbooks():
@@ -113,8 +172,8 @@ def test_holm_is_the_textbooks():
 
 def test_how_many_standard_errors_are_needed():
     """A difference of exactly as many has the p-value of the level, corrected."""
-    for count, comparisons in ((2, 1), (3, 27), (6, 9)):
-        p = 2 * stats.t.sf(needed_errors(0.05, count, comparisons), count - 1)
+    for freedom, comparisons in ((1, 1), (2, 27), (5, 9)):
+        p = 2 * stats.t.sf(needed_errors(0.05, freedom, comparisons), freedom)
         assert p * comparisons == pytest.approx(0.05)
 
 
@@ -129,22 +188,35 @@ def table_of(folder, shift, noise=0.01, shifts=SUBJECTS, seeds=(1, 2, 3), **opti
 
 
 def test_a_clear_difference_is_marked_and_noise_is_not(tmp_path):
-    """Marks, the interval beside them and the note say what was tested, corrected over all comparisons."""
+    """Marks, intervals of all that was tested, and the notes say what, and what could have been shown."""
     table = table_of(tmp_path / "clear", 1.0)
     rows, _ = body(to_markdown(table))
     assert re.fullmatch(r"\*\*25\.00 ± 0\.00\\\* \[\+(0\.9|1\.0)\d, \+1\.0\d\]\*\*", rows["✗", "✗"][0])
     assert rows["✓", "✓"][0] == "24.00 ± 0.00"
     (note,) = (n for n in table.notes if "beyond chance" in n)
     assert "from the row of the whole method: two-sided t test over 3 seeds and 20 subjects together" in note
-    assert "Holm's correction over the 3 comparisons" in note
+    assert "Holm's correction over the 1 comparison of" in note
     assert "95 % interval" in note
-    assert f"With 3 seeds or subjects a difference must be {needed_errors(0.05, 3, 3):.3g}" in note
-    # Three comparisons: PSNR, and SSIM and FLIP, which are equal.
+    assert "PSNR differs" in note
+    assert "other metrics are not tested" in note
     test = table.cells["test"].iloc[0]
+    (note,) = (n for n in table.notes if "could have shown" in n)
+    assert note.startswith(
+        f"3 seeds and 20 subjects could have shown {test.smallest:.2f} dB of PSNR (with 80 %"
+    )
+    assert test.corrected == test.p
+    assert table.cells["test"].notna().sum() == 1
+    every = table_of(tmp_path / "every", 1.0, test={"metrics": ["flip", "psnr", "ssim"]})
+    assert every.comparisons == 3
+    assert not any("not tested" in n for n in every.notes)
+    test = every.cells["test"].iloc[0]
     assert test.corrected == pytest.approx(3 * test.p)
     table = table_of(tmp_path / "noise", 0.0, noise=1.0)
     assert "\\* [" not in to_markdown(table)
     assert not table.cells["marked"].any()
+    assert re.fullmatch(
+        r"\d\d\.\d\d ± \d\.\d\d \[-\d\.\d\d, \+\d\.\d\d\]", body(to_markdown(table))[0]["✗", "✗"][0]
+    )
 
 
 def test_the_reference_can_be_the_best_or_none(tmp_path):
@@ -157,6 +229,10 @@ def test_the_reference_can_be_the_best_or_none(tmp_path):
     table = table_of(tmp_path / "b", 1.0, test={"against": "none"})
     assert "\\*" not in to_markdown(table)
     assert not any("differences" in n for n in table.notes)
+    with pytest.raises(
+        InputError, match=r"test\.metrics: expected one of psnr, ssim, flip; found 'psnr_box'"
+    ):
+        table_of(tmp_path / "c", 1.0, test={"metrics": "psnr_box"})
     for wrong in ({"against": "worst"}, {"alpha": 0}):
         with pytest.raises(InputError, match="test"):
             PairedTest(**wrong)
@@ -172,6 +248,18 @@ def test_every_pair_counts_where_the_reference_is_the_best(tmp_path):
     (best,) = tables_of(tmp_path, views=(4,), metrics=("psnr",), test={"against": "best"})
     assert (full.comparisons, best.comparisons) == (2, 3)
     assert best.cells["test"].notna().sum() == 2
+
+
+def test_the_variance_is_pooled_over_all_rows_of_a_column(tmp_path):
+    """Four rows of three seeds have six degrees of freedom, not two."""
+    for name in ("full", "no_unprojection", "no_semantic", "neither"):
+        for seed in (1, 2, 3):
+            psnr = 20.0 + RNG.normal()
+            write_run(tmp_path / f"{name}{seed}", name, psnr, seed, shifts=SUBJECTS, views=(4,))
+    (table,) = tables_of(tmp_path, views=(4,))
+    tests = table.cells["test"].dropna()
+    assert [test.freedom for test in tests] == [6, 6, 6]
+    assert len({test.error for test in tests}) == 1  # no row differs in its people
 
 
 def test_one_seed_is_said_and_not_marked(tmp_path):

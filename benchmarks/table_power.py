@@ -1,0 +1,116 @@
+"""Power and false stars of ``ghgs table`` in tables that are drawn by chance.
+
+    python benchmarks/table_power.py [number of tables]
+
+A value is the sum of its row's mean, a chance of its seed and of its subject that rows share, and a chance of
+the row's own with each seed (``deviations``), each subject and both. ``pairs``: each pair of rows alone,
+corrected over three metrics as if all were tested; ``pooled``: as ``ghgs table`` does; ``plain``: the same
+without room for a reference that varies more than others. False stars are counted where seeds decide, which
+is the worst for a pooled variance.
+"""
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from ghgs_lit.evaluation.tables.significance import compare, holm, pool, smallest_difference
+
+ALPHA = 0.05
+SUBJECTS = 20
+DEVIATION = 0.1
+"""Of a row over seeds, dB; for power, also of its interactions with subjects and of the rest."""
+WAYS = ("pairs", "plain", "pooled")
+PAPER = (0.0, -0.35, -0.74, -1.09)
+"""The paper's differences from the whole method, and their sum for the row with neither, dB."""
+
+
+def draw(
+    rng: np.random.Generator, means: Sequence[float], deviations: Sequence[float], seeds: int, people: float
+) -> list[pd.DataFrame]:
+    """Rows of a table: values by seed and subject.
+
+    Args:
+        rng: Source of all that is drawn.
+        means: Of the rows, dB.
+        deviations: Of the rows over seeds, dB.
+        seeds: Number of seeds.
+        people: Deviation of a row over subjects and of the rest, dB.
+    """
+    seed, subject = DEVIATION * rng.normal(size=(seeds, 1)), rng.normal(size=SUBJECTS)
+    rows = []
+    for mean, deviation in zip(means, deviations, strict=True):
+        by_seed = deviation * rng.normal(size=(seeds, 1))
+        by_subject = people * rng.normal(size=SUBJECTS)
+        rest = people * rng.normal(size=(seeds, SUBJECTS))
+        rows.append(pd.DataFrame(mean + seed + subject + by_seed + by_subject + rest))
+    return rows
+
+
+def marked(rows: Sequence[pd.DataFrame], way: str) -> tuple[list[bool], float]:
+    """Whether each row but the first is marked against it, and the mean of the smallest differences."""
+    shared = None if way == "pairs" else pool(rows)
+    if way == "plain":
+        shared = replace(shared, rows=2)
+    comparisons = [compare(row, rows[0], ALPHA, shared) for row in rows[1:]]
+    others = [1.0] * (2 * len(comparisons)) if way == "pairs" else []
+    corrected = holm([comparison.p for comparison in comparisons] + others)
+    smallest = [smallest_difference(each, ALPHA, len(corrected)) for each in comparisons]
+    return [p < ALPHA for p in corrected[: len(comparisons)]], float(np.mean(smallest))
+
+
+def tables(
+    means: Sequence[float],
+    ratios: Sequence[float],
+    seeds: int,
+    way: str,
+    trials: int,
+    people: float = DEVIATION,
+    start: int = 0,
+) -> tuple[np.ndarray, float]:
+    """Marks of ``trials`` tables [trials, rows - 1], and the root mean square of their smallest differences.
+
+    Args:
+        means: Of the rows, dB; the first is the reference.
+        ratios: Deviations of the rows over seeds, in multiples of ``DEVIATION``.
+        seeds: Number of seeds.
+        way: One of ``WAYS``.
+        trials: Number of tables.
+        people: Deviation of a row over subjects and of the rest, dB.
+        start: Seed of the draws.
+    """
+    rng = np.random.default_rng(start)
+    deviations = [DEVIATION * ratio for ratio in ratios]
+    found = [marked(draw(rng, means, deviations, seeds, people), way) for _ in range(trials)]
+    return np.array([marks for marks, _ in found]), float(
+        np.sqrt(np.mean([smallest**2 for _, smallest in found]))
+    )
+
+
+def main(trials: int = 100) -> None:
+    """Print tables with a star without a difference, stars by difference, and the smallest difference."""
+    started = time.perf_counter()
+    print(f"| tables with a false star | rows | seeds | {' | '.join(WAYS)} |\n|{'---|' * 6}")
+    for name, ratios in (("alike", (1,)), ("reference twice", (2, 1)), ("reference and another", (2, 2, 1))):
+        for rows, seeds in ((4, 3), (4, 5), (6, 3), (6, 6)):
+            each = [*ratios, *[1] * rows][:rows]
+            marks = [tables([0] * rows, each, seeds, way, trials, 0.01)[0] for way in WAYS]
+            shares = " | ".join(f"{each.any(axis=1).mean():.1%}" for each in marks)
+            print(f"| {name} | {rows} | {seeds} | {shares} |")
+    print(f"\n| power | seeds | {' | '.join(f'{gain:+.2f} dB' for gain in PAPER[1:])} |\n|{'---|' * 5}")
+    for seeds in (3, 5):
+        for way in WAYS:
+            power = tables(PAPER, [1] * 4, seeds, way, trials)[0].mean(axis=0)
+            print(f"| {way} | {seeds} | {' | '.join(f'{share:.0%}' for share in power)} |")
+    for seeds in (3, 5):
+        said = tables([0] * 4, [1] * 4, seeds, "pooled", trials)[1]
+        found = tables([0, said, 0, 0], [1] * 4, seeds, "pooled", trials, start=1)[0]
+        print(f"\n{seeds} seeds could have shown {said:.2f} dB: found in {found[:, 0].mean():.0%}")
+    print(f"\n{trials} tables each, {time.perf_counter() - started:.0f} s")
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))

@@ -1,0 +1,131 @@
+"""Tests of differences between rows of a table, with intervals and what they could have found.
+
+A value is the sum of a fixed effect of its row, random effects of the seed and the subject, which rows share,
+and their interactions with the row: a mixed model with crossed effects. Seeds are few: their variance is
+pooled over all rows of a column (residuals of the two-way table of rows and seeds). Subjects are many: each
+pair of rows has its own. The two squared standard errors are added (min F', Clark 1973), with the degrees of
+freedom of the smaller sample (Mickey and Brown 1966), so that the level holds whichever of the two varies
+more.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+from scipy.optimize import brentq
+
+POWER = 0.8
+"""Share of tables that find the smallest difference which is said below a table."""
+RATIO = 2.0
+"""Ratio of the deviations of rows over seeds up to which the level holds."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Comparison of a row with the reference row of its column, on the seeds and subjects that both have.
+    ``difference``: mean of row minus reference; None without pairs. ``low``, ``high``: its interval at level
+    1 - alpha, not corrected. ``p``: two-sided p-value, ``corrected`` by Holm. ``error``: standard error, with
+    ``freedom``. ``smallest``: the difference that is found with a probability of ``POWER`` among all
+    comparisons of the table. Interval, p-values and these are None with fewer than two seeds or subjects."""
+
+    seeds: int
+    subjects: int
+    difference: float | None = None
+    low: float | None = None
+    high: float | None = None
+    p: float | None = None
+    corrected: float | None = None
+    error: float | None = None
+    freedom: int | None = None
+    smallest: float | None = None
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Variance of a row over seeds, pooled over ``rows``; ``freedom``: degrees of freedom, 0 if unknown."""
+
+    variance: float
+    freedom: int
+    rows: int
+
+    @property
+    def allowance(self) -> float:
+        """Factor by which the variance of a difference can exceed twice the pooled one, if the deviation of
+        the reference is ``RATIO`` times that of the others; 1 for two rows."""
+        return (RATIO**2 + 1) * self.rows / (2 * (RATIO**2 + self.rows - 1))
+
+
+def pool(rows: Sequence[pd.DataFrame]) -> Pool:
+    """Pool the variance of rows of values by seed (index) and subject (columns). Each row counts with the
+    subjects that it has at all its seeds; rows may lack seeds."""
+    means = [row.dropna(axis="columns").mean(axis="columns") for row in rows]
+    table = pd.concat(means, axis="columns").to_numpy()
+    table = table[(~np.isnan(table)).sum(axis=1) > 1]
+    known = ~np.isnan(table)
+    seed, row = np.nonzero(known)
+    if not len(seed):
+        return Pool(0.0, 0, 0)
+    # Effects of seeds are taken out of values and of the rows' indicators (Frisch, Waugh and Lovell).
+    values = (table - np.nanmean(table, axis=1, keepdims=True))[seed, row]
+    indicators = np.eye(len(rows))[row] - (known / known.sum(axis=1, keepdims=True))[seed]
+    effects, _, rank, _ = np.linalg.lstsq(indicators, values)
+    residuals = values - indicators @ effects
+    freedom = len(values) - len(table) - int(rank)
+    return Pool(float(residuals @ residuals) / max(freedom, 1), freedom, len(set(row)))
+
+
+def compare(
+    row: pd.DataFrame, reference: pd.DataFrame, alpha: float = 0.05, pooled: Pool | None = None
+) -> Comparison:
+    """Compare two rows of values.
+
+    Args:
+        row, reference: Values by seed (index) and subject (columns).
+        alpha: Level of the interval.
+        pooled: Variance over seeds of all rows of the column; None: of these two (a paired t test).
+    """
+    row, reference = row.align(reference, join="inner")
+    differences = (row - reference).dropna(axis="columns")
+    seeds, subjects = differences.shape
+    if not differences.size:
+        return Comparison(seeds, subjects)
+    mean = float(differences.to_numpy().mean())
+    if min(seeds, subjects) < 2:
+        return Comparison(seeds, subjects, mean)
+    both = [part[differences.columns] for part in (row, reference)]
+    pooled = pooled if pooled and pooled.freedom else pool(both)
+    freedom = min(pooled.freedom, subjects - 1)
+    over_seeds = 2 * pooled.allowance * pooled.variance / seeds
+    error = math.sqrt(over_seeds + differences.mean().var() / subjects)
+    errors = abs(mean) / error if error > 0 else math.inf if mean else 0.0
+    p = float(2 * stats.t.sf(errors, freedom))
+    half = needed_errors(alpha, freedom) * error
+    return Comparison(seeds, subjects, mean, mean - half, mean + half, p, error=error, freedom=freedom)
+
+
+def needed_errors(alpha: float, freedom: int, comparisons: int = 1) -> float:
+    """Standard errors by which rows must differ so that the smallest p of ``comparisons`` is significant at
+    level ``alpha`` of all together; ``freedom``: degrees of freedom, at least 1."""
+    return float(stats.t.isf(alpha / 2 / comparisons, freedom))
+
+
+def smallest_difference(comparison: Comparison, alpha: float, comparisons: int) -> float:
+    """Difference that is significant with a probability of ``POWER``, by the noncentral t distribution."""
+    needed, freedom = needed_errors(alpha, comparison.freedom, comparisons), comparison.freedom
+
+    def excess(errors: float) -> float:
+        return stats.nct.sf(needed, freedom, errors) - POWER
+
+    return comparison.error * brentq(excess, 0, 2 * needed + 10)
+
+
+def holm(values: Sequence[float]) -> list[float]:
+    """Holm's correction of the p-values of a table."""
+    order = np.argsort(values, kind="stable")
+    scaled = np.asarray(values, dtype=np.float64)[order] * np.arange(len(values), 0, -1)
+    corrected = np.empty(len(values))
+    corrected[order] = np.minimum(np.maximum.accumulate(scaled), 1)
+    return corrected.tolist()
