@@ -42,6 +42,9 @@ def test_the_height_of_each_subject_decides():
     expected = round(SIDE * HEIGHT / rows / 14) * 14
     assert coarse_sizes(pair, HEIGHT, 14) == [(expected, expected), None]
     assert coarse_sizes(pair, rows, 14) == [None, None]
+    cut = tall.masks.clone()
+    cut[:, 0, SIDE // 2 :] = False  # the tallest view decides
+    assert coarse_sizes(dataclasses.replace(tall, masks=cut), HEIGHT, 14) == [(expected, expected)]
     lying = dataclasses.replace(tall, masks=tall.masks.mT)
     assert coarse_sizes(lying, HEIGHT, 14) == [(expected, expected)]
     nobody = dataclasses.replace(tall, masks=torch.zeros_like(tall.masks))
