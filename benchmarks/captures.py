@@ -165,11 +165,11 @@ def predicted(
     clean, own = data
     for subject in list(clean.subjects("val"))[first:]:
         taken = photographed(capture, own.evaluation_batch(subject, views=_VIEWS))
-        keys = {"refine_cameras": refine, "refine_masks": refine}
+        keys = {"refine_cameras": refine, "refine_masks": refine, "tones": refine or {}}
         result = predict(taken, model, size, **keys, renderer=renderer)
         if refine:
             moved = "".join(f" {pixels:.2f}" for pixels in result.moved)
-            print(f"  {subject}: {result.why or 'nothing'}{moved}", flush=True)
+            print(f"  {subject}: {(result.why | result.tones) or 'nothing'}{moved}", flush=True)
         batch = clean.evaluation_batch(subject, views=_VIEWS, targets=targets)
         cameras = result.batch.cameras.to(torch.float32)
         yield dataclasses.replace(result.batch, cameras=cameras, targets=batch.targets)

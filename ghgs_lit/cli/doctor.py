@@ -18,8 +18,11 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.prediction.capture.calibration import calibrate
 from ghgs_lit.prediction.capture.camera_report import diagnose
+from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.drawing import camera_sheet
 from ghgs_lit.prediction.capture.formats.json_and_toml import json_text
+from ghgs_lit.prediction.capture.predict import predict
+from ghgs_lit.prediction.capture.tones import tone_lines
 from ghgs_lit.visualization.pictures import save_png
 
 _LISTED = 6  #: Number of interpretations of a calibration that are listed
@@ -51,6 +54,11 @@ def cameras(cfg: DictConfig) -> None:
     rich.print(listing)
     print("\n".join(diagnosis.lines), flush=True)
     views = best.views
+    if diagnosis.consistent:
+        capture = Capture(folder.instants[0], folder.photographs(folder.instants[0]))
+        tones = predict(capture, refine_cameras=0, refine_masks=0).tones
+        for line in tone_lines(tones, "which ghgs predict undoes"):
+            print(line, flush=True)
     if best.score > 0:
         images = [photograph.image for photograph in best.photographs(folder)]
         save_png(camera_sheet([v.name for v in views], images, best.silhouettes(folder)), picture)

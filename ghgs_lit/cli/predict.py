@@ -30,6 +30,7 @@ from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.formats.json_and_toml import json_text
 from ghgs_lit.prediction.capture.predict import TimedPrediction, crop_size, in_frame, predict, predict_batch
 from ghgs_lit.prediction.capture.rig import INSTANTS, Rig, corrected_rig, turned_from
+from ghgs_lit.prediction.capture.tones import tone_lines, without_tones
 from ghgs_lit.prediction.export.reports import REPORT
 from ghgs_lit.prediction.export.unseen import GUESSED
 from ghgs_lit.prediction.sequence.temporal import Temporal
@@ -109,12 +110,14 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
     size = crop_size(config["size"], trained, model)
     write_config(config, directory)
     refining = {name: config[name] for name in ("refine_cameras", "refine_masks", "refine")}
+    refining["tones"] = config["refine_tones"] or {}
     temporal = Temporal(partial(in_frame, model), model.skip.every, renderer)
     totals: Counter[str] = Counter()
     count, begin = 0, time.perf_counter()
     rig, backgrounds = None, Backgrounds({})
     if together:
-        backgrounds, rig, together.others["rig.json"] = shared_by(folder, model, size, refining, renderer)
+        shared = shared_by(folder, model, size, refining, renderer)
+        refining["tones"], backgrounds, rig, together.others["rig.json"] = shared
         refining["refine_cameras"] = 0
     for given, waited in captures_of(folder):
         capture = mended_by(backgrounds, given)
@@ -145,24 +148,28 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
 
 def shared_by(
     folder: CaptureFolder, model: GHGS, size: tuple[int, int], refining: Mapping[str, Any], renderer: Renderer
-) -> tuple[Backgrounds, Rig | None, bytes]:
-    """Static backgrounds and corrected cameras of a sequence, estimated from a few instants, and the content
-    of the cameras' file. None and no content: the cameras stay as they are."""
+) -> tuple[Mapping[str, float], Backgrounds, Rig | None, bytes]:
+    """What the instants of a sequence share, estimated from a few of them: tone curves (those of the first),
+    static backgrounds, corrected cameras, and the content of the cameras' file. None and no content: the
+    cameras stay as they are."""
     begin, names, captures = time.perf_counter(), folder.instants, []
-    rounds, masks = refining["refine_cameras"], refining["refine_masks"]
+    rounds, masks, tones = (refining[key] for key in ("refine_cameras", "refine_masks", "tones"))
     spread = [round((len(names) - 1) * i / (INSTANTS - 1)) for i in range(INSTANTS)]
-    for name in [names[place] for place in dict.fromkeys(spread)] if rounds or masks else ():
+    for name in [names[place] for place in dict.fromkeys(spread)] if rounds or masks or tones else ():
         with contextlib.suppress(InputError):  # this instant is left out
             captures.append(Capture(name, folder.photographs(name)))
+    if tones == "auto":
+        plain = {"refine_cameras": 0, "refine_masks": 0, "renderer": renderer}
+        tones = predict(captures[0], model, size, **plain).tones if captures else {}
     backgrounds = Backgrounds.of(captures if masks else [])
-    mended = [backgrounds.applied(capture) for capture in captures]
+    mended = [without_tones(backgrounds.applied(capture), tones) for capture in captures]
     rig = corrected_rig(mended, model, size, rounds, masks, renderer) if captures and rounds else None
     if rig is None:
-        return backgrounds, None, b""
+        return tones, backgrounds, None, b""
     why = f"; {rig.why} (refine_cameras=0 leaves them)" if rig.why else ""
     took = time.perf_counter() - begin
     print(f"{moved_line(rig.moved)} in all instants{why}; {took:.3g} s", flush=True)
-    return backgrounds, rig, json_text(rig.calibrations(folder, captures)).encode()
+    return tones, backgrounds, rig, json_text(rig.calibrations(folder, captures)).encode()
 
 
 def mended_by(backgrounds: Backgrounds, given: Capture) -> Capture:
@@ -184,6 +191,7 @@ def advice_of(directory: Path) -> Iterator[str]:
     ]
     if said:
         yield f"gains: {', '.join(said)} than the mean of the cameras, undone"
+    yield from tone_lines(report.get("tones", {}), "undone (refine_tones=0 leaves it)")
     quality = report["psnr_box_of_inputs"].values()
     if len(quality) < 3:
         yield f"{len(quality)} photographs leave much unseen: 3 to 5 all around show a person"
@@ -271,6 +279,8 @@ def write_result(
     if result.batch.log_gains is not None:
         gains = result.batch.log_gains[0].exp().tolist()
         facts["gains"] = dict(zip(result.batch.views[0], gains, strict=True))
+    if result.tones:
+        facts["tones"] = result.tones
     if model.auto is not None:
         facts["skip"] = model.auto.report(prediction.decisions)
         print(facts["skip"], flush=True)

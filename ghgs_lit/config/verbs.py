@@ -107,6 +107,8 @@ class Predict(Photographs, Measured):
     refine_cameras: Literal["auto"] | Annotated[int, Field(ge=0, le=100)] = "auto"
     """Rounds, at most, that correct the cameras until the photographs agree; 0: none; auto: 4 where
     silhouettes contradict the cameras (of images alone, not of a data set)."""
+    refine_tones: Literal["auto", 0] = "auto"
+    """auto: undo the tone curve that a single camera has beside the others (of images alone); 0: leave it."""
     refine: int = Field(0, ge=0, le=10000)
     """Steps of optimisation towards the photographs after the prediction, such as 15; 0: none."""
     out: Path | None = None

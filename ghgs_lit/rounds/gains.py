@@ -1,11 +1,12 @@
-"""Gains of cameras whose exposure or white balance differ. A point on the surface has the same colour in all
-views that see it, up to a gain of each camera and channel (as for panoramas: Brown and Lowe, IJCV 2007)."""
+"""What differs between cameras: gains, of their exposure or white balance, and gammas. A point on the surface
+has the same colour in all views that see it, up to a gain of each camera and channel (as for panoramas: Brown
+and Lowe, IJCV 2007)."""
 
 import dataclasses
 import itertools
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ghgs_lit.geometry.masks import coverage, surface_colors
@@ -23,12 +24,13 @@ _DARK = 0.05
 _OUTLIER = 0.15
 #: Log gains well below this are probably errors of the estimate, and shrunk towards 0.
 _LEAST = 0.02
-#: Weight of the prior, gains of 1, in Gaussians; views that share nothing get these.
-_PRIOR = 1.0
+#: Weight of the prior, gains of 1, in Gaussians; views that share nothing get these. For gammas it is one
+#: whose brightness is a tenth from the mean.
+_PRIOR, _PRIOR_OF_SLOPES = 1.0, 0.1**2
 #: One Gaussian in this many is compared: a third is enough and takes a third of the time.
 _EVERY = 3
-#: Steps of reweighting.
-_STEPS = 5
+#: Steps of reweighting, and of that of slopes, which begins farther away.
+_STEPS, _STEPS_OF_SLOPES = 5, 15
 
 
 def equalized(gaussians: Gaussians, batch: Batch) -> tuple[Gaussians, Batch]:
@@ -50,20 +52,42 @@ def log_gains(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
     photographs do not tell which camera is right. Pairs of views are compared at the Gaussians that both see,
     with Cauchy weights, so that wrong depths matter little."""
     with exact(gaussians.means.device.type):
-        depth = render(gaussians, batch.cameras).depth
-        some = _thinned(gaussians)
-        ratios, weights = _compared(some, batch, depth)
+        own, ratios, _, weights = _compared(gaussians, batch)
         b, views = batch.masks.shape[:2]
-        gains = ratios.new_zeros(b, views, 3)
-        own, element = some.image, some.image // views
+        gains, element = ratios.new_zeros(b, views, 3), own // views
         for _ in range(_STEPS):
             between = gains[element] - gains.flatten(0, 1)[own, None]
             counted = weights / (1 + ((ratios - between) / _OUTLIER).square())
-            sums = ratios.new_zeros(2, b * views, views, 3)
-            sums[0].index_add_(0, own, counted)
-            sums[1].index_add_(0, own, counted * ratios)
+            sums = _summed(own, b * views, counted, counted * ratios)
             gains = _solved(*sums.view(2, b, views, views, 3))
         return gains * gains.square() / (gains.square() + _LEAST**2)
+
+
+@torch.no_grad()
+def log_gammas(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
+    """Natural logarithms of cameras' gammas, exponents of their colours, beside the median camera's; about 0
+    if views share nothing. Where those of two views differ, log ratios of their colours change as much
+    with log brightness, while gains only shift them: lines are fitted to these, with Cauchy weights."""
+    with exact(gaussians.means.device.type):
+        own, ratios, levels, weights = _compared(gaussians, batch)
+        b, views = batch.masks.shape[:2]
+        fitted = torch.zeros_like(ratios)
+        for _ in range(_STEPS_OF_SLOPES):
+            counted = weights / (1 + ((ratios - fitted) / _OUTLIER).square())
+            total, *sums = _summed(own, b * views, counted, counted * ratios, counted * levels)
+            ratio, level = (each / total.clamp(min=_PRIOR) for each in sums)
+            away = levels - level[own]
+            moments = _summed(own, b * views, counted * away.square(), counted * away * ratios)
+            gammas = _solved(*moments.view(2, b, views, views, 3), _PRIOR_OF_SLOPES)
+            between = gammas[own // views] - gammas.flatten(0, 1)[own, None]
+            fitted = ratio[own] + between * away
+        return gammas - gammas.quantile(0.5, 1, keepdim=True)
+
+
+def _summed(own: Int[Tensor, " N"], images: int, *values: Float[Tensor, "N V 3"]) -> Float[Tensor, "k I V 3"]:
+    """Sums of values over the Gaussians of each image."""
+    stacked = torch.stack(values)
+    return stacked.new_zeros(len(values), images, *stacked.shape[2:]).index_add_(1, own, stacked)
 
 
 def _thinned(gaussians: Gaussians) -> Gaussians:
@@ -74,30 +98,34 @@ def _thinned(gaussians: Gaussians) -> Gaussians:
 
 
 def _compared(
-    gaussians: Gaussians, batch: Batch, depth: Float[Tensor, "B V 1 H W"]
-) -> tuple[Float[Tensor, "N V 3"], Float[Tensor, "N V 3"]]:
-    """Log ratios of a Gaussian's colour in each view to that in its own photograph, and their weights."""
-    views = batch.masks.shape[1]
+    gaussians: Gaussians, batch: Batch
+) -> tuple[Int[Tensor, " N"], Float[Tensor, "N V 3"], Float[Tensor, "N V 3"], Float[Tensor, "N V 3"]]:
+    """Own photograph of some Gaussians, log ratios of their colours in each view to those in it, means of
+    both logs, and weights."""
+    depth, views = render(gaussians, batch.cameras).depth, batch.masks.shape[1]
+    gaussians = _thinned(gaussians)
     shares = coverage(batch)[:, :, None]
-    maps = torch.cat((batch.once(surface_colors) * shares, shares, depth), 2)
+    maps = torch.cat((batch.once(surface_colors) * shares, shares, depth), 2).to(batch.cameras.extrinsics)
     found, z, can_see = looked_up(gaussians, batch.cameras, maps)
     color, share, depth = found.split((3, 1, 1), -1)
     color = color / torch.where(share > 0, share, 1)
-    weights = torch.where(can_see, torch.exp(-((z - depth) / _NEAR).square()), 0)
+    near = _NEAR if gaussians.metre is None else _NEAR * gaussians.metre[gaussians.image // views, None, None]
+    weights = torch.where(can_see, torch.exp(-((z - depth) / near).square()), 0)
     weights = weights * (10 * share - 9).clamp(0, 1)
     weights = weights * (torch.minimum(color, 1 - color) / _DARK).clamp(0, 1)
     own = (gaussians.image % views)[:, None, None].expand(-1, 1, 3)
     logs = color.clamp(min=_DARK / 8).log()
-    return logs - logs.gather(1, own), weights * weights.gather(1, own)
+    theirs = logs.gather(1, own)
+    return gaussians.image, logs - theirs, (logs + theirs) / 2, weights * weights.gather(1, own)
 
 
 def _solved(
-    counts: Float[Tensor, "B V V 3"], differences: Float[Tensor, "B V V 3"]
+    counts: Float[Tensor, "B V V 3"], differences: Float[Tensor, "B V V 3"], prior: float = _PRIOR
 ) -> Float[Tensor, "B V 3"]:
-    """Log gains that best fit the sums of differences of views (last V) from own views (first V)."""
+    """Logs that best fit the sums of differences of views (last V) from own views (first V)."""
     counts, differences = counts.movedim(-1, 1), differences.movedim(-1, 1)
     both = counts + counts.mT
     identity = torch.eye(both.shape[-1], dtype=both.dtype, device=both.device)
-    laplacian = torch.diag_embed(both.sum(-1)) - both + _PRIOR * identity
+    laplacian = torch.diag_embed(both.sum(-1)) - both + prior * identity
     right = differences.sum(-2) - differences.sum(-1)
     return torch.linalg.solve(laplacian, right).mT

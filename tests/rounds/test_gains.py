@@ -9,7 +9,7 @@ import torch
 
 from ghgs_lit.data.imperfections import color_gains
 from ghgs_lit.geometry.projection import unproject_maps
-from ghgs_lit.rounds.gains import divided, equalized, log_gains
+from ghgs_lit.rounds.gains import divided, equalized, log_gains, log_gammas
 from ghgs_lit.types import Gaussians
 from tests.helpers.models import make_model
 from tests.helpers.scenes import CENTER, RADII, ellipsoid, make_batch, with_soft_rims
@@ -180,3 +180,17 @@ def test_photographs_that_are_divided_already_are_not_equalized_again():
             expected, found = plain(without).gaussians.colors, equal(some).gaussians.colors
             assert torch.equal(found, expected)
             assert not torch.equal(equal(without).gaussians.colors, expected)
+
+
+@pytest.mark.parametrize("gamma", [0.8, 1.2])
+@pytest.mark.parametrize("view", range(4))
+def test_the_gamma_of_each_camera_is_found(view, gamma):
+    """In all channels, whatever its exposure; the others have none."""
+    batch = painted(2)
+    gains = drawn(batch)
+    images = (0.6 * batch.images * torch.as_tensor(gains)[..., None, None].float()).clone()
+    images[1, view] **= gamma
+    wrong = dataclasses.replace(batch, images=images)
+    expected = torch.zeros(2, 4, 3)
+    expected[1, view] = math.log(gamma)
+    torch.testing.assert_close(log_gammas(splats(wrong), wrong), expected, atol=0.04, rtol=0)

@@ -17,6 +17,7 @@ from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.doubts import ENOUGH, doubt_of_cameras, doubt_of_masks
+from ghgs_lit.prediction.capture.tones import own_tones, without_tones
 from ghgs_lit.prediction.refinement import CameraRefinement, Refinement, Report, pixels_moved
 from ghgs_lit.prediction.sequence.temporal import Temporal
 from ghgs_lit.rendering import Renderer
@@ -37,6 +38,7 @@ class TimedPrediction:
     changed: tuple[float, ...] = ()  #: share of the subject that refining masks changed in each crop
     refined: Report | None = None  #: what refining the Gaussians gained, where asked; depths stay
     why: dict[str, str] = field(default_factory=dict)  #: doubts, by the refinement that ``auto`` chose
+    tones: dict[str, float] = field(default_factory=dict)  #: gammas of cameras that were undone, by name
 
     @property
     def gaussians(self) -> Gaussians:
@@ -53,6 +55,7 @@ def predict(
     refine: int = 0,
     renderer: Renderer | None = None,
     temporal: Temporal | None = None,
+    tones: Mapping[str, float] | Literal["auto"] = "auto",
 ) -> TimedPrediction:
     """The Gaussians of a capture. InputError: the checkpoint cannot be used, or the size does not fit the
     model.
@@ -69,13 +72,41 @@ def predict(
             photographs show other outlines.
         refine: steps that bring the Gaussians nearer to the photographs, such as 15; 0: none.
         renderer: what refining draws with; None: that of the device.
-        temporal: the predictor of the instants before, in their order; None: no sequence."""
+        temporal: the predictor of the instants before, in their order; None: no sequence.
+        tones: gammas of cameras, by name, that are undone first; ``auto``: of those that have one of their
+            own beside the others, by a first prediction."""
     if not isinstance(model, GHGS):
         path = file_of(model)
         model = _model(path, path.stat().st_mtime_ns)
         size = crop_size(size, read_config(path), model)
     require(size is not None, "size", "a size in pixels beside a model that is no checkpoint", size)
-    size, seconds, why = image_size("size", size), {}, {}
+    refining = refine_cameras, refine_masks, refine
+    keys = model, image_size("size", size), *refining, renderer or Renderer(), temporal
+    result = _predicted(capture if tones == "auto" else without_tones(capture, tones), *keys)
+    if tones != "auto":
+        return replace(result, tones=dict(tones))
+    tones = own_tones(result.batch, result.gaussians)
+    if not tones:
+        return result
+    if temporal is not None:
+        temporal.reset()
+    again = _predicted(without_tones(capture, tones), *keys)
+    seconds = again.seconds | {"tones": sum(result.seconds.values())}
+    return replace(again, seconds=seconds, tones=tones)
+
+
+def _predicted(
+    capture: Capture,
+    model: GHGS,
+    size: tuple[int, int],
+    refine_cameras: int | Literal["auto"],
+    refine_masks: int | Literal["auto"],
+    refine: int,
+    renderer: Renderer,
+    temporal: Temporal | None,
+) -> TimedPrediction:
+    """:func:`predict` of photographs with their colours as they are."""
+    seconds, why = {}, {}
     if refine_masks == "auto":
         why["refine_masks"] = doubt_of_masks(capture, size)
         refine_masks = ENOUGH if why["refine_masks"] else 0
@@ -85,7 +116,7 @@ def predict(
         refine_cameras = ENOUGH if why["refine_cameras"] else 0
     batch = batch.to(next(model.parameters()).device)
     forward = functools.partial(in_frame, model)
-    result = predict_batch(batch, model, renderer or Renderer(), refine_cameras, refine, forward, temporal)
+    result = predict_batch(batch, model, renderer, refine_cameras, refine, forward, temporal)
     why = {name: doubt for name, doubt in why.items() if doubt}
     return replace(result, seconds=seconds | result.seconds, changed=changed, why=why)
 
