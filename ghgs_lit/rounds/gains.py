@@ -52,7 +52,8 @@ def log_gains(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
     photographs do not tell which camera is right. Pairs of views are compared at the Gaussians that both see,
     with Cauchy weights, so that wrong depths matter little."""
     with exact(gaussians.means.device.type):
-        own, ratios, _, weights = _compared(gaussians, batch)
+        own, logs, theirs, weights = _compared(gaussians, batch)
+        ratios = logs - theirs
         b, views = batch.masks.shape[:2]
         gains, element = ratios.new_zeros(b, views, 3), own // views
         for _ in range(_STEPS):
@@ -69,7 +70,8 @@ def log_gammas(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
     if views share nothing. Where those of two views differ, log ratios of their colours change as much
     with log brightness, while gains only shift them: lines are fitted to these, with Cauchy weights."""
     with exact(gaussians.means.device.type):
-        own, ratios, levels, weights = _compared(gaussians, batch)
+        own, logs, theirs, weights = _compared(gaussians, batch)
+        ratios, levels = logs - theirs, (logs + theirs) / 2
         b, views = batch.masks.shape[:2]
         fitted = torch.zeros_like(ratios)
         for _ in range(_STEPS_OF_SLOPES):
@@ -100,8 +102,7 @@ def _thinned(gaussians: Gaussians) -> Gaussians:
 def _compared(
     gaussians: Gaussians, batch: Batch
 ) -> tuple[Int[Tensor, " N"], Float[Tensor, "N V 3"], Float[Tensor, "N V 3"], Float[Tensor, "N V 3"]]:
-    """Own photograph of some Gaussians, log ratios of their colours in each view to those in it, means of
-    both logs, and weights."""
+    """Own photograph of some Gaussians, logs of their colours in each view and in their own, and weights."""
     depth, views = render(gaussians, batch.cameras).depth, batch.masks.shape[1]
     gaussians = _thinned(gaussians)
     shares = coverage(batch)[:, :, None]
@@ -115,8 +116,7 @@ def _compared(
     weights = weights * (torch.minimum(color, 1 - color) / _DARK).clamp(0, 1)
     own = (gaussians.image % views)[:, None, None].expand(-1, 1, 3)
     logs = color.clamp(min=_DARK / 8).log()
-    theirs = logs.gather(1, own)
-    return gaussians.image, logs - theirs, (logs + theirs) / 2, weights * weights.gather(1, own)
+    return gaussians.image, logs, logs.gather(1, own), weights * weights.gather(1, own)
 
 
 def _solved(

@@ -114,7 +114,7 @@ DEFECTS = (
         "black",
     ),
     Defect(
-        "gains of the rounds that nothing holds", gains._solved, "_PRIOR * identity", "1e-9 * identity",
+        "gains of the rounds that nothing holds", gains._solved, "prior * identity", "1e-9 * identity",
         "pipeline shipped", "ordinary",
     ),
     Defect(
