@@ -1,6 +1,6 @@
 """Train a small sweep whose processes are killed at random, moved and queued again, and check the result.
 
-    python scripts/drill.py --out runs/drill [--kills 10] [--random 0] [overrides of ghgs train]
+    python scripts/drill.py --out runs/drill [--kills 10] [--steps 60] [--random 0] [overrides of ghgs train]
 
 Two processes share twelve runs. They are killed while they train by SIGKILL, SIGTERM or SIGINT; once all are
 killed and the sweep's folder is moved, and once a job of SLURM (the environment of ``srun``, a replacement of
@@ -23,15 +23,11 @@ from pathlib import Path
 import torch
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
-STEPS, VALIDATION = 24, 6
+VALIDATION = 6
 SEEDS, ABLATIONS = (1, 2, 3, 4, 5, 6), ("full", "no_semantic")
 SETTINGS = (
     *("experiment=demo", "data.people={train: 4, val: 1}", "data.size=56", "evaluation.views=[4]"),
-    *(
-        f"trainer.max_steps={STEPS}",
-        f"trainer.val_check_interval={VALIDATION}",
-        "trainer.log_every_n_steps=1",
-    ),
+    *(f"trainer.val_check_interval={VALIDATION}", "trainer.log_every_n_steps=1"),
     *("evaluation.pictures=0", "callbacks=steps", "callbacks.last.every_n_train_steps=5", "data.workers=0"),
 )
 JOB = {"SLURM_JOB_ID": "77", "SLURM_JOB_NAME": "drill", "SLURM_NTASKS": "1", "SLURM_NNODES": "1"}
@@ -42,7 +38,8 @@ JOB |= {"SLURM_JOB_NODELIST": "localhost"}
 class Drill:
     """The sweep's folder, its two processes and what is done to them."""
 
-    def __init__(self, out: Path, overrides: list[str]):
+    def __init__(self, out: Path, steps: int, overrides: list[str]):
+        overrides = [f"trainer.max_steps={steps}", *overrides]
         self.out, self.overrides, self.sweep = out, overrides, out / "sweep"
         self.processes: list[subprocess.Popen] = []
         self.requests = out / "requests"  # of the replacement of scontrol
@@ -93,7 +90,7 @@ class Drill:
             self.start_two()
             victim = chance.choice(self.processes)
             if not self.wait_for_training(victim):
-                raise SystemExit(f"all runs were done after {count} kills: try more steps")
+                raise SystemExit(f"all runs were done after {count} kills: try more --steps")
             time.sleep(chance.uniform(0, 4))
             number = chance.choice([signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
             self.stop(victim, number)
@@ -113,7 +110,7 @@ class Drill:
         job = self.train(self.sweep, **JOB)
         self.processes.append(job)
         if not self.wait_for_training(job):
-            raise SystemExit("all runs were done before a job was queued again: try more steps")
+            raise SystemExit("all runs were done before a job was queued again: try more --steps")
         time.sleep(chance.uniform(0, 2))
         self.stop(job, signal.SIGUSR1)
         if self.requests.read_text() != "requeue 77\n":
@@ -143,9 +140,9 @@ def curves_of(sweep: Path, run: Path) -> Path:
     return owners[0] if owners else run / "tensorboard"
 
 
-def faults_of(sweep: Path, run: Path) -> list[str]:
+def faults_of(sweep: Path, run: Path, steps: int) -> list[str]:
     """What is wrong with a run that has ended."""
-    every, validations = list(range(1, STEPS + 1)), list(range(VALIDATION, STEPS + 1, VALIDATION))
+    every, validations = list(range(1, steps + 1)), list(range(VALIDATION, steps + 1, VALIDATION))
     results = json.loads((run / "metrics.json").read_text())
     sessions = [json.loads(line) for line in (run / "sessions.jsonl").read_text().splitlines()]
     last, best = (
@@ -158,7 +155,7 @@ def faults_of(sweep: Path, run: Path) -> list[str]:
     found = {
         "hash of the configuration": (results["provenance"]["config_hash"], run.name),
         "sessions that ended well": ([s["outcome"] for s in sessions if "outcome" in s].count("done"), 1),
-        "step of last.ckpt": (last["global_step"], STEPS),
+        "step of last.ckpt": (last["global_step"], steps),
         "step of best.ckpt": (best["global_step"], next(step for step, score in scores if score == top)),
         "best score": (round(float(state["best_model_score"]), 4), round(top, 4)),
         "steps of the CSV": ([step for step, _ in steps_of_csv(run, "loss/total")], every),
@@ -181,11 +178,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("runs/drill"))
     parser.add_argument("--kills", type=int, default=10)
+    parser.add_argument("--steps", type=int, default=60, help="of each run; fewer on a slow machine")
     parser.add_argument("--random", type=int, default=0, help="seed of what is killed and when")
     arguments, overrides = parser.parse_known_args()
+    # A shell starts what it puts into the background with Ctrl-C ignored, and children inherit that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     if arguments.out.exists():
         raise SystemExit(f"{arguments.out}: expected a new directory; found one")
-    drill, begin = Drill(arguments.out, overrides), time.monotonic()
+    drill, begin = Drill(arguments.out, arguments.steps, overrides), time.monotonic()
     whole = arguments.out / "whole"
     code = drill.train(whole, SEEDS[:1], ABLATIONS[:1]).wait()
     faults = [f"exit code {code} of the undisturbed run"] * (code != 0)
@@ -194,7 +194,7 @@ def main() -> int:
     runs = sorted(path.parent for path in drill.sweep.glob("*/metrics.json"))
     count = len(SEEDS) * len(ABLATIONS)
     faults += [f"{len(runs)} runs have results, expected {count}"] * (len(runs) != count)
-    faults += [fault for run in runs for fault in faults_of(drill.sweep, run)]
+    faults += [fault for run in runs for fault in faults_of(drill.sweep, run, arguments.steps)]
     (undisturbed,) = (path.parent for path in whole.glob("*/metrics.json"))
     tensors = differing(undisturbed, drill.sweep / undisturbed.name)
     faults += [f"{len(tensors)} tensors differ from those of an undisturbed run"] * bool(tensors)
