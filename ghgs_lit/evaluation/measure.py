@@ -16,7 +16,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.unprojection import seen_surfaces
 from ghgs_lit.metrics import ImageMetrics, depth_error_mm, surface_error_mm
 from ghgs_lit.prediction.refinement import CameraRefinement, Refinement
-from ghgs_lit.recalibration.inspection import Neighborhood, seen_neighborhoods
+from ghgs_lit.recalibration.inspection import Call, neighborhoods, seen_calls
 from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
 from ghgs_lit.types import Batch, Cameras, Decision, Gaussians, Prediction, Rendering
@@ -30,7 +30,7 @@ class Estimate:
     """Prediction of a method for a batch; None: not predicted. ``image``: renders [B, T, 3, h, w] of the
     targets. ``depth``: of the inputs [B, V, H, W], metres, defined where ``depth_valid``. ``gaussians``: what
     was drawn. For each element: number of Gaussians and subject depths that are ``not_finite``; ``decisions``
-    of ``skip=auto``; ``neighborhoods`` of its recalibration."""
+    of ``skip=auto``. ``recalibrated``: the recalibration with its inputs, where it has neighbours."""
 
     image: Tensor
     depth: Tensor | None = None
@@ -38,7 +38,7 @@ class Estimate:
     gaussians: Gaussians | None = None
     not_finite: tuple[int, ...] | None = None
     decisions: tuple[Decision, ...] = ()
-    neighborhoods: tuple[Neighborhood, ...] = ()
+    recalibrated: Call | None = None
 
 
 Method = Callable[[Batch], Estimate]
@@ -57,7 +57,7 @@ class ModelMethod:
     def __call__(self, batch: Batch) -> Estimate:
         if self.cameras is not None:
             batch = self.cameras(batch)
-        with seen_neighborhoods(getattr(self.model, "recalibration", None)) as seen:
+        with seen_calls(getattr(self.model, "recalibration", None)) as seen:
             prediction = self.model(batch)
         gaussians, depth = prediction.gaussians, prediction.depth
         if self.refinement is not None:
@@ -65,8 +65,8 @@ class ModelMethod:
         image, valid = self.renderer(gaussians, batch.targets.cameras).image, prediction.depth_valid
         lost = not_finite(batch, prediction)
         # Smaller copies of photographs (coarse to fine) go through the stages first.
-        seen = tuple(seen[-len(batch.images) :])
-        return Estimate(image, depth, valid, gaussians, lost, prediction.decisions, seen)
+        last = seen[-1] if seen else None
+        return Estimate(image, depth, valid, gaussians, lost, prediction.decisions, last)
 
 
 def not_finite(batch: Batch, prediction: Prediction) -> tuple[int, ...]:
@@ -88,32 +88,35 @@ def _depth_error(batch: Batch, estimate: Estimate, element: int) -> float | None
     return depth_error_mm(estimate.depth[element], batch.depths[element], valid).item()
 
 
-def _surface_error(batch: Batch, estimate: Estimate, element: int) -> float | None:
-    """Error of the drawn Gaussians against the true surface that the inputs show."""
-    if batch.depths is None or estimate.gaussians is None:
-        return None
-    splats = estimate.gaussians[element]
-    return surface_error_mm(splats.means, splats.opacities, seen_surfaces(batch)[element]).item()
+def _surface_errors(batch: Batch, gaussians: Gaussians) -> list[float | None]:
+    """Error of each element's Gaussians against the true surface that the inputs show; None: unknown."""
+    if batch.depths is None:
+        return [None] * len(batch.images)
+    splats = [gaussians[element] for element in range(len(batch.images))]
+    pairs = zip(splats, seen_surfaces(batch), strict=True)
+    return [surface_error_mm(own.means, own.opacities, surface).item() for own, surface in pairs]
 
 
 def _rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[Row]:
     targets, (b, t) = batch.targets, batch.targets.images.shape[:2]
     flat = metrics(estimate.image.flatten(0, 1), targets.images.flatten(0, 1), targets.masks.flatten(0, 1))
     values = {name: value.reshape(b, t).tolist() for name, value in flat.items()}
+    surfaces = [] if estimate.gaussians is None else _surface_errors(batch, estimate.gaussians)
+    around = [] if estimate.recalibrated is None else neighborhoods(*estimate.recalibrated)
     rows = []
     for element in range(b):
         about = {"subject": batch.subjects[element], "views": batch.images.shape[1]}
         about["inputs"] = list(batch.views[element]) if batch.views else []
         shared = {"depth_error_mm": _depth_error(batch, estimate, element)}
         if estimate.gaussians is not None:
-            shared["surface_mm"] = _surface_error(batch, estimate, element)
+            shared["surface_mm"] = surfaces[element]
             shared["gaussians"] = estimate.gaussians.splits[element]
         if estimate.not_finite is not None and estimate.not_finite[element]:
             shared["not_finite"] = estimate.not_finite[element]
-        if estimate.neighborhoods:
-            shared["tokens"] = estimate.neighborhoods[element].tokens
-            shared["neighbors"] = estimate.neighborhoods[element].neighbors
-            shared["shared_neighbors"] = estimate.neighborhoods[element].shared
+        if around:
+            shared["tokens"] = around[element].tokens
+            shared["neighbors"] = around[element].neighbors
+            shared["shared_neighbors"] = around[element].shared
         if estimate.decisions:
             about["skip"] = estimate.decisions[element].preset
             shared["encoder_products"] = estimate.decisions[element].products

@@ -90,23 +90,25 @@ def neighborhoods(recalibration: Recalibration, tokens: Tokens, points: Points) 
     for number in range(tokens.grid[0]):
         chosen = (takes_part & (element == number)).nonzero()[:, 0]
         near, changed = (_near(stage, tokens, points, chosen) for stage in (recalibration, other))
-        same = (near[:, :, None] == changed[:, None]).any(-1).float()
-        shared = same.mean().item() if len(chosen) else 1.0
+        is_near = near.new_zeros(len(chosen), len(chosen), dtype=torch.bool).scatter_(1, near, True)
+        shared = is_near.gather(1, changed).float().mean().item() if len(chosen) else 1.0
         found.append(Neighborhood(len(chosen), near.shape[1], shared))
     return found
 
 
+#: A stage with its inputs, as :func:`neighborhoods` takes them.
+Call = tuple[Recalibration, Tokens, Points]
+
+
 @contextmanager
-def seen_neighborhoods(recalibration: nn.Module | None) -> Iterator[list[Neighborhood]]:
-    """A list that gets the neighbourhoods of each element that the stage works on while the context lasts; it
-    stays empty for None and a stage without neighbours."""
-    found: list[Neighborhood] = []
+def seen_calls(recalibration: nn.Module | None) -> Iterator[list[Call]]:
+    """A list that gets the calls of the stage while the context lasts; it stays empty for None and a stage
+    without neighbours. Nothing is computed, so that what is timed takes no longer."""
+    found: list[Call] = []
     if not isinstance(recalibration, Recalibration):
         yield found
         return
-    hook = recalibration.register_forward_pre_hook(
-        lambda stage, inputs: found.extend(neighborhoods(stage, *inputs))
-    )
+    hook = recalibration.register_forward_pre_hook(lambda stage, inputs: found.append((stage, *inputs)))
     try:
         yield found
     finally:

@@ -11,7 +11,7 @@ from lightning.pytorch.callbacks import Callback
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from ghgs_lit.config.options import Options
-from ghgs_lit.recalibration.inspection import seen_neighborhoods
+from ghgs_lit.recalibration.inspection import neighborhoods, seen_calls
 from ghgs_lit.runs.progress import Lines, clock, on_terminal
 
 
@@ -77,13 +77,14 @@ class NeighborsAtStart(Callback):
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self._stack = ExitStack()
         stage = getattr(pl_module.model, "recalibration", None)
-        self._seen = self._stack.enter_context(seen_neighborhoods(stage))
+        self._seen = self._stack.enter_context(seen_calls(stage))
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
         self._stack.close()
         if self._seen and trainer.is_global_zero:
+            around = neighborhoods(*self._seen[-1])
             tokens, count, shared = (
-                fmean(getattr(one, name) for one in self._seen) for name in ("tokens", "neighbors", "shared")
+                fmean(getattr(one, name) for one in around) for name in ("tokens", "neighbors", "shared")
             )
             other = "without" if pl_module.model.recalibration.neighborhood == "xyz" else "with"
             said = f"{tokens:.0f} tokens take part, {count:.0f} neighbours each, {shared:.0%} of them"

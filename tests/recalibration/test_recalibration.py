@@ -11,7 +11,7 @@ import ghgs_lit.recalibration.recalibration as stage
 from ghgs_lit.errors import InputError
 from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
 from ghgs_lit.recalibration.attention import S_MIN, Similarity
-from ghgs_lit.recalibration.inspection import seen_neighborhoods
+from ghgs_lit.recalibration.inspection import neighborhoods, seen_calls
 from ghgs_lit.recalibration.recalibration import RecalibrationOptions, neighbor_cosines, neighbor_count
 from tests.helpers.scenes import CASES, fixture
 from tests.helpers.tokens import literal_neighbors, make_stage, scene
@@ -260,9 +260,11 @@ def test_gathered_neighbors_give_what_a_product_of_all_tokens_gives(similarity, 
 def test_neighbors_that_the_ablation_keeps_are_counted(neighborhood):
     """Against sets of the nearest tokens in space and on the image plane."""
     tokens, points = scene()
-    with seen_neighborhoods(stage_of := make_stage(k=5, neighborhood=neighborhood)) as seen:
+    with seen_calls(stage_of := make_stage(k=5, neighborhood=neighborhood)) as calls:
         stage_of(tokens, points)
     stage_of(tokens, points)  # no longer seen
+    (call,) = calls
+    seen = neighborhoods(*call)
     assert [one.tokens for one in seen] == [12, 13]
     assert {one.neighbors for one in seen} == {5}
     for element, one in enumerate(seen):
