@@ -7,8 +7,10 @@ import torch
 
 from ghgs_lit.evaluation.measure import Estimate, ModelMethod, measure, not_finite
 from ghgs_lit.metrics import MetricsOptions, psnr
+from ghgs_lit.recalibration import inspection
 from ghgs_lit.rendering import render
 from ghgs_lit.runs.provenance import config_hash
+from ghgs_lit.types import Targets
 from tests.helpers.models import make_model
 from tests.helpers.scenes import make_batch
 from tests.helpers.training import Standin, example_batch, flat_renderer
@@ -123,3 +125,20 @@ def test_seconds_are_those_of_a_subject(monkeypatch):
     monkeypatch.setattr("ghgs_lit.evaluation.measure.time.perf_counter", lambda: next(ticks))
     rows = measure(lambda b: Estimate(b.targets.images), "model", [example_batch(subjects=2)], OFF)
     assert [row["seconds"] for row in rows] == [3, 3]
+
+
+def test_what_is_timed_searches_no_neighbors_of_the_other_setting(monkeypatch):
+    """Seconds of a prediction are its own; the share of neighbours that an ablation keeps comes later."""
+    searched, search = [], inspection.nearest_neighbors
+    monkeypatch.setattr(inspection, "nearest_neighbors", lambda *args: searched.append(1) or search(*args))
+    batch = make_batch(1, 3)
+    own = Targets(batch.images[:, :1], batch.masks[:, :1], batch.cameras[:, :1], (("a",),), ("midway",))
+    batch = dataclasses.replace(batch, targets=own, subjects=("p0",))
+    method = ModelMethod(make_model("model=paper").eval(), render)
+    with torch.no_grad():
+        method(batch)
+    assert not searched
+    (row,) = measure(method, "model", [batch], OFF)
+    assert len(searched) == 2
+    assert row["neighbors"] <= row["tokens"]
+    assert 0 < row["shared_neighbors"] <= 1
