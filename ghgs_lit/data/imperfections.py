@@ -8,8 +8,8 @@ import math
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float
-from scipy.ndimage import zoom
 from torch import Tensor
 
 from ghgs_lit.errors import require
@@ -81,7 +81,9 @@ def imperfect_mask(
             slice(max(0, lines.min() - margin), lines.max() + 1 + margin) for lines in (rows, columns)
         )
         part = mask[window]
-        noise = zoom(bumps, _BUMP, order=1)[: mask.shape[0], : mask.shape[1]][window]
+        sides = [_BUMP * side for side in bumps.shape]
+        noise = _stretched(torch.from_numpy(bumps), *sides).numpy()
+        noise = noise[: mask.shape[0], : mask.shape[1]][window]
         result[window] = signed_distance(part) + (2 * grow - 1) * offset + height * ragged * noise > 0
     if missing < hole_chance:
         middle, radius = int(place * len(rows)), size * hole * (rows.max() - rows.min() + 1) / 2
@@ -93,13 +95,31 @@ def imperfect_mask(
 def backgrounds(
     views: int, height: int, width: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "V 3 h w"]:
-    """Random background for each camera: cloudy patterns of large and small patches, in [0, 1]."""
-    size = (views, 3, height, width)
-    found = 0.5 + rng.uniform(-0.2, 0.2, (views, 3, 1, 1)) + _NOISE * rng.standard_normal(size)
+    """Random background for each camera: cloudy patterns of large and small patches.
+
+    Args:
+        views: number of cameras V.
+        height: rows h of a photograph.
+        width: columns w of a photograph.
+        rng: where patterns are drawn from.
+
+    Returns:
+        Colours [V, 3, h, w] float32 in [0, 1].
+    """
+    base = torch.from_numpy(0.5 + rng.uniform(-0.2, 0.2, (views, 3, 1, 1)))
+    noise = torch.from_numpy(rng.standard_normal((views, 3, height, width)))
+    colors = noise.float().mul_(_NOISE).add_(base.float())
     for cells, deviation in _PATCHES:
-        patches = rng.uniform(-deviation, deviation, (views, 3, cells, cells))
-        found += zoom(patches, (1, 1, height / cells, width / cells), order=1)
-    return found.clip(0, 1)
+        patches = torch.from_numpy(rng.uniform(-deviation, deviation, (views, 3, cells, cells)))
+        colors += _stretched(patches.float(), height, width)
+    return colors.clamp_(0, 1).numpy()
+
+
+def _stretched(patches: Float[Tensor, "*batch m n"], height: int, width: int) -> Float[Tensor, "*batch h w"]:
+    """Patches interpolated linearly, the middles of the outer ones at the middles of the outer pixels."""
+    channels = patches.reshape(1, -1, *patches.shape[-2:])
+    pixels = F.interpolate(channels, (height, width), mode="bilinear", align_corners=True)
+    return pixels.reshape(*patches.shape[:-2], height, width)
 
 
 def miscalibrated(

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import binary_dilation, binary_erosion
+from scipy.ndimage import binary_dilation, binary_erosion, zoom
 
-from ghgs_lit.data.imperfections import color_gains, imperfect_mask, miscalibrated
+from ghgs_lit.data.imperfections import backgrounds, color_gains, imperfect_mask, miscalibrated
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.synthesis.rig import Rig
@@ -58,6 +58,18 @@ def test_masks_grow_shrink_and_fray_within_their_pixels():
     outline = (mask & ~binary_erosion(mask)).sum()
     assert min(most.values()) > 1.5 * outline
     assert both > 6
+
+
+@pytest.mark.parametrize("size", [(60, 45), (31, 50)])
+def test_backgrounds_are_patches_that_scipy_enlarges(size):
+    """The same random numbers by another interpolation: patterns agree to the rounding of float32."""
+    found = backgrounds(2, *size, np.random.default_rng(4))
+    rng = np.random.default_rng(4)
+    expected = 0.5 + rng.uniform(-0.2, 0.2, (2, 3, 1, 1)) + 0.02 * rng.standard_normal((2, 3, *size))
+    for cells, deviation in ((3, 0.35), (12, 0.15), (40, 0.06)):
+        patches = rng.uniform(-deviation, deviation, (2, 3, cells, cells))
+        expected += zoom(patches, (1, 1, size[0] / cells, size[1] / cells), order=1)
+    np.testing.assert_allclose(found, expected.clip(0, 1), rtol=0, atol=2e-6)
 
 
 def test_a_missing_piece_is_round_and_not_larger_than_its_share():
