@@ -1,5 +1,6 @@
 """Defects planted one at a time in the code of the stages: the stress test reports each of them."""
 
+import ast
 import inspect
 import sys
 import textwrap
@@ -9,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from benchmarks.planted_defects import change_code
 from ghgs_lit.bounds.agreement import trusted_views
 from ghgs_lit.diagnostics.stress.measure import measure
 from ghgs_lit.diagnostics.stress.stages import STAGES, heads
@@ -24,12 +26,11 @@ from ghgs_lit.rounds import gains
 
 @dataclass(frozen=True)
 class Defect:
-    """A line of ``function`` that is another one, and a stage, a family and a dtype that show it."""
+    """A change of the code of ``function``, and a stage, a family and a dtype that show it."""
 
     says: str
     function: Callable
-    before: str
-    after: str
+    change: str
     stage: str
     family: str
     dtype: str = "float32"
@@ -37,89 +38,92 @@ class Defect:
     def plant(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Change the function wherever it is known, until the test ends."""
         function = inspect.unwrap(self.function)
-        source = textwrap.dedent(inspect.getsource(function))
-        assert source.count(self.before) == 1, self
+        tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+        change_code(tree, self.change)
         changed: dict[str, Callable] = {}
-        exec(source.replace(self.before, self.after), vars(sys.modules[function.__module__]), changed)
+        exec(ast.unparse(tree), vars(sys.modules[function.__module__]), changed)
         code = inspect.unwrap(changed[function.__name__]).__code__
         monkeypatch.setattr(function, "__code__", code)
 
 
 DEFECTS = (
     Defect(
-        "a bare square root", rotations.unit, "keepdim=True).masked_fill(is_zero, 1.0)", "keepdim=True)",
+        "a bare square root", rotations.unit, "squared = A.masked_fill(B, 1.0) → squared = A",
         "unit vectors", "zero_quaternion",
     ),
     Defect(
-        "squares that overflow", rotations.unit, "scaled = x / largest.masked_fill(is_zero, 1.0)",
-        "scaled = x", "unit vectors", "huge_quaternion",
+        "squares that overflow", rotations.unit, "scaled = x / A → scaled = x",
+        "unit vectors", "huge_quaternion",
     ),
     Defect(
-        "an epsilon that hides what is short", rotations.unit, "scaled * squared.rsqrt()",
-        "x / (x.norm(dim=-1, keepdim=True) + 1e-8)", "cosine", "tiny_features",
+        "an epsilon that hides what is short", rotations.unit,
+        "scaled * A → x / (x.norm(dim=-1, keepdim=True) + 1e-8)", "cosine", "tiny_features",
     ),
     Defect(
-        "geometry in half precision", projection.unproject, "x, y, z = x * depth",
-        "depth = depth.half().to(depth)\n    x, y, z = x * depth", "unprojection", "ordinary",
+        "geometry in half precision", projection.unproject, "x * depth → x * depth.half().to(depth)",
+        "unprojection", "ordinary",
     ),
     Defect(
-        "a product that autocast catches", projection._camera_axes, "return a * x",
-        "return (extrinsics[..., :3, :3] @ points[..., None])[..., 0].movedim(-1, 0)\n    return a * x",
+        "a product that autocast catches", projection._camera_axes,
+        "return A → return (extrinsics[..., :3, :3] @ points[..., None])[..., 0].movedim(-1, 0)",
         "projection", "ordinary", "bfloat16",
     ),
     Defect(
-        "a softmax without its maximum", SemanticAttention._attend, "logits.softmax(-1)",
-        "logits.exp() / logits.exp().sum(-1, keepdim=True)", "attention", "huge_features",
+        "a softmax without its maximum", SemanticAttention._attend,
+        "A.softmax(-1) → A.exp() / A.exp().sum(-1, keepdim=True)", "attention", "huge_features",
     ),
     Defect(
-        "distances in half precision", nearest_neighbors, "torch.cdist(points[rows], points,",
-        "torch.cdist(points[rows].half().float(), points.half().float(),", "neighbours", "shifted",
+        "distances in half precision", nearest_neighbors, "points[rows] → points[rows].half().float()",
+        "neighbours", "shifted",
     ),
     Defect(
-        "distances by products", nearest_neighbors, '"donot_use_mm_for_euclid_dist"',
-        '"use_mm_for_euclid_dist"', "neighbours", "shifted",
+        "distances by products", nearest_neighbors,
+        "'donot_use_mm_for_euclid_dist' → 'use_mm_for_euclid_dist'", "neighbours", "shifted",
     ),
     Defect(
-        "the map of another subject", projection.sample, "2 * image.to(pixels) + 1",
-        "2 * (image.to(pixels) + 1) % (2 * count) + 1", "samples of maps", "ordinary",
+        "the map of another subject", projection.sample,
+        "2 * image.to(pixels) + 1 → 2 * (image.to(pixels) + 1) % (2 * count) + 1",
+        "samples of maps", "ordinary",
     ),
     Defect(
         "a quaternion over its squared length", rotations.quaternion_to_matrix,
-        "q.norm(dim=-1, keepdim=True)", "q.square().sum(-1, keepdim=True)",
+        "q.norm(dim=-1, keepdim=True) → q.square().sum(-1, keepdim=True)",
         "quaternion and covariance", "ordinary",
     ),
     Defect(
-        "a window whose sum is not 1", functional._gaussian_window, "weights / weights.sum()", "weights",
+        "a window whose sum is not 1", functional._gaussian_window, "A / A.sum() → A",
         "L1 and SSIM", "ordinary",
     ),
     Defect(
-        "a border on the wrong side", Padding.pad_batch, "cropped(self.top, self.left,",
-        "cropped(self.top, -self.left,",
+        "a border on the wrong side", Padding.pad_batch,
+        "A.cropped(self.top, self.left, B, C) → A.cropped(self.top, -self.left, B, C)",
         "padding", "ordinary",
     ),
     Defect(
-        "a wrong mask that keeps its vote", trusted_views, "voting & ~", "voting | ~",
+        "a wrong mask that keeps its vote", trusted_views, "voting & ~A → voting | ~A",
         "bounds and hull", "wrong_mask",
     ),
     Defect(
         "a Jacobian without its clamp", reference.project,
-        "torch.minimum(torch.maximum(tangents, low), high)", "tangents", "compositing", "beside",
+        "torch.minimum(torch.maximum(A, B), C) → A", "compositing", "beside",
     ),
     Defect(
         "a lens half a pixel beside its place", undistortion.undistorting_grid,
-        "torch.linspace(0.5, side - 0.5,", "torch.linspace(0.0, side - 1.0,", "undistortion", "ordinary",
+        
+        "torch.linspace(0.5, A - 0.5, B, dtype=C) → torch.linspace(0, A - 1, B, dtype=C)",
+        "undistortion", "ordinary",
     ),
     Defect(
-        "the logarithm of black", gains._compared, "color.clamp(min=_DARK / 8).log()", "color.log()", "gains",
-        "black",
+        "the logarithm of black", gains._compared, "color.clamp(min=A).log() → color.log()",
+        "gains", "black",
     ),
     Defect(
-        "gains of the rounds that nothing holds", gains._solved, "prior * identity", "1e-9 * identity",
+        "gains of the rounds that nothing holds", gains._solved, "prior * identity → 1e-9 * identity",
         "pipeline shipped", "ordinary",
     ),
     Defect(
-        "colours that move beyond their limit", refinement.Descent._changed, "c.limit * torch.tanh",
-        "torch.tanh", "refinement", "ordinary",
+        "colours that move beyond their limit", refinement.Descent._changed, "c.limit * A → A",
+        "refinement", "ordinary",
     ),
 )  # fmt: skip
 
