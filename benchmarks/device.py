@@ -6,7 +6,7 @@ it idles where the host waits for a value. A list that is copied to the device m
     python benchmarks/device.py                          # vggt_nano, two elements of four views of 140 x 140
     python benchmarks/device.py --lines model=paper      # which lines wait; with overrides of `ghgs train`
 
-gsplat's kernels are left out: a stand-in draws nothing.
+gsplat's kernels, which project and draw, are left out: a stand-in draws nothing.
 """
 
 import argparse
@@ -72,21 +72,36 @@ def forward(model: GHGS, batch: Batch, log: Log) -> Counts:
     return probe.counts
 
 
+class Gsplat:
+    """A stand-in for gsplat that draws nothing: every splat touches a tile."""
+
+    __version__ = "1.5.3"
+
+    @staticmethod
+    def fully_fused_projection(
+        means: Tensor, scales: Tensor, quats: Tensor, viewmats: Tensor, calc_compensations: bool, **options
+    ) -> tuple[Tensor | None, ...]:
+        values = torch.cat((means, scales, quats), -1)[:, None].expand(-1, viewmats.shape[1], -1, -1)
+        radii = values.new_ones(*values.shape[:-1], 2, dtype=torch.int32)
+        compensations = values[..., 0] if calc_compensations else None
+        return radii, values[..., :2].contiguous(), values[..., 2], values[..., 3:6], compensations
+
+    @staticmethod
+    def rasterize_to_pixels(
+        means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, width: int, height: int,
+        *lists: Any, **options: Any,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        seen = means2d.sum() + conics.sum() + colors.sum() + opacities.sum()
+        values = means2d.new_zeros(*means2d.shape[:2], height, width, colors.shape[-1]) + 0 * seen
+        return values, values[..., :1]
+
+
 @contextmanager
 def drawing_nothing() -> Iterator[None]:
     """Rendering goes through the gsplat backend to a stand-in for gsplat."""
-
-    def rasterization(
-        means: Tensor, colors: Tensor, viewmats: Tensor, width: int, height: int, **options
-    ) -> tuple[Tensor, Tensor, dict]:
-        shape = (*viewmats.shape[:2], height, width)
-        seen = means.sum() + colors.sum() + sum(options[n].sum() for n in ("quats", "scales", "opacities"))
-        values = means.new_zeros(*shape, colors.shape[-1] + 1) + 0 * seen
-        return values, values[..., :1], {}
-
     with (
         mock.patch.object(api, "resolve_backend", return_value="gsplat"),
-        mock.patch.object(gsplat_backend, "load", return_value=rasterization),
+        mock.patch.object(gsplat_backend, "load", return_value=Gsplat),
     ):
         yield
 

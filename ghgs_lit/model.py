@@ -15,6 +15,7 @@ from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.padding import bounds_of
 from ghgs_lit.heads.dpt import LEVELS, DPTHead
 from ghgs_lit.kernels.precision import PRECISIONS
+from ghgs_lit.rendering.capacity import settled
 from ghgs_lit.rounds import CoarseDepths, Rounds, State, coarse_depths, prediction_of, replaced
 from ghgs_lit.skipping import SkipOptions
 from ghgs_lit.stages import HEADS, OPTIONS, STAGES
@@ -68,7 +69,7 @@ class GHGS(nn.Module):
         for layer in around:
             batch = layer.enter(batch)
         with computing(self.precision, self.auto, self.encoder, batch.masks) as (decisions, kept):
-            prediction = self._predict(batch, kept, self._coarse(batch))
+            prediction = settled(lambda: self._predict(batch, kept, self._coarse(batch)))
         for layer in reversed(around):
             prediction = layer.leave(prediction)
         return dataclasses.replace(prediction, decisions=decisions)

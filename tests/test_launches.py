@@ -31,14 +31,14 @@ class Asked(NamedTuple):
 _VERSION = "2.13."
 
 LIMITS = {
-    ("model=paper", 1): Asked(1692, 4, 4389, 5),
-    ("model=paper", 8): Asked(1847, 4, 4614, 5),
-    ("model=hull", 1): Asked(2062, 4, 4899, 5),
-    ("model=hull", 8): Asked(2217, 4, 5124, 5),
-    ("model=recurrent", 1): Asked(3395, 5, 6716, 6),
-    ("model=recurrent", 8): Asked(3611, 5, 7002, 6),
-    ("shipped", 1): Asked(3822, 5, 6782, 6),
-    ("shipped", 8): Asked(4056, 5, 7068, 6),
+    ("model=paper", 1): Asked(1692, 4, 4447, 5),
+    ("model=paper", 8): Asked(1847, 4, 4671, 5),
+    ("model=hull", 1): Asked(2062, 4, 4956, 5),
+    ("model=hull", 8): Asked(2217, 4, 5181, 5),
+    ("model=recurrent", 1): Asked(3520, 6, 6903, 7),
+    ("model=recurrent", 8): Asked(3736, 6, 7189, 7),
+    ("shipped", 1): Asked(3988, 6, 6969, 7),
+    ("shipped", 8): Asked(4222, 6, 7255, 7),
 }
 
 

@@ -142,7 +142,7 @@ def _in_one_dtype(gaussians: Gaussians) -> Gaussians:
 
 def _of_each(values: Tensor, gaussians: Gaussians) -> Tensor:
     """``values`` of the elements [B, ...], repeated for each of their Gaussians."""
-    counts = torch.tensor(gaussians.splits, device=values.device)
+    counts = torch.tensor(gaussians.splits).to(values.device, non_blocking=True)
     return values.repeat_interleave(counts, dim=0, output_size=len(gaussians))
 
 

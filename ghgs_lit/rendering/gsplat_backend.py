@@ -1,11 +1,19 @@
-"""The gsplat backend (CUDA), imported on first use; most constants are compiled into gsplat."""
+"""The gsplat backend (CUDA), imported on first use; most constants are compiled into gsplat.
+
+Its kernels project and draw. What lies between them, finding the splats of each tile, makes the host wait in
+gsplat, and is done here (:mod:`ghgs_lit.rendering.intersections`)."""
 
 import importlib
+import warnings
+from functools import cache, partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.rendering.capacity import with_room
+from ghgs_lit.rendering.intersections import TILE, Intersections, intersections
 from ghgs_lit.rendering.settings import RasterSettings
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
@@ -15,21 +23,27 @@ _ALPHA_MAX = RasterSettings().alpha_max
 #: element alone, and would mix those of elements with fewer Gaussians than this.
 _WARP = 32
 _FIXED = ("alpha_min", "stop", "extent", "frustum_margin")
+#: Versions whose kernels are known to draw the intersections that are found here.
+_KNOWN = ("1.5.3",)
+#: Channels, with depth, up to which gsplat draws all at once.
+_CHANNELS = 32
 
 
 class BackendUnavailable(InputError):
     """The chosen renderer cannot run on this machine; the message says what was tried."""
 
 
-def load():
-    """gsplat's function ``rasterization``. BackendUnavailable: no CUDA device, or the import fails."""
+def load() -> Any:
+    """The package gsplat. BackendUnavailable: no CUDA device, or the import fails."""
     if not torch.cuda.is_available():
         raise BackendUnavailable(
             "renderer.backend=gsplat: needs a CUDA device, but torch.cuda.is_available() is false "
             f"(torch {torch.__version__}, built for CUDA {torch.version.cuda}); use renderer=cpu"
         )
     try:
-        return importlib.import_module("gsplat").rasterization
+        gsplat = importlib.import_module("gsplat")
+        gsplat.rasterization  # noqa: B018
+        return gsplat
     except Exception as error:
         # Building gsplat's kernels can fail in many ways; the message repeats the reason.
         reason = str(error).strip().splitlines()
@@ -53,42 +67,90 @@ def rasterize(
     for name in _FIXED:
         value, fixed = getattr(settings, name), getattr(default, name)
         require(value == fixed, f"renderer.settings.{name}", f"{fixed}, which is compiled into gsplat", value)
-    rasterization = load()
+    gsplat = load()
     channels = gaussians.colors.shape[1]
     if len(gaussians) == 0 or 0 in cameras.shape:
         # Part of the graph, so that a batch of empty elements can be differentiated.
         nothing = (gaussians.means.sum() + gaussians.colors.sum()).float()
         drawn = nothing * nothing.new_zeros(*cameras.shape, channels + 2, cameras.height, cameras.width)
     else:
-        drawn = _drawn(rasterization, gaussians, cameras, settings, near, far)
+        drawn = _drawn(gsplat, gaussians, cameras, settings, near, far)
     image, depth, alpha = drawn.split((channels, 1, 1), dim=2)
     return Rendering(image=image, alpha=alpha, depth=depth)
 
 
-def _drawn(rasterization, gaussians: Gaussians, cameras: Cameras, settings, near, far) -> Tensor:
-    """Colours, expected depth and alpha of all views, [B, T, C + 2, h, w], by one call of gsplat."""
-    means, quaternions, scales, opacities, colors = _sanitized(*_side_by_side(gaussians))
+def _drawn(
+    gsplat: Any, gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
+) -> Tensor:
+    """Colours, expected depth and alpha of all views, [B, T, C + 2, h, w]."""
+    fields = _sanitized(*_side_by_side(gaussians))
+    means, quaternions, scales, opacities, colors = fields
     if settings.alpha_max < _ALPHA_MAX:
         # Opacities above the limit keep their gradient, as away from the centre of a splat in other backends.
         opacities = opacities - (opacities - settings.alpha_max).clamp(min=0).detach()
-    values, alpha, _ = rasterization(
-        means=means,
-        quats=quaternions,
-        scales=scales,
-        opacities=opacities,
-        colors=colors,
-        viewmats=cameras.extrinsics.float(),
-        Ks=cameras.intrinsics.float(),
-        width=cameras.width,
-        height=cameras.height,
-        near_plane=near,
-        far_plane=far,
-        eps2d=settings.low_pass,
-        render_mode="RGB+ED",
-        packed=False,
-        rasterize_mode="antialiased" if settings.antialiased else "classic",
-    )
+    seen = {
+        "means": means,
+        "quats": quaternions,
+        "scales": scales,
+        "opacities": opacities,
+        "viewmats": cameras.extrinsics.float(),
+        "Ks": cameras.intrinsics.float(),
+        "width": cameras.width,
+        "height": cameras.height,
+        "near_plane": near,
+        "far_plane": far,
+        "eps2d": settings.low_pass,
+    }
+    if _is_known(gsplat) and colors.shape[-1] < _CHANNELS:
+        values, alpha = _without_wait(gsplat, seen, colors, settings.antialiased)
+    else:
+        mode = "antialiased" if settings.antialiased else "classic"
+        options = {"render_mode": "RGB+ED", "packed": False, "rasterize_mode": mode}
+        values, alpha, _ = gsplat.rasterization(colors=colors, **seen, **options)
     return torch.cat((values, alpha), dim=-1).movedim(-1, -3)
+
+
+@cache
+def _is_known(gsplat: Any) -> bool:
+    """Whether gsplat's kernels can be called one by one; said once where they are unknown."""
+    version = getattr(gsplat, "__version__", "unknown")
+    known = version in _KNOWN
+    if not known:
+        warnings.warn(
+            f"renderer.backend=gsplat: the version of gsplat is {version}, not {', '.join(_KNOWN)}: images "
+            "are drawn by its function rasterization, in which the host waits for the GPU",
+            stacklevel=2,
+        )
+    return known
+
+
+def _without_wait(
+    gsplat: Any, seen: dict[str, Any], colors: Tensor, antialiased: bool
+) -> tuple[Tensor, Tensor]:
+    """What gsplat's ``rasterization`` draws: colours and expected depth [B, T, h, w, C + 1], alpha [..., 1].
+    ``seen``: Gaussians and cameras, by gsplat's names. ``colors``: [B, N, C]."""
+    radii, centers, depths, conics, compensations = gsplat.fully_fused_projection(
+        covars=None, calc_compensations=antialiased, **seen
+    )
+    height, width = seen["height"], seen["width"]
+    opacities = seen["opacities"][:, None].expand(depths.shape)
+    if antialiased:
+        opacities = opacities * compensations
+    colors = torch.cat((colors[:, None].expand(*depths.shape, -1), depths[..., None]), -1)
+
+    def find(capacity: int) -> tuple[Intersections, Tensor]:
+        found = intersections(centers.detach(), radii, depths.detach(), height, width, capacity)
+        return found, found.needed
+
+    draw = partial(gsplat.rasterize_to_pixels, centers, conics, colors, opacities, width, height, TILE)
+
+    def drawn(found: Intersections) -> tuple[Tensor, Tensor]:
+        return draw(found.offsets, found.splats, masks=found.has_pixels)
+
+    grid = (-(-height // TILE), -(-width // TILE))
+    values, alpha = with_room(grid, depths.numel(), find, drawn)
+    depth = values[..., -1:] / alpha.clamp(min=1e-10)
+    return torch.cat((values[..., :-1], depth), -1), alpha
 
 
 def _side_by_side(gaussians: Gaussians) -> tuple[Tensor, ...]:

@@ -1,28 +1,25 @@
 """gsplat: its projection in PyTorch as an independent check, how it is called, and its image on a GPU."""
 
+import contextlib
 import inspect
 import sys
 import types
+import warnings
 
 import pytest
 import torch
 
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
-from ghgs_lit.rendering import BackendUnavailable, RasterSettings, gsplat_backend, reference, render
-from ghgs_lit.types import Cameras, Gaussians
+from ghgs_lit.rendering import BackendUnavailable, RasterSettings, capacity, gsplat_backend, reference, render
+from ghgs_lit.types import Cameras
+from tests.helpers.gsplat import Documented, InParts, functions
 from tests.helpers.splats import FIELDS, camera_ring, cloud, differentiate, relative_error, with_gradients
-
-
-def _functions():
-    """gsplat's functions in plain PyTorch, which need no GPU."""
-    reason = "needs the package gsplat (it needs no GPU for this test)"
-    return pytest.importorskip("gsplat.cuda._torch_impl", reason=reason)
 
 
 def test_covariances_are_those_of_gsplat():
     """Rotation and scale make the same covariance as in gsplat."""
     gaussians = with_gradients(cloud(100), torch.float64)
-    wanted, _ = _functions()._quat_scale_to_covar_preci(
+    wanted, _ = functions()._quat_scale_to_covar_preci(
         gaussians.quaternions, gaussians.scales, compute_preci=False
     )
     root = quaternion_to_matrix(gaussians.quaternions) * gaussians.scales[:, None, :]
@@ -36,10 +33,10 @@ def test_projection_is_that_of_gsplat(distance, antialiased):
     gaussians, views = with_gradients(cloud(200), torch.float64), camera_ring(3, 40, 50, distance=distance)
     views = Cameras(views.intrinsics.double(), views.extrinsics.double(), 40, 50)
     settings = RasterSettings(antialiased=antialiased)
-    covariances, _ = _functions()._quat_scale_to_covar_preci(
+    covariances, _ = functions()._quat_scale_to_covar_preci(
         gaussians.quaternions, gaussians.scales, compute_preci=False
     )
-    _, centers, depths, conics, compensations = _functions()._fully_fused_projection(
+    _, centers, depths, conics, compensations = functions()._fully_fused_projection(
         gaussians.means, covariances, views.extrinsics[0], views.intrinsics[0], 50, 40,
         eps2d=settings.low_pass, calc_compensations=True,
     )  # fmt: skip
@@ -94,38 +91,18 @@ def test_gsplat_refuses_constants_it_does_not_know():
         render(cloud(5), camera_ring(1, 8, 8), "gsplat", settings=RasterSettings(stop=0.5))
 
 
-def _documented_rasterization(
-    means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane, far_plane, eps2d,
-    render_mode, packed, rasterize_mode,
-):  # fmt: skip
-    """A replacement for gsplat's ``rasterization``, as documented, that draws by the reference."""
-    assert (render_mode, packed) == ("RGB+ED", False)
-    assert all(torch.isfinite(t).all() for t in (means, quats, scales, opacities))
-    batch, count = means.shape[:2]
-    assert quats.shape == (batch, count, 4)
-    assert opacities.shape == (batch, count)
-    assert viewmats.shape[:1] == Ks.shape[:1] == (batch,)
-    torch.testing.assert_close(quats.norm(dim=-1), torch.ones(batch, count))
-    fields = (x.flatten(0, 1) for x in (means, quats, scales, opacities, colors))
-    gaussians = Gaussians(*fields, splits=(count,) * batch)
-    settings = RasterSettings(low_pass=eps2d, antialiased=rasterize_mode == "antialiased")
-    drawn = reference.rasterize(
-        gaussians, Cameras(Ks, viewmats, height, width), settings, near_plane, far_plane
-    )
-    values = torch.cat((drawn.image, drawn.depth), dim=2).permute(0, 1, 3, 4, 2)
-    return values, drawn.alpha.permute(0, 1, 3, 4, 2), {}
+@pytest.fixture(autouse=True)
+def forgotten():
+    """What earlier renderings needed, and what was said of other versions."""
+    capacity._expected.clear()
+    gsplat_backend._is_known.cache_clear()
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_gsplat_is_called_as_documented(monkeypatch, antialiased):
+@pytest.mark.parametrize("gsplat", [Documented, InParts])
+def test_gsplat_is_called_as_documented(monkeypatch, gsplat, antialiased):
     """gsplat gets finite, normalised input, and its output is read as documented; once for a batch."""
-    calls = []
-
-    def rasterization(**arguments):
-        calls.append(arguments["means"].shape)
-        return _documented_rasterization(**arguments)
-
-    monkeypatch.setattr(gsplat_backend, "load", lambda: rasterization)
+    monkeypatch.setattr(gsplat_backend, "load", lambda: gsplat)
     gaussians, views = cloud(40, splits=(15, 0, 25)), camera_ring(2, 20, 30, batch=3)
     gaussians.quaternions[3] = 0
     gaussians.quaternions[4] *= 1e-25
@@ -133,20 +110,54 @@ def test_gsplat_is_called_as_documented(monkeypatch, antialiased):
     gaussians.opacities[15:] = 1  # gsplat limits alpha itself, not opacity
     settings = RasterSettings(low_pass=0.2, antialiased=antialiased)
     gaussians = with_gradients(gaussians)
-    found = gsplat_backend.rasterize(gaussians, views, settings, 0.5, 20.0)
+    known = contextlib.nullcontext() if gsplat is InParts else pytest.warns(UserWarning, match="1.4.0")
+    with known:
+        found = gsplat_backend.rasterize(gaussians, views, settings, 0.5, 20.0)
     wanted = render(gaussians, views, "cpu", settings=settings, near=0.5, far=20.0)
     for name in ("image", "alpha", "depth"):
         torch.testing.assert_close(getattr(found, name), getattr(wanted, name), rtol=1e-4, atol=1e-4)
-    assert calls == [(3, 32, 3)]  # as many as a warp has threads
     found.image.sum().backward()
     assert all(torch.isfinite(getattr(gaussians, name).grad).all() for name in FIELDS)
+
+
+def test_an_unknown_version_is_said_once(monkeypatch):
+    """Kernels of other versions may read the lists of tiles otherwise."""
+    monkeypatch.setattr(gsplat_backend, "load", lambda: Documented)
+    gaussians, views = cloud(20, splits=(10, 10)), camera_ring(1, 8, 8, batch=2)
+    with pytest.warns(UserWarning, match="the host waits"):
+        gsplat_backend.rasterize(gaussians, views, RasterSettings(), 0.5, 20.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        gsplat_backend.rasterize(gaussians, views, RasterSettings(), 0.5, 20.0)
+
+
+def test_the_gradient_in_parts_is_that_of_the_reference(monkeypatch):
+    """Through projection, the lists of tiles and drawing, for all that a Gaussian has."""
+    monkeypatch.setattr(gsplat_backend, "load", lambda: InParts)
+    gaussians, views = cloud(80, splits=(45, 35)), camera_ring(2, 40, 50, batch=2)
+    weights = torch.randn(2, 2, 3, 40, 50, generator=torch.Generator().manual_seed(1))
+    slopes = []
+    for module in (gsplat_backend, reference):
+        leaves = with_gradients(gaussians)
+        image = module.rasterize(leaves, views, RasterSettings(), 0.5, 20.0).image
+        (image * weights).sum().backward()
+        slopes.append(leaves)
+    for name in FIELDS:
+        found, wanted = (getattr(leaves, name).grad for leaves in slopes)
+        assert relative_error(found, wanted) < 1e-3
 
 
 def test_every_argument_is_one_of_gsplat():
     """The arguments and defaults that are relied on exist in the installed gsplat."""
     gsplat = pytest.importorskip("gsplat", reason="needs the package gsplat (it needs no GPU for this test)")
+    for name in ("fully_fused_projection", "rasterize_to_pixels"):
+        called = list(inspect.signature(getattr(InParts, name)).parameters)
+        theirs = list(inspect.signature(getattr(gsplat, name)).parameters)
+        assert set(called) <= set(theirs)
+        assert called[:9] == theirs[:9]
+    assert gsplat.__version__ in gsplat_backend._KNOWN
     parameters = inspect.signature(gsplat.rasterization).parameters
-    assert set(inspect.signature(_documented_rasterization).parameters) <= set(parameters)
+    assert set(inspect.signature(Documented.rasterization).parameters) <= set(parameters)
     defaults = {"radius_clip": 0.0, "sh_degree": None, "backgrounds": None, "camera_model": "pinhole"}
     assert {name: parameters[name].default for name in defaults} == defaults
 

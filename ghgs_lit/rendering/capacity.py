@@ -1,0 +1,144 @@
+"""How many intersections of splats with tiles there is room for, and what happens where there are more.
+
+A GPU should not have to tell the host a number before it can go on. So each rendering gets room for what
+similar ones needed, and some more; the number that it really needed is read later: at the end of the
+rendering, while the GPU draws, or of several together (:func:`settled`). Where the room was too small the
+rendering is repeated with enough: an image never lacks splats."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+T = TypeVar("T")
+Drawn = TypeVar("Drawn")
+#: Tiles that a splat is expected to touch at first, and what is added to the most that was seen.
+_FIRST, _SPARE = 4.0, 1.25
+#: Share of a difference by which an expectation falls if less was needed; it rises at once.
+_FALL = 0.1
+#: Leading binary digits of a capacity: at most an eighth is added, and few sizes occur.
+_DIGITS = 4
+
+#: Tiles of an image (rows, columns): what is expected for them depends on nothing else that is known.
+Grid = tuple[int, int]
+_expected: dict[Grid, float] = {}
+
+
+@dataclass(frozen=True)
+class Room:
+    """Room that a rendering had, and the number that it ``needed``, on its device. ``splats``: number of all
+    images together."""
+
+    grid: Grid
+    splats: int
+    capacity: int
+    needed: Int[Tensor, ""]
+
+    def expect(self, needed: int) -> bool:
+        """Whether the room sufficed; later renderings expect what was ``needed``."""
+        found, before = needed / self.splats, _expected.get(self.grid, 0.0)
+        _expected[self.grid] = max(found, before + _FALL * (found - before))
+        return needed <= self.capacity
+
+
+@dataclass
+class Rooms:
+    """Rooms of the renderings in a context, in their order."""
+
+    rooms: list[Room] = field(default_factory=list)
+
+    @property
+    def needed(self) -> list[Tensor]:
+        """What each rendering needed, on its device."""
+        return [room.needed for room in self.rooms]
+
+    def suffice(self, needed: Sequence[Tensor] | None = None) -> bool:
+        """Whether every rendering had enough room; the host waits once. ``needed``: instead of the rooms'
+        own, of the same renderings played back with other values."""
+        needed = self.needed if needed is None else needed
+        if not needed:
+            return True
+        numbers = torch.stack(list(needed)).tolist()
+        return all([room.expect(number) for room, number in zip(self.rooms, numbers, strict=True)])
+
+
+_rooms: ContextVar[Rooms | None] = ContextVar("rooms", default=None)
+
+
+@contextmanager
+def deferred() -> Iterator[Rooms]:
+    """Inside, renderings do not check their rooms: who opens this must see whether they ``suffice``."""
+    rooms = Rooms()
+    token = _rooms.set(rooms)
+    try:
+        yield rooms
+    finally:
+        _rooms.reset(token)
+
+
+def settled(call: Callable[[], T]) -> T:
+    """The result of ``call``; the host waits once for all renderings inside, and not at all without any.
+    Where one had too little room, ``call`` is repeated with enough for what was seen."""
+    if _rooms.get() is not None:
+        return call()
+    while True:
+        with deferred() as rooms:
+            result = call()
+        if rooms.suffice():
+            return result
+
+
+def with_room(
+    grid: Grid,
+    splats: int,
+    find: Callable[[int], tuple[T, Tensor]],
+    draw: Callable[[T], Drawn],
+) -> Drawn:
+    """What is drawn with enough room.
+
+    Args:
+        grid: tiles of an image.
+        splats: number of all images together, at least 1.
+        find: finds intersections in a capacity, and gives them and the number that is needed.
+        draw: draws intersections."""
+    rooms = _rooms.get()
+    while True:
+        capacity = size_class(int(_SPARE * splats * _expected.get(grid, _FIRST)))
+        found, needed = find(capacity)
+        room = Room(grid, splats, capacity, needed)
+        number = Coming(needed) if rooms is None else None
+        drawn = draw(found)
+        if rooms is not None:
+            rooms.rooms.append(room)
+            return drawn
+        if room.expect(number.read()):
+            return drawn
+
+
+def size_class(count: int) -> int:
+    """The least number of at least ``count`` (and 1) with few binary digits, so that few sizes occur."""
+    step = 1 << max(count.bit_length() - _DIGITS, 0)
+    return max(-(-count // step) * step, 1)
+
+
+class Coming:
+    """A number on its way to the host, which can go on until it reads it. ``value``: on any device."""
+
+    def __init__(self, value: Int[Tensor, ""]):
+        self.value, self.arrived = value, None
+        if value.is_cuda:
+            self.value = torch.empty((), dtype=value.dtype, pin_memory=True)
+            self.value.copy_(value, non_blocking=True)
+            self.arrived = torch.cuda.Event()
+            self.arrived.record()
+
+    def read(self) -> int:
+        """The number; waits for what the device was asked before it was made, and no longer."""
+        if self.arrived is not None:
+            self.arrived.synchronize()
+        return int(self.value)

@@ -1,0 +1,131 @@
+"""Splats of tiles against gsplat's functions in plain PyTorch, and room for them that never is too small."""
+
+import pytest
+import torch
+
+from ghgs_lit.rendering import RasterSettings, capacity, gsplat_backend, reference
+from ghgs_lit.rendering.capacity import deferred, settled, size_class
+from ghgs_lit.rendering.intersections import TILE, intersections
+from tests.helpers.gsplat import InParts, functions
+from tests.helpers.pretend_device import DEVICE, pretend_device
+from tests.helpers.splats import camera_ring, cloud
+
+
+@pytest.fixture(autouse=True)
+def forgotten():
+    capacity._expected.clear()
+
+
+def splats(images, count, height, width, seed=0):
+    """Boxes that lie across tiles, beyond the image and nowhere; a fifth has one depth."""
+    generator = torch.Generator().manual_seed(seed)
+    centers = torch.rand(images, count, 2, generator=generator) * torch.tensor([1.3 * width, 1.3 * height])
+    radii = (torch.rand(images, count, 2, generator=generator) * 24 - 2).clamp(min=0).ceil().int()
+    depths = 1 + torch.rand(images, count, generator=generator)
+    depths[:, ::5] = 1.5
+    centers[:, ::7] = float("nan")  # gsplat leaves values of splats that it does not draw as they were
+    radii[:, ::7] = 0
+    return centers - 10, radii, depths
+
+
+@pytest.mark.parametrize("size", [(3, 200, 60, 75), (1, 9, 16, 16), (2, 90, 100, 33), (40, 3, 400, 400)])
+def test_splats_and_offsets_are_those_of_gsplat(size):
+    """In its order: by image, tile, depth, index; 40 images have more tiles than 16 bits count."""
+    images, _, height, width = size
+    rows, columns = -(-height // TILE), -(-width // TILE)
+    centers, radii, depths = splats(*size)
+    drawn = centers.nan_to_num()
+    _, keys, wanted = functions()._isect_tiles(drawn, radii, depths, TILE, columns, rows, sort=False)
+    keys, order = keys.sort(stable=True)  # as a radix sort is
+    offsets = functions()._isect_offset_encode(keys, images, columns, rows)
+    found = intersections(centers, radii, depths, height, width, len(keys) + 37)
+    assert int(found.needed) == len(keys) > 0
+    assert torch.equal(found.splats[: len(keys)], wanted[order])
+    assert torch.equal(found.offsets[:, :-1], offsets)
+    assert torch.equal(
+        found.offsets[:, -1],
+        torch.cat((offsets[1:, 0, 0], offsets.new_tensor([len(keys)])))[:, None].expand(-1, columns),
+    )
+    assert (found.splats >= 0).all()
+    assert (found.splats < radii[..., 0].numel()).all()
+    assert found.has_pixels[:, :-1].all()
+    assert not found.has_pixels[:, -1].any()
+
+
+def test_nothing_is_asked_of_the_device():
+    """The second time, when what depends on sizes alone is there."""
+    values = splats(2, 50, 40, 40)
+    with pretend_device() as log:
+        values = [value.to(DEVICE) for value in values]
+        for _ in range(2):
+            log.clear()
+            intersections(*values, 40, 40, 500)
+        assert log.waits.total() == 0
+
+
+@pytest.fixture
+def capacities(monkeypatch):
+    """Capacities that were tried, with gsplat's projection in PyTorch."""
+    tried = []
+
+    def noted(*arguments):
+        tried.append(arguments[-1])
+        return intersections(*arguments)
+
+    monkeypatch.setattr(gsplat_backend, "intersections", noted)
+    monkeypatch.setattr(gsplat_backend, "load", lambda: InParts)
+    return tried
+
+
+def drawn(size=0.3):
+    gaussians, views = cloud(60, splits=(35, 25), size=size), camera_ring(2, 70, 90, batch=2)
+    found = gsplat_backend.rasterize(gaussians, views, RasterSettings(), 0.5, 20.0)
+    return found, reference.rasterize(gaussians, views, RasterSettings(), 0.5, 20.0)
+
+
+def test_an_image_is_drawn_again_where_splats_lacked_room(capacities):
+    """The image is the reference's; the next one has room at once, and the room shrinks slowly."""
+    found, wanted = drawn()
+    torch.testing.assert_close(found.image, wanted.image, rtol=1e-3, atol=1e-4)
+    assert len(capacities) == 2
+    assert capacities[0] == size_class(5 * 2 * 2 * 35) < capacities[1]
+    drawn()
+    assert capacities[2:] == capacities[1:2]
+    drawn(size=0.01)
+    drawn(size=0.01)
+    assert len(capacities) == 5
+    assert capacities[0] < capacities[4] < capacities[3]
+
+
+def test_several_renderings_are_settled_together(capacities):
+    """One answer for all; only what lacked room is repeated, with the call that it belongs to."""
+    calls = []
+
+    def call():
+        calls.append(None)
+        return drawn(), drawn()
+
+    for found, wanted in settled(call):
+        torch.testing.assert_close(found.image, wanted.image, rtol=1e-3, atol=1e-4)
+    assert len(calls) == 2
+    settled(call)
+    assert len(calls) == 3
+
+
+def test_too_little_room_is_seen_also_when_played_back(capacities):
+    """Numbers of the same renderings with other values can be given instead of their own."""
+    with deferred() as rooms:
+        drawn(size=0.01)
+    assert rooms.suffice()
+    assert not rooms.suffice([torch.tensor(rooms.rooms[0].capacity + 1)])
+    with deferred() as rooms:
+        pass
+    assert rooms.suffice()
+
+
+def test_size_classes_are_few_and_close():
+    """At most an eighth above the number; they never fall."""
+    classes = [size_class(count) for count in range(5000)]
+    assert classes == sorted(classes)
+    assert all(count <= found <= max(1, count * 9 / 8) for count, found in enumerate(classes))
+    assert len(set(classes)) < 90
