@@ -120,6 +120,10 @@ _SWEEP = (
     f"ghgs train -m experiment=demo {TINY} {SHORT} ablation=full,neither 'evaluation.views=[4]' "
     "evaluation.pictures=0 logger=none callbacks=none hydra.sweep.dir=runs/train/paper"
 )
+_ABLATION = (
+    "mkdir -p my_conf/ablation && "
+    r"printf '# @package _global_\nrecalibration: {k: 1}\n' > my_conf/ablation/one_neighbor.yaml"
+)
 _CHECKPOINTS = (
     f"{_RUN} hydra.run.dir=runs/mine",
     *(f"cp runs/mine/checkpoints/last.ckpt {n}.ckpt" for n in "ab"),
@@ -181,7 +185,7 @@ BEFORE = {
         _CAPTURE,
     ),
     "docs/rounds.md": _RENDERED,
-    "docs/sweeps.md": (_SWEEP,),
+    "docs/sweeps.md": (_SWEEP, _ABLATION),
     "docs/tables.md": (_SWEEP,),
     "docs/training.md": (
         f"{_RUN} hydra.run.dir=runs/before",

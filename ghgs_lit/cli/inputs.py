@@ -102,11 +102,11 @@ def model_of(checkpoint: str, cfg: DictConfig) -> dict[str, Any]:
     for stage in STAGES:
         place, found = f"{checkpoint}: config.{stage}", trained.get(stage)
         require(isinstance(found, Mapping), place, "a stage of the model", found)
-    before = {node: trained[node] for node in MODEL_NODES if node in trained}
+    before = {node: trained[node] for node in (*MODEL_NODES, "chosen") if node in trained}
     after = OmegaConf.create(before)
     for key in said():
         if key == "ablation":
-            _require_ablation(before)
+            _require_ablation(trained)
         if not is_below(key, MODEL_NODES):
             continue
         value = OmegaConf.select(cfg, key)

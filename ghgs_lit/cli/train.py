@@ -20,6 +20,7 @@ from torch import nn
 from ghgs_lit.cli.inputs import build_data, check_size, choices, overrides, said
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import build, resolve
+from ghgs_lit.config.compose import chosen_options
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.protocols import check_evaluation
@@ -110,6 +111,7 @@ def environments() -> list[ClusterEnvironment]:
 def run(cfg: DictConfig) -> float | str | None:
     """Train and measure (in a sweep: unless done); return the mean PSNR. Interrupted: Ctrl-C or SIGTERM."""
     config, run_directory = resolve(cfg), RunDirectory(output_dir())
+    config["chosen"] = chosen_options(config, HydraConfig.get())
     require(not config["dry_run"], "dry_run", "false without a grid (-m, or sweep=<file>)", True)
     job.check_config(config)
     if job.in_sweep():

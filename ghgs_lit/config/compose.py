@@ -98,17 +98,40 @@ def check_ablation(cfg: DictConfig, hydra_node: DictConfig) -> None:
         if group in cfg:
             file = f"{group}/{hydra_node.runtime.choices.get(group)}.yaml"
             raise InputError(f"{file}: expected the first line '# @package _global_'; found none")
-    loader, name = GlobalHydra.instance().config_loader(), hydra_node.runtime.choices.get("ablation")
-    if name is None:
-        return
-    wanted = flatten(OmegaConf.to_container(loader.repository.load_config(f"ablation/{name}").config))
+    name = hydra_node.runtime.choices.get("ablation")
+    wanted = _set_by_ablation(name)
     composed = OmegaConf.to_container(cfg)
     overrides = OmegaConf.to_container(hydra_node.overrides.task)  # with interpolations as they were typed
     said = [part.key_or_group for part in OverridesParser.create().parse_overrides(overrides)]
     for key, value in wanted.items():
         found = lookup(composed, key)
-        holds = not key or found == value or is_below(key, ["hydra", *said])
+        holds = found == value or is_below(key, ["hydra", *said])
         require(holds, key, f"{value!r}, as ablation/{name}.yaml sets it", found)
+
+
+def _set_by_ablation(name: str | None) -> dict[str, Any]:
+    """Dotted keys that an option of the group ``ablation`` sets, with its values; None: no option."""
+    if name is None:
+        return {}
+    file = GlobalHydra.instance().config_loader().repository.load_config(f"ablation/{name}")
+    values = flatten(OmegaConf.to_container(file.config))
+    return {key: value for key, value in values.items() if key}
+
+
+def chosen_options(config: Mapping[str, Any], hydra_node: DictConfig) -> dict[str, Any]:
+    """What tables call a run by, for the key ``chosen`` of its configuration.
+
+    Args:
+        config: Resolved configuration of a training.
+        hydra_node: The node ``hydra`` of the application that composed it.
+
+    Returns:
+        ``model``, ``encoder`` and ``ablation``: names of the chosen options, None without one; ``sets``:
+        dotted keys that the ablation sets, with their values in ``config``.
+    """
+    choices = hydra_node.runtime.choices
+    names = {group: choices.get(group) for group in ("model", "encoder", "ablation")}
+    return {**names, "sets": {key: lookup(config, key) for key in _set_by_ablation(names["ablation"])}}
 
 
 def read_options(

@@ -7,7 +7,7 @@ from ghgs_lit.errors import require
 
 #: Keys that no result depends on: where a run writes, what it shows and how it shares the machine.
 WITHOUT_INFLUENCE = (
-    "hydra", "allow_random_encoder", "dry_run", "overwrite", "resume", "logger", "callbacks",
+    "hydra", "allow_random_encoder", "chosen", "dry_run", "overwrite", "resume", "logger", "callbacks",
     "data.cache_dir", "data.cache_images_mb", "data.render_workers", "data.workers",
     "encoder.weights",  # repeats the origin of init_from's weights, which counts
     "evaluation.pictures", "trainer.log_every_n_steps", "trainer.profiler",
@@ -27,12 +27,13 @@ OF_TRAINING = ("views.training_counts", "views.training", "targets.training_view
 #: Keys by which a protocol of one name has other targets.
 OF_TARGETS = ("targets.kind", "targets.view", "targets.positions", "targets.per_subject")
 
-#: Keys that may differ between the runs of a table: those without influence, the seed, the switches of the
-#: ablation, and views, targets and metrics, which tables keep apart themselves.
-EXPECTED_TO_DIFFER = (
-    *WITHOUT_INFLUENCE, "evaluation", "metrics.kind", "recalibration.neighborhood",
-    "recalibration.similarity", "seed", "targets", "views",
-)  # fmt: skip
+#: Keys that may differ between the runs of a row of a table: those without influence, the seed, and views,
+#: targets and metrics, which tables keep apart themselves.
+OF_A_RUN = (*WITHOUT_INFLUENCE, "evaluation", "metrics.kind", "seed", "targets", "views")
+#: Keys that name files and machines: the same run elsewhere has others.
+OF_A_PLACE = ("checkpoint", "data.root", "data.source", "init_from", "trainer.accelerator")
+#: Keys that may differ between the runs of a table: those of a run, and the switches of the ablation.
+EXPECTED_TO_DIFFER = (*OF_A_RUN, "recalibration.neighborhood", "recalibration.similarity")
 
 
 def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
@@ -110,5 +111,20 @@ def switches_of(config: Mapping[str, Any]) -> tuple[bool, bool]:
 
 
 def ablation_of(config: Mapping[str, Any]) -> str:
-    """Name of a model's row in the ablation table."""
-    return ABLATIONS[switches_of(config)]
+    """Name of a model's row in the ablation table.
+
+    Args:
+        config: Resolved configuration of a training. Its ``chosen.ablation``, where it has one, is the option
+            of the group ``ablation`` that was chosen.
+
+    Returns:
+        The option where it is a user's own; else the name that :data:`ABLATIONS` gives to the model's
+        switches, which the command line may have set one by one.
+    """
+    name = lookup(config, "chosen.ablation")
+    return name if is_own_ablation(name) else ABLATIONS[switches_of(config)]
+
+
+def is_own_ablation(name: Any) -> bool:
+    """Whether ``name`` is an option of the group ``ablation`` that is a user's own."""
+    return isinstance(name, str) and name not in ABLATIONS.values()

@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from tabulate import tabulate
 
 from ghgs_lit.config import resolve
-from ghgs_lit.config.compose import check_ablation, saved_text
+from ghgs_lit.config.compose import check_ablation, chosen_options, saved_text
 from ghgs_lit.config.keys import is_hyperparameter, key_of
 from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError, require
@@ -224,9 +224,10 @@ def plan(
         check_ablation(cfg, cfg.hydra)
         with open_dict(cfg):
             cfg.hydra.job.num = len(planned)
-            subdirectory, verb = str(cfg.hydra.sweep.subdir), cfg.hydra.job.name
+            subdirectory, verb, hydra_node = str(cfg.hydra.sweep.subdir), cfg.hydra.job.name, cfg.hydra
             del cfg["hydra"]
         config = resolve(cfg, verb if verb in VERBS else None)
+        config["chosen"] = chosen_options(config, hydra_node)
         name, shown = config_hash(config), tuple(filter_overrides(overrides))
         # The job writes to the planned directory, whatever number a launcher gives it.
         places = {"dir": str(directory), "subdir": subdirectory}

@@ -92,6 +92,9 @@ def _table(rows: pd.DataFrame, sweep: Sweep, options: TableOptions) -> Table:
         names, figures = _reported(layout, reported, groups)
         lines = [*names, *lines]
     stub = ("3D Unproj.", "Semantic Cons.") if layout.rows == "ablation" else ("Methods",)
+    if layout.rows == "ablation" and any(line.variant.is_own for line in lines):
+        stub = ("Ablation", *stub)
+        lines = [replace(line, stub=(line.variant.ablation, *line.stub)) for line in lines]
     on = reported_table(reported)[0] if reported else None
     table = Table(options, rows, planned, sweep.configs, stub, groups, metrics, lines, reported_on=on)
     fill(table, figures)
@@ -128,7 +131,9 @@ def _reported(layout: Layout, reported: str, groups: list[Group]) -> tuple[list[
             # The paper does not say with how many views its Table 1 was measured.
             for metric, figure in by_group.get(group.data or group.views, {}).items():
                 cells.append({"line": len(lines), "group": number, "metric": metric, "mean": figure})
-        lines.append(Line(Variant("reported", method, switches=pair), stub, absent=NO_FIGURE))
+        ablation = "" if pair is None else method
+        variant = Variant("reported", method, ablation=ablation, switches=pair)
+        lines.append(Line(variant, stub, absent=NO_FIGURE))
     return lines, cells
 
 
@@ -137,21 +142,25 @@ def _signs(switches: tuple[bool, bool]) -> tuple[str, str]:
 
 
 def _measured_lines(variants: list[Variant], planned: list[Planned], layout: Layout) -> list[Line]:
-    """Rows of all four ablations; or of baselines, other methods and ours, in this order."""
+    """Rows of all four ablations, then of a user's own; or of baselines, other methods and ours, in this
+    order."""
+    begun = list(dict.fromkeys([*variants, *(p.variant for p in planned if not p.done)]))
     if layout.rows == "ablation":
-        first, lines = variants[0], []
-        for pair in ABLATIONS:
-            unprojection, semantic = _signs(pair)
-            note = " (a)" if pair[1] and not first.has_semantics else ""
-            lines.append(Line(replace(first, switches=pair), (unprojection, semantic + note)))
-        return lines
-    variants = list(dict.fromkeys([*variants, *(p.variant for p in planned if not p.done)]))
+        first = variants[0]
+        papers = [replace(first, ablation=name, switches=pair) for pair, name in ABLATIONS.items()]
+        return [_ablation_line(variant) for variant in (*papers, *(v for v in begun if v.is_own))]
     order = ("baseline", "other", "model")
-    models = [v for v in variants if v.kind == "model"]
+    models = [v for v in begun if v.kind == "model"]
     return [
         Line(v, (_label(v, models),), absent="missing" if v.kind == "model" else NO_FIGURE)
-        for v in sorted(variants, key=lambda v: order.index(v.kind))
+        for v in sorted(begun, key=lambda v: order.index(v.kind))
     ]
+
+
+def _ablation_line(variant: Variant) -> Line:
+    unprojection, semantic = _signs(variant.switches)
+    note = " (a)" if variant.switches[1] and not variant.has_semantics else ""
+    return Line(variant, (unprojection, semantic + note))
 
 
 def _label(variant: Variant, models: list[Variant]) -> str:

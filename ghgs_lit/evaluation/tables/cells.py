@@ -8,10 +8,18 @@ from typing import Any
 
 import pandas as pd
 
+from ghgs_lit.config.keys import OF_A_PLACE, OF_A_RUN, is_below
 from ghgs_lit.config.nodes import PairedTest
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.tables.layouts import CELL, Table, arrow, data_title, decimals
-from ghgs_lit.evaluation.tables.records import TRAINING, differing, differing_text, person_of, telling_apart
+from ghgs_lit.evaluation.tables.records import (
+    ABSENT,
+    TRAINING,
+    differing,
+    differing_text,
+    person_of,
+    telling_apart,
+)
 from ghgs_lit.evaluation.tables.significance import Comparison, compare, holm, pool, smallest_difference
 
 
@@ -59,22 +67,47 @@ def _values(table: Table) -> pd.DataFrame:
 
 
 def _refuse_rivals(table: Table, values: pd.DataFrame) -> None:
-    """Refuse several runs for one cell; names them and the keys in which they differ."""
+    """Refuse several runs for one cell and seed, and runs of different configurations in one cell.
+
+    Raises:
+        InputError: Names the runs, and the keys in which they differ.
+    """
     means = values.groupby([*CELL, "seed", "source"], sort=False)["value"].mean().reset_index("source")
     for (line, group, _, seed), part in means.groupby(level=[*CELL, "seed"], sort=False):
-        if part["value"].nunique() < 2:
-            continue
-        variant, sources = table.lines[line].variant, list(part["source"])
-        what = f"ablation={variant.ablation}" if variant.switches else variant.name
-        of_models = [table.configs[source] for source in sources if source in table.configs]
-        keys = differing(of_models)
-        apart = ",".join(telling_apart(of_models, keys))
-        rows = f"they differ in {differing_text(keys)}: by=[{apart}] gives each a row"
-        rows = rows if keys else "their configurations are equal"
-        raise InputError(
-            f"runs: expected one run for {what}, {table.groups[group].views} views, seed {seed}; found"
-            f" {' and '.join(sources)}; {rows}; runs=[...] lists those to show"
-        )
+        if part["value"].nunique() > 1:
+            sources = list(part["source"])
+            expected = f"one run for {_cell(table, line, group)}, seed {seed}"
+            raise _rivals(table, expected, sources, _differing(table, sources))
+    for (line, group), column in values.groupby(["line", "group"], sort=False)["source"]:
+        sources = list(dict.fromkeys(column))
+        keys = _differing(table, sources)
+        # Another version of the package has other keys; copies of the data lie in other folders.
+        both = {key: shown for key, shown in keys.items() if len({*shown} - {ABSENT}) > 1}
+        both = {key: shown for key, shown in both.items() if not is_below(key, OF_A_PLACE)}
+        if both:
+            raise _rivals(table, f"one configuration for {_cell(table, line, group)}", sources, both)
+
+
+def _cell(table: Table, line: int, group: int) -> str:
+    variant = table.lines[line].variant
+    row = f"ablation={variant.ablation}" if variant.ablation else variant.name
+    return f"{row}, {table.groups[group].views} views"
+
+
+def _differing(table: Table, sources: Sequence[str]) -> dict[str, list[str]]:
+    """Keys in which the models of runs differ beyond what the runs of a row may."""
+    return differing([table.configs[source] for source in sources if source in table.configs], OF_A_RUN)
+
+
+def _rivals(
+    table: Table, expected: str, sources: Sequence[str], keys: Mapping[str, Sequence[str]]
+) -> InputError:
+    apart = ",".join(telling_apart([table.configs.get(source, {}) for source in sources], keys))
+    rows = f"they differ in {differing_text(keys)}: by=[{apart}] gives each a row"
+    rows = rows if keys else "their configurations are equal"
+    return InputError(
+        f"runs: expected {expected}; found {' and '.join(sources)}; {rows}; runs=[...] lists those to show"
+    )
 
 
 def _lacking(table: Table, cell: Any) -> tuple[int, ...]:

@@ -1,9 +1,11 @@
 """The caption of a table and the notes below it."""
 
+from typing import Any
+
 import pandas as pd
 
 from ghgs_lit.evaluation.tables.layouts import Table, data_title, decimals, reported_source, title
-from ghgs_lit.evaluation.tables.records import differing, differing_text
+from ghgs_lit.evaluation.tables.records import ablation_sets, differing, differing_text
 from ghgs_lit.evaluation.tables.significance import POWER, RATIO
 
 FOOTNOTE = (
@@ -52,6 +54,8 @@ def write_notes(table: Table) -> list[str]:
         said.append(FOOTNOTE)
         if not table.ours[0].variant.has_semantics:
             said.append(f"(a) {NO_SEMANTICS}.")
+    for name, sets in own_ablations(table).items():
+        said.append(f"`{name}`: {', '.join(f'`{key}={value}`' for key, value in sets.items())}.")
     if "flip" in table.metrics and "lpips" not in table.metrics:
         said.append("FLIP replaces the paper's LPIPS, which at least one run could not compute.")
     if table.reported_on:
@@ -63,6 +67,16 @@ def write_notes(table: Table) -> list[str]:
     said += _about_others(table)
     said += _about_test(table)
     return said + _about_neighbors(table) + _about_training(table) + _about_runs(table)
+
+
+def own_ablations(table: Table) -> dict[str, dict[str, Any]]:
+    """Keys that a user's own ablations set, with their values, by the name of the row."""
+    own: dict[str, dict[str, Any]] = {}
+    for source, variant in _of(table.rows, "model")[["source", "variant"]].drop_duplicates().values:
+        sets = ablation_sets(table.configs[source])
+        if variant.is_own and sets:
+            own[variant.ablation] = sets
+    return own
 
 
 def _of(rows: pd.DataFrame, kind: str) -> pd.DataFrame:
@@ -174,10 +188,11 @@ def _about_runs(table: Table) -> list[str]:
     groups: dict[tuple, list] = {}
     ours = _of(table.rows, "model")[["source", "variant", "data"]].drop_duplicates()
     for source, variant, data in ours.values:
-        row = (variant.model, variant.encoder, variant.switches, data)
+        row = (variant.model, variant.encoder, variant.ablation, data)
         groups.setdefault(() if table.layout.rows == "ablation" else row, []).append(table.configs[source])
     keys = {key: values for group in groups.values() for key, values in differing(group).items()}
-    for shown in ("checkpoint", *(key for line in table.ours for key, _ in line.variant.extra)):
+    by_rows = [key for line in table.ours for key, _ in line.variant.extra]
+    for shown in ("checkpoint", *by_rows, *(key for sets in own_ablations(table).values() for key in sets)):
         keys.pop(shown, None)
     if keys:
         said.append(f"Runs side by side differ also in {differing_text(keys)}.")

@@ -14,7 +14,7 @@ subjects (optional). ``seed`` is optional.
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,17 +24,21 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from ghgs_lit.config import conf_dir
 from ghgs_lit.config.keys import (
-    ABLATIONS,
     EXPECTED_TO_DIFFER,
+    OF_A_PLACE,
+    OF_A_RUN,
     OF_TARGETS,
     OF_TRAINING,
+    ablation_of,
     flatten,
     is_below,
+    is_own_ablation,
     lookup,
     switches_of,
 )
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.readers import read_json, read_yaml
+from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.results import KEYS, METHOD, read_results, validated
 
 SETTING = ["data", "split", "targets", "protocol"]
@@ -43,6 +47,8 @@ TRAINING = ("steps", "seconds", "peak_gb")
 """Metrics of the training, which no subject has."""
 #: Keys of `ghgs evaluate` that change its results, beside model, data and metrics.
 _OF_EVALUATION = ("checkpoint", "refine", "refine_cameras")
+ABSENT = "absent"
+"""Text of a value that a configuration does not have."""
 _ROW = ["method", "views", "targets", "subject"]
 # Keys that identify an encoder of conf/encoder; models change its other keys.
 _ENCODER_KEYS = ("width", "heads", "depth", "layers", "vit")
@@ -53,23 +59,25 @@ class Variant:
     """Identity of a row of a table.
 
     ``kind``: ``model`` (ours), ``baseline``, ``other`` (another method) or ``reported`` (by the paper).
-    ``switches``: whether 3D unprojection and semantic consistency are on. ``has_semantics``: whether the
-    semantic features were trained (published weights or `ghgs pretext`); unknown before training starts, so
-    it does not distinguish rows. ``extra``: further configuration keys and values that do.
+    ``ablation``: the option that was chosen; empty for other methods. ``switches``: whether its 3D
+    unprojection and semantic consistency are on. ``has_semantics``: whether the semantic features were
+    trained (published weights or `ghgs pretext`); unknown before training starts, so it does not distinguish
+    rows. ``extra``: further configuration keys and values that do.
     """
 
     kind: str
     name: str
     model: str = ""
     encoder: str = ""
+    ablation: str = ""
     switches: tuple[bool, bool] | None = None
     has_semantics: bool = field(default=True, compare=False)
     extra: tuple[tuple[str, str], ...] = ()
 
     @property
-    def ablation(self) -> str:
-        """Name of the ablation; empty without switches."""
-        return ABLATIONS[self.switches] if self.switches else ""
+    def is_own(self) -> bool:
+        """Whether this is a row of a user's own ablation."""
+        return bool(self.ablation) and is_own_ablation(self.ablation)
 
     @property
     def trained(self) -> tuple:
@@ -100,8 +108,8 @@ class Sweep:
 
 
 @cache
-def _shipped_encoders() -> dict[str, dict]:
-    return {path.stem: read_yaml(path) for path in (conf_dir() / "encoder").glob("*.yaml")}
+def _shipped(group: str) -> dict[str, dict]:
+    return {path.stem: read_yaml(path) for path in (conf_dir() / group).glob("*.yaml")}
 
 
 def encoder_name(config: Mapping[str, Any]) -> str:
@@ -109,27 +117,59 @@ def encoder_name(config: Mapping[str, Any]) -> str:
     encoder = config.get("encoder")
     encoder = encoder if isinstance(encoder, Mapping) else {}
     branch = ", semantic branch" * (encoder.get("semantic") is not None)
-    for name, shipped in sorted(_shipped_encoders().items()):
+    for name, shipped in sorted(_shipped("encoder").items()):
         if all(key in encoder and encoder[key] == shipped.get(key) for key in _ENCODER_KEYS):
             return name + branch
     return "unnamed" + branch
 
 
+def _model_name(config: Mapping[str, Any]) -> str:
+    """A user's own option of conf/model, which may have kept the name of the one that it changes; else the
+    name in the configuration."""
+    chosen = lookup(config, "chosen.model")
+    is_own = chosen is not None and chosen not in _shipped("model")
+    return chosen if is_own else str(lookup(config, "model.name") or "unnamed")
+
+
+def ablation_sets(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Dotted keys that the chosen ablation of a training sets, with their values, where it says so."""
+    sets = lookup(config, "chosen.sets")
+    return dict(sets) if isinstance(sets, Mapping) else {}
+
+
 def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()) -> Variant:
-    """Variant of a model. ``by``: keys that distinguish rows beside model, encoder and ablation. InputError:
-    the configuration has no recalibration, which defines the ablation."""
+    """Variant of a model.
+
+    Args:
+        config: Configuration of the model as trained and measured.
+        source: File of the configuration, for messages.
+        by: Keys that distinguish rows beside model, encoder and ablation.
+
+    Returns:
+        The row that the model belongs to.
+
+    Raises:
+        InputError: The configuration has no recalibration, of which the ablation takes parts away.
+    """
     recalibration = config.get("recalibration")
     require(isinstance(recalibration, Mapping), f"{source}: recalibration", "a mapping", recalibration)
     compat = lookup(config, "compat.name")
-    model = [str(lookup(config, "model.name") or "unnamed")]
+    ablation, encoder = ablation_of(config), encoder_name(config)
+    model = [_model_name(config)]
     model += [f"compat {compat}"] * (compat not in (None, "none"))
-    # Not an ablation, whose neighbours are in 3D or on the image plane.
-    model += ["neighbours by feature"] * (recalibration.get("neighborhood") == "feature")
+    # What an ablation of one's own changes is a row of the model's table, not another model. The paper's
+    # ablations find neighbours in 3D or on the image plane.
+    if is_own_ablation(ablation):
+        if any(is_below(key, ["encoder"]) for key in ablation_sets(config)):
+            encoder = encoder.replace("unnamed", str(lookup(config, "chosen.encoder")))
+    elif recalibration.get("neighborhood") == "feature":
+        model.append("neighbours by feature")
     return Variant(
         kind="model",
         name="ours",
         model=", ".join(model),
-        encoder=encoder_name(config),
+        encoder=encoder,
+        ablation=ablation,
         switches=switches_of(config),
         # Without such weights the encoder has learned from the rendering loss only.
         has_semantics=bool(lookup(config, "encoder.weights")),
@@ -167,6 +207,8 @@ class _Provenance(_Strict):
     # Of `ghgs evaluate`: how the model was trained, and what the command line changed in it.
     checkpoint_config: dict[str, Any] | None = None
     changed_model: dict[str, Any] | None = Field(None, alias="model_config")
+    verb: str | None = None
+    choices: dict[str, Any] = {}
     seed: int | None = None
     data: _Data
     protocol: _Protocol
@@ -180,6 +222,8 @@ def _read_run(path: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
     content = read_results(path)
     source = validated(_Provenance, content["provenance"], f"{path}: provenance")
     trained = (source.checkpoint_config or source.config) | (source.changed_model or {})
+    if source.verb == "train":  # of a version that did not write the options into the configuration
+        trained = {"chosen": source.choices, **trained}
     kept = (*_OF_EVALUATION, "data", "metrics")
     config = trained | {key: source.config.get(key) for key in kept if key in {*source.config, *trained}}
     measured = source.config.get("targets")
@@ -213,11 +257,9 @@ def _read_run(path: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
     return rows.assign(**facts), config
 
 
-def _with_variants(rows: pd.DataFrame, config: Mapping[str, Any], by: Sequence[str]) -> pd.DataFrame:
-    """Rows of a run whose ``method`` is replaced by their ``variant``."""
-    variants = {name: Variant("baseline", name) for name in rows["method"]}
-    if METHOD in variants:
-        variants[METHOD] = model_variant(config, rows["source"].iloc[0], by)
+def _with_variants(rows: pd.DataFrame, model: Variant | None) -> pd.DataFrame:
+    """Rows of a run whose ``method`` is replaced by their ``variant``; ``model``: that of the model's."""
+    variants = {name: model if name == METHOD else Variant("baseline", name) for name in rows["method"]}
     return rows.drop(columns="method").assign(variant=[variants[name] for name in rows["method"]])
 
 
@@ -234,10 +276,9 @@ def _training_config(path: Path) -> dict[str, Any] | None:
     return config
 
 
-def _planned(path: Path, config: Mapping[str, Any], by: Sequence[str]) -> Planned:
+def _planned(path: Path, config: Mapping[str, Any], variant: Variant) -> Planned:
     done = (path.parent / "metrics.json").exists()
-    variant, data = model_variant(config, str(path), by), str(lookup(config, "data.name"))
-    return Planned(variant, data, config.get("seed", 0), done)
+    return Planned(variant, str(lookup(config, "data.name")), config.get("seed", 0), done)
 
 
 def keys_of_rows(configs: Iterable[Mapping[str, Any]]) -> list[str]:
@@ -245,12 +286,25 @@ def keys_of_rows(configs: Iterable[Mapping[str, Any]]) -> list[str]:
     they were trained, those with a protocol of the same name by its targets."""
     values: dict[tuple[str, ...], set[str]] = {}
     for config in configs:
-        data, protocol = (str(lookup(config, key)) for key in ("data.name", "targets.name"))
+        data = str(lookup(config, "data.name"))
+        protocol = str(lookup(config, "targets.name"))
         for key in OF_TRAINING:
             values.setdefault((key, data), set()).add(str(lookup(config, key)))
         for key in OF_TARGETS:
             values.setdefault((key, data, protocol), set()).add(str(lookup(config, key)))
     return list(dict.fromkeys(key for (key, *_), found in values.items() if len(found) > 1))
+
+
+def _variants(configs: Mapping[str, Mapping[str, Any]], by: Sequence[str]) -> dict[str, Variant]:
+    """Variants of models by file. Those of one configuration have one row, whatever their ablations are
+    called: by the paper's name if one has it."""
+    variants = {path: model_variant(config, path, by) for path, config in configs.items()}
+    keys = {path: config_hash(config, (*OF_A_RUN, *OF_A_PLACE)) for path, config in configs.items()}
+    names: dict[str, str] = {}
+    for path, variant in variants.items():
+        if keys[path] not in names or not variant.is_own:
+            names[keys[path]] = variant.ablation
+    return {path: replace(variant, ablation=names[keys[path]]) for path, variant in variants.items()}
 
 
 def files_below(folders: Sequence[Path], name: str) -> list[Path]:
@@ -267,8 +321,8 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
     encoder, ablation and the views and targets of the training. FileNotFoundError: a folder is missing.
     InputError: there is no finished run, a ``metrics.json`` is damaged, or no run has a key of ``by``."""
     runs = {str(path): _read_run(path) for path in files_below(folders, "metrics.json")}
-    found = {path: _training_config(path) for path in files_below(folders, "config.yaml")}
-    trainings = {path: config for path, config in found.items() if config is not None}
+    files = {str(path): _training_config(path) for path in files_below(folders, "config.yaml")}
+    trainings = {path: config for path, config in files.items() if config is not None}
     if not runs:
         names = ", ".join(map(str, folders))
         begun = f"{len(trainings)} runs without one" if trainings else "none"
@@ -278,8 +332,10 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
     for key in by:
         require(any(is_below(k, [key]) for k in known), "by", "keys of the runs' configurations", key)
     by = list(dict.fromkeys([*by, *keys_of_rows([*models.values(), *trainings.values()])]))
-    rows = pd.concat([_with_variants(*run, by) for run in runs.values()], ignore_index=True)
-    return Sweep(rows, [_planned(path, config, by) for path, config in trainings.items()], models)
+    variants = _variants({**models, **trainings}, by)
+    rows = pd.concat([_with_variants(rows, variants.get(path)) for path, (rows, _) in runs.items()])
+    planned = [_planned(Path(path), config, variants[path]) for path, config in trainings.items()]
+    return Sweep(rows.reset_index(drop=True), planned, models)
 
 
 def person_of(subject: str, unit: re.Pattern[str] | None) -> str:
@@ -288,13 +344,16 @@ def person_of(subject: str, unit: re.Pattern[str] | None) -> str:
     return match[1] if match else subject
 
 
-def differing(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
-    """Keys in which ``configs`` differ, with their values, except :data:`EXPECTED_TO_DIFFER`."""
+def differing(
+    configs: Sequence[Mapping[str, Any]], expected: Iterable[str] = EXPECTED_TO_DIFFER
+) -> dict[str, list[str]]:
+    """Keys in which ``configs`` differ, with their values as text, ``absent`` among them; except ``expected``
+    keys and those below them."""
     flat = [flatten(config) for config in configs]
     keys = dict.fromkeys(key for values in flat for key in values)
-    found = {key: list(dict.fromkeys(str(values.get(key, "absent")) for values in flat)) for key in keys}
-    known = {key: values for key, values in found.items() if not is_below(key, EXPECTED_TO_DIFFER)}
-    return {key: values for key, values in known.items() if len(values) > 1}
+    known = [key for key in keys if not is_below(key, expected)]
+    found = {key: list(dict.fromkeys(str(values.get(key, ABSENT)) for values in flat)) for key in known}
+    return {key: values for key, values in found.items() if len(values) > 1}
 
 
 def differing_text(keys: Mapping[str, Sequence[str]], limit: int = 6) -> str:
@@ -305,8 +364,9 @@ def differing_text(keys: Mapping[str, Sequence[str]], limit: int = 6) -> str:
 
 
 def telling_apart(configs: Sequence[Mapping[str, Any]], keys: Mapping[str, Sequence[str]]) -> Iterable[str]:
-    """The first of ``keys`` that distinguishes all ``configs``, else all keys."""
-    return next(([key] for key, values in keys.items() if len(values) == len(configs)), list(keys))
+    """The first of ``keys`` whose values distinguish all different ``configs``, else all keys."""
+    count = len({config_hash(config, (*OF_A_RUN, *OF_A_PLACE)) for config in configs})
+    return next(([key] for key, values in keys.items() if len(values) == count), list(keys))
 
 
 _Text = Annotated[str, Field(min_length=1)]

@@ -166,7 +166,7 @@ def _column_spec(table: Table) -> str:
     """Columns such as ``ccccc`` (ablation) or ``l | c c c | c c c`` (methods; no first bar for data sets)."""
     if table.layout.rows == "ablation" and len(table.groups) == 1:
         return "c" * (len(table.stub) + len(table.metrics))
-    stub = "c c" if len(table.stub) == 2 else "l"
+    stub = " ".join("c" * len(table.stub)) if len(table.stub) > 1 else "l"
     spec = " | ".join([stub] + [" ".join("c" * len(table.metrics))] * len(table.groups))
     return spec.replace(" |", "", 1) if table.layout.columns == "data" else spec
 
