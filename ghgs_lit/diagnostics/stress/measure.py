@@ -44,13 +44,18 @@ def measure(
     # A case depends on stage, family and seed only.
     keys = [zlib.crc32(f"{stage.name}/{family}/{seed}".encode()) for seed in seeds]
     cases = stack([stage.make(family, torch.Generator().manual_seed(key)) for key in keys])
-    if family in PLANTED:
-        check = partial(_planted, stage, PLANTED[family], cases, seeds)
-    elif family in stage.refused:
-        check = partial(_refused, stage, cases)
-    else:
-        check = _comparison(stage, family, cases)
-    outcomes = {dtype: check(dtype) for dtype in chosen}
+    try:
+        if family in PLANTED:
+            check = partial(_planted, stage, PLANTED[family], cases, seeds)
+        elif family in stage.refused:
+            check = partial(_refused, stage, cases)
+        else:
+            check = _comparison(stage, family, cases)
+        outcomes = {dtype: check(dtype) for dtype in chosen}
+    except Exception as error:  # whatever a stage raises is a failure of its own, and the others go on
+        message = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
+        none = torch.full((len(seeds),), torch.inf)
+        outcomes = dict.fromkeys(chosen, Outcome(none, none > 0, [message] * len(seeds)))
     seconds = (time.perf_counter() - started) / max(len(chosen), 1)
     return [_row(stage, family, dtype, seeds, found, seconds) for dtype, found in outcomes.items()]
 
@@ -147,7 +152,7 @@ def _compared(stage: Stage, family: str, exact: Values, truth: Values, spread: V
     found = truth  # where a stage is its own reference
     if dtype != "float64" or stage.reference is not None:
         found = evaluate(stage.run, _inputs(exact, dtype), stage.gradients, dtype)
-    eps = torch.finfo(getattr(torch, dtype) if stage.network else working).eps
+    eps = torch.finfo(getattr(torch, dtype) if stage.kind == "network" else working).eps
     floor = torch.finfo(working).tiny / eps
     ratios = {}
     for name, value in truth.items():
@@ -157,8 +162,6 @@ def _compared(stage: Stage, family: str, exact: Values, truth: Values, spread: V
             scale = scale * stage.kappa(exact).clamp(min=1)
         if stage.sizes is not None and slope:
             scale = torch.maximum(scale, stage.sizes(exact))
-        if slope and family in stage.ties:
-            scale = torch.full_like(scale, torch.finfo(torch.float64).max)
         ratios[name] = _largest(found[name] - value) / (eps * (scale + spread[name] + floor))
     names = list(ratios)
     table = torch.stack(list(ratios.values())).nan_to_num(nan=math.inf, posinf=math.inf)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 from torch import Generator, Tensor
@@ -76,7 +77,6 @@ Values = dict[str, Tensor]
 
 #: Names of dtypes; the last two run in autocast, with inputs in float32.
 DTYPES = ("float64", "float32", "bfloat16", "float16")
-FLOAT32_ONLY = DTYPES[1:]  #: Dtypes of kernels and photographs, which are never in float64
 
 #: Largest factor of a budget.
 LARGEST = 100.0
@@ -98,14 +98,13 @@ class Stage:
         reference: computes the same in float64 by other means; None: ``run`` in float64.
         gradients: inputs whose gradients are compared, too.
         steady: inputs that are not rounded for kappa.
-        seeds: number of cases of each family and dtype in the full run.
-        quick: the same in a quick run, which misses rare failures.
-        network: whether the stage computes in autocast's dtype, not in float32 or wider.
+        seeds: number of cases of each family and dtype in the full run; a quick run misses rare failures.
+        kind: a formula computes in float32 or wider, a kernel in float32 only, a network in autocast's dtype.
         kappa: lower bound of the condition number, where the stage's definition subtracts large numbers.
         excluded: families that do not apply although their ingredient does, separated by spaces, with the
             reason.
-        sizes: magnitude [n] of terms that cancel in the gradients by definition.
-        ties: families whose gradients are not unique and must only be finite.
+        sizes: magnitude [n] of terms that cancel in the gradients by definition; where these are not unique
+            and must only be finite, the largest number.
         refused: families that must be refused with an :class:`~ghgs_lit.errors.InputError`.
         silent: why a value that is not finite need not show in the outputs; empty: it must.
     """
@@ -120,19 +119,26 @@ class Stage:
     gradients: tuple[str, ...] = ()
     steady: tuple[str, ...] = ()
     seeds: int = 128
-    quick: int = 3
-    network: bool = False
-    dtypes: tuple[str, ...] = DTYPES
+    kind: Literal["formula", "kernel", "network"] = "formula"
     kappa: Callable[[Values], Tensor] | None = None
     excluded: Mapping[str, str] = field(default_factory=dict)
     sizes: Callable[[Values], Tensor] | None = None
-    ties: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
     silent: str = ""
 
     def __post_init__(self) -> None:
         if not (0 < self.factor <= LARGEST and self.reason):
             raise ValueError(f"{self.name}: a budget needs a factor up to {LARGEST} and a reason")
+
+    @property
+    def dtypes(self) -> tuple[str, ...]:
+        """Dtypes of its inputs."""
+        return DTYPES[1:] if self.kind == "kernel" else DTYPES
+
+    @property
+    def quick(self) -> int:
+        """Number of cases in a quick run: one of a stage that is slow, three of another."""
+        return 1 if self.seeds < 25 else 3
 
     def has(self, family: str) -> bool:
         """Whether the stage has cases of a family."""

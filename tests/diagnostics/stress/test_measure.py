@@ -1,6 +1,7 @@
 """The stress test itself: its matrix is complete, and it catches what it must catch."""
 
 import dataclasses
+import json
 from collections import Counter
 
 import pytest
@@ -8,8 +9,9 @@ import torch
 
 from ghgs_lit.diagnostics.stress.measure import measure
 from ghgs_lit.diagnostics.stress.run import Task, run_tasks, tasks_of
-from ghgs_lit.diagnostics.stress.stage import FAMILIES, PLANTED
+from ghgs_lit.diagnostics.stress.stage import DTYPES, FAMILIES, PLANTED
 from ghgs_lit.diagnostics.stress.stages import STAGES
+from tests.helpers.verbs import ghgs
 
 
 def failures(name, family, run, dtype="float32"):
@@ -75,3 +77,18 @@ def test_a_run_in_other_processes_has_the_same_rows():
     tasks = [Task("unit vectors", family, 2) for family in ("ordinary", "zero_quaternion")]
     alone, beside = ([{**row, "seconds": 0} for row in run_tasks(tasks, n)] for n in (0, 1))
     assert alone == beside
+
+
+def test_a_stage_that_raises_is_a_failure(monkeypatch, capsys, tmp_path):
+    """In one line, and the other stages are measured."""
+    broken = dataclasses.replace(STAGES["cosine"], run=lambda v: {"cosines": v + 1})
+    monkeypatch.setitem(STAGES, "cosine", broken)
+    settings = ("quick=true", "workers=0", f"hydra.run.dir={tmp_path}")
+    assert ghgs("stress", "stages=[cosine,unit vectors]", "families=[ordinary]", *settings) == 1
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ghgs stress: ")]
+    assert [line.partition(": expected")[0] for line in lines] == [
+        f"ghgs stress: cosine, ordinary, {dtype}" for dtype in DTYPES
+    ]
+    assert all("TypeError" in line for line in lines)
+    cells = json.loads((tmp_path / "stress.json").read_text())["cells"]
+    assert [(cell["stage"], cell["failures"]) for cell in cells[::4]] == [("cosine", 3), ("unit vectors", 0)]

@@ -117,6 +117,6 @@ STAGES = (
         lambda f, g: {f"layer{i}": inputs.features(f, g, _GRID[0] * _GRID[1], 32) for i in range(4)},
         _dpt, 100,
         "twenty convolutions in a row, each a sum of up to 72 products; tokens are normalised first",
-        gradients=tuple(f"layer{i}" for i in range(4)), seeds=64, network=True,
+        gradients=tuple(f"layer{i}" for i in range(4)), seeds=64, kind="network",
     ),
 )  # fmt: skip

@@ -7,7 +7,7 @@ import torch
 from torch import Generator, Tensor
 
 from ghgs_lit.diagnostics.stress import inputs
-from ghgs_lit.diagnostics.stress.stage import FAMILIES, FLOAT32_ONLY, Stage, Values, case_by_case
+from ghgs_lit.diagnostics.stress.stage import FAMILIES, Stage, Values, case_by_case
 from ghgs_lit.diagnostics.stress.stages.geometry import batch_of, cameras_of, scene
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.geometry.undistortion import undistorting_grid
@@ -158,12 +158,12 @@ _EXCLUDED = {
 STAGES = (
     Stage(
         "undistortion", ("cameras",), _lens_inputs, _lens, 50,
-        "a polynomial of degree 9 and its division by the focal length", _lens_slowly, dtypes=FLOAT32_ONLY,
+        "a polynomial of degree 9 and its division by the focal length", _lens_slowly, kind="kernel",
     ),
     Stage(
         "gains", ("cameras", "images", "masks"), partial(_surface_inputs, 5, 32), case_by_case(_gains), 100,
         "logarithms of samples at projected places, weighted by depths of a render, five times",
-        steady=("middle", "truth"), seeds=24, quick=1, excluded=_EXCLUDED,
+        steady=("middle", "truth"), seeds=24, excluded=_EXCLUDED,
         silent="what no other view sees says nothing",
     ),
     Stage(
@@ -171,7 +171,7 @@ STAGES = (
         case_by_case(_refined), 100,
         "two renders and their gradients, and steps that divide them by their size",
         case_by_case(_refined_slowly),
-        steady=("middle", "truth"), seeds=24, quick=1, excluded=_EXCLUDED,
+        steady=("middle", "truth"), seeds=24, excluded=_EXCLUDED,
         silent="what is not drawn does not show",
     ),
 )  # fmt: skip

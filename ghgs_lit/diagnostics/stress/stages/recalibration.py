@@ -4,7 +4,7 @@ import torch
 from torch import Generator, Tensor
 
 from ghgs_lit.diagnostics.stress import inputs
-from ghgs_lit.diagnostics.stress.stage import FLOAT32_ONLY, Stage, Values, case_by_case
+from ghgs_lit.diagnostics.stress.stage import Stage, Values, case_by_case
 from ghgs_lit.encoder.cpu import attend as attend_heads
 from ghgs_lit.kernels.compile import processor_features
 from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
@@ -133,5 +133,5 @@ if "avx512f" in processor_features():
         "encoder kernel", ("features",), _head_inputs,
         lambda v: {"attended": attend_heads(v["q"], v["k"], v["v"])}, 100,
         f"logits of sums of 64 products; exponentials by a polynomial. {_HUGE}", _heads_slowly,
-        dtypes=FLOAT32_ONLY, silent=_INFINITE,
+        kind="kernel", silent=_INFINITE,
     ))  # fmt: skip

@@ -4,7 +4,7 @@ import torch
 from torch import Generator, Tensor
 
 from ghgs_lit.diagnostics.stress import inputs
-from ghgs_lit.diagnostics.stress.stage import FLOAT32_ONLY, Stage, Values, case_by_case
+from ghgs_lit.diagnostics.stress.stage import Stage, Values, case_by_case
 from ghgs_lit.geometry.chamfer import chamfer
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.metrics.flip import flip_map
@@ -122,6 +122,13 @@ def _clouds(family: str, g: Generator) -> Values:
     }
 
 
+def _ties(v: Values) -> Tensor:
+    """The largest number where several points are at one place, so that any of them may be the nearest."""
+    apart = (v["points"][:, :, None] - v["points"][:, None]).abs().sum(-1)
+    tied = (apart == 0).flatten(1).sum(1) > apart.shape[1]
+    return tied * torch.tensor(torch.finfo(torch.float64).max, dtype=torch.float64)
+
+
 def _chamfer_slowly(v: Values) -> Values:
     apart = (v["points"][:, None] - v["surface"]).square().sum(-1)
     return {"chamfer": 2 * torch.cat((apart.amin(1), apart.amin(0))).mean()}
@@ -141,7 +148,7 @@ STAGES = (
         "compositing", _TAKES, _inputs, lambda v: _render("cpu", v), 100,
         "an exponential of a square, and a product of up to 1500 transmittances",
         lambda v: _render("reference", v), gradients=_FIELDS, seeds=24, silent=_NOT_DRAWN,
-        dtypes=FLOAT32_ONLY,
+        kind="kernel",
     ),
     Stage(
         "L1 and SSIM", ("images",), _pair,
@@ -153,7 +160,7 @@ STAGES = (
         "Chamfer", ("cameras", "points", "neighbors"), _clouds,
         case_by_case(lambda v: {"chamfer": chamfer(v["points"], v["surface"])}), 20,
         "means of squares of differences", case_by_case(_chamfer_slowly), gradients=("points", "surface"),
-        seeds=96, ties=("duplicates", "collapsed"),
+        seeds=96, sizes=_ties,
         excluded=inputs.NO_CAMERA,
     ),
     Stage(

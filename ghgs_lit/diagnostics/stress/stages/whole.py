@@ -116,8 +116,7 @@ _stage = partial(
     make=_inputs,
     factor=100,
     seeds=20,
-    quick=1,
-    network=True,
+    kind="network",
     kappa=_far,
     excluded={
         "wide": "the subject is smaller than a pixel",
