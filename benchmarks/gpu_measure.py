@@ -88,20 +88,6 @@ class Gpu:
             "longest": longest,
         }
 
-    def recorded(self, call: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
-        """What plays a call back as one CUDA graph, and the place of its result. RuntimeError: it cannot be
-        recorded, since it waits or its sizes depend on values."""
-        side = torch.cuda.Stream()
-        side.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(side):
-            for _ in range(3):
-                call()
-        torch.cuda.current_stream().wait_stream(side)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            result = call()
-        return graph.replay, result
-
 
 def _events(found: profile) -> list[dict]:
     with tempfile.TemporaryDirectory() as folder:
@@ -146,7 +132,7 @@ class _Event:
 
 def _stand_ins(log: Log) -> dict[str, Any]:
     @contextlib.contextmanager
-    def graph(_):
+    def graph(_, **options):
         before = log.waits.total()
         yield
         if waits := log.waits.total() - before:
@@ -161,6 +147,7 @@ def _stand_ins(log: Log) -> dict[str, Any]:
         "empty_cache": lambda: None,
         "get_device_properties": lambda device: SimpleNamespace(name="pretend", total_memory=80 << 30),
         "graph": graph,
+        "graph_pool_handle": lambda: (0, 1),
         "max_memory_allocated": lambda device=None: 0,
         "reset_peak_memory_stats": lambda device=None: None,
         "set_per_process_memory_fraction": lambda share, device=None: None,

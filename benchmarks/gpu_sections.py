@@ -2,6 +2,7 @@
 
 import gc
 import importlib
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -20,9 +21,11 @@ from ghgs_lit.diagnostics.benchmark.stages import TOTAL, SecondsProbe, inside, t
 from ghgs_lit.diagnostics.doctor.selfcheck import PASSED, selfcheck
 from ghgs_lit.diagnostics.machine import machine_facts
 from ghgs_lit.kernels.precision import precision_of
+from ghgs_lit.kernels.recording import CudaTape, Recorder
 from ghgs_lit.kernels.watching import Inputs, Watcher
 from ghgs_lit.kernels.watching import watched as stages_watched
 from ghgs_lit.model import GHGS
+from ghgs_lit.rendering.capacity import deferred
 from ghgs_lit.stages import STAGES
 from ghgs_lit.types import Batch, map_tensors
 
@@ -119,20 +122,35 @@ def graphs(call: Call) -> None:
             stage = model
             for name in piece.split("."):
                 stage = getattr(stage, name)
-            _recorded(call, f"batch of {size}, {piece}", partial(stage, *arguments, **options))
-        _recorded(call, f"batch of {size}, all", partial(model, batch))
+            _recorded(call, f"batch of {size}, {piece}", _Called(stage), (arguments, options))
+        _recorded(call, f"batch of {size}, all", _Called(model), ((batch,), {}))
 
 
-def _recorded(call: Call, name: str, run: Callable[[], Any]) -> None:
-    """Row of a recording: eager and played back, or why it cannot be recorded."""
-    eager = call.gpu.milliseconds(run, call.sizes.repeats)
-    try:
-        play, _ = call.gpu.recorded(run)
-        ms = call.gpu.milliseconds(play, call.sizes.repeats)
-    except RuntimeError as error:
-        call.add(name, eager_ms=eager, refused=reason(error))
-    else:
-        call.add(name, eager_ms=eager, graph_ms=ms, busy_ms=call.gpu.work(play)["busy_ms"])
+class _Called:
+    """A function of positional and named arguments as one of their pair; renderings have room enough."""
+
+    def __init__(self, function: Callable[..., Any]):
+        self.function = function
+
+    def __call__(self, inputs: Inputs) -> Any:
+        with deferred():
+            return self.function(*inputs[0], **inputs[1])
+
+
+def _recorded(call: Call, name: str, function: Callable[[Inputs], Any], inputs: Inputs) -> None:
+    """Row of a recording: eager and played back (with copies of inputs and results), or why it cannot be
+    recorded."""
+    eager = call.gpu.milliseconds(partial(function, inputs), call.sizes.repeats)
+    recorder = Recorder(eager=0, tape=CudaTape(call.gpu.device.type))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the row has the reason
+        recorder(function, inputs)
+    if recorder.reason:
+        call.add(name, eager_ms=eager, refused=recorder.reason)
+        return
+    play = partial(recorder, function, inputs)
+    ms = call.gpu.milliseconds(play, call.sizes.repeats)
+    call.add(name, eager_ms=eager, graph_ms=ms, busy_ms=call.gpu.work(play)["busy_ms"])
 
 
 class _Step:

@@ -1,6 +1,6 @@
 """Precision: half precision for products of networks, float32 for geometry and last projections."""
 
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cache
@@ -88,6 +88,12 @@ def round_products(rounding: bool, device: str = "cuda", also_older: bool = True
 def rounds_products(device: str) -> bool:
     """Whether products or convolutions of float32 numbers round their factors now on a type of device."""
     return _Rounding.now(device).is_any
+
+
+def rounding_state(device: str) -> Hashable:
+    """The state of all switches that decide which products and convolutions round on a type of device."""
+    now = _Rounding.now(device)
+    return tuple(now.of_modules), now.of_older
 
 
 @dataclass(frozen=True)

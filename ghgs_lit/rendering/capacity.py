@@ -5,7 +5,7 @@ similar ones needed, and some more; the number that it really needed is read lat
 rendering, while the GPU draws, or of several together (:func:`settled`). Where the room was too small the
 rendering is repeated with enough: an image never lacks splats."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -52,18 +52,11 @@ class Rooms:
 
     rooms: list[Room] = field(default_factory=list)
 
-    @property
-    def needed(self) -> list[Tensor]:
-        """What each rendering needed, on its device."""
-        return [room.needed for room in self.rooms]
-
-    def suffice(self, needed: Sequence[Tensor] | None = None) -> bool:
-        """Whether every rendering had enough room; the host waits once. ``needed``: instead of the rooms'
-        own, of the same renderings played back with other values."""
-        needed = self.needed if needed is None else needed
-        if not needed:
+    def suffice(self) -> bool:
+        """Whether every rendering had enough room; the host waits once."""
+        if not self.rooms:
             return True
-        numbers = torch.stack(list(needed)).tolist()
+        numbers = torch.stack([room.needed for room in self.rooms]).tolist()
         return all([room.expect(number) for room, number in zip(self.rooms, numbers, strict=True)])
 
 

@@ -113,11 +113,12 @@ def test_several_renderings_are_settled_together(capacities):
 
 
 def test_too_little_room_is_seen_also_when_played_back(capacities):
-    """Numbers of the same renderings with other values can be given instead of their own."""
+    """What the same renderings need with other values takes the place of the numbers."""
     with deferred() as rooms:
         drawn(size=0.01)
     assert rooms.suffice()
-    assert not rooms.suffice([torch.tensor(rooms.rooms[0].capacity + 1)])
+    rooms.rooms[0].needed.fill_(rooms.rooms[0].capacity + 1)
+    assert not rooms.suffice()
     with deferred() as rooms:
         pass
     assert rooms.suffice()

@@ -1,0 +1,300 @@
+"""Work of a GPU that is recorded once for each class of inputs and then played back as one CUDA graph.
+
+A host that starts thousands of small kernels is slower than the GPU that runs them. A recording starts all of
+them at once. It repeats the very same work: the same sizes, the same addresses, the same numbers of the host.
+So a call is recorded together with all that may differ between calls (:func:`described`), its inputs are
+copied to the places that were recorded, and functions that read a value of the device are refused."""
+
+import threading
+import traceback
+import warnings
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Hashable, Iterator
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from ghgs_lit.kernels.precision import rounding_state
+
+Result = TypeVar("Result")
+_PACKAGE = Path(__file__).parents[1]
+
+
+class NotRecordable(RuntimeError):
+    """A function whose work cannot be recorded; the message says why, and which line is to blame."""
+
+
+class Tape(Protocol):
+    """Records calls on devices of one type, ``device``."""
+
+    device: str
+
+    def record(self, call: Callable[[], Result]) -> tuple[Result, Callable[[], None]]:
+        """The result of a call, and a function that fills it again from the same inputs."""
+
+
+class CudaTape:
+    """CUDA graphs. One pool of memory for all, since none is played while another's results are needed."""
+
+    def __init__(self, device: str = "cuda") -> None:
+        self.device = device
+        self._pool: Any = None
+
+    def record(self, call: Callable[[], Result]) -> tuple[Result, Callable[[], None]]:
+        """See :class:`Tape`. The call is made once before on the stream that records, for workspaces."""
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            call()
+        torch.cuda.current_stream().wait_stream(stream)
+        self._pool = self._pool or torch.cuda.graph_pool_handle()
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, pool=self._pool, stream=stream):
+            result = call()
+        return result, graph.replay
+
+
+@dataclass
+class _Recording:
+    """``inputs``: where they are copied to. ``result``: where it comes about. ``kept``: memory that is read
+    and that was there before, such as tables in caches, which may forget them."""
+
+    inputs: list[Tensor]
+    result: Any
+    play: Callable[[], None]
+    kept: list[Any]
+
+
+class Recorder:
+    """Calls functions of tensors, and plays them back from the second call of a class on.
+
+    Args:
+        limit: largest number of recordings; the one that was not used for longest makes room.
+        eager: calls of a class before it is recorded: what comes once is not worth it, and caches are filled.
+        tape: makes recordings.
+
+    Attributes:
+        counts: calls that were ``played``, ``recorded`` (and played), ``eager``, ``refused``.
+        reason: why the last recording failed; empty if none did."""
+
+    def __init__(self, limit: int = 8, eager: int = 1, tape: Tape | None = None):
+        self.limit, self.eager, self.tape = limit, eager, tape or CudaTape()
+        self.counts: Counter[str] = Counter()
+        self.reason = ""
+        self._lock = threading.RLock()
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all recordings: after weights have moved."""
+        self._recordings: OrderedDict[Hashable, _Recording] = OrderedDict()
+        self._seen: OrderedDict[Hashable, int] = OrderedDict()
+        self._refused: set[Hashable] = set()
+
+    def forget(self, inputs: Any, key: Hashable = ()) -> None:
+        """Forget the recording of the class of ``inputs``, as of :meth:`__call__`, if there is one."""
+        self._recordings.pop(self._class(inputs, key, []), None)
+
+    def __call__(self, function: Callable[[Any], Result], inputs: Any, key: Hashable = ()) -> Result:
+        """``function(inputs)``. Without a gradient; ``function`` writes none of its inputs.
+
+        Args:
+            function: depends on ``inputs``, ``key`` and on tensors that stay where they are. The first call
+                of a class is eager, and so are all where recording fails, which is said once.
+            inputs: dataclasses, tuples, lists and dicts of tensors on one device, and of anything hashable.
+            key: all else that may change what ``function`` does."""
+        tensors: list[Tensor] = []
+        kind = self._class(inputs, key, tensors)
+        if kind is None or kind in self._refused or {t.device.type for t in tensors} != {self.tape.device}:
+            self.counts["eager"] += 1
+            return function(inputs)
+        with self._lock:
+            if kind in self._recordings:
+                self._recordings.move_to_end(kind)
+                self.counts["played"] += 1
+                return _played(self._recordings[kind], tensors)
+            if self._seen.get(kind, 0) < self.eager:
+                self._note(kind)
+                self.counts["eager"] += 1
+                return function(inputs)
+            try:
+                recording = _recorded(self.tape, function, inputs)
+            except (
+                Exception
+            ) as error:  # a driver has many ways to fail; the eager call shows the function's own
+                self._refuse(kind, error)
+                return function(inputs)
+            while len(self._recordings) >= self.limit:
+                self._recordings.popitem(last=False)
+            self._recordings[kind] = recording
+            self.counts["recorded"] += 1
+            return _played(recording, tensors)
+
+    def _class(self, inputs: Any, key: Hashable, tensors: list[Tensor]) -> Hashable | None:
+        """What must be equal for a recording to be valid; None: it cannot be told. Notes the ``tensors``."""
+        kind = (key, described(inputs, tensors), _surroundings(self.tape.device))
+        try:
+            hash(kind)
+        except TypeError:
+            return None
+        return kind
+
+    def _note(self, kind: Hashable) -> None:
+        self._seen[kind] = self._seen.pop(kind, 0) + 1
+        while len(self._seen) > 64 * self.limit:
+            self._seen.popitem(last=False)
+
+    def _refuse(self, kind: Hashable, error: Exception) -> None:
+        self.counts["refused"] += 1
+        said, self.reason = self.reason, " ".join(str(error).split())[:300] or type(error).__name__
+        if not said:
+            warnings.warn(f"not recorded as a CUDA graph, but called as always: {self.reason}", stacklevel=4)
+        self._refused.add(kind)
+
+
+def described(value: Any, tensors: list[Tensor]) -> Any:
+    """What is fixed in ``value``: sizes and types of its tensors, which are appended to ``tensors``, and all
+    that is no tensor. Values that dataclasses keep beside their fields belong to them."""
+    if isinstance(value, Tensor):
+        tensors.append(value)
+        return tuple(value.shape), value.dtype, value.device
+    if is_dataclass(value) and not isinstance(value, type):
+        return type(value), tuple((name, described(item, tensors)) for name, item in _entries(value))
+    if isinstance(value, (tuple, list)):
+        return type(value), tuple(described(item, tensors) for item in value)
+    if isinstance(value, dict):
+        return tuple((key, described(item, tensors)) for key, item in value.items())
+    return type(value), value
+
+
+def _entries(value: Any) -> Iterator[tuple[str, Any]]:
+    """Fields of a dataclass, then what it keeps beside them."""
+    names = [field.name for field in fields(value)]
+    yield from ((name, getattr(value, name)) for name in names)
+    yield from ((name, item) for name, item in vars(value).items() if name not in names)
+
+
+def _surroundings(device: str) -> Hashable:
+    """State of PyTorch that decides which kernels run."""
+    autocast = torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device)
+    modes = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+    return autocast, modes, torch.are_deterministic_algorithms_enabled(), rounding_state(device)
+
+
+def _replaced(value: Any, replace: Callable[[Tensor], Tensor]) -> Any:
+    """``value`` with other tensors, also in what dataclasses keep beside their fields."""
+    if is_dataclass(value) and not isinstance(value, type):
+        names = {field.name for field in fields(value)}
+        entries = {name: _replaced(item, replace) for name, item in _entries(value)}
+        made = type(value)(**{name: item for name, item in entries.items() if name in names})
+        vars(made).update(entries)
+        return made
+    if isinstance(value, (tuple, list)):
+        items = [_replaced(item, replace) for item in value]
+        return type(value)(*items) if hasattr(value, "_fields") else type(value)(items)
+    if isinstance(value, dict):
+        return {key: _replaced(item, replace) for key, item in value.items()}
+    return replace(value) if isinstance(value, Tensor) else value
+
+
+def _recorded(tape: Tape, function: Callable[[Any], Any], inputs: Any) -> _Recording:
+    places: list[Tensor] = []
+
+    def place(tensor: Tensor) -> Tensor:
+        places.append(torch.empty_like(tensor).copy_(tensor))
+        return places[-1]
+
+    fixed = _replaced(inputs, place)
+    guards: list[_Guard] = []
+
+    def guarded() -> Any:
+        # Casts of weights would be shared between what is recorded and what is not.
+        torch.clear_autocast_cache()
+        guards.append(_Guard())
+        with guards[-1]:
+            return function(fixed)
+
+    result, play = tape.record(guarded)
+    torch.clear_autocast_cache()
+    return _Recording(places, result, play, list(guards[-1].kept.values()))
+
+
+def _played(recording: _Recording, tensors: list[Tensor]) -> Any:
+    """The result for other values, in memory of its own."""
+    torch._foreach_copy_(recording.inputs, tensors)
+    recording.play()
+    results: dict[int, Tensor] = {}
+
+    def noted(tensor: Tensor) -> Tensor:
+        results[id(tensor)] = tensor
+        return tensor
+
+    _replaced(recording.result, noted)
+    copies = {key: torch.empty_like(tensor) for key, tensor in results.items()}
+    if copies:
+        torch._foreach_copy_(list(copies.values()), list(results.values()))
+    return _replaced(recording.result, lambda tensor: copies[id(tensor)])
+
+
+class _Guard(TorchDispatchMode):
+    """Refuses what a recording cannot repeat, before it is done: reading a value of the device, and copying
+    from the host, whose memory will hold something else. ``kept``: memory that was not made inside."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.kept: dict[int, Any] = {}
+        self._made: set[int] = set()
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        given = list(_tensors((args, tuple(kwargs.values()))))
+        reason = _reason(function, given, args, kwargs)
+        if reason is not None:
+            raise NotRecordable(f"{reason} by {function.name()} ({_line()})")
+        for storage in map(Tensor.untyped_storage, given):
+            if storage._cdata not in self._made:
+                self.kept[storage._cdata] = storage
+        result = function(*args, **kwargs)
+        self._made.update(tensor.untyped_storage()._cdata for tensor in _tensors(result))
+        return result
+
+
+def _tensors(value: Any) -> Iterator[Tensor]:
+    if isinstance(value, Tensor):
+        yield value
+    elif isinstance(value, (tuple, list)):
+        for item in value:
+            yield from _tensors(item)
+
+
+_INDEXING = ("aten::index", "aten::index_put", "aten::index_put_", "aten::_unsafe_index")
+
+
+def _reason(function: Any, given: list[Tensor], args: tuple, kwargs: dict) -> str | None:
+    """Why an operator cannot be played back; None if it can."""
+    name = function.name().split(".")[0]
+    if torch.Tag.data_dependent_output in function.tags:
+        return "a value is read"
+    if name in _INDEXING:
+        masks = [index for index in args[1] if index is not None and index.dtype in (torch.bool, torch.uint8)]
+        return "a size depends on values" if masks else None
+    sized = kwargs.get("output_size") is not None
+    if torch.Tag.dynamic_output_shape in function.tags and not sized:
+        return "a size depends on values"
+    types = {tensor.device.type for tensor in given}
+    if name in ("aten::_to_copy", "aten::copy_", "aten::_copy_from") and kwargs.get("device") is not None:
+        types.add(torch.device(kwargs["device"]).type)
+    copies = len(types) > 1 and (name == "aten::_to_copy" or "copy_" in name)
+    # What remains to be seen of torch.tensor(list, device=...).
+    copies |= name == "aten::lift_fresh" and types != {"cpu"}
+    return "the host's memory is copied" if copies else None
+
+
+def _line() -> str:
+    """The innermost line of the package that is running."""
+    lines = [f for f in traceback.extract_stack() if Path(f.filename).is_relative_to(_PACKAGE)]
+    lines = [f for f in lines if Path(f.filename).name != Path(__file__).name]
+    return f"{Path(lines[-1].filename).name}:{lines[-1].lineno}" if lines else "no line of the package"

@@ -1,0 +1,307 @@
+"""Recorded calls: what is played back, what is refused, and what makes a class of its own."""
+
+import dataclasses
+import warnings
+from contextlib import nullcontext
+from functools import lru_cache
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch import nn
+
+from ghgs_lit.kernels import recording
+from ghgs_lit.kernels.precision import precision_of
+from ghgs_lit.kernels.recording import CudaTape, Recorder
+from ghgs_lit.types import Cameras
+from tests.helpers.pretend_device import DEVICE, pretend_device
+from tests.helpers.tape import OperatorTape
+
+HERE = "cpu"
+
+
+@pytest.fixture(autouse=True)
+def no_gradient():
+    with torch.no_grad():
+        yield
+
+
+def made(**options):
+    return Recorder(tape=OperatorTape(HERE), **options)
+
+
+def numbers(seed, *shape):
+    return torch.randn(*shape or (2, 3), generator=torch.Generator().manual_seed(seed))
+
+
+def work(values):
+    """Views, writes to its own memory, sorting and several results of which two are one."""
+    a, b = values
+    table = torch.zeros_like(a)
+    table[:, 1:] = a[:, 1:] * 2
+    table.add_(b)
+    order = table.flatten().argsort()
+    best = table.flatten()[order].view_as(a)
+    return {"best": best, "same": best, "order": (order, 3, "name")}
+
+
+def test_other_values_give_what_an_eager_call_gives():
+    """From the third call on nothing but the recording runs, and results keep their memory."""
+    recorder, calls = made(), []
+
+    def counted(values):
+        calls.append(None)
+        return work(values)
+
+    found = [recorder(counted, (numbers(seed), numbers(seed + 50))) for seed in range(6)]
+    for seed, result in enumerate(found):
+        wanted = work((numbers(seed), numbers(seed + 50)))
+        assert torch.equal(result["best"], wanted["best"])
+        assert torch.equal(result["order"][0], wanted["order"][0])
+        assert result["order"][1:] == (3, "name")
+        assert result["best"] is result["same"]
+    assert len(calls) == 2
+    assert recorder.counts == {"eager": 1, "recorded": 1, "played": 4}
+
+
+def test_dataclasses_come_back_with_what_they_keep():
+    """Values beside fields are inputs like fields: recorded functions may rely on them."""
+    recorder = made()
+
+    def moved(cameras):
+        extrinsics = cameras.extrinsics + vars(cameras)["noted"]
+        return dataclasses.replace(cameras, extrinsics=extrinsics)
+
+    for seed in range(4):
+        cameras = Cameras(numbers(seed, 2, 3, 3), numbers(seed, 2, 4, 4), 5, 6)
+        vars(cameras)["noted"] = numbers(seed + 9, 2, 4, 4)
+        found = recorder(moved, cameras)
+        assert torch.equal(found.extrinsics, cameras.extrinsics + vars(cameras)["noted"])
+        assert (found.height, found.width) == (5, 6)
+    assert recorder.counts["played"] == 2
+
+
+def bfloat16():
+    return torch.autocast("cpu", torch.bfloat16)
+
+
+def other_class(name):
+    """Inputs, key and surroundings that differ from the usual ones in one respect."""
+    usual = {"inputs": (numbers(0), numbers(1), 7), "key": ("skip", 1), "around": nullcontext()}
+    changes = {
+        "shape": {"inputs": (numbers(0, 2, 4), numbers(1, 2, 4), 7)},
+        "dtype": {"inputs": (numbers(0).double(), numbers(1), 7)},
+        "number": {"inputs": (numbers(0), numbers(1), 8)},
+        "type": {"inputs": (numbers(0), numbers(1), 7.0)},
+        "structure": {"inputs": [numbers(0), numbers(1), 7]},
+        "key": {"key": ("skip", 2)},
+        "autocast": {"around": bfloat16()},
+        "gradient": {"around": torch.enable_grad()},
+        "inference": {"around": torch.inference_mode()},
+        "rounding": {"around": precision_of("tf32", torch.device("cuda"))},
+    }
+    return usual | changes.get(name, {})
+
+
+NAMES = ["shape", "dtype", "number", "type", "structure", "key", "autocast", "gradient", "inference"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_difference_is_a_class_of_its_own(name):
+    """What a recording fixes must be the same."""
+    recorder = made()
+    for each in ("usual", "usual", name, "usual"):
+        case = other_class(each)
+        with case["around"]:
+            recorder(lambda values: values[0] + values[1], case["inputs"], case["key"])
+    assert recorder.counts == {"eager": 2, "recorded": 1, "played": 1}
+
+
+def test_rounding_of_products_is_a_class_of_its_own():
+    """TF32 chooses other kernels."""
+    kinds = []
+    for name in ("usual", "rounding"):
+        with other_class(name)["around"]:
+            kinds.append(recording._surroundings("cuda"))
+    assert kinds[0] != kinds[1]
+
+
+@lru_cache(maxsize=1)
+def table(size):
+    return torch.arange(float(size))
+
+
+def reads(values):
+    return values[0] * float(values[0].sum())
+
+
+def decides(values):
+    return values[0] if values[0].sum() > 0 else -values[0]
+
+
+def selects(values):
+    return values[0][values[0] > 0]
+
+
+def counts_places(values):
+    return values[0].nonzero()
+
+
+def repeats(values):
+    return values[0].repeat_interleave(values[1].abs().int().sum(1), 0)
+
+
+REFUSED = {
+    reads: "a value is read",
+    decides: "a value is read",
+    selects: "a size depends on values",
+    counts_places: "a size depends on values",
+    repeats: "a size depends on values",
+}
+
+
+@pytest.mark.parametrize("function", REFUSED)
+def test_what_cannot_be_played_back_stays_eager(function):
+    """It is said once, with the reason, and the answer is right."""
+    recorder = made()
+    recorder(function, (numbers(0), numbers(1)))
+    with pytest.warns(UserWarning, match=REFUSED[function]):
+        recorder(function, (numbers(0), numbers(1)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for seed in range(3):
+            values = (numbers(seed), numbers(seed + 1))
+            assert torch.equal(recorder(function, values), function(values))
+            recorder(function, (*values, seed))
+            recorder(function, (*values, seed))
+    assert recorder.counts["refused"] == 4
+    assert recorder.counts["recorded"] == 0
+
+
+def test_copies_from_the_host_are_refused():
+    """A recording would read memory that holds something else by then; a waiting copy fails on CUDA."""
+    recorder = Recorder(tape=OperatorTape())
+    with pretend_device():
+        values = numbers(0).to(DEVICE)
+        recorder(lambda x: x + torch.tensor([1.0, 2.0, 3.0], device=x.device), values)
+        with pytest.warns(UserWarning, match=r"the host's memory is copied by aten::\w+"):
+            recorder(lambda x: x + torch.tensor([1.0, 2.0, 3.0], device=x.device), values)
+        for _ in range(3):
+            found = recorder(lambda x: x + torch.ones(3, device=x.device), values, key="made there")
+        assert torch.equal(found.cpu(), numbers(0) + 1)
+    assert recorder.counts["played"] == 1
+
+
+def test_tensors_of_other_devices_are_not_recorded():
+    """Recordings act on one type of device; all else is eager, and nothing is said."""
+    recorder = Recorder(tape=OperatorTape())
+    for _ in range(3):
+        recorder(work, (numbers(0), numbers(1)))
+    assert recorder.counts == {"eager": 3}
+
+
+def test_an_unhashable_value_is_eager():
+    """It cannot be compared with what was recorded."""
+    recorder = made()
+    for _ in range(3):
+        recorder(lambda values: values[0] + 1, (numbers(0), {"a": {1}}))
+    assert recorder.counts == {"eager": 3}
+
+
+def test_the_least_recently_used_recording_makes_room():
+    """And is recorded again when it comes back."""
+    recorder = made(limit=2)
+    for size in (1, 1, 2, 2, 1, 3, 3):  # 2 leaves
+        recorder(lambda x: x + 1, numbers(0, size))
+    assert recorder.counts == {"eager": 3, "recorded": 3, "played": 1}
+    recorder(lambda x: x + 1, numbers(0, 1))
+    recorder(lambda x: x + 1, numbers(0, 2))
+    assert recorder.counts == {"eager": 3, "recorded": 4, "played": 2}
+    assert len(recorder._recordings) == 2
+
+
+def test_memory_of_caches_is_kept():
+    """A cache may forget a table that a recording reads."""
+    recorder = made()
+    address = table(3).data_ptr()
+    for seed in range(3):
+        found = recorder(lambda x: x + table(3), numbers(seed))
+        table(4)
+        if seed == 0:
+            address = table(3).data_ptr()
+    assert torch.equal(found, numbers(2) + torch.arange(3.0))
+    kept = [storage.data_ptr() for each in recorder._recordings.values() for storage in each.kept]
+    assert address in kept or table(3).data_ptr() in kept
+
+
+def test_weights_that_change_in_place_are_seen():
+    """Training writes them where they are; after they have moved, all is recorded again."""
+    recorder, layer = made(), nn.Linear(3, 2)
+    for seed in range(3):
+        recorder(layer, numbers(seed))
+    layer.weight.add_(1.0)
+    assert torch.equal(recorder(layer, numbers(5)), layer(numbers(5)))
+    layer.weight = nn.Parameter(numbers(6, 2, 3))
+    recorder.clear()
+    for seed in range(3):
+        assert torch.equal(recorder(layer, numbers(seed)), layer(numbers(seed)))
+    assert recorder.counts == {"eager": 2, "recorded": 2, "played": 3}
+
+
+def test_casts_of_weights_are_recorded_with_what_reads_them():
+    """Autocast shares casts within a context; a recording reads the weights again."""
+    recorder, layer = made(), nn.Linear(3, 2)
+    with bfloat16():
+        for seed in range(3):
+            recorder(layer, numbers(seed))
+        layer.weight.mul_(-2.0)
+        torch.clear_autocast_cache()
+        assert torch.equal(recorder(layer, numbers(5)), layer(numbers(5)))
+
+
+def test_a_class_can_be_forgotten():
+    """Such as one with too little room for what has come since."""
+    recorder = made()
+    for _ in range(3):
+        recorder(work, (numbers(0), numbers(1)), key=1)
+    recorder.forget((numbers(2), numbers(3)), key=1)
+    recorder(work, (numbers(0), numbers(1)), key=1)
+    assert recorder.counts == {"eager": 1, "recorded": 2, "played": 1}
+
+
+def test_graphs_are_made_as_pytorch_documents(monkeypatch):
+    """A warm-up on a stream of its own, then the recording there, all in one pool of memory."""
+    log = []
+
+    class Stream:
+        def wait_stream(self, other):
+            log.append("wait")
+
+    class Within:
+        def __init__(self, *arguments, **options):
+            log.append(sorted(options))
+
+        def __enter__(self):
+            log.append("in")
+
+        def __exit__(self, *_):
+            log.append("out")
+
+    stand_ins = {
+        "Stream": Stream,
+        "current_stream": Stream,
+        "stream": Within,
+        "graph": Within,
+        "graph_pool_handle": lambda: log.append("pool") or (0, 1),
+        "CUDAGraph": lambda: SimpleNamespace(replay=lambda: log.append("play")),
+    }
+    for name, value in stand_ins.items():
+        monkeypatch.setattr(torch.cuda, name, value)
+    tape = CudaTape()
+    for _ in range(2):
+        result, play = tape.record(lambda: log.append("call") or 5)
+        play()
+    assert result == 5
+    once = ["wait", [], "in", "call", "out", "wait"]
+    then = [["pool", "stream"], "in", "call", "out", "play"]
+    assert log == [*once, "pool", *then, *once, *then]
