@@ -48,16 +48,13 @@ NOT_RUN = [
     (r"ghgs adapt (cameras=<|data\.size=518)", "renders the people of a rig, for minutes"),
     (r"ghgs stress dump=", "needs a training step that was not finite"),
     (r"ghgs (train|evaluate|benchmark) .*split=bench", "renders forty people"),
-    (r"(ghgs table|python benchmarks/when_recalibration\.py) .*runs/ablation", "needs twelve runs"),
-    (r"(ghgs (train|table)|python benchmarks/training_curves\.py) .*runs/peers", "needs five runs"),
+    (r"ghgs table .*runs/ablation", "needs twelve runs"),
+    (r"ghgs (train|table) .*runs/peers", "needs five runs"),
     (r"ghgs (train|export) .*runs/shipped", "renders 344 people"),
-    (r"python benchmarks/(protocols|attention_on_parts|semantic_consistency)", "renders many people"),
     (r"ghgs evaluate .*per_scene", "fits Gaussians to each person, for minutes"),
     (r"ghgs stress$", "takes a quarter of an hour"),
     (r"python scripts/drill\.py", "trains twelve runs, killed ten times"),
-    (r"python benchmarks/half_precision", "takes an hour"),
     (r"SMPL_MODEL=…", "needs the licensed body model and both data sets"),
-    (r"python benchmarks/(weights|attention)\.py", "measures models of the published size"),
     (r"python benchmarks/encoder\.py (?!--size vggt_small)", "measures models of the published size"),
 ]
 if importlib.util.find_spec("smplx") is None:

@@ -61,6 +61,7 @@ def code(document: str) -> list[str]:
     text = (REPOSITORY / document).read_text()
     blocks = re.findall(r"^```(?!python)\w*\n(.*?)^```", text, re.M | re.S)
     prose = re.sub(r"^```.*?^```", "", text, flags=re.M | re.S)
+    prose = re.sub(r"`[^`]*` of commit \w+", "", prose)  # what made a table, and is not needed any more
     return [" ".join(s.split()) for s in [*re.findall(r"(?<!`)`([^`]+)`(?!`)", prose), *blocks]]
 
 
