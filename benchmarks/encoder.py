@@ -26,9 +26,10 @@ from recorder import Recorder, Stage, forget_peak, memory_gb, merged
 from ghgs_lit import encoder
 from ghgs_lit.config import compose
 from ghgs_lit.diagnostics.benchmark.scene import random_model
-from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.kernels.linear import linear
 from ghgs_lit.model import GHGS, STAGES
+from ghgs_lit.plan import Plan
+from ghgs_lit.plan.patches import KeptPatches
 from ghgs_lit.types import Batch, DepthBounds, Points, Tokens
 from tests.helpers.literal_recalibration import literal_recalibration
 from tests.helpers.scenes import make_batch
@@ -48,7 +49,7 @@ def _patch_tokens_first(model: GHGS, record: Recorder) -> Callable:
     aggregator = model.encoder.aggregator
     embed = aggregator.patch_embed
 
-    def encode(batch: Batch, bounds: DepthBounds | None) -> Tokens:
+    def encode(batch: Batch, bounds: DepthBounds | None, plan: Plan) -> Tokens:
         found = []
         kept = embed.forward
 
@@ -61,7 +62,7 @@ def _patch_tokens_first(model: GHGS, record: Recorder) -> Callable:
         embed.forward = timed
         try:
             start = time.perf_counter()
-            tokens = model.encoder(batch.images, batch.masks, bounds)
+            tokens = model.encoder(batch.images, batch.masks, bounds, plan)
             seconds = time.perf_counter() - start
         finally:
             del embed.forward
@@ -77,15 +78,16 @@ def _patch_tokens_first(model: GHGS, record: Recorder) -> Callable:
 def forward(model: GHGS, batch: Batch, record: Recorder) -> tuple[Tokens, Points]:
     """``GHGS.forward``, stage by stage; returns the tokens and points that enter the recalibration."""
     bounds = model.bounds(batch)
-    tokens = _patch_tokens_first(model, record)(batch, bounds)
+    plan = model.plan(batch)
+    tokens = _patch_tokens_first(model, record)(batch, bounds, plan)
     with record("depth head"):
-        depth_maps = model.depth_head(tokens, batch, bounds)
+        depth_maps = model.depth_head(tokens, batch, bounds, plan)
     with record("unproject"):
         points = model.unprojection(depth_maps, tokens, batch)
     with record("recalibration"):
-        recalibrated = model.recalibration(tokens, points)
+        recalibrated = model.recalibration(tokens, points, plan)
     with record("Gaussian head"):
-        model.gaussian_head(recalibrated, batch, points, depth_maps)
+        model.gaussian_head(recalibrated, batch, points, depth_maps, plan)
     return tokens, points
 
 

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from ghgs_lit.encoder.block import Attention, Block, Rotary, rotate
 from ghgs_lit.kernels.linear import Linear
 from ghgs_lit.model import GHGS
+from ghgs_lit.plan import Plan
 from ghgs_lit.recalibration import Recalibration
 from ghgs_lit.types import Points, Tokens
 from tests.helpers.literal_recalibration import literal_recalibration
@@ -46,7 +47,7 @@ def _block(self: Block, x: Tensor, lengths: list[int], rotary: Rotary | None = N
     return x + self.mlp(self.norm2(x)) * self.ls2.gamma
 
 
-def _recalibration(self: Recalibration, tokens: Tokens, points: Points) -> Tokens:
+def _recalibration(self: Recalibration, tokens: Tokens, points: Points, plan: Plan) -> Tokens:
     counts = [math.prod(tokens.grid[1:])] * tokens.grid[0]
     parts = list(zip(points.tokens.split(counts), tokens.semantic.split(counts), strict=True))
     layers = [

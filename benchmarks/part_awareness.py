@@ -19,9 +19,10 @@ from torch import Tensor
 from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import build, compose, resolve
-from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.semantic import SemanticBranch, SemanticOptions
 from ghgs_lit.geometry.masks import patches_around_subject
+from ghgs_lit.plan import planned
+from ghgs_lit.plan.patches import KeptPatches
 from ghgs_lit.training.pretext.labels import PARTS, part_shares
 from ghgs_lit.training.pretext.module import neighbor_shows_part
 from ghgs_lit.types import Batch, Tokens
@@ -128,8 +129,8 @@ def main() -> None:
         print(f"| {name} | {found[0] / count:.1%} | {found[1] / count:.1%} |")
     torch.set_num_threads(1)
     encoder = build(config["encoder"], "encoder").eval()
-    kept = encoder.keeps(batch.masks)
-    branch = fastest(lambda: encoder.semantic(batch.images, batch.masks, kept))
+    plan = planned(batch.masks, patch_size, [encoder.keeps(batch.masks)])
+    branch = fastest(lambda: encoder.semantic(batch.images, batch.masks, plan))
     whole = fastest(lambda: encoder(batch.images, batch.masks))
     size = tuple(batch.images.shape)
     print(f"the branch takes {1e3 * branch:.1f} of the encoder's {1e3 * whole:.1f} ms, photographs {size}")

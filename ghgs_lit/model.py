@@ -1,25 +1,26 @@
 """The whole method as one module, from photographs to Gaussians (paper, section 3)."""
 
 import dataclasses
-from collections.abc import Mapping
+import functools
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from ghgs_lit import stages
 from ghgs_lit.config.registry import build, read_node
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.padding import bounds_of
 from ghgs_lit.heads.dpt import LEVELS, DPTHead
-from ghgs_lit.kernels.precision import PRECISIONS
+from ghgs_lit.kernels.precision import PRECISIONS, precision_of
+from ghgs_lit.plan import Plan, SkipOptions, planned
 from ghgs_lit.rendering.capacity import settled
 from ghgs_lit.rounds import CoarseDepths, Rounds, State, coarse_depths, prediction_of, replaced
-from ghgs_lit.skipping import SkipOptions
 from ghgs_lit.stages import HEADS, OPTIONS, STAGES
-from ghgs_lit.surroundings import ModelOptions, computing, surroundings
+from ghgs_lit.surroundings import Finding, ModelOptions, any_bad, refuse, surroundings
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Prediction, Tokens
 from ghgs_lit.weights.checkpoint import load_weights, read_config
 from ghgs_lit.weights.reading import SHIPPED
@@ -68,19 +69,42 @@ class GHGS(nn.Module):
         around = surroundings(self.options, self.encoder.patch_size, self.checks_values)
         for layer in around:
             batch = layer.enter(batch)
-        with computing(self.precision, self.auto, self.encoder, batch.masks) as (decisions, kept):
-            prediction = settled(lambda: self._predict(batch, kept, self._coarse(batch)))
+        plan = self.plan(batch, [finding for layer in around for finding in layer.findings])
+        with precision_of(self.precision, batch.masks.device):
+            prediction = settled(lambda: self._predict(batch, plan, self._coarse(batch)))
         for layer in reversed(around):
             prediction = layer.leave(prediction)
-        return dataclasses.replace(prediction, decisions=decisions)
+        return dataclasses.replace(prediction, decisions=plan.decisions)
 
-    def _predict(self, batch: Batch, kept: Tensor | None, coarse: CoarseDepths | None = None) -> Prediction:
+    def plan(self, batch: Batch, findings: Sequence[Finding] = ()) -> Plan:
+        """What the stages work on, read from a batch as they see it; a GPU is waited for once. ``findings``:
+        of its checks, which are read, too. InputError: the batch violates one."""
+        auto, encoder, masks = self.auto, self.encoder, batch.masks
+        cameras = [batch.cameras] if batch.targets is None else [batch.cameras, batch.targets.cameras]
+        plan = planned(
+            masks,
+            encoder.patch_size,
+            [encoder.keeps(masks)] if auto is None else auto.choices(encoder, masks),
+            self.skip.pixels,
+            self.recalibration.tokens,
+            None if auto is None else functools.partial(auto.choose, encoder),
+            [*(each.any_skew for each in cameras), *([any_bad(findings)] if findings else [])],
+        )
+        *skews, is_bad = plan.flags if findings else (*plan.flags, False)
+        if is_bad:
+            refuse(findings)
+        for each, has_skew in zip(cameras, skews, strict=True):
+            vars(each)["has_skew"] = has_skew
+        batch.note(plan.extents, plan.subject.index)
+        return plan
+
+    def _predict(self, batch: Batch, plan: Plan, coarse: CoarseDepths | None = None) -> Prediction:
         bounds = bounds_of(self.bounds, batch)
-        tokens = self._encode(batch, bounds, kept)
-        depth_maps = self._depths(tokens, batch, bounds, coarse)
+        tokens = self._encode(batch, bounds, plan)
+        depth_maps = self._depths(tokens, batch, bounds, plan, coarse)
         points = self.unprojection(depth_maps, tokens, batch)
-        tokens = self.recalibration(tokens, points)
-        raw = self.gaussian_head(tokens, batch, points, depth_maps, self.skip.pixels)
+        tokens = self.recalibration(tokens, points, plan)
+        raw = self.gaussian_head(tokens, batch, points, depth_maps, plan)
         activate = self.gaussian_head.activate
         first = replaced(activate, self.training) if self.rounds else activate
         state = State(raw, first(raw, batch, points, depth_maps), points, depth_maps)
@@ -89,14 +113,17 @@ class GHGS(nn.Module):
         return prediction_of(states, self.keeps_drafts and not self.training)
 
     def _depths(
-        self, tokens: Tokens, batch: Batch, bounds: DepthBounds | None, coarse: CoarseDepths | None
+        self,
+        tokens: Tokens,
+        batch: Batch,
+        bounds: DepthBounds | None,
+        plan: Plan,
+        coarse: CoarseDepths | None,
     ) -> DepthMaps:
         """Depths of the depth head, but the coarse ones of elements that have them."""
         if coarse is not None and coarse.are_all:
             return coarse.maps(batch, bounds)
-        # If all tokens are recalibrated, all need a depth.
-        wanted = "all" if self.recalibration.tokens == "all" else self.skip.pixels
-        maps = self.depth_head(tokens, batch, bounds, wanted)
+        maps = self.depth_head(tokens, batch, bounds, plan)
         return maps if coarse is None else coarse.maps(batch, bounds, maps)
 
     def _coarse(self, batch: Batch) -> CoarseDepths | None:
@@ -105,15 +132,14 @@ class GHGS(nn.Module):
             return None
 
         def predict(small: Batch) -> DepthMaps:
-            kept = None if self.auto is None else self.auto.decide(self.encoder, small.masks)[1]
-            return self._predict(small, kept).depth_maps
+            return self._predict(small, self.plan(small)).depth_maps
 
         sizes = (self.rounds.options.height, self.encoder.patch_size)
         return coarse_depths(batch, *sizes, self.options.matte, predict)
 
-    def _encode(self, batch: Batch, bounds: DepthBounds | None, kept: Tensor | None) -> Tokens:
+    def _encode(self, batch: Batch, bounds: DepthBounds | None, plan: Plan) -> Tokens:
         """Tokens in the precision of the heads, which may differ from that of the encoder."""
-        tokens = self.encoder(batch.images, batch.masks, bounds, kept)
+        tokens = self.encoder(batch.images, batch.masks, bounds, plan)
         heads = (parameter for name in HEADS for parameter in getattr(self, name).parameters())
         return tokens.in_precision(next(heads, tokens.semantic).dtype)
 

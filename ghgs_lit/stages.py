@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.errors import require
+from ghgs_lit.plan import Plan
 from ghgs_lit.types import (
     Batch,
     Cameras,
@@ -57,9 +58,9 @@ class Encoder(Protocol):
         images: Float[Tensor, "B V 3 H W"],
         masks: Bool[Tensor, "B V H W"],
         bounds: DepthBounds | None,
-        kept: Bool[Tensor, "B V h w"] | None,
+        plan: Plan,
     ) -> Tokens:
-        """Tokens of the ``kept`` patches (None: of those that ``keeps`` gives)."""
+        """Tokens of the patches ``plan.kept``."""
 
     def keeps(self, masks: Bool[Tensor, "B V H W"]) -> Bool[Tensor, "B V h w"]:
         """Patches that have tokens."""
@@ -70,10 +71,8 @@ class DepthHead(Protocol):
 
     is_bounded: bool
 
-    def __call__(
-        self, tokens: Tokens, batch: Batch, bounds: DepthBounds | None, pixels: DecodedPixels
-    ) -> DepthMaps:
-        """Depths of all pixels; with ``pixels="subject"`` at least of those of the subject."""
+    def __call__(self, tokens: Tokens, batch: Batch, bounds: DepthBounds | None, plan: Plan) -> DepthMaps:
+        """Depths of all pixels; of those within ``plan.depth_windows`` at least."""
 
 
 class Unprojection(Protocol):
@@ -89,8 +88,8 @@ class Recalibration(Protocol):
 
     tokens: DecodedPixels
 
-    def __call__(self, tokens: Tokens, points: Points) -> Tokens:
-        """The same tokens with recalibrated layers."""
+    def __call__(self, tokens: Tokens, points: Points, plan: Plan) -> Tokens:
+        """The same tokens with recalibrated layers: those of ``plan.peers`` whose points are valid."""
 
 
 class GaussianHead(Protocol):
@@ -100,9 +99,9 @@ class GaussianHead(Protocol):
     channels: int
 
     def __call__(
-        self, tokens: Tokens, batch: Batch, points: Points, depth_maps: DepthMaps, pixels: DecodedPixels
+        self, tokens: Tokens, batch: Batch, points: Points, depth_maps: DepthMaps, plan: Plan
     ) -> Any:
-        """Raw attributes of the valid pixels."""
+        """Raw attributes of the pixels ``plan.subject`` that are valid."""
 
     def activate(self, raw: Any, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
         """Gaussians from raw attributes, with the pixels that they belong to."""

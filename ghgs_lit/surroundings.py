@@ -1,7 +1,6 @@
 """Layers around the stages: they check and prepare a batch, and bring the prediction back to its world."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -14,10 +13,7 @@ from ghgs_lit.errors import require
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.geometry.masks import with_matte
 from ghgs_lit.geometry.padding import pad_to_patches
-from ghgs_lit.kernels.precision import precision_of
-from ghgs_lit.skipping import AutoSkip
-from ghgs_lit.stages import Encoder
-from ghgs_lit.types import Batch, Decision, Prediction
+from ghgs_lit.types import Batch, Prediction
 
 #: Colours may leave [0, 1] by this much, as resizing does.
 _ROUNDING = 1e-3
@@ -27,16 +23,31 @@ Finding = tuple[str, str, Tensor]
 
 
 def check_batch(batch: Batch, patch_size: int, values: bool = True) -> None:
-    """Refuse a batch that the stages cannot work on; its targets are not checked. All values are checked
-    together, so that the host waits for a GPU once. ``patch_size``: must divide height and width, in pixels.
-    ``values``: check every value, too: one NaN in the background leaves no Gaussian. InputError: names the
-    field, what was expected, what was found and where."""
+    """Refuse a batch that the stages cannot work on, for which the host waits for a GPU once; arguments and
+    InputError as of :func:`findings_of` and :func:`refuse`."""
+    findings = findings_of(batch, patch_size, values)
+    if bool(any_bad(findings)):
+        refuse(findings)
+
+
+def findings_of(batch: Batch, patch_size: int, values: bool = True) -> list[Finding]:
+    """What is expected of a batch's values, and where they violate it, without waiting for a GPU; its targets
+    are not checked. ``patch_size``: must divide height and width, in pixels. ``values``: check every value,
+    too: one NaN in the background leaves no Gaussian. InputError: a shape or a dtype is wrong."""
     _check_shapes(batch, patch_size)
-    findings = _findings_of_cameras(batch) + (_findings_of_values(batch) if values else [])
-    if bool(torch.stack([bad.any() for _, _, bad in findings]).any()):
-        for name, expected, bad in findings:
-            found = f"others at {bad.nonzero().tolist()} (element, view)"
-            require(not bool(bad.any()), f"batch.{name}", expected, found)
+    return _findings_of_cameras(batch) + (_findings_of_values(batch) if values else [])
+
+
+def any_bad(findings: Sequence[Finding]) -> Bool[Tensor, ""]:
+    """Whether anything is violated."""
+    return torch.stack([bad.any() for _, _, bad in findings]).any()
+
+
+def refuse(findings: Sequence[Finding]) -> None:
+    """InputError: names the first field that violates what is expected of it, and where."""
+    for name, expected, bad in findings:
+        found = f"others at {bad.nonzero().tolist()} (element, view)"
+        require(not bool(bad.any()), f"batch.{name}", expected, found)
 
 
 def _check_shapes(batch: Batch, patch_size: int) -> None:
@@ -113,7 +124,10 @@ class ModelOptions(Options):
 
 
 class Surrounding:
-    """A layer around the stages for one batch; ``leave`` may use what ``enter`` found."""
+    """A layer around the stages for one batch; ``leave`` may use what ``enter`` found. ``findings``: what
+    ``enter`` expects of values, to be read later."""
+
+    findings: Sequence[Finding] = ()
 
     def enter(self, batch: Batch) -> Batch:
         """The batch for the inner layers."""
@@ -125,14 +139,14 @@ class Surrounding:
 
 
 class Photographs(Surrounding):
-    """Checked, with masks that are thresholds of soft mattes, if any (:mod:`ghgs_lit.geometry.masks`)."""
+    """To be checked; masks are thresholds of soft mattes, if any."""
 
     def __init__(self, side_multiple: int, checks_values: bool, least_matte: float | None) -> None:
         self.options = side_multiple, checks_values
         self.least_matte = least_matte
 
     def enter(self, batch: Batch) -> Batch:
-        check_batch(batch, *self.options)
+        self.findings = findings_of(batch, *self.options)
         return with_matte(batch, self.least_matte)
 
 
@@ -173,15 +187,3 @@ def surroundings(options: ModelOptions, patch_size: int, checks_values: bool) ->
         *([SubjectFrame()] if options.frame == "subject" else []),
         *([Border(patch_size)] if options.pad == "multiple" else []),
     ]
-
-
-@contextmanager
-def computing(
-    precision: str, auto: AutoSkip | None, encoder: Encoder, masks: Bool[Tensor, "B V H W"]
-) -> Iterator[tuple[tuple[Decision, ...], Bool[Tensor, "B V h w"] | None]]:
-    """Set the precision while the context lasts; gives the choices of ``skip=auto`` and the patches they
-    keep. ``precision``: one of :data:`ghgs_lit.kernels.precision.PRECISIONS`. ``auto``: None: no choices, and
-    the encoder decides about the patches."""
-    decisions, kept = ((), None) if auto is None else auto.decide(encoder, masks)
-    with precision_of(precision, torch.device(masks.device)):
-        yield decisions, kept

@@ -80,8 +80,13 @@ class Cameras(_TensorStruct):
 
     @cached_property
     def has_skew(self) -> bool:
-        """Whether any ``K[0, 1]`` is not 0; the host waits for a GPU at the first use."""
-        return bool((self.intrinsics[..., 0, 1] != 0).any())
+        """Whether any ``K[0, 1]`` is not 0; the host waits for a GPU at the first use, if none read it."""
+        return bool(self.any_skew)
+
+    @property
+    def any_skew(self) -> Bool[Tensor, ""]:
+        """:attr:`has_skew` where the cameras are, without a wait."""
+        return (self.intrinsics[..., 0, 1] != 0).any()
 
     def __getitem__(self, index) -> "Cameras":
         return dataclasses.replace(self, intrinsics=self.intrinsics[index], extrinsics=self.extrinsics[index])
@@ -162,9 +167,14 @@ class Batch(_TensorStruct):
             known[function] = function(self)
         return known[function]
 
+    def note(self, extents: Sequence["Extent"], pixels: Int[Tensor, " n"]) -> None:
+        """Keep what a plan read of the masks as :attr:`extents` and :attr:`pixels`."""
+        self.__dict__.update(extents=list(extents), pixels=pixels)
+
     @cached_property
     def extents(self) -> list["Extent"]:
-        """Extent of the subject in each image ``b * V + v``; the host waits for a GPU at the first use."""
+        """Extent of the subject in each image ``b * V + v``; the host waits for a GPU at the first use, if no
+        plan read it."""
         return extents(self.masks.flatten(0, 1))
 
     @cached_property
@@ -191,10 +201,15 @@ class Extent(NamedTuple):
 
 def extents(masks: Bool[Tensor, "n H W"]) -> list[Extent]:
     """Extent of each mask; the host waits for a GPU once."""
+    return [Extent(*numbers) for numbers in extent_numbers(masks).tolist()]
+
+
+def extent_numbers(masks: Bool[Tensor, "n H W"]) -> Int[Tensor, "n 5"]:
+    """The numbers of each mask's :class:`Extent`."""
     found = [masks.sum((1, 2))]
     for lines in (masks.any(2).to(torch.uint8), masks.any(1).to(torch.uint8)):
         found += [lines.argmax(1), lines.shape[1] - lines.flip(1).argmax(1)]
-    return [Extent(*numbers) for numbers in torch.stack(found, dim=1).tolist()]
+    return torch.stack(found, dim=1)
 
 
 def true_places(mask: Bool[Tensor, "..."], count: int, repeats: bool = False) -> Int[Tensor, " n"]:

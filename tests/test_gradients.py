@@ -23,8 +23,8 @@ from ghgs_lit.geometry.unprojection import subject_tokens
 from ghgs_lit.heads.activations import confidence_of
 from ghgs_lit.heads.depth import BOUNDED, bounded_depth, inverse_linear
 from ghgs_lit.heads.gaussian import FootprintAttributes, release_attributes
-from ghgs_lit.heads.window import Span, Window
 from ghgs_lit.losses import terms
+from ghgs_lit.plan.window import Span, Window
 from ghgs_lit.recalibration import SemanticAttention
 from ghgs_lit.types import DepthBounds, DepthMaps
 from tests.helpers.scenes import make_batch, training_batch

@@ -101,7 +101,7 @@ def test_the_pipeline_matches_the_release(dtype):
         torch.testing.assert_close(
             value.double(), target, atol=bound, rtol=0, msg=lambda m, k=key: f"{k}: {m}"
         )
-    layers = model.recalibration(model.encoder.tokens, prediction.points).latent
+    layers = model.recalibration(model.encoder.tokens, prediction.points, model.plan(batch)).latent
     for layer, index in zip(layers, (4, 11, 17, 23), strict=True):
         target = fixture(name, "mid", dtype)[f"fused_{index}"][0]
         torch.testing.assert_close(layer, target, atol=bounds[f"fused_{index}"], rtol=0)

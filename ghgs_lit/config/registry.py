@@ -84,7 +84,7 @@ KINDS: dict[str, dict[str | None, str]] = {
     },
     "gaussian_head": {"dpt": "ghgs_lit.heads.gaussian.GaussianHeadOptions"},
     "rounds": {"recurrent": "ghgs_lit.rounds.RoundsOptions"},
-    "skip": {None: "ghgs_lit.skipping.SkipOptions"},
+    "skip": {None: "ghgs_lit.plan.presets.SkipOptions"},
     "model": {None: "ghgs_lit.surroundings.ModelOptions"},
     "compat": {None: "ghgs_lit.weights.switches.CompatOptions"},
     "renderer": {"splats": "ghgs_lit.rendering.Renderer"},

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from ghgs_lit.config.options import Count, Options, Side, Text, Width
 from ghgs_lit.encoder.block import REGISTERS, Block, draw_normal_, rotary_tables, run_block
-from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.semantic import PARTS, SemanticOptions
 from ghgs_lit.encoder.vit import ConvStem, PatchEmbed, VisionTransformer
 from ghgs_lit.errors import require
@@ -22,6 +21,8 @@ from ghgs_lit.geometry.masks import (
     relative_bounds,
 )
 from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.plan import Plan, planned
+from ghgs_lit.plan.patches import KeptPatches
 from ghgs_lit.types import DepthBounds, Tokens
 
 #: Fields of each kind of patch embedding.
@@ -212,18 +213,18 @@ class VGGTEncoder(nn.Module):
         images: Float[Tensor, "b v c H W"],
         masks: Bool[Tensor, "..."],
         bounds: DepthBounds | None = None,
-        kept: Bool[Tensor, "b v h w"] | None = None,
+        plan: Plan | None = None,
     ) -> Tokens:
-        """Tokens of the kept patches of all views. ``images``: sides divisible by the patch size. ``masks``:
-        read with ``mask_input``, ``bounds_input`` or ``semantic``, and where ``tokens`` is not ``all``.
-        ``bounds``: read with ``bounds_input``. ``kept``: None: the patches of :meth:`keeps`."""
+        """Tokens of the patches ``plan.kept`` of all views. ``images``: sides divisible by the patch size.
+        ``masks``: read with ``mask_input`` or ``bounds_input``. ``bounds``: read with ``bounds_input``.
+        ``plan``: None: one for the patches of :meth:`keeps`."""
         narrow = images.dtype != torch.float64 or self.aggregator.camera_token.dtype == torch.float64
         require(narrow, "images", "float32 where the weights are no float64", images.dtype)
-        chosen = self.keeps(masks) if kept is None else kept
-        kept = KeptPatches(chosen, images.device)
+        plan = planned(masks, self.patch_size, [self.keeps(masks)]) if plan is None else plan
+        kept = plan.kept
         pairs, patches = self.aggregator(self._normalized(images, masks, bounds), kept)
         latent = tuple(_joined(pairs, kept, self.aggregator.special))
-        semantic = patches.detach() if self.semantic is None else self.semantic(images, masks, chosen)
+        semantic = patches.detach() if self.semantic is None else self.semantic(images, masks, plan)
         places = (kept.image, kept.row, kept.column)
         return Tokens(latent, semantic, *places, kept.grid, self.patch_size)
 

@@ -7,10 +7,11 @@ from torch import Tensor, nn
 
 from ghgs_lit.config.options import Options, Width
 from ghgs_lit.encoder.block import Block, draw_normal_, rotary_tables, run_block
-from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.vit import ConvStem
 from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.plan import Plan
+from ghgs_lit.plan.patches import KeptPatches
 
 NORM_EPS = 1e-5
 #: Body parts that ``ghgs pretext`` distinguishes (``training.pretext.labels``): channels of a feature.
@@ -87,14 +88,9 @@ class SemanticBranch(nn.Module):
         return at_least_float32(self.head(self.norm(kept.take(x, 1)))).log_softmax(1)
 
     def forward(
-        self,
-        images: Float[Tensor, "b v c H W"],
-        masks: Bool[Tensor, "b v H W"],
-        kept: Bool[Tensor, "b v h w"],
+        self, images: Float[Tensor, "b v c H W"], masks: Bool[Tensor, "b v H W"], plan: Plan
     ) -> Float[Tensor, "N p"]:
-        """Features of the patches ``kept``; 0 (cosine 0 with all others) for those without the subject."""
-        every = KeptPatches(kept, images.device)
-        shown = KeptPatches(kept.to(masks.device) & self.subject(masks), images.device)
-        features = features_of(self.log_shares(images, masks, shown))
-        places = torch.searchsorted(every.index, shown.index)
-        return features.new_zeros(len(every.index), self.parts).index_copy(0, places, features)
+        """Features of the patches ``plan.kept``; 0 (cosine 0 with all others) where no subject is shown."""
+        features = features_of(self.log_shares(images, masks, plan.shown_patches))
+        places = torch.searchsorted(plan.kept.index, plan.shown_patches.index)
+        return features.new_zeros(len(plan.kept.index), self.parts).index_copy(0, places, features)

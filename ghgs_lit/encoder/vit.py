@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.encoder.block import REGISTERS, Block, draw_normal_, run_block
-from ghgs_lit.encoder.packing import KeptPatches
+from ghgs_lit.plan.patches import KeptPatches
 
 
 class PatchEmbed(nn.Module):

@@ -2,14 +2,14 @@
 again, so that results are in the photograph's own pixels."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch.nn.functional as F
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 from torch import Tensor
 
-from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Prediction, map_tensors
+from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Extent, Gaussians, Prediction, map_tensors
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,22 @@ class Padding:
         return map_tensors(maps, self.cut)
 
     def _cut_gaussians(self, gaussians: Gaussians) -> Gaussians:
-        row, column = gaussians.pixel // self.width + self.top, gaussians.pixel % self.width + self.left
-        return dataclasses.replace(gaussians, pixel=row * self.full[1] + column)
+        return dataclasses.replace(gaussians, pixel=self._cut_pixel(gaussians.pixel))
+
+    def _cut_pixel(self, pixel: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
+        """Indices of pixels of an image in that of its photograph."""
+        row, column = pixel // self.width + self.top, pixel % self.width + self.left
+        return row * self.full[1] + column
+
+    def cut_pixels(self, pixels: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
+        """Indices of pixels among those of all images, among those of all photographs."""
+        image, pixel = pixels // (self.height * self.width), pixels % (self.height * self.width)
+        return image * (self.full[0] * self.full[1]) + self._cut_pixel(pixel)
+
+    def cut_extent(self, extent: Extent) -> Extent:
+        """The extent of a mask without its border."""
+        count, top, bottom, left, right = extent
+        return Extent(count, top + self.top, bottom + self.top, left + self.left, right + self.left)
 
     def _sides(self, maps: Tensor) -> list[int]:
         """Widths of the border in the order of ``F.pad``: last axis first, before and after."""
@@ -77,6 +91,11 @@ class PaddedBatch(Batch):
 
     photographs: Batch | None = None
     padding: Padding | None = None
+
+    def note(self, extents: Sequence[Extent], pixels: Int[Tensor, " n"]) -> None:
+        """Keep them for the photographs, too, in their own pixels."""
+        super().note(extents, pixels)
+        self.photographs.note([self.padding.cut_extent(e) for e in extents], self.padding.cut_pixels(pixels))
 
 
 def bounds_of(stage: Callable[[Batch], DepthBounds | None], batch: Batch) -> DepthBounds | None:

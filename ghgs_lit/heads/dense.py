@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ghgs_lit.heads.dpt import DPTHead
 from ghgs_lit.heads.guide import Guide
-from ghgs_lit.heads.window import Span, Window
 from ghgs_lit.kernels.pool import even_parts
+from ghgs_lit.plan.window import Span, Window
 from ghgs_lit.types import Tokens
 
 #: Values of the largest map in memory at once without a gradient (32 MB in float32).

@@ -10,15 +10,15 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from ghgs_lit.config.options import Options
-from ghgs_lit.geometry.masks import BOUNDS_CHANNELS, patches_around_subject, relative_bounds
+from ghgs_lit.geometry.masks import BOUNDS_CHANNELS, relative_bounds
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.heads.activations import bounded_sigmoid, confidence_of
 from ghgs_lit.heads.dense import Part, decode
 from ghgs_lit.heads.dpt import DPTHead
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, photo_guide
-from ghgs_lit.heads.window import subject_windows
-from ghgs_lit.types import Batch, DecodedPixels, DepthBounds, DepthMaps, Tokens
+from ghgs_lit.plan import Plan
+from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Tokens
 
 
 def _bounded_inverse(fraction: Tensor, near: Tensor, far: Tensor) -> Tensor:
@@ -100,27 +100,18 @@ class DepthHead(nn.Module):
         """Whether depths lie between bounds, which :meth:`forward` then needs."""
         return self.options.is_bounded
 
-    def forward(
-        self, tokens: Tokens, batch: Batch, bounds: DepthBounds | None, pixels: DecodedPixels = "all"
-    ) -> DepthMaps:
+    def forward(self, tokens: Tokens, batch: Batch, bounds: DepthBounds | None, plan: Plan) -> DepthMaps:
         """Depths of all pixels; those of the subject are valid if they are finite. ``batch``: images, masks
-        and cameras are read. ``bounds``: None if :attr:`is_bounded` is false. ``pixels``: with ``subject``
-        only windows around the subject are decoded, and other depths have no meaning."""
+        and cameras are read. ``bounds``: None if :attr:`is_bounded` is false. ``plan``: only its
+        ``depth_windows`` are decoded, and other depths have no meaning."""
         guide = None
         if self.dpt.guide is not None:
             maps = [] if bounds is None else [relative_bounds(bounds, batch.masks)]
             if self.options.consistency_depths:
                 maps.append(photo_consistency(batch, bounds, self.options.consistency_depths))
             guide = photo_guide(batch, *maps)
-        wanted = windows = None
-        if pixels == "subject":
-            # Whole patches: the token points of the release depend on pixels beside the mask.
-            p, size = tokens.patch_size, tuple(batch.masks.shape[2:])
-            patches = patches_around_subject(batch.masks, p, 0)
-            wanted = patches.repeat_interleave(p, -2).repeat_interleave(p, -1)
-            windows = [
-                window and window.coarser(p).finer(p, size) for window in subject_windows(batch.extents, size)
-            ]
+        windows, p = plan.depth_windows, plan.patch_size
+        wanted = None if windows is None else plan.shown.repeat_interleave(p, -2).repeat_interleave(p, -1)
         value, confidence = _whole(decode(self.dpt, tokens, guide, windows), batch, wanted)
         if self.is_bounded:
             depth = bounded_depth(value + self.start, bounds.near, bounds.far, self.options.parameterization)

@@ -24,19 +24,18 @@ from ghgs_lit.heads.dense import Part, decode
 from ghgs_lit.heads.dpt import DPTHead
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, Guide, photo_guide
 from ghgs_lit.heads.surface import surface_axes
-from ghgs_lit.heads.window import subject_windows
 from ghgs_lit.kernels.linear import Linear
 from ghgs_lit.kernels.pool import multiplies
 from ghgs_lit.kernels.precision import exact, without_float16
+from ghgs_lit.plan import Plan
+from ghgs_lit.plan.rows import Rows
 from ghgs_lit.types import (
     Batch,
-    DecodedPixels,
     DepthBounds,
     DepthMaps,
     Gaussians,
     Points,
     Tokens,
-    true_places,
 )
 
 Attributes = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -277,22 +276,21 @@ class GaussianHead(nn.Module):
         batch: Batch,
         points: Points,
         depth_maps: DepthMaps,
-        pixels: DecodedPixels = "subject",
+        plan: Plan,
     ) -> RawGaussians:
-        """Raw attributes of the valid pixels in the order of element, view, row, column. ``batch``: images,
-        masks and cameras are read. ``pixels``: ``subject`` computes windows around the subject and its
-        pixels, ``all`` computes every pixel and selects afterwards; the result is the same."""
+        """Raw attributes of the subject's pixels with a valid point, in the order of element, view, row,
+        column. ``batch``: images, masks and cameras are read. ``plan``: its ``windows`` and the subject's
+        pixels are computed; with ``pixels="all"`` every pixel, to select afterwards: the result is the
+        same."""
         views, height, width = points.valid.shape[1:]
-        counts = points.valid.flatten(0, 1).sum((1, 2)).tolist()
-        index = true_places(points.valid, sum(counts))
-        image, pixel = index // (height * width), index % (height * width)
-        windows = None if pixels == "all" else subject_windows(batch.extents, (height, width))
-        parts = decode(self.decoder, tokens, self._guide(batch, points, depth_maps), windows)
-        of_part = self._of_subject if pixels == "subject" else self._of_all
-        raw = zip(*(of_part(part, image, pixel, counts) for part in parts), strict=True)
+        rows = plan.subject.only(points.valid)
+        image, pixel = rows.index // (height * width), rows.index % (height * width)
+        parts = decode(self.decoder, tokens, self._guide(batch, points, depth_maps), plan.windows)
+        of_part = self._of_subject if plan.pixels == "subject" else self._of_all
+        raw = zip(*(of_part(part, image, pixel, rows) for part in parts), strict=True)
         values = [torch.cat(values) for values in raw]
-        splits = tuple(sum(counts[first : first + views]) for first in range(0, len(counts), views))
-        return RawGaussians(*values[:5], values[5] if len(values) > 5 else None, image, pixel, splits)
+        color = values[5] if len(values) > 5 else None
+        return RawGaussians(*values[:5], color, image, pixel, rows.splits(views))
 
     def activate(self, raw: RawGaussians, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
         """Gaussians from raw attributes, at the points of their pixels."""
@@ -342,20 +340,20 @@ class GaussianHead(nn.Module):
         return photo_guide(batch, *maps)
 
     def _of_subject(
-        self, part: Part, image: Int[Tensor, " N"], pixel: Int[Tensor, " N"], counts: Sequence[int]
+        self, part: Part, image: Int[Tensor, " N"], pixel: Int[Tensor, " N"], rows: Rows
     ) -> Sequence[Tensor]:
-        """Descriptors and raw values (:meth:`_raw`) of the pixels in a part; ``counts``: pixels per image."""
-        row, column, within = _in_part(part, pixel, counts)
+        """Descriptors and raw values (:meth:`_raw`) of the pixels in a part, some of ``rows``."""
+        row, column, within = _in_part(part, pixel, rows)
         chosen = part.maps.permute(0, 2, 3, 1)[image[within] - part.images.start, row, column]
         return chosen, *self._raw(chosen)
 
     def _of_all(
-        self, part: Part, image: Int[Tensor, " N"], pixel: Int[Tensor, " N"], counts: Sequence[int]
+        self, part: Part, image: Int[Tensor, " N"], pixel: Int[Tensor, " N"], rows: Rows
     ) -> Sequence[Tensor]:
         """:meth:`_of_subject`, but computed for every pixel of the part."""
-        row, column, _ = _in_part(part, pixel, counts)
+        row, column, _ = _in_part(part, pixel, rows)
         # One image at a time, to save memory: hidden layers are wider than the maps.
-        of_images = zip(*(values.split(counts[part.images]) for values in (row, column)), strict=True)
+        of_images = zip(*(values.split(rows.counts[part.images]) for values in (row, column)), strict=True)
         each = [
             [values[index] for values in (maps, *self._raw(maps))]
             for maps, index in zip(part.maps.permute(0, 2, 3, 1), of_images, strict=True)
@@ -376,9 +374,9 @@ class GaussianHead(nn.Module):
 
 
 def _in_part(
-    part: Part, pixel: Int[Tensor, " N"], counts: Sequence[int]
+    part: Part, pixel: Int[Tensor, " N"], rows: Rows
 ) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"], slice]:
     """Rows and columns in a part's maps of the pixels that lie in it, and the slice of these pixels."""
-    within = slice(sum(counts[: part.images.start]), sum(counts[: part.images.stop]))
+    within = rows.within(part.images)
     (top, _, _), (left, _, width) = part.window
     return pixel[within] // width - top, pixel[within] % width - left, within

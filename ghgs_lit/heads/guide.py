@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from ghgs_lit.geometry.masks import coverage
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.heads.window import Window
+from ghgs_lit.plan.window import Window
 from ghgs_lit.types import Batch
 
 #: Channels of :func:`photo_guide` without further maps.

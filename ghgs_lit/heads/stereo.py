@@ -20,7 +20,8 @@ from ghgs_lit.heads.activations import bounded_sigmoid
 from ghgs_lit.heads.depth import BOUNDED, finite_maps
 from ghgs_lit.heads.dpt import ResidualUnit
 from ghgs_lit.kernels.precision import exact, without_float16
-from ghgs_lit.types import Batch, Cameras, DecodedPixels, DepthBounds, DepthMaps, Tokens, true_places
+from ghgs_lit.plan import Plan
+from ghgs_lit.types import Batch, Cameras, DepthBounds, DepthMaps, Tokens, true_places
 
 #: Side of a cell in pixels, and channels of its features and of the GRU's memory.
 CELL, CHANNELS = 4, 32
@@ -66,10 +67,10 @@ class StereoHead(nn.Module):
         self.weights = _two_layers(CHANNELS, 9 * CELL**2)
 
     def forward(
-        self, tokens: Tokens, batch: Batch, bounds: DepthBounds, pixels: DecodedPixels = "all"
+        self, tokens: Tokens, batch: Batch, bounds: DepthBounds, plan: Plan | None = None
     ) -> DepthMaps:
         """Depths of all pixels between the nearest and the farthest bound of their view; those of the subject
-        are valid. ``batch``: images, masks and cameras are read. ``tokens`` and ``pixels`` are not read."""
+        are valid. ``batch``: images, masks and cameras are read. ``tokens`` and ``plan`` are not read."""
         height, width = batch.masks.shape[2:]
         near, far = subject_range(bounds, batch)
         with without_float16(batch.masks.device.type):

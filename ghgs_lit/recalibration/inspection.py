@@ -108,7 +108,7 @@ def seen_calls(recalibration: nn.Module | None) -> Iterator[list[Call]]:
     if not isinstance(recalibration, Recalibration):
         yield found
         return
-    hook = recalibration.register_forward_pre_hook(lambda stage, inputs: found.append((stage, *inputs)))
+    hook = recalibration.register_forward_pre_hook(lambda stage, inputs: found.append((stage, *inputs[:2])))
     try:
         yield found
     finally:

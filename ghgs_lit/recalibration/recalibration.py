@@ -15,9 +15,10 @@ from ghgs_lit.geometry.rotations import unit
 from ghgs_lit.kernels.linear import linear
 from ghgs_lit.kernels.pool import at_once, even_parts
 from ghgs_lit.kernels.precision import exact
+from ghgs_lit.plan import Plan
 from ghgs_lit.recalibration.attention import SemanticAttention, Similarity
 from ghgs_lit.recalibration.neighbors import nearest_neighbors
-from ghgs_lit.types import DecodedPixels, Points, Tokens, true_places
+from ghgs_lit.types import DecodedPixels, Points, Tokens
 
 #: Cosines in memory at once, on a CPU and on a GPU.
 _COSINES, _GPU_COSINES = 1 << 21, 1 << 25
@@ -54,13 +55,12 @@ class Recalibration(nn.Module):
         self.k, self.neighborhood, self.tokens = options.k, options.neighborhood, options.tokens
         self.block = SemanticAttention(dim_latent, options.num_heads, options.similarity)
 
-    def forward(self, tokens: Tokens, points: Points) -> Tokens:
-        """Tokens with recalibrated layers; semantic features and order are unchanged."""
-        batch_size, views = tokens.grid[:2]
-        takes_part = self.takes_part(points)
-        elements = torch.arange(batch_size, device=takes_part.device)[:, None]
-        counts = ((tokens.image // views == elements) & takes_part).sum(1).tolist()
-        chosen = true_places(takes_part, sum(counts))
+    def forward(self, tokens: Tokens, points: Points, plan: Plan) -> Tokens:
+        """Tokens with recalibrated layers; semantic features and order are unchanged. ``plan``: its ``peers``
+        take part if their points are valid, or if all tokens do."""
+        batch_size, takes_part = tokens.grid[0], self.takes_part(points)
+        rows = plan.peers.only(takes_part)
+        counts, chosen = rows.counts, rows.index
 
         def part(values: Tensor) -> Tensor:
             return values if len(chosen) == len(values) else values[chosen]
@@ -141,5 +141,5 @@ class NoRecalibration(nn.Module):
 
     tokens: DecodedPixels = "subject"
 
-    def forward(self, tokens: Tokens, points: Points) -> Tokens:
+    def forward(self, tokens: Tokens, points: Points, plan: Plan) -> Tokens:
         return tokens

@@ -16,7 +16,7 @@ from ghgs_lit.losses import Losses
 from ghgs_lit.metrics import depth_error_mm, surface_error_mm
 from ghgs_lit.metrics.functional import box_of, psnr, ssim
 from ghgs_lit.model import GHGS
-from ghgs_lit.skipping import View, seeing
+from ghgs_lit.plan.presets import View, seeing
 from ghgs_lit.training.base import BudgetedModule, image_mean
 from ghgs_lit.training.guard import Guard, Step
 from ghgs_lit.training.optimization import Optimization

@@ -59,7 +59,7 @@ class Pictures(Callback):
             self._hook = stage.register_forward_pre_hook(self._see)
 
     def _see(self, stage: Recalibration, inputs: tuple) -> None:
-        self._seen = (stage, *inputs)
+        self._seen = (stage, *inputs[:2])
 
     @rank_zero_only
     def on_validation_batch_end(

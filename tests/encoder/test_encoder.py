@@ -9,8 +9,8 @@ from omegaconf import OmegaConf
 
 from ghgs_lit.encoder import VGGTEncoder
 from ghgs_lit.encoder.block import rotary_tables, rotate
-from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.errors import InputError
+from ghgs_lit.plan.patches import KeptPatches
 from tests.helpers.configs import composed
 from tests.helpers.encoders import make_encoder
 

@@ -6,8 +6,9 @@ import torch.nn.functional as F
 
 from ghgs_lit.encoder import VGGTEncoder
 from ghgs_lit.encoder.block import rotary_tables, rotate
-from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.geometry.masks import patches_around_subject, patches_in_window
+from ghgs_lit.plan import planned
+from ghgs_lit.plan.patches import KeptPatches
 from tests.helpers.encoders import make_encoder
 
 PATCH, ROWS, COLUMNS = 14, 5, 7
@@ -164,7 +165,7 @@ def test_kept_patches_that_are_given_take_part():
     """``skip=auto`` gives each subject patches of its own: the encoder's choice must not act."""
     encoder, (images, masks) = _encoder(VITS[2]), _people()
     kept = torch.stack((patches_in_window(masks, PATCH, 0)[0], patches_around_subject(masks, PATCH, 1)[1]))
-    found = encoder(images, masks, kept=kept)
+    found = encoder(images, masks, plan=planned(masks, PATCH, [kept]))
     for b, tokens in enumerate(("window", "subject")):
         own = slice(b, b + 1)
         expected = _encoder(VITS[2], tokens=tokens, margin=b)(images[own], masks[own])

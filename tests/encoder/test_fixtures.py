@@ -13,9 +13,9 @@ import torch
 from safetensors.torch import load_file
 
 from ghgs_lit.encoder.block import REGISTERS, rotary_tables, rotate
-from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.vit import VisionTransformer
 from ghgs_lit.heads.dpt import DPTHead, add_positions_
+from ghgs_lit.plan.patches import KeptPatches
 from ghgs_lit.types import Tokens
 from tests.helpers.activations import split_activated
 from tests.helpers.encoders import make_encoder

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.vit import ConvStem
+from ghgs_lit.plan.patches import KeptPatches
 
 GRID = (2, 2, 9, 11)
 PLACES = [[(0, 0, 4, 5)], [(0, 0, 3, 4), (1, 1, 5, 2)], [(0, 1, 0, 10), (1, 0, 8, 0)]]

@@ -9,12 +9,12 @@ import torch.nn.functional as F
 import ghgs_lit.kernels.linear
 from ghgs_lit.encoder import cpu
 from ghgs_lit.encoder.block import Block, rotary_tables
-from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.errors import InputError
 from ghgs_lit.kernels.compile import processor_features
 from ghgs_lit.kernels.linear import linear
 from ghgs_lit.kernels.pool import even_parts
 from ghgs_lit.kernels.precision import has_bfloat16, precision_of
+from ghgs_lit.plan.patches import KeptPatches
 from tests.helpers.encoders import make_encoder
 from tests.helpers.models import ATTRIBUTES, make_model
 from tests.helpers.scenes import make_batch

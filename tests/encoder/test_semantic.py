@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from ghgs_lit.encoder import VGGTEncoder
-from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.masks import patches_around_subject
+from ghgs_lit.plan.patches import KeptPatches
 from ghgs_lit.training import Optimization
 from tests.helpers.encoders import make_encoder
 

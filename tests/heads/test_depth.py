@@ -10,6 +10,7 @@ from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.heads.depth import BOUNDED, DepthHead, DepthHeadOptions, inverse_linear
 from ghgs_lit.heads.dpt import DPTHead
 from ghgs_lit.types import Cameras, Tokens
+from tests.helpers.plans import plan_of
 from tests.helpers.scenes import fixture, make_batch, ring
 
 PATCH = 14
@@ -27,7 +28,9 @@ def make_tokens(batch, dim=64, seed=0):
 
 
 def predict(head, batch, bounds=None):
-    return head(make_tokens(batch), batch, (bounds or SubjectBox())(batch))
+    return head(
+        make_tokens(batch), batch, (bounds or SubjectBox())(batch), plan_of(batch.masks, pixels="all")
+    )
 
 
 def make_head(**options):
@@ -96,9 +99,10 @@ def test_depth_is_wide_under_autocast():
     batch = make_batch()
     head, tokens, bounds = make_head(), make_tokens(batch), VisualHull()(batch)
     torch.nn.init.normal_(head.dpt.scratch.output_conv2[-1].weight)
-    expected = head(tokens, batch, bounds)
+    plan = plan_of(batch.masks, pixels="all")
+    expected = head(tokens, batch, bounds, plan)
     with torch.autocast("cpu", torch.bfloat16):
-        found = head(tokens, batch, bounds)
+        found = head(tokens, batch, bounds, plan)
         points = Unprojection()(expected, tokens, batch)
     assert found.depth.dtype == found.bounds.near.dtype == points.pixels.dtype == torch.float32
     assert torch.equal(found.bounds.near, expected.bounds.near)

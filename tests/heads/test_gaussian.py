@@ -14,6 +14,7 @@ from ghgs_lit.heads.gaussian import GaussianHead, GaussianHeadOptions
 from ghgs_lit.heads.surface import surface_axes
 from ghgs_lit.types import DepthMaps
 from tests.heads.test_depth import make_tokens
+from tests.helpers.plans import plan_of
 from tests.helpers.scenes import CASES, CENTER, RADII, fixture, make_batch
 
 HEADERS = ("offset_header", "scale_header", "rot_header", "opacity_header")
@@ -28,7 +29,8 @@ def run(head, batch, masks=None, pixels="subject"):
     maps = DepthMaps(batch.depths, batch.masks if masks is None else masks, batch.depths)
     tokens = make_tokens(batch)
     points = Unprojection()(maps, tokens, batch)
-    return head.activate(head(tokens, batch, points, maps, pixels), batch, points, maps)
+    plan = plan_of(batch.masks, pixels=pixels)
+    return head.activate(head(tokens, batch, points, maps, plan), batch, points, maps)
 
 
 def shake(head, scale=1.0):
@@ -92,7 +94,7 @@ def test_offsets_and_rotations_are_along_the_axes_of_the_surface():
     maps = DepthMaps(batch.depths, batch.masks, batch.depths)
     points = Unprojection()(maps, make_tokens(batch), batch)
     head = make_head(axes="surface", attributes={"scale_start": 0.5, "thickness_start": 0.2})
-    raw = head(make_tokens(batch), batch, points, maps)
+    raw = head(make_tokens(batch), batch, points, maps, plan_of(batch.masks))
     n = len(raw.image)
     some = {"offset": (0.3, -0.2, 0.1), "rotation": (0.0, 0.4, 0.1, -0.2)}
     some = {name: torch.tensor(value).expand(n, -1) for name, value in some.items()}

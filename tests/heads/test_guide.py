@@ -9,9 +9,10 @@ from ghgs_lit.bounds import VisualHull
 from ghgs_lit.encoder import VGGTOptions
 from ghgs_lit.geometry.masks import UNIT, relative_bounds, relative_depth
 from ghgs_lit.heads.guide import GuidePyramid, photo_guide
-from ghgs_lit.heads.window import Window
+from ghgs_lit.plan.window import Window
 from ghgs_lit.types import DepthBounds
 from tests.heads.test_depth import make_head
+from tests.helpers.plans import plan_of
 from tests.helpers.scenes import make_batch
 
 
@@ -73,7 +74,9 @@ def test_depth_follows_the_guide():
         head = make_head(guide=guided)
         torch.nn.init.normal_(head.dpt.scratch.output_conv2[-1].weight)
         bounds = VisualHull()(batch)
-        same = torch.equal(head(tokens, batch, bounds).depth, head(tokens, other, bounds).depth)
+        plan = plan_of(batch.masks, pixels="all")
+        found, changed = (head(tokens, each, bounds, plan).depth for each in (batch, other))
+        same = torch.equal(found, changed)
         assert same == (not guided)
 
 

@@ -5,6 +5,7 @@ import torch
 
 from ghgs_lit.recalibration import RecalibrationOptions
 from ghgs_lit.types import Points, Tokens
+from tests.helpers.plans import with_plan
 
 
 def literal_neighbors(points, i, k):
@@ -40,4 +41,4 @@ def scene(counts=((4, 5, 3), (6, 2, 5)), dim=32, grid=(4, 4), seed=0, dtype=torc
 
 def make_stage(dim=32, k=4, num_heads=2, **options):
     torch.manual_seed(2)
-    return RecalibrationOptions(k=k, num_heads=num_heads, **options).build(dim)
+    return with_plan(RecalibrationOptions(k=k, num_heads=num_heads, **options).build(dim))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.masks import patches_around_subject
+from ghgs_lit.plan.patches import KeptPatches
 from ghgs_lit.synthesis.people.body import BODY_VERTICES, load_body
 from ghgs_lit.training.pretext.labels import PARTS, part_shares, parts_of_points, vertex_parts
 from ghgs_lit.training.validation_pictures import PicturesOptions

@@ -1,60 +1,85 @@
 """Sequences of different lengths packed into one tensor: views keep different numbers of patches. Only the
 attention of a block mixes tokens, so views need no padding."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghgs_lit.types import true_places
+from ghgs_lit.types import Extent, extents, true_places
 
 
 class KeptPatches:
     """The kept patches of a batch, and their places among packed tokens. Packed tokens [T, C] are the
     sequences of all images, one after another: the special tokens of an image (class, camera or registers),
-    then its kept patches, row by row. ``kept``: on any device. ``device``: that of the tokens."""
+    then its kept patches, row by row.
 
-    def __init__(self, kept: Bool[Tensor, "b v h w"], device: torch.device):
-        _, _, height, width = self.grid = tuple(kept.shape)
-        self._kept = kept.cpu()  # lengths and box are needed as Python numbers
-        self._counts = self._kept.flatten(2).sum(-1)
-        total = int(self._counts.sum())
-        is_whole = total == kept.numel()
-        self.index = torch.arange(total, device=device) if is_whole else true_places(kept.to(device), total)
+    Args:
+        kept: on any device.
+        device: that of the tokens.
+        known: the extent of the kept patches of each image; None: it is read from ``kept``."""
+
+    def __init__(
+        self,
+        kept: Bool[Tensor, "b v h w"],
+        device: torch.device,
+        known: Sequence[Extent] | None = None,
+    ):
+        _, views, height, width = self.grid = tuple(kept.shape)
+        self._extents = extents(kept.flatten(0, 1)) if known is None else known
+        counts = [extent.count for extent in self._extents]
+        self._counts = [counts[first : first + views] for first in range(0, len(counts), views)]
+        self.is_whole = sum(counts) == kept.numel()
+        if self.is_whole:
+            self.index = torch.arange(kept.numel(), device=device)
+        else:
+            self.index = true_places(kept.to(device), sum(counts))
         self.image = self.index // (height * width)
         self.row = self.index // width % height
         self.column = self.index % width
+        self._packed: dict[int, Int[Tensor, " N"]] = {}
 
     def lengths(self, special: int) -> list[int]:
         """Number of tokens of each image, with ``special`` special ones."""
-        return (self._counts + special).flatten().tolist()
+        return [count + special for element in self._counts for count in element]
 
     def element_lengths(self, special: int) -> list[int]:
         """Number of tokens of each batch element, with ``special`` special ones in each view."""
-        return (self._counts + special).sum(1).tolist()
+        return [sum(element) + len(element) * special for element in self._counts]
 
     def box(self, margin: int) -> tuple[slice, slice]:
         """Rows and columns of the patches that are kept in any image, with a margin; at least one patch."""
-        anywhere = self._kept.flatten(0, 1).any(0)
-        return _around(anywhere.any(1), margin), _around(anywhere.any(0), margin)
+        filled = [extent for extent in self._extents if extent.count] or [Extent(1, 0, 1, 0, 1)]
+        rows = min(e.top for e in filled), max(e.bottom for e in filled)
+        columns = min(e.left for e in filled), max(e.right for e in filled)
+        sides = zip((rows, columns), self.grid[2:], strict=True)
+        return tuple(slice(max(a - margin, 0), min(b + margin, side)) for (a, b), side in sides)
 
     def select(self, patches: Float[Tensor, "n p c"]) -> Float[Tensor, "N c"]:
         """The kept ones of the tokens of all patches."""
         flat = patches.flatten(0, 1)
-        return flat if len(flat) == len(self.index) else flat[self.index]
+        return flat if self.is_whole else flat[self.index]
 
     def join(self, special: Tensor, patches: Tensor) -> Tensor:
         """Packed tokens [B * V * s + N, C] of special [B * V, s, C] and patch tokens, in the wider dtype."""
         images, count, width = special.shape
+        dtype = torch.promote_types(special.dtype, patches.dtype)
+        if self.is_whole:
+            parts = (special.to(dtype), patches.to(dtype).reshape(images, -1, width))
+            return torch.cat(parts, dim=1).flatten(0, 1)
         number = torch.arange(images, device=patches.device)
         before = number * count + torch.searchsorted(self.image, number)
         places = before[:, None] + torch.arange(count, device=patches.device)
-        dtype = torch.promote_types(special.dtype, patches.dtype)
         packed = patches.new_empty(images * count + len(patches), width, dtype=dtype)
         packed.index_copy_(0, places.flatten(), special.flatten(0, 1).to(dtype))
         return packed.index_copy_(0, self._places(count), patches.to(dtype))
 
     def take(self, packed: Float[Tensor, "t c"], special: int) -> Float[Tensor, "N c"]:
         """The patch tokens of packed tokens with ``special`` special ones in each image."""
+        if self.is_whole:
+            images = self.grid[0] * self.grid[1]
+            return packed.unflatten(0, (images, -1))[:, special:].flatten(0, 1)
         return packed[self._places(special)]
 
     def positions(self, special: int) -> Int[Tensor, "t 2"]:
@@ -65,10 +90,8 @@ class KeptPatches:
         return self.join(at_patches.new_zeros(b * v, special, 2), at_patches)
 
     def _places(self, special: int) -> Int[Tensor, " N"]:
-        return torch.arange(len(self.index), device=self.index.device) + (self.image + 1) * special
-
-
-def _around(line: Bool[Tensor, " n"], margin: int) -> slice:
-    """From the first to the last True with a margin inside the line; the first place if there is none."""
-    places = line.nonzero()[:, 0].tolist() or [0]
-    return slice(max(places[0] - margin, 0), min(places[-1] + 1 + margin, len(line)))
+        """Places of the patch tokens among packed ones, found once for each number of special tokens."""
+        if special not in self._packed:
+            numbers = torch.arange(len(self.index), device=self.index.device)
+            self._packed[special] = numbers + (self.image + 1) * special
+        return self._packed[special]

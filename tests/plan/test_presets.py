@@ -8,7 +8,7 @@ import torch
 from ghgs_lit.diagnostics.benchmark.stages import FlopsProbe
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
-from ghgs_lit.skipping import SkipOptions, encoder_products
+from ghgs_lit.plan.presets import SkipOptions, encoder_products
 from ghgs_lit.weights.checkpoint import load_weights, write_checkpoint
 from tests.helpers.models import close, config, make_model
 from tests.helpers.scenes import hard_subjects, make_batch, stack
@@ -34,7 +34,7 @@ def test_the_cost_is_what_the_blocks_compute(skip):
             module.register_forward_hook(lambda *_, n=name: probe.end(n))
         model(batch)
     counted = probe.flops["all"] - probe.flops["patches"]
-    products = encoder_products(model.encoder, model.encoder.keeps(batch.masks))
+    products = encoder_products(model.encoder, model.encoder.keeps(batch.masks).flatten(2).sum(-1))
     expected = len(aggregator.global_blocks) * products.sum().item()
     assert counted == pytest.approx(expected, rel=1e-9)
 
@@ -61,8 +61,9 @@ def test_each_subject_gets_the_cheapest_preset_and_it_is_what_runs():
 )
 def test_budget_and_margin_count(said, expected):
     """A preset beyond the budget must not run, and the line says why not."""
-    model, masks = make_model("skip=auto", *said), stack(people()).masks
-    decisions, kept = model.auto.decide(model.encoder, masks)
+    model, batch = make_model("skip=auto", *said), stack(people())
+    plan, masks = model.plan(batch), batch.masks
+    decisions, kept = plan.decisions, plan.kept
     assert tuple(decision.preset for decision in decisions) == expected
     line = model.auto.report(decisions)
     assert "\n" not in line
@@ -73,8 +74,10 @@ def test_budget_and_margin_count(said, expected):
     assert (note in line) == bool(unsure)
     for b, name in enumerate(expected):
         own = make_model(f"skip={name}", *(key for key in said if key == "skip.margin=0")).encoder
-        assert torch.equal(kept[b], own.keeps(masks)[b])
-        products = [encoder_products(own, patches[b : b + 1]).item() for patches in (kept, kept | True)]
+        assert torch.equal(kept.row[kept.image // 3 == b], own.keeps(masks)[b].nonzero()[:, 1])
+        every = torch.full((1, 3), 36)
+        counts = own.keeps(masks)[b : b + 1].flatten(2).sum(-1)
+        products = [encoder_products(own, each).item() for each in (counts, every)]
         assert decisions[b].products == pytest.approx(products[0] / products[1])
 
 
@@ -96,7 +99,7 @@ def test_presets_that_the_training_did_not_show_are_left_out(tmp_path, trained, 
     model = GHGS.from_config(config("skip=auto"))
     load_weights(model, path)
     assert list(model.auto.presets) == left
-    decisions, _ = model.auto.decide(model.encoder, people()[2].masks)
+    decisions = model.plan(people()[2]).decisions
     assert {decision.preset for decision in decisions} == {"fast" if "fast" in left else "exact"}
     assert model.auto.report(decisions).count("not shown in training") == 3 - len(left)
 

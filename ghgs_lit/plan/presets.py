@@ -7,7 +7,7 @@ from statistics import fmean
 from typing import Any, Literal, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from pydantic import model_validator
 from torch import Tensor
 
@@ -144,20 +144,23 @@ class AutoSkip:
         unknown = {name: "not shown in training" for name in self.presets if name not in known}
         return replace(self, presets=known, left_out={**unknown, **self.left_out})
 
-    def decide(
-        self, encoder: Any, masks: Bool[Tensor, "B V H W"]
-    ) -> tuple[tuple[Decision, ...], Bool[Tensor, "B V h w"]]:
-        """The preset of each element, by its masks alone (among equals the most accurate), and the patches
-        that it keeps, on the CPU. ``masks``: sides are divisible by the patch size."""
-        choices = []
+    def choices(self, encoder: Any, masks: Bool[Tensor, "B V H W"]) -> list[Bool[Tensor, "B V h w"]]:
+        """The patches that each preset keeps. ``masks``: sides are divisible by the patch size."""
+        found = []
         for preset in self.presets.values():
             with seeing(encoder, preset.view):
-                choices.append(encoder.keeps(masks).cpu())
-        table = torch.stack([encoder_products(encoder, kept) for kept in choices], dim=-1)
-        best = [min(range(len(choices)), key=row.__getitem__) for row in table.tolist()]
-        kept = torch.stack([choices[k][element] for element, k in enumerate(best)])
+                found.append(encoder.keeps(masks))
+        return found
+
+    def choose(
+        self, encoder: Any, counts: Sequence[Int[Tensor, "B V"]]
+    ) -> tuple[tuple[Decision, ...], list[int]]:
+        """The preset of each element, by its masks alone (among equals the most accurate), and its number.
+        ``counts``: numbers of patches that each preset keeps, on the CPU."""
+        table = torch.stack([encoder_products(encoder, kept) for kept in counts], dim=-1)
+        best = [min(range(len(counts)), key=row.__getitem__) for row in table.tolist()]
         names, shares = list(self.presets), (table / table[:, :1]).tolist()
-        return tuple(Decision(names[k], share[k]) for k, share in zip(best, shares, strict=True)), kept
+        return tuple(Decision(names[k], share[k]) for k, share in zip(best, shares, strict=True)), best
 
     def report(self, decisions: Sequence[Decision]) -> str:
         """One line that says which presets the subjects got, and why."""
@@ -177,11 +180,11 @@ class AutoSkip:
         return f"skip=auto: {', '.join(parts)}, {why} (100% is {next(iter(self.presets))}){left_out}"
 
 
-def encoder_products(encoder: Any, kept: Bool[Tensor, "B V h w"]) -> Float[Tensor, " B"]:
-    """FLOPs of a frame block and a global block for each element, with the patches that are kept. The linear
+def encoder_products(encoder: Any, kept: Int[Tensor, "B V"]) -> Float[Tensor, " B"]:
+    """FLOPs of a frame block and a global block for each element, for numbers of kept patches. The linear
     layers of a block take 24 n C^2 (6 for queries, keys and values, 2 for the projection of the attention's
     output, 16 for the MLP of four times the width), attention among m tokens 4 m^2 C: within a view in the
     frame block, among all views in the global block. ``encoder``: a :class:`ghgs_lit.encoder.VGGTEncoder`."""
-    tokens = (kept.flatten(2).sum(-1) + encoder.aggregator.special).double()
+    tokens = (kept + encoder.aggregator.special).double()
     width, both = encoder.dim_latent // 2, tokens.sum(1)
     return 48 * width**2 * both + 4 * width * (tokens.square().sum(1) + both.square())

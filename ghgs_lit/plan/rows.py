@@ -1,0 +1,81 @@
+"""Rows that count: the pixels or tokens of a batch that a stage works on, as indices of known number."""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from ghgs_lit.types import true_places
+
+#: Size classes of an octave.
+_STEPS = 8
+
+
+def size_class(count: int) -> int:
+    """The smallest size class that holds ``count`` rows: 1 to 16, then eight of equal steps in each octave
+    (18, 20, ..., 32, 36, ...), so that at most an eighth is added."""
+    step = max((1 << max(count - 1, 0).bit_length()) // (2 * _STEPS), 1)
+    return -(-count // step) * step
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of each group (an image, or an element of the batch), one group after another.
+
+    Exact rows (``real`` is None) are those that count. Filled ones have the same number in each group, a size
+    class: what counts comes first, then its last row is repeated, or the group's first row if none counts.
+
+    Attributes:
+        index: places of the rows among all pixels or tokens, ascending within a group.
+        counts: number of rows of each group.
+        images: number of images of a group.
+        real: which rows count; None: all."""
+
+    index: Int[Tensor, " n"]
+    counts: tuple[int, ...]
+    images: int = 1
+    real: Bool[Tensor, " n"] | None = None
+
+    @classmethod
+    def exact(cls, wanted: Bool[Tensor, "..."], counts: Sequence[int], images: int) -> "Rows":
+        """The rows that are ``wanted``, of which each group of ``images`` images has ``counts``."""
+        return cls(true_places(wanted, sum(counts)), tuple(counts), images)
+
+    @classmethod
+    def filled(cls, wanted: Bool[Tensor, "g m"], counts: Sequence[int], images: int) -> "Rows":
+        """The rows that are ``wanted``, filled up to the size class of the largest of ``counts``."""
+        groups, of_group = wanted.shape
+        size = min(size_class(max(max(counts, default=0), 1)), of_group)
+        number = torch.arange(of_group, device=wanted.device)
+        ranks = wanted.cumsum(1)
+        # The n-th row that counts goes to place n, all others to one place more, which is cut off.
+        target = torch.where(wanted, ranks - 1, size)
+        places = number.new_zeros(groups, size + 1).scatter_(1, target, number.expand(groups, -1))
+        total, order = ranks[:, -1:], number[:size]
+        places = places.gather(1, torch.minimum(order, (total - 1).clamp(min=0)))
+        first = of_group * torch.arange(groups, device=wanted.device)
+        index = (places + first[:, None]).flatten()
+        return cls(index, (size,) * groups, images, (order < total).flatten())
+
+    def only(self, valid: Bool[Tensor, "..."]) -> "Rows":
+        """The rows that are ``valid``: others are left out, or no longer real where rows are filled."""
+        found = valid.flatten()[self.index]
+        if self.real is not None:
+            return dataclasses.replace(self, real=self.real & found)
+        if bool(found.all()):
+            return self
+        counts = tuple(int(part.sum()) for part in found.split(self.counts))
+        return dataclasses.replace(self, index=self.index[found], counts=counts)
+
+    def within(self, images: slice) -> slice:
+        """The rows of consecutive images, which are whole groups."""
+        first, last = images.start // self.images, images.stop // self.images
+        return slice(sum(self.counts[:first]), sum(self.counts[:last]))
+
+    def splits(self, images: int) -> tuple[int, ...]:
+        """The number of rows of each element of ``images`` images."""
+        step = images // self.images
+        return tuple(sum(self.counts[first : first + step]) for first in range(0, len(self.counts), step))

@@ -1,0 +1,23 @@
+"""Plans for stages that are called by themselves."""
+
+import torch
+
+from ghgs_lit.plan import planned
+
+
+def plan_of(masks, patch_size=14, pixels="subject", tokens="subject"):
+    """The plan of masks [B, V, H, W] if all patches become tokens."""
+    b, v, height, width = masks.shape
+    kept = torch.ones(b, v, height // patch_size, width // patch_size, dtype=torch.bool)
+    return planned(masks, patch_size, [kept], pixels, tokens)
+
+
+def with_plan(stage):
+    """A recalibration stage that is given the plan of its points where it is called without one."""
+
+    def given(module, inputs):
+        tokens, points, *plan = inputs
+        return inputs if plan else (*inputs, plan_of(points.valid, tokens.patch_size, tokens=module.tokens))
+
+    stage.register_forward_pre_hook(given)
+    return stage
