@@ -31,14 +31,14 @@ class Asked(NamedTuple):
 _VERSION = "2.13."
 
 LIMITS = {
-    ("model=paper", 1): Asked(1692, 4, 4447, 5),
-    ("model=paper", 8): Asked(1847, 4, 4671, 5),
-    ("model=hull", 1): Asked(2062, 4, 4956, 5),
-    ("model=hull", 8): Asked(2217, 4, 5181, 5),
-    ("model=recurrent", 1): Asked(3520, 6, 6903, 7),
-    ("model=recurrent", 8): Asked(3736, 6, 7189, 7),
-    ("shipped", 1): Asked(3988, 6, 6969, 7),
-    ("shipped", 8): Asked(4222, 6, 7255, 7),
+    ("model=paper", 1): Asked(1658, 3, 4403, 4),
+    ("model=paper", 8): Asked(1813, 3, 4627, 4),
+    ("model=hull", 1): Asked(2022, 3, 4906, 4),
+    ("model=hull", 8): Asked(2177, 3, 5131, 4),
+    ("model=recurrent", 1): Asked(3477, 4, 6850, 5),
+    ("model=recurrent", 8): Asked(3693, 4, 7136, 5),
+    ("shipped", 1): Asked(3945, 4, 6916, 5),
+    ("shipped", 8): Asked(4179, 4, 7202, 5),
 }
 
 

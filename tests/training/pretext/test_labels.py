@@ -81,7 +81,7 @@ def test_validation_logs_the_share_of_attention_on_other_parts(size):
     batch, _ = scene(2, 2, *size)
     model = make_model("model=paper", "model.pad=multiple").eval()
     logged, seen = {}, []
-    model.recalibration.register_forward_pre_hook(lambda stage, inputs: seen.append((stage, *inputs)))
+    model.recalibration.register_forward_pre_hook(lambda stage, inputs: seen.append((stage, *inputs[:2])))
     with torch.no_grad():
         model(batch)
     pictures = PicturesOptions().build()
