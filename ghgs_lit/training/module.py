@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from ghgs_lit.config import build
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.unprojection import seen_surfaces
+from ghgs_lit.heads.inspection import offsets_at_limit, seen_attributes
 from ghgs_lit.losses import Losses
 from ghgs_lit.metrics import depth_error_mm, surface_error_mm
 from ghgs_lit.metrics.functional import box_of, psnr, ssim
@@ -141,7 +142,9 @@ class GHGSModule(BudgetedModule):
         return total
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
-        prediction, rendering = self(batch)
+        head = getattr(self.model, "gaussian_head", None)
+        with seen_attributes(head) as seen:
+            prediction, rendering = self(batch)
         image, target = rendering.image.flatten(0, 1).clamp(0, 1), batch.targets.images.flatten(0, 1)
         size, box = len(batch.images), box_of(batch.targets.masks.flatten(0, 1))
         self.val_psnr.update(psnr(image, target))
@@ -149,6 +152,8 @@ class GHGSModule(BudgetedModule):
         self.log("val/psnr", self.val_psnr, prog_bar=True, on_epoch=True, batch_size=size)
         self.log("val/psnr_box", self.val_psnr_box, on_epoch=True, batch_size=size)
         means = {"val/ssim": ssim(image, target).mean(), **self._rounds(batch, prediction)}
+        if seen and head.has_offset_limit:
+            means["val/offsets_at_limit"] = offsets_at_limit(seen[-1])
         if self.lpips is not None:
             means["val/lpips"] = self.lpips(image, target).mean()
         if batch.depths is not None:
