@@ -3,7 +3,7 @@
 import gc
 import importlib
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -20,7 +20,7 @@ from ghgs_lit.config import build
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL, SecondsProbe, inside, top_level, watched
 from ghgs_lit.diagnostics.doctor.selfcheck import PASSED, selfcheck
 from ghgs_lit.diagnostics.machine import machine_facts
-from ghgs_lit.kernels.precision import precision_of
+from ghgs_lit.kernels.precision import keep_rounded, precision_of
 from ghgs_lit.kernels.recording import CudaTape, Recorder
 from ghgs_lit.kernels.watching import Inputs, Watcher
 from ghgs_lit.kernels.watching import watched as stages_watched
@@ -30,6 +30,8 @@ from ghgs_lit.stages import STAGES
 from ghgs_lit.types import Batch, map_tensors
 
 PRECISIONS = ("float32", "tf32", "bfloat16")
+#: Attention of PyTorch but cuDNN's, the fastest first.
+ATTENTION = (SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION, SDPBackend.MATH)
 
 
 def machine(call: Call) -> None:
@@ -65,9 +67,11 @@ def _built(call: Call, config: Config) -> GHGS:
         return GHGS.from_config(config).to(call.gpu.device)
 
 
-def _predicted(call: Call, name: str, model: GHGS, batch: Batch) -> None:
+def _predicted(
+    call: Call, name: str, model: GHGS, batch: Batch, precisions: Sequence[str] = PRECISIONS
+) -> None:
     """Rows of a prediction in each precision."""
-    for precision in PRECISIONS:
+    for precision in precisions:
         model.precision = precision
         with torch.no_grad():
             run = partial(model, batch)
@@ -92,7 +96,13 @@ def paper(call: Call) -> None:
     """A prediction of a large encoder, model=paper"""
     model = _built(call, call.config(f"encoder={call.sizes.encoder}", "model=paper")).eval()
     batch = replace(call.batch(1, call.sizes.large), targets=None).to(call.gpu.device)
-    _predicted(call, f"{call.sizes.encoder}, {call.sizes.large}²", model, batch)
+    name = f"{call.sizes.encoder}, {call.sizes.large}²"
+    _predicted(call, name, model, batch)
+    if call.gpu.is_real:  # a rehearsal has no autocast
+        keep_rounded(model.encoder, torch.bfloat16)
+    _predicted(call, f"{name}, rounded weights", model, batch, ("bfloat16",))
+    with sdpa_kernel([SDPBackend.CUDNN_ATTENTION, *ATTENTION], set_priority=True):
+        _predicted(call, f"{name}, rounded weights, cuDNN's attention first", model, batch, ("bfloat16",))
 
 
 class _FirstInputs(Watcher):

@@ -13,6 +13,7 @@ from ghgs_lit.config import build
 from ghgs_lit.config.keys import ablation_of, flatten, is_below, lookup
 from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.kernels.precision import half_precision, keep_rounded
 from ghgs_lit.model import GHGS
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.rendering.api import resolve_backend
@@ -58,6 +59,9 @@ def load_model(config: Mapping[str, Any], device: torch.device) -> GHGS:
     model = GHGS.from_config(config, empty=True)
     load_weights(model, config["checkpoint"], device=device)
     model.precision = config["precision"]
+    half = half_precision(model.precision, device)
+    if half is not None and device.type == "cuda":
+        keep_rounded(model.encoder, half)  # a verb never changes its precision
     return model.to(device).eval()
 
 

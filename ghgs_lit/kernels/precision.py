@@ -1,5 +1,6 @@
 """Precision: half precision for products of networks, float32 for geometry and last projections."""
 
+import warnings
 from collections.abc import Hashable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -7,6 +8,7 @@ from functools import cache
 from typing import Any
 
 import torch
+from torch import nn
 
 from ghgs_lit.errors import choice, require
 
@@ -36,22 +38,29 @@ def precision_of(name: str, device: torch.device) -> AbstractContextManager:
     device without it.
 
     Args:
-        name: one of :data:`PRECISIONS`. ``inherit``: the caller's, by PyTorch's default convolutions in TF32
-            on CUDA; ``float32``: :func:`exact`; ``tf32``: all products and convolutions; ``auto``: bfloat16
-            if the device has it, else float16 on CUDA and float32 on a CPU."""
+        name: one of :data:`PRECISIONS`. ``inherit``: the caller's, but where convolutions round to TF32, as
+            PyTorch has it on CUDA, products do, too, which is said once; ``float32``: :func:`exact`;
+            ``tf32``: all products and convolutions; ``auto``: bfloat16 if the device has it, else float16 on
+            CUDA and float32 on a CPU."""
     choice("precision", name, PRECISIONS)
     if name == "inherit":
-        return nullcontext()
-    if name == "auto":
-        slow = "float16" if device.type == "cuda" else "float32"
-        name = "bfloat16" if has_bfloat16(device) else slow
+        return _inherited() if device.type == "cuda" else nullcontext()
     if name == "bfloat16":
         require(has_bfloat16(device), "precision", "float32 on a device without bfloat16", name)
     if name in ("tf32", "float16"):
         require(device.type == "cuda", "precision", f"{name} on CUDA only", device.type)
-    if name in ("float32", "tf32"):
+    half = half_precision(name, device)
+    if half is None:
         return _float32(device.type, rounding=name == "tf32")
-    return torch.autocast(device.type, getattr(torch, name))
+    return torch.autocast(device.type, half)
+
+
+def half_precision(name: str, device: torch.device) -> torch.dtype | None:
+    """The half precision of products in a precision ``name`` (:func:`precision_of`); None: float32."""
+    if name == "auto":
+        slow = "float16" if device.type == "cuda" else "float32"
+        name = "bfloat16" if has_bfloat16(device) else slow
+    return getattr(torch, name) if name in ("bfloat16", "float16") else None
 
 
 def exact(device: str) -> AbstractContextManager[None]:
@@ -59,6 +68,31 @@ def exact(device: str) -> AbstractContextManager[None]:
     ``torch.set_float32_matmul_precision`` allows, and PyTorch's default for convolutions on CUDA (TF32 has 11
     bits: 1 mm at 2 m). ``device``: its type."""
     return _float32(device, rounding=False)
+
+
+@contextmanager
+def _inherited() -> Iterator[None]:
+    """The caller's precision on CUDA. PyTorch's default rounds factors of convolutions to TF32, but not those
+    of products: slower, and no more accurate as a whole."""
+    before = _Rounding.now("cuda")
+    if not before.is_default:
+        yield
+        return
+    _say_rounding()
+    round_products(True, "cuda")
+    try:
+        yield
+    finally:
+        before.restore("cuda")
+
+
+@cache
+def _say_rounding() -> None:
+    warnings.warn(
+        "precision=inherit: factors of products are rounded to TF32 (11 bits), as PyTorch does in "
+        "convolutions on a GPU; precision=float32 rounds neither",
+        stacklevel=6,
+    )
 
 
 @contextmanager
@@ -120,6 +154,15 @@ class _Rounding:
         products = self.of_older is not None and self.of_older[0] != "highest"
         return products or any(value not in ("ieee", "none") for value in self.of_modules)
 
+    @property
+    def is_default(self) -> bool:
+        """Whether convolutions on CUDA round and products do not, as PyTorch has it and nobody chooses it."""
+        if self.of_older != ("highest", True):
+            return False
+        return not self.of_modules or (
+            self.of_modules[2] == "tf32" and self.of_modules[0] in ("ieee", "none")
+        )
+
     def restore(self, device: str) -> None:
         if self.of_older is not None:
             torch.set_float32_matmul_precision(self.of_older[0])
@@ -138,6 +181,15 @@ def _modules(device: str) -> list[Any]:
         return [matmul, mkldnn.matmul, mkldnn.conv]
     # Recurrent layers have one older switch with convolutions.
     return [matmul, mkldnn.matmul, cudnn.conv, cudnn.rnn]
+
+
+def keep_rounded(module: nn.Module, dtype: torch.dtype) -> None:
+    """Store weights of linear layers and convolutions in the half precision that autocast rounds them to at
+    every call: the same numbers in half the memory, without a kernel for each weight. From then on the module
+    runs under autocast to ``dtype`` alone."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear | nn.Conv2d | nn.ConvTranspose2d):
+            layer.to(dtype)
 
 
 def without_float16(device: str) -> AbstractContextManager:

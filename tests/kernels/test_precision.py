@@ -1,11 +1,24 @@
 """Precisions: what rounds products and convolutions of float32 numbers on CUDA, set and read without it."""
 
+import warnings
+
 import pytest
 import torch
+from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.kernels.precision import exact, precision_of, rounds_products
+from ghgs_lit.kernels.precision import (
+    _say_rounding,
+    exact,
+    keep_rounded,
+    precision_of,
+    round_products,
+    rounds_products,
+)
 from ghgs_lit.training.trainer import TrainerOptions
+from tests.helpers.models import make_model
+from tests.helpers.scenes import make_batch
 
 CUDA = torch.device("cuda")
 MATMUL, CUDNN, MKLDNN = torch.backends.cuda.matmul, torch.backends.cudnn, torch.backends.mkldnn
@@ -77,13 +90,67 @@ def test_older_switches_can_be_read_inside_and_come_back(setting):
 
 
 def test_float32_is_exact_and_tf32_is_refused_on_a_cpu():
-    """``precision=float32`` has no convolutions in TF32, ``inherit`` has what the process has."""
+    """``precision=float32`` has no convolutions in TF32 on CUDA."""
     with precision_of("float32", CUDA):
         assert not rounds_products("cuda")
-    with precision_of("inherit", CUDA):
-        assert CUDNN.conv.fp32_precision == "tf32"
     with pytest.raises(InputError, match="precision: expected tf32 on CUDA only; found 'cpu'"):
         precision_of("tf32", torch.device("cpu"))
+
+
+def test_products_round_where_convolutions_do_which_is_said_once():
+    """PyTorch's default on CUDA rounds convolutions alone; what was set comes back."""
+    _say_rounding.cache_clear()
+    before = state()
+    with pytest.warns(UserWarning, match="precision=inherit: factors of products are rounded to TF32"):
+        _entered("inherit")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert _entered("inherit")[:4] == ["tf32"] * 4
+    assert state() == before
+
+
+def _entered(name):
+    """The state of the switches inside."""
+    with precision_of(name, CUDA):
+        return state()
+
+
+def float32_alone():
+    round_products(False)
+
+
+@pytest.mark.parametrize("setting", [medium, everything, float32_alone])
+def test_what_a_process_has_chosen_is_inherited(setting):
+    """Such as float32 in convolutions, too, by ``trainer.precision=32-true``."""
+    setting()
+    before = state()
+    assert _entered("inherit") == before
+
+
+@pytest.mark.parametrize("kind", ["model=paper", "model=hull"])
+def test_rounded_weights_give_the_same_numbers_as_rounding_at_each_call(kind):
+    """Half the memory, and no kernel that casts a weight."""
+    model, batch = make_model(kind).eval(), make_batch(1, 2, 28, 42)
+    found, casts = [], []
+    for _ in range(2):
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16), Casts() as seen:
+            found.append(model(batch))
+        casts.append(seen.count)
+        keep_rounded(model.encoder, torch.bfloat16)
+    for name in ("means", "scales", "opacities", "colors"):
+        assert torch.equal(getattr(found[0].gaussians, name), getattr(found[1].gaussians, name))
+    layers = [layer for layer in model.encoder.modules() if isinstance(layer, nn.Linear)]
+    assert casts[0] - casts[1] >= len(layers) > 0
+
+
+class Casts(TorchDispatchMode):
+    """Counts casts."""
+
+    count = 0
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        self.count += function.name().startswith("aten::_to_copy")
+        return function(*args, **(kwargs or {}))
 
 
 def test_a_training_in_tf32_leaves_nothing_to_the_next_one_of_its_process():
