@@ -1,17 +1,16 @@
 """What ``benchmarks/gpu.py`` measures: functions of a :class:`Call`; docstrings are titles of tables."""
 
 import gc
-import importlib
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
-from unittest import mock
 
 import torch
 from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from benchmarks.gpu_call import Call, Config
 from benchmarks.gpu_data import loader, people, training
@@ -20,6 +19,7 @@ from ghgs_lit.config import build
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL, SecondsProbe, inside, top_level, watched
 from ghgs_lit.diagnostics.doctor.selfcheck import PASSED, selfcheck
 from ghgs_lit.diagnostics.machine import machine_facts
+from ghgs_lit.kernels.gpu import PLAIN
 from ghgs_lit.kernels.precision import keep_rounded, precision_of
 from ghgs_lit.kernels.recording import CudaTape, Recorder
 from ghgs_lit.kernels.watching import Inputs, Watcher
@@ -240,37 +240,35 @@ def frozen(call: Call) -> None:
         torch.cuda.empty_cache()
 
 
-#: Functions whose operators are pointwise chains, where they are looked up.
-CHAINS = (
-    "ghgs_lit.heads.gaussian.surface_axes",
-    "ghgs_lit.rounds.observation.looked_up",
-    "ghgs_lit.rounds.rounds.consistency_of",
-    "ghgs_lit.bounds.box.subject_box",
-    "ghgs_lit.bounds.hull._march",
-)
+class _Calls(TorchDispatchMode):
+    """The first inputs of each operator of the package."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.inputs: dict[str, tuple[Callable[..., Any], Sequence[Any]]] = {}
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        if function.namespace == "ghgs_lit":
+            self.inputs.setdefault(function.name().partition("::")[2], (function, args))
+        return function(*args, **(kwargs or {}))
 
 
 def kernels(call: Call) -> None:
-    """Chains of small operators: eager and compiled, beside the rate of a copy; attention by backend"""
+    """Kernels in Triton, the same eager and compiled, beside the rate of a copy; attention by backend"""
     model = GHGS.from_checkpoint().to(call.gpu.device)
     batch = replace(call.batch(max(call.sizes.batches), call.sizes.side), targets=None).to(call.gpu.device)
-    for chain in CHAINS:
-        module, _, name = chain.rpartition(".")
-        function = getattr(importlib.import_module(module), name, None)
-        if function is None:
-            call.add(name, refused=f"{module} has no {name}")
-            continue
-        with mock.patch(chain, side_effect=function) as watching, torch.no_grad():
-            model(batch)
-        if not watching.called:
+    with _Calls() as calls:
+        means = model(batch).gaussians.means
+        means.sum().backward()
+    for name, plain in PLAIN.items():
+        if name not in calls.inputs:
             call.add(name, refused="not called")
             continue
-        run = partial(function, *watching.call_args.args, **watching.call_args.kwargs)
-        moved = _bytes((watching.call_args.args, watching.call_args.kwargs)) + _bytes(run())
-        _chain(call, name, "eager", run, moved)
-        compiled = torch.compile(function, dynamic=False)
-        run = partial(compiled, *watching.call_args.args, **watching.call_args.kwargs)
-        _chain(call, name, "compiled", run, moved)
+        function, inputs = calls.inputs[name]
+        moved = _bytes(inputs) + _bytes(function(*inputs))
+        kinds = {"kernel": function, "eager": plain, "compiled": torch.compile(plain, dynamic=False)}
+        for kind, run in kinds.items():
+            _chain(call, name, kind, partial(run, *inputs), moved)
     _attention(call)
 
 

@@ -227,6 +227,7 @@ def main(words: list[str]) -> None:
         copied.mkdir()
         # Python's own caches know a changed file by the second only.
         os.environ |= {"PYTHONPATH": str(copied), "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1"}
+        os.environ["TRITON_INTERPRET"] = "1"  # read when Triton is imported
         multiprocessing.set_forkserver_preload(list(LOADED))
         for path in (path for name in COPIED for path in ROOT.glob(name)):
             if path.is_dir():

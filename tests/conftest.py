@@ -33,6 +33,10 @@ check_shapes([f"ghgs_lit.{name}" for name in _CHECKED])
 
 import torch  # noqa: E402
 
+# Kernels in Triton run on tensors of the CPU where there is no GPU; read when Triton is imported.
+if not torch.cuda.is_available():
+    os.environ["TRITON_INTERPRET"] = "1"
+
 import tests.helpers.composing  # noqa: E402, F401
 
 torch.set_num_threads(_THREADS)

@@ -1,8 +1,18 @@
 """Activations of the raw channels of heads."""
 
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
 import torch
-from jaxtyping import Float
+import torch.nn.functional as F
+from jaxtyping import Float, Int
 from torch import Tensor
+
+from ghgs_lit.geometry.projection import focal_lengths
+from ghgs_lit.geometry.rotations import multiply_quaternions, rotate, unit
+from ghgs_lit.heads.surface import surface_axes
+from ghgs_lit.types import Cameras, DepthMaps
 
 
 class _Saturate(torch.autograd.Function):
@@ -49,3 +59,124 @@ def bounded_tanh(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 def confidence_of(raw: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """A confidence of at least 1, as in published heads, finite for any raw value."""
     return 1 + raw.clamp(max=EXP_LIMIT).exp()
+
+
+#: The gradient of shorter quaternions is that of this length: it would grow without bound near 0.
+SHORTEST = 0.1
+
+Attributes = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+class Constants(NamedTuple):
+    """Numbers of :func:`footprint_attributes`. Lengths are in footprints, except those of offsets."""
+
+    offset_limit: float
+    """Largest offset along each axis in metres; 0: none."""
+    offset_unit: float
+    """Offset in metres for a raw value of 1 where there is no limit."""
+    inward: float
+    scale_floor: float
+    scale_range: float
+    """Logarithm of the ratio of the largest to the smallest scale."""
+    across: float
+    """Bias of the raw scales of the first two axes."""
+    thickness: float
+    """Bias of the raw scale of the third axis."""
+    opacity_floor: float
+    opacity_bias: float
+    color_limit: float
+    """Largest change of a colour from its pixel's."""
+
+
+def footprint_attributes(
+    offset: Float[Tensor, "N 3"],
+    scale: Float[Tensor, "N 3"],
+    rotation: Float[Tensor, "N 4"],
+    opacity: Float[Tensor, " N"],
+    footprint: Float[Tensor, " N"],
+    constants: Constants,
+) -> Attributes:
+    """Offsets in metres, scales in metres, quaternions and opacities.
+
+    Args:
+        offset: raw, as are the next three.
+        scale: raw.
+        rotation: raw.
+        opacity: raw.
+        footprint: side of a pixel at each Gaussian's depth, in metres.
+        constants: of ``FootprintAttributes``."""
+    limit, metres, inward, floor, span, across, thickness, least, bias, _ = constants
+    identity = F.pad(rotation.new_ones(1), (0, 3))
+    scale = torch.cat((scale[:, :2] + across, scale[:, 2:] + thickness), 1)
+    scale = floor * torch.exp(span * bounded_sigmoid(scale))
+    shown = bounded_sigmoid(opacity + bias)
+    moved = limit * bounded_tanh(offset) if limit > 0 else metres * offset
+    return (
+        moved + F.pad(inward * footprint[:, None], (2, 0)),
+        footprint[:, None] * scale,
+        unit(identity + rotation, SHORTEST),
+        least + (1 - least) * shown,
+    )
+
+
+def activated(
+    raw: tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None],
+    image: Int[Tensor, " N"],
+    pixel: Int[Tensor, " N"],
+    maps: DepthMaps,
+    points: Float[Tensor, "B V H W 3"],
+    photo: Float[Tensor, "B V 3 H W"],
+    share: Float[Tensor, "B V H W"] | None,
+    cameras: Cameras,
+    attributes: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], Attributes],
+    color_limit: float,
+    on_surface: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Means, quaternions, scales, opacities and colours of Gaussians.
+
+    Args:
+        raw: offsets, scales, rotations, opacities and colours (or None) before activations.
+        image: numbers of the images (``b * V + v``) that the Gaussians belong to.
+        pixel: row-major indices of their pixels.
+        maps: depths in metres.
+        points: world points of pixels, in metres.
+        photo: colours of pixels.
+        share: factors of opacities; None: 1.
+        cameras: of the images.
+        attributes: offsets, scales, quaternions and opacities of raw ones and of footprints.
+        color_limit: largest change of a colour from its pixel's.
+        on_surface: ``raw`` is in axes of the surface."""
+    *numbers, color = raw
+    focal = focal_lengths(cameras).prod(-1).sqrt().flatten()[image]
+    depth = maps.depth.flatten(0, 1).flatten(1)[image, pixel]
+    # No gradient: a splat that is too large must not move nearer to become smaller.
+    footprint = depth.detach() / focal
+    offset, scales, quaternions, opacities = attributes(*numbers, footprint)
+    if on_surface:
+        axes = surface_axes(maps, cameras, image, pixel)
+        offset, quaternions = rotate(axes, offset), multiply_quaternions(axes, quaternions)
+    if share is not None:
+        opacities = opacities * share.to(opacities).flatten(0, 1).flatten(1)[image, pixel]
+    colors = photo.flatten(0, 1).flatten(2).transpose(1, 2)[image, pixel]
+    if color is not None:
+        colors = colors + color_limit * bounded_tanh(color)
+    means = points.flatten(0, 1).flatten(1, 2)[image, pixel] + offset
+    return means, quaternions, scales, opacities, colors
+
+
+def footprint_gaussians(
+    raw: tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None],
+    image: Int[Tensor, " N"],
+    pixel: Int[Tensor, " N"],
+    maps: DepthMaps,
+    points: Float[Tensor, "B V H W 3"],
+    photo: Float[Tensor, "B V 3 H W"],
+    share: Float[Tensor, "B V H W"] | None,
+    cameras: Cameras,
+    constants: Constants,
+    on_surface: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """:func:`activated` with :func:`footprint_attributes`, which kernels compute, too."""
+    attributes = partial(footprint_attributes, constants=constants)
+    given = (raw, image, pixel, maps, points, photo, share, cameras)
+    return activated(*given, attributes, constants.color_limit, on_surface)

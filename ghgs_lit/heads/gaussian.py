@@ -16,14 +16,19 @@ from torch import Tensor, nn
 from ghgs_lit.config.options import Amount, Options, Positive, Share, Width
 from ghgs_lit.geometry.masks import relative_depth, surface_colors
 from ghgs_lit.geometry.photo_consistency import photo_consistency
-from ghgs_lit.geometry.projection import at_least_float32, focal_lengths
-from ghgs_lit.geometry.rotations import multiply_quaternions, rotate, unit
-from ghgs_lit.heads import cpu
-from ghgs_lit.heads.activations import bounded_sigmoid, bounded_tanh
+from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.geometry.rotations import unit
+from ghgs_lit.heads import cpu, cuda
+from ghgs_lit.heads.activations import (
+    Attributes,
+    Constants,
+    activated,
+    footprint_attributes,
+    footprint_gaussians,
+)
 from ghgs_lit.heads.dense import Part, decode
 from ghgs_lit.heads.dpt import DPTHead
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, Guide, photo_guide
-from ghgs_lit.heads.surface import surface_axes
 from ghgs_lit.kernels.linear import Linear
 from ghgs_lit.kernels.pool import multiplies
 from ghgs_lit.kernels.precision import exact, without_float16
@@ -38,8 +43,6 @@ from ghgs_lit.types import (
     Tokens,
 )
 
-Attributes = tuple[Tensor, Tensor, Tensor, Tensor]
-
 #: Offset of a Gaussian from its pixel's point along each axis, in metres, for a raw value of 1 where there is
 #: no limit; and the limit where none is said.
 OFFSET_UNIT = 0.05
@@ -47,9 +50,6 @@ OFFSET_UNIT = 0.05
 SCALE_CAP = 4.0
 #: Opacity at the start of training: high, since transparent splats do not recover.
 OPACITY_START = 0.8
-
-#: The gradient of shorter quaternions is that of this length: it would grow without bound near 0.
-_SHORTEST = 0.1
 
 
 def _logit(probability: float) -> float:
@@ -146,13 +146,11 @@ class FootprintAttributes(Options):
         """Bias of raw opacities, so that 0 gives the start."""
         return _logit((OPACITY_START - self.opacity_floor) / (1 - self.opacity_floor))
 
-    def constants(self, offset_limit: float | None, color_limit: float) -> tuple[float, ...]:
-        """Constants of :func:`ghgs_lit.heads.cpu.activate`: limit of offsets (0: none) and their unit,
-        distance inwards, smallest scale, log range and biases of scales, smallest opacity and its bias, limit
-        of colour changes."""
+    def constants(self, offset_limit: float | None, color_limit: float) -> Constants:
+        """Numbers of :func:`ghgs_lit.heads.activations.footprint_attributes`."""
         offsets = (offset_limit or 0.0, OFFSET_UNIT, self.inward)
         size = (self.scale_floor, self.scale_range, *self.scale_biases)
-        return *offsets, *size, self.opacity_floor, self.opacity_bias, color_limit
+        return Constants(*offsets, *size, self.opacity_floor, self.opacity_bias, color_limit)
 
     def __call__(
         self,
@@ -172,18 +170,8 @@ class FootprintAttributes(Options):
             opacity: raw.
             footprint: side of a pixel at each Gaussian's depth, in metres.
             offset_limit: of ``gaussian_head``."""
-        identity = F.pad(rotation.new_ones(1), (0, 3))
-        across, thickness = self.scale_biases
-        scale = torch.cat((scale[:, :2] + across, scale[:, 2:] + thickness), 1)
-        scale = self.scale_floor * torch.exp(self.scale_range * bounded_sigmoid(scale))
-        shown = bounded_sigmoid(opacity + self.opacity_bias)
-        moved = OFFSET_UNIT * offset if offset_limit is None else offset_limit * bounded_tanh(offset)
-        return (
-            moved + F.pad(self.inward * footprint[:, None], (2, 0)),
-            footprint[:, None] * scale,
-            unit(identity + rotation, _SHORTEST),
-            self.opacity_floor + (1 - self.opacity_floor) * shown,
-        )
+        constants = self.constants(offset_limit, 0.0)
+        return footprint_attributes(offset, scale, rotation, opacity, footprint, constants)
 
 
 def release_attributes(
@@ -302,38 +290,19 @@ class GaussianHead(nn.Module):
         numbers = (raw.offset, raw.scale, raw.rotation, raw.opacity, raw.color)
         photo, share, options = batch.once(surface_colors), batch.alpha, self.options
         inputs = (*numbers, photo, share, depth_maps.depth, points.pixels, batch.cameras.extrinsics)
-        if isinstance(self.attributes, FootprintAttributes) and cpu.is_supported(*inputs):
-            constants = self.attributes.constants(options.offset_limit, options.color_limit)
-            on_surface = options.axes == "surface"
-            given = (raw.image, raw.pixel, depth_maps, points, photo, share, batch.cameras)
-            found = cpu.activate(numbers, *given, constants, on_surface)
+        given = (numbers, raw.image, raw.pixel, depth_maps, points.pixels, photo, share, batch.cameras)
+        on_surface = options.axes == "surface"
+        if not isinstance(self.attributes, FootprintAttributes):
+            found = activated(*given, self.attributes, options.color_limit, on_surface)
         else:
-            found = self._activated(raw, batch, points, depth_maps)
+            constants = self.attributes.constants(options.offset_limit, options.color_limit)
+            if cuda.is_supported(*inputs, fixed=(photo, share, batch.cameras.intrinsics)):
+                activate = cuda.activate
+            else:
+                activate = cpu.activate if cpu.is_supported(*inputs) else footprint_gaussians
+            found = activate(*given, constants, on_surface)
         constants = {"low_pass": options.low_pass, "antialiased": options.antialiased}
         return Gaussians(*found, raw.splits, raw.image, raw.pixel, **constants)
-
-    def _activated(
-        self, raw: RawGaussians, batch: Batch, points: Points, depth_maps: DepthMaps
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        image, pixel = raw.image, raw.pixel
-        focal = focal_lengths(batch.cameras).prod(-1).sqrt().flatten()[image]
-        depth = depth_maps.depth.flatten(0, 1).flatten(1)[image, pixel]
-        # No gradient: a splat that is too large must not move nearer to become smaller.
-        footprint = depth.detach() / focal
-        limit = () if self.attributes is release_attributes else (self.options.offset_limit,)
-        offset, scales, quaternions, opacities = self.attributes(
-            raw.offset, raw.scale, raw.rotation, raw.opacity, footprint, *limit
-        )
-        if self.options.axes == "surface":
-            axes = surface_axes(depth_maps, batch.cameras, image, pixel)
-            offset, quaternions = rotate(axes, offset), multiply_quaternions(axes, quaternions)
-        if batch.alpha is not None:
-            opacities = opacities * batch.alpha.to(opacities).flatten(0, 1).flatten(1)[image, pixel]
-        colors = batch.once(surface_colors).flatten(0, 1).flatten(2).transpose(1, 2)[image, pixel]
-        if raw.color is not None:
-            colors = colors + self.options.color_limit * bounded_tanh(raw.color)
-        means = points.pixels.flatten(0, 1).flatten(1, 2)[image, pixel] + offset
-        return means, quaternions, scales, opacities, colors
 
     def _guide(self, batch: Batch, points: Points, depth_maps: DepthMaps) -> Guide | None:
         if self.decoder.guide is None:

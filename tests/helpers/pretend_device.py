@@ -14,9 +14,9 @@ accelerator: where CUDA is, tests of this one are skipped.
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from unittest import SkipTest
+from unittest import SkipTest, mock
 
 import torch
 from torch import library
@@ -25,6 +25,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
 
 import ghgs_lit
+from ghgs_lit.kernels import gpu
 
 _PACKAGE = str(Path(ghgs_lit.__file__).parent)
 
@@ -200,7 +201,7 @@ def pretend_device(by_line: bool = False) -> Iterator[Log]:
     log = Log(by_line)
     _logs.append(log)
     try:
-        with _Mode(), _attention_is_one_call():
+        with _Mode(), _attention_is_one_call(), mock.patch.object(gpu, "DEVICES", {DEVICE.type}):
             yield log
     finally:
         _logs.remove(log)
@@ -224,13 +225,21 @@ def _call(function, args, kwargs):
         for log in _logs:
             log.add(name, reason)
     bare = {key: _mapped(value, _inner) for key, value in kwargs.items()}
-    result = function(*_mapped(args, _inner), **bare)
+    with _gradients_of_the_package(function):
+        result = function(*_mapped(args, _inner), **bare)
     if function._schema.is_mutable:
         written = _written(function, args, kwargs)
         _require_same_size(name, written)
         if function._schema.returns and written:
             return written[0] if len(written) == 1 else tuple(written)
     return _mapped(result, PretendTensor) if to_here else result
+
+
+def _gradients_of_the_package(function):
+    """Operators of the package are kernels on CUDA; here gradients come from autograd, which is off."""
+    if function.namespace != "ghgs_lit":
+        return nullcontext()
+    return torch._C._SetExcludeDispatchKeyGuard(torch._C.DispatchKey.AutogradFunctionality, False)
 
 
 def _tensors(values) -> Iterator[torch.Tensor]:

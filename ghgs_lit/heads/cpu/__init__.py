@@ -8,8 +8,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.geometry.rotations import matrix_to_quaternion
+from ghgs_lit.heads.activations import Constants
 from ghgs_lit.kernels import pool
-from ghgs_lit.types import Cameras, DepthMaps, Points
+from ghgs_lit.types import Cameras, DepthMaps
 
 #: Gaussians in one task.
 _TASK = 1024
@@ -26,24 +27,22 @@ def activate(
     image: Tensor,
     pixel: Tensor,
     maps: DepthMaps,
-    points: Points,
+    points: Float[Tensor, "B V H W 3"],
     photo: Float[Tensor, "B V 3 H W"],
     share: Float[Tensor, "B V H W"] | None,
     cameras: Cameras,
-    constants: tuple[float, ...],
+    constants: Constants,
     on_surface: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Means, quaternions, scales, opacities and colours of Gaussians; see :func:`is_supported`. ``raw``:
-    offsets, scales, rotations, opacities and colours (or None) before activations. ``image``, ``pixel``:
-    where they belong, ascending. ``photo``: colours of pixels. ``share``: factors of opacities.
-    ``constants``: of ``FootprintAttributes``. ``on_surface``: ``raw`` is in axes of the surface."""
+    """:func:`ghgs_lit.heads.activations.footprint_gaussians`; see :func:`is_supported`. ``image``, ``pixel``:
+    ascending."""
     from ghgs_lit.heads.cpu.kernel import activate as compiled  # here: it loads a compiler
 
     *raw, color = raw
     color = raw[0].new_empty(0, 3) if color is None else color
     share = raw[0].new_empty(0, *photo.shape[3:]) if share is None else share.flatten(0, 1)
     turns = matrix_to_quaternion(cameras.extrinsics.flatten(0, 1)[:, :3, :3].mT)
-    seen = (maps.depth, maps.valid, points.pixels, photo)
+    seen = (maps.depth, maps.valid, points, photo)
     tables = (*(x.flatten(0, 1) for x in seen), share)
     inputs = (*raw, color, pixel, *tables, cameras.intrinsics.flatten(0, 1), turns)
     count = len(pixel)

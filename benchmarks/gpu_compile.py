@@ -1,0 +1,117 @@
+"""Compiles the kernels in Triton for GPUs on a machine without one, as a prediction and a step call them.
+
+    python benchmarks/gpu_compile.py          # for the compute capabilities 8.0, 8.6, 8.9 and 9.0
+    python benchmarks/gpu_compile.py 90
+
+Says for each kernel and each GPU how many registers a thread needs, and how many bytes do not fit into them.
+"""
+
+import argparse
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import torch
+from torch.library import _scoped_library
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+os.environ.pop("TRITON_INTERPRET", None)  # read when Triton is imported
+
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+
+from benchmarks import device
+from ghgs_lit.config import compose, resolve
+from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
+from ghgs_lit.kernels import gpu
+from ghgs_lit.model import GHGS
+
+SMALL = ("encoder.width=32", "encoder.heads=2", "encoder.vit.channels=8", "recalibration.k=8")
+#: Names of types in Triton.
+TYPES = {torch.float32: "*fp32", torch.int64: "*i64", torch.bool: "*i1", torch.uint8: "*u8"}
+
+
+class Compiler:
+    """Compiles a kernel instead of starting it, once for each GPU and each set of flags."""
+
+    def __init__(self, capabilities: list[int]):
+        self.capabilities = capabilities
+        self.done: set[Any] = set()
+
+    def run(self, kernel: Any, *arguments: Any, grid: Any, warmup: bool, **flags: Any) -> None:
+        names = [name for name in kernel.arg_names if name not in flags]
+        signature = {name: _type(value) for name, value in zip(names, arguments, strict=True)}
+        signature |= dict.fromkeys(flags, "constexpr")
+        unused = {name: value for name, value in zip(names, arguments, strict=True) if value is None}
+        for capability in self.capabilities:
+            key = (kernel.__name__, capability, *signature.values(), *flags.values())
+            if key not in self.done:
+                self.done.add(key)
+                source = ASTSource(fn=kernel, signature=signature, constexprs={**flags, **unused})
+                compiled = triton.compile(source, target=GPUTarget("cuda", capability, 32))
+                said = [name.lower() for name, value in flags.items() if value is True]
+                title = " ".join((kernel.__name__.removesuffix("_rows"), *said))
+                print(f"{title}: {capability}, {_needs(compiled)}", flush=True)
+
+
+def _type(value: Any) -> str:
+    """Triton's name of the type of an argument."""
+    if isinstance(value, torch.Tensor):
+        return TYPES[value.dtype]
+    return {float: "fp32", int: "i32", type(None): "constexpr"}[type(value)]
+
+
+def _needs(compiled: Any) -> str:
+    """Registers of a thread, and bytes that did not fit into them."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "kernel.ptx"
+        path.write_text(compiled.asm["ptx"])
+        target = re.search(r"^\.target (\w+)", compiled.asm["ptx"], re.MULTILINE)[1]
+        command = [triton.knobs.nvidia.ptxas.path, "-v", f"-arch={target}", "-o", f"{path}.o", str(path)]
+        said = subprocess.run(command, capture_output=True, text=True, check=True).stderr
+    registers, spilled = re.search(r"Used (\d+) registers", said)[1], re.search(r"(\d+) bytes spill", said)
+    return f"{registers} registers, {spilled[1] if spilled else 0} bytes spilled"
+
+
+def compiled_too(name: str, plain: Callable[..., Any]) -> Callable[..., Any]:
+    """An operator in plain PyTorch that calls its kernel, too."""
+
+    def call(*inputs):
+        gpu.KERNELS[name](*inputs)
+        return plain(*inputs)
+
+    return call
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("capabilities", nargs="*", type=int, default=[80, 86, 89, 90])
+    compiler = Compiler(parser.parse_args().capabilities)
+    batch = ellipsoid_batch(0.15, 3, 28, 1)
+    with ExitStack() as stack:
+        library = stack.enter_context(_scoped_library("ghgs_lit", "IMPL"))
+        for name, plain in gpu.PLAIN.items():
+            library.impl(name, compiled_too(name, plain), "CPU")
+        stack.enter_context(mock.patch.object(gpu, "DEVICES", {"cpu"}))
+        stack.enter_context(
+            mock.patch.object(triton.JITFunction, "run", lambda *a, **b: compiler.run(*a, **b))
+        )
+        stack.enter_context(device.drawing_nothing())
+        for overrides in (("model=recurrent",), ("model=hull", "skip=fast")):
+            model = GHGS.from_config(resolve(compose("train", [*SMALL, *overrides])))
+            with torch.no_grad():
+                model.eval()(batch)
+            prediction = model.train()(batch).gaussians
+            sum(getattr(prediction, name).sum() for name in ("means", "scales", "colors")).backward()
+
+
+if __name__ == "__main__":
+    main()

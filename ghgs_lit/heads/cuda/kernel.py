@@ -1,0 +1,260 @@
+"""Activations of Gaussians and their gradients for a GPU, in Triton: ``ROWS`` Gaussians in a program.
+
+Formulas are those of :mod:`ghgs_lit.heads.activations` and :mod:`ghgs_lit.heads.surface`. A Gaussian reads at
+most 45 numbers, so that its gradient computes again what it needs."""
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from ghgs_lit.heads import activations, surface
+from ghgs_lit.kernels.tiles import clamp, contiguous, load3, load4, rows_of, store3, store4, tanh
+
+ROWS = 128
+SIGMOID, TANH = tl.constexpr(activations.SIGMOID_LIMIT), tl.constexpr(activations.TANH_LIMIT)
+SHORTEST = tl.constexpr(activations.SHORTEST)
+FAR, RANGE = tl.constexpr(surface.OTHER), tl.constexpr(surface.OTHER - surface.SAME)
+
+
+@triton.jit
+def _sigmoid(x):
+    """The sigmoid of ``x`` within its limit, and its slope, exact also where the sigmoid is nearly 1."""
+    x = clamp(x, -SIGMOID, SIGMOID)
+    shrunk = tl.exp(-tl.abs(x))
+    other = 1 / (1 + shrunk)
+    return tl.where(x < 0, shrunk * other, other), shrunk * other * other
+
+
+@triton.jit
+def _back(slope, own, x, limit):
+    """Gradient of an activation with slope ``own``: beyond the limit only what leads back into it remains."""
+    return tl.where((tl.abs(x) <= limit) | (slope * x > 0), slope * own, 0.0)
+
+
+@triton.jit
+def _tanh_back(slope, x):
+    shrunk = tl.exp(-2 * tl.abs(clamp(x, -TANH, TANH)))
+    return _back(slope, 4 * shrunk / ((1 + shrunk) * (1 + shrunk)), x, TANH)
+
+
+@triton.jit
+def _unit(w, x, y, z):
+    """Four numbers divided by their length, and the length; 0 stays 0. The largest is divided out first."""
+    largest = tl.maximum(tl.maximum(tl.abs(w), tl.abs(x)), tl.maximum(tl.abs(y), tl.abs(z)))
+    scale = 1 / tl.where(largest == 0, 1.0, largest)
+    w, x, y, z = w * scale, x * scale, y * scale, z * scale
+    squared = w * w + x * x + y * y + z * z
+    length = tl.sqrt(tl.where(largest == 0, 1.0, squared))
+    scale = 1 / length
+    return w * scale, x * scale, y * scale, z * scale, largest * length
+
+
+@triton.jit
+def _multiply(a, b, c, d, w, x, y, z):
+    """The product of two quaternions."""
+    return (
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    )
+
+
+@triton.jit
+def _rotate(w, a, b, c, x, y, z):
+    """The vector (x, y, z) rotated by a unit quaternion."""
+    p, q, r = 2 * (b * z - c * y), 2 * (c * x - a * z), 2 * (a * y - b * x)
+    return x + w * p + (b * r - c * q), y + w * q + (c * p - a * r), z + w * r + (a * q - b * p)
+
+
+@triton.jit
+def _better(one, other, at: tl.constexpr):
+    """The row of Shepperd's table with the larger number ``at`` its diagonal."""
+    is_better = other[at] > one[4]
+    w, x = tl.where(is_better, other[0], one[0]), tl.where(is_better, other[1], one[1])
+    y, z = tl.where(is_better, other[2], one[2]), tl.where(is_better, other[3], one[3])
+    return w, x, y, z, tl.where(is_better, other[at], one[4])
+
+
+@triton.jit
+def _to_world(extrinsics, image):
+    """The quaternion from axes of a camera to the world (Shepperd 1978)."""
+    a, ba, ca, _ = load4(extrinsics, image * 4)
+    ab, b, cb, _ = load4(extrinsics, image * 4 + 1)
+    ac, bc, c, _ = load4(extrinsics, image * 4 + 2)
+    x, y, z = cb - bc, ac - ca, ba - ab
+    xy, xz, yz = ba + ab, ac + ca, cb + bc
+    best = (1 + a + b + c, x, y, z, 1 + a + b + c)
+    best = _better(best, (x, 1 + a - b - c, xy, xz), 1)
+    best = _better(best, (y, xy, 1 - a + b - c, yz), 2)
+    best = _better(best, (z, xz, yz, 1 - a - b + c), 3)
+    return _unit(best[0], best[1], best[2], best[3])
+
+
+@triton.jit
+def _neighbour(depth, valid, image, row, column, own, footprint, height, width):
+    """How much deeper a neighbour is, times its weight from 0 to 1, and the weight: 0 for another surface."""
+    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    place = (image * height + row) * width + column
+    is_valid = inside & (tl.load(valid + place, inside, 0) != 0)
+    deeper = tl.load(depth + place, is_valid, float("inf")) - own
+    near = clamp((tl.abs(deeper) / footprint - FAR) / -RANGE, 0.0, 1.0)
+    return near * tl.where(near > 0, deeper, 0.0), near
+
+
+@triton.jit
+def _slope(depth, valid, image, row, column, down, right, own, footprint, height, width):
+    """Relative change of depth from a pixel to the one ``down`` rows and ``right`` columns away."""
+    after, near = _neighbour(depth, valid, image, row + down, column + right, own, footprint, height, width)
+    before, other = _neighbour(depth, valid, image, row - down, column - right, own, footprint, height, width)
+    return (after - before) / ((1 + near * other) * own + after + before)
+
+
+@triton.jit
+def _axes(depth, valid, intrinsics, extrinsics, image, pixel, own, height, width):
+    """The quaternion from axes of the surface to the world."""
+    row, column = pixel // width, pixel % width
+    fx, skew, cx = load3(intrinsics, image * 3)
+    _, fy, cy = load3(intrinsics, image * 3 + 1)
+    right = _slope(depth, valid, image, row, column, 0, 1, own, own / fx, height, width)
+    down = _slope(depth, valid, image, row, column, 1, 0, own, own / fx, height, width)
+    toward = 1 + right * (column + 0.5 - cx) + down * (row + 0.5 - cy)
+    x, y = -fx * right, -skew * right - fy * down
+    length = tl.sqrt(x * x + y * y + toward * toward)
+    w, a, b, c, _ = _to_world(extrinsics, image)
+    p, q, r, s, _ = _unit(length + toward, -y, x, tl.zeros_like(x))
+    return _multiply(w, a, b, c, p, q, r, s)
+
+
+@triton.jit
+def _depth_and_footprint(depth, intrinsics, image, place):
+    """Depths, and sides of the pixels there, in metres."""
+    own = tl.load(depth + place)
+    fx, fy = tl.load(intrinsics + image * 9), tl.load(intrinsics + image * 9 + 4)
+    return own, own / tl.sqrt(fx * fy)
+
+
+@triton.jit
+def _offset(x, limit, unit, HAS_LIMIT: tl.constexpr):
+    return limit * tanh(clamp(x, -TANH, TANH)) if HAS_LIMIT else unit * x
+
+
+@triton.jit
+def _offset_back(slope, x, limit, unit, HAS_LIMIT: tl.constexpr):
+    return _tanh_back(limit * slope, x) if HAS_LIMIT else unit * slope
+
+
+@triton.jit
+def activate_rows(
+    offset, scale, rotation, opacity, color, image, pixel, depth, valid, points, photo, share, intrinsics,
+    extrinsics, means, quaternions, scales, opacities, colors, count, height, width,
+    limit, unit, inward, floor, span, across, thickness, least, bias, change,
+    HAS_LIMIT: tl.constexpr, HAS_COLOR: tl.constexpr, HAS_SHARE: tl.constexpr, ON_SURFACE: tl.constexpr,
+    ROWS: tl.constexpr,
+):  # fmt: skip
+    """Write ``ROWS`` Gaussians; see :func:`activate`."""
+    i = rows_of(count, ROWS)
+    view, at = tl.load(image + i), tl.load(pixel + i)
+    place = view * height * width + at
+    own, footprint = _depth_and_footprint(depth, intrinsics, view, place)
+    x, y, z = load3(offset, i)
+    x, y = _offset(x, limit, unit, HAS_LIMIT), _offset(y, limit, unit, HAS_LIMIT)
+    z = _offset(z, limit, unit, HAS_LIMIT) + inward * footprint
+    w, a, b, c = load4(rotation, i)
+    w, a, b, c, _ = _unit(w + 1, a, b, c)
+    if ON_SURFACE:
+        p, q, r, s = _axes(depth, valid, intrinsics, extrinsics, view, at, own, height, width)
+        x, y, z = _rotate(p, q, r, s, x, y, z)
+        w, a, b, c = _multiply(p, q, r, s, w, a, b, c)
+    u, v, t = load3(points, place)
+    store3(means, i, u + x, v + y, t + z)
+    store4(quaternions, i, w, a, b, c)
+    for k in tl.static_range(3):
+        raw = tl.load(scale + 3 * i + k) + (thickness if k == 2 else across)
+        tl.store(scales + 3 * i + k, footprint * (floor * tl.exp(span * _sigmoid(raw)[0])))
+        shade = tl.load(photo + (view * 3 + k) * height * width + at)
+        if HAS_COLOR:
+            shade += change * tanh(clamp(tl.load(color + 3 * i + k), -TANH, TANH))
+        tl.store(colors + 3 * i + k, shade)
+    shown = least + (1 - least) * _sigmoid(tl.load(opacity + i) + bias)[0]
+    if HAS_SHARE:
+        shown *= tl.load(share + place)
+    tl.store(opacities + i, shown)
+
+
+@triton.jit
+def activate_back_rows(
+    offset, scale, rotation, opacity, color, image, pixel, depth, valid, share, intrinsics, extrinsics,
+    of_means, of_quaternions, of_scales, of_opacities, of_colors,
+    d_offset, d_scale, d_rotation, d_opacity, d_color, d_points, count, height, width,
+    limit, unit, inward, floor, span, across, thickness, least, bias, change,
+    HAS_LIMIT: tl.constexpr, HAS_COLOR: tl.constexpr, HAS_SHARE: tl.constexpr, ON_SURFACE: tl.constexpr,
+    ROWS: tl.constexpr,
+):  # fmt: skip
+    """Write the gradients of ``ROWS`` Gaussians; see :func:`activate_back`."""
+    i = rows_of(count, ROWS)
+    view, at = tl.load(image + i), tl.load(pixel + i)
+    place = view * height * width + at
+    own, footprint = _depth_and_footprint(depth, intrinsics, view, place)
+    x, y, z = load3(of_means, i)
+    store3(d_points, place, x, y, z)
+    w, a, b, c = load4(of_quaternions, i)
+    if ON_SURFACE:
+        # Rotations and products with unit quaternions are transposed by the conjugate.
+        p, q, r, s = _axes(depth, valid, intrinsics, extrinsics, view, at, own, height, width)
+        x, y, z = _rotate(p, -q, -r, -s, x, y, z)
+        w, a, b, c = _multiply(p, -q, -r, -s, w, a, b, c)
+    u, v, t = load3(offset, i)
+    x, y = _offset_back(x, u, limit, unit, HAS_LIMIT), _offset_back(y, v, limit, unit, HAS_LIMIT)
+    store3(d_offset, i, x, y, _offset_back(z, t, limit, unit, HAS_LIMIT))
+    p, q, r, s = load4(rotation, i)
+    p, q, r, s, length = _unit(p + 1, q, r, s)
+    rate = tl.where(length == 0, 0.0, 1 / tl.where(length < SHORTEST, SHORTEST, length))
+    along = p * w + q * a + r * b + s * c
+    w, a, b, c = w - p * along, a - q * along, b - r * along, c - s * along
+    store4(d_rotation, i, rate * w, rate * a, rate * b, rate * c)
+    for k in tl.static_range(3):
+        raw = tl.load(scale + 3 * i + k) + (thickness if k == 2 else across)
+        value, steep = _sigmoid(raw)
+        slope = tl.load(of_scales + 3 * i + k) * footprint * (floor * tl.exp(span * value)) * span
+        tl.store(d_scale + 3 * i + k, _back(slope, steep, raw, SIGMOID))
+        if HAS_COLOR:
+            slope = change * tl.load(of_colors + 3 * i + k)
+            tl.store(d_color + 3 * i + k, _tanh_back(slope, tl.load(color + 3 * i + k)))
+    raw = tl.load(opacity + i) + bias
+    slope = (1 - least) * tl.load(of_opacities + i)
+    if HAS_SHARE:
+        slope *= tl.load(share + place)
+    tl.store(d_opacity + i, _back(slope, _sigmoid(raw)[1], raw, SIGMOID))
+
+
+def _start(kernel, tensors, maps: Tensor, count: int, constants, color, share, on_surface: bool) -> None:
+    """Launch ``kernel`` for ``count`` Gaussians."""
+    flags = {"HAS_LIMIT": constants[0] > 0, "HAS_COLOR": color is not None, "HAS_SHARE": share is not None}
+    if count > 0:
+        kernel[(triton.cdiv(count, ROWS),)](
+            *tensors, count, *maps.shape[-2:], *constants, **flags, ON_SURFACE=on_surface, ROWS=ROWS
+        )
+
+
+def activate(*inputs) -> tuple[Tensor, ...]:
+    """The operator of :mod:`ghgs_lit.heads.cuda`."""
+    *tensors, constants, on_surface = inputs
+    tensors = contiguous(*tensors)
+    offset, color, image, depth, share = (tensors[k] for k in (0, 4, 5, 7, 11))
+    out = [offset.new_empty(len(image), *size) for size in ((3,), (4,), (3,), (), (3,))]
+    _start(activate_rows, (*tensors, *out), depth, len(image), constants, color, share, on_surface)
+    return tuple(out)
+
+
+def activate_back(*inputs) -> list[Tensor]:
+    """The operator of :mod:`ghgs_lit.heads.cuda`."""
+    *tensors, constants, on_surface, slopes = inputs
+    tensors = contiguous(*tensors)
+    offset, color, image, depth, points, share = (tensors[k] for k in (0, 4, 5, 7, 9, 11))
+    found = [offset.new_empty(0) if x is None else torch.empty_like(x) for x in tensors[:5]]
+    found.append(torch.zeros_like(points))
+    given = (*tensors[:9], *tensors[11:], *contiguous(*slopes), *found)
+    _start(activate_back_rows, given, depth, len(image), constants, color, share, on_surface)
+    return found

@@ -1,0 +1,64 @@
+"""What kernels in Triton share: functions of tiles, which hold one number for each row. Only kernels import
+it, since no other PyTorch than CUDA's comes with Triton."""
+
+import triton
+import triton.language as tl
+from torch import Tensor
+
+
+def contiguous(*tensors: Tensor | None) -> list[Tensor | None]:
+    """The tensors as kernels read them."""
+    return [None if x is None else x.contiguous() for x in tensors]
+
+
+@triton.jit
+def rows_of(count, ROWS: tl.constexpr):
+    """Rows of this program; beyond the last one it is repeated, so that no row need be masked."""
+    i = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
+    return tl.minimum(i, count - 1)
+
+
+@triton.jit
+def load3(table, i):
+    """Numbers of rows ``i`` of a table of three columns."""
+    return tl.load(table + 3 * i), tl.load(table + 3 * i + 1), tl.load(table + 3 * i + 2)
+
+
+@triton.jit
+def store3(table, i, x, y, z):
+    """Write rows ``i`` of a table of three columns."""
+    tl.store(table + 3 * i, x)
+    tl.store(table + 3 * i + 1, y)
+    tl.store(table + 3 * i + 2, z)
+
+
+@triton.jit
+def load4(table, i):
+    """Numbers of rows ``i`` of a table of four columns."""
+    at = table + 4 * i
+    return tl.load(at), tl.load(at + 1), tl.load(at + 2), tl.load(at + 3)
+
+
+@triton.jit
+def store4(table, i, w, x, y, z):
+    """Write rows ``i`` of a table of four columns."""
+    tl.store(table + 4 * i, w)
+    tl.store(table + 4 * i + 1, x)
+    tl.store(table + 4 * i + 2, y)
+    tl.store(table + 4 * i + 3, z)
+
+
+@triton.jit
+def clamp(x, low, high):
+    """``x`` between ``low`` and ``high``; NaN stays."""
+    return tl.where(x > high, high, tl.where(x < low, low, x))
+
+
+@triton.jit
+def tanh(x):
+    """The hyperbolic tangent. Near 0 a series: the quotient loses digits there."""
+    shrunk = tl.exp(-2 * tl.abs(x))
+    size = (1 - shrunk) / (1 + shrunk)
+    squared = x * x
+    series = x * (1 + squared * (-1 / 3 + squared * (2 / 15 - squared * (17 / 315))))
+    return tl.where(tl.abs(x) < 0.2, series, tl.where(x < 0, -size, size))

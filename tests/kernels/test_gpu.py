@@ -1,0 +1,47 @@
+"""Operators of the package: kernels of a GPU, which compile without one."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from ghgs_lit.kernels import gpu
+from tests.helpers.kernels import kernels
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "gpu_compile.py"
+
+
+def test_every_kernel_compiles_for_gpus():
+    """For NVIDIA's A100 and H100, down to machine code, with registers for all that a thread holds."""
+    pytest.importorskip("triton")
+    env = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
+    command = [sys.executable, str(SCRIPT), "80", "90"]
+    done = subprocess.run(command, capture_output=True, text=True, env=env)
+    assert done.returncode == 0, done.stderr
+    lines = [line for line in done.stdout.splitlines() if "registers" in line]
+    assert all(line.endswith(" 0 bytes spilled") for line in lines)
+    for capability in ("80", "90"):
+        compiled = {line.split(":")[0].split()[0] for line in lines if f": {capability}," in line}
+        assert compiled == set(gpu.KERNELS)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="Triton works there")
+def test_without_a_driver_the_reason_is_said_and_plain_pytorch_used(monkeypatch):
+    """As on a machine without a C compiler, which Triton needs once."""
+    pytest.importorskip("triton")
+    with pytest.warns(UserWarning, match=r"Triton: expected to start kernels; found .*; plain"):
+        assert not gpu._triton_works.__wrapped__()
+    monkeypatch.setitem(sys.modules, "triton.runtime", None)
+    assert not gpu._triton_works.__wrapped__()  # not installed: nothing to say
+
+
+def test_a_switch_of_tests_and_nothing_else_chooses_kernels():
+    values = torch.ones(2)
+    assert not gpu.is_supported(values)
+    with kernels():
+        assert gpu.is_supported(values, None)
+        assert not gpu.is_supported(values, values.double())
+        assert not gpu.is_supported(values, values.to("meta"))
