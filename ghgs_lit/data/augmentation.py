@@ -85,6 +85,11 @@ class Augmentation(Options):
         self.require(low <= high, "target_scale", "[least, greatest] above 0")
         return self
 
+    @property
+    def varies_sizes(self) -> bool:
+        """Whether steps have inputs or targets of different sizes."""
+        return self.sizes is not None or self.target_scale is not None
+
     def draw_sizes(self, size: Size, target: Size, seed: int, step: int) -> tuple[Size, Size]:
         """Sizes of the inputs and targets of a step, from their sizes without variation."""
         rng = np.random.default_rng([seed, _SIZES, step])

@@ -63,14 +63,14 @@ def _views(
 
 
 def _images(views: list[list[View]]) -> Tensor:
-    return _stacked(views, "image").permute(0, 1, 4, 2, 3).float() / 255
+    return _stacked(views, "image").permute(0, 1, 4, 2, 3).float().div_(255)
 
 
 def _stacked(views: list[list[View]], name: str) -> Tensor | None:
-    arrays = [[getattr(view, name) for view in row] for row in views]
-    if any(array is None for row in arrays for array in row):
+    arrays = [getattr(view, name) for row in views for view in row]
+    if any(array is None for array in arrays):
         return None
-    return torch.from_numpy(np.stack([np.stack(row) for row in arrays]))
+    return torch.from_numpy(np.stack(arrays)).unflatten(0, (len(views), -1))
 
 
 def _cameras(views: list[list[View]]) -> Cameras:

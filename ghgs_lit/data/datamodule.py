@@ -1,6 +1,7 @@
 """LightningDataModule of all data sets."""
 
 import dataclasses
+import logging
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -13,6 +14,7 @@ from torch.utils.data import Dataset as TorchDataset
 
 from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.batches import BatchBuilder, EvaluationBatches, StepSampler, TrainingBatches
+from ghgs_lit.data.packed import Packing, folder_of, packed_reader
 from ghgs_lit.data.reader import PHASES, Photographs
 from ghgs_lit.data.sampling import (
     RING_VIEW,
@@ -29,6 +31,8 @@ from ghgs_lit.types import Batch
 if TYPE_CHECKING:  # its options build this class
     from ghgs_lit.data.dataset import DataOptions
 
+log = logging.getLogger(__name__)
+
 Targets = TargetProtocol | Mapping[str, Any]
 
 
@@ -40,6 +44,21 @@ def trained_batches(trainer: Trainer | None, length: int) -> int:
     length = min(length, trainer.num_training_batches)  # trainer.limit_train_batches
     epochs, steps = divmod(trainer.global_step, math.ceil(length / trainer.accumulate_grad_batches))
     return epochs * length + steps * trainer.accumulate_grad_batches
+
+
+def planned_batches(trainer: Trainer | None, length: int) -> float:
+    """Number of batches that each process will train on; infinite where nothing limits it.
+
+    Args:
+        trainer: its limits count; None: there are none.
+        length: batches of an epoch.
+    """
+    limits = [math.inf]
+    if trainer is not None and trainer.max_steps > 0:
+        limits.append(trainer.max_steps * trainer.accumulate_grad_batches)
+    if trainer is not None and (trainer.max_epochs or -1) > 0:
+        limits.append(trainer.max_epochs * length)
+    return min(limits)
 
 
 def _protocols(targets: Targets | Sequence[Targets]) -> list[TargetProtocol]:
@@ -108,10 +127,54 @@ class PhotographsDataModule(LightningDataModule):
         return self._training_batches(self.training_sampler(), step + 1)[step]
 
     def _training_batches(
-        self, sampler: TrainingSampler, length: int, rank: int = 0, world: int = 1
+        self,
+        sampler: TrainingSampler,
+        length: int,
+        rank: int = 0,
+        world: int = 1,
+        builder: BatchBuilder | None = None,
     ) -> TrainingBatches:
-        builder = dataclasses.replace(self.builder("train"), depths=self.trains_on_depths)
+        builder = dataclasses.replace(builder or self.builder("train"), depths=self.trains_on_depths)
         return TrainingBatches(builder, sampler, self.augmentation, length, rank, world)
+
+    def _packed_builder(self, length: int, rank: int) -> BatchBuilder:
+        """Builder of training batches that reads packed files. ``length``: batches of an epoch."""
+        plain = self.builder("train")
+        steps = planned_batches(self.trainer, length)
+        views = max(self.views.training_counts) + self.targets.per_step
+        reads = steps * self.dataset.batch_size * views
+        inputs = self._packed(plain.inputs, self.trains_on_depths, reads, rank)
+        if plain.targets is plain.inputs:
+            return BatchBuilder(inputs, inputs)
+        return BatchBuilder(inputs, self._packed(plain.targets, False, reads, rank))
+
+    def _packed(self, photographs: Photographs, depths: bool, reads: float, rank: int) -> Photographs:
+        """Photographs of training from packed files.
+
+        Args:
+            photographs: as they are read from their own files.
+            depths: whether depth maps are read, too.
+            reads: number of photographs that the run will read; files that are missing are written only where
+                this is more than there are photographs.
+            rank: number of this process; the first one says where packed files are.
+
+        Returns:
+            The same photographs, from packed files where there are any.
+        """
+        data = self.dataset
+        reader = photographs.reader
+        if data.packed_gb <= 0 or not reader.subjects:
+            return photographs
+        # Photographs that are resized in each step are packed as they are stored.
+        size = None if self.augmentation.varies_sizes or photographs.is_stored_size else photographs.size
+        views = tuple(sorted({RING_VIEW, *self.targets.training_views}))
+        there = sum(map(len, reader.subjects.values())) * len(views)
+        packing = Packing(folder_of(data.folder), size, data.resampling, views, depths, writes=reads > there)
+        said = log.info if rank == 0 else log.debug
+        reader = packed_reader(reader, packing, data.packed_gb, said)
+        if reader is photographs.reader:
+            return photographs
+        return Photographs(reader, photographs.size, 0, data.resampling)  # the system keeps the files' pages
 
     def train_dataloader(self) -> DataLoader:
         """Batches of one epoch, which continues where the last one ended."""
@@ -120,7 +183,7 @@ class PhotographsDataModule(LightningDataModule):
         rank = self.trainer.global_rank if self.trainer else 0
         once = math.ceil(len(sampler.subjects) / (self.dataset.batch_size * world))
         length = self.dataset.steps_per_epoch or once
-        batches = self._training_batches(sampler, length, rank, world)
+        batches = self._training_batches(sampler, length, rank, world, self._packed_builder(length, rank))
         return self._loader(
             batches, sampler=StepSampler(batches, lambda: trained_batches(self.trainer, length))
         )

@@ -57,6 +57,9 @@ class DataOptions(Options):
     """Training steps of an epoch; null: one pass over the subjects."""
     cache_images_mb: Amount = 512
     """MiB of decoded photographs kept in memory by each process."""
+    packed_gb: Amount = 16
+    """Largest size in GB (10^9 bytes) of the decoded photographs of training that are kept on the disk, in
+    the data's folder or the user's cache, and mapped into memory; 0: none are."""
     evaluation_positions: tuple[tuple[Index, ...], ...] = ()
     """Lists of input positions, such as [[0, 6, 11]] for 3 views; other numbers of views: evenly spaced."""
     workers: Workers = 0

@@ -17,7 +17,7 @@ and ``done/<phase>/<subject>`` (an empty file for each complete subject, written
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -95,6 +95,8 @@ def lights_of(render: Mapping[str, Any]) -> str:
 
 
 _IMAGE_SUFFIXES = (".jpg", ".png", ".jpeg")
+#: Folders of each position.
+_KINDS = ("img", "mask", "alpha", "depth", "parm")
 _POSITION = re.compile(r"(.+)_(\d{3,})")
 #: Folders of bodies; the first that exists is read.
 _BODY_MODELS = ("smpl", "smplx")
@@ -187,12 +189,23 @@ class Layout(Reader):
         images = [path for path in files if path.suffix.lower() in _IMAGE_SUFFIXES]
         return sorted(int(path.stem) for path in images if path.stem.isdecimal())
 
+    def sources(self, name: str) -> Iterator[Path | str]:
+        yield f"principal points moved by {self._shift}"
+        for position in self.subjects[name]:
+            for kind in _KINDS:
+                folder = self._folder(name, kind, position)
+                yield from folder.iterdir() if folder.is_dir() else ()
+        body = self._body(name)
+        yield from () if body is None else (body,)
+
     def read_body(self, name: str) -> np.ndarray | None:
-        for model in _BODY_MODELS:
-            path = find_path(self._folders[name], f"{model}/{name}/vertices.npy")
-            if path is not None:
-                return read_vertices(path)
-        return None
+        path = self._body(name)
+        return None if path is None else read_vertices(path)
+
+    def _body(self, name: str) -> Path | None:
+        """The file of a subject's body, if there is one."""
+        paths = (find_path(self._folders[name], f"{model}/{name}/vertices.npy") for model in _BODY_MODELS)
+        return next((path for path in paths if path is not None), None)
 
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
         image = read_photograph(self._file(name, "img", position, str(view), _IMAGE_SUFFIXES))

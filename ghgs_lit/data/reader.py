@@ -8,7 +8,7 @@ import contextlib
 import logging
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +55,24 @@ class Reader(ABC):
     def place(self, name: str, position: int, view: int) -> str:
         """Name of a photograph in messages, preferably the path of its mask."""
         return f"{name}, camera {position}, view {view}"
+
+    def sources(self, name: str) -> Iterable[Path | str]:
+        """All that a subject's photographs and body depend on: paths of files, and texts that say the options
+        of their decoding. None: not known, and the subject is never packed (:mod:`ghgs_lit.data.packed`)."""
+        return ()
+
+    def checked_view(self, name: str, position: int, view: int, depth: bool) -> View:
+        """One photograph as :meth:`read_view`.
+
+        Raises:
+            InputError: a file is missing or bad, the reader gives a wrong view, or the mask is empty.
+        """
+        stored = self.read_view(name, position, view, depth)
+        place = self.place(name, position, view)
+        check_view(place, stored)
+        if not stored.mask.any():
+            raise InputError(f"{place}: expected a subject in the mask; found none")
+        return stored
 
     @contextlib.contextmanager
     def collecting(self) -> Iterator[None]:
@@ -122,14 +140,18 @@ class Photographs:
         size = size or self.size
 
         def read() -> View:
-            stored = self.reader.read_view(name, position, view, depth)
-            place = self.reader.place(name, position, view)
-            check_view(place, stored)
-            if not stored.mask.any():
-                raise InputError(f"{place}: expected a subject in the mask; found none")
+            stored = self.reader.checked_view(name, position, view, depth)
             return stored if size is None else resize_view(stored, *size, self.resampling)
 
         return self._cached((name, position, view, depth, size), read)
+
+    @property
+    def is_stored_size(self) -> bool:
+        """Whether the first photograph that can be read has :attr:`size` as it is stored."""
+        for name, positions in self.reader.subjects.items():
+            with contextlib.suppress(InputError):
+                return self.reader.read_view(name, positions[0], 0, False).mask.shape == self.size
+        return False
 
     def body(self, name: str) -> np.ndarray | None:
         """Body vertices as :meth:`Reader.read_body`. InputError: they are bad."""

@@ -119,10 +119,7 @@ class View:
     @property
     def depth(self) -> np.ndarray | None:
         """Depth [h, w] float32 in metres, 0 where unknown."""
-        if self.inverse_depth is None:
-            return None
-        known = self.inverse_depth > 0
-        return np.where(known, _DEPTH_SCALE / np.where(known, self.inverse_depth, 1), 0).astype(np.float32)
+        return None if self.inverse_depth is None else _depths()[self.inverse_depth]
 
     @property
     def nbytes(self) -> int:
@@ -132,7 +129,14 @@ class View:
     @property
     def alpha(self) -> np.ndarray | None:
         """Matte [h, w] float32 in [0, 1]."""
-        return None if self.matte is None else self.matte.astype(np.float32) / 255
+        return None if self.matte is None else np.divide(self.matte, 255, dtype=np.float32)
+
+
+@lru_cache(maxsize=1)
+def _depths() -> np.ndarray:
+    """Depth [65536] float32 in metres of each inverse depth; 0 for 0."""
+    inverse = np.arange(1, 1 << 16)
+    return np.concatenate(([0], _DEPTH_SCALE / inverse)).astype(np.float32)
 
 
 def encode_depth(depth: np.ndarray) -> np.ndarray:

@@ -93,7 +93,7 @@ def test_evaluation_has_the_batches_that_are_asked_for(boxes):
 def test_each_process_of_several_loads_its_own_samples(boxes, rank):
     """Its number and how many there are come from the trainer: four subjects, two steps."""
     data = rendered(boxes, batch_size=1)
-    data.trainer = SimpleNamespace(world_size=2, global_rank=rank)
+    data.trainer = SimpleNamespace(world_size=2, global_rank=rank, max_steps=-1, max_epochs=None)
     batches = data.train_dataloader().dataset
     assert (batches.rank, batches.world, len(batches)) == (rank, 2, 2)
     drawn = data.training_sampler()

@@ -6,6 +6,7 @@ import shutil
 import sys
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +20,15 @@ from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.errors import InputError
 from scripts.miniatures import humman
 from scripts.miniatures.smpl import stand_in
-from tests.helpers.captures import blob, build_data, centroid, inside, make_miniature, project
+from tests.helpers.captures import (
+    blob,
+    build_data,
+    centroid,
+    inside,
+    make_miniature,
+    project,
+    require_same_packed,
+)
 
 TEST = "p000455_a000986"
 WIDTH, HEIGHT = 160, 90
@@ -232,3 +241,17 @@ def test_targets_between_cameras_that_stand_still_are_refused(root):
         with pytest.raises(InputError, match=r"targets: expected cameras for data=humman.*; found"):
             draw()
     assert len(data.evaluation_loader(targets=CAMERAS)) > 0
+
+
+def test_packed_frames_are_the_same(root, tmp_path):
+    """Photographs and bodies of a frame in one file, which depends on the body model, too."""
+    reader = photographs(root).reader
+    require_same_packed(reader, tmp_path, (36, 64))
+    without = set(tmp_path.iterdir())
+    assert len(without) == len(reader.subjects)
+    reader._body = SimpleNamespace(
+        file=root.with_name("recon_body_models") / "smpl" / "SMPL_NEUTRAL.pkl",
+        vertices=lambda parameters: parameters["body_pose"].reshape(-1, 3).astype(np.float32),
+    )
+    require_same_packed(reader, tmp_path, (36, 64))
+    assert without.isdisjoint(tmp_path.iterdir())

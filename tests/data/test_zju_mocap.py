@@ -20,7 +20,15 @@ from ghgs_lit.data.zju_mocap.dataset import ZJUMoCap
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.undistortion import undistort, undistorting_grid
 from scripts.miniatures import zju_mocap
-from tests.helpers.captures import blob, build_data, centroid, inside, make_miniature, project
+from tests.helpers.captures import (
+    blob,
+    build_data,
+    centroid,
+    inside,
+    make_miniature,
+    project,
+    require_same_packed,
+)
 
 OPENCV = np.load(Path(__file__).parents[1] / "fixtures" / "opencv_camera.npz")
 SIZE = 112
@@ -349,3 +357,10 @@ def test_photographs_are_undistorted_about_their_own_pixel_centers(root):
     view = photographs(root).view("CoreView_386_000000", 7)
     np.testing.assert_array_equal(view.mask, matte > 127)
     np.testing.assert_array_equal(view.image, np.where(view.mask[..., None], straight, 0))
+
+
+@pytest.mark.parametrize("sequence", ["386", "313"])
+def test_packed_frames_are_the_same(root, tmp_path, sequence):
+    """Photographs without lens distortion, and with it in another file; names of both generations."""
+    require_same_packed(photographs(root, sequence).reader, tmp_path, (64, 48))
+    require_same_packed(photographs(root, sequence, undistorted=False).reader, tmp_path, (64, 48))

@@ -1,5 +1,6 @@
 """Shared by the tests of data sets: miniatures made once, broken files, what a view must agree with."""
 
+import dataclasses
 import functools
 import os
 from collections.abc import Callable
@@ -12,8 +13,9 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 
 from ghgs_lit.config import build, compose
-from ghgs_lit.data.reader import Photographs
-from ghgs_lit.data.view import View
+from ghgs_lit.data.packed import Packing, packed_reader
+from ghgs_lit.data.reader import Photographs, Reader
+from ghgs_lit.data.view import View, resize_view
 from ghgs_lit.errors import InputError
 from ghgs_lit.synthesis import people
 
@@ -43,6 +45,19 @@ def build_data(name: str, root: Path, *overrides: str):
 def stored(data, phase: str, size: tuple[int, int] | None = None) -> Photographs:
     """The photographs of a data module, at their stored size unless ``size`` is given."""
     return Photographs(data.dataset.reader(phase), size)
+
+
+def require_same_packed(reader: Reader, folder: Path, size: tuple[int, int]) -> None:
+    """Check that photographs and bodies from packed files in ``folder`` are those of a reader, to the bit."""
+    packed = packed_reader(reader, Packing(folder, size, "area", (0,), False), 1, print)
+    for name, positions in reader.subjects.items():
+        assert packed.pack(name) is not None
+        np.testing.assert_array_equal(packed.read_body(name), reader.read_body(name))
+        for position in positions:
+            found = packed.checked_view(name, position, 0, False)
+            expected = resize_view(reader.checked_view(name, position, 0, False), *size)
+            for field in dataclasses.fields(View):
+                np.testing.assert_array_equal(getattr(found, field.name), getattr(expected, field.name))
 
 
 class Malice:

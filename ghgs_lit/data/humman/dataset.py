@@ -9,7 +9,7 @@ are missing), ``kinect_color/kinect_<k>/<frame>.png`` (1920 x 1080), ``kinect_ma
 
 import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -80,6 +80,11 @@ class _Frame:
         folder, name = self.folder / kind / f"kinect_{kinect:03d}", f"{self.number:06d}.png"
         return find_path(folder, name) or folder / name
 
+    @property
+    def parameters(self) -> Path:
+        """File of the body's parameters."""
+        return self.folder / "smpl_params" / f"{self.number:06d}.npz"
+
 
 class HuMManReader(FrameReader):
     """Frames of the sequences of a phase, each a subject ``<sequence>_<frame>``; positions are the colour
@@ -131,8 +136,17 @@ class HuMManReader(FrameReader):
     def read_body(self, name: str) -> np.ndarray | None:
         if self._body is None:
             return None
+        return self._body.vertices(read_parameters(self.frames[name].parameters))
+
+    def sources(self, name: str) -> Iterator[Path | str]:
         frame = self.frames[name]
-        return self._body.vertices(read_parameters(frame.folder / "smpl_params" / f"{frame.number:06d}.npz"))
+        yield frame.folder / "cameras.json"
+        for position in self.subjects[name]:
+            yield frame.file("kinect_color", position)
+            yield frame.file(self.data.masks, position)
+        if self._body is not None:
+            yield frame.parameters
+            yield self._body.file
 
     def place(self, name: str, position: int, view: int) -> str:
         return str(self.frames[name].file(self.data.masks, position))

@@ -93,6 +93,7 @@ class Body:
         file = path / _FILE if path.is_dir() else path
         expected = f"SMPL_NEUTRAL.pkl, or a folder with {_FILE}"
         require(file.is_file(), str(path), expected, "neither")
+        self.file = file
         self.model = _model(file)
 
     @torch.no_grad()

@@ -7,7 +7,7 @@
 
 import functools
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Annotated, ClassVar
@@ -109,11 +109,25 @@ class ZJUMoCapReader(FrameReader):
         return opencv_view(image, mask, intrinsics, frame.annotations.extrinsics[position])
 
     def read_body(self, name: str) -> np.ndarray | None:
+        path = self._body(self.frames[name])
+        return None if path is None else read_array(path, [(BODY_VERTICES, 3)]).astype(np.float32)
+
+    def sources(self, name: str) -> Iterator[Path | str]:
         frame = self.frames[name]
+        yield f"undistorted: {self.data.undistorted}"
+        yield frame.folder / "annots.npy"
+        for position in self.subjects[name]:
+            photograph = frame.annotations.frames[frame.index][position]
+            yield _find(frame.folder, photograph, photograph.suffix)
+            for masks in self._mask_folders(frame.folder):
+                yield _find(masks, photograph, ".png")
+        body = self._body(frame)
+        yield from () if body is None else (body,)
+
+    def _body(self, frame: _Frame) -> Path | None:
+        """The file of a frame's vertices, if its sequence has any."""
         folder = next((f for b in _BODIES if (f := frame.folder / b).is_dir()), None)
-        if folder is None:
-            return None
-        return read_array(folder / f"{frame.number}.npy", [(BODY_VERTICES, 3)]).astype(np.float32)
+        return None if folder is None else folder / f"{frame.number}.npy"
 
     def place(self, name: str, position: int, view: int) -> str:
         frame = self.frames[name]

@@ -1,0 +1,283 @@
+"""Decoded photographs of each subject in one file, from which training reads at the speed of memory.
+
+A file holds the photographs of a subject that training may draw: of each the part that is not black, with the
+mask, the matte and the depth map of that part, and its camera. It is mapped into memory, so that processes
+share its pages. Its name has a digest of all that its values depend on (names, sizes and times of the files
+that were read, options, the version of this format): changed data is never read from an old file. Files are
+written at a subject's first use, atomically: what is interrupted is written again, and where two processes
+write the same file, either is right.
+"""
+
+import contextlib
+import functools
+import hashlib
+import json
+import logging
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import PIL
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from ghgs_lit.data.reader import Reader
+from ghgs_lit.data.view import View, resize_view
+from ghgs_lit.errors import InputError
+from ghgs_lit.files import write_atomically
+
+log = logging.getLogger(__name__)
+
+#: Changes with the format of the files and with every change of how photographs are decoded or resized.
+_VERSION = 1
+#: Files that a process keeps open.
+_OPEN_FILES = 128
+#: Largest share of the free disk that packed photographs may take.
+_SHARE_OF_DISK = 0.5
+#: Numbers of each photograph in a file: where it begins, its size, the part of it that is kept, its maps.
+_COLUMNS = ("position", "view", "start", "height", "width", "top", "bottom", "left", "right", "maps")
+_MATTE, _DEPTH = 1, 2
+
+
+@dataclass(frozen=True)
+class Packing:
+    """How photographs are packed.
+
+    Args:
+        folder: where the files are.
+        size: (height, width) of the packed photographs in pixels; None: as stored.
+        resampling: how they are resized, as for :func:`ghgs_lit.data.view.resize_view`.
+        views: numbers of the views at each position that are packed.
+        depths: whether depth maps are packed.
+        writes: whether missing files are written; otherwise only those that exist are read.
+    """
+
+    folder: Path
+    size: tuple[int, int] | None
+    resampling: str
+    views: tuple[int, ...]
+    depths: bool
+    writes: bool = True
+
+    @property
+    def digest(self) -> str:
+        """Name of the settings in names of files."""
+        resized = None if self.size is None else (self.size, self.resampling)
+        return _digest([_VERSION, PIL.__version__, resized, self.views, self.depths])
+
+
+class PackedReader(Reader):
+    """A reader whose photographs come from packed files, at their size, and from the other reader's files
+    where a subject cannot be packed.
+
+    Args:
+        reader: reads what is packed; its ``sources`` say what a subject's file depends on.
+        packing: where and how it is packed.
+    """
+
+    def __init__(self, reader: Reader, packing: Packing) -> None:
+        super().__init__(reader.strict)
+        self.reader = reader
+        self.packing = packing
+        self.subjects = reader.subjects
+        self._paths: dict[str, Path | None] = {}
+        self._writes = packing.writes
+
+    def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
+        pack = self.pack(name)
+        found = None
+        if pack is not None and depth <= self.packing.depths:
+            found = pack.view(position, view, depth)
+        return self._resized(name, position, view, depth) if found is None else found
+
+    checked_view = read_view  # was checked before it was packed
+
+    def read_body(self, name: str) -> np.ndarray | None:
+        pack = self.pack(name)
+        return self.reader.read_body(name) if pack is None else pack.body
+
+    def views_at(self, name: str, position: int) -> list[int]:
+        return self.reader.views_at(name, position)
+
+    def place(self, name: str, position: int, view: int) -> str:
+        return self.reader.place(name, position, view)
+
+    def pack(self, name: str) -> "Pack | None":
+        """The packed file of a subject, written if it is missing; None: there is none."""
+        if name not in self._paths:
+            self._paths[name] = self._path(name)
+        path = self._paths[name]
+        if path is None:
+            return None
+        pack = _opened(path)
+        if pack is None and self._writes:
+            self._write(name, path)
+            pack = _opened(path)
+        if pack is None:  # nothing is written or looked for again
+            self._paths[name] = None
+        return pack
+
+    def _path(self, name: str) -> Path | None:
+        """The file of a subject, named after the names, sizes and times of its sources."""
+        facts = []
+        for source in sorted(map(str, self.reader.sources(name))):
+            with contextlib.suppress(OSError):  # an option, or a file that may be missing
+                found = os.stat(source)
+                facts.append((found.st_size, found.st_mtime_ns, found.st_ctime_ns))
+            facts.append(source)
+        if not facts:
+            return None
+        return self.packing.folder / f"{name}-{self.packing.digest}-{_digest(facts)}.safetensors"
+
+    def _write(self, name: str, path: Path) -> None:
+        """Write the file of a subject and remove older ones of the same settings."""
+        content = self._content(name)
+        try:
+            write_atomically(path, lambda temporary: temporary.write_bytes(save(content)))
+            beginning = path.name.rpartition("-")[0] + "-"
+            for other in os.listdir(path.parent):
+                if other.startswith(beginning) and other != path.name and other.endswith(path.suffix):
+                    (path.parent / other).unlink(missing_ok=True)
+        except OSError as error:
+            self._writes = False
+            log.warning("%s: expected room for packed photographs; found %s", path, error.strerror)
+
+    def _content(self, name: str) -> dict[str, np.ndarray]:
+        rows, matrices, parts = [], [], [np.empty(0, np.uint8)]
+        start = 0
+        for position in self.subjects[name]:
+            for view in self.packing.views:
+                try:
+                    found = self._resized(name, position, view, self.packing.depths)
+                except InputError:  # said when it is drawn
+                    continue
+                row, part = _packed(found)
+                rows.append((position, view, start, *row))
+                matrices.append(np.concatenate((found.intrinsics.ravel(), found.extrinsics.ravel())))
+                parts.append(part)
+                start += len(part)
+        content = {
+            "pixels": np.concatenate(parts),
+            "rows": np.array(rows, np.int64).reshape(-1, len(_COLUMNS)),
+            "matrices": np.array(matrices, np.float32).reshape(-1, 25),
+        }
+        body = self.reader.read_body(name)
+        return content if body is None else content | {"body": body}
+
+    def _resized(self, name: str, position: int, view: int, depth: bool) -> View:
+        found = self.reader.checked_view(name, position, view, depth)
+        size = self.packing.size
+        return found if size is None else resize_view(found, *size, self.packing.resampling)
+
+
+class Pack:
+    """The packed photographs of one subject, in the file ``path``.
+
+    Attributes:
+        body: vertices [n, 3] of the body, or None.
+        bytes: size of the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.bytes = path.stat().st_size
+        self._file = safe_open(path, "np")
+        rows = self._file.get_tensor("rows")
+        self._rows = {(row[0], row[1]): (i, *row[2:]) for i, row in enumerate(rows.tolist())}
+        self._matrices = self._file.get_tensor("matrices")
+        self._pixels = self._file.get_slice("pixels")
+        self.body = self._file.get_tensor("body") if "body" in self._file.keys() else None  # noqa: SIM118
+
+    def view(self, position: int, view: int, depth: bool) -> View | None:
+        """One photograph with or without its depth map; None: it is not in the file."""
+        if (position, view) not in self._rows:
+            return None
+        number, start, height, width, top, bottom, left, right, maps = self._rows[position, view]
+        part = (bottom - top, right - left)
+        count = part[0] * part[1]
+        kinds = [("image", np.uint8, (3,)), ("mask", np.bool_, ())]
+        kinds += [("matte", np.uint8, ())] if maps & _MATTE else []
+        depths = maps & _DEPTH
+        pixels = self._pixels[start : start + count * (4 + bool(maps & _MATTE) + 2 * bool(depths))]
+        whole: dict[str, np.ndarray | None] = {"matte": None, "inverse_depth": None}
+        if depths and depth:
+            kinds.insert(0, ("inverse_depth", np.uint16, ()))
+        first = 2 * count if depths and not depth else 0
+        for kind, dtype, channels in kinds:
+            end = first + count * np.dtype(dtype).itemsize * (channels or (1,))[0]
+            whole[kind] = np.zeros((height, width, *channels), dtype)
+            whole[kind][top:bottom, left:right] = pixels[first:end].view(dtype).reshape(*part, *channels)
+            first = end
+        matrices = self._matrices[number]
+        return View(**whole, intrinsics=matrices[:9].reshape(3, 3), extrinsics=matrices[9:].reshape(4, 4))
+
+
+def _packed(view: View) -> tuple[tuple[int, ...], np.ndarray]:
+    """Size, kept part and maps of a photograph, and its bytes: depths first, where they are aligned."""
+    named = [(_DEPTH, view.inverse_depth), (0, view.image), (0, view.mask), (_MATTE, view.matte)]
+    there = [(flag, array) for flag, array in named if array is not None]
+    shown = view.image.any(-1)
+    for _, array in there:
+        if array.ndim == 2:
+            shown = shown | (array != 0)
+    shown[0, 0] |= not shown.any()  # a part has a pixel
+    rows, columns = (np.flatnonzero(shown.any(axis)) for axis in (1, 0))
+    top, bottom, left, right = int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+    parts = [np.ascontiguousarray(array[top:bottom, left:right]).view(np.uint8).ravel() for _, array in there]
+    maps = sum(flag for flag, _ in there)
+    return (*view.mask.shape, top, bottom, left, right, maps), np.concatenate(parts)
+
+
+def _opened(path: Path) -> Pack | None:
+    """The file at ``path`` if there is a whole one."""
+    try:
+        return _open(path)
+    except (OSError, SafetensorError):
+        return None
+
+
+_open = functools.lru_cache(maxsize=_OPEN_FILES)(Pack)
+
+
+def _digest(facts: list) -> str:
+    return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:12]
+
+
+def folder_of(data: Path) -> Path:
+    """Folder of the packed photographs of the data set in ``data``: in it, or in the user's cache where it
+    cannot be written to."""
+    beside = data / "packed"
+    if os.access(beside if beside.is_dir() else data, os.W_OK | os.X_OK):
+        return beside
+    cache = Path(os.environ.get("GHGS_CACHE") or "~/.cache/ghgs_lit").expanduser()
+    return cache / "packed" / _digest([str(data.resolve())])
+
+
+def packed_reader(reader: Reader, packing: Packing, most_gb: float, say: Callable[[str], None]) -> Reader:
+    """A reader with packed photographs, if they fit.
+
+    Args:
+        reader: of the photographs in their own files.
+        packing: where and how they are packed.
+        most_gb: largest size of all files in GB (10^9 bytes); 0: nothing is packed.
+        say: is told size and place, or why nothing is packed.
+
+    Returns:
+        A :class:`PackedReader`, or ``reader`` itself where nothing is packed.
+    """
+    names = list(reader.subjects)
+    packed = PackedReader(reader, packing)
+    pack = packed.pack(names[0]) if names and most_gb > 0 else None
+    if pack is None:
+        return reader
+    there = sum(file.stat().st_size for file in packing.folder.glob(f"*-{packing.digest}-*.safetensors"))
+    whole = max(pack.bytes * len(names), there)
+    free = shutil.disk_usage(packing.folder).free
+    size = f"about {whole / 1e9:.2g} GB for {len(names)} subjects in {packing.folder}"
+    if whole > most_gb * 1e9 or whole - there > _SHARE_OF_DISK * free:
+        say(f"photographs are not packed: {size} (data.packed_gb={most_gb:g}, {free / 1e9:.0f} GB are free)")
+        return reader
+    say(f"photographs of training are packed: {size} (data.packed_gb=0: none)")
+    return packed

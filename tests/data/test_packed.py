@@ -1,0 +1,207 @@
+"""Packed photographs: samples are those of the data's own files, whatever happens to either."""
+
+import logging
+import multiprocessing
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ghgs_lit.data import packed
+from tests.helpers.people import equal, render_boxes, rendered
+
+SIZES = {"sizes": [28, [42, 28]], "target_scale": [0.7, 1.0]}
+
+
+@pytest.fixture(scope="module")
+def boxes(tmp_path_factory) -> Path:
+    """Two people of training and one of validation."""
+    folder = tmp_path_factory.mktemp("boxes")
+    render_boxes(folder / "out", folder / "scans", train=2, val=1)
+    return folder / "out"
+
+
+@pytest.fixture
+def root(boxes, tmp_path) -> Path:
+    """A copy that a test may change."""
+    return shutil.copytree(boxes, tmp_path / "out")
+
+
+def batches(root, gb=1, **options):
+    """The first steps of a training."""
+    data = rendered(root, packed_gb=gb, **{"steps_per_epoch": 4, "batch_size": 2, **options})
+    return list(data.train_dataloader())
+
+
+def files(root) -> list[Path]:
+    return sorted((root / "packed").glob("*.safetensors"))
+
+
+def same(root, **options) -> bool:
+    """Whether steps from packed files are, to the bit, those from the data's own."""
+    return all(map(equal, batches(root, **options), batches(root, gb=0, **options)))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"size": 42},
+        {"target_size": 42},
+        {"augmentation": SIZES},
+        {"resampling": "release"},
+        {"workers": 2},
+    ],
+    ids=str,
+)
+def test_samples_are_those_of_the_folder(root, options):
+    """Photographs, masks, mattes, depths, bodies and cameras; resized once, in each step, or not at all."""
+    assert same(root, **options)
+    assert files(root)
+    assert batches(root, **options)[0].depths is not None
+
+
+def test_samples_come_from_the_packed_files(root):
+    """Once they are there no photograph is decoded."""
+    expected = batches(root)
+    times = [path.stat().st_mtime_ns for path in files(root)]
+
+    def refuse(*_):
+        raise AssertionError("a photograph was decoded")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ghgs_lit.data.layout.read_photograph", refuse)
+        with pytest.raises(AssertionError):
+            batches(root, gb=0)
+        # The first photograph's size is compared with the size that is asked for.
+        patch.setattr("ghgs_lit.data.reader.Photographs.is_stored_size", False)
+        assert all(map(equal, batches(root), expected))
+    assert [path.stat().st_mtime_ns for path in files(root)] == times
+
+
+@pytest.mark.parametrize("kind", ["img", "alpha", "depth", "parm", "smpl"])
+def test_changed_data_is_never_read_from_an_old_file(root, kind):
+    """Not even where size and time of files stay: their last change has another time."""
+    before = batches(root)
+    for path in (root / "train" / kind).glob("*/*"):
+        stat = path.stat()
+        if path.suffix == ".npy":
+            matrix = np.load(path)
+            matrix[0, -1] += 0.1
+            np.save(path, matrix)
+        else:
+            values = np.asarray(Image.open(path))
+            Image.fromarray(values - values // 4).save(path)
+        os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    after = batches(root)
+    assert all(map(equal, after, batches(root, gb=0)))
+    assert not any(map(equal, after, before))
+    assert len(files(root)) == 2  # the old ones are gone
+
+
+def test_an_interrupted_or_torn_file_is_written_again(root):
+    """What a killed process or a full disk has left is no data."""
+    batches(root)
+    packed._open.cache_clear()
+    for path in files(root):
+        path.write_bytes(path.read_bytes()[:-100])
+    assert same(root)
+    packed._open.cache_clear()
+    files(root)[0].write_bytes(b"")
+    assert same(root)
+    assert all(path.stat().st_size > 1000 for path in files(root))
+
+
+def _read(root, go_on):
+    go_on.wait()
+    raise SystemExit(not same(root))
+
+
+def test_many_processes_at_once(root):
+    """Each reads what is right, whoever has written it."""
+    context = multiprocessing.get_context("fork")
+    go_on = context.Barrier(3)
+    readers = [context.Process(target=_read, args=(root, go_on)) for _ in range(3)]
+    for reader in readers:
+        reader.start()
+    for reader in readers:
+        reader.join(60)
+    assert [reader.exitcode for reader in readers] == [0, 0, 0]
+    assert len(files(root)) == 2
+
+
+def test_a_broken_photograph_is_named_when_it_is_drawn(root):
+    """It is left out of the file; the others are packed."""
+    path = root / "train" / "img" / "s0_000" / "0.jpg"
+    path.write_bytes(b"no image")
+    reader = rendered(root).dataset.reader("train")
+    packing = packed.Packing(root / "packed", None, "area", (0, 2), True)
+    found = packed.packed_reader(reader, packing, 1, print)
+    assert found.checked_view("s0", 0, 2, True).image.shape == (42, 42, 3)
+    with pytest.raises(ValueError, match=r"s0_000.0\.jpg: expected a readable image"):
+        found.checked_view("s0", 0, 0, True)
+
+
+def test_size_and_place_are_said_once(root, caplog):
+    """The log names the option that switches it off, which writes nothing."""
+    with caplog.at_level(logging.INFO):
+        batches(root, gb=0)
+        assert not files(root)
+        assert "packed" not in caplog.text
+        batches(root)
+    line = next(record.message for record in caplog.records if "packed" in record.message)
+    whole = sum(path.stat().st_size for path in files(root)) / 1e9
+    assert line == (
+        f"photographs of training are packed: about {whole:.2g} GB for 2 subjects in {root / 'packed'} "
+        "(data.packed_gb=0: none)"
+    )
+
+
+def test_what_would_not_fit_is_not_packed(root, caplog):
+    """More than packed_gb, or than half of the free disk: the data's own files are read, and that is said."""
+    with caplog.at_level(logging.INFO):
+        assert all(map(equal, batches(root, gb=1e-9), batches(root, gb=0)))
+    assert "photographs are not packed: about" in caplog.text
+    assert len(files(root)) == 1  # of the first subject, by which the size is known
+
+
+def test_a_full_disk_stops_no_training(root, caplog, monkeypatch):
+    """What cannot be written is read from the data's own files; it is said once."""
+    batches(root)
+    files(root)[1].unlink()
+
+    def full(path, write):
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(packed, "write_atomically", full)
+    packed._open.cache_clear()
+    assert same(root)
+    assert sum("found No space left on device" in record.message for record in caplog.records) == 1
+
+
+def test_data_that_cannot_be_written_to_is_packed_in_the_cache(root, tmp_path, monkeypatch):
+    """Two data sets have two folders there."""
+    monkeypatch.setenv("GHGS_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(packed.os, "access", lambda path, mode: False)
+    assert same(root)
+    assert not files(root)
+    assert len(list((tmp_path / "cache" / "packed").glob("*/*.safetensors"))) == 2
+    assert packed.folder_of(root) != packed.folder_of(tmp_path)
+
+
+def test_short_trainings_write_nothing(root):
+    """Where fewer photographs are read than would be packed; those that are there are read."""
+    from lightning import Trainer
+
+    def steps(count):
+        data = rendered(root, steps_per_epoch=4)
+        data.trainer = Trainer(max_steps=count, accelerator="cpu", logger=False, enable_checkpointing=False)
+        return data.train_dataloader()
+
+    steps(20)  # of 5 photographs; there are 2 x 16 x 4
+    assert not files(root)
+    steps(30)
+    assert files(root)
