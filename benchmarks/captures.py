@@ -22,6 +22,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from ghgs_capture.capture import Capture
+from ghgs_capture.crops import Photograph
+from ghgs_capture.prediction import predict, trained_size
 from ghgs_lit import GHGS
 from ghgs_lit.cli.evaluate import baselines_of
 from ghgs_lit.cli.inputs import build_data, build_renderer, pick_device
@@ -36,10 +39,7 @@ from ghgs_lit.evaluation.measure import Method, ModelMethod, measure
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.geometry.masks import signed_distance
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
-from ghgs_lit.prediction.capture.capture import Capture
-from ghgs_lit.prediction.capture.crops import Photograph
-from ghgs_lit.prediction.capture.predict import predict, trained_size
-from ghgs_lit.prediction.refinement import CameraRefinement
+from ghgs_lit.refinement import CameraRefinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import read_checkpoint

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import torch
 
+from ghgs_capture.prediction import trained_size
 from ghgs_lit import GHGS, Capture
 from ghgs_lit.cli.inputs import build_renderer, pick_device
 from ghgs_lit.config import build, compose, resolve
@@ -23,8 +24,7 @@ from ghgs_lit.evaluation.baselines import nearest_view, splatted
 from ghgs_lit.evaluation.baselines.splats import hull_depth
 from ghgs_lit.evaluation.measure import Method, ModelMethod, measure
 from ghgs_lit.geometry.frame import Frame
-from ghgs_lit.prediction.capture.predict import trained_size
-from ghgs_lit.prediction.refinement import CameraRefinement, Refinement
+from ghgs_lit.refinement import CameraRefinement, Refinement
 from ghgs_lit.types import Batch, Targets
 from ghgs_lit.visualization.pictures import save_png, to_uint8
 from ghgs_lit.weights.checkpoint import read_checkpoint

@@ -24,17 +24,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ghgs_capture.backgrounds import Backgrounds
+from ghgs_capture.capture import Capture
+from ghgs_capture.doubts import ENOUGH, doubt_of_cameras, doubt_of_masks
+from ghgs_capture.folder import CaptureFolder
+from ghgs_capture.prediction import crop_size, in_frame
+from ghgs_capture.rig import INSTANTS, Rig, corrected_rig
+from ghgs_capture.temporal import Temporal
 from ghgs_lit import GHGS
 from ghgs_lit.data.view import area_image
 from ghgs_lit.metrics.functional import box_of, decibels, flicker_in_place, mean_over, psnr
-from ghgs_lit.prediction.capture.backgrounds import Backgrounds
-from ghgs_lit.prediction.capture.capture import Capture
-from ghgs_lit.prediction.capture.doubts import ENOUGH, doubt_of_cameras, doubt_of_masks
-from ghgs_lit.prediction.capture.folder import CaptureFolder
-from ghgs_lit.prediction.capture.predict import crop_size, in_frame
-from ghgs_lit.prediction.capture.rig import INSTANTS, Rig, corrected_rig
-from ghgs_lit.prediction.refinement import CameraRefinement
-from ghgs_lit.prediction.sequence.temporal import Temporal
+from ghgs_lit.refinement import CameraRefinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.rounds.gains import divided
 from ghgs_lit.types import Batch, Cameras, Prediction

@@ -10,14 +10,14 @@ from scipy.spatial.transform import Rotation
 from ghgs_lit.data.reader import Reader
 from ghgs_lit.data.sampling import subject_rng
 from ghgs_lit.data.view import View
-from ghgs_lit.synthesis.jobs import LIGHTS, RenderOptions, photographs
-from ghgs_lit.synthesis.people.ambient_occlusion import occluding_spheres
-from ghgs_lit.synthesis.people.body import BODY_VERTICES, BodyModel, bone_transforms, skin
-from ghgs_lit.synthesis.people.garments import Figure
-from ghgs_lit.synthesis.people.generate import MAX_POSES, Character, arm_depth, pose_figure
-from ghgs_lit.synthesis.people.mesh import Person
-from ghgs_lit.synthesis.photograph import Studio
-from ghgs_lit.synthesis.rig import Rig
+from ghgs_people.figures.ambient_occlusion import occluding_spheres
+from ghgs_people.figures.body import BODY_VERTICES, BodyModel, bone_transforms, skin
+from ghgs_people.figures.garments import Figure
+from ghgs_people.figures.generate import MAX_POSES, Character, arm_depth, pose_figure
+from ghgs_people.figures.mesh import Person
+from ghgs_people.jobs import LIGHTS, RenderOptions, photographs
+from ghgs_people.photograph import Studio
+from ghgs_people.rig import Rig
 
 #: Instants from one pose to the other: one second.
 PASSAGE = 30
@@ -70,7 +70,7 @@ class Motion:
 
 def generate_moving(seed: int, index: int, instants: int, active: bool = False) -> Person:
     """Person ``index`` of the family ``seed`` at all instants: parts and bodies of one instant after another.
-    Arguments as of :func:`ghgs_lit.synthesis.people.generate`; the frame is that of the first instant."""
+    Arguments as of :func:`ghgs_people.figures.generate`; the frame is that of the first instant."""
     person = Character(seed, index, active)
     first = person.first
     for _ in range(MAX_POSES):  # until the arms do not cut the trunk on the way

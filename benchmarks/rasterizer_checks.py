@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from ghgs_lit.rendering import RasterSettings, render
-from ghgs_lit.synthesis.people import TexturedMesh, generate
 from ghgs_lit.types import Cameras, Gaussians
+from ghgs_people.figures import TexturedMesh, generate
 from tests.helpers.splats import FIELDS, ambiguous, differentiate, relative_error
 
 # Factor by which differences are magnified in pictures.

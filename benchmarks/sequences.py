@@ -59,7 +59,7 @@ def black(batch: Batch) -> Estimate:
 
 
 def temporal(model: GHGS, renderer: Renderer, every: int) -> Callable[[Batch], Prediction]:
-    from ghgs_lit.prediction.sequence.temporal import Temporal
+    from ghgs_capture.temporal import Temporal
 
     return Temporal(model, every, renderer)
 

@@ -7,8 +7,8 @@ Masks lie beside the photographs (``front_mask.png`` of ``front.jpg``), or are t
 
 import sys
 
-from ghgs_lit import Capture, predict
-from ghgs_lit.prediction.export.ply import write_ply
+from ghgs_capture import Capture, predict
+from ghgs_lit.ply import write_ply
 
 images, cameras, checkpoint, splat = sys.argv[1:]
 capture = Capture.read(images, cameras)

@@ -5,8 +5,6 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ghgs_lit.model import GHGS
-    from ghgs_lit.prediction.capture.capture import Capture
-    from ghgs_lit.prediction.capture.predict import predict
     from ghgs_lit.rendering import render
     from ghgs_lit.types import Batch, Cameras, Gaussians
 
@@ -14,12 +12,10 @@ _MODULES = {
     "GHGS": "ghgs_lit.model",
     "Batch": "ghgs_lit.types",
     "Cameras": "ghgs_lit.types",
-    "Capture": "ghgs_lit.prediction.capture.capture",
     "Gaussians": "ghgs_lit.types",
-    "predict": "ghgs_lit.prediction.capture.predict",
     "render": "ghgs_lit.rendering",
 }
-__all__ = ["GHGS", "Batch", "Cameras", "Capture", "Gaussians", "predict", "render"]
+__all__ = ["GHGS", "Batch", "Cameras", "Gaussians", "render"]
 
 
 def __getattr__(name: str):

@@ -2,7 +2,7 @@
 
     python scripts/bake_bench.py bench
 
-for one of their splits. Only after ``version`` in ``ghgs_lit/synthesis/bench/<split>.json`` went up: results
+for one of their splits. Only after ``version`` in ``ghgs_people/bench/<split>.json`` went up: results
 on the old version can not be compared with those on the new one. Takes a few minutes.
 """
 
@@ -15,9 +15,9 @@ import numpy as np
 from ghgs_lit.data.layout import Layout
 from ghgs_lit.data.sampling import RING_VIEW
 from ghgs_lit.errors import choice
-from ghgs_lit.synthesis import bench
-from ghgs_lit.synthesis.jobs import RenderOptions, SyntheticSource, everything, render_people
-from ghgs_lit.synthesis.rig import Rig
+from ghgs_people import bench
+from ghgs_people.jobs import RenderOptions, SyntheticSource, everything, render_people
+from ghgs_people.rig import Rig
 
 
 def main(split: str) -> None:

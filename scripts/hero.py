@@ -14,12 +14,12 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
+from ghgs_capture.capture import Capture
+from ghgs_capture.crops import Photograph
+from ghgs_capture.prediction import predict, trained_size
 from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import compose, resolve
-from ghgs_lit.prediction.capture.capture import Capture
-from ghgs_lit.prediction.capture.crops import Photograph
-from ghgs_lit.prediction.capture.predict import predict, trained_size
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Gaussians
 from ghgs_lit.visualization.pictures import to_uint8

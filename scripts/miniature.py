@@ -20,7 +20,7 @@ from ghgs_lit.data.humman.dataset import HuMMan
 from ghgs_lit.data.reader import PHASES
 from ghgs_lit.data.zju_mocap.dataset import ZJUMoCap
 from ghgs_lit.errors import InputError
-from ghgs_lit.synthesis.thuman2 import THuman2
+from ghgs_people.thuman2 import THuman2
 from scripts.miniatures import humman, scans, thuman2, zju_mocap
 from scripts.miniatures.scans import mark
 

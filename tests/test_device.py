@@ -17,7 +17,7 @@ from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.measure import ModelMethod, measure
 from ghgs_lit.metrics import MetricsOptions
 from ghgs_lit.model import GHGS
-from ghgs_lit.prediction.refinement import CameraRefinement, Refinement
+from ghgs_lit.refinement import CameraRefinement, Refinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.checkpoints import CheckpointOptions
@@ -176,7 +176,7 @@ def test_batches_are_copied_there_without_a_wait():
 
 def test_everything_is_measured_there(tmp_path, monkeypatch):
     """The model, refined too, and all baselines, with all metrics and pictures: rows are those of the CPU."""
-    monkeypatch.setattr("ghgs_lit.prediction.refinement.cameras._STEPS", 3)
+    monkeypatch.setattr("ghgs_lit.refinement.cameras._STEPS", 3)
     metrics = MetricsOptions(regions=("image", "box", "subject", "edge"), lpips="off").build()
 
     def rows(device):

@@ -12,7 +12,7 @@ import torch
 from ghgs_lit import GHGS
 from ghgs_lit.config import registry
 from ghgs_lit.errors import InputError
-from ghgs_lit.prediction.export.ply import read_ply
+from ghgs_lit.ply import read_ply
 from ghgs_lit.training import GHGSModule
 from tests.helpers.figures import Figure
 from tests.helpers.models import TINY
@@ -53,7 +53,7 @@ def project(tmp_path, monkeypatch):
         (tmp_path / "conf" / group / "mine.yaml").write_text("kind: mine\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setattr(registry, "_REGISTERED", {})
+    monkeypatch.setattr(registry, "_REGISTERED", dict(registry._REGISTERED))
     monkeypatch.setenv(registry.VARIABLE, "own_stages.py")
     yield tmp_path
     sys.modules.pop("own_stages", None)

@@ -46,7 +46,7 @@ def test_wheel_carries_the_configuration_and_assets(tmp_path):
     assert conf == (site / "ghgs_lit" / "conf").resolve()
     assert groups(conf) == groups(REPOSITORY / "conf")
     assert (site / "hydra_plugins" / "ghgs_lit_sweeper.py").is_file()
-    assets = Path("ghgs_lit", "synthesis", "people", "assets")
+    assets = Path("ghgs_people", "figures", "assets")
     shipped, packed = (
         {p.name for p in (root / assets).iterdir() if p.is_file()} for root in (REPOSITORY, site)
     )

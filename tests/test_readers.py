@@ -17,7 +17,7 @@ from ghgs_lit.evaluation.tables.records import read_others, read_sweep
 from ghgs_lit.readers import LARGEST, read_json, read_lines_of_json, read_npy, read_rows, read_text, read_yaml
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
-from ghgs_lit.synthesis.progress import Progress
+from ghgs_people.progress import Progress
 
 READERS = (read_text, read_json, read_yaml, read_rows, read_npy)
 

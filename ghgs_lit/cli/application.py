@@ -1,7 +1,5 @@
 """Run each verb as a Hydra application of ``conf/<verb>.yaml``."""
 
-import importlib
-import keyword
 import os
 import re
 import signal
@@ -16,11 +14,10 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.cli import messages
-from ghgs_lit.cli.usage import VERBS
-from ghgs_lit.config import VERSION_BASE, conf_dir, own_keys
-from ghgs_lit.config.compose import check_ablation
+from ghgs_lit.config import VERSION_BASE, conf_dir
+from ghgs_lit.config.compose import check_ablation, plain, read_verb
 from ghgs_lit.config.outside import check_outside_files
-from ghgs_lit.config.registry import check
+from ghgs_lit.config.registry import check, verb_class
 from ghgs_lit.files import require_no_links, write_text_atomically
 from ghgs_lit.kernels.allocation import collect_garbage_again
 from ghgs_lit.kernels.cores import children_sleep
@@ -30,11 +27,6 @@ from ghgs_lit.runs.signals import Interrupted, interruptible
 
 register_resolvers()  # on import, so that the processes of a launcher have them too
 check_outside_files()
-
-
-def module_of(verb: str) -> str:
-    """Name of a verb's module; a Python keyword (``import``) gets an underscore."""
-    return f"ghgs_lit.cli.{verb}" + "_" * keyword.iskeyword(verb)
 
 
 def discard_unused(directory: Path, verb: str, since: float) -> None:
@@ -68,21 +60,19 @@ class Verb:
     def __call__(self, cfg: DictConfig) -> object:
         # Lightning runs sys.argv again for the other processes of a DDP job; it must contain the verb.
         sys.argv = list(self.argv)
-        from ghgs_lit.cli.photographs import require_paths  # here: --help needs no NumPy
-
         try:
             directory = Path(HydraConfig.get().runtime.output_dir)
             check_ablation(cfg, HydraConfig.get())
-            config = own_keys(cfg, self.name)
-            if self.name in ("train", "pretext"):  # before a run of others gets files of this one
+            config = plain(cfg)
+            verb = read_verb(self.name, config)
+            if verb.begins_run:
                 RunDirectory(directory).start(config)
             write_hydra_files(cfg, directory)
-            require_paths(self.name, config)
-            check(config)  # before the verb's module is imported, which takes longer
-            module = importlib.import_module(module_of(self.name))
+            verb.require_files(config)
+            check(config)  # before the verb imports what takes longer
             collect_garbage_again()
             children_sleep()
-            return module.run(cfg)
+            return verb.run(cfg)
         except messages.BAD_INPUT as error:
             # In a sweep Hydra prints the error with its job's number.
             if HydraConfig.get().mode == RunMode.MULTIRUN:
@@ -101,7 +91,7 @@ def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
     if sweeps and not any(argument.startswith("hydra.mode=") for argument in arguments):
         return [*arguments, "hydra.mode=MULTIRUN"]
     has_data = any(argument.startswith("data=") for argument in arguments)
-    if verb in ("evaluate", "predict", "view") and not has_data:
+    if verb_class(verb).has_trained_data and not has_data:
         return [re.sub(r"^data\.", "++data.", argument) for argument in arguments]
     return arguments
 
@@ -114,7 +104,7 @@ def _help(verb: str, words: list[str], folder: str | None) -> int:
     for group in groups:
         print_group(verb, group, folders)
     if not groups:
-        print_verb(verb, *VERBS[verb], folders)
+        print_verb(verb, folders)
     return 0
 
 

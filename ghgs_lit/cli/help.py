@@ -11,8 +11,7 @@ from pydantic_core import PydanticUndefined
 
 from ghgs_lit.config import compose, conf_dir
 from ghgs_lit.config.options import did_you_mean, expected, meanings, options_of
-from ghgs_lit.config.registry import KINDS, class_of, kinds_of
-from ghgs_lit.config.verbs import VERBS
+from ghgs_lit.config.registry import KINDS, class_of, kinds_of, verb_class
 from ghgs_lit.errors import InputError
 
 _WIDTH = 100
@@ -37,16 +36,17 @@ def _files(group: str, folders: Sequence[Path]) -> list[Path]:
     return [path for folder in (conf_dir(), *folders) for path in sorted((folder / group).glob("*.yaml"))]
 
 
-def print_verb(verb: str, summary: str, example: str, folders: Sequence[Path] = ()) -> None:
+def print_verb(verb: str, folders: Sequence[Path] = ()) -> None:
     """Print what a verb does, its groups and its keys; ``folders`` are those of ``--config-dir``."""
     print(f"ghgs {verb} [key=value ...] [group=option ...] [-m for a sweep over comma-separated values]\n")
-    print(f"{summary[0].upper()}{summary[1:]}: {example}\n")
+    about = verb_class(verb)
+    print(f"{about.summary()}: {about.example}\n")
     print("== Groups (group=option; * is the default) ==")
     for group, default in defaults_of(verb).items():
         names = [f"{path.stem}{'*' * (path.stem == default)}" for path in _files(group, folders)]
         print(_filled(f"{group}: {' | '.join(names)}"))
     print(f"\nghgs {verb} --help <group> explains the keys of a group.\n\n== Keys (key=value) ==")
-    for line in _fields(VERBS[verb]):
+    for line in _fields(about):
         print(line)
     print("\n--cfg job prints the composed configuration, --info defaults says where each part comes from.")
 

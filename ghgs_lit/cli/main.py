@@ -4,13 +4,14 @@ import gc
 import os
 import sys
 
-from ghgs_lit.cli.usage import VERBS, usage
 from ghgs_lit.kernels.allocation import collect_garbage_again, keep_freed_memory
 from ghgs_lit.kernels.cores import spin_if_alone
 
 
 def _command(argv: list[str]) -> int:
     if len(argv) < 2 or argv[1] in ("-h", "--help", "help"):
+        from ghgs_lit.cli.usage import usage  # here: it loads pydantic
+
         print(usage())
         return 0 if len(argv) > 1 else 2
     if argv[1] == "--version":
@@ -18,11 +19,12 @@ def _command(argv: list[str]) -> int:
 
         print(version("ghgs-lit"))
         return 0
-    if argv[1] not in VERBS:
-        from ghgs_lit.config.options import did_you_mean  # here: it loads pydantic
+    from ghgs_lit.config.options import did_you_mean
+    from ghgs_lit.config.registry import VERBS, verbs
 
-        hint = did_you_mean(argv[1], VERBS)
-        print(f"ghgs: expected a verb ({', '.join(VERBS)}); found {argv[1]!r}{hint}", file=sys.stderr)
+    if argv[1] not in VERBS and argv[1] not in verbs():
+        hint = did_you_mean(argv[1], verbs())
+        print(f"ghgs: expected a verb ({', '.join(verbs())}); found {argv[1]!r}{hint}", file=sys.stderr)
         return 2
     try:
         os.getcwd()

@@ -19,7 +19,7 @@ from yaml import YAMLError
 from ghgs_lit.config import compose, conf_dir, resolve
 from ghgs_lit.config.keys import flatten, is_below
 from ghgs_lit.config.options import did_you_mean
-from ghgs_lit.config.verbs import VERBS
+from ghgs_lit.config.registry import verb_class, verbs
 from ghgs_lit.errors import InputError
 
 #: Errors that are bad input, not bugs.
@@ -104,7 +104,7 @@ def _hint(verb: str, key: str) -> str:
     folders = {str(path.relative_to(conf_dir())) for path in conf_dir().rglob("*") if path.is_dir()}
     chosen = [text for text in overrides if text.partition("=")[0] in folders and "," not in text]
     keys, group = _keys(verb, chosen) or _keys(verb), key.partition(".")[0]
-    if any(key in options.model_fields for options in VERBS.values()):
+    if any(key in verb_class(name).model_fields for name in verbs()):
         return ""  # a key of another verb
     for of in (group, "model") if "." in key else ():  # a model chooses groups of its own
         options = [path.stem for path in sorted((conf_dir() / of).glob("*.yaml"))]

@@ -12,7 +12,6 @@ from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.reader import PHASES
 from ghgs_lit.errors import InputError
 from ghgs_lit.files import resolved
-from ghgs_lit.synthesis.datasets import Scans
 
 log = logging.getLogger(__name__)
 
@@ -30,10 +29,7 @@ def run(cfg: DictConfig) -> None:
 
 def render(data: PhotographsDataModule) -> None:
     """Render what is missing, then check that it can be read."""
-    if isinstance(data.dataset, Scans):
-        data.dataset.render_missing()
-    else:
-        data.prepare_data()
+    data.dataset.make()
     for phase in PHASES:
         log.info("%s: %d subjects", phase, len(data.subjects(phase)) if data.dataset.has(phase) else 0)
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
@@ -12,9 +12,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.config.options import did_you_mean
-from ghgs_lit.config.registry import KINDS, check
-from ghgs_lit.config.verbs import VERBS
+from ghgs_lit.config.registry import KINDS, check, verb_class
 from ghgs_lit.errors import InputError, require
+
+if TYPE_CHECKING:
+    from ghgs_lit.cli.verb import Verb
 
 #: Hydra 1.3 asks for the version to be compatible with; later versions do not.
 VERSION_BASE: dict[str, Any] = {"version_base": "1.3"} if hydra.__version__.startswith("1.3") else {}
@@ -70,20 +72,25 @@ def saved_text(config: dict[str, Any]) -> str:
 def resolve(cfg: DictConfig, verb: str | None = None) -> dict[str, Any]:
     """A composed configuration as plain data; groups and the keys of ``verb`` are checked. InputError: a
     value is missing or has a wrong type or range."""
-    data = own_keys(cfg, verb)
+    data = plain(cfg)
+    if verb is not None:
+        read_verb(verb, data)
     check(data)
     return data
 
 
-def own_keys(cfg: DictConfig, verb: str | None) -> dict[str, Any]:
-    """:func:`resolve` without the check of groups, whose options import PyTorch."""
+def plain(cfg: DictConfig) -> dict[str, Any]:
+    """A composed configuration as plain data that nothing has checked. InputError: a value is missing."""
     missing = sorted(OmegaConf.missing_keys(cfg))
     if missing:
         raise InputError(f"{missing[0]}: expected a value ({missing[0]}=...); found none")
-    data = OmegaConf.to_container(cfg, resolve=True)
-    if verb is not None:
-        VERBS[verb].read({name: value for name, value in data.items() if name not in KINDS}, "")
-    return data
+    return OmegaConf.to_container(cfg, resolve=True)
+
+
+def read_verb(name: str, config: Mapping[str, Any]) -> "Verb":
+    """The verb with its own keys of ``config``, which are all but groups. InputError: a key is unknown, or a
+    value has a wrong type or range."""
+    return verb_class(name).read({key: value for key, value in config.items() if key not in KINDS}, "")
 
 
 #: Groups whose files set keys of the whole configuration.

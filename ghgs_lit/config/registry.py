@@ -1,9 +1,11 @@
 """Registry of what a configuration may build: kinds of options by group, never a path of Python code.
 
 A configuration can come from somebody else's checkpoint, so a node such as ``depth_head: {kind: dpt, ...}``
-can only name a kind listed below or a registered one. Kinds are registered by the files of the group's
-subpackage, such as ``ghgs_lit/heads``, and by plug-ins: modules in the environment variable ``GHGS_PLUGINS``
-(Python files or module names, separated as in ``PATH``) or entry points in the group ``ghgs_lit.plugins``.
+can only name a kind listed below or a registered one. Kinds and verbs are registered by the files of the
+group's subpackage, such as ``ghgs_lit/heads``, and by plug-ins: modules in the environment variable
+``GHGS_PLUGINS`` (Python files or module names, separated as in ``PATH``) or entry points in the group
+``ghgs_lit.plugins``. The other packages of this distribution, ``ghgs_people`` and ``ghgs_capture``, are such
+entry points; they offer import paths, so that nothing is imported before it is chosen.
 """
 
 import gc
@@ -23,7 +25,11 @@ from omegaconf import OmegaConf
 from ghgs_lit.config.options import Options, did_you_mean
 from ghgs_lit.errors import InputError, shown
 
-VARIABLE, GROUP = "GHGS_PLUGINS", "ghgs_lit.plugins"
+VARIABLE = "GHGS_PLUGINS"
+GROUP = "ghgs_lit.plugins"
+#: Groups of what plug-ins register that no configuration names: verbs, and body models whose parts are known.
+_VERBS = "verb"
+PARTS = "parts"
 
 
 def load_plugins() -> None:
@@ -96,10 +102,6 @@ KINDS: dict[str, dict[str | None, str]] = {
     "trainer": {"lightning": "ghgs_lit.training.trainer.TrainerOptions"},
     "data": {
         "humman": "ghgs_lit.data.humman.dataset.HuMMan",
-        "people_in_rig": "ghgs_lit.synthesis.datasets.PeopleInRig",
-        "scans": "ghgs_lit.synthesis.datasets.Scans",
-        "synthetic": "ghgs_lit.synthesis.datasets.Synthetic",
-        "thuman2": "ghgs_lit.synthesis.thuman2.THuman2",
         "zju_mocap": "ghgs_lit.data.zju_mocap.dataset.ZJUMoCap",
     },
     "views": {None: "ghgs_lit.data.sampling.ViewProtocol"},
@@ -118,27 +120,99 @@ KINDS: dict[str, dict[str | None, str]] = {
     },
 }
 
+#: Import path of each verb.
+VERBS: dict[str, str] = {
+    "train": "ghgs_lit.cli.verbs.Train",
+    "pretext": "ghgs_lit.cli.verbs.Pretext",
+    "evaluate": "ghgs_lit.cli.verbs.Evaluate",
+    "table": "ghgs_lit.cli.verbs.Table",
+    "benchmark": "ghgs_lit.cli.verbs.Benchmark",
+    "stress": "ghgs_lit.cli.verbs.Stress",
+    "prepare": "ghgs_lit.cli.verbs.Prepare",
+    "import": "ghgs_lit.cli.verbs.Import",
+    "export": "ghgs_lit.cli.verbs.Export",
+}
+
 #: Groups of named nodes: ``callbacks.<name>: {kind: ...}``.
 NAMED = ("callbacks", "logger")
 
-_REGISTERED: dict[tuple[str, str], type[Options]] = {}
+#: What plug-ins registered: classes, or import paths.
+_REGISTERED: dict[tuple[str, str], type[Options] | str] = {}
 
 
 def register(group: str, kind: str) -> Callable[[_C], _C]:
-    """Class decorator that registers options as ``<group>: {kind: <kind>, ...}``. InputError: there is no
-    such group, or the kind is taken."""
-    if group not in KINDS:
-        raise InputError(f"register: expected one of {', '.join(KINDS)}; found {group!r}")
+    """Class decorator that registers options as ``<group>: {kind: <kind>, ...}``.
+
+    Raises:
+        InputError: there is no such group, or the kind is taken.
+    """
 
     def keep(cls: _C) -> _C:
-        other = _REGISTERED.get((group, kind))
-        taken = kind in KINDS[group] or (other is not None and other.__qualname__ != cls.__qualname__)
-        if taken:
-            raise InputError(f"register: expected a new kind of {group}; found {kind!r}")
-        _REGISTERED[group, kind] = cls
+        _keep(group, kind, cls)
         return cls
 
     return keep
+
+
+def register_verb(name: str) -> Callable[[_C], _C]:
+    """Class decorator that registers a :class:`ghgs_lit.cli.verb.Verb` as ``ghgs <name>``; without a file
+    ``<name>.yaml`` in ``--config-dir`` it has its own keys alone.
+
+    Raises:
+        InputError: the name is taken.
+    """
+    return register(_VERBS, name)
+
+
+def offer(group: str, **paths: str) -> None:
+    """Register options by import path, such as ``offer("data", scans="my_package.scans.Scans")``: they are
+    imported when they are chosen.
+
+    Raises:
+        InputError: as :func:`register`.
+    """
+    for kind, path in paths.items():
+        _keep(group, kind, path)
+
+
+def offer_verbs(**paths: str) -> None:
+    """Register verbs by import path, as :func:`offer` does options."""
+    offer(_VERBS, **paths)
+
+
+def _keep(group: str, kind: str, what: type[Options] | str) -> None:
+    if group not in (*KINDS, _VERBS, PARTS):
+        raise InputError(f"register: expected one of {', '.join(KINDS)}; found {group!r}")
+    known = VERBS if group == _VERBS else KINDS.get(group, {})
+    before = _REGISTERED.get((group, kind), what)
+    if kind in known or _path_of(before) != _path_of(what):
+        raise InputError(f"register: expected a new kind of {group}; found {kind!r}")
+    _REGISTERED[group, kind] = what
+
+
+def _path_of(what: type[Options] | str) -> str:
+    """Import path without the module, which a file that is loaded twice may have under two names."""
+    return what if isinstance(what, str) else what.__qualname__
+
+
+def _imported(what: type[Options] | str) -> type[Options]:
+    if not isinstance(what, str):
+        return what
+    module, _, name = what.rpartition(".")
+    return getattr(importlib.import_module(module), name)
+
+
+def verbs() -> list[str]:
+    """Names of all verbs, those of plug-ins last."""
+    load_plugins()
+    return [*VERBS, *(name for group, name in _REGISTERED if group == _VERBS)]
+
+
+def verb_class(name: str) -> type[Options]:
+    """The class of a verb, one of :func:`verbs`."""
+    if name not in VERBS:
+        load_plugins()
+    return _imported(VERBS.get(name) or _REGISTERED[_VERBS, name])
 
 
 @cache
@@ -151,24 +225,24 @@ def _import_room(group: str) -> None:
 
 def _load(group: str) -> None:
     load_plugins()
-    if None not in KINDS[group]:
+    if group in KINDS and None not in KINDS[group]:
         _import_room(group)
 
 
 def kinds_of(group: str) -> list[str | None]:
     """All kinds of a group, including registered ones."""
     _load(group)
-    return [*KINDS[group], *(kind for of, kind in _REGISTERED if of == group)]
+    return [*KINDS.get(group, {}), *(kind for of, kind in _REGISTERED if of == group)]
 
 
 def class_of(group: str, kind: Any, key: str) -> type[Options]:
     """The options class of a kind (None: the group has no kinds); ``key``: that of the node, for messages.
     InputError: there is no such kind; names the known ones."""
-    known = KINDS[group]
+    known = KINDS.get(group, {})
     if isinstance(kind, str) and kind not in known:
         _load(group)
         if (group, kind) in _REGISTERED:
-            return _REGISTERED[group, kind]
+            return _imported(_REGISTERED[group, kind])
     if not (kind is None or isinstance(kind, str)) or kind not in known:
         names = sorted(name for name in kinds_of(group) if name)
         expected = "one of " * (len(names) > 1) + ", ".join(names)
@@ -176,8 +250,7 @@ def class_of(group: str, kind: Any, key: str) -> type[Options]:
             f"{key}.kind: expected {expected}; found {shown(kind)}{did_you_mean(kind, names)}"
             f" ({VARIABLE}=file.py adds kinds of your own)"
         )
-    module, _, name = known[kind].rpartition(".")
-    return getattr(importlib.import_module(module), name)
+    return _imported(known[kind])
 
 
 def read_node(node: Any, key: str) -> Options:

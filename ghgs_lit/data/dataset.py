@@ -94,6 +94,10 @@ class DataOptions(Options):
         """Make missing data of these splits; called once, before any process reads."""
         return
 
+    def make(self) -> None:
+        """Make all data that can be made (``ghgs prepare task=render``)."""
+        self.prepare()
+
     def check_targets(self, targets: TargetProtocol) -> None:
         """Refuse a target protocol whose views this data set never has."""
         return

@@ -20,7 +20,7 @@ from tabulate import tabulate
 from ghgs_lit.config import resolve
 from ghgs_lit.config.compose import check_ablation, chosen_options, saved_text
 from ghgs_lit.config.keys import is_hyperparameter, key_of
-from ghgs_lit.config.verbs import VERBS
+from ghgs_lit.config.registry import verbs
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import resolved, write_text_atomically
 from ghgs_lit.runs.job import BUSY, check_config, check_launcher
@@ -226,7 +226,7 @@ def plan(
             cfg.hydra.job.num = len(planned)
             subdirectory, verb, hydra_node = str(cfg.hydra.sweep.subdir), cfg.hydra.job.name, cfg.hydra
             del cfg["hydra"]
-        config = resolve(cfg, verb if verb in VERBS else None)
+        config = resolve(cfg, verb if verb in verbs() else None)
         config["chosen"] = chosen_options(config, hydra_node)
         name, shown = config_hash(config), tuple(filter_overrides(overrides))
         # The job writes to the planned directory, whatever number a launcher gives it.

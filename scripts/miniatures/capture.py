@@ -7,8 +7,8 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.types import Cameras
+from ghgs_people.figures.mesh import Person
 
 
 def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from PIL import Image, ImageFilter
 
-from ghgs_lit.synthesis import people
-from ghgs_lit.synthesis.people.mesh import Person
-from ghgs_lit.synthesis.photograph import LightRig, Lights, Studio
 from ghgs_lit.types import Cameras
+from ghgs_people import figures
+from ghgs_people.figures.mesh import Person
+from ghgs_people.photograph import LightRig, Lights, Studio
 from scripts.miniatures import capture
 from scripts.miniatures.smpl import parameters, write_stand_in
 
@@ -68,7 +68,7 @@ def _write_sequence(
     folder: Path, scale: float, frames: Sequence[int], identity: tuple[int, int], manual: bool
 ) -> None:
     rng = np.random.default_rng(identity)
-    person, lights = people.generate(*identity), Lights().draw(rng)
+    person, lights = figures.generate(*identity), Lights().draw(rng)
     cameras = _rig(scale, rng)
     to_world = cameras.extrinsics[0].double().numpy()  # from the floor's frame to that of the first camera
     from_world = torch.from_numpy(np.linalg.inv(to_world))

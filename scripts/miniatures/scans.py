@@ -1,6 +1,6 @@
 """Built-in people as a few scans of THuman2.0, with their fits.
 
-Names, types, shapes and units are those of the real files (:mod:`ghgs_lit.synthesis.thuman2`). Bodies
+Names, types, shapes and units are those of the real files (:mod:`ghgs_people.thuman2`). Bodies
 are MakeHuman's in place of SMPL-X: the parameters in ``smplx_param.pkl`` have the right shapes and place the
 body correctly, but do not pose it. Folders that are written get a mark, so that real data of the same names
 is never overwritten.
@@ -19,10 +19,10 @@ from trimesh.caching import TrackedArray
 
 from ghgs_lit.data.sampling import subject_rng
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.synthesis import people
-from ghgs_lit.synthesis.people.generate import join
-from ghgs_lit.synthesis.people.mesh import TexturedMesh
-from ghgs_lit.synthesis.thuman2 import FIT_FOLDERS
+from ghgs_people import figures
+from ghgs_people.figures.generate import join
+from ghgs_people.figures.mesh import TexturedMesh
+from ghgs_people.thuman2 import FIT_FOLDERS
 
 #: A file in each folder that a miniature was written to.
 MARKER = "miniature"
@@ -73,7 +73,7 @@ class Scan:
 @lru_cache(maxsize=4)
 def scan_of(name: str, seed: int) -> Scan:
     """Person number ``int(name)``, turned by a random yaw, in units that are not metres."""
-    person = people.generate(seed, int(name))
+    person = figures.generate(seed, int(name))
     rng = subject_rng(seed, name)
     yaw = float(rng.uniform(-np.pi, np.pi))
     scale, translation = float(rng.uniform(0.5, 0.9)), rng.uniform(-0.3, 0.3, 3)

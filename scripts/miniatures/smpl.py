@@ -12,9 +12,9 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from ghgs_lit.synthesis.people.body import BODY_VERTICES, BodyModel, load_body
-from ghgs_lit.synthesis.people.generate import pose_figure
-from ghgs_lit.synthesis.people.mesh import Person
+from ghgs_people.figures.body import BODY_VERTICES, BodyModel, load_body
+from ghgs_people.figures.generate import pose_figure
+from ghgs_people.figures.mesh import Person
 
 VERTICES, SHAPES = 6890, 10
 # The joints of SMPL in order: the built-in bone that starts at each, and the index of the parent joint.

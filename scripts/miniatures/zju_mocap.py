@@ -15,9 +15,9 @@ import torch.nn.functional as F
 from kornia.geometry.calibration import undistort_points
 from scipy.spatial.transform import Rotation
 
-from ghgs_lit.synthesis import people
-from ghgs_lit.synthesis.people.mesh import Person
-from ghgs_lit.synthesis.photograph import Lights, Studio
+from ghgs_people import figures
+from ghgs_people.figures.mesh import Person
+from ghgs_people.photograph import Lights, Studio
 from scripts.miniatures import capture
 from scripts.miniatures.smpl import chosen_vertices
 
@@ -48,7 +48,7 @@ def make(root: Path, sequences: Sequence[str], size: int = 256, seed: int = 0, f
     for index, sequence in enumerate(sequences):
         folder = root / f"CoreView_{sequence}"
         folder.mkdir(parents=True, exist_ok=True)
-        _write_sequence(folder, sequence, people.generate(seed, index), size, frames, [seed, index])
+        _write_sequence(folder, sequence, figures.generate(seed, index), size, frames, [seed, index])
         folders.append(folder)
     return folders
 

@@ -14,8 +14,8 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 
 from ghgs_lit.cli import main as cli
-from ghgs_lit.synthesis import datasets
 from ghgs_lit.weights.checkpoint import write_checkpoint
+from ghgs_people import datasets
 from tests.cli.bad_commands import ROWS
 from tests.helpers.models import config, make_model
 from tests.helpers.processes import start_verb

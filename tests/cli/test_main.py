@@ -1,6 +1,5 @@
 """The command line: verbs, one-line errors, exit codes."""
 
-import importlib
 import logging
 import os
 import re
@@ -18,8 +17,9 @@ from ghgs_lit.cli import main as cli
 from ghgs_lit.cli.application import discard_unused
 from ghgs_lit.cli.messages import parsed
 from ghgs_lit.cli.runtime import write_config
+from ghgs_lit.cli.verbs import Prepare, Train
 from ghgs_lit.config import compose, conf_dir
-from ghgs_lit.config.verbs import VERBS
+from ghgs_lit.config.registry import verb_class, verbs
 from tests.helpers.processes import run_python
 from tests.helpers.verbs import ghgs
 
@@ -41,10 +41,9 @@ def test_help_shows_an_example_for_every_verb_and_only_built_verbs(monkeypatch, 
     """A verb in the help without a module or a configuration would fail only when a user calls it."""
     code, out, _ = call(monkeypatch, capsys, "--help")
     assert code == 0
-    for verb, (_, example) in cli.VERBS.items():
-        assert example in out
+    for verb in verbs():
+        assert verb_class(verb).example in out
         assert (conf_dir() / f"{verb}.yaml").is_file()
-        assert callable(importlib.import_module(application.module_of(verb)).run)
 
 
 @pytest.mark.parametrize("argv", [(), ("paint",)])
@@ -85,20 +84,17 @@ def test_an_example_of_the_help_names_the_checkpoint_where_training_writes_it(mo
 def test_an_error_inside_a_verb_keeps_its_traceback(monkeypatch, capsys, tmp_path):
     """Only bad input is one line: a bug must not look like it."""
 
-    class Module:
-        @staticmethod
-        def run(cfg):
-            raise KeyError("bug")
+    def run(self, cfg):
+        raise KeyError("bug")
 
-    monkeypatch.setitem(sys.modules, application.module_of("train"), Module)
+    monkeypatch.setattr(Train, "run", run)
     with pytest.raises(KeyError, match="bug"):
         call(monkeypatch, capsys, "train", f"hydra.run.dir={tmp_path}")
 
 
 def test_a_bad_value_is_refused_before_the_verb_is_imported(monkeypatch, capsys, tmp_path):
     """The check must not wait for PyTorch, and nothing may be rendered or downloaded before it."""
-    # An import of what is None in sys.modules fails.
-    monkeypatch.setitem(sys.modules, application.module_of("prepare"), None)
+    monkeypatch.setattr(Prepare, "run", None)
     code, _, err = call(monkeypatch, capsys, "prepare", "data.size=100000", f"hydra.run.dir={tmp_path}")
     assert code == 1
     assert "data.size: expected an integer >= 1 and <= 8192" in err
@@ -126,11 +122,11 @@ def test_help_of_a_verb_and_of_a_group(monkeypatch, capsys, tmp_path):
     assert "found 'depth_heat' (did you mean depth_head?)" in err
 
 
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("verb", verbs())
 def test_help_of_every_verb_names_its_keys(monkeypatch, capsys, verb):
     code, out, _ = call(monkeypatch, capsys, verb, "--help")
     assert code == 0
-    for name in VERBS[verb].model_fields:
+    for name in verb_class(verb).model_fields:
         assert re.search(rf"^ *{name}( |\.|:|$)", out, re.MULTILINE), name
 
 
@@ -181,9 +177,10 @@ def test_a_prediction_goes_where_out_says():
 
 def test_a_prediction_does_not_wait_for_what_training_needs():
     """Lightning, torchmetrics and PyTorch's compiler take seconds to import."""
-    code = "import sys, ghgs_lit.cli.predict, ghgs_lit; ghgs_lit.GHGS.from_checkpoint(); print(*sys.modules)"
+    imports = "import sys, ghgs_capture.verbs.predict, ghgs_lit"
+    code = f"{imports}; ghgs_lit.GHGS.from_checkpoint(); print(*sys.modules)"
     loaded = set(run_python(code).stdout.split())
-    assert {"torch", "ghgs_lit.prediction.refinement"} <= loaded
+    assert {"torch", "ghgs_lit.refinement"} <= loaded
     assert not {"lightning", "torchmetrics", "torch._dynamo", "trimesh", "matplotlib.pyplot"} & loaded
 
 
@@ -191,13 +188,11 @@ def test_the_verb_is_in_argv_while_the_task_runs(monkeypatch):
     """Lightning starts the other processes of a DDP job by sys.argv, which must contain the verb."""
     seen = {}
 
-    class Module:
-        @staticmethod
-        def run(cfg):
-            seen["argv"] = list(sys.argv)
+    def run(self, cfg):
+        seen["argv"] = list(sys.argv)
 
     monkeypatch.setattr("sys.argv", ["ghgs", "seed=1"])
-    monkeypatch.setitem(sys.modules, application.module_of("train"), Module)
+    monkeypatch.setattr(Train, "run", run)
     monkeypatch.setattr(application, "write_hydra_files", lambda cfg, directory: None)
     monkeypatch.setattr(application, "check_ablation", lambda cfg, hydra_node: None)
     monkeypatch.setattr(HydraConfig, "get", lambda: OmegaConf.create({"runtime": {"output_dir": "."}}))

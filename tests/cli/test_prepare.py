@@ -48,7 +48,7 @@ def test_a_size_that_the_model_cannot_take_is_refused_before_rendering(monkeypat
     def rendered(*_, **__):
         raise AssertionError("rendered before the check")
 
-    monkeypatch.setattr("ghgs_lit.synthesis.datasets.render_people", rendered)
+    monkeypatch.setattr("ghgs_people.datasets.render_people", rendered)
     run = (f"data.cache_dir={tmp_path}", f"hydra.run.dir={tmp_path / 'run'}")
     code, _, err = call(monkeypatch, capsys, *argv, *run)
     assert code == 1

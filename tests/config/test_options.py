@@ -8,12 +8,10 @@ from typing import get_origin
 import pytest
 from omegaconf import OmegaConf
 
-from ghgs_lit.cli.usage import VERBS
 from ghgs_lit.config import compose, conf_dir, resolve
 from ghgs_lit.config.keys import flatten
 from ghgs_lit.config.options import expected, meanings, options_of
-from ghgs_lit.config.registry import KINDS, NAMED, check, class_of
-from ghgs_lit.config.verbs import VERBS as OPTIONS
+from ghgs_lit.config.registry import KINDS, NAMED, check, class_of, verb_class, verbs
 from ghgs_lit.errors import InputError
 from tests.helpers.configs import composed, verb_with
 
@@ -27,7 +25,7 @@ def shipped(group):
     configurations = [composed(verb_with(group), f"{group}={path.stem}") for path in files]
     configurations += [composed("train", f"model={name}") for name in ("paper", "hull", "recurrent")]
     configurations += [composed("train", *over) for over in (["compat=release"], ["experiment=shipped"])]
-    configurations += [composed(verb) for verb in VERBS]
+    configurations += [composed(verb) for verb in verbs()]
     nodes = []
     for cfg in configurations:
         if (node := cfg.get(group)) is not None:
@@ -95,7 +93,7 @@ def numbers(cls, prefix=""):
 
 def test_every_number_has_a_limit_or_can_do_no_harm():
     """``skip.margin=1000000000`` and ``rounds.count=1000000000`` ran until somebody killed them."""
-    classes = [class_of(group, kind, group) for group, kind in TYPED] + list(OPTIONS.values())
+    classes = [class_of(group, kind, group) for group, kind in TYPED] + [verb_class(verb) for verb in verbs()]
     found = {key for cls in classes for key in numbers(cls)}
     harmless = {name for names in UNLIMITED.values() for name in names.split()}
     assert {key for key in found if key not in harmless and key.split(".")[-1] not in harmless} == set()

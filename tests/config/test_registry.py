@@ -4,10 +4,13 @@ import contextlib
 import importlib
 import inspect
 import pkgutil
+from itertools import chain
 
 import pytest
 
+import ghgs_capture
 import ghgs_lit.heads
+import ghgs_people
 from ghgs_lit.config import build, registry
 from ghgs_lit.config.options import Options
 from ghgs_lit.config.registry import KINDS, NAMED, class_of, read_node, register
@@ -19,7 +22,8 @@ from tests.helpers.weights import config
 
 def everything_callable():
     """Paths of all functions and classes that the package defines."""
-    for info in pkgutil.walk_packages(ghgs_lit.__path__, "ghgs_lit."):
+    packages = (ghgs_lit, ghgs_people, ghgs_capture)
+    for info in chain.from_iterable(pkgutil.walk_packages(p.__path__, f"{p.__name__}.") for p in packages):
         if info.name.endswith("__main__"):
             continue
         try:
@@ -92,7 +96,7 @@ def test_every_kind_exists():
 
 def test_kinds_of_the_users_own(monkeypatch):
     """A registered kind is read and built like those of the package, and hides none of them."""
-    monkeypatch.setattr("ghgs_lit.config.registry._REGISTERED", {})
+    monkeypatch.setattr(registry, "_REGISTERED", dict(registry._REGISTERED))
 
     @register("bounds", "sphere")
     class Sphere(Options):
@@ -113,7 +117,7 @@ def test_kinds_of_the_users_own(monkeypatch):
     with pytest.raises(InputError, match="a new kind of bounds; found 'hull'"):
         register("bounds", "hull")(Sphere)
     with pytest.raises(InputError, match=r"register: expected one of .*; found 'shape'"):
-        register("shape", "sphere")
+        register("shape", "sphere")(Sphere)
 
 
 def test_a_file_of_a_room_registers_its_kinds(monkeypatch, tmp_path):
@@ -125,7 +129,7 @@ def test_a_file_of_a_room_registers_its_kinds(monkeypatch, tmp_path):
         "class Flat(Options):\n"
         "    metres: float = 2.0\n"
     )
-    monkeypatch.setattr("ghgs_lit.config.registry._REGISTERED", {})
+    monkeypatch.setattr(registry, "_REGISTERED", dict(registry._REGISTERED))
     monkeypatch.setattr("ghgs_lit.heads.__path__", [*ghgs_lit.heads.__path__, str(tmp_path)])
     registry._import_room.cache_clear()
     assert read_node({"kind": "flat", "metres": 3}, "depth_head").metres == 3.0

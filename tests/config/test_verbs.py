@@ -2,11 +2,9 @@
 
 import pytest
 
-from ghgs_lit.cli.usage import VERBS as DESCRIBED
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.config.options import meanings, options_of
-from ghgs_lit.config.registry import KINDS
-from ghgs_lit.config.verbs import VERBS
+from ghgs_lit.config.registry import KINDS, verb_class, verbs
 from ghgs_lit.errors import InputError
 
 #: What the user must say.
@@ -20,15 +18,11 @@ def every_class(cls):
             yield from every_class(nested)
 
 
-def test_every_verb_has_options():
-    assert set(VERBS) == set(DESCRIBED)
-
-
-@pytest.mark.parametrize("verb", sorted(VERBS))
+@pytest.mark.parametrize("verb", verbs())
 def test_yaml_and_options_of_a_verb_agree(verb):
     """A default in two places that differ would be wrong in one of them."""
     data = resolve(compose(verb, GIVEN.get(verb, [])), verb)
-    options = VERBS[verb]
+    options = verb_class(verb)
     own = {name: value for name, value in data.items() if name not in KINDS}
     assert set(own) == set(options.model_fields)
     read = options.read(own, "")
@@ -37,10 +31,10 @@ def test_yaml_and_options_of_a_verb_agree(verb):
             assert getattr(read, name) == field.get_default(call_default_factory=True), name
 
 
-@pytest.mark.parametrize("verb", sorted(VERBS))
+@pytest.mark.parametrize("verb", verbs())
 def test_every_key_of_a_verb_has_a_meaning(verb):
     """``--help`` shows it."""
-    for cls in every_class(VERBS[verb]):
+    for cls in every_class(verb_class(verb)):
         assert set(cls.model_fields) <= set(meanings(cls)), cls
 
 

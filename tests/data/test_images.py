@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from PIL import EpsImagePlugin, ExifTags, Image
 
+from ghgs_capture.photographs import read_pixels
 from ghgs_lit.data.decoding import read_map, read_photograph
 from ghgs_lit.data.images import listed_formats, read_image
 from ghgs_lit.errors import InputError
-from ghgs_lit.prediction.capture.photographs import read_pixels
-from ghgs_lit.synthesis.scans import ScanSource
+from ghgs_people.scans import ScanSource
 from tests.helpers.people import write_obj_scan
 from tests.helpers.profiles import DISPLAY_P3, SRGB, in_srgb, profile
 

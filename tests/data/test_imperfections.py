@@ -8,8 +8,8 @@ from scipy.ndimage import binary_dilation, binary_erosion, zoom
 from ghgs_lit.data.imperfections import backgrounds, color_gains, imperfect_mask, miscalibrated
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import project
-from ghgs_lit.synthesis.rig import Rig
 from ghgs_lit.types import Cameras
+from ghgs_people.rig import Rig
 
 
 def figure(height=96, width=72) -> np.ndarray:

@@ -15,9 +15,9 @@ from ghgs_lit.data.sampling import subject_rng
 from ghgs_lit.data.view import View, encode_depth
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
-from ghgs_lit.synthesis.jobs import LIGHTS, write_body, write_view
-from ghgs_lit.synthesis.photograph import Studio
 from ghgs_lit.types import Cameras
+from ghgs_people.jobs import LIGHTS, write_body, write_view
+from ghgs_people.photograph import Studio
 from tests.helpers.people import RIG, box_person
 
 SIZE = 56

@@ -22,7 +22,7 @@ from ghgs_lit.evaluation.measure import ModelMethod, measure_all
 from ghgs_lit.evaluation.protocols import target_protocols
 from ghgs_lit.metrics import MetricsOptions
 from ghgs_lit.model import GHGS
-from ghgs_lit.prediction.export.ply import read_ply
+from ghgs_lit.ply import read_ply
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import config_hash
 from tests.helpers.people import rendered

@@ -3,8 +3,8 @@
 import torch
 
 from ghgs_lit.geometry.projection import project
-from ghgs_lit.synthesis.people.body import BODY_VERTICES, load_body
 from ghgs_lit.types import Batch
+from ghgs_people.figures.body import BODY_VERTICES, load_body
 from tests.helpers.cameras import camera_ring
 
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from ghgs_lit.prediction.capture.calibration import StoredCamera
-from ghgs_lit.prediction.capture.formats import read_cameras
+from ghgs_capture.calibration import StoredCamera
+from ghgs_capture.formats import read_cameras
 
 CAMERA = {"K": [[1000, 0, 320], [0, 1000, 240], [0, 0, 1]], "R": np.eye(3).tolist(), "T": [0, 0, 3]}
 LENS = [-0.35, 0.12, 0.001, -0.0005, 0.01]

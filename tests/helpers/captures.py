@@ -17,15 +17,15 @@ from ghgs_lit.data.packed import Packing, packed_reader
 from ghgs_lit.data.reader import Photographs, Reader
 from ghgs_lit.data.view import View, resize_view
 from ghgs_lit.errors import InputError
-from ghgs_lit.synthesis import people
+from ghgs_people import figures
 
-_person = functools.lru_cache(people.generate)
+_person = functools.lru_cache(figures.generate)
 
 
 def make_miniature(miniature, *arguments, **options) -> list[Path]:
     """``miniature.make(...)`` of people that are generated once for all tests of a process."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(miniature.people, "generate", _person)
+        patch.setattr(miniature.figures, "generate", _person)
         return miniature.make(*arguments, **options)
 
 

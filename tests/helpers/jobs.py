@@ -9,7 +9,8 @@ from typing import Any
 import hydra
 
 from ghgs_lit.cli.runtime import output_dir
-from ghgs_lit.config import VERSION_BASE, conf_dir, own_keys
+from ghgs_lit.config import VERSION_BASE, conf_dir
+from ghgs_lit.config.compose import plain
 from ghgs_lit.runs import job as job_module
 from ghgs_lit.runs.grid import PlannedRun, Rehearsal, run_all
 from ghgs_lit.runs.job import register_resolvers, train_once
@@ -49,7 +50,7 @@ def executed(sweep: Path) -> list[str]:
 def job(cfg) -> float | str | None:
     """The job of a launcher: the verb without its training, and without the checks that import PyTorch. With
     ``data.workers`` it loads data, as training does."""
-    return train_once(RunDirectory(output_dir()), own_keys(cfg, None), load_and_record)
+    return train_once(RunDirectory(output_dir()), plain(cfg), load_and_record)
 
 
 def load_and_record(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float:

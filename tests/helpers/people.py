@@ -11,11 +11,11 @@ import torch
 import trimesh
 from PIL import Image
 
-from ghgs_lit.synthesis.datasets import Scans
-from ghgs_lit.synthesis.jobs import RenderOptions, render_people
-from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
-from ghgs_lit.synthesis.rig import Rig
-from ghgs_lit.synthesis.scans import ScanSource
+from ghgs_people.datasets import Scans
+from ghgs_people.figures.mesh import Person, TexturedMesh
+from ghgs_people.jobs import RenderOptions, render_people
+from ghgs_people.rig import Rig
+from ghgs_people.scans import ScanSource
 
 if TYPE_CHECKING:  # processes that render need not import Lightning
     from ghgs_lit.data.datamodule import PhotographsDataModule

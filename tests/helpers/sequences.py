@@ -3,8 +3,8 @@
 import numpy as np
 from PIL import Image
 
-from ghgs_lit.cli.predict import captures_of
-from ghgs_lit.prediction.capture.folder import CaptureFolder
+from ghgs_capture.folder import CaptureFolder
+from ghgs_capture.verbs.predict import captures_of
 from tests.helpers.figures import Figure
 from tests.helpers.videos import number_of, numbered_frames
 

@@ -7,7 +7,7 @@ import lightning.pytorch as L
 import pytest
 import torch
 
-from ghgs_lit.config.verbs import Train
+from ghgs_lit.cli.verbs import Train
 from ghgs_lit.errors import InputError
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.module import drawn_budget, token_budget

@@ -16,7 +16,7 @@ from ghgs_lit.diagnostics.benchmark.stages import FlopsProbe, PeakProbe, Seconds
 from ghgs_lit.evaluation.measure import Estimate, measure
 from ghgs_lit.metrics import ImageMetrics
 from ghgs_lit.metrics.functional import decibels, squared_error
-from ghgs_lit.prediction.export.ply import ply_bytes
+from ghgs_lit.ply import ply_bytes
 from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
 from ghgs_lit.types import Batch, Gaussians, Prediction, Rendering

@@ -4,14 +4,12 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import torch
 from torch import nn
 
 from ghgs_lit.errors import require
 from ghgs_lit.model import GHGS
-from ghgs_lit.synthesis.rig import Rig
-from ghgs_lit.types import Batch, Targets
+from ghgs_lit.types import Batch, Cameras, Targets
 
 #: Width over height of the silhouette, as of a standing person, and its largest height over the frame's.
 _ASPECT, _TALLEST = 0.4, 0.9
@@ -27,14 +25,27 @@ def ellipse(share: float, size: tuple[int, int]) -> torch.Tensor:
     return (row / height)[:, None].square() + (column / width).square() < 0.25
 
 
+def ring(count: int, height: int, width: int) -> Cameras:
+    """Cameras [count] that look at the origin from 2 m, evenly around the y axis, with a focal length of one
+    image height."""
+    yaw = 2 * math.pi * torch.arange(count, dtype=torch.float64) / count
+    zero = torch.zeros_like(yaw)
+    right = torch.stack((yaw.cos(), zero, -yaw.sin()), -1)
+    down = torch.tensor((0.0, -1.0, 0.0), dtype=yaw.dtype).expand(count, 3)
+    forward = torch.stack((-yaw.sin(), zero, -yaw.cos()), -1)
+    extrinsics = torch.eye(4).repeat(count, 1, 1)
+    extrinsics[:, :3, :3] = torch.stack((right, down, forward), -2)
+    extrinsics[:, 2, 3] = 2.0
+    intrinsics = torch.tensor([[height, 0, width / 2], [0, height, height / 2], [0, 0, 1]])
+    return Cameras(intrinsics.repeat(count, 1, 1), extrinsics, height, width)
+
+
 def ellipsoid_batch(share: float, views: int, size: int | tuple[int, int], batch: int) -> Batch:
     """Batch of photographs of noise on an ellipsoid of revolution, whose mask is the same in every view; the
     target is the first input view. ``share``: part of the frame that the subject covers. ``size``: side, or
     height and width, in pixels."""
     size = (size, size) if isinstance(size, int) else size
-    rig = Rig(look_at=(0.0, 0.0, 0.0), pitch=0.0, focal=1.0, shift_y=0.0)
-    yaws = np.tile(np.arange(views) * 360.0 / views, (batch, 1))
-    cameras = rig.cameras(yaws, *size)
+    cameras = ring(views, *size)[None].expand(batch)
     masks = ellipse(share, size).expand(batch, views, -1, -1).contiguous()
     noise = torch.rand(batch, views, 3, *size, generator=torch.Generator().manual_seed(0))
     images = noise * masks[:, :, None]

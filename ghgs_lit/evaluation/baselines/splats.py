@@ -15,7 +15,7 @@ from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import focal_lengths, unproject_maps, world_to_camera
 from ghgs_lit.geometry.rotations import rotate
 from ghgs_lit.heads.surface import surface_axes
-from ghgs_lit.prediction.refinement import Change, Refinement
+from ghgs_lit.refinement import Change, Refinement
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians
 
 #: Finer and closer to the masks than a model's bounds, which must contain the subject despite bad masks.

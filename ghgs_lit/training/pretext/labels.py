@@ -1,6 +1,7 @@
-"""Parts of the built-in body, from its skinning weights, and the parts that patches show."""
+"""Parts of bodies that plug-ins know, and the parts that patches show."""
 
 from functools import cache
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -9,63 +10,65 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from ghgs_lit.config import registry
+from ghgs_lit.config.options import Options
+from ghgs_lit.config.registry import class_of, kinds_of
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.projection import unproject_maps
-from ghgs_lit.synthesis.people.body import BODY_VERTICES, load_body
 from ghgs_lit.types import Batch, Tokens
 
-# Prefixes of the names of a part's bones. Bones of limbs end with .L or .R, and their sides are two parts.
-_TRUNK = {
-    "head": ("head", "neck"),
-    "chest": ("spine01", "spine02", "clavicle", "shoulder"),
-    "abdomen": ("spine03", "spine04"),
-    "hips": ("spine05", "root"),
-}
-_LIMBS = {
-    "upper arm": ("upperarm",),
-    "forearm": ("lowerarm",),
-    "hand": ("wrist", "finger"),
-    "thigh": ("upperleg",),
-    "shin": ("lowerleg",),
-    "foot": ("foot", "toe"),
-}
-
-PARTS = (*_TRUNK, *(f"{side} {name}" for name in _LIMBS for side in ("left", "right")))
+#: Parts of a body that patches are labelled with.
+PARTS = (
+    "head", "chest", "abdomen", "hips",
+    "left upper arm", "right upper arm", "left forearm", "right forearm", "left hand", "right hand",
+    "left thigh", "right thigh", "left shin", "right shin", "left foot", "right foot",
+)  # fmt: skip
 
 
-def _part_of(bone: str) -> str:
-    for name, beginnings in _TRUNK.items():
-        if bone.startswith(beginnings):
-            return name
-    side = {"L": "left", "R": "right"}[bone[-1]]
-    return next(f"{side} {name}" for name, beginnings in _LIMBS.items() if bone.startswith(beginnings))
+class BodyParts(Options):
+    """A body model whose vertices have known parts: a kind of ``parts``, which plug-ins offer."""
+
+    vertices: ClassVar[int]
+    """Number of vertices, by which bodies of the model are recognised."""
+
+    def of_vertices(self) -> np.ndarray:
+        """The part of each vertex [n], an index into :data:`PARTS`."""
+        raise NotImplementedError
 
 
 @cache
-def vertex_parts() -> np.ndarray:
-    """The part of each vertex of the skin [n]: that with the largest total weight of its bones."""
-    body = load_body()
-    weights = np.zeros((BODY_VERTICES, len(PARTS)))
-    for bone, name in enumerate(body.bone_names):
-        weights[:, PARTS.index(_part_of(name))] += body.weights[:BODY_VERTICES, bone]
-    return weights.argmax(1)
+def _vertex_parts(vertices: int) -> np.ndarray | None:
+    """Parts of the body model of so many vertices; None: no plug-in knows it."""
+    for kind in kinds_of(registry.PARTS):
+        body = class_of(registry.PARTS, kind, registry.PARTS)
+        if body.vertices == vertices:
+            return body().of_vertices()
+    return None
 
 
 def parts_of_points(points: Float[Tensor, "n 3"], vertices: Float[Tensor, "m 3"]) -> Int[Tensor, " n"]:
     """The body part of each world point on clothes, hair or skin: that of the nearest vertex of the skin.
-    ``vertices``: of the posed body [:data:`BODY_VERTICES`, 3]. InputError: not those of a built-in body."""
-    expected = f"{BODY_VERTICES}, all of a built-in person (data=synthetic)"
-    require(len(vertices) == BODY_VERTICES, "vertices of the body", expected, len(vertices))
+
+    Args:
+        points: in the unit of ``vertices``.
+        vertices: of the posed body, all of them.
+
+    Raises:
+        InputError: no plug-in knows the parts of a body of so many vertices.
+    """
+    parts = _vertex_parts(len(vertices))
+    expected = "those of a body whose parts are known, as of a built-in person (data=synthetic)"
+    require(parts is not None, "vertices of the body", expected, len(vertices))
     # For one batch: a tree that is quick to build, not the quickest to query.
     tree = cKDTree(vertices.double().cpu().numpy(), balanced_tree=False, compact_nodes=False)
     nearest = tree.query(points.double().cpu().numpy())[1]
-    return torch.from_numpy(vertex_parts()[nearest]).to(points.device)
+    return torch.from_numpy(parts[nearest]).to(points.device)
 
 
 def has_parts(batch: Batch) -> bool:
-    """Whether the bodies of a batch are built-in ones, whose parts are known."""
+    """Whether the parts of all bodies of a batch are known."""
     bodies = batch.body_vertices or ()
-    return len(bodies) > 0 and all(len(body) == BODY_VERTICES for body in bodies)
+    return len(bodies) > 0 and all(_vertex_parts(len(body)) is not None for body in bodies)
 
 
 def token_parts(shares: Float[Tensor, "n P"], tokens: Tokens) -> Int[Tensor, " N"]:

@@ -17,8 +17,8 @@ from ghgs_lit.diagnostics.stress.stages import STAGES, heads
 from ghgs_lit.geometry import projection, rotations, undistortion
 from ghgs_lit.geometry.padding import Padding
 from ghgs_lit.metrics import functional
-from ghgs_lit.prediction.refinement import refinement
 from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
+from ghgs_lit.refinement import refinement
 from ghgs_lit.rendering import reference
 from ghgs_lit.rendering.cpu import backend
 from ghgs_lit.rounds import gains

@@ -11,9 +11,10 @@ import torch
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.plan.patches import KeptPatches
-from ghgs_lit.synthesis.people.body import BODY_VERTICES, load_body
-from ghgs_lit.training.pretext.labels import PARTS, part_shares, parts_of_points, vertex_parts
+from ghgs_lit.training.pretext.labels import PARTS, part_shares, parts_of_points
 from ghgs_lit.training.validation_pictures import PicturesOptions
+from ghgs_people.figures.body import BODY_VERTICES, load_body
+from ghgs_people.figures.parts import vertex_parts
 from tests.helpers.bodies import body_batch
 from tests.helpers.models import make_model
 
@@ -52,7 +53,9 @@ def test_a_point_has_the_part_of_the_nearest_vertex():
     )
     nearest = (points[:, None].double() - vertices).square().sum(-1).argmin(1)
     assert parts_of_points(points.float(), vertices.float()).tolist() == vertex_parts()[nearest].tolist()
-    with pytest.raises(InputError, match="vertices of the body: expected 13380, all of a built-in person"):
+    with pytest.raises(
+        InputError, match="vertices of the body: expected those of a body whose parts are known"
+    ):
         parts_of_points(points.float(), vertices[:-1].float())
 
 

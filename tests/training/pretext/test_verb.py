@@ -8,7 +8,7 @@ import torch
 
 from ghgs_lit import GHGS
 from ghgs_lit.evaluation.tables.records import model_variant
-from ghgs_lit.synthesis.people.body import BODY_VERTICES, load_body
+from ghgs_people.figures.body import BODY_VERTICES, load_body
 from tests.helpers.people import render_boxes
 from tests.helpers.verbs import ghgs
 

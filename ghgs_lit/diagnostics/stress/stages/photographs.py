@@ -12,7 +12,7 @@ from ghgs_lit.diagnostics.stress.stages.geometry import batch_of, cameras_of, sc
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.geometry.undistortion import undistorting_grid
 from ghgs_lit.metrics.functional import ssim
-from ghgs_lit.prediction.refinement.refinement import Refinement
+from ghgs_lit.refinement.refinement import Refinement
 from ghgs_lit.rendering import Renderer, render
 from ghgs_lit.rounds.gains import log_gains
 from ghgs_lit.types import Batch, Gaussians

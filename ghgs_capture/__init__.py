@@ -1,0 +1,34 @@
+"""A user's own photographs and calibration become files, pages and weights for one's rig.
+
+A plug-in of :mod:`ghgs_lit` by the door that a user's own has: it offers the verbs for photographs.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from ghgs_lit.config.registry import offer_verbs
+
+if TYPE_CHECKING:
+    from ghgs_capture.capture import Capture
+    from ghgs_capture.prediction import predict
+
+offer_verbs(
+    predict="ghgs_capture.verbs.Predict",
+    view="ghgs_capture.verbs.View",
+    adapt="ghgs_capture.verbs.Adapt",
+    doctor="ghgs_capture.verbs.Doctor",
+)
+
+_MODULES = {"Capture": "ghgs_capture.capture", "predict": "ghgs_capture.prediction"}
+__all__ = ["Capture", "predict"]
+
+
+def __getattr__(name: str):
+    """Import public names on first use: ``ghgs --help`` must not wait for PyTorch."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_MODULES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__]

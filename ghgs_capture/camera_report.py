@@ -1,0 +1,346 @@
+"""Report on the cameras of a capture: other meanings of their numbers (:class:`Hypothesis`), ranked by how
+well masks and cameras agree (:mod:`ghgs_lit.geometry.silhouettes`)."""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ghgs_capture.calibration import AXES, EXTRINSICS, INTRINSICS, Convention, StoredCamera
+from ghgs_capture.crops import Photograph
+from ghgs_capture.folder import CaptureFolder
+from ghgs_capture.photographs import Pixels
+from ghgs_capture.placement import copies, placement_lines
+from ghgs_lit.data.silhouettes import twins
+from ghgs_lit.data.view import area_image, area_mask
+from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, subject_sphere
+
+#: Least agreement of every view of a right calibration, and by how much a better meaning must win.
+AGREES, BETTER = 0.9, 0.05
+#: Agreement below which a view is sought that disagrees, and how much of the disagreement it may leave.
+_SOUND, _REST = 0.97, 1 / 3
+_SAME = 0.01  # Difference of agreement that tells nothing
+_BESIDE = 3  # Pixels beside a mask in which it may lack a part
+_SIDE = 320  # Longer side of the photographs that are compared, in pixels
+_MIDDLE = (0.3, 0.7)  # Shares of a photograph between which a principal point is plausible
+PERSON = (0.5, 2.5)  #: A person's largest extent in metres
+# Usual factors of a resize after the calibration.
+_RESIZES = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 1.0, 4 / 3, 1.5, 2.0, 3.0, 4.0)
+# A part of a mask is another person where it has this share of the largest part's area, or more.
+_PART = 1 / 3
+_UNITS = {"millimetres": 0.001, "centimetres": 0.01, "metres": 1.0, "kilometres": 1000.0}
+
+
+@dataclass(frozen=True)
+class StoredView:
+    """One photograph at a small size, its camera as stored, and what the camera's numbers mean."""
+
+    name: str
+    camera: StoredCamera
+    pixels: Pixels
+    mask: np.ndarray
+    convention: Convention
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A meaning of a calibration, and how well masks and cameras agree with it."""
+
+    says: str
+    option: str  #: of the command line, for this meaning; empty: none
+    views: tuple[StoredView, ...]
+    blames: tuple[str, ...] = ()  #: the cameras that are wrong by it; empty: all, or none
+    shares: dict[str, float] = field(default_factory=dict)  #: of each mask, in the hull of the others
+
+    @property
+    def score(self) -> float:
+        """The agreement of the worst view."""
+        return min(self.shares.values())
+
+    def photographs(self, folder: CaptureFolder) -> list[Photograph]:
+        """The small photographs without lens distortion, upright, with their masks as mattes and their
+        cameras in this meaning. InputError: a photograph has another aspect ratio."""
+        white = np.uint8(255)
+        return [
+            folder.photograph(v.name, v.camera, v.pixels, v.mask * white, v.convention) for v in self.views
+        ]
+
+    def silhouettes(self, folder: CaptureFolder) -> list[Silhouette]:
+        """Masks with their cameras in this meaning. InputError: a photograph has another aspect ratio."""
+        return [Silhouette(p.mask, p.intrinsics, p.extrinsics) for p in self.photographs(folder)]
+
+    def ranked(self, folder: CaptureFolder) -> "Hypothesis":
+        """The same meaning with its :attr:`shares`, all 0 where no camera can have it."""
+        try:
+            shares = HullSearch().shares(self.silhouettes(folder))
+        except (InputError, np.linalg.LinAlgError):
+            shares = [0.0] * len(self.views)
+        return replace(self, shares={v.name: share for v, share in zip(self.views, shares, strict=True)})
+
+    def size(self, folder: CaptureFolder) -> float:
+        """The subject's largest extent in the user's unit; 0 where it is not known."""
+        try:
+            silhouettes = self.silhouettes(folder)
+        except InputError:
+            return 0.0
+        focus, _ = subject_sphere(silhouettes)
+        return float(np.median([s.extent(focus).max() for s in silhouettes]))
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The report on a calibration."""
+
+    consistent: bool
+    lines: tuple[str, ...]
+    option: str  #: of the command line, for the best meaning; empty: none
+    ranking: tuple[Hypothesis, ...]  #: all meanings that were tried, the best first
+    size: float  #: the subject's largest extent in the user's unit, by the best meaning
+    suspects: tuple[str, ...] = ()  #: views that disagree with the others; a few may also if consistent
+
+
+def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
+    """Examine the cameras of one instant (None: the first). InputError: a file cannot be read."""
+    views = small_views(folder, folder.instants[0] if instant is None else instant)
+    given = Hypothesis("the calibration is right as it is", "", views).ranked(folder)
+    same = twins({view.name: view.camera.pose for view in views})
+    if same is not None:
+        line = f"{' and '.join(same)} have the same pose: one of them is a copy"
+        return Diagnosis(False, (line,), "", (given,), given.size(folder), same)
+    photographs = given.photographs(folder) if given.score > 0 else []
+    same = copies(photographs)
+    if same is not None:
+        line = f"{' and '.join(same)} are the same photograph: one of them is a copy"
+        return Diagnosis(False, (line,), "", (given,), given.size(folder), same)
+    if given.score >= AGREES:
+        size = given.size(folder)
+        agree = f"{given.score:.0%} of each mask or more lies in the hull of the others"
+        lines = [f"cameras and masks agree ({agree})", _size_line(size)]
+        suspects, *said = _suspected(given, folder) if given.score < _SOUND else ((),)
+        lines += [*said, *placement_lines(photographs, [view.camera.pose for view in views])]
+        return Diagnosis(True, tuple(lines), "", (given,), size, suspects)
+    tried = [given, *(hypothesis.ranked(folder) for hypothesis in _for_all(views))]
+    best = max(tried, key=lambda hypothesis: hypothesis.score)
+    if best.score < AGREES:
+        # A single wrong camera is sought with the best meaning for all.
+        base = best if best.score > given.score + BETTER else given
+        tried += [hypothesis.ranked(folder) for hypothesis in _for_some(base.views)]
+        best = max(tried, key=lambda hypothesis: hypothesis.score)
+    tried.sort(key=lambda hypothesis: -hypothesis.score)
+    if best.score >= max(AGREES, given.score + BETTER):
+        size = best.size(folder)
+        lines = [f"{best.says}: masks agree by {best.score:.0%} instead of {given.score:.0%}"]
+        lines += [f"try {best.option}"] if best.option else []
+        return Diagnosis(False, (*lines, _size_line(size)), best.option, tuple(tried), size, best.blames)
+    return _unexplained(folder, given, tried)
+
+
+def small_views(folder: CaptureFolder, instant: str) -> tuple[StoredView, ...]:
+    """The photographs of an instant, so small that many meanings can be tried."""
+    views = []
+    for name, (camera, pixels, matte) in folder.decode(instant).items():
+        height, width = pixels.size
+        scale = min(_SIDE / max(height, width), 1)
+        size = max(round(height * scale), 1), max(round(width * scale), 1)
+        # Without a stored size the intrinsics are for the whole photograph.
+        camera = camera.sized(pixels.stored_size if folder.keeps_stored(camera, pixels) else pixels.size)
+        small = Pixels(area_image(np.ascontiguousarray(pixels.image), *size), None, pixels.turns)
+        mask = area_mask(np.ascontiguousarray(matte > 127), *size)
+        views.append(StoredView(name, camera, small, mask, folder.convention))
+    return tuple(views)
+
+
+def in_parts(views: Sequence[StoredView]) -> list[str]:
+    """The photographs whose masks have a second large part, as two people have."""
+    from scipy import ndimage  # here: it takes time to import
+
+    found = []
+    for view in views:
+        regions, _ = ndimage.label(view.mask)
+        areas = np.sort(np.bincount(regions.ravel())[1:])
+        if len(areas) > 1 and areas[-2] >= _PART * areas[-1]:
+            found.append(view.name)
+    return found
+
+
+def _for_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
+    given = views[0].convention
+    points = [view.camera.intrinsics[:2, 2] / np.array(view.camera.size)[::-1] for view in views]
+    scale = 0.5 / max(float(np.median(points)), 0.01)  # brings principal points to the middle
+    likely = min(_RESIZES, key=lambda resize: abs(np.log(resize / scale)))
+    for intrinsics, resized in itertools.product(INTRINSICS, (given.resized, likely)):
+        inner = replace(given, intrinsics=intrinsics, resized=resized)
+        if not all(_plausible(replace(view, convention=inner)) for view in views):
+            continue
+        for extrinsics, axes in itertools.product(EXTRINSICS, AXES):
+            convention = replace(inner, extrinsics=extrinsics, axes=axes)
+            if convention == given:
+                continue
+            changed = [
+                (key, value if isinstance(value, str) else f"{value:.4g}")
+                for key, value in vars(convention).items()
+                if value != getattr(given, key)
+            ]
+            yield Hypothesis(
+                f"all cameras: {', '.join(map(' '.join, changed))}",
+                " ".join(f"calibration.{key}={value}" for key, value in changed),
+                tuple(replace(view, convention=convention) for view in views),
+            )
+
+
+def _plausible(view: StoredView) -> bool:
+    share = view.camera.intrinsics[:2, 2] * view.convention.resized
+    if view.convention.intrinsics == "pixels":
+        share = share / np.array(view.camera.size)[::-1]
+    return bool(((share >= _MIDDLE[0]) & (share <= _MIDDLE[1])).all())
+
+
+def _for_some(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
+    """Mistakes of one camera, and two cameras or masks that are exchanged."""
+    for i, view in enumerate(views):
+        for says, changed in _mistakes(view):
+            mended = (*views[:i], changed, *views[i + 1 :])
+            yield Hypothesis(f"{view.name} alone: {says}", "", mended, (view.name,))
+    for i, j in itertools.combinations(range(len(views)), 2):
+        one, other = views[i], views[j]
+        swapped = list(views)
+        swapped[i] = replace(one, camera=other.camera)
+        swapped[j] = replace(other, camera=one.camera)
+        names, blames = f"{one.name} and {other.name}", (one.name, other.name)
+        # Outlines of the masks may follow edges of the other photograph rather than of their own.
+        if one.mask.shape == other.mask.shape and (
+            _contrast(one, other.mask) * _contrast(other, one.mask)
+            > _contrast(one, one.mask) * _contrast(other, other.mask)
+        ):
+            swapped[i], swapped[j] = replace(one, mask=other.mask), replace(other, mask=one.mask)
+            yield Hypothesis(f"the masks of {names} are exchanged", "", tuple(swapped), blames)
+            continue
+        option = f"'calibration.names={{{one.name}: {other.name}, {other.name}: {one.name}}}'"
+        yield Hypothesis(f"the cameras of {names} are exchanged", option, tuple(swapped), blames)
+
+
+def _mistakes(view: StoredView) -> Iterator[tuple[str, StoredView]]:
+    """Usual mistakes of a single camera in words, each with the view after mending it."""
+    given = view.convention
+    for extrinsics, axes in itertools.product(EXTRINSICS, AXES):
+        convention = replace(given, extrinsics=extrinsics, axes=axes)
+        if convention != given:
+            yield f"its extrinsics are {extrinsics} with axes of {axes}", replace(view, convention=convention)
+
+    def with_camera(says: str, **changes: np.ndarray) -> tuple[str, StoredView]:
+        return says, replace(view, camera=replace(view.camera, **changes))
+
+    for factor, says in ((0.001, "long"), (1000.0, "short")):
+        pose = view.camera.pose.copy()
+        pose[:3, 3] *= factor
+        yield with_camera(f"its translation is 1000 times too {says}", pose=pose)
+    intrinsics = view.camera.intrinsics.copy()
+    sides = np.array(view.camera.size)[::-1] if given.intrinsics == "pixels" else 1.0
+    intrinsics[:2, 2] = sides / 2 / given.resized
+    yield with_camera("its principal point should be near the middle", intrinsics=intrinsics)
+    for factor in (0.5, 2.0):
+        intrinsics = view.camera.intrinsics * [[factor], [factor], [1.0]]
+        says = f"its intrinsics are for photographs {1 / factor:g} times as large"
+        yield with_camera(says, intrinsics=intrinsics)
+
+
+def _contrast(view: StoredView, mask: np.ndarray) -> float:
+    """Mean gradient of the photograph on the outline of a mask, largest for the right mask."""
+    on_outline = _gradient(view.pixels.image)[_outline(mask)]
+    return float(on_outline.mean()) if len(on_outline) else 0.0
+
+
+def _gradient(image: np.ndarray) -> np.ndarray:
+    return np.hypot(*np.gradient(image.astype(np.float64).mean(-1)))
+
+
+def _outline(mask: np.ndarray) -> np.ndarray:
+    return np.hypot(*np.gradient(mask.astype(np.float64))) > 0
+
+
+def _size_line(size: float) -> str:
+    if PERSON[0] <= size <= PERSON[1]:
+        return f"the subject is {size:.3g} units tall: a person in metres"
+    unit = next((n for n, u in _UNITS.items() if PERSON[0] <= size * u <= PERSON[1]), None)
+    if unit is None:
+        return f"the subject is {size:.3g} units tall; it is scaled to a person's size inside, and back"
+    option = f"calibration.unit={_UNITS[unit]:g}"
+    return f"the subject is {size:.4g} units tall, a person in {unit}: {option} makes it metres"
+
+
+def _unexplained(folder: CaptureFolder, given: Hypothesis, tried: list[Hypothesis]) -> Diagnosis:
+    """The diagnosis where no meaning fits: the view without which the others agree, if there is one."""
+    base = max((h for h in tried if not h.blames), key=lambda h: h.score)
+    base = base if base.score > given.score + BETTER else given
+    suspects, *lines = _suspected(base, folder)
+    shares = ", ".join(f"{name} {share:.0%}" for name, share in base.shares.items())
+    if not suspects:
+        lines = [f"masks and cameras disagree (share of each mask in the hull of the others: {shares})"]
+    return Diagnosis(False, tuple(lines), "", tuple(tried), base.size(folder), suspects)
+
+
+def _suspected(found: Hypothesis, folder: CaptureFolder) -> tuple[Any, ...]:
+    """The views that explain by themselves most of the disagreement, and a line about them; () if none does.
+
+    A mask that lacks a part lies in the hull of the others, and theirs do not lie in that with it: what is
+    compared are the others with and without it."""
+    least = max(AGREES, 1 - (1 - found.score) * _REST)
+    without = {
+        left_out.name: replace(found, views=tuple(v for v in found.views if v is not left_out)).ranked(folder)
+        for left_out in (found.views if len(found.views) > 2 else ())
+    }
+    fitting = {name: others.score for name, others in without.items() if others.score >= least}
+    readings = {name: _reading(found, name) for name in fitting}
+    if len(found.views) == 3 and any(readings.values()):  # two views alone agree nearly always
+        fitting = {name: share for name, share in fitting.items() if readings[name]}
+    if not fitting:
+        return ((),)
+    best = max(fitting.values())
+    names = tuple(name for name, share in fitting.items() if share >= best - _SAME)
+    line = f"{' or '.join(names)} disagrees with the others, which agree by {best:.0%} without it"
+    if len(names) == 1:
+        return names, f"{line} and by {found.score:.0%} with it{readings[names[0]]}"
+    if len(names) == 2 and len(found.views) > 3:
+        names = tuple(sorted(names, key=_edges(found, names, folder).__getitem__))
+        return names, f"{line}: rather {names[0]}, by the edges of the photographs (silhouettes cannot tell)"
+    return names, f"{line} (silhouettes cannot tell for sure)"
+
+
+def _edges(found: Hypothesis, names: tuple[str, str], folder: CaptureFolder) -> dict[str, float]:
+    """Contrast of two photographs, of which one's mask has a part that the other's lacks, at that part of the
+    mask's outline, compared with the rest of it: the wrong mask's outline follows no edge there."""
+    from scipy import ndimage  # here: it takes time to import
+
+    photographs = found.photographs(folder)
+    silhouettes = [Silhouette(p.mask, p.intrinsics, p.extrinsics) for p in photographs]
+    more, sphere, edges = min(names, key=found.shares.__getitem__), subject_sphere(silhouettes), {}
+    for place, view in enumerate(found.views):
+        if view.name not in names:
+            continue
+        one, others = silhouettes[place], silhouettes[:place] + silhouettes[place + 1 :]
+        close, around = (ndimage.binary_dilation(one.mask, iterations=n * _BESIDE) for n in (1, 2))
+        cells = np.argwhere(one.mask if view.name == more else around & ~close)
+        meets = HullSearch().meets(one, cells[:, ::-1] + 0.5, others, *sphere)
+        part = np.zeros_like(one.mask)
+        part[tuple(cells[meets != (view.name == more)].T)] = True
+        near, outline = ndimage.binary_dilation(part, iterations=2 * _BESIDE), _outline(one.mask)
+        gradient = _gradient(photographs[place].image)
+        here, elsewhere = (gradient[outline & which] for which in (near, ~near))
+        edges[view.name] = (
+            here.sum() / max(len(here), 1) / max(elsewhere.sum() / max(len(elsewhere), 1), 1e-6)
+        )
+    return edges
+
+
+def _reading(found: Hypothesis, name: str) -> str:
+    """What may be wrong with a view, by whether its own mask or those of the others lie outside a hull."""
+    own = 1 - found.shares[name]
+    others = 1 - min(share for other, share in found.shares.items() if other != name)
+    if own <= _REST * others:
+        return ": its mask lacks a part that theirs have, or its focal length is too long"
+    if others <= _REST * own:
+        return ": its mask has a part that theirs lack, or its focal length is too short"
+    return ""

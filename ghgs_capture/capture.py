@@ -1,0 +1,57 @@
+"""A user's photographs of one instant, and the batch that a model sees of them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ghgs_capture.crops import Photograph, crop_to_subject
+from ghgs_capture.folder import CaptureFolder
+from ghgs_lit.errors import require
+from ghgs_lit.rounds.gains import divided
+from ghgs_lit.types import Batch, Cameras
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Photographs of one instant, two or more."""
+
+    name: str
+    photographs: tuple[Photograph, ...]
+
+    @classmethod
+    def read(cls, images: str | Path, cameras: str | Path, **options: Any) -> "Capture":
+        """The photographs of a folder with their cameras. ``cameras``: the calibration, in one of
+        :data:`ghgs_capture.formats.FORMATS`. ``options``: as for
+        :class:`ghgs_capture.folder.CaptureFolder`, such as ``masks``. InputError: a file is
+        missing or wrong, or the folder holds several instants."""
+        folder = CaptureFolder(images, cameras, **options)
+        instants = folder.instants
+        require(len(instants) == 1, str(images), "one instant (CaptureFolder reads several)", len(instants))
+        return cls(instants[0], folder.photographs(instants[0]))
+
+    def batch(self, size: tuple[int, int], refine_masks: int = 0) -> Batch:
+        """Crops around the subject on a black background, as a model sees them: a batch of one element.
+
+        Cameras are in the user's world, in float64, which a world far from its origin needs. Photographs are
+        divided by the gains of their cameras where those of all are known. ``size``: (height, width) of the
+        crops in pixels. ``refine_masks``: pixels of a crop by which outlines of masks may be wrong; mattes
+        are then searched in the photographs (:func:`refined_matte`). 0: masks are right."""
+        crops = [crop_to_subject(photograph, size, refine_masks) for photograph in self.photographs]
+        images, mattes, intrinsics, extrinsics = (
+            torch.from_numpy(np.stack([getattr(crop, name) for crop in crops]))[None]
+            for name in ("image", "matte", "intrinsics", "extrinsics")
+        )
+        batch = Batch(
+            images=images.movedim(-1, 2).float() / 255,
+            masks=mattes > 127,
+            cameras=Cameras(intrinsics, extrinsics, *size),
+            alpha=mattes.float() / 255,
+            subjects=(self.name,),
+            views=(tuple(crop.name for crop in crops),),
+        )
+        gains = [crop.gains for crop in crops]
+        known = all(values is not None for values in gains)
+        return divided(batch, torch.from_numpy(np.log(gains)).float()[None]) if known else batch

@@ -1,0 +1,119 @@
+"""A single HTML file that shows Gaussians in any browser with WebGL 2, without a network."""
+
+import base64
+import html
+import json
+import re
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from importlib.resources import files
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ghgs_capture.export.subject import ExportedSubject
+from ghgs_lit.ply import stored_values
+from ghgs_lit.types import Gaussians
+
+#: Quantisation steps in a pixel of a photograph (centre), a factor of e (standard deviation) and 1 (opacity;
+#: rotation, to each side of 0): ``FINE`` for one instant, ``COARSE`` for each of several.
+FINE = {"center": 64, "scale": 24, "opacity": 255, "rotation": 127}
+COARSE = {"center": 12, "scale": 12, "opacity": 127, "rotation": 31}
+#: A Gaussian's numbers of four bytes (its centre) and of one (the others).
+_WIDE, _NARROW = 3, 10
+_LARGEST = 1 << 29
+
+
+def pack(gaussians: Gaussians, pixel: float, center: Tensor, steps: Mapping[str, int]) -> bytes:
+    """Gaussians of one subject (RGB colours) in few bytes, which ``page.html`` unpacks: planes [22, N].
+
+    A Gaussian becomes whole numbers: its centre relative to ``center`` [3] in parts of ``pixel``, the side of
+    a photograph's pixel at the subject; the logarithms of its standard deviations; colour and opacity; and
+    its rotation as ``v / (1 + w)`` of the unit quaternion ``(w, v)`` with ``w >= 0``. Each is stored as the
+    difference from the Gaussian before, mostly its neighbour's. ``steps``: ``FINE`` or ``COARSE``."""
+    values = stored_values(gaussians, torch.float64)
+    w, v = values["quaternions"].split((1, 3), dim=1)
+    parts = (
+        ((values["means"] - center.cpu()) * (steps["center"] / pixel)).clamp(-_LARGEST, _LARGEST),
+        ((values["scales"] / pixel).log() * steps["scale"]).clamp(-128, 127),
+        values["colors"].clamp(0, 1) * 255,
+        values["opacities"].clamp(0, 1)[:, None] * steps["opacity"],
+        v * torch.where(w < 0, -1, 1) / (1 + w.abs()) * steps["rotation"],
+    )
+    numbers = torch.cat([part.round().long() for part in parts], dim=1).numpy()
+    numbers[:, [6, 8]] -= numbers[:, [7]]  # red and blue are like green
+    wide, narrow = np.split(np.diff(numbers, axis=0, prepend=0), [_WIDE], axis=1)
+    wide = ((wide << 1) ^ (wide >> 63)).astype("<u4")  # with the sign as last bit, high bytes are mostly 0
+    planes = wide.view(np.uint8).T.tobytes() + narrow.astype(np.uint8).T.tobytes()
+    packer = zlib.compressobj(9, strategy=zlib.Z_FILTERED)
+    return packer.compress(planes) + packer.flush()
+
+
+def unpack(data: bytes, pixel: float, center: Tensor, steps: Mapping[str, int], like: Gaussians) -> Gaussians:
+    """The Gaussians of :func:`pack`, on the CPU, with the image constants of ``like``."""
+    planes = np.frombuffer(zlib.decompress(data), np.uint8).reshape(4 * _WIDE + _NARROW, -1)
+    wide = np.ascontiguousarray(planes[: 4 * _WIDE].T).view("<u4").astype(np.int64)
+    centers = torch.from_numpy((wide >> 1 ^ -(wide & 1)).cumsum(0))
+    narrow = planes[4 * _WIDE :].T.astype(np.int64).cumsum(0)
+    narrow[:, [3, 5]] += narrow[:, [4]]
+    scales, colors, rotations = (torch.from_numpy(part) for part in np.split(narrow, [3, 7], axis=1))
+    turned = _signed(rotations) / steps["rotation"]
+    square = turned.square().sum(1, keepdim=True)
+    values = {
+        "means": center.cpu() + centers * (pixel / steps["center"]),
+        "scales": pixel * (_signed(scales) / steps["scale"]).exp(),
+        "quaternions": torch.cat([1 - square, 2 * turned], dim=1) / (1 + square),
+        "colors": (colors[:, :3] & 255) / 255,
+        "opacities": (colors[:, 3] & 255) / steps["opacity"],
+    }
+    values = {name: value.float() for name, value in values.items()}
+    return replace(like, **values, image=None, pixel=None, splits=(len(centers),))
+
+
+def _signed(numbers: Tensor) -> Tensor:
+    """Numbers modulo 256, from -128 to 127."""
+    return (numbers + 128 & 255) - 128
+
+
+def page(
+    subject: ExportedSubject,
+    name: str,
+    packed: Sequence[bytes] = (),
+    path: Sequence[Sequence[float]] = ((0.0, 0.0, 0.0),),
+    fps: float = 1.0,
+) -> str:
+    """The text of a page that shows one instant or plays several, with a button for each camera.
+
+    Args:
+        subject: the first instant; the page begins at its first camera.
+        packed: :func:`pack` of each of several instants, with ``COARSE``.
+        path: shift of the page's camera at each instant [instants, 3].
+        fps: instants a second."""
+    gaussians, cameras, center, pixel = subject.gaussians, subject.cameras, subject.center, subject.pixel
+    steps = COARSE if packed else FINE
+    packed = packed or [pack(gaussians, pixel, center, steps)]
+    scene = {
+        "size": [cameras.width, cameras.height],
+        "up": subject.up.tolist(),
+        "target": center.tolist(),
+        "pixel": pixel,
+        "steps": steps,
+        "low_pass": gaussians.low_pass,
+        "antialiased": gaussians.antialiased,
+        "cameras": [
+            {"name": view, "intrinsics": k.tolist(), "extrinsics": e.tolist()}
+            for view, k, e in zip(subject.views, cameras.intrinsics, cameras.extrinsics, strict=True)
+        ],
+        "path": path,
+        "fps": fps,
+    }
+    text = files("ghgs_capture.export").joinpath("page.html").read_text()
+    values = {
+        "title": html.escape(name),
+        # "<!--", "<script" and "</" mean something inside a script, too.
+        "scene": json.dumps(scene).replace("<", "\\u003c"),
+        "data": "\n".join(base64.b64encode(instant).decode() for instant in packed),
+    }
+    return re.sub(r"\{\{(\w+)\}\}", lambda name: values[name[1]], text)

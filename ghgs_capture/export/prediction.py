@@ -1,0 +1,179 @@
+"""The files of a prediction: one entry of ``FORMATS`` for each format."""
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ghgs_capture.export.compact import CONVERTED, converted, to_records
+from ghgs_capture.export.gltf import glb_bytes
+from ghgs_capture.export.instants import mp4_bytes
+from ghgs_capture.export.maps import depth_files, depth_unit, input_files, png, points_ply
+from ghgs_capture.export.page import page
+from ghgs_capture.export.reports import begin_files, end_files, write_file
+from ghgs_capture.export.subject import ExportedSubject, OutputOptions, exported_subject, file_names
+from ghgs_capture.export.unseen import unseen
+from ghgs_lit.errors import choice, installed, require
+from ghgs_lit.geometry.frame import HEIGHT
+from ghgs_lit.kernels.cores import allowed_cores
+from ghgs_lit.metrics import psnr
+from ghgs_lit.metrics.functional import box_of
+from ghgs_lit.ply import ply_bytes
+from ghgs_lit.rendering import Renderer
+from ghgs_lit.runs.provenance import versions
+from ghgs_lit.types import Batch, Gaussians, Prediction
+from ghgs_lit.visualization.pictures import palette, sheet
+
+SHEET = "sheet.png"  #: The picture to look at
+
+
+@dataclass(frozen=True)
+class Format:
+    """One format. ``contents`` gives a function for each file, in order; threads call it for the content."""
+
+    files: tuple[str, ...]  #: names; one for each ``{view}``, or ``{frame}`` of the turntable
+    contents: Callable[[ExportedSubject], Iterable[Callable[[], bytes]]]
+    package: str | None = None  #: package that it needs
+    extra: str = "formats"  #: extra of this package that installs it
+
+    def names(self, views: Sequence[str], frames: int) -> list[str]:
+        """The names of all files."""
+        names = []
+        for pattern in self.files:
+            if "{view}" in pattern:
+                names += [pattern.format(view=name) for name in file_names(views)]
+            elif "{frame" in pattern:
+                names += [pattern.format(frame=frame) for frame in range(frames)]
+            else:
+                names.append(pattern)
+        return names
+
+
+def _one(content: Callable[[ExportedSubject], bytes]) -> Callable[[ExportedSubject], list]:
+    return lambda subject: [partial(content, subject)]
+
+
+def _of_viewers(content: Callable[[Gaussians], bytes]) -> Callable[[ExportedSubject], list]:
+    """Contents of one file from the Gaussians for other viewers, which are made before threads begin."""
+    return lambda subject: [partial(content, subject.for_other_renderers)]
+
+
+FORMATS: dict[str, Format] = {
+    "ply": Format(("gaussians.ply",), _one(lambda s: ply_bytes(s.stored))),
+    **{
+        name: Format((f"gaussians.{suffix}",), _of_viewers(partial(converted, name)), "gaussforge")
+        for name, suffix in CONVERTED.items()
+    },
+    "splat": Format(("gaussians.splat",), _of_viewers(lambda g: to_records(g).tobytes())),
+    "glb": Format(
+        ("gaussians.glb",), lambda s: [partial(glb_bytes, s.for_other_renderers, s.up)], "pygltflib"
+    ),
+    "html": Format(("viewer.html",), _one(lambda s: page(s, s.name).encode())),
+    "turntable": Format(("turntable/{frame:03d}.png",), lambda s: (partial(png, p) for p in s.turntable)),
+    "mp4": Format(
+        ("turntable.mp4",),
+        lambda s: [partial(mp4_bytes, s.turntable, s.options.fps)],
+        "imageio_ffmpeg",
+        "video",
+    ),
+    "depth": Format(("depth/{view}.png", "depth.npz"), depth_files),
+    "points": Format(("points.ply",), _one(points_ply)),
+    "inputs": Format(("inputs/{view}.png", "cameras.json"), input_files),
+}
+
+
+def output_options(config: Mapping[str, Any]) -> OutputOptions:
+    """The options of a verb's configuration, checked before any work. ``config``: plain data with ``formats``
+    (``all``: all of them), ``up``, ``smooth`` and ``turntable``. InputError: an unknown format, a value out
+    of range, or a package that is not installed."""
+    formats = config["formats"]
+    formats = [formats] if isinstance(formats, str) else formats
+    formats = tuple(FORMATS) if "all" in formats else tuple(dict.fromkeys(formats))
+    for name in formats:
+        choice("formats", name, ("all", *FORMATS))
+        if FORMATS[name].package is not None:
+            installed(FORMATS[name].package, FORMATS[name].extra, f"formats={name}")
+    frames = config["turntable"]["frames"]
+    require(frames > 0 or "mp4" not in formats, "turntable.frames", "at least 1 for formats=mp4", frames)
+    return OutputOptions(formats, config["up"], config["smooth"], frames, config["turntable"]["fps"])
+
+
+def output_files(options: OutputOptions, views: Sequence[str]) -> list[str]:
+    """Names of the files, except the report, that :func:`write_prediction` writes into its directory."""
+    names = [name for format in options.formats for name in FORMATS[format].names(views, options.frames)]
+    return [*names, SHEET]
+
+
+@torch.no_grad()
+def write_prediction(
+    directory: Path,
+    batch: Batch,
+    prediction: Prediction,
+    renderer: Renderer,
+    options: OutputOptions,
+    facts: Mapping[str, Any] | None = None,
+) -> list[Path]:
+    """Write the prediction of one subject, ``sheet.png`` to look at and ``report.json`` about it.
+
+    Lengths in the files are in the unit of the batch's cameras. Returns: the paths, that of ``report.json``
+    last. InputError: several subjects, or a file of another origin is in the way.
+
+    Args:
+        directory: files of an earlier prediction are replaced, others stay.
+        batch: photographs, masks and cameras of the subject; the sheet compares renders with its targets, or
+            with the photographs where it has none.
+        renderer: draws the turntable, and the input views for the report.
+        facts: further plain data for the report, such as the seconds of each stage."""
+    subject = exported_subject(batch, prediction, renderer, options)
+    names, seconds = output_files(options, subject.views), {}
+    begin_files(directory, names)
+    with ThreadPoolExecutor(allowed_cores()) as pool:
+        pool.submit(palette, "turbo")  # imports matplotlib, which the sheet needs, meanwhile
+        tasks = {}
+        for name in options.formats:
+            begin = time.perf_counter()
+            files = FORMATS[name].names(subject.views, options.frames)
+            contents = zip(files, FORMATS[name].contents(subject), strict=True)
+            tasks[name] = [pool.submit(write_file, directory / file, made) for file, made in contents]
+            seconds[f"write {name}"] = time.perf_counter() - begin
+        seen = batch.cameras if batch.targets is None else batch.targets.cameras
+        image = renderer(prediction.gaussians, seen).image
+        overview = sheet(batch, image, 0, prediction.depth, prediction.depth_valid)
+        write_file(directory / SHEET, partial(png, overview))
+        facts = dict(facts or {})
+        report = {**_report(subject), **facts}
+        for name, begun in tasks.items():
+            seconds[f"write {name}"] += sum(task.result() for task in begun)
+    report["seconds"] = {**facts.get("seconds", {}), **seconds}
+    return end_files(directory, names, report)
+
+
+def _report(subject: ExportedSubject) -> dict[str, Any]:
+    gaussians, valid = subject.gaussians, subject.depth_valid
+    lost = subject.masks & ~valid
+    drawn = subject.renderer(gaussians, subject.cameras[None])
+    image = drawn.image[0].clamp(0, 1)
+    quality = psnr(image, subject.images, box_of(subject.masks)).tolist()
+    means = gaussians.means if len(gaussians) else gaussians.means.new_full((1, 3), torch.nan)
+    return {
+        "subject": subject.name,
+        "views": list(subject.views),
+        "gaussians": len(gaussians),
+        "gaussians_not_finite": subject.dropped,
+        "frame": "world of the cameras" if subject.options.up is None else f"up is +{subject.options.up}",
+        "up": subject.up.tolist(),
+        "subject_size": None if gaussians.metre is None else HEIGHT * float(gaussians.metre[0]),
+        "smallest": means.amin(0).tolist(),
+        "largest": means.amax(0).tolist(),
+        "depths_not_finite": dict(zip(subject.views, lost.flatten(1).sum(1).tolist(), strict=True)),
+        "depth_pixels": dict(zip(subject.views, valid.flatten(1).sum(1).tolist(), strict=True)),
+        "depth_png_unit": depth_unit(float(torch.where(valid, subject.depth, 0).max())),
+        "psnr_box_of_inputs": dict(zip(subject.views, quality, strict=True)),
+        **unseen(subject, drawn.depth),
+        "versions": versions(),
+    }

@@ -1,0 +1,231 @@
+"""One subject as its files hold it: prediction, photographs and cameras, in the frame of the files."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ghgs_lit.errors import choice, require
+from ghgs_lit.geometry.masks import coverage, surface_colors
+from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.geometry.rotations import multiply_quaternions, quaternion_to_matrix
+from ghgs_lit.refinement import Change, Descent
+from ghgs_lit.rendering import Renderer
+from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction
+from ghgs_lit.visualization.pictures import to_uint8
+from ghgs_lit.visualization.turntable import center_of, pixel_size, subject_points, turntable, up_direction
+
+AXES = {"y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+def turn(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Float[Tensor, "4"]:
+    """The unit quaternion of the shortest rotation from unit vector ``start`` to ``end``, float64."""
+    start, end = start.double(), end.double()
+    axis = torch.linalg.cross(start, end)
+    quaternion = torch.cat([(1 + start @ end)[None], axis])
+    if quaternion.norm() < 1e-7:  # opposite: half a turn about any axis at right angles
+        other = torch.zeros_like(start).index_fill(0, start.abs().argmin(), 1)
+        quaternion = torch.cat([start.new_zeros(1), torch.linalg.cross(start, other)])
+    return torch.nn.functional.normalize(quaternion, dim=0)
+
+
+def rotate_world(
+    quaternion: Float[Tensor, "4"], gaussians: Gaussians, cameras: Cameras
+) -> tuple[Gaussians, Cameras]:
+    """The same scene in a world rotated by the unit ``quaternion``. Colours must not depend on direction."""
+    quaternion = quaternion.double()
+    rotation = quaternion_to_matrix(quaternion)
+    means = gaussians.means.double() @ rotation.to(gaussians.means.device).mT
+    quaternions = multiply_quaternions(quaternion.to(means.device), gaussians.quaternions.double())
+    extrinsics = cameras.extrinsics.double().clone()
+    extrinsics[..., :3, :3] = extrinsics[..., :3, :3] @ rotation.to(extrinsics.device).mT
+    values = {"means": means.to(gaussians.means.dtype), "quaternions": quaternions.to(gaussians.quaternions)}
+    moved = replace(cameras, extrinsics=extrinsics.to(cameras.extrinsics.dtype))
+    return replace(gaussians, **values), moved
+
+
+#: Low-pass, in px^2, of other viewers' renderers, which are not antialiased.
+VIEWER_LOW_PASS = 0.3
+_SMALLEST = 1e-3  #: Least standard deviation in pixels
+#: The fit of Gaussians for other viewers: changes, steps, cameras around the subject (beside the inputs), and
+#: views in each step.
+_FIT = {"scales": Change(3.0, 0.15), "opacities": Change(5.0, 0.3), "colors": Change(0.1, 0.006)}
+_FIT_STEPS, _AROUND, _AT_ONCE = 32, 8, 2
+_WEIGHTS = (1.0, 0.0, 0.1)  #: Of L1, 1 - SSIM (it would take half of the time) and silhouette
+
+
+@dataclass(frozen=True)
+class OutputOptions:
+    """Choices for the files of a prediction."""
+
+    formats: tuple[str, ...] = ("ply",)  #: names of :data:`ghgs_capture.export.prediction.FORMATS`
+    up: str | None = None  #: axis (``y``, ``-y``, ``z``) that points up in files; None: the cameras' world
+    smooth: bool = False  #: files hold the :func:`smoothed` Gaussians
+    frames: int = 24  #: pictures of the turntable
+    fps: int = 12  #: pictures per second of the video
+
+    def __post_init__(self):
+        choice("up", self.up, (None, *AXES))
+        require(self.frames >= 0, "turntable.frames", "a number of at least 0", self.frames)
+
+
+def smoothed(gaussians: Gaussians, pixel: float) -> Gaussians:
+    """Gaussians widened by what a renderer adds in photographs with pixels of side ``pixel``: ``low_pass``
+    square pixels and, with ``antialiased``, the loss of opacity (exact for round Gaussians; for others the
+    geometric mean of their axes)."""
+    variances = gaussians.scales.square()
+    wider = variances + gaussians.low_pass * pixel**2
+    opacities = gaussians.opacities
+    if gaussians.antialiased:
+        ratio = variances / torch.where(wider > 0, wider, 1.0)
+        opacities = opacities * ratio.prod(-1).pow(1 / 3)
+    return replace(gaussians, scales=wider.sqrt(), opacities=opacities, low_pass=0.0, antialiased=False)
+
+
+def for_other_renderers(gaussians: Gaussians, pixel: float) -> Gaussians:
+    """Gaussians that 3D Gaussian Splatting's own renderer draws as ours draws the given ones.
+
+    It always adds 0.3 px^2 and does not reduce opacity. Variances are reduced by what it adds too much at the
+    photographs' size, with pixels of side ``pixel``; those that ours draws below 0.3 px^2 become points."""
+    if gaussians.low_pass == VIEWER_LOW_PASS and not gaussians.antialiased:
+        return gaussians
+    drawn = smoothed(gaussians, pixel)
+    variances = drawn.scales.square() - VIEWER_LOW_PASS * pixel**2
+    scales = variances.clamp(min=(_SMALLEST * pixel) ** 2).sqrt()
+    return replace(drawn, scales=scales, low_pass=VIEWER_LOW_PASS)
+
+
+def fitted(theirs: Gaussians, ours: Gaussians, cameras: Sequence[Cameras], renderer: Renderer) -> Gaussians:
+    """``theirs`` optimised to render more like ``ours``. ``cameras``: sets of cameras [n], used in turn."""
+    drawn = [renderer(ours, some[None], background=0.0) for some in cameras]
+    search = Descent(theirs, None, _FIT)
+    for step in range(_FIT_STEPS):
+        lap, among = divmod(step, len(cameras))
+        seen, wanted = cameras[among], drawn[among]
+        count = seen.extrinsics.shape[0]
+        # Far apart, to see different sides.
+        views = [(lap + part * max(count // _AT_ONCE, 1)) % count for part in range(_AT_ONCE)]
+        part = (wanted.image[:, views], wanted.alpha[:, views], seen[views][None])
+        search.step(renderer, part, _WEIGHTS)
+    return search.gaussians
+
+
+@dataclass(frozen=True)
+class ExportedSubject:
+    """One subject. Lengths are in the unit of the cameras; ``up`` is the upward unit vector.
+
+    ``images`` are premultiplied by ``mattes`` (the masks, where there are none). ``points`` are the subject's
+    unprojected pixels with their ``colors``; ``dropped`` counts Gaussians that are not finite, which no
+    renderer draws and no file holds."""
+
+    name: str
+    views: tuple[str, ...]
+    gaussians: Gaussians
+    dropped: int
+    cameras: Cameras
+    images: Float[Tensor, "V 3 H W"]
+    masks: Bool[Tensor, "V H W"]
+    mattes: Float[Tensor, "V H W"]
+    depth: Float[Tensor, "V H W"]
+    depth_valid: Bool[Tensor, "V H W"]
+    points: Float[Tensor, "n 3"]
+    colors: Float[Tensor, "n 3"]
+    up: Float[Tensor, "3"]
+    renderer: Renderer
+    options: OutputOptions
+
+    @property
+    def file_names(self) -> list[str]:
+        """:func:`file_names` of the views."""
+        return file_names(self.views)
+
+    @cached_property
+    def stored(self) -> Gaussians:
+        """The Gaussians of the PLY, which stores their image constants; with ``smooth`` they are
+        :func:`smoothed` (as in Mip-Splatting, Yu et al. 2024), so that a larger screen shows no gaps."""
+        return smoothed(self.gaussians, self.pixel) if self.options.smooth else self.gaussians
+
+    @cached_property
+    def for_other_renderers(self) -> Gaussians:
+        """The Gaussians of files without image constants, fitted to our renders of inputs and all around."""
+        if self.options.smooth:
+            return self.stored
+        converted = for_other_renderers(self.gaussians, self.pixel)
+        if converted is self.gaussians or not len(converted):
+            return converted
+        around = turntable(self.cameras, _AROUND, self.body)
+        return fitted(converted, self.gaussians, (self.cameras, around), self.renderer)
+
+    @cached_property
+    def body(self) -> Float[Tensor, "n 3"]:
+        """The points that pictures of the whole subject must show."""
+        return subject_points(self.gaussians)
+
+    @property
+    def center(self) -> Float[Tensor, "3"]:
+        """The point that the page and the turntable turn about."""
+        return center_of(self.body, self.cameras)
+
+    @property
+    def pixel(self) -> float:
+        """The side of a photograph's pixel at the subject, in the unit of the cameras."""
+        return pixel_size(self.cameras, self.center)
+
+    @cached_property
+    def turntable(self) -> list[np.ndarray]:
+        """Pictures [h, w, 3] uint8 from all around."""
+        orbit = turntable(self.cameras, self.options.frames, self.body)
+        seen = (orbit[frame : frame + 1][None] for frame in range(self.options.frames))
+        return [to_uint8(self.renderer(self.gaussians, cameras).image[0, 0]) for cameras in seen]
+
+
+def exported_subject(
+    batch: Batch, prediction: Prediction, renderer: Renderer, options: OutputOptions
+) -> ExportedSubject:
+    """The subject of a batch of one, in the frame that ``options`` choose. InputError: several subjects."""
+    count = len(batch.images)
+    require(count == 1, "write_prediction", "a batch of one subject", count)
+    cameras, gaussians = batch.cameras[0], prediction.gaussians.detach()
+    finite = gaussians.is_finite
+    kept = int(finite.sum())
+    dropped = len(gaussians) - kept
+    gaussians = gaussians.select(finite, (kept,)) if dropped else gaussians
+    up = up_direction(cameras)
+    if options.up is not None:
+        end = up.new_tensor(AXES[options.up])
+        gaussians, cameras = rotate_world(turn(up, end), gaussians, cameras)
+        up = end
+    depth, valid = prediction.depth[0].detach(), prediction.depth_valid[0] & batch.masks[0]
+    valid = valid & depth.isfinite() & (depth > 0)
+    return ExportedSubject(
+        name=batch.subjects[0] if batch.subjects else "subject",
+        views=batch.views[0] if batch.views else tuple(map(str, range(batch.images.shape[1]))),
+        gaussians=gaussians,
+        dropped=dropped,
+        cameras=cameras,
+        images=batch.images[0],
+        masks=batch.masks[0],
+        mattes=coverage(batch)[0],
+        depth=depth,
+        depth_valid=valid,
+        points=unproject_maps(depth, cameras)[valid],
+        colors=surface_colors(batch)[0].movedim(1, -1)[valid],
+        up=up,
+        renderer=renderer,
+        options=options,
+    )
+
+
+def file_names(views: Sequence[str]) -> list[str]:
+    """Names of photographs made fit for file names, all different even without case."""
+    names: dict[str, str] = {}
+    for view in views:
+        name = "".join(c if c.isalnum() or c in "-_." else "_" for c in view)
+        while name.casefold() in names:
+            name += "_"
+        names[name.casefold()] = name
+    return list(names.values())

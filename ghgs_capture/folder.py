@@ -1,0 +1,254 @@
+"""A folder of photographs or videos with a calibration: one instant, or many."""
+
+import functools
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ghgs_capture.calibration import Convention, StoredCamera, calibrate, quarter_turned
+from ghgs_capture.crops import Photograph
+from ghgs_capture.formats import CameraFile, read_cameras
+from ghgs_capture.frames import Frame, Source, VideoFrame, find_frames, has_videos
+from ghgs_capture.masks import mask_path, matte_of_background, matte_of_file, segmenter
+from ghgs_capture.photographs import (
+    Pixels,
+    composed_names,
+    find_instants,
+    fits_stored,
+    image_named,
+    read_pixels,
+)
+from ghgs_lit.config import nodes
+from ghgs_lit.data.silhouettes import implausible
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.kernels.cores import allowed_cores
+
+if TYPE_CHECKING:  # photographs are read while PyTorch is imported
+    import torch
+
+ENOUGH = 3  #: Photographs that an instant needs where others of its are missing
+
+
+@dataclass(frozen=True)
+class CaptureFolder:
+    """``folder.photographs(instant)`` for each of ``folder.instants``. InputError: a folder or file is
+    missing or wrong.
+
+    Args:
+        images: folder of photographs named after their cameras; of such folders, one for each instant; or of
+            videos named after their cameras. Or the decoded frames of one instant, by camera.
+        cameras: the calibration, in one of :data:`ghgs_capture.formats.FORMATS`, or already
+            read.
+        masks: folder of masks, laid out and named as the photographs; None: the first there is of
+            ``backgrounds``, ``segment``, masks beside the photographs (``<name>_mask.png``) or named by the
+            calibration, alpha.
+        backgrounds: folder of photographs without the subject, named after the cameras.
+        segment: a segmenter of :data:`ghgs_capture.masks.SEGMENTERS`.
+        calibration: what the file does not say, or says wrongly (:class:`ghgs_lit.config.nodes.Calibration`).
+        sequence: which instants count, and how videos fit together (:class:`ghgs_lit.config.nodes.Sequence`).
+    """
+
+    images: str | Path | Mapping[str, Frame]
+    cameras: str | Path | CameraFile
+    masks: str | Path | None = None
+    backgrounds: str | Path | None = None
+    segment: str | None = None
+    calibration: Mapping[str, Any] = field(default_factory=dict)
+    sequence: Mapping[str, Any] = field(default_factory=dict)
+    #: The views of one instant that are decoded, or are being decoded.
+    _begun: dict[str, dict[str, Future]] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        for name in ("images", "cameras", "masks", "backgrounds"):
+            if isinstance(path := getattr(self, name), str | Path):
+                object.__setattr__(self, name, Path(path).expanduser())
+        for name in ("masks", "backgrounds"):
+            path = getattr(self, name)
+            require(path is None or path.is_dir(), name, "a folder", str(path))
+        _ = self.paths  # reads the calibration and lists the photographs: missing files are refused here
+
+    @functools.cached_property
+    def _said(self) -> nodes.Calibration:
+        return nodes.Calibration.read(self.calibration, "calibration")
+
+    @functools.cached_property
+    def _part(self) -> nodes.Sequence:
+        return nodes.Sequence.read(self.sequence, "sequence")
+
+    @functools.cached_property
+    def file(self) -> CameraFile:
+        """The cameras as stored."""
+        given = self.cameras
+        return given if isinstance(given, CameraFile) else read_cameras(given, self._said.format)
+
+    @functools.cached_property
+    def convention(self) -> Convention:
+        """Meaning of the stored numbers: the format's, unless the user says otherwise."""
+        return self.file.convention.told(vars(self._said))
+
+    @functools.cached_property
+    def _found(self) -> tuple[dict[str, dict[str, Source]], str]:
+        folder, cameras, part = self.images, self.file.cameras, self._part
+        if isinstance(folder, Mapping):
+            return {"": dict(folder)}, ""
+        names = composed_names(self._said.names)
+        if has_videos(folder, cameras, names):
+            return find_frames(folder, self.masks, cameras, names, self.convention, part.sync, part.step)
+        require(part.sync is None, "sequence.sync", "null for photographs", part.sync)
+        return find_instants(folder, cameras, names), ""
+
+    @property
+    def note(self) -> str:
+        """A line about frames that are left over; empty where there are none."""
+        return self._found[1]
+
+    @functools.cached_property
+    def paths(self) -> dict[str, dict[str, Source]]:
+        """``{instant: {camera: path or frame}}`` of the instants that ``sequence`` selects."""
+        found, part = self._found[0], self._part
+        names = list(found)[part.start : part.stop : part.step]
+        expected = f"a part of {len(found)} instants"
+        require(bool(names), "sequence.start", expected, f"none from {part.start} to {part.stop}")
+        return {name: found[name] for name in names}
+
+    @functools.cached_property
+    def missing(self) -> dict[str, dict[str, str]]:
+        """``{instant: {camera: why}}`` of photographs that are missing, or could not be read so far."""
+        cameras = dict.fromkeys(name for paths in self._found[0].values() for name in paths)
+        return {
+            instant: {name: "there is no photograph" for name in cameras if name not in paths}
+            for instant, paths in self.paths.items()
+        }
+
+    @property
+    def instants(self) -> list[str]:
+        """Names of the instants, in their order."""
+        return list(self.paths)
+
+    @property
+    def input_files(self) -> list[Path]:
+        """All files that may be read: photographs and what lies beside them, the calibration, masks."""
+        sources = (path for paths in self.paths.values() for path in paths.values())
+        folders = {path.parent if isinstance(path, Path) else self.images for path in sources}
+        given = [path for path in (self.cameras, self.masks, self.backgrounds) if isinstance(path, Path)]
+        files = [path for folder in folders for path in folder.iterdir()]
+        return files + [file for path in given for file in (path.rglob("*") if path.is_dir() else [path])]
+
+    def photographs(self, instant: str) -> tuple[Photograph, ...]:
+        """The photographs of one instant, two or more. InputError: as for :meth:`decode`."""
+        views = self.decode(instant)
+        self._begun.clear()  # they take much memory
+        upright = {n: partial(self.photograph, n, *view, self.convention) for n, view in views.items()}
+        return tuple(self._complete(instant, upright).values())
+
+    def decode(self, instant: str) -> dict[str, tuple[StoredCamera, Pixels, np.ndarray]]:
+        """Camera, photograph and matte as shown of each view, before the calibration is applied.
+
+        They are kept until :meth:`photographs` has them, or another instant is decoded. InputError: a
+        photograph or mask is missing or wrong; of several instants one may lack photographs (:attr:`missing`)
+        where three or more remain."""
+        self.begin(instant)
+        return self._complete(instant, {name: view.result for name, view in self._begun[instant].items()})
+
+    def _complete(self, instant: str, views: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
+        """The values of all views; in a sequence, without those that fail where the others are enough."""
+        found = {}
+        for name, view in views.items():
+            try:
+                found[name] = view()
+            except InputError as error:
+                if len(self.instants) == 1:
+                    raise
+                self.missing[instant][name] = str(error)
+        missing = self.missing[instant] if len(self.instants) > 1 else {}
+        why = "; ".join(f"{name}: {text}" for name, text in missing.items())
+        least, why = (ENOUGH, f"{len(found)} ({why})") if missing else (2, len(found))
+        require(len(found) >= least, f"{self.images}: {instant}", f"{least} photographs or more", why)
+        return found
+
+    def begin(self, instant: str) -> None:
+        """Decode the views of an instant in threads; :meth:`decode` waits for them."""
+        if instant in self._begun:
+            return
+        self._begun.clear()
+        # Segmentation has threads of its own, and one session.
+        pool = ThreadPoolExecutor(allowed_cores() if self.segment is None else 1)
+        self._begun[instant] = {
+            name: pool.submit(self._view, name, path) for name, path in self.paths[instant].items()
+        }
+        pool.shutdown(wait=False)
+
+    def _view(self, name: str, path: Source) -> tuple[StoredCamera, Pixels, np.ndarray]:
+        camera = self.file.cameras[name]
+        pixels = read_pixels(path) if isinstance(path, Path) else path.pixels()
+        matte = self._matte(name, camera, path, pixels)
+        problem = implausible(matte > 127)
+        if problem is not None:
+            raise InputError(f"{path}: {problem}")
+        return camera, pixels, matte
+
+    def keeps_stored(self, camera: StoredCamera, pixels: Pixels) -> bool:
+        """Whether a camera was calibrated with the photograph as stored, not as shown."""
+        return fits_stored(pixels, camera, self._said.exif)
+
+    def photograph(
+        self, name: str, camera: StoredCamera, pixels: Pixels, matte: np.ndarray, convention: Convention
+    ) -> Photograph:
+        """One view, undistorted and upright, with the camera that a convention gives it."""
+        image, turns = pixels.image, 0
+        if self.keeps_stored(camera, pixels):
+            turns = pixels.turns
+            image, matte = np.rot90(image, -turns), np.rot90(matte, -turns)
+        size = image.shape[:2]
+        calibration = calibrate(camera, convention, size)
+        if calibration.distortion.any():
+            from ghgs_lit.geometry.undistortion import undistort
+
+            # All that undistortion depends on, as the key of a cache that instants share.
+            lens = tuple(calibration.intrinsics.ravel()), tuple(calibration.distortion), calibration.fisheye
+            image, matte = undistort(image, matte, _grid(*lens, *size))
+            expected, lens = "a lens distortion that leaves some of the subject", calibration.distortion
+            require(bool((matte > 127).any()), camera.origin, expected, lens.tolist())
+        found = quarter_turned(calibration, turns, size)
+        image, matte = np.rot90(image, turns), np.rot90(matte, turns)
+        return Photograph(name, image, matte, found.intrinsics, found.extrinsics, found.gains)
+
+    def _matte(self, name: str, camera: StoredCamera, path: Source, pixels: Pixels) -> np.ndarray:
+        """The matte [h, w] uint8 of the photograph as shown, from the first source that there is."""
+        masks = self.images if self.masks is None else self.masks
+        mask = mask_path(path, self.images, masks) if isinstance(path, Path) else path.mask
+        if self.masks is not None:
+            require(mask is not None, f"{self.masks}", f"a mask of {path}", "none")
+        elif self.backgrounds is not None:
+            background = image_named(self.backgrounds, name)
+            expected = f"a photograph {name} without the subject"
+            require(background is not None, f"{self.backgrounds}", expected, "none")
+            return matte_of_background(pixels, background)
+        elif self.segment is not None:
+            return _segmenter(self.segment)(pixels)
+        mask = mask or camera.mask
+        if isinstance(mask, VideoFrame):
+            return mask.matte(pixels)
+        if mask is not None:
+            return matte_of_file(mask, pixels)
+        if pixels.alpha is not None:
+            return pixels.alpha
+        raise InputError(
+            f"{path}: expected a mask of the subject: masks=<folder>, backgrounds=<folder without it>,"
+            f" segment=rembg, <name>_mask beside the photograph, or an alpha channel; found none"
+        )
+
+
+_segmenter = functools.cache(segmenter)
+
+
+@functools.lru_cache(maxsize=16)
+def _grid(intrinsics: tuple, distortion: tuple, fisheye: bool, height: int, width: int) -> "torch.Tensor":
+    from ghgs_lit.geometry.undistortion import undistorting_grid
+
+    return undistorting_grid(np.reshape(intrinsics, (3, 3)), np.array(distortion), height, width, fisheye)

@@ -1,0 +1,64 @@
+"""Files of cameras: one module a format, each a function from a path to a :class:`CameraFile`."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from ghgs_capture.formats.camera_file import CameraFile
+from ghgs_capture.formats.colmap import model_folder, read_colmap
+from ghgs_capture.formats.json_and_toml import read_json, read_json_file, read_toml
+from ghgs_capture.formats.nerfstudio import read_nerfstudio
+from ghgs_capture.formats.opencv import EASYMOCAP, read_easymocap, read_opencv, yaml_files
+from ghgs_capture.formats.qualisys import read_qualisys
+from ghgs_lit.errors import InputError, choice
+from ghgs_lit.readers import find_path
+
+__all__ = ["FORMATS", "CameraFile", "read_cameras"]
+
+#: Readers by the format's name; ``ghgs`` is this package's JSON.
+FORMATS: dict[str, Callable[[Path], CameraFile]] = {
+    "ghgs": read_json,
+    "colmap": read_colmap,
+    "nerfstudio": read_nerfstudio,
+    "opencv": read_opencv,
+    "easymocap": read_easymocap,
+    "toml": read_toml,
+    "qualisys": read_qualisys,
+}
+
+
+def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
+    """Read a file or a folder of cameras; a warning names entries that are not read. ``path``: a folder for
+    COLMAP's models, OpenCV's files for each camera and EasyMocap's. ``format``: one of :data:`FORMATS`;
+    ``auto`` tells it by file names and keys of JSON. InputError: no such path or format, or a wrong camera.
+    """
+    path = Path(path).expanduser()
+    choice("calibration.format", format, ("auto", *FORMATS))
+    if not path.exists():
+        raise InputError(f"{path}: expected a file or folder of cameras; found no such path")
+    return FORMATS[_format_of(path) if format == "auto" else format](path)
+
+
+def _format_of(path: Path) -> str:
+    suffix, folder = path.suffix.lower(), path if path.is_dir() else path.parent
+    if path.name.lower() in EASYMOCAP or (path.is_dir() and find_path(path, EASYMOCAP[0]) is not None):
+        return "easymocap"
+    if path.is_dir():
+        if model_folder(path) is not None:
+            return "colmap"
+        if yaml_files(path):
+            return "opencv"
+    elif suffix in (".yml", ".yaml"):
+        return "opencv"
+    elif suffix == ".toml":
+        return "toml"
+    elif suffix == ".json":
+        return "nerfstudio" if "frames" in read_json_file(path) else "ghgs"
+    elif path.name.lower().endswith(".qca.txt"):
+        return "qualisys"
+    elif suffix in (".bin", ".txt") and model_folder(folder) is not None:
+        return "colmap"
+    raise InputError(
+        f"{path}: expected JSON, transforms.json, a COLMAP model, YAML of OpenCV or EasyMocap, TOML, or"
+        f" Qualisys' .qca.txt; "
+        f"found {'a folder without any' if path.is_dir() else repr(path.suffix)}"
+    )

@@ -1,0 +1,69 @@
+"""Cameras of a file, and what the readers of all formats share."""
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ghgs_capture.calibration import Convention, StoredCamera
+from ghgs_capture.photographs import PICTURES, SUFFIXES
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.readers import composed, parts_of, read_parsed
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """The cameras of a file by name, the meaning of their numbers by its format, and the format's name."""
+
+    cameras: dict[str, StoredCamera]
+    convention: Convention
+    format: str
+
+    @classmethod
+    def of(
+        cls, cameras: Sequence[StoredCamera], convention: Convention, format: str, unread: Sequence[str] = ()
+    ) -> "CameraFile":
+        """Cameras in their order, named by their photographs without folder and suffix. One warning names
+        entries that are not read: those of the cameras, and ``unread`` ones beside them.
+
+        Where different cameras share such a name (that of an instant), all are named by their folders, or as
+        the file has it. A camera that is listed for several photographs is one, without their masks.
+        InputError: two cameras have one name."""
+        if unread := sorted({*unread, *(key for camera in cameras for key in camera.unread)}):
+            warnings.warn(f"cameras: entries that are not read: {', '.join(unread)}", stacklevel=3)
+        for part in (-1, -2, 0):
+            named: dict[str, StoredCamera] = {}
+            for camera in cameras:
+                name = _parts(camera.name)[part:][0] if part else composed(camera.name)
+                if name not in named:
+                    named[name] = camera
+                elif named[name].has_numbers_of(camera):
+                    named[name] = replace(camera, mask=None)
+                else:
+                    break
+            else:
+                return cls(named, convention, format)
+        raise InputError(f"{camera.origin}: expected cameras of different names; found {name} twice")
+
+
+def _parts(name: str) -> list[str]:
+    *folders, last = parts_of(name)
+    path = Path(last)
+    suffix = path.suffix.lower()
+    is_picture = suffix in SUFFIXES or suffix[1:] in PICTURES.split()
+    return [*folders, path.stem if is_picture else last]
+
+
+def read_mapping(path: Path, parse: Callable[[str], Any], kind: str, content: str) -> dict[str, Any]:
+    """The mapping in a text file. ``kind``, ``content``: for messages. InputError: there is none."""
+    value = read_parsed(path, kind, parse)
+    require(isinstance(value, dict), str(path), content, type(value).__name__)
+    return value
+
+
+def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+    """Intrinsics [3, 3] of focal lengths and a principal point in pixels."""
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)

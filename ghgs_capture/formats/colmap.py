@@ -1,0 +1,80 @@
+"""COLMAP's sparse models, text and binary, by COLMAP's own reader (the extra ``colmap``)."""
+
+from pathlib import Path
+
+import numpy as np
+
+from ghgs_capture.calibration import Convention, StoredCamera
+from ghgs_capture.formats.camera_file import CameraFile, pinhole
+from ghgs_capture.formats.entries import FISHEYE, PERSPECTIVE, coefficients
+from ghgs_lit.errors import InputError, installed, require
+from ghgs_lit.readers import require_file
+
+#: COLMAP's camera models: order of its parameters; ``f`` is both focal lengths.
+_MODELS = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+}
+_FILES = ("cameras", "images", "points3D", "rigs", "frames")
+
+
+def model_folder(path: Path) -> Path | None:
+    """The folder of a sparse model at or below ``path``, None where there is none."""
+    folders = [path, path / "sparse" / "0", path / "sparse", path / "0"]
+    return next((p for p in folders if (p / "cameras.bin").exists() or (p / "cameras.txt").exists()), None)
+
+
+def read_colmap(path: Path) -> CameraFile:
+    """Registered photographs of a sparse model. InputError: it cannot be read, pycolmap is not installed, or
+    a camera model is not known."""
+    folder = model_folder(path if path.is_dir() else path.parent)
+    require(folder is not None, str(path), "a COLMAP model (cameras.bin or cameras.txt)", "none")
+    pycolmap = installed("pycolmap", "colmap", str(path))
+    for file in folder.iterdir():
+        if file.stem in _FILES:
+            require_file(file, "a file of a COLMAP model")
+    names = _names(folder)
+    try:
+        model = pycolmap.Reconstruction(str(folder))
+        images = [image for image in model.images.values() if image.has_pose]
+    except (RuntimeError, ValueError, OSError, IndexError) as error:
+        raise InputError(f"{folder}: expected a COLMAP model; found {error}") from error
+    require(bool(images), str(folder), "photographs with a pose", "none")
+    cameras = [
+        _camera(folder, names.get(image.image_id, image.name), image, model.cameras[image.camera_id])
+        for image in images
+    ]
+    return CameraFile.of(cameras, Convention(), "colmap")
+
+
+def _names(folder: Path) -> dict[int, str]:
+    """Names of photographs in ``images.txt`` by id; COLMAP's own reader cuts them at a space."""
+    path = folder / "images.txt"
+    if (folder / "images.bin").exists() or not path.exists():
+        return {}
+    lines = path.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    lines = [line for line in lines if not line.startswith("#")]
+    # Every second line has points.
+    images = [fields for line in lines[::2] if len(fields := line.split(maxsplit=9)) == 10]
+    return {int(fields[0]): fields[9].rstrip() for fields in images if fields[0].isdecimal()}
+
+
+def _camera(folder: Path, name: str, image, camera) -> StoredCamera:
+    origin, model = f"{folder}: {name}", camera.model.name
+    require(model in _MODELS, origin, f"a camera model among {', '.join(_MODELS)}", model)
+    values = dict(zip(_MODELS[model].split(), camera.params, strict=True))
+    fx, fy = (values.get(name, values.get("f")) for name in ("fx", "fy"))
+    intrinsics = pinhole(fx, fy, values["cx"], values["cy"])
+    fisheye = "FISHEYE" in model
+    distortion = coefficients(values, FISHEYE if fisheye else PERSPECTIVE)
+    pose = np.eye(4)
+    pose[:3] = image.cam_from_world().matrix()
+    size = (camera.height, camera.width)
+    return StoredCamera(name, origin, intrinsics, pose, size, distortion, fisheye)

@@ -1,0 +1,67 @@
+"""``transforms.json`` of nerfstudio and Instant NGP: camera-to-world matrices with OpenGL's axes."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ghgs_capture.calibration import Convention, PartialIntrinsics, StoredCamera
+from ghgs_capture.formats.camera_file import CameraFile
+from ghgs_capture.formats.entries import FISHEYE, Entries
+from ghgs_capture.formats.json_and_toml import read_json_file
+from ghgs_lit.errors import require
+from ghgs_lit.readers import find_path
+
+# Entries that are irrelevant for a camera, as :func:`plain` spells them.
+_IRRELEVANT = (
+    *("frames", "aabbscale", "scale", "offset", "appliedtransform", "appliedscale", "orientationoverride"),
+    *("plyfilepath", "depthfilepath", "colmapimid", "sharpness", "rotation", "time", "up"),
+    *("trainfilenames", "valfilenames", "testfilenames"),
+)
+
+
+def read_nerfstudio(path: Path) -> CameraFile:
+    """Cameras of ``frames``, whose intrinsics win over those of the file. InputError: a frame is wrong."""
+    content = read_json_file(path)
+    frames = content.get("frames")
+    require(isinstance(frames, list) and len(frames) > 0, f"{path}: frames", "a list of frames", frames)
+    cameras = [_camera(path, f"{path}: frames[{i}]", content, frame) for i, frame in enumerate(frames)]
+    convention = Convention(extrinsics="camera_to_world", axes="opengl")
+    return CameraFile.of(cameras, convention, "nerfstudio")
+
+
+def _camera(path: Path, origin: str, shared: Mapping[str, Any], frame: Any) -> StoredCamera:
+    require(isinstance(frame, Mapping), origin, "a mapping", frame)
+    entries = Entries(origin, {**shared, **frame})
+    photograph, mask = entries.text("file_path"), entries.text("mask_path")
+    require(photograph is not None, origin, "file_path", sorted(frame))
+    pose, size, fisheye = entries.needed("transform_matrix", (4, 4), (3, 4)), entries.size, entries.is_fisheye
+    lens = _lens(entries)
+    is_known = size is not None or lens.is_known
+    return StoredCamera(
+        photograph,
+        origin,
+        lens.intrinsics(size or (0, 0)) if is_known else np.eye(3),
+        pose,
+        size,
+        distortion=entries.distortion(FISHEYE if fisheye else "k1 k2 p1 p2 k3"),
+        fisheye=fisheye,
+        mask=None if mask is None else find_path(path.parent, mask) or path.parent / mask,
+        lens=None if is_known else lens,
+        unread=entries.unread(_IRRELEVANT),
+    )
+
+
+def _lens(entries: Entries) -> PartialIntrinsics:
+    """What the entries say of intrinsics. InputError: neither a focal length nor an angle of view."""
+    focal = entries.number("fl_x"), entries.number("fl_y")
+    middle = entries.number("cx"), entries.number("cy")
+    angles = entries.number("camera_angle_x"), entries.number("camera_angle_y")
+    is_enough = any(value is not None for value in (*focal, *angles))
+    require(is_enough, entries.origin, "fl_x or camera_angle_x", sorted(entries.fields))
+    for axis, angle in zip("xy", angles, strict=True):
+        is_angle = angle is None or 0 < angle < math.pi
+        require(is_angle, f"{entries.origin}: camera_angle_{axis}", "radians between 0 and pi", angle)
+    return PartialIntrinsics(focal, middle, angles)

@@ -1,0 +1,202 @@
+"""Frames of a folder with one video for each camera, by instant."""
+
+import os
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ghgs_capture.calibration import Convention, StoredCamera, calibrate
+from ghgs_capture.photographs import (
+    MASK_ENDING,
+    Pixels,
+    by_camera,
+    camera_named,
+    image_named,
+    images_in,
+    require_all_read,
+)
+from ghgs_capture.videos import SUFFIXES, Reader, Video, read_video
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.kernels.cores import allowed_cores
+from ghgs_lit.readers import composed, read_rows
+
+# Coding changes black and white by less than this.
+_CODED = 16
+_DIGITS = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A decoded photograph [h, w, 3] uint8 RGB, and its source; ``mask`` as for :class:`VideoFrame`."""
+
+    origin: str
+    image: np.ndarray
+    mask: None = None
+
+    def __str__(self) -> str:
+        return self.origin
+
+    def pixels(self) -> Pixels:
+        return Pixels(self.image, None, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class VideoFrame:
+    """A photograph, or a mask, that is a frame of a video; ``mask``: that of the photograph, where known."""
+
+    video: Reader
+    number: int
+    mask: "VideoFrame | Path | None" = None
+
+    def __str__(self) -> str:
+        return f"{self.video.video.path}, frame {self.number}"
+
+    def pixels(self) -> Pixels:
+        """The photograph. InputError: it cannot be decoded."""
+        return Pixels(self.video.frame(self.number), None, 0)
+
+    def matte(self, pixels: Pixels) -> np.ndarray:
+        """The mask [h, w] uint8 of a photograph. InputError: it cannot be decoded or has another size."""
+        grey = self.video.frame(self.number)
+        expected = f"the size of its video, {pixels.size} (height, width)"
+        require(grey.shape == pixels.size, str(self.video.video.path), expected, grey.shape)
+        return np.where(grey < _CODED, 0, np.where(grey > 255 - _CODED, 255, grey)).astype(np.uint8)
+
+
+Source = Path | Frame | VideoFrame  #: Where a photograph comes from
+
+
+def has_videos(folder: Path, cameras: Mapping[str, StoredCamera], names: Mapping[str, str]) -> bool:
+    """Whether a folder without photographs has a camera's video, or videos and no folders."""
+    if not folder.is_dir() or images_in(folder):
+        return False
+    videos = images_in(folder, SUFFIXES)
+    is_known = any(camera_named(name, cameras, names) in cameras for name in videos)
+    return is_known or (bool(videos) and not any(path.is_dir() for path in folder.iterdir()))
+
+
+def find_frames(
+    folder: Path,
+    masks: Path | None,
+    cameras: Mapping[str, StoredCamera],
+    names: Mapping[str, str],
+    convention: Convention,
+    sync: Mapping[str, int] | str | None,
+    step: int,
+) -> tuple[dict[str, dict[str, VideoFrame]], str]:
+    """The frames of each instant that all videos show. Returns: ``{instant: {camera: frame}}``, instants
+    named by the first camera's frame; and a line about frames that are left over. InputError: videos do not
+    fit the cameras or one another.
+
+    Args:
+        masks: folder of masks: for each video one of the same name, or a folder of numbered images; None:
+            videos beside the others that end with ``_mask``, if any.
+        sync: frames by which a camera began before the others; or a CSV of ``camera,frame,seconds``, by which
+            each frame of the first camera gets the nearest one of every other; None: all began together.
+        step: of the instants that will be read."""
+    found = images_in(folder, SUFFIXES)
+    require_all_read(folder, found, {*cameras, *names}, SUFFIXES)
+    paths = by_camera(folder, found, cameras, names)
+    with ThreadPoolExecutor(allowed_cores()) as pool:
+        videos = dict(zip(paths, pool.map(read_video, paths.values()), strict=True))
+    for name, video in videos.items():
+        camera = cameras[name]
+        calibrate(replace(camera, origin=f"{video.path}: {camera.origin}"), convention, video.size)
+    if isinstance(sync, str):
+        numbers, step = _by_time(videos, Path(sync).expanduser(), names), 1
+    else:
+        numbers = _by_number(videos, {names.get(str(key), str(key)): n for key, n in (sync or {}).items()})
+    frames = {}
+    for name, video in videos.items():
+        reader, drawn = Reader(video, "rgb24", step), _masks_of(video, folder, masks, step)
+        frames[name] = {n: VideoFrame(reader, n, drawn.get(n)) for n in video.numbers.tolist()}
+    instants = {
+        f"{instant:0{_DIGITS}d}": {name: frames[name][n] for name, n in shown.items() if n in frames[name]}
+        for instant, shown in numbers.items()
+    }
+    counts = ", ".join(f"{name} {video.count}" for name, video in videos.items())
+    note = f"videos differ in length ({counts} frames): the {len(numbers)} instants that all show are used"
+    return instants, note if len({video.count for video in videos.values()}) > 1 else ""
+
+
+def _by_number(videos: Mapping[str, Video], offsets: Mapping[str, Any]) -> dict[int, dict[str, int]]:
+    """The frame of each camera by the first camera's."""
+    unknown = sorted(set(offsets) - set(videos))
+    require(not unknown, "sequence.sync", f"cameras among {', '.join(videos)}", unknown)
+    wrong = {name: value for name, value in offsets.items() if type(value) is not int}
+    require(not wrong, "sequence.sync", "whole numbers of frames", wrong)
+    rates = {name: round(video.rate, 4) for name, video in videos.items() if video.count > 1}
+    length = min(video.count for video in videos.values())
+    drift = (max(rates.values(), default=1) / min(rates.values(), default=1) - 1) * length
+    expected = "as many frames a second of all, or the path of a CSV with camera,frame,seconds"
+    require(drift < 0.5, "sequence.sync", expected, rates)
+    first = next(iter(videos))
+    shift = {name: offsets.get(name, 0) - offsets.get(first, 0) for name in videos}
+    begin = max(-n for n in shift.values())
+    end = min(video.count - shift[name] for name, video in videos.items())
+    require(begin < end, "sequence.sync", "frames that all videos show", dict(offsets))
+    return {number: {name: number + n for name, n in shift.items()} for number in range(begin, end)}
+
+
+def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) -> dict[int, dict[str, int]]:
+    """The frame of each camera nearest to each of the first camera's, within half of its frame time."""
+    import pandas as pd  # here: it takes time to import
+
+    columns, rows = {"camera": str, "frame": int, "seconds": float}, read_rows(path)
+    try:
+        table = pd.DataFrame(rows, columns=list(columns)).astype(columns)
+        if not np.isfinite(table.seconds).all():
+            raise ValueError("no time")
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{path}: expected camera,frame,seconds with numbers; found {error}") from None
+    cameras = table.camera.map(lambda name: names.get(composed(name), composed(name)))
+    times = {name: found.sort_values("seconds") for name, found in table.groupby(cameras)}
+    require(times.keys() == videos.keys(), str(path), f"the times of {', '.join(videos)}", ", ".join(times))
+    first, *others = videos
+    steps = times[first].seconds.diff().dropna()
+    half = float(steps.median()) / 2 if len(steps) else np.inf
+    begin = max(found.seconds.iloc[0] for found in times.values()) - half
+    end = min(found.seconds.iloc[-1] for found in times.values()) + half
+    shared = times[first][times[first].seconds.between(begin, end)][["seconds", "frame"]]
+    require(len(shared) > 0, str(path), "times that all cameras share", "none")
+    shared = shared.rename(columns={"frame": first})
+    for other in others:
+        found = times[other][["seconds", "frame"]].rename(columns={"frame": other})
+        shared = pd.merge_asof(shared, found, on="seconds", direction="nearest", tolerance=half)
+    entries = shared.drop(columns="seconds").to_dict("records")
+    return {entry[first]: {name: int(n) for name, n in entry.items() if n == n} for entry in entries}
+
+
+def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict[int, VideoFrame | Path]:
+    """The masks of a video by frame number; empty if there are none beside it."""
+    name, place = composed(video.path.stem), folder if masks is None else masks
+    marked = f"{name}{MASK_ENDING}"
+    names = (marked,) if os.path.realpath(place) == os.path.realpath(folder) else (name, marked)
+    path = image_named(place, *names, suffixes=SUFFIXES)
+    if path is not None:
+        drawn = read_video(path)
+        reader, numbers = Reader(drawn, "gray", step), drawn.numbers.tolist()
+        # Masks made frame by frame lack those that the camera dropped.
+        known = video.numbers.tolist() if len(numbers) == len(video.numbers) else numbers
+        return {n: VideoFrame(reader, its) for n, its in zip(known, numbers, strict=True)}
+    if masks is None:
+        return {}
+    below = next((place / spelled for spelled in names if (place / spelled).is_dir()), None)
+    require(below is not None, str(masks), f"a video {name} or a folder of it", "none")
+    return _numbered(below, video)
+
+
+def _numbered(folder: Path, video: Video) -> dict[int, Path]:
+    """Images by the number of their frame; programs count them from 0 or from 1."""
+    digits = {"".join(filter(str.isdigit, name)): path for name, path in images_in(folder).items()}
+    numbered = {int(number): path for number, path in digits.items() if number}
+    if len(numbered) == len(video.numbers):
+        return dict(zip(video.numbers.tolist(), (numbered[n] for n in sorted(numbered)), strict=True))
+    from_one = video.count in numbered
+    expected = f"masks numbered from 0 to {video.count - 1} or from 1 to {video.count}"
+    require(from_one != (0 in numbered), str(folder), expected, f"{len(numbered)} masks")
+    return {number - from_one: path for number, path in numbered.items()}

@@ -1,0 +1,235 @@
+"""Live captures: instants of a folder that is being written, videos at their own rate, or cameras."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ghgs_capture.capture import Capture
+from ghgs_capture.folder import ENOUGH, CaptureFolder
+from ghgs_capture.formats import CameraFile, read_cameras
+from ghgs_capture.frames import Frame
+from ghgs_capture.photographs import (
+    by_camera,
+    camera_named,
+    composed_names,
+    counted,
+    images_in,
+)
+from ghgs_capture.videos import SUFFIXES
+from ghgs_lit.config.nodes import Sequence
+from ghgs_lit.errors import InputError, require
+
+#: Seconds between looks for a frame and for a folder, and of waiting for a camera at the end.
+_FRAME_POLL, _FOLDER_POLL, _PATIENCE = 0.002, 0.02, 2.0
+
+
+def opened(devices: Mapping[str, int | str]) -> dict[str, Any]:
+    """OpenCV's captures by camera. ``devices``: number, address of a stream or path of a video. InputError:
+    one cannot be opened, or OpenCV is not installed."""
+    try:
+        import cv2
+    except ImportError:
+        hint = "pip install opencv-python-headless"
+        raise InputError(f"images: expected the package cv2 for cameras ({hint}); found none") from None
+    found = {name: cv2.VideoCapture(device) for name, device in devices.items()}
+    for name, device in devices.items():
+        require(found[name].isOpened(), f"images.{name}", "a camera or stream that OpenCV opens", device)
+    return found
+
+
+def newest_frames(
+    captures: Mapping[str, Any], least: int, clock: Callable[[], float], sleep: Callable[[float], None]
+) -> Iterator[tuple[dict[str, Frame], int, float]]:
+    """The newest frames by camera whenever they are asked for, how many were taken before and not asked for,
+    and when the newest were taken. A thread takes frames as they come, so that none waits in a camera's
+    buffer, and decodes only those that are asked for. Ends, and releases the cameras, where fewer than
+    ``least`` give frames."""
+    wanted, stopped, ready = threading.Event(), threading.Event(), SimpleQueue()
+    wanted.set()  # the first frames
+
+    def take() -> None:
+        passed = 0
+        try:
+            while not stopped.is_set():
+                # All are grabbed before decoding, which takes longer.
+                shown = {name: capture for name, capture in captures.items() if capture.grab()}
+                taken = clock()
+                if len(shown) < least:
+                    break
+                if not wanted.is_set():
+                    passed += 1
+                    continue
+                decoded = {name: capture.retrieve() for name, capture in shown.items()}
+                # OpenCV's pixels are BGR.
+                frames = {
+                    name: Frame(f"images.{name}", np.ascontiguousarray(image[..., ::-1]))
+                    for name, (is_read, image) in decoded.items()
+                    if is_read
+                }
+                wanted.clear()
+                ready.put((frames, passed, taken))
+                passed = 0
+        finally:
+            for capture in captures.values():
+                capture.release()
+            ready.put(None)
+
+    thread = threading.Thread(target=take, daemon=True)
+    thread.start()
+    try:
+        while True:
+            while ready.empty():
+                sleep(_FRAME_POLL)
+            found = ready.get()
+            if found is None:
+                return
+            yield found
+            wanted.set()
+    finally:
+        stopped.set()
+        thread.join(_PATIENCE)
+
+
+class Arrived(NamedTuple):
+    """A capture, how many were dropped since the one before, and its time of arrival by the clock."""
+
+    capture: Capture
+    dropped: int
+    taken: float
+
+
+def live_frames(
+    images: str | Path | Mapping[str, int | str],
+    cameras: str | Path,
+    masks: str | Path | None = None,
+    idle: float | None = None,
+    clock: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+    **options: Any,
+) -> Iterator[Arrived]:
+    """The newest capture whenever one is asked for; those that come meanwhile or cannot be read are dropped.
+    InputError: the calibration, a video, a camera or the folder is missing or wrong.
+
+    Args:
+        images: a folder of videos, played at their own rate; or of instants, each a folder that counts once
+            it has a photograph of every camera and none of its files grows any more. Or what OpenCV opens, by
+            camera: numbers of devices, addresses of streams; ``options`` then says where masks come from, and
+            at least ``ENOUGH`` cameras must go on.
+        masks: a folder laid out as ``images``.
+        idle: seconds without a new instant after which a folder of instants ends; None: never.
+        clock, sleep: tells seconds, and waits.
+        options: as for :class:`CaptureFolder`."""
+    said, part = options.get("calibration", {}), options.get("sequence", {})
+    if is_folder := not isinstance(images, Mapping):
+        folder = Path(images).expanduser()
+        require(folder.is_dir(), str(images), "a folder", "no such folder")
+        if images_in(folder, SUFFIXES):
+            return _played(CaptureFolder(folder, cameras, masks, **options), clock, sleep)
+    expected = f"all instants of {'a folder that is being written' if is_folder else 'cameras'}"
+    require(Sequence.read(part, "sequence") == Sequence(), "sequence", expected, part)
+    stored = read_cameras(cameras, said.get("format") or "auto")
+    if not is_folder:
+        devices = by_camera(
+            Path("images"), {str(n): device for n, device in images.items()}, stored.cameras, {}
+        )
+        expected = "backgrounds=<folder> or segment=rembg for masks of cameras"
+        is_told = masks is None and (options.get("backgrounds") or options.get("segment"))
+        require(bool(is_told), "masks", expected, masks)
+        least = min(ENOUGH, len(devices))
+        return _watched(newest_frames(opened(devices), least, clock, sleep), stored, options)
+    names = composed_names(said.get("names"))
+    places = [folder] if masks is None else [folder, Path(masks).expanduser()]
+
+    def read(name: str) -> Capture:
+        found = CaptureFolder(folder / name, stored, None if masks is None else places[1] / name, **options)
+        return Capture(name, found.photographs(found.instants[0]))
+
+    def is_whole(name: str) -> bool:
+        photographs = images_in(folder / name)
+        return stored.cameras.keys() <= {camera_named(n, stored.cameras, names) for n in photographs}
+
+    return _arriving(places, is_whole, read, idle, clock, sleep)
+
+
+def _watched(
+    frames: Iterator[tuple[dict[str, Frame], int, float]], stored: CameraFile, options: Mapping[str, Any]
+) -> Iterator[Arrived]:
+    number, dropped, said = -1, 0, ""
+    for images, passed, taken in frames:
+        number, dropped = number + passed + 1, dropped + passed
+        try:
+            capture = Capture(f"{number:06d}", CaptureFolder(images, stored, **options).photographs(""))
+        except InputError as error:
+            dropped += 1
+            if str(error) != said:
+                said = str(error)
+                print(f"instant {number:06d} is left out: {said}", flush=True)
+            continue
+        yield Arrived(capture, dropped, taken)
+        dropped = 0
+
+
+def _played(
+    folder: CaptureFolder, clock: Callable[[], float], sleep: Callable[[float], None]
+) -> Iterator[Arrived]:
+    names = folder.instants
+    first = next(iter(folder.paths[names[0]].values())).video.video
+    # Instants are named by the frame of the first camera.
+    due = (np.array([int(name) for name in names]) - int(names[0])) / first.rate
+    begin, place, dropped = clock(), 0, 0
+    while place < len(names):
+        newest = max(place, int(np.searchsorted(due, clock() - begin, side="right")) - 1)
+        dropped += newest - place
+        place = newest + 1
+        try:
+            capture = Capture(names[newest], folder.photographs(names[newest]))
+        except InputError:
+            dropped += 1
+            continue
+        sleep(max(float(due[newest]) - (clock() - begin), 0.0))
+        yield Arrived(capture, dropped, begin + float(due[newest]))
+        dropped = 0
+
+
+def _arriving(
+    places: list[Path],
+    is_whole: Callable[[str], bool],
+    read: Callable[[str], Capture],
+    idle: float | None,
+    clock: Callable[[], float],
+    sleep: Callable[[float], None],
+) -> Iterator[Arrived]:
+    done, before, unread, last = [], {}, {}, clock()
+    while idle is None or clock() - last < idle:
+        folders = (path.name for path in places[0].iterdir() if path.is_dir() and path.name[0] != ".")
+        sizes = {name: [_sizes(place / name) for place in places] for name in folders if counted(name) > done}
+        still = [name for name, found in sizes.items() if before.get(name) == found != unread.get(name)]
+        newest, before = max(filter(is_whole, still), key=counted, default=None), sizes
+        if newest is None:
+            sleep(_FOLDER_POLL)
+            continue
+        try:
+            capture = read(newest)
+        except InputError:  # until its files change: masks may come later
+            unread[newest] = sizes[newest]
+            continue
+        done, last = counted(newest), clock()
+        files = [path for place in places if (place / newest).is_dir() for path in (place / newest).iterdir()]
+        age = max(time.time() - max(path.stat().st_ctime for path in files), 0.0)
+        yield Arrived(capture, sum(counted(name) < done for name in sizes), last - age)
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    """Bytes of each file; -1 for one that vanishes meanwhile."""
+    found = {}
+    for path in folder.iterdir() if folder.is_dir() else ():
+        try:
+            found[path.name] = path.stat().st_size
+        except FileNotFoundError:
+            found[path.name] = -1
+    return found

@@ -1,0 +1,92 @@
+"""The subject's matte in a photograph: from a file, alpha, a photograph of the background, or rembg.
+
+A matte [h, w] uint8 is 255 times the share of each pixel that shows the subject; a mask has only 0 and 255.
+"""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from ghgs_capture.photographs import MASK_ENDING, Pixels, image_named, read_pixels
+from ghgs_lit.data.images import read_image
+from ghgs_lit.errors import choice, installed, require
+
+SEGMENTERS = ("rembg",)  #: Choices of ``segment``
+_LABELS = 32  # Labels of body parts are numbers below this; alpha and probabilities reach 255
+# By how many deviations of the noise a pixel differs from the background, and by how much at least.
+_DEVIATIONS, _LEAST_DIFFERENCE = 6.0, 12.0
+_SPECK = 0.05  # Regions below this share of the largest one's area are not of the subject
+
+
+def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
+    """The matte of the photograph as shown, from alpha, labels, or grey of 8 or 16 bits.
+
+    An alpha channel counts unless it is constant. All labels but 0 are the subject; a single larger number
+    beside them is void. InputError: it cannot be decoded, or fits the photograph neither as shown nor stored.
+    """
+    image = read_image(path)
+    values = np.asarray(image)
+    if image.mode in ("LA", "RGBA"):
+        alpha = values[..., -1]
+        values = alpha if alpha.min() < alpha.max() else values[..., :-1]
+    require(values.dtype.kind in "bui", str(path), "a mask of whole numbers", values.dtype)
+    values = values if values.ndim == 2 else values.max(-1)
+    if values.shape != pixels.size:
+        fits = values.shape == pixels.stored_size
+        require(fits, str(path), f"the size of its photograph, {pixels.size} (height, width)", values.shape)
+        values = np.rot90(values, pixels.turns)
+    most = int(values.max(initial=0))
+    labelled = (values > 0) & (values < _LABELS)
+    # Void is a thin rim, and a soft matte has numbers between it and the labels.
+    is_void = (values == most).sum() < labelled.sum() and not ((values >= _LABELS) & (values < most)).any()
+    if most < _LABELS or is_void:
+        return labelled * np.uint8(255)
+    return np.round(values * (1 / 257 if most > 255 else 1)).astype(np.uint8)
+
+
+def matte_of_background(pixels: Pixels, path: Path) -> np.ndarray:
+    """A mask of what differs from a background. InputError: it has another size, or nothing differs."""
+    from scipy import ndimage  # here: masks of files do not need it
+
+    background = read_pixels(path)
+    fits = background.size == pixels.size
+    require(fits, str(path), f"the size of the photograph, {pixels.size} (height, width)", background.size)
+    difference = np.abs(pixels.image.astype(np.float32) - background.image).max(-1)
+    # Most pixels show the background: 1.48 times the median is a deviation of the noise.
+    threshold = max(_DEVIATIONS * 1.4826 * float(np.median(difference)), _LEAST_DIFFERENCE)
+    radius = max(max(pixels.size) // 400, 1)
+    regions, count = ndimage.label(ndimage.binary_opening(difference > threshold, iterations=radius))
+    require(count > 0, str(path), "a background that differs from the photograph", "no difference")
+    areas = np.bincount(regions.ravel())
+    areas[0] = 0
+    subject = (areas >= _SPECK * areas.max())[regions]
+    radius *= 2
+    closed = ndimage.binary_closing(np.pad(subject, radius), iterations=radius)
+    return ndimage.binary_fill_holes(closed[radius:-radius, radius:-radius]) * np.uint8(255)
+
+
+def segmenter(name: str) -> Callable[[Pixels], np.ndarray]:
+    """A function from photographs to mattes. ``name``: of :data:`SEGMENTERS`. InputError: not installed."""
+    choice("segment", name, SEGMENTERS)
+    rembg = installed("rembg", "segment", "segment")
+    session = rembg.new_session()
+
+    def matte(pixels: Pixels) -> np.ndarray:
+        alpha = rembg.remove(Image.fromarray(pixels.image), session=session, only_mask=True)
+        return np.asarray(alpha.convert("L"))
+
+    return matte
+
+
+def mask_path(photograph: Path, images: Path, masks: Path) -> Path | None:
+    """The mask's file: in the same place below ``masks`` as the photograph below ``images``; None: none."""
+    # Not resolved: photographs may be links to files elsewhere.
+    folder = masks / photograph.parent.relative_to(images)
+    marked = f"{photograph.stem}{MASK_ENDING}"
+    # Beside the photograph, the image of its name is the photograph itself.
+    beside = os.path.realpath(folder) == os.path.realpath(photograph.parent)
+    # COLMAP's masks keep the suffix of the photograph: front.jpg.png.
+    return image_named(folder, *([marked] if beside else [photograph.stem, photograph.name, marked]))

@@ -1,0 +1,194 @@
+"""Photographs in a folder: which camera took each, and the pixels that its calibration is for."""
+
+import re
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ghgs_capture.calibration import StoredCamera, same_ratio
+from ghgs_lit.data.images import orientation_of, read_image, rgb_of
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.readers import composed, find_path
+
+SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif", ".tif", ".tiff", ".bmp")
+#: Suffixes of pictures that are not read, and of files that are no photographs whatever their name.
+PICTURES = "heic heif hif jxl jp2 j2k gif tga ppm pgm exr hdr psd dng cr2 cr3 nef arw raf orf rw2 pef srw raw"
+_COMPANIONS = "json xml xmp txt toml yaml yml csv npy npz pkl aae md log ply obj"
+MASK_ENDING = "_mask"  #: A mask beside its photograph ends with this
+#: Quarter turns as of ``numpy.rot90`` by EXIF orientation.
+_TURNS = {1: 0, 3: 2, 6: 3, 8: 1}
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """One decoded photograph as it is shown."""
+
+    image: np.ndarray  #: [h, w, 3] uint8, RGB
+    alpha: np.ndarray | None  #: [h, w] uint8 where the file has it
+    turns: int  #: quarter turns that showing it took, as of ``numpy.rot90``
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) as shown."""
+        return self.image.shape[:2]
+
+    @property
+    def stored_size(self) -> tuple[int, int]:
+        """(height, width) as the file stores it."""
+        return self.size[::-1] if self.turns % 2 else self.size
+
+
+def read_pixels(path: Path) -> Pixels:
+    """Decode a photograph of 8 bits a channel and turn it as its EXIF entry says. InputError: it is missing,
+    cannot be decoded, has other values, or is mirrored."""
+    image = read_image(path)
+    orientation = orientation_of(image, path)
+    found = f"EXIF orientation {orientation}"
+    require(orientation in _TURNS, str(path), "a photograph that is not mirrored", found)
+    turns, alpha = _TURNS[orientation], None
+    colors = np.rot90(rgb_of(image, path), turns)
+    if image.has_transparency_data:
+        alpha = np.rot90(np.asarray(image.convert("RGBA").getchannel("A")), turns)
+    return Pixels(colors, alpha, turns)
+
+
+def fits_stored(pixels: Pixels, camera: StoredCamera, exif: str) -> bool:
+    """Whether a camera was calibrated with the photograph as stored, not as shown. With ``exif`` ``auto`` the
+    size of the calibration tells for quarter turns; otherwise it is as shown, since OpenCV turns photographs
+    on reading. ``exif``: ``auto`` | ``stored`` | ``shown``, by the user."""
+    if exif != "auto" or not pixels.turns:
+        return exif == "stored"
+    size = camera.size
+    return size is not None and same_ratio(size, pixels.stored_size) and not same_ratio(size, pixels.size)
+
+
+def composed_names(names: Mapping[Any, Any] | None) -> dict[str, str]:
+    """``calibration.names`` as text in its composed spelling: numbers, too, are names of cameras."""
+    return {composed(str(key)): composed(str(name)) for key, name in (names or {}).items()}
+
+
+def images_in(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[str, Path]:
+    """Photographs of a folder by name without suffix, sorted, no masks. InputError: two have one name."""
+    paths: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        is_image = path.suffix.lower() in suffixes and not path.name.startswith(".") and not path.is_dir()
+        if not is_image or path.stem.lower().endswith(MASK_ENDING):
+            continue
+        name = composed(path.stem)
+        require(name not in paths, str(path), "one file for each photograph", str(paths.get(name)))
+        paths[name] = path
+    return paths
+
+
+def image_named(folder: Path, *names: str, suffixes: tuple[str, ...] = SUFFIXES) -> Path | None:
+    """The image of a folder with one of these names (without suffix), None where there is none."""
+    return next((path for name in names if (path := find_path(folder, name, suffixes))), None)
+
+
+def require_all_read(
+    folder: Path, read: Collection[str], known: Collection[str], suffixes: tuple[str, ...] = SUFFIXES
+) -> None:
+    """Refuse to leave out a photograph or video without a word. InputError: there is a picture of a kind that
+    is not read, or another file of a known name, such as ``right.heic`` or ``right.jpg.part``.
+
+    Args:
+        folder: of photographs or of videos.
+        read: names of those that are read; what lies beside them under their names is no matter.
+        known: further names: of cameras or instants.
+        suffixes: of what is read, for the message."""
+    for path in sorted(folder.iterdir()):
+        name, kind = composed(path.name), path.suffix.lower().removeprefix(".")
+        begins = {name[:end] for end, letter in enumerate(f"{name}.") if letter == "."}
+        is_other = path.name.startswith(".") or path.is_dir() or path.stem.lower().endswith(MASK_ENDING)
+        if is_other or kind in _COMPANIONS.split() or not begins.isdisjoint(read):
+            continue
+        if kind in PICTURES.split() or not begins.isdisjoint(known):
+            raise InputError(
+                f"{path}: expected a file that can be read ({', '.join(suffixes)}); found another kind"
+                " (convert it, or move it elsewhere to do without it)"
+            )
+
+
+def find_instants(
+    folder: Path, cameras: Mapping[str, StoredCamera], names: Mapping[str, str]
+) -> dict[str, dict[str, Path]]:
+    """``{instant: {camera: path}}``, of photographs in the folder itself or in its folders.
+
+    A folder is an instant with a photograph of every camera, or, if named after a camera, has one photograph
+    for each instant. Of several instants one may lack photographs. ``names``: the camera of a photograph (or
+    camera's folder) of another name. InputError: there are none, or photographs do not fit the cameras."""
+    problem = "a file" if folder.exists() else "no such folder"
+    require(folder.is_dir(), str(folder), "a folder of photographs", problem)
+    known = {*cameras, *names}
+    photographs = images_in(folder)
+    require_all_read(folder, photographs, known)
+    if photographs:
+        return {folder.resolve().name: by_camera(folder, photographs, cameras, names)}
+    places = {
+        composed(path.name): path
+        for path in sorted(folder.iterdir(), key=lambda path: counted(path.name))
+        if path.is_dir() and not path.name.startswith(".")
+    }
+    below = {name: images_in(path) for name, path in places.items()}
+    for name, paths in below.items():
+        is_camera = camera_named(name, cameras, names) in cameras
+        instants = {instant for others in below.values() for instant in others}
+        require_all_read(places[name], paths, instants if is_camera else known)
+    folders = {name: paths for name, paths in below.items() if paths}
+    require(bool(folders), str(folder), f"photographs ({', '.join(SUFFIXES)})", "none")
+    if all(camera_named(name, cameras, names) in cameras for name in folders):
+        return _by_instant(folder, by_camera(folder, folders, cameras, names))
+    least = 2 if len(folders) == 1 else 1
+    return {name: by_camera(folder / name, paths, cameras, names, least) for name, paths in folders.items()}
+
+
+def counted(name: str) -> list[str | int]:
+    """Sort key of names by which numbers follow one another: 2 before 10."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
+
+
+def _by_instant(folder: Path, by_camera: Mapping[str, dict[str, Path]]) -> dict[str, dict[str, Path]]:
+    """Turn ``{camera: {instant: path}}`` into ``{instant: {camera: path}}``."""
+    first, *others = by_camera
+    for other in others:
+        shared = by_camera[first].keys() & by_camera[other].keys()
+        expected, found = f"photographs named as those of {first}", ", ".join(list(by_camera[other])[:3])
+        require(bool(shared), f"{folder}: {other}", expected, f"others: {found}")
+    instants = sorted({instant for paths in by_camera.values() for instant in paths}, key=counted)
+    return {
+        instant: {camera: paths[instant] for camera, paths in by_camera.items() if instant in paths}
+        for instant in instants
+    }
+
+
+def camera_named(name: str, cameras: Collection[str], names: Mapping[str, str]) -> str:
+    """The camera of a photograph: what ``names`` says, or the one of its name, or the only one whose name
+    differs by upper and lower case alone; the name itself where there is none."""
+    said = names.get(name, name)
+    alike = [camera for camera in cameras if camera.casefold() == said.casefold()]
+    return alike[0] if said not in cameras and len(alike) == 1 else said
+
+
+def by_camera(
+    folder: Path,
+    values: Mapping[str, Any],
+    cameras: Mapping[str, StoredCamera],
+    names: Mapping[str, str],
+    least: int = 2,
+) -> dict[str, Any]:
+    """Values by camera instead of by name of a photograph, of a video or of a camera's folder. InputError: a
+    name is that of no camera, two are of one, or there are fewer than ``least``."""
+    named = {name: camera_named(name, cameras, names) for name in values}
+    unknown = [name for name, camera in named.items() if camera not in cameras]
+    if unknown:
+        raise InputError(
+            f"{folder}: expected photographs named after cameras ({', '.join(cameras)}), or"
+            f" calibration.names={{photograph: camera}}; found {', '.join(unknown)}"
+        )
+    require(len(values) >= least, str(folder), f"{least} photographs or more", len(values))
+    found = {named[name]: value for name, value in values.items()}
+    require(len(found) == len(values), "calibration.names", "one photograph for each camera", dict(names))
+    return found

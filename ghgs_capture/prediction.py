@@ -1,0 +1,212 @@
+"""Gaussians of a capture in the user's world, and of any batch, with corrected cameras."""
+
+import functools
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from ghgs_capture.capture import Capture
+from ghgs_capture.doubts import ENOUGH, doubt_of_cameras, doubt_of_masks
+from ghgs_capture.temporal import Temporal
+from ghgs_capture.tones import own_tones, without_tones
+from ghgs_lit.config.keys import lookup
+from ghgs_lit.config.options import image_size
+from ghgs_lit.errors import require
+from ghgs_lit.geometry.frame import Frame
+from ghgs_lit.model import GHGS
+from ghgs_lit.refinement import CameraRefinement, Refinement, Report, pixels_moved
+from ghgs_lit.rendering import Renderer
+from ghgs_lit.surroundings import side_multiple
+from ghgs_lit.types import Batch, Gaussians, Prediction
+from ghgs_lit.weights.checkpoint import read_config
+from ghgs_lit.weights.reading import SHIPPED, file_of
+
+
+@dataclass(frozen=True)
+class TimedPrediction:
+    """A prediction with the batch that the model saw."""
+
+    batch: Batch  #: photographs or crops around the subject, masks and cameras, corrected where asked
+    prediction: Prediction  #: of this batch, in the world and unit of its cameras
+    seconds: dict[str, float] = field(default_factory=dict)
+    moved: tuple[float, ...] = ()  #: pixels that correcting cameras moved the subject by in each photograph
+    changed: tuple[float, ...] = ()  #: share of the subject that refining masks changed in each crop
+    refined: Report | None = None  #: what refining the Gaussians gained, where asked; depths stay
+    why: dict[str, str] = field(default_factory=dict)  #: doubts, by the refinement that ``auto`` chose
+    tones: dict[str, float] = field(default_factory=dict)  #: gammas of cameras that were undone, by name
+
+    @property
+    def gaussians(self) -> Gaussians:
+        return self.prediction.gaussians
+
+
+@torch.no_grad()
+def predict(
+    capture: Capture,
+    model: GHGS | str | Path = SHIPPED,
+    size: int | tuple[int, int] | None = None,
+    refine_cameras: int | Literal["auto"] = "auto",
+    refine_masks: int | Literal["auto"] = "auto",
+    refine: int = 0,
+    renderer: Renderer | None = None,
+    temporal: Temporal | None = None,
+    tones: Mapping[str, float] | Literal["auto"] = "auto",
+) -> TimedPrediction:
+    """The Gaussians of a capture. InputError: the checkpoint cannot be used, or the size does not fit the
+    model.
+
+    Args:
+        model: a model in evaluation mode, or a checkpoint (kept in memory for further calls): a path, or the
+            one that comes with the package.
+        size: side or (height, width) of the crops that the model sees, in pixels; None: as it was trained
+            (checkpoints only).
+        refine_cameras: most rounds that correct the cameras until the photographs agree
+            (:class:`CameraRefinement`); 0: none; ``auto``: 4 where silhouettes contradict one another.
+        refine_masks: pixels of a crop by which masks may be wrong; mattes are then searched in the
+            photographs (:func:`ghgs_lit.data.matting.refined_matte`). 0: masks are right; ``auto``: 4 where
+            photographs show other outlines.
+        refine: steps that bring the Gaussians nearer to the photographs, such as 15; 0: none.
+        renderer: what refining draws with; None: that of the device.
+        temporal: the predictor of the instants before, in their order; None: no sequence.
+        tones: gammas of cameras, by name, that are undone first; ``auto``: of those that have one of their
+            own beside the others, by a first prediction."""
+    if not isinstance(model, GHGS):
+        path = file_of(model)
+        model = _model(path, path.stat().st_mtime_ns)
+        size = crop_size(size, read_config(path), model)
+    require(size is not None, "size", "a size in pixels beside a model that is no checkpoint", size)
+    refining = refine_cameras, refine_masks, refine
+    keys = model, image_size("size", size), *refining, renderer or Renderer(), temporal
+    result = _predicted(capture if tones == "auto" else without_tones(capture, tones), *keys)
+    if tones != "auto":
+        return replace(result, tones=dict(tones))
+    tones = own_tones(result.batch, result.gaussians)
+    if not tones:
+        return result
+    if temporal is not None:
+        temporal.reset()
+    again = _predicted(without_tones(capture, tones), *keys)
+    seconds = again.seconds | {"tones": sum(result.seconds.values())}
+    return replace(again, seconds=seconds, tones=tones)
+
+
+def _predicted(
+    capture: Capture,
+    model: GHGS,
+    size: tuple[int, int],
+    refine_cameras: int | Literal["auto"],
+    refine_masks: int | Literal["auto"],
+    refine: int,
+    renderer: Renderer,
+    temporal: Temporal | None,
+) -> TimedPrediction:
+    """:func:`predict` of photographs with their colours as they are."""
+    seconds, why = {}, {}
+    if refine_masks == "auto":
+        why["refine_masks"] = doubt_of_masks(capture, size)
+        refine_masks = ENOUGH if why["refine_masks"] else 0
+    batch, changed = _crops(capture, size, refine_masks, seconds)
+    if refine_cameras == "auto":
+        why["refine_cameras"] = doubt_of_cameras(capture, batch)
+        refine_cameras = ENOUGH if why["refine_cameras"] else 0
+    batch = batch.to(next(model.parameters()).device)
+    forward = functools.partial(in_frame, model)
+    result = predict_batch(batch, model, renderer, refine_cameras, refine, forward, temporal)
+    why = {name: doubt for name, doubt in why.items() if doubt}
+    return replace(result, seconds=seconds | result.seconds, changed=changed, why=why)
+
+
+def in_frame(model: GHGS, batch: Batch) -> Prediction:
+    """A prediction in the subject's frame, whatever the weights, so that a capture may have any unit."""
+    # Weights with compat=release do not enter a frame of their own.
+    frame = Frame.of(batch)
+    return frame.leave(model(frame.enter(batch)), batch.cameras.extrinsics.dtype)
+
+
+def predict_batch(
+    batch: Batch,
+    model: GHGS,
+    renderer: Renderer,
+    refine_cameras: int = 0,
+    refine: int = 0,
+    forward: Callable[[Batch], Prediction] | None = None,
+    temporal: Temporal | None = None,
+) -> TimedPrediction:
+    """The Gaussians of a batch of one subject, which keeps its targets.
+
+    Args:
+        renderer: draws what :class:`CameraRefinement` and :class:`Refinement` compare.
+        refine_cameras: most rounds of :class:`CameraRefinement`; 0: none.
+        refine: steps of :class:`Refinement`; 0: none.
+        forward: predicts a batch without targets; None: the model.
+        temporal: takes the place of ``forward`` where instants before are known."""
+    forward, moved, seconds, start = forward or model, (), {}, time.perf_counter()
+    if refine_cameras:
+        given, batch = batch, CameraRefinement(refine_cameras, model, renderer)(batch)
+        moved = tuple(pixels_moved(given, batch)[0])
+        seconds["refine_cameras"] = time.perf_counter() - start
+        start = time.perf_counter()
+    prediction = (temporal or forward)(replace(batch, targets=None))
+    if batch.images.device.type == "cuda":
+        torch.cuda.synchronize()
+    seconds["predict"] = time.perf_counter() - start
+    refined = None
+    if refine:
+        refinement, before, start = Refinement(refine, renderer), prediction.gaussians, time.perf_counter()
+        prediction = replace(prediction, gaussians=refinement(before, batch))
+        seconds["refine"] = time.perf_counter() - start
+        untold = replace(batch, targets=None)
+        refined = refinement.report(before, prediction.gaussians, untold, lambda b: forward(b).gaussians)
+    return TimedPrediction(batch, prediction, seconds, moved, refined=refined)
+
+
+def _crops(
+    capture: Capture, size: tuple[int, int], refine_masks: int, seconds: dict[str, float]
+) -> tuple[Batch, tuple[float, ...]]:
+    """The batch that the model sees, and the share by which refining changed each matte; adds run times."""
+    start = time.perf_counter()
+    given = capture.batch(size)
+    seconds["crop"] = time.perf_counter() - start
+    if not refine_masks:
+        return given, ()
+    start = time.perf_counter()
+    batch = capture.batch(size, refine_masks)
+    seconds["refine_masks"] = time.perf_counter() - start
+    changed = (batch.alpha - given.alpha).abs().sum((-2, -1)) / given.alpha.sum((-2, -1))
+    return batch, tuple(changed[0].tolist())
+
+
+def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:
+    """Side or (height, width) of the photographs that a checkpoint's model was trained with; of imported
+    weights the size of the encoder's position embedding."""
+    return lookup(config, "data.size") or lookup(config, "encoder.image_size") or 518
+
+
+def crop_size(size: int | tuple[int, int] | None, config: Mapping[str, Any], model: GHGS) -> tuple[int, int]:
+    """(height, width) of the crops that a checkpoint's model sees; None: as it was trained. Warns of larger
+    ones, which make results worse, not sharper, where the model does not work from coarse to fine
+    (``rounds.height``). InputError: the model cannot take this size."""
+    trained, patch = image_size("size", trained_size(config)), model.encoder.patch_size
+    height, width = trained if size is None else image_size("size", size)
+    multiple = side_multiple(model.options, patch)
+    expected = f"sides divisible by the patch size {multiple}"
+    require(height % multiple == width % multiple == 0, "size", expected, (height, width))
+    is_coarse_to_fine = model.rounds is not None and model.rounds.options.height is not None
+    if not is_coarse_to_fine and (height > trained[0] or width > trained[1]):
+        below = ", ".join(str(n * patch) for n in range(max(trained) // patch, 0, -3)[:3])
+        warnings.warn(
+            f"size: {height} x {width} is larger than the {trained[0]} x {trained[1]} of the training, which"
+            f" makes results worse, not sharper; multiples of {patch} up to that fit, such as {below}",
+            stacklevel=3,
+        )
+    return height, width
+
+
+@functools.lru_cache(maxsize=1)
+def _model(path: Path, changed: int) -> GHGS:
+    return GHGS.from_checkpoint(path)

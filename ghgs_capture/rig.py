@@ -1,0 +1,162 @@
+"""Cameras of a rig that stands still, corrected once over several instants, and their colour gains.
+
+One instant shows one pose, often with a mask that is wrong somewhere; several say more about the cameras, and
+cameras that are the same in all instants do not flicker."""
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from ghgs_capture.calibration import MOST_GAIN, Calibration, calibrate
+from ghgs_capture.capture import Capture
+from ghgs_capture.crops import Photograph
+from ghgs_capture.doubts import ENOUGH, doubt_of_cameras, doubt_of_masks
+from ghgs_capture.folder import CaptureFolder
+from ghgs_lit.geometry.frame import Frame
+from ghgs_lit.model import GHGS
+from ghgs_lit.refinement import CameraRefinement, pixels_moved
+from ghgs_lit.rendering import Renderer
+from ghgs_lit.rounds.gains import log_gains
+from ghgs_lit.types import Batch, Cameras
+
+INSTANTS = 8  #: Instants, spread over a sequence, for correcting its cameras
+#: Median deviation of log gains above which exposures change between instants.
+_CHANGING = 0.05
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Corrected cameras, and colour gains where found, by name."""
+
+    extrinsics: Mapping[str, np.ndarray]  #: [4, 4] float64, world to camera
+    zoom: Mapping[str, float]  #: factor of their focal lengths
+    moved: Mapping[str, float]  #: pixels of a crop that the correction moved the subject by
+    why: str = ""  #: what the given cameras contradicted, where ``auto`` decided
+    gains: Mapping[str, np.ndarray] = field(default_factory=dict)  #: [3], with a geometric mean of 1
+
+    def applied(self, capture: Capture) -> Capture:
+        """The capture with the corrected cameras."""
+        return replace(capture, photographs=tuple(map(self._corrected, capture.photographs)))
+
+    def _corrected(self, photograph: Photograph) -> Photograph:
+        """A camera that most instants lack stays as it is."""
+        pose = self.extrinsics.get(photograph.name, photograph.extrinsics)
+        lens = photograph.intrinsics * self._zoom_of(photograph.name)
+        gains = self.gains.get(photograph.name, photograph.gains)
+        return replace(photograph, intrinsics=lens, extrinsics=pose, gains=gains)
+
+    def _zoom_of(self, name: str) -> list[float]:
+        return [self.zoom.get(name, 1.0)] * 2 + [1.0]
+
+    def calibrations(
+        self, folder: CaptureFolder, captures: Sequence[Capture]
+    ) -> dict[str, tuple[Calibration, tuple[int, int]]]:
+        """The corrected cameras of a folder's photographs as they are stored, and their (height, width).
+        ``captures``: of the folder, with the cameras as given."""
+        found = {}
+        for name, photograph in {p.name: p for c in captures for p in c.photographs}.items():
+            stored = folder.file.cameras[name]
+            size = stored.size or photograph.mask.shape
+            given = calibrate(stored, folder.convention, size)
+            # The motion is the same before the photograph is turned upright.
+            corrected = self._corrected(photograph)
+            moved = np.linalg.inv(photograph.extrinsics) @ corrected.extrinsics
+            lens, pose = given.intrinsics * self._zoom_of(name), given.extrinsics @ moved
+            changed = replace(given, intrinsics=lens, extrinsics=pose, gains=corrected.gains)
+            found[name] = changed, size
+        return found
+
+
+def corrected_rig(
+    captures: Sequence[Capture],
+    model: GHGS,
+    size: tuple[int, int],
+    rounds: int | Literal["auto"],
+    refine_masks: int | Literal["auto"],
+    renderer: Renderer,
+) -> Rig | None:
+    """The cameras of several instants, corrected together; None: they stay as they are.
+
+    Args:
+        captures: of one rig; those that lack a camera take no part.
+        size: (height, width) of the crops in pixels.
+        rounds: most rounds of :class:`CameraRefinement`; ``auto``: 4 where the silhouettes of half of the
+            instants contradict the cameras.
+        refine_masks: as for :func:`ghgs_capture.prediction.predict`."""
+    names = Counter(_names(capture) for capture in captures).most_common(1)[0][0]
+    captures = [capture for capture in captures if _names(capture) == names]
+    batches, doubts = [], []
+    for capture in captures:
+        masks = refine_masks
+        if masks == "auto":
+            masks = ENOUGH if doubt_of_masks(capture, size) else 0
+        batches.append(capture.batch(size, masks))
+        doubts.append(doubt_of_cameras(capture, batches[-1]) if rounds == "auto" else "")
+    contradicted = [doubt for doubt in doubts if doubt]
+    if rounds == "auto":
+        if 2 * len(contradicted) < len(captures):
+            return None
+        rounds = ENOUGH
+    batch = _together(batches).to(next(model.parameters()).device)
+    corrected = CameraRefinement(rounds, model, renderer, shared=True)(batch)
+    before, after = batch.cameras, corrected.cameras
+    if torch.equal(before.extrinsics, after.extrinsics) and torch.equal(before.intrinsics, after.intrinsics):
+        return None
+    why = f"in {len(contradicted)} of {len(captures)} instants {contradicted[0]}" if contradicted else ""
+    extrinsics = after.extrinsics[0].double().cpu().numpy()
+    zoom = (after.intrinsics / before.intrinsics)[0, :, 0, 0].tolist()
+    moved = np.mean(pixels_moved(batch, corrected), 0).tolist()
+    gains = shared_gains(corrected, model)
+    by_name = (dict(zip(names, values, strict=True)) for values in (extrinsics, zoom, moved))
+    return Rig(*by_name, why, {} if gains is None else dict(zip(names, gains, strict=True)))
+
+
+@torch.no_grad()
+def shared_gains(batch: Batch, model: GHGS) -> np.ndarray | None:
+    """Colour gains [V, 3] of the cameras: the median over instants, with a geometric mean of 1 over cameras.
+    None: exposures change between instants, photographs are divided by gains already, or the model uses none.
+    ``batch``: an element for each instant, in the world."""
+    if model.rounds is None or not model.rounds.options.gains or batch.log_gains is not None:
+        return None
+    batch = Frame.of(batch).enter(batch)
+    each = log_gains(model(batch).gaussians, batch)
+    logs = each.quantile(0.5, 0)
+    if (each - logs).abs().quantile(0.5, 0).max() > _CHANGING:
+        return None
+    logs = (logs - logs.mean(0)).double()
+    scale = (math.log(MOST_GAIN) / logs.abs().amax(0)).clamp(max=1)
+    return torch.exp(logs * scale).clamp(1 / MOST_GAIN, MOST_GAIN).cpu().numpy()
+
+
+def turned_from(rig: np.ndarray, cameras: np.ndarray) -> float:
+    """Greatest angle in degrees between cameras [n, 4, 4] and the nearest of a rig's [R, 4, 4], after the
+    rotation of the world that makes it least; 0 for cameras of the rig, whichever and in any order. Quarter
+    turns about the optical axis do not count: photographs may be turned upright."""
+    quarters = Rotation.from_euler("z", [[0], [90], [180], [270]], degrees=True).as_matrix()
+    known = (quarters[:, None] @ rig[:, :3, :3]).reshape(-1, 1, 3, 3)
+    taken = cameras[:, :3, :3]
+    worlds = known.mT @ taken[0]
+    between = known[:, None] @ worlds[None] @ taken.mT
+    cosines = (np.trace(between, axis1=-2, axis2=-1) - 1) / 2
+    angles = np.degrees(np.arccos(cosines.clip(-1, 1)))
+    return float(angles.min(0).max(-1).min())
+
+
+def _names(capture: Capture) -> tuple[str, ...]:
+    return tuple(photograph.name for photograph in capture.photographs)
+
+
+def _together(batches: Sequence[Batch]) -> Batch:
+    names = ("images", "masks", "alpha", "log_gains")
+    known = [name for name in names if getattr(batches[0], name) is not None]
+    parts = {name: torch.cat([getattr(batch, name) for batch in batches]) for name in known}
+    both = ([getattr(batch.cameras, name) for batch in batches] for name in ("intrinsics", "extrinsics"))
+    cameras = Cameras(*map(torch.cat, both), *parts["masks"].shape[2:])
+    subjects, views = zip(*((b.subjects[0], b.views[0]) for b in batches), strict=True)
+    return Batch(**parts, cameras=cameras, subjects=subjects, views=views)

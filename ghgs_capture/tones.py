@@ -1,0 +1,51 @@
+"""Tone curves of single cameras (another profile, contrast or picture style): found, said and undone."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from ghgs_capture.capture import Capture
+from ghgs_capture.crops import Photograph
+from ghgs_lit.rounds.gains import log_gammas
+from ghgs_lit.types import Batch, Gaussians
+
+#: Log gamma of all channels, beside the median camera's, above which a camera has a tone curve of its own,
+#: and how many times as large in one as in another: what light and wrong depths do differs between them.
+_OWN, _UNLIKE = 0.1, 2.0
+
+
+def own_tones(batch: Batch, gaussians: Gaussians) -> dict[str, float]:
+    """Gammas, about, of cameras with a tone curve of their own, by name; two photographs do not tell which
+    has it. ``gaussians``: predicted from the batch, of one subject."""
+    if len(batch.views[0]) < 3:
+        return {}
+    tones = {}
+    for name, logs in zip(batch.views[0], log_gammas(gaussians, batch)[0].tolist(), strict=True):
+        least, middle, most = sorted(logs, key=abs)
+        if abs(least) > _OWN and abs(most) < _UNLIKE * abs(least) and min(logs) * max(logs) > 0:
+            tones[name] = math.exp(middle)
+    return tones
+
+
+def without_tones(capture: Capture, tones: Mapping[str, float]) -> Capture:
+    """The capture with the gammas of ``tones`` undone, others of its photographs as they are."""
+    if not tones:
+        return capture
+    photographs = (_without(one, tones.get(one.name, 1.0)) for one in capture.photographs)
+    return replace(capture, photographs=tuple(photographs))
+
+
+def tone_lines(tones: Mapping[str, float], what_is_done: str) -> Iterator[str]:
+    """A line for each camera with a tone curve of its own."""
+    for name, gamma in tones.items():
+        yield (
+            f"photograph {name} has a gamma of about {gamma:.2f} beside the others: a tone curve, profile or"
+            f" contrast of its own, {what_is_done}"
+        )
+
+
+def _without(photograph: Photograph, gamma: float) -> Photograph:
+    levels = np.round(255 * (np.arange(256) / 255) ** (1 / gamma)).astype(np.uint8)
+    return replace(photograph, image=levels[photograph.image])

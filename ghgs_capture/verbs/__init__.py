@@ -1,0 +1,176 @@
+"""The verbs that work on a user's photographs: what each is for, its keys, and where its work begins.
+
+The module that does the work is imported when the verb runs: ``ghgs --help`` waits for no library.
+"""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from omegaconf import DictConfig
+from pydantic import Field
+
+from ghgs_lit.cli.verb import Budgets, Device, Measured, Training, Verb
+from ghgs_lit.config.nodes import Sequence, Texts, Turntable
+from ghgs_lit.config.options import CropSize, Index, Path, Positive, Seed, Text, Words
+
+Axis = Literal["y", "-y", "z"]
+
+
+class Photographs(Verb):
+    """The user's photographs and their cameras."""
+
+    images: Path | None = None
+    """Folder of photographs or videos named after their cameras; of such folders: one for each instant."""
+    cameras: Path | None = None
+    """Their calibration: JSON, transforms.json, COLMAP, YAML of OpenCV or EasyMocap, TOML of Pose2Sim."""
+    masks: Path | None = None
+    """Folder of masks; null: backgrounds, segment, <name>_mask.png, those of the calibration, or alpha."""
+    backgrounds: Path | None = None
+    """Folder of photographs without the subject."""
+    segment: Text | None = None
+    """rembg: masks by that package."""
+
+    def reads_at_once(self) -> bool:
+        """Whether photographs are decoded while the libraries are imported."""
+        return False
+
+    def require_files(self, config: Mapping[str, Any]) -> None:
+        super().require_files(config)
+        if self.reads_at_once() and self.images is not None and self.cameras is not None:
+            from ghgs_capture.verbs.photographs import begin_to_read
+
+            begin_to_read(config)
+
+
+class Predict(Photographs, Measured):
+    """Turn photographs into a splat, pictures and a page."""
+
+    example = "ghgs predict images=photographs cameras=cameras.json masks=masks out=splat"
+    opens = ("checkpoint",)
+    reads_data = True
+    has_trained_data = True
+
+    checkpoint: Path | None = "shipped"
+    """The one that comes with the package, or a file of ``ghgs train`` or ``ghgs import``."""
+    check_cameras: bool = True
+    """Refuse cameras that the masks contradict (``ghgs doctor task=cameras`` says more)."""
+    size: CropSize | None = None
+    """Side or [height, width] of what the model sees, in pixels; null: as it was trained. At most 2072, four
+    times the published 518: memory grows with its square."""
+    refine_masks: Literal["auto"] | Annotated[int, Field(ge=0, le=64)] = "auto"
+    """Pixels of size that masks may be off by: photographs say where outlines are; 0: none; auto: 4 where
+    photographs contradict the masks (of images alone, not of a data set)."""
+    refine_cameras: Literal["auto"] | Annotated[int, Field(ge=0, le=100)] = "auto"
+    """Rounds, at most, that correct the cameras until the photographs agree; 0: none; auto: 4 where
+    silhouettes contradict the cameras (of images alone, not of a data set)."""
+    refine_tones: Literal["auto", 0] = "auto"
+    """auto: undo the tone curve that a single camera has beside the others (of images alone); 0: leave it."""
+    refine: int = Field(0, ge=0, le=10000)
+    """Steps of optimisation towards the photographs after the prediction, such as 15; 0: none."""
+    out: Path | None = None
+    """Folder for the results; null: that of this run."""
+    subject: Text | Index = 0
+    """Without images: name of the subject, or its number in the split."""
+    split: Literal["train", "val"] = "val"
+    """Without images: where the subject is."""
+    formats: Texts = ("ply", "html", "turntable", "depth", "points", "inputs")
+    """What is written: ply, html, turntable, depth, points, inputs, splat; with the extra formats:
+    compressed_ply, spz, sog, glb; with the extra video: mp4; or all."""
+    up: Axis | None = None
+    """Axis that points up in all files; null: they are in the world of the cameras."""
+    smooth: bool = False
+    """Gaussians in files are as large as the photographs' pixels: no gaps on larger screens."""
+    turntable: Turntable = Turntable()
+    """Pictures around the subject."""
+    sequence: Sequence = Sequence()
+    """Which instants count, and how the videos of cameras fit together."""
+
+    def reads_at_once(self) -> bool:
+        return True
+
+    def run(self, cfg: DictConfig) -> object:
+        from ghgs_capture.verbs import predict
+
+        return predict.run(cfg)
+
+
+class View(Predict):
+    """A page in the browser to look around in a prediction."""
+
+    example = "ghgs view path=runs/predict/..."
+    opens = ()
+    reads_data = False
+
+    images: Path | Annotated[dict, Words("a folder or a mapping of cameras to devices")] | None = None
+    """As for ``ghgs predict``; with live also {camera: number of a device, or address of a stream}, which
+    OpenCV opens."""
+    path: Path | None = None
+    """A directory of ``ghgs predict`` (its formats ply and inputs), or a PLY; null: predict first."""
+    checkpoint: Path | None = None
+    """Without path: a checkpoint, as for ``ghgs predict``; null: the one that comes with the package."""
+    formats: Texts = ("ply", "inputs")
+    """What is written, as for ``ghgs predict``."""
+    host: Text = "127.0.0.1"
+    """Address to listen at: this machine only; 0.0.0.0 opens the page to the network."""
+    port: int = Field(8080, ge=0, le=65535)
+    """The next free one is taken where it is in use."""
+    seconds: Positive | None = None
+    """The page is closed after so long; null: never."""
+    live: bool = False
+    """Show the newest instant of images again and again: of a folder that is being written, of videos at
+    their rate, or of cameras. Their calibration is not checked, auto refines nothing, and out gets
+    sequence/0000.ply and so on."""
+    delay: Positive | None = None
+    """Of live: seconds between an instant and its picture after which it is dropped; null: none is."""
+
+    def reads_at_once(self) -> bool:
+        return False
+
+    def run(self, cfg: DictConfig) -> object:
+        from ghgs_capture.verbs import view
+
+        return view.run(cfg)
+
+
+class Adapt(Photographs, Training):
+    """Train the weights of the package further for your own cameras, in minutes."""
+
+    example = "ghgs adapt cameras=cameras.json images=photographs masks=masks out=mine.ckpt"
+    opens = ("checkpoint",)
+
+    checkpoint: Path = "shipped"
+    """The weights to start from."""
+    minutes: float = Field(3, gt=0, le=1440)
+    """Minutes of training."""
+    out: Path | None = None
+    """File for the weights; null: adapted.ckpt in the run's directory."""
+
+    def run(self, cfg: DictConfig) -> object:
+        from ghgs_capture.verbs import adapt
+
+        return adapt.run(cfg)
+
+
+class Doctor(Photographs):
+    """Whether cameras and masks fit together, what this machine lacks, whether a GPU computes well."""
+
+    example = "ghgs doctor task=cameras images=photographs cameras=cameras.json masks=masks"
+
+    task: Literal["cameras", "machine", "selfcheck"] = "cameras"
+    """cameras: whether photographs, masks and calibration fit together, and what would fit. machine: what
+    there is, and what is missing for which feature. selfcheck: whether ``device`` computes as the CPU does in
+    float64: a table for a bug report."""
+    device: Device = "auto"
+    """Of task=machine and selfcheck."""
+    seed: Seed = 1
+    """Of random weights."""
+    token_budgets: Budgets | None = None
+    """As for ``ghgs train``."""
+
+    def reads_at_once(self) -> bool:
+        return self.task == "cameras"
+
+    def run(self, cfg: DictConfig) -> object:
+        from ghgs_capture.verbs import doctor
+
+        return doctor.run(cfg)

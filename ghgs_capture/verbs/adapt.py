@@ -1,0 +1,147 @@
+"""``ghgs adapt``: weights for the cameras of one rig, from built-in people who stand in it."""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+from ghgs_capture.calibration import calibrate
+from ghgs_capture.export.maps import camera_entry
+from ghgs_capture.formats import read_cameras
+from ghgs_capture.verbs.photographs import capture_folder
+from ghgs_lit.cli.inputs import build_data, build_renderer, choices, load_model, model_of, pick_device, said
+from ghgs_lit.cli.runtime import announce, files_to_write, output_dir
+from ghgs_lit.cli.train import run_job, train
+from ghgs_lit.config import compose, resolve
+from ghgs_lit.errors import require
+from ghgs_lit.evaluation.measure import ModelMethod
+from ghgs_lit.evaluation.report import measure_and_write
+from ghgs_lit.runs.results import read_results
+from ghgs_lit.runs.run import RunDirectory
+from ghgs_lit.weights.exporting import write_inference
+from ghgs_lit.weights.reading import file_of
+
+if TYPE_CHECKING:
+    from ghgs_lit.data.datamodule import PhotographsDataModule
+
+# Training people are as tall in a photograph as the user's subject, give or take this share.
+_SPREAD = 0.1
+# Minutes for which the training people of conf/adapt.yaml suffice; ten passes over them learn them by heart.
+_MINUTES = 3
+
+
+def run(cfg: DictConfig) -> float | str | None:
+    """Run the verb; return the mean PSNR of validation people in the rig. Interrupted: Ctrl-C or SIGTERM."""
+    config = resolve(cfg) | model_of(cfg.checkpoint, cfg)
+    files_to_write(config, ["out"])
+    return run_job(with_rig(config), RunDirectory(output_dir()), adapt)
+
+
+def with_rig(config: dict[str, Any]) -> dict[str, Any]:
+    """Place the people of ``config`` in the rig of ``cameras`` or of the data set ``data``. All its cameras
+    are inputs unless ``views.training_counts`` is given. InputError: a file or the data is bad or missing."""
+    people = config["data"]
+    if people["kind"] != "people_in_rig":
+        people = resolve(compose("adapt"))["data"]
+        entries, fill = _cameras_of_data(config)
+    elif config["images"] is None:
+        entries, fill = _cameras_of_file(config), people["fill"]
+    else:
+        folder = capture_folder(config)
+        photographs = folder.photographs(folder.instants[0])
+        entries = {p.name: camera_entry(p.intrinsics, p.extrinsics, p.mask.shape) for p in photographs}
+        fill = _fill_of([p.mask for p in photographs])
+    count = len(entries)
+    require(2 <= count <= 8, "cameras", "2 to 8 cameras, those of the photographs in images=", count)
+    trained = config["views"]["training_counts"] if "views.training_counts" in said() else [count]
+    views = {**config["views"], "training_counts": trained, "evaluation_count": count}
+    return {
+        **config,
+        "data": {**people, **_more_people(people, config["minutes"]), "cameras": entries, "fill": fill},
+        "views": views,
+        "evaluation": {**config["evaluation"], "views": [count]},
+    }
+
+
+def _more_people(data: dict[str, Any], minutes: float) -> dict[str, dict[str, int]]:
+    """Numbers of people of each kind, as many more to train on as ``minutes`` exceed three."""
+    kinds = [k for k in ("people", "active") if {f"data.{k}", f"data.{k}.train"}.isdisjoint(said())]
+    return {k: {**data[k], "train": round(data[k]["train"] * max(1, minutes / _MINUTES))} for k in kinds}
+
+
+def _cameras_of_data(config: dict[str, Any]) -> tuple[dict[str, dict[str, Any]], list[float]]:
+    """Input cameras of the first validation subject, and the ``fill`` that its masks suggest."""
+    for name in ("images", "cameras"):
+        require(config[name] is None, name, "null beside data=<data set>, which has cameras", config[name])
+    data = build_data(config)
+    data.prepare_data()
+    subjects = list(data.subjects("val"))
+    require(subjects != [], "data", "a subject in the split val", subjects)
+    batch = data.evaluation_batch(subjects[0])
+    cameras, masks = batch.cameras[0], batch.masks[0].numpy()
+    pairs = zip(cameras.intrinsics.numpy(), cameras.extrinsics.numpy(), strict=True)
+    entries = {f"camera_{i}": camera_entry(*pair, masks.shape[1:]) for i, pair in enumerate(pairs)}
+    return entries, _fill_of(masks)
+
+
+def _cameras_of_file(config: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    require(config["cameras"] is not None, "cameras", "cameras=<calibration>", None)
+    file = read_cameras(config["cameras"], config["calibration"]["format"])
+    convention, entries = file.convention.told(config["calibration"]), {}
+    for name, camera in file.cameras.items():
+        require(camera.size is not None, camera.origin, "the photographs' size, or images=<folder>", None)
+        calibration = calibrate(camera, convention, camera.size)
+        entries[name] = camera_entry(calibration.intrinsics, calibration.extrinsics, camera.size)
+    return entries
+
+
+def _fill_of(masks: Sequence[np.ndarray]) -> list[float]:
+    """[least, greatest] share of the photograph's height that training people take."""
+    tallest = max(np.ptp(np.nonzero(mask.any(1))[0]) / len(mask) for mask in masks)
+    return [float(np.clip(tallest * (1 + side * _SPREAD), 0.05, 0.99)) for side in (-1, 1)]
+
+
+def adapt(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float | None:
+    """Render people, train and write the weights; arguments as for :func:`ghgs_lit.cli.train.train`."""
+    begin = time.perf_counter()
+    data = build_data(config)
+    data.prepare_data()
+    rendered = time.perf_counter() - begin
+    before = _measure(config, data, directory / "before")
+    training = {
+        **config,
+        "trainer": {**config["trainer"], "max_time": {"seconds": 60 * config["minutes"]}},
+        "init_from": str(file_of(config["checkpoint"])),
+        "init_strict": True,
+        "allow_random_encoder": False,
+        # Stages are frozen at first only where training starts from random weights.
+        "optimizer": {**config["optimizer"], "freeze_until": {}},
+    }
+    after = train(training, directory, stats)
+    if after is None:
+        return None
+    out = Path(config["out"] or directory / "adapted.ckpt").expanduser()
+    write_inference(directory / "checkpoints" / "last.ckpt", out, "float16")
+    people = config["data"]["people"]["val"] + config["data"]["active"]["val"]
+    print(
+        f"{people} people that were not trained on, half-way between the cameras: {before:.2f} dB before,"
+        f" {after:.2f} dB after ({rendered:.0f} s of rendering, {stats['seconds']:.0f} s of training)",
+        flush=True,
+    )
+    if after <= before:
+        print(f"no better: checkpoint={config['checkpoint']} stays the better one for this rig", flush=True)
+    announce(out)
+    return after
+
+
+def _measure(config: dict[str, Any], data: "PhotographsDataModule", directory: Path) -> float:
+    device = pick_device("cpu" if config["trainer"]["accelerator"] == "cpu" else "auto")
+    inference = {**config, "precision": "inherit"}
+    method = ModelMethod(load_model(inference, device), build_renderer(config, device))
+    path = measure_and_write(
+        {"model": method}, data, config, directory, device, verb="adapt", choices=choices()
+    )
+    return read_results(path)["summary"][0]["psnr"]

@@ -1,0 +1,63 @@
+"""Folder of photographs that a configuration names, and the check of its cameras before a verb runs."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from ghgs_capture.folder import CaptureFolder
+from ghgs_lit.errors import InputError, require
+
+_BEGUN: list[CaptureFolder] = []  #: The folder whose photographs are being decoded, if any
+
+_SOURCES = ("images", "cameras", "masks", "backgrounds", "segment", "calibration", "sequence")
+_CHECKED = 5  #: Number of instants of a sequence whose cameras are checked
+
+
+def sources_of(config: Mapping[str, Any]) -> dict[str, Any]:
+    """``images``, ``cameras`` and the keys beside them. InputError: one of the two is missing."""
+    for name, example in (("images", "images=<folder of photographs>"), ("cameras", "cameras=<calibration>")):
+        require(config[name] is not None, name, example, None)
+    return {name: config[name] for name in _SOURCES if name in config}
+
+
+def capture_folder(config: Mapping[str, Any]) -> CaptureFolder:
+    """The folder that :func:`sources_of` describes. InputError: a key or file is missing or wrong."""
+    folder = CaptureFolder(**sources_of(config))
+    return _BEGUN.pop() if [folder] == _BEGUN else folder
+
+
+def begin_to_read(config: Mapping[str, Any]) -> None:
+    """Start decoding the first instant for the next :func:`capture_folder`; raises what that raises."""
+    _BEGUN[:] = [capture_folder(config)]
+    if config["segment"] is None:
+        _BEGUN[0].begin(_BEGUN[0].instants[0])
+
+
+def check_cameras(folder: CaptureFolder) -> None:
+    """Print how well cameras and masks agree in a few instants. InputError: they contradict each other in all
+    of these, or the only instant cannot be read."""
+    from ghgs_capture.camera_report import diagnose, in_parts
+
+    names, found = folder.instants, {}
+    last = len(names) - 1
+    for place in sorted({round(last * i / (_CHECKED - 1)) for i in range(_CHECKED)}):
+        try:
+            found[names[place]] = diagnose(folder, names[place])
+        except InputError:
+            if not last:
+                raise
+    if not found:
+        print("cameras are not checked: none of the instants looked at can be read", flush=True)
+    for name, diagnosis in found.items():
+        parts = in_parts(diagnosis.ranking[0].views)
+        if len(parts) > 1:
+            print(f"instant {name}: masks of {', '.join(parts)} have two large parts, taken for one subject")
+        if not diagnosis.consistent and last:
+            print(f"instant {name}: cameras and masks do not fit: {'; '.join(diagnosis.lines)}", flush=True)
+    sound = [diagnosis for diagnosis in found.values() if diagnosis.consistent]
+    for diagnosis in (sound or list(found.values()))[:1]:
+        if not diagnosis.consistent:
+            raise InputError(
+                "cameras: expected cameras that fit photographs and masks (ghgs doctor draws them,"
+                f" check_cameras=false goes on anyway); found {'; '.join(diagnosis.lines)}"
+            )
+        print("\n".join(diagnosis.lines), flush=True)

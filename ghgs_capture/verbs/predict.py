@@ -1,0 +1,293 @@
+"""``ghgs predict``: turn photographs into a splat and the other files that ``formats`` lists."""
+
+import contextlib
+import json
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from statistics import geometric_mean
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from omegaconf import DictConfig
+
+from ghgs_capture import export
+from ghgs_capture.backgrounds import Backgrounds
+from ghgs_capture.capture import Capture
+from ghgs_capture.export.reports import REPORT
+from ghgs_capture.export.unseen import GUESSED
+from ghgs_capture.folder import CaptureFolder
+from ghgs_capture.formats.json_and_toml import json_text
+from ghgs_capture.prediction import TimedPrediction, crop_size, in_frame, predict, predict_batch
+from ghgs_capture.rig import INSTANTS, Rig, corrected_rig, turned_from
+from ghgs_capture.temporal import Temporal
+from ghgs_capture.tones import tone_lines, without_tones
+from ghgs_capture.verbs.photographs import capture_folder, check_cameras
+from ghgs_lit.cli import inputs
+from ghgs_lit.cli.runtime import announce, output_dir, write_config
+from ghgs_lit.config import resolve
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import resolved
+from ghgs_lit.model import GHGS
+from ghgs_lit.rendering import Renderer
+from ghgs_lit.types import Batch
+from ghgs_lit.weights.checkpoint import read_config
+
+if TYPE_CHECKING:  # it would import Lightning, which takes seconds
+    from ghgs_lit.data.datamodule import PhotographsDataModule
+
+
+#: PSNR in dB, in the subject's box, below which the render of an input counts as poor.
+LOW_PSNR = 25.0
+#: Degrees that a camera is turned by, from which weights for one rig are said to be for another.
+OTHER_RIG = 5.0
+
+
+@torch.no_grad()
+def run(cfg: DictConfig) -> None:
+    """Run the verb."""
+    directory = output_dir() if cfg.out is None else resolved(cfg.out)
+    is_capture = cfg.images is not None or cfg.cameras is not None
+    config = resolve(cfg if is_capture else inputs.with_trained_data(cfg))
+    config |= inputs.model_of(cfg.checkpoint, cfg)
+    (predict_photographs if is_capture else predict_subject)(config, directory)
+    announce(directory)
+
+
+def subject_batch(
+    data: "PhotographsDataModule", subject: str | int, split: str, targets: dict[str, Any] | None
+) -> Batch:
+    """Photographs of one subject, given by its name or number in the split. ``targets``: a protocol whose
+    targets are read too. InputError: there is no such subject."""
+    names = list(data.subjects(split))
+    if isinstance(subject, int) and 0 <= subject < len(names):
+        subject = names[subject]
+    expected = f"0 to {len(names) - 1} or a name such as {names[0]}"
+    require(subject in names, "subject", expected, subject)
+    return data.evaluation_batch(subject, split, targets=targets)
+
+
+def predict_subject(config: dict[str, Any], directory: Path) -> None:
+    """Predict a subject of a data set."""
+    expected = "0 without images=...: photographs of data sets are on black"
+    require(config["refine_masks"] in (0, "auto"), "refine_masks", expected, config["refine_masks"])
+    options, device = export.output_options(config), inputs.pick_device(config["device"])
+    renderer, model = inputs.build_renderer(config, device), inputs.load_model(config, device)
+    data = inputs.build_data(config)
+    inputs.check_size(data, model)
+    write_config(config, directory)
+    data.prepare_data([config["split"]])
+    batch = subject_batch(data, config["subject"], config["split"], config.get("targets")).to(device)
+    rounds = 0 if config["refine_cameras"] == "auto" else config["refine_cameras"]
+    result = predict_batch(batch, model, renderer, rounds, config["refine"])
+    write_result(directory, result, model, renderer, config, options)
+
+
+def predict_photographs(config: dict[str, Any], directory: Path) -> None:
+    """Predict each instant of a folder of photographs; several instants get a folder each and shared files.
+    InputError: no instant can be read."""
+    folder, options = capture_folder(config), export.output_options(config)
+    several, read = len(folder.instants) > 1, folder.input_files
+    directories = {name: directory / name if several else directory for name in folder.instants}
+    others = ["rig.json"] if config["refine_cameras"] else []
+    together = export.Instants(len(directories), options, others) if several else None
+    for name, path in directories.items():
+        export.require_free(path, export.output_files(options, list(folder.paths[name])), read)
+    if together:
+        export.require_free(directory, together.files, read)
+    if folder.note:
+        print(folder.note, flush=True)
+    if config["check_cameras"]:
+        check_cameras(folder)
+    device = inputs.pick_device(config["device"])
+    renderer, model = inputs.build_renderer(config, device), inputs.load_model(config, device)
+    trained = read_config(config["checkpoint"])
+    size = crop_size(config["size"], trained, model)
+    write_config(config, directory)
+    refining = {name: config[name] for name in ("refine_cameras", "refine_masks", "refine")}
+    refining["tones"] = config["refine_tones"] or {}
+    temporal = Temporal(partial(in_frame, model), model.skip.every, renderer)
+    totals: Counter[str] = Counter()
+    count, begin = 0, time.perf_counter()
+    rig, backgrounds = None, Backgrounds({})
+    if together:
+        shared = shared_by(folder, model, size, refining, renderer)
+        refining["tones"], backgrounds, rig, together.others["rig.json"] = shared
+        refining["refine_cameras"] = 0
+    for given, waited in captures_of(folder):
+        capture = mended_by(backgrounds, given)
+        capture = rig.applied(capture) if rig else capture
+        result = predict(capture, model, size, **refining, renderer=renderer, temporal=temporal)
+        result.seconds["read"] = waited
+        seconds = write_result(directories[capture.name], result, model, renderer, config, options)
+        if together:
+            together.add(directories[capture.name], result.batch, result.prediction, renderer)
+        count += 1
+        if count == 1:
+            for line in (*advice_of(directories[capture.name]), *rig_advice(trained, result.batch)):
+                print(line, flush=True)
+        totals.update(seconds)
+    left_out = len(folder.instants) - count
+    require(count > 0, str(folder.images), "an instant that can be read", f"none of {left_out}")
+    if together:
+        paths = together.write(directory)
+        print("\n".join(str(path) for path in paths if path.parent == directory), flush=True)
+        total = time.perf_counter() - begin
+        stages = ", ".join(f"{stage} {value / count:.3g} s" for stage, value in totals.items())
+        print(f"{count} instants, {count / total:.3g} a second (each: {stages})", flush=True)
+        if model.skip.every > 1:
+            print(f"skip.every={model.skip.every}: {temporal.anew} instants predicted anew", flush=True)
+    if left_out:
+        print(f"left out: {left_out} of {len(folder.instants)} instants", flush=True)
+
+
+def shared_by(
+    folder: CaptureFolder, model: GHGS, size: tuple[int, int], refining: Mapping[str, Any], renderer: Renderer
+) -> tuple[Mapping[str, float], Backgrounds, Rig | None, bytes]:
+    """What the instants of a sequence share, estimated from a few of them: tone curves (those of the first),
+    static backgrounds, corrected cameras, and the content of the cameras' file. None and no content: the
+    cameras stay as they are."""
+    begin, names, captures = time.perf_counter(), folder.instants, []
+    rounds, masks, tones = (refining[key] for key in ("refine_cameras", "refine_masks", "tones"))
+    spread = [round((len(names) - 1) * i / (INSTANTS - 1)) for i in range(INSTANTS)]
+    for name in [names[place] for place in dict.fromkeys(spread)] if rounds or masks or tones else ():
+        with contextlib.suppress(InputError):  # this instant is left out
+            captures.append(Capture(name, folder.photographs(name)))
+    if tones == "auto":
+        plain = {"refine_cameras": 0, "refine_masks": 0, "renderer": renderer}
+        tones = predict(captures[0], model, size, **plain).tones if captures else {}
+    backgrounds = Backgrounds.of(captures if masks else [])
+    mended = [without_tones(backgrounds.applied(capture), tones) for capture in captures]
+    rig = corrected_rig(mended, model, size, rounds, masks, renderer) if captures and rounds else None
+    if rig is None:
+        return tones, backgrounds, None, b""
+    why = f"; {rig.why} (refine_cameras=0 leaves them)" if rig.why else ""
+    took = time.perf_counter() - begin
+    print(f"{moved_line(rig.moved)} in all instants{why}; {took:.3g} s", flush=True)
+    return tones, backgrounds, rig, json_text(rig.calibrations(folder, captures)).encode()
+
+
+def mended_by(backgrounds: Backgrounds, given: Capture) -> Capture:
+    """The capture with masks corrected by static backgrounds; prints which ones changed."""
+    capture = backgrounds.applied(given)
+    both = zip(given.photographs, capture.photographs, strict=True)
+    if mended := [after.name for before, after in both if after is not before]:
+        line = f"instant {given.name}: the background mends masks of {', '.join(mended)}"
+        print(f"{line} (refine_masks=0 leaves them)", flush=True)
+    return capture
+
+
+def advice_of(directory: Path) -> Iterator[str]:
+    """Advice from a prediction's report: gains that were undone, why it may be poor and what may help."""
+    report = json.loads((directory / REPORT).read_text())
+    shares = {name: geometric_mean(each) - 1 for name, each in report.get("gains", {}).items()}
+    said = [
+        f"{n} {abs(x):.0%} {'darker' if x < 0 else 'brighter'}" for n, x in shares.items() if round(100 * x)
+    ]
+    if said:
+        yield f"gains: {', '.join(said)} than the mean of the cameras, undone"
+    yield from tone_lines(report.get("tones", {}), "undone (refine_tones=0 leaves it)")
+    quality = report["psnr_box_of_inputs"].values()
+    if len(quality) < 3:
+        yield f"{len(quality)} photographs leave much unseen: 3 to 5 all around show a person"
+    for edge, names in report["cut"].items():
+        yield f"{', '.join(names)} end at the subject's {edge}: what no photograph shows is missing"
+    guessed = [part for part, share in report["seen_once"].items() if share > GUESSED]
+    if guessed:
+        yield f"at {', '.join(guessed)} of its height at most one photograph shows most of it: a guess"
+    low, high = min(quality), max(quality)
+    if low < LOW_PSNR:
+        left = [key for key in ("refine_cameras", "refine_masks") if key not in report]
+        hint = f" ({' and '.join(f'{key}=4' for key in left)} may mend them)" if left else ""
+        yield (
+            f"photographs come back at {low:.1f} to {high:.1f} dB only, sound ones at 30 or more: mostly"
+            f" cameras or masks are off{hint}; sheet.png shows where"
+        )
+
+
+def rig_advice(trained: Mapping[str, Any], batch: Batch) -> Iterator[str]:
+    """Lines that say where photographs are not of the rig that ``ghgs adapt`` trained weights for, by their
+    configuration ``trained``."""
+    data, count = trained.get("data", {}), len(batch.views[0])
+    if data.get("kind") != "people_in_rig":
+        return
+    hint = "checkpoint=shipped, or ghgs adapt with these cameras, may predict them better"
+    if count not in (counts := trained["views"]["training_counts"]):
+        yield f"the weights were adapted to {' or '.join(map(str, counts))} photographs, not {count}; {hint}"
+    rig = np.array([camera["extrinsics"] for camera in data["cameras"].values()])
+    turned = turned_from(rig, batch.cameras.extrinsics[0].double().cpu().numpy())
+    if turned > OTHER_RIG:
+        yield f"the weights were adapted to another rig: a camera is {turned:.0f} degrees off; {hint}"
+
+
+def moved_line(moved: dict[str, float]) -> str:
+    """Message: pixels by which the subject moved in each photograph, and the cameras if only some moved."""
+    off = [name for name, pixels in moved.items() if pixels]
+    beside = f": {', '.join(off)} beside the others" if 0 < len(off) < len(moved) else ""
+    return f"refine_cameras: moved by {', '.join(f'{p:.2f}' for p in moved.values())} pixels{beside}"
+
+
+def captures_of(folder: CaptureFolder) -> Iterator[tuple[Capture, float]]:
+    """Yield the capture of each instant and the seconds of waiting for it; the next one is decoded meanwhile.
+    Of several instants, those that cannot be read are left out with a message."""
+    names = folder.instants
+    with ThreadPoolExecutor(1) as pool:
+        following = pool.submit(folder.photographs, names[0])
+        for name, after in zip(names, [*names[1:], None], strict=True):
+            start = time.perf_counter()
+            photographs, missing = (), folder.missing[name]
+            try:
+                photographs = following.result()
+            except InputError as error:
+                if len(names) == 1:
+                    raise
+                print(f"instant {name} is left out: {error}", flush=True)
+            waited = time.perf_counter() - start
+            if after is not None:
+                following = pool.submit(folder.photographs, after)
+            if not photographs:
+                continue
+            for camera, why in missing.items() if len(names) > 1 else ():
+                print(f"instant {name} is without {camera}: {why}", flush=True)
+            yield Capture(name, photographs), waited
+
+
+def write_result(
+    directory: Path,
+    result: TimedPrediction,
+    model: GHGS,
+    renderer: Renderer,
+    config: dict[str, Any],
+    options: export.OutputOptions,
+) -> dict[str, float]:
+    """Write the files of a result and print what was done; return the seconds of each stage."""
+    prediction, seconds = result.prediction, dict(result.seconds)
+    facts: dict[str, Any] = {"checkpoint": config["checkpoint"], "seconds": seconds, "why": result.why}
+    why = {name: f"; {doubt} ({name}=0 leaves it)" for name, doubt in result.why.items()}
+    if result.changed:
+        shares = ", ".join(f"{share:.1%}" for share in result.changed)
+        print(f"refine_masks: changed by {shares} of the subject{why.get('refine_masks', '')}", flush=True)
+        facts["refine_masks"] = list(result.changed)
+    if result.moved:
+        facts["refine_cameras"] = dict(zip(result.batch.views[0], result.moved, strict=True))
+        print(moved_line(facts["refine_cameras"]) + why.get("refine_cameras", ""), flush=True)
+    if result.batch.log_gains is not None:
+        gains = result.batch.log_gains[0].exp().tolist()
+        facts["gains"] = dict(zip(result.batch.views[0], gains, strict=True))
+    if result.tones:
+        facts["tones"] = result.tones
+    if model.auto is not None:
+        facts["skip"] = model.auto.report(prediction.decisions)
+        print(facts["skip"], flush=True)
+    if result.refined is not None:
+        facts["refine"] = asdict(result.refined)
+        print(result.refined, flush=True)
+    begin = time.perf_counter()
+    paths = export.write_prediction(directory, result.batch, prediction, renderer, options, facts)
+    print("\n".join(str(path) for path in paths if path.parent == directory), flush=True)
+    return {**seconds, "write": time.perf_counter() - begin}

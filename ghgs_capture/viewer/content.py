@@ -1,0 +1,122 @@
+"""Contents of a page, read from the directory of a prediction or from a PLY."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ghgs_capture.calibration import calibrate
+from ghgs_capture.export.compact import visible_first
+from ghgs_capture.export.subject import AXES
+from ghgs_capture.formats.json_and_toml import read_json
+from ghgs_lit.bounds import VisualHull
+from ghgs_lit.data.images import read_image
+from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.metrics import flip_map, psnr
+from ghgs_lit.metrics.functional import box_of, mean_over
+from ghgs_lit.ply import read_ply
+from ghgs_lit.rendering import render
+from ghgs_lit.types import Batch, Cameras, Gaussians
+from ghgs_lit.visualization.pictures import colorize, to_uint8
+from ghgs_lit.visualization.turntable import center_of, subject_points, up_direction
+
+_HULL_POINTS = 50_000
+
+
+@dataclass(frozen=True)
+class Content:
+    """Gaussians of one subject; ``batch`` has its photographs, masks and cameras where they are known."""
+
+    gaussians: Gaussians
+    up: Float[Tensor, "3"]
+    batch: Batch | None = None
+
+    @property
+    def cameras(self) -> Cameras:
+        """The cameras [V] of the photographs."""
+        return self.batch.cameras[0]
+
+    @cached_property
+    def center(self) -> Float[Tensor, "3"]:
+        """The middle of the subject."""
+        return center_of(subject_points(self.gaussians), self.cameras)
+
+    @cached_property
+    def order(self) -> Tensor:
+        """Indices of the Gaussians, large and opaque ones first."""
+        return visible_first(self.gaussians)
+
+    @cached_property
+    def points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Centres [N, 3] and colours [N, 3] uint8 of the Gaussians, in ``order``."""
+        colors = (self.gaussians.colors[self.order].clamp(0, 1) * 255).round().byte()
+        return self.gaussians.means[self.order].numpy(), colors.numpy()
+
+    @cached_property
+    def hull(self) -> np.ndarray:
+        """Points [n, 3] of the visual hull: where the rays of the subject's pixels enter it."""
+        near = VisualHull(dilation=0.0)(self.batch).near
+        points = unproject_maps(near, self.batch.cameras)[self.batch.masks]
+        return points[:: -(-max(len(points), 1) // _HULL_POINTS)].numpy()
+
+    @torch.no_grad()
+    def comparison(self, view: int) -> dict[str, np.ndarray | float]:
+        """One view and its photograph: pictures [H, W, 3] uint8 ``render``, ``photograph`` and ``FLIP``, and
+        in the subject's box ``psnr`` (dB) and ``flip``, nan where the mask is empty."""
+        camera, target = self.batch.cameras[:, view : view + 1], self.batch.images[:, view]
+        image = render(self.gaussians, camera).image[:, 0].clamp(0, 1)
+        difference, box = flip_map(image, target), box_of(self.batch.masks[:, view])
+        return {
+            "render": to_uint8(image[0]),
+            "photograph": to_uint8(target[0]),
+            "FLIP": colorize(difference[0], 0, 1, "magma"),
+            "psnr": float(psnr(image, target, box)),
+            "flip": float(mean_over(difference, box)),
+        }
+
+
+def read_content(path: str | Path, up: str | None) -> Content:
+    """Read what ``ghgs predict`` wrote into a directory (its formats ``ply`` and ``inputs``), or a PLY.
+    ``up``: the axis ``y``, ``-y`` or ``z`` that points up; None: the up of the cameras, and ``y`` for a PLY.
+    InputError: ``path`` is neither, or a file of it is missing or wrong."""
+    path = Path(path)
+    choice("up", up, (None, *AXES))
+    if path.is_file():
+        return Content(read_ply(path), torch.tensor(AXES[up or "y"]))
+    require(path.is_dir(), f"path={path}", "a directory of ghgs predict or a PLY", "neither")
+    for name, wanted in (("gaussians.ply", "ply"), ("cameras.json", "inputs")):
+        if not (path / name).exists():
+            raise InputError(f"{path / name}: expected a file of ghgs predict formats=[{wanted}]; found none")
+    batch = _read_inputs(path)
+    direction = up_direction(batch.cameras[0]) if up is None else torch.tensor(AXES[up])
+    return Content(read_ply(path / "gaussians.ply"), direction, batch)
+
+
+def _read_inputs(directory: Path) -> Batch:
+    stored = read_json(directory / "cameras.json")
+    pictures, cameras = [], []
+    for name, camera in stored.cameras.items():
+        file = directory / "inputs" / f"{name}.png"
+        inside = file.resolve().parent == (directory / "inputs").resolve()
+        require(inside, str(file), f"the photograph of camera {name} in this folder", "a file outside")
+        require(file.exists(), str(file), f"the photograph of camera {name}", "none")
+        pictures.append(np.asarray(read_image(file).convert("RGBA")))
+        cameras.append(calibrate(camera, stored.convention, pictures[-1].shape[:2]))
+    shapes = {picture.shape for picture in pictures}
+    require(len(shapes) == 1, str(directory / "inputs"), "photographs of one size", sorted(shapes))
+    values = torch.from_numpy(np.stack(pictures)).movedim(-1, 1).float()[None] / 255
+    matrices = ([getattr(c, name) for c in cameras] for name in ("intrinsics", "extrinsics"))
+    stacked = [torch.from_numpy(np.stack(each)).float()[None] for each in matrices]
+    colors, alpha = values[:, :, :3], values[:, :, 3:]
+    return Batch(
+        images=torch.where(alpha > 0, colors * alpha, colors),
+        masks=alpha[:, :, 0] > 0.5,
+        alpha=alpha[:, :, 0],
+        cameras=Cameras(*stacked, *pictures[0].shape[:2]),
+        views=(tuple(stored.cameras),),
+    )

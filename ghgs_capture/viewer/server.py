@@ -1,0 +1,238 @@
+"""The page: a viser server with the Gaussians, cameras, points and hull, and controls for them."""
+
+import contextlib
+import logging
+import math
+import re
+import socket
+import threading
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ghgs_capture.export.subject import smoothed
+from ghgs_capture.viewer.content import Content
+from ghgs_lit.errors import InputError, installed
+from ghgs_lit.geometry.rotations import quaternion_to_matrix
+from ghgs_lit.visualization.pictures import to_uint8
+from ghgs_lit.visualization.turntable import pixel_size
+
+PICTURES = ("render", "photograph", "FLIP")
+
+
+def _require_address(host: str) -> None:
+    """Refuse an address that is not this machine's: viser would wait for it silently."""
+    try:
+        family, *_ = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
+        socket.create_server((host, 0), family=family).close()
+    except (OSError, UnicodeError) as error:
+        raise InputError(f"host: expected an address of this machine; found {host!r} ({error})") from error
+
+
+def _refuse_other_addresses(connection: Any, request: Any, response: Any) -> Any:
+    """Answer 403 to a page whose origin is not the address that it connects to; None: accepted."""
+    origin = request.headers.get("Origin")
+    if response.status_code != 101 or origin is None or origin.split("://")[-1] == request.headers["Host"]:
+        return None
+    return connection.respond(403, "expected a page of this address\n")
+
+
+@contextlib.contextmanager
+def _own_pages_only(host: str) -> Iterator[None]:
+    """Make servers that start in this context refuse pages of other sites; viser accepts any origin."""
+    from websockets.asyncio import server
+
+    serve, names = server.serve, "|".join(map(re.escape, (host, "localhost", "127.0.0.1", "[::1]")))
+    # A server open to the network has many names; the Host header has the one in use.
+    names = ".+" if host in ("0.0.0.0", "::") else names
+    origins = [None, re.compile(rf"https?://({names})(:\d+)?")]
+    server.serve = partial(serve, origins=origins, process_response=_refuse_other_addresses)
+    try:
+        yield
+    finally:
+        server.serve = serve
+
+
+class Viewer:
+    """A running page. InputError: viser is not installed, or this machine has no such address.
+
+    Args:
+        host: the address to listen at; ``127.0.0.1`` is seen by this machine alone.
+        port: the first one to try.
+        layers: also show cameras, photographs, point cloud and hull, of the first content alone."""
+
+    def __init__(self, content: Content, host: str = "127.0.0.1", port: int = 8080, layers: bool = True):
+        viser = installed("viser", "viewer", "ghgs view")
+        _require_address(host)
+        self.content = content
+        self._lock = threading.Lock()  # controls are answered by several threads
+        logging.getLogger("websockets").setLevel(logging.WARNING)  # else a line for each visitor
+        with _own_pages_only(host):
+            self.server = viser.ViserServer(host, port, label="ghgs", verbose=False)
+        self.server.scene.set_up_direction(content.up.numpy())
+        self._prepare()
+        with self.server.gui.add_folder("Gaussians"):
+            self._add_splat_controls()
+        if layers:
+            self._add_points()
+        if content.batch is not None:
+            self._place_visitors()
+        if content.batch is not None and layers:
+            self._add_cameras()
+            with self.server.gui.add_folder("Photographs"):
+                self._add_comparison()
+        self.show_splats()
+
+    @property
+    def address(self) -> str:
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+
+    def stop(self) -> None:
+        self.server.stop()
+
+    def show(self, content: Content) -> None:
+        """Show other Gaussians; visitors stay where they are."""
+        with self._lock:
+            self.content = content
+            self._prepare()
+        self.show_splats()
+
+    def _prepare(self) -> None:
+        g, order = self.content.gaussians, self.content.order
+        if self.content.batch is not None:
+            # Else a screen larger than the photographs shows gaps.
+            g = smoothed(g, pixel_size(self.content.cameras, self.content.center))
+        root = quaternion_to_matrix(g.quaternions[order]) * g.scales[order][:, None, :]
+        self._covariances = (root @ root.mT).numpy()
+        self._colors = g.colors[order].clamp(0, 1).numpy()
+        self._opacities = g.opacities[order][:, None].numpy()
+
+    def _add_splat_controls(self) -> None:
+        gui, count = self.server.gui, len(self.content.gaussians)
+        self.visible = gui.add_checkbox("show", True)
+        self.opacity = gui.add_slider("opacity", 0.0, 2.0, 0.05, 1.0, hint="factor of all opacities")
+        self.count = gui.add_slider("count", min(1, count), max(1, count), 1, max(1, count))
+        for control in (self.visible, self.opacity, self.count):
+            control.on_update(lambda _: self.show_splats())
+
+    def show_splats(self) -> None:
+        """Show the Gaussians with the count and the opacity of the controls."""
+        with self._lock:
+            # The slider's end means all, also where the first content had fewer.
+            n = None if self.count.value == self.count.max else self.count.value
+            self.splats = self.server.scene.add_gaussian_splats(
+                "/gaussians",
+                self.content.points[0][:n],
+                self._covariances[:n],
+                self._colors[:n],
+                (self._opacities[:n] * self.opacity.value).clip(0, 1),
+                visible=self.visible.value,
+            )
+
+    def _add_points(self) -> None:
+        means, colors = self.content.points
+        extent = np.ptp(means, axis=0).max() if len(means) else 1.0
+        clouds = {"points": (means, colors)}
+        if self.content.batch is not None:
+            clouds["hull"] = (self.content.hull, np.array([90, 160, 255], np.uint8))
+        with self.server.gui.add_folder("Layers"):
+            for name, cloud in clouds.items():
+                node = self.server.scene.add_point_cloud(
+                    f"/{name}", *cloud, point_size=float(extent) / 400, precision="float32", visible=False
+                )
+                self._switch(name, node)
+
+    def _switch(self, name: str, node: Any) -> None:
+        box = self.server.gui.add_checkbox(name, node.visible)
+
+        @box.on_update
+        def _(_) -> None:
+            node.visible = box.value
+
+    def _show_frustums(self) -> None:
+        """Show the cameras; that of the visitors hides its photograph unless ``picture`` chooses it."""
+        for view, frustum in enumerate(self._frustums):
+            is_clear = view != self._at or self._shown == "photograph"
+            frustum.visible = self.cameras.value and is_clear
+
+    def _add_cameras(self) -> None:
+        from viser.transforms import SO3
+
+        cameras, batch = self.content.cameras, self.content.batch
+        self._poses, self._frustums = [], []
+        target = self.content.center.numpy()
+        size = np.linalg.norm(cameras.centers.numpy() - target, axis=-1).mean()
+        for view, name in enumerate(batch.views[0]):
+            k, e = cameras.intrinsics[view].numpy(), cameras.extrinsics[view].numpy().astype(np.float64)
+            pose = {"wxyz": SO3.from_matrix(e[:3, :3].T).wxyz, "position": -e[:3, :3].T @ e[:3, 3]}
+            fov = 2 * math.atan(cameras.height / 2 / k[1, 1])
+            alpha = batch.masks[0, view].numpy() * np.uint8(255)
+            node = self.server.scene.add_camera_frustum(
+                f"/cameras/{name}",
+                fov,
+                cameras.width / cameras.height,
+                scale=size / 12,
+                thickness=size / 400,
+                image=np.dstack([to_uint8(batch.images[0, view]), alpha]),
+                **pose,
+            )
+            node.on_click(lambda _, view=view: self.go_to(view))
+            self._frustums.append(node)
+            self._poses.append((pose, fov))
+        self.cameras = self.server.gui.add_checkbox("cameras", True)
+        self.cameras.on_update(lambda _: self._show_frustums())
+        self._at: int | None = None  # the camera that visitors were put at
+
+    def _place_visitors(self) -> None:
+        """Start visitors behind and beside the first camera: its photograph would hide the subject."""
+        cameras, target = self.content.cameras, self.content.center.numpy()
+        up = self.content.up.numpy().astype(np.float64)
+        away = cameras.centers[0].numpy() - target
+        start = self.server.initial_camera
+        start.position = target + 1.5 * away + 0.6 * np.cross(up, away)
+        start.look_at, start.up = target, up
+        start.fov = 2 * math.atan(cameras.height / 2 / float(cameras.intrinsics[0, 1, 1]))
+
+    def go_to(self, view: int) -> None:
+        """Put every visitor at the camera of a photograph."""
+        pose, fov = self._poses[view]
+        for client in self.server.get_clients().values():
+            with client.atomic():
+                client.camera.wxyz, client.camera.position = pose["wxyz"], pose["position"]
+                client.camera.fov = fov
+        self.view.value = self.content.batch.views[0][view]
+        self._at = view
+        self._show_frustums()
+
+    def _add_comparison(self) -> None:
+        gui, views = self.server.gui, self.content.batch.views[0]
+        self.view = gui.add_dropdown("view", views)
+        self.picture = gui.add_button_group("picture", PICTURES, hint="one after the other at one place")
+        self.text = gui.add_markdown("")
+        self._shown = PICTURES[0]
+        self._comparison = self.content.comparison(0)
+        self.image = gui.add_image(self._comparison[self._shown])
+        go = gui.add_button("go to this camera")
+        go.on_click(lambda _: self.go_to(views.index(self.view.value)))
+
+        def show() -> None:
+            self._show_frustums()
+            self.image.image = self._comparison[self._shown]
+            quality = "FLIP {flip:.4f}, PSNR {psnr:.2f} dB".format(**self._comparison)
+            self.text.content = f"{self._shown} of {self.view.value}; in the subject's box: {quality}"
+
+        @self.view.on_update
+        def _(_) -> None:
+            with self._lock:
+                self._comparison = self.content.comparison(views.index(self.view.value))
+                show()
+
+        @self.picture.on_click
+        def _(_) -> None:
+            with self._lock:
+                self._shown = self.picture.value
+                show()
+
+        show()

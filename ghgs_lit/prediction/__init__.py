@@ -1,1 +1,0 @@
-"""From photographs to files and pages: captures, their refinement, and the files of predictions."""

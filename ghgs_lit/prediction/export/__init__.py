@@ -1,8 +1,0 @@
-"""Predictions as files for other programs: one table of formats, one function that writes all."""
-
-from ghgs_lit.prediction.export.instants import Instants
-from ghgs_lit.prediction.export.prediction import output_files, output_options, write_prediction
-from ghgs_lit.prediction.export.reports import require_free
-from ghgs_lit.prediction.export.subject import OutputOptions
-
-__all__ = ["Instants", "OutputOptions", "output_files", "output_options", "require_free", "write_prediction"]

@@ -1,6 +1,0 @@
-"""Refinement of a prediction by seconds of optimisation through the rasterizer."""
-
-from ghgs_lit.prediction.refinement.cameras import CameraRefinement, pixels_moved
-from ghgs_lit.prediction.refinement.refinement import Change, Descent, Refinement, Report
-
-__all__ = ["CameraRefinement", "Change", "Descent", "Refinement", "Report", "pixels_moved"]

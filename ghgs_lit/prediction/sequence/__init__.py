@@ -1,1 +1,0 @@
-"""Sequences: instants whose prediction starts from that of the last."""

@@ -1,0 +1,210 @@
+"""Correction of a capture's cameras until its photographs agree.
+
+First, cameras move and zoom until silhouettes are consistent
+(:mod:`ghgs_lit.refinement.coherence`); they stay where a prediction does not confirm the gain, as
+with wrong masks. Then the Gaussians of the other views are rendered with each view's camera, which moves
+until the render fits the photograph (bundle adjustment as in BARF, Lin et al., ICCV 2021). Photographs do not
+tell where the whole rig is: only relative motions of cameras are estimated
+(:mod:`ghgs_lit.geometry.rotations`)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ghgs_lit.errors import require
+from ghgs_lit.geometry.frame import HEIGHT, Frame
+from ghgs_lit.geometry.masks import coverage, on_black
+from ghgs_lit.geometry.projection import at_least_float32, project
+from ghgs_lit.geometry.rotations import after_motions, rigid, without_common
+from ghgs_lit.kernels.precision import exact
+from ghgs_lit.refinement.coherence import coherent_cameras
+from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
+
+Renderer = Callable[..., Rendering]
+#: Numbers of the elements of a batch, and a choice of their cameras.
+Numbers, Which = Float[Tensor, " B"], Bool[Tensor, "B V"]
+
+#: Steps of the optimiser in a round, and their size at first: radians, and half heights of the subject.
+_STEPS, _RATE = 15, 0.006
+_OUTLINE = 0.5  #: Weight of silhouettes; that of colours is 1
+_SAME = 0.05  #: Largest difference in metres of depths of one surface
+_STAY = 4.0  #: Weight of the squared motion
+#: Relative decrease of the loss for which the cameras of the first and of a later round are kept: with exact
+#: cameras it is up to 0.01 (0.02 from above), with cameras off by a pixel 0.02 to 0.2. ``_FIRST`` also holds
+#: for cameras that silhouettes propose.
+_FIRST, _LATER = 0.02, 0.01
+#: With ``_TELLING`` cameras or more (fewer silhouettes tell less), a silhouette distance below ``_EXACT``
+#: pixels means that they are off by half a pixel at most: the first round must gain ``_DOUBTED``.
+_TELLING, _EXACT, _DOUBTED = 4, 1.5e-4, 0.05
+
+
+@dataclass(frozen=True)
+class _Views:
+    """The ``n`` views of a batch with the Gaussians that the element's other views predict; ``owner``: the
+    view that each of these Gaussians is drawn in."""
+
+    gaussians: Gaussians
+    owner: Int[Tensor, " N"]
+    cameras: Cameras
+    photographs: Float[Tensor, "n 3 H W"]
+    silhouettes: Float[Tensor, "n H W"]
+    depths: Float[Tensor, "n H W"]
+
+
+class CameraRefinement:
+    """``refinement(batch)``: the batch with cameras that agree better.
+
+    Args:
+        rounds: most rounds of prediction and correction, 1 or more. An element keeps its cameras from the
+            first round on that does not make its photographs agree better.
+        predict: gives the prediction of a batch, as a model does.
+        renderer: draws Gaussians, with gradients.
+        shared: the elements of a batch are instants of one rig, whose cameras move alike in all of them."""
+
+    def __init__(
+        self, rounds: int, predict: Callable[[Batch], Prediction], renderer: Renderer, shared: bool = False
+    ):
+        require(rounds >= 1, "refine_cameras", "1 or more rounds", rounds)
+        self.rounds, self.predict, self.renderer, self.shared = rounds, predict, renderer, shared
+
+    def __call__(self, batch: Batch) -> Batch:
+        """The batch with corrected cameras; targets stay as they are. ``batch``: two views or more."""
+        frame = Frame.of(batch).shared if self.shared else Frame.of(batch)
+        inside, moved, free, first = self._coherent(frame.enter(batch))
+        for _ in range(self.rounds):
+            with torch.no_grad():
+                prediction = self.predict(inside)
+            worth = torch.where(moved, _LATER, first)
+            cameras, is_better = self._corrected(prediction, inside, free, worth)
+            if not bool(is_better.any()):
+                break
+            inside, moved = replace(inside, cameras=cameras), moved | is_better
+        left = frame.leave_cameras(inside.cameras, batch.cameras)  # to the frame and back is not exact
+        return replace(batch, cameras=_chosen(moved[:, None] & free, left, batch.cameras))
+
+    @torch.no_grad()
+    def _coherent(self, batch: Batch) -> tuple[Batch, Bool[Tensor, " B"], Which, Numbers]:
+        """The batch with cameras of consistent silhouettes; which elements these improve; which cameras may
+        be wrong (all, unless silhouettes and prediction agree on a few); and what the first round must gain.
+        """
+        cameras, free, distance = coherent_cameras(batch, self.shared)
+        are_right = (distance < _EXACT) & (batch.masks.shape[1] >= _TELLING)
+        first = torch.where(are_right, _DOUBTED, _FIRST)
+        is_better = self._confirmed(batch, cameras)
+        shared = ~is_better & ~free.all(1)
+        if bool(shared.any()):  # no camera that is wrong by itself, as it seemed
+            together, _, _ = coherent_cameras(batch, self.shared, alone=False)
+            cameras = _chosen(shared[:, None], together, cameras)
+            free = free | shared[:, None]
+            is_better = torch.where(shared, self._confirmed(batch, cameras), is_better)
+        free = free | ~is_better[:, None]
+        cameras = _chosen(is_better[:, None] & free, cameras, batch.cameras)
+        return replace(batch, cameras=cameras), is_better, free, first
+
+    def _confirmed(self, batch: Batch, cameras: Cameras) -> Bool[Tensor, " B"]:
+        """Which elements' predictions agree better with other cameras; false where these are the same."""
+        moved = (cameras.extrinsics != batch.cameras.extrinsics).flatten(1).any(1)
+        if not bool(moved.any()):
+            return moved
+        before, after = map(self._disagreement, (batch, replace(batch, cameras=cameras)))
+        return moved & (after < (1 - _FIRST) * before)
+
+    def _disagreement(self, batch: Batch) -> Numbers:
+        views = _views(self.predict(batch), batch)
+        return self._loss(self.renderer(views.gaussians, views.cameras, background=0.0), views, batch)
+
+    def _loss(self, drawn: Rendering, views: _Views, batch: Batch) -> Numbers:
+        """L1 of colours and silhouettes per pixel of an element's subject, or with ``shared`` its mean."""
+        image, alpha = drawn.image[:, 0], drawn.alpha[:, 0, 0]
+        # Where the other views lack the surface of the photograph, what lies behind it is drawn.
+        same = (drawn.depth.detach()[:, 0, 0] - views.depths).abs() < _SAME
+        errors = same * (image - views.photographs).abs().mean(1)
+        errors = errors + _OUTLINE * (alpha - views.silhouettes).abs()
+        shape = batch.masks.shape[:2]
+        subject, errors = (each.reshape(*shape, -1).sum((1, 2)) for each in (views.silhouettes, errors))
+        loss = errors / torch.where(subject > 0, subject, 1)
+        return loss.mean().expand(len(loss)) if self.shared else loss
+
+    def _corrected(
+        self, prediction: Prediction, batch: Batch, free: Which, worth: Numbers
+    ) -> tuple[Cameras, Bool[Tensor, " B"]]:
+        """Cameras after one round, and which elements gain ``worth``; the cameras of the others stay."""
+        cameras, losses = batch.cameras, []
+        views = _views(prediction, batch)
+        axes = cameras.extrinsics[..., 2, :3]
+        rigs = 1 if self.shared else len(axes)
+        raw = torch.zeros(rigs, axes.shape[1], 6, dtype=axes.dtype, device=axes.device, requires_grad=True)
+        # Without an epsilon: gradients shrink with the size of the photographs.
+        optimizer = torch.optim.Adam([raw], lr=_RATE, betas=(0.8, 0.95), eps=1e-15)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _STEPS, 0.05 * _RATE)
+        for _ in range(_STEPS):
+            with exact(axes.device.type), torch.enable_grad():
+                motion = _of_free(raw.expand(len(axes), -1, -1), axes, free)
+                drawn = self.renderer(_moved(views, motion), views.cameras, background=0.0)
+                losses.append(self._loss(drawn, views, batch))
+                optimizer.zero_grad()
+                (losses[-1].sum() + _STAY * motion.square().sum()).backward()
+                optimizer.step()
+            schedule.step()
+        is_better = losses[-1].detach() < (1 - worth) * losses[0].detach()
+        with exact(axes.device.type):
+            motion = _of_free(raw.detach().expand(len(axes), -1, -1), axes, free)
+            extrinsics = after_motions(cameras.extrinsics, motion, axes.new_zeros(3), HEIGHT / 2)
+        corrected = replace(cameras, extrinsics=extrinsics)
+        return _chosen(is_better[:, None] & free, corrected, cameras), is_better
+
+
+def _of_free(motions: Float[Tensor, "B V 6"], axes: Float[Tensor, "B V 3"], free: Which) -> Tensor:
+    """Motions of the free cameras: without their common motion if all are free; 0 for fixed cameras."""
+    all_are = free.all(1)[:, None, None]
+    return torch.where(all_are, without_common(motions, axes), motions * free[..., None])
+
+
+def _chosen(which: Which, first: Cameras, second: Cameras) -> Cameras:
+    which = which[..., None, None]
+    lenses = torch.where(which, first.intrinsics, second.intrinsics)
+    poses = torch.where(which, first.extrinsics, second.extrinsics)
+    return replace(first, intrinsics=lenses, extrinsics=poses)
+
+
+def pixels_moved(before: Batch, after: Batch) -> list[list[float]]:
+    """Root mean square motion in pixels of a box around the subject in each photograph [B][V]."""
+    frame = Frame.of(before)
+    corners = HEIGHT / 2 * torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], device=before.masks.device)] * 3)
+    seen = []
+    for batch in (before, after):
+        cameras = frame.enter(batch).cameras
+        shape = (*cameras.extrinsics.shape[:2], len(corners))
+        lenses, poses = (
+            matrix[:, :, None].expand(*shape, -1, -1) for matrix in (cameras.intrinsics, cameras.extrinsics)
+        )
+        seen.append(project(corners.to(lenses).expand(*shape, 3), lenses, poses)[0])
+    return (seen[0] - seen[1]).square().sum(-1).mean(-1).sqrt().tolist()
+
+
+def _views(prediction: Prediction, batch: Batch) -> _Views:
+    """Each view as an element of its own, with the Gaussians of its element's other views."""
+    b, v = batch.masks.shape[:2]
+    gaussians = prediction.gaussians.detach()
+    element = gaussians.image // v
+    kept = [((element == i // v) & (gaussians.image != i)).nonzero()[:, 0] for i in range(b * v)]
+    counts = tuple(map(len, kept))
+    others = gaussians.select(torch.cat(kept), counts)
+    if others.metre is not None:
+        others = replace(others, metre=others.metre.repeat_interleave(v))
+    owner = torch.repeat_interleave(torch.tensor(counts, device=element.device))
+    cameras = batch.cameras
+    lenses, poses = (matrix.flatten(0, 1)[:, None] for matrix in (cameras.intrinsics, cameras.extrinsics))
+    apart = Cameras(lenses, poses, cameras.height, cameras.width)
+    maps = (at_least_float32(on_black(batch)), coverage(batch), prediction.depth.detach())
+    return _Views(others, owner, apart, *(each.flatten(0, 1) for each in maps))
+
+
+def _moved(views: _Views, motion: Float[Tensor, "B V 6"]) -> Gaussians:
+    """The Gaussians of each view, moved in place of its camera; their orientations stay."""
+    rotations, shifts = (value.flatten(0, 1)[views.owner] for value in rigid(motion, HEIGHT / 2))
+    means = (rotations @ views.gaussians.means[..., None])[..., 0] + shifts
+    return replace(views.gaussians, means=means)

@@ -1,0 +1,322 @@
+"""Correction of a capture's cameras by motions and zooms that make its silhouettes consistent.
+
+With right cameras, the ray of every silhouette pixel has a point inside all other silhouettes (silhouette
+coherence: Boyer, ACCV 2006; Hernandez, Schmitt and Cipolla, PAMI 2007). With wrong ones, rays near the
+outlines have none: Gauss-Newton steps minimise how far outside the other silhouettes their best points lie.
+This needs no model and no surface that two photographs share."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import reduce
+from itertools import combinations
+from operator import add
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ghgs_lit.geometry.frame import HEIGHT, subject_center
+from ghgs_lit.geometry.masks import coverage
+from ghgs_lit.geometry.projection import project, unproject, world_to_camera
+from ghgs_lit.geometry.rotations import after_motions, without_common
+from ghgs_lit.kernels.precision import exact
+from ghgs_lit.refinement.outlines import QUICK, TO, Outlines
+from ghgs_lit.types import Batch, Cameras
+
+Lens, Pose = Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"]
+#: Those of ``K`` instants, whose crops differ in intrinsics.
+Lenses, Middles = Float[Tensor, "K V 3 3"], Float[Tensor, "K 3"]
+#: One for each camera, and one for each ray.
+Which, Numbers, Points = Bool[Tensor, " V"], Int[Tensor, " R"], Float[Tensor, "R 3"]
+
+_DEPTHS = 48  #: Depths tried along a ray
+#: Mean distance of rays in pixels below which silhouettes are consistent.
+_COHERENT = 5e-4
+#: Weight of the squared steps, in pixels, relative to the mean squared distance; and the factor of it for
+#: zooms: lenses are known better than poses.
+_STAY, _KNOWN = 1e-3, 5.0
+#: Cameras are wrong by themselves if the others, as given, miss one another by less than ``_CLEARLY`` times
+#: what they do without any other ones (opposite cameras are nearly exchangeable), counted from ``_EXACT``
+#: pixels, which exact cameras reach. They move alone if that leaves less than ``_COHERENT``, ``_AS_WELL``
+#: times the distance that moving all leaves, or ``_REST`` of the given distance, as with rough masks.
+_CLEARLY, _EXACT, _AS_WELL, _REST = 0.25, 5e-5, 1.5, 0.02
+_BUMPED = 1e-3  #: Given distance from which it is tried: that of one camera off by a pixel
+
+
+@dataclass(frozen=True)
+class _Phase:
+    """Gauss-Newton steps with one kind of distance, for rays from pixels up to ``to`` inside their outline.
+
+    First, rays must meet the other silhouettes; the weight of those that miss them by r > ``scale`` pixels
+    falls with 1 / r. Then (``is_exact``) they must lie as deep in the others as in their own, as outlines
+    from the front and from behind do; beyond ``scale`` the weight vanishes (Geman and McClure)."""
+
+    steps: int
+    to: float
+    scale: float
+    is_exact: bool
+
+    def distances(self, depth: Tensor, depth_at_home: Tensor) -> Tensor:
+        return depth - depth_at_home if self.is_exact else depth.clamp(max=0)
+
+    def weights(self, r: Tensor) -> Tensor:
+        if self.is_exact:
+            return 1 / (1 + (r / self.scale) ** 2) ** 2
+        return (r < 0) * self.scale / r.abs().clamp(min=self.scale)
+
+
+_MEET, _LIE = _Phase(12, TO, 1.0, is_exact=False), _Phase(6, 3.0, 0.3, is_exact=True)
+
+
+@dataclass(frozen=True)
+class _Alignment:
+    """Cameras after steps of the ``free`` ones, and the mean distance of rays before each step."""
+
+    lens: Lenses
+    pose: Pose
+    free: Which
+    distances: tuple[float, ...] = ()
+
+    def after(self, phase: _Phase, silhouettes: "_Silhouettes") -> "_Alignment":
+        found = self
+        for _ in range(phase.steps):
+            equations = silhouettes.equations(found.lens, found.pose, phase)
+            steps, are_all = equations.solved(self.free), bool(self.free.all())
+            moved = _stepped(steps, found.lens, found.pose, are_all)
+            found = _Alignment(*moved, self.free, (*found.distances, equations.distance))
+        return found
+
+
+@torch.no_grad()
+def contradiction(batch: Batch) -> tuple[Float[Tensor, " B"], Float[Tensor, "B V"]]:
+    """Mean distances in pixels by which rays near outlines miss other silhouettes: of all views, and of the
+    others without each (0 for three views or fewer: two nearly always agree); a quick check.
+
+    With exact cameras that of all is up to 0.0025, with ones off by 1.5 pixels 0.007 to 0.09; where one is
+    off, the others' is that of exact cameras. ``batch``: as for :func:`coherent_cameras`."""
+    found, without = [], []
+    for mattes, lens, pose in zip(*_on_cpu(batch), strict=True):
+        silhouettes = _Silhouettes((Outlines.of(mattes, QUICK),), pose.new_zeros(1, 3))
+        found.append(silhouettes.distance(lens[None], pose))
+        views = range(len(pose))
+        each = [silhouettes.distance(lens[None], pose, (v,)) if len(pose) > 3 else 0.0 for v in views]
+        without.append(each)
+    return torch.tensor(found), torch.tensor(without)
+
+
+def culprit(without: Sequence[float]) -> int | None:
+    """Which of several views, or sets of them, is wrong by itself, where it is clear: the others agree
+    without it alone. ``without``: mean distances of the others, in pixels."""
+    first, second = sorted(range(len(without)), key=without.__getitem__)[:2]
+    is_clear = without[first] + _EXACT < _CLEARLY * (without[second] + _EXACT)
+    return first if is_clear else None
+
+
+def _on_cpu(batch: Batch) -> list[Tensor]:
+    parts = (coverage(batch), batch.cameras.intrinsics, batch.cameras.extrinsics)
+    return [part.float().cpu() for part in parts]
+
+
+@torch.no_grad()
+def coherent_cameras(
+    batch: Batch, shared: bool = False, alone: bool = True
+) -> tuple[Cameras, Bool[Tensor, "B V"], Float[Tensor, " B"]]:
+    """Cameras with consistent silhouettes; those of an element whose silhouettes are consistent stay.
+
+    Where moving a minority of the cameras is as good as moving all, the others stay. Silhouettes do not tell
+    this from all cameras moving by less, relative to one another.
+
+    Also returned is which cameras were free to move, and by how many pixels rays near outlines miss other
+    silhouettes with the given cameras, on average: 0 to 0.00014 with exact cameras and mattes; with four
+    cameras 0.0001 to 0.0004 if off by up to half a pixel, 0.002 by one, 0.04 to 0.08 by three; infinite where
+    no silhouette has an outline. ``batch``: in the subject's frame (:class:`ghgs_lit.geometry.frame.Frame`).
+    ``shared``: the elements are instants of one rig, in one frame; its cameras move and zoom alike in all.
+    ``alone``: a minority of the cameras may move by itself."""
+    cameras = batch.cameras
+    # On a CPU: many short steps, and distances to outlines are computed there anyway.
+    mattes, lens, pose = _on_cpu(batch)
+    middle = subject_center(batch.masks, cameras).float().cpu() if shared else pose.new_zeros(len(pose), 3)
+    each = [slice(None)] if shared else [slice(b, b + 1) for b in range(len(pose))]
+    with exact("cpu"):
+        rigs = [_coherent(mattes[part], lens[part], pose[part][0], middle[part], alone) for part in each]
+    lenses, poses, free, distances = zip(*rigs, strict=True)
+    count, device = len(pose) // len(rigs), batch.masks.device
+    poses, free = (torch.stack(found).repeat_interleave(count, 0) for found in (poses, free))
+    lenses, poses = torch.cat(lenses).to(cameras.intrinsics), poses.to(cameras.extrinsics)
+    moved = replace(cameras, intrinsics=lenses, extrinsics=poses)
+    return moved, free.to(device), torch.tensor(distances, device=device).repeat_interleave(count)
+
+
+def _coherent(
+    mattes: Float[Tensor, "K V H W"], lens: Lenses, pose: Pose, middle: Middles, alone: bool
+) -> tuple[Lenses, Pose, Which, float]:
+    """Intrinsics and extrinsics of one rig, which were free, and the mean distance with the given ones."""
+    silhouettes = _Silhouettes(tuple(Outlines.of(each) for each in mattes), middle)
+    every = torch.ones(len(pose), dtype=torch.bool)
+    if not any(len(outlines.depth) for outlines in silhouettes.outlines):
+        return lens, pose, every, math.inf
+    given = silhouettes.equations(lens, pose, _MEET)
+    if given.distance < _COHERENT:
+        return lens, pose, every, given.distance
+    start = _Alignment(lens, pose, every)
+    found = start.after(_MEET, silhouettes)
+    few = _minority(silhouettes, lens, pose) if alone and given.distance > _BUMPED else None
+    if few is not None:
+        apart = _Alignment(lens, pose, few).after(_MEET, silhouettes)
+        # Two of three views nearly always agree.
+        rest = 0.1 * _COHERENT if len(pose) == 3 else max(_COHERENT, _REST * given.distance)
+        enough = max(_AS_WELL * found.distances[-1], rest)
+        found = apart if apart.distances[-1] < enough else found
+    found = found.after(_LIE, silhouettes)
+    return found.lens, found.pose, found.free, given.distance
+
+
+def _minority(silhouettes: "_Silhouettes", lens: Lenses, pose: Pose) -> Which | None:
+    """The camera, or the fewest of less than half of them, without which alone the others agree."""
+    count = len(pose)
+    for size in range(1, (count + 1) // 2):
+        sets = list(combinations(range(count), size))
+        which = culprit([silhouettes.distance(lens, pose, views) for views in sets])
+        if which is not None:
+            return torch.zeros(count, dtype=torch.bool).index_fill(0, torch.tensor(sets[which]), True)
+    return None
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """Normal equations of a Gauss-Newton step, and the number and total distance of rays before it."""
+
+    normal: Float[Tensor, "n n"]
+    right: Float[Tensor, " n"]
+    rays: int
+    total: float
+
+    @property
+    def distance(self) -> float:
+        return self.total / max(self.rays, 1)
+
+    def __add__(self, other: "_Equations") -> "_Equations":
+        sums = (getattr(self, f.name) + getattr(other, f.name) for f in fields(self))
+        return _Equations(*sums)
+
+    def solved(self, free: Which) -> Float[Tensor, "V 7"]:
+        """The step of the free cameras; 0 for the others."""
+        index = free.repeat_interleave(7).nonzero()[:, 0]
+        steps = torch.linalg.solve(self.normal[index][:, index], self.right[index])
+        return torch.zeros_like(self.right).index_copy(0, index, steps).view(-1, 7)
+
+
+@dataclass(frozen=True)
+class _Silhouettes:
+    """The silhouettes of each instant, and where its subject is in the frame."""
+
+    outlines: tuple[Outlines, ...]
+    middle: Middles
+
+    def distance(self, lens: Lenses, pose: Pose, views: Sequence[int] = ()) -> float:
+        """Mean distance by which rays miss other silhouettes, without those of ``views``."""
+        kept = [view for view in range(len(pose)) if view not in views]
+        missed, rays = 0.0, 0
+        for outlines, each, middle in zip(self.outlines, lens, self.middle, strict=True):
+            some = outlines.of_views(kept)
+            placed = _placed(pose[kept], middle)
+            depth = _best_points(some, each[kept], placed, some.view, some.pixels)[2]
+            missed, rays = missed - float(depth.clamp(max=0).sum()), rays + len(depth)
+        return missed / max(rays, 1)
+
+    def equations(self, lens: Lenses, pose: Pose, phase: _Phase) -> "_Equations":
+        pixel = _pixel(lens, pose)
+        parts = zip(self.outlines, lens, self.middle, strict=True)
+        return reduce(add, (_equations(*part, pose, phase, pixel) for part in parts))
+
+
+def _equations(
+    outlines: Outlines, lens: Lens, middle: Float[Tensor, " 3"], pose: Pose, phase: _Phase, pixel: Tensor
+) -> _Equations:
+    """Unknowns: motions about the frame's origin and zooms of all cameras, in about a pixel."""
+    count = len(pose)
+    pose = _placed(pose, middle)
+    near = outlines.depth <= phase.to
+    view, depth_at_home = outlines.view[near], outlines.depth[near]
+    points, other, depth = _best_points(outlines, lens, pose, view, outlines.pixels[near])
+    distances = phase.distances(depth, depth_at_home)
+    rays = max(len(distances), 1)
+    gradients = _gradients(outlines, lens, pose, points, other) / pixel
+    jacobian = gradients.new_zeros(len(gradients), count, 7)
+    index = torch.arange(len(gradients))
+    jacobian[index, other] = _rows(points, gradients, pose[other], middle)
+    jacobian[index, view] -= _rows(points, gradients, pose[view], middle)
+    jacobian = jacobian.flatten(1)
+    weighted = phase.weights(distances)[:, None] * jacobian
+    stay = _STAY * rays * torch.tensor([*[1.0] * 6, _KNOWN]).to(gradients).repeat(count)
+    normal = weighted.mT @ jacobian + stay.diag()
+    return _Equations(normal, -(weighted.mT @ distances), len(distances), float(distances.abs().sum()))
+
+
+def _placed(pose: Pose, middle: Float[Tensor, " 3"]) -> Pose:
+    """Poses around the subject's middle, where rays are searched."""
+    return after_motions(pose, F.pad(middle, (3, 0)).expand(len(pose), 6), pose.new_zeros(3))
+
+
+def _pixel(lens: Lenses, pose: Pose) -> Float[Tensor, ""]:
+    """Half the height of the subject, in pixels."""
+    return HEIGHT / 2 * (lens[..., 0, 0] / pose[:, 2, 3]).mean()
+
+
+def _stepped(steps: Float[Tensor, "V 7"], lens: Lenses, pose: Pose, are_all: bool) -> tuple[Lenses, Pose]:
+    """Intrinsics and extrinsics after a step, without what is common to all cameras if ``are_all`` free."""
+    motions, zooms = (steps / _pixel(lens, pose)).split((6, 1), -1)
+    if are_all:
+        motions, zooms = without_common(motions, pose[:, 2, :3]), zooms - zooms.mean(0)
+    zoomed = lens.clone()
+    zoomed[..., [0, 1], [0, 1]] *= zooms.exp()
+    return zoomed, after_motions(pose, motions, pose.new_zeros(3), HEIGHT / 2)
+
+
+def _best_points(
+    outlines: Outlines, lens: Lens, pose: Pose, view: Numbers, pixels: Float[Tensor, "R 2"]
+) -> tuple[Points, Numbers, Float[Tensor, " R"]]:
+    """The point of each ray that is deepest in the other silhouettes, the silhouette that it is least deep
+    in, and its signed depth in that in pixels. ``view``: the silhouette of each ray, ascending."""
+    centers = -(pose[:, :3, :3].mT @ pose[:, :3, 3:])[..., 0]
+    along = torch.linspace(-HEIGHT / 2, HEIGHT / 2, _DEPTHS).to(pixels)
+    views, points = range(len(pose)), []
+    for home in views:
+        rays = pixels[view == home]
+        ahead = unproject(rays, torch.ones_like(rays[:, 0]), lens[home], pose[home]) - centers[home]
+        depths = pose[home, 2, 3] + along
+        least = rays.new_full((len(rays), _DEPTHS), torch.inf)
+        for one in views:
+            if one != home:
+                seen = outlines.along(one, lens[one], pose[one], centers[home], ahead, depths)
+                least = torch.minimum(least, seen)
+        points.append(centers[home] + depths[least.argmax(1)][:, None] * ahead)
+    points = torch.cat(points)
+    shown = []
+    for one in views:
+        depth = outlines.at(torch.full_like(view, one), project(points, lens[one], pose[one])[0])
+        shown.append(torch.where(view == one, torch.inf, depth))
+    depth, other = torch.stack(shown).min(0)
+    return points, other, depth
+
+
+def _gradients(outlines: Outlines, lens: Lens, pose: Pose, points: Points, other: Numbers) -> Points:
+    """Derivatives of the distances with respect to the points, in the world's axes."""
+    seen, depth = project(points, lens[other], pose[other])
+    slopes = outlines.slopes(other, seen) * lens[other][:, [0, 1], [0, 1]]
+    inside = world_to_camera(points, pose[other])
+    ahead = -(slopes * inside[:, :2]).sum(-1) / depth**2
+    in_camera = torch.cat((slopes / depth[:, None], ahead[:, None]), -1)
+    return (pose[other, :3, :3].mT @ in_camera[..., None])[..., 0]
+
+
+def _rows(
+    points: Points, gradients: Points, pose: Float[Tensor, "R 4 4"], middle: Float[Tensor, " 3"]
+) -> Float[Tensor, "R 7"]:
+    """Derivatives of the distances by a camera's rotation vector about the frame's origin, its shift in half
+    heights and the logarithm of its focal length, which moves points away from the optical axis."""
+    across = world_to_camera(points, pose)[:, :2]
+    zoom = ((pose[:, :3, :3] @ gradients[..., None])[:, :2, 0] * across).sum(-1, keepdim=True)
+    return torch.cat((torch.linalg.cross(points + middle, gradients), HEIGHT / 2 * gradients, zoom), -1)

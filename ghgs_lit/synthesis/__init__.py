@@ -1,1 +1,0 @@
-"""Synthesis of data: people, rigs of cameras, photographs, scans."""

@@ -1,0 +1,16 @@
+"""Making of data: people, rigs of cameras, photographs, scans.
+
+A plug-in of :mod:`ghgs_lit` by the door that a user's own has: it offers data sets that are rendered, and the
+parts of its bodies.
+"""
+
+from ghgs_lit.config.registry import PARTS, offer
+
+offer(
+    "data",
+    people_in_rig="ghgs_people.datasets.PeopleInRig",
+    scans="ghgs_people.datasets.Scans",
+    synthetic="ghgs_people.datasets.Synthetic",
+    thuman2="ghgs_people.thuman2.THuman2",
+)
+offer(PARTS, built_in="ghgs_people.figures.parts.BuiltInParts")

@@ -1,0 +1,53 @@
+"""People who are rendered beside training, which waits for the first ones only."""
+
+import multiprocessing
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from ghgs_lit.data.layout import Completeness, Layout
+from ghgs_lit.errors import InputError
+from ghgs_people.jobs import PersonSource, RenderOptions, render_people, start_worker
+
+# A process of this priority only takes time that training leaves idle.
+_NICE = 19
+_running: dict[Path, multiprocessing.process.BaseProcess] = {}
+
+
+class Joining(dict[str, tuple[int, ...]]):
+    """``subjects`` of a training layout; iterating adds those of ``names`` that have become complete."""
+
+    def __init__(self, layout: Layout, names: Sequence[str]) -> None:
+        super().__init__(layout.subjects)
+        self._layout, self._names, self._made = layout, names, Completeness(layout.root)
+        layout.subjects = self
+
+    def __iter__(self) -> Iterator[str]:
+        if len(self) < len(self._names):
+            whole = self._made.whole("train", self._names)
+            if len(whole) > len(self):
+                self._layout.find("train", whole)
+        return super().__iter__()
+
+
+def render_beside(
+    root: Path, names: Sequence[str], source: PersonSource, rig: object, settings: RenderOptions, seed: int
+) -> None:
+    """Start to render training people below ``root`` in a process that ends with this one; arguments as of
+    :func:`ghgs_people.jobs.render_people`."""
+    running = root in _running and _running[root].is_alive()
+    if running or not Completeness(root).missing("train", names):
+        return
+    arguments = (root, {"train": list(names)}, source, rig, settings, seed)
+    _running[root] = multiprocessing.get_context("spawn").Process(target=_render, args=arguments, daemon=True)
+    _running[root].start()
+
+
+def _render(*arguments: object) -> None:
+    start_worker()
+    os.nice(_NICE)
+    try:
+        render_people(*arguments, workers=0, shown=False)
+    except (InputError, OSError) as error:
+        print(f"training goes on with the people rendered so far: {error}", file=sys.stderr, flush=True)

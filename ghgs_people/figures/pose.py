@@ -1,0 +1,307 @@
+"""Poses on two feet within the limits of human joints: gestures for the arms, stances for the legs.
+
+Arms are posed by forward kinematics: a direction of the upper arm, an elbow angle, and where the forearm
+points. Legs are posed by inverse kinematics: the soles are placed on the ground and the knees follow, so feet
+do not float. Directions are in the person's frame: +x left, +y up, +z forward; for the right side x is
+mirrored.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ghgs_people.figures.body import BodyModel, bone_transforms
+
+SPINE = ("spine05", "spine04", "spine03", "spine02", "spine01")
+NECK = ("neck01", "neck02", "neck03", "head")
+FINGERS = ("finger2", "finger3", "finger4", "finger5")
+
+# Direction of the upper arm (x outwards), direction in which the elbow bends; then elbow, forearm twist and
+# curl of the fingers as (mean, half range) in degrees. Directions need no unit length.
+GESTURES = {
+    "relaxed": ((0.20, -1.0, 0.00), (-0.25, 0.2, 1.0), (18, 9), (-35, 15), (28, 14)),
+    "loose": ((0.34, -1.0, 0.10), (-0.35, 0.2, 1.0), (32, 14), (-25, 15), (30, 15)),
+    "away": ((0.62, -1.0, 0.05), (-0.10, 0.1, 1.0), (22, 14), (-10, 25), (22, 14)),
+    "akimbo": ((0.78, -0.85, -0.42), (-0.88, -0.25, 0.42), (88, 5), (20, 10), (45, 15)),
+    "guard": ((0.38, -1.0, 0.18), (-0.35, 0.85, 0.85), (95, 18), (-10, 30), (60, 25)),
+    "offer": ((0.36, -1.0, 0.25), (0.20, 0.35, 1.0), (72, 18), (55, 20), (18, 10)),
+    "point": ((0.30, -0.15, 1.0), (0.0, 0.6, 0.9), (16, 9), (-20, 25), (40, 25)),
+    "side": ((1.0, -0.15, 0.08), (0.1, 0.25, 1.0), (16, 10), (-10, 30), (18, 12)),
+    "wave": ((1.0, -0.20, 0.12), (-0.05, 1.0, 0.25), (92, 20), (-30, 25), (14, 10)),
+    "raised": ((0.55, 0.85, 0.14), (-0.10, 1.0, 0.25), (26, 16), (-20, 30), (22, 15)),
+    "reach": ((0.42, 0.30, 0.95), (-0.1, 0.8, 0.6), (34, 14), (0, 30), (20, 12)),
+    "overhead": ((0.85, 0.60, 0.20), (-0.85, 0.75, 0.0), (82, 22), (0, 30), (25, 15)),
+    "folded": ((0.42, -0.85, 0.50), (-0.90, 0.30, 0.55), (98, 10), (10, 20), (30, 15)),
+    "back": ((0.40, -0.75, -0.65), (0.0, -0.2, -1.0), (12, 8), (0, 30), (25, 15)),
+}
+EVERYDAY = ("relaxed", "relaxed", "loose", "loose", "away", "akimbo", "guard", "offer")
+STRIKING = ("point", "side", "wave", "raised", "reach")
+SPORT = (*STRIKING, "overhead", "folded", "back", "guard", "akimbo")
+STANCES = ("stand", "contrapposto", "walk", "step", "crouch", "wide")
+#: Of people in motion, with the least and greatest share of its length to which a leg is bent.
+BENT = {"lunge": (0.62, 0.95), "squat": (0.45, 0.85), "cross": (0.98, 1.0), "crouch": (0.55, 0.8)}
+
+
+@dataclass(frozen=True)
+class _Skeleton:
+    """Joints at rest [b, 3] and the rotations [b, 3, 3] of the bones in world axes, which posing fills in."""
+
+    body: BodyModel
+    joints: np.ndarray
+    rotations: np.ndarray
+
+    def rest(self, *bones: str, end: str = "") -> np.ndarray:
+        """Joints [k, 3] of k named bones at rest; `end` is added to every name."""
+        return self.joints[[self.body.bone(bone + end) for bone in bones]]
+
+    def rotate(self, bone: str, rotation: np.ndarray) -> None:
+        """Set the rotation [3, 3] of a bone."""
+        self.rotations[self.body.bone(bone)] = rotation
+
+
+def sample_pose(
+    body: BodyModel, joints: np.ndarray, rng: np.random.Generator, widen: float = 0.0, active: bool = False
+) -> np.ndarray:
+    """Transforms [b, 3, 4] of the bones from rest to a random pose. ``joints``: [b, 3] at rest, of one shape.
+    ``widen``: 0 to 1, how far the arms move away from the body. ``active``: as in sport and dance, with legs
+    far apart, bent or crossed, in place of standing or walking."""
+    if active:
+        stance = str(rng.choice(list(BENT), p=(0.4, 0.3, 0.2, 0.1)))
+    else:
+        stance = str(rng.choice(STANCES, p=(0.24, 0.22, 0.22, 0.12, 0.08, 0.12)))
+    local = np.tile(np.eye(3), (len(joints), 1, 1))
+    pelvis = _bend_trunk(body, local, stance, rng)
+    skeleton = _Skeleton(body, joints, _compose(body.bone_parents, local))
+    gestures = tuple(rng.choice(SPORT, 2)) if active else _gestures(stance, rng)
+    stride = rng.uniform(0.25, 0.5) * rng.choice((-1, 1))  # of the left foot, in lengths of the leg
+    for side, gesture in zip((1, -1), gestures, strict=True):
+        _pose_arm(skeleton, side, gesture, widen, -stride * side if stance == "walk" else 0.0, rng)
+    root = _pose_legs(skeleton, pelvis, stance, stride, rng)
+    return bone_transforms(body.bone_parents, joints, skeleton.rotations, root)
+
+
+def _gestures(stance: str, rng: np.random.Generator) -> tuple[str, str]:
+    """Choose what the left and the right arm do: half the time the same thing."""
+    if stance == "walk" and rng.random() < 0.7:
+        return "loose", "loose"
+    first = str(rng.choice(EVERYDAY if rng.random() < 0.7 else STRIKING))
+    second = first if rng.random() < 0.5 else str(rng.choice(EVERYDAY))
+    return (first, second) if rng.random() < 0.5 else (second, first)
+
+
+def _bend_trunk(body: BodyModel, local: np.ndarray, stance: str, rng: np.random.Generator) -> np.ndarray:
+    """Twist, lean and bend spine and neck in place; return the rotation of the pelvis [3, 3]."""
+    twist, side, lean = rng.uniform(-22, 22), rng.uniform(-5, 5), rng.uniform(-4, 7)
+    tilt = 0.0
+    if stance == "contrapposto":
+        tilt = rng.uniform(3.5, 7.0) * rng.choice((-1, 1))
+        side -= 1.3 * tilt
+    elif stance == "crouch":
+        lean += rng.uniform(10, 20)
+    elif stance == "walk":
+        twist *= 0.5
+    elif stance in ("lunge", "squat"):
+        lean, side = lean + rng.uniform(0, 18), 2 * side
+    pelvis = Rotation.from_euler("zxy", [tilt, 0.35 * lean, 0.25 * twist], degrees=True).as_matrix()
+    local[body.bone("root")] = pelvis
+    nod, turn, roll = rng.uniform(-9, 9) - 0.6 * lean, rng.uniform(-30, 30) - 0.5 * twist, rng.uniform(-6, 6)
+    for names, angles in ((SPINE, (side, 0.65 * lean, 0.75 * twist)), (NECK, (roll, nod, turn))):
+        share = Rotation.from_euler("zxy", np.array(angles) / len(names), degrees=True).as_matrix()
+        local[[body.bone(name) for name in names]] = share
+    return pelvis
+
+
+def _compose(parents: np.ndarray, local: np.ndarray) -> np.ndarray:
+    rotations = local.copy()
+    for bone, parent in enumerate(parents):
+        if parent >= 0:
+            rotations[bone] = rotations[parent] @ local[bone]
+    return rotations
+
+
+def _frame(along: np.ndarray, across: np.ndarray) -> np.ndarray:
+    """Right-handed frame [3, 3] (columns) with its first axis `along`, its third nearest to `across`."""
+    first = along / np.linalg.norm(along)
+    third = across - (across @ first) * first
+    third /= np.linalg.norm(third)
+    return np.stack([first, np.cross(third, first), third], 1)
+
+
+def _descendants(body: BodyModel, bone: str) -> list[int]:
+    """A bone and all bones below it in the rig."""
+    members = [body.bone(bone)]
+    for child, parent in enumerate(body.bone_parents):
+        if parent in members:
+            members.append(child)
+    return members
+
+
+def _pose_arm(
+    skeleton: _Skeleton, side: int, gesture: str, widen: float, swing: float, rng: np.random.Generator
+) -> None:
+    """Rotate one arm (side +1: left); `swing` moves it forward (back where negative) when walking."""
+    end = ".L" if side > 0 else ".R"
+    mirror = np.array([side, 1.0, 1.0])
+    upper, bend, elbow, forearm, curl = GESTURES[gesture]
+    chest = skeleton.rotations[skeleton.body.bone("spine01")]
+    upper = np.array(upper) + rng.normal(0, 0.07, 3) + np.array([0.55 * widen, 0, 0.9 * swing])
+    upper = upper / np.linalg.norm(upper)
+    flex, twist, curl = (
+        np.radians(mean + half * rng.uniform(-1, 1)) for mean, half in (elbow, forearm, curl)
+    )
+    bend = np.array(bend) + rng.normal(0, 0.08, 3)
+    bend = bend - (bend @ upper) * upper
+    lower = np.cos(flex) * upper + np.sin(flex) * bend / np.linalg.norm(bend)
+    upper, lower = chest @ (mirror * upper), chest @ (mirror * lower)
+
+    # The shoulder girdle follows a raised arm.
+    lift = np.radians(np.interp(upper @ chest[:, 1], [-0.6, 0.0, 0.9], [0.0, 6.0, 24.0])) * side
+    girdle = Rotation.from_rotvec(chest @ np.array([0, 0, lift])).as_matrix() @ chest
+    for name, weight in (("clavicle", 0.6), ("shoulder01", 1.0)):
+        skeleton.rotate(name + end, chest @ _fraction(chest.T @ girdle, weight))
+
+    shoulder, elbow_at, wrist = skeleton.rest("upperarm01", "lowerarm01", "wrist", end=end)
+    hinge_rest = np.cross(elbow_at - shoulder, wrist - elbow_at)
+    hinge = np.cross(upper, lower)
+    full = _frame(upper, hinge) @ _frame(elbow_at - shoulder, hinge_rest).T
+    swung = _shortest(girdle @ (elbow_at - shoulder), upper) @ girdle
+    skeleton.rotate("upperarm01" + end, swung @ _fraction(swung.T @ full, 0.5))
+    skeleton.rotate("upperarm02" + end, full)
+    fore = _frame(lower, hinge) @ _frame(wrist - elbow_at, hinge_rest).T
+    pronate = Rotation.from_rotvec(lower * twist * side).as_matrix()
+    skeleton.rotate("lowerarm01" + end, fore)
+    skeleton.rotate("lowerarm02" + end, _fraction(pronate, 0.5) @ fore)
+    _pose_hand(skeleton, end, pronate @ fore, curl, rng)
+
+
+def _pose_hand(
+    skeleton: _Skeleton, end: str, hand: np.ndarray, curl: float, rng: np.random.Generator
+) -> None:
+    """Bend the wrist a little and curl the fingers by `curl` radians."""
+    index, little = skeleton.rest("finger2-1", "finger5-1", end=end)
+    across = (index - little) / np.linalg.norm(index - little)
+    rest_curl = 0.0
+    for finger in FINGERS:
+        one, two, three = skeleton.rest(*(f"{finger}-{i}" for i in (1, 2, 3)), end=end)
+        rest_curl += np.cross(across, two - one) @ (three - two)
+    across *= np.sign(rest_curl)
+    hand = hand @ Rotation.from_rotvec(across * rng.uniform(-0.2, 0.2)).as_matrix()
+    skeleton.rotations[_descendants(skeleton.body, "wrist" + end)] = hand
+    along = {}
+    for finger in (*FINGERS, "finger1"):
+        one, two = skeleton.rest(f"{finger}-1", f"{finger}-2", end=end)
+        along[finger] = (two - one) / np.linalg.norm(two - one)
+    middle = np.mean([along[finger] for finger in FINGERS], 0)
+    close = rng.uniform(0.2, 0.9)  # the hand at rest is spread
+    for number, finger in enumerate(FINGERS):
+        amount = curl * (0.75 + 0.14 * number) + rng.uniform(-0.06, 0.06)
+        sideways = _shortest(along[finger], (1 - close) * along[finger] + close * middle)
+        for joint, share in enumerate((0.55, 1.35, 1.7), start=1):
+            turn = Rotation.from_rotvec(across * amount * share).as_matrix()
+            skeleton.rotate(f"{finger}-{joint}{end}", hand @ turn @ sideways)
+    thumb = hand @ _shortest(along["finger1"], along["finger1"] + 0.5 * close * middle)
+    for joint in (1, 2, 3):
+        skeleton.rotate(f"finger1-{joint}{end}", thumb)
+
+
+def _pose_legs(
+    skeleton: _Skeleton, pelvis: np.ndarray, stance: str, stride: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Place the soles on the ground, solve hips and knees; return where the root joint goes [3]."""
+    (root,) = skeleton.rest("root")
+    feet = _feet(skeleton, stance, stride, rng)
+    ankles, hips, lengths = [], [], []
+    for end, (across, forward, yaw, heel) in zip((".L", ".R"), feet, strict=True):
+        hip, knee, ankle, toes = skeleton.rest("upperleg01", "lowerleg01", "foot", "toe2-1", end=end)
+        turn = Rotation.from_euler("y", yaw, degrees=True).as_matrix()
+        lifted = turn @ Rotation.from_euler("x", heel, degrees=True).as_matrix()
+        ball = np.array([across, toes[1], forward]) + turn @ [0, 0, toes[2] - ankle[2]]
+        ankles.append(ball + lifted @ (ankle - toes))
+        hips.append(pelvis @ (hip - root))
+        lengths.append((np.linalg.norm(knee - hip), np.linalg.norm(ankle - knee)))
+        skeleton.rotate("foot" + end, lifted)
+        skeleton.rotate("toe2-1" + end, turn)
+    centre = np.mean(ankles, 0) - np.mean(hips, 0)
+    if stance == "contrapposto":  # the leg with the higher hip carries the weight
+        centre += 0.3 * (ankles[0] - ankles[1]) * (1 if hips[0][1] > hips[1][1] else -1)
+    elif stance == "lunge":  # towards the foot in front
+        centre += rng.uniform(0.0, 0.2) * (ankles[0] - ankles[1]) * np.sign(stride)
+    bend = rng.uniform(*BENT[stance]) if stance in BENT else 1.0
+    heights = []
+    for ankle, hip, (thigh, shin) in zip(ankles, hips, lengths, strict=True):
+        reach = 0.994 * (thigh + shin) * (bend**0.35)
+        flat = ankle[[0, 2]] - (centre + hip)[[0, 2]]
+        heights.append(ankle[1] + np.sqrt(reach**2 - flat @ flat) - hip[1])
+    centre[1] = min(heights)
+    for end, ankle, hip, (thigh, shin), foot in zip((".L", ".R"), ankles, hips, lengths, feet, strict=True):
+        toward = Rotation.from_euler("y", 0.7 * foot[2], degrees=True).as_matrix() @ [0, 0, 1.0]
+        _solve_leg(skeleton, end, centre + hip, ankle, (thigh, shin), toward)
+    return centre
+
+
+def _feet(
+    skeleton: _Skeleton, stance: str, stride: float, rng: np.random.Generator
+) -> list[tuple[float, float, float, float]]:
+    """For the left and the right foot: ankle across and forward (metres), yaw and heel lift (degrees)."""
+    half, leg, _ = skeleton.rest("upperleg01.L")[0]
+    half = half * rng.uniform(0.85, 1.25)
+    feet = []
+    for side in (1, -1):
+        x, z, yaw, heel = side * half, rng.normal(0, 0.015), side * rng.uniform(2, 16), 0.0
+        if stance in ("walk", "step"):
+            scale = 0.62 if stance == "walk" else 0.35
+            x, z = side * half * 0.7, scale * leg * stride * side
+            heel = rng.uniform(14, 32) if z < 0 and stance == "walk" else 0.0
+        elif stance in ("wide", "crouch"):
+            x, yaw = side * half * rng.uniform(1.5, 2.1), side * rng.uniform(10, 26)
+        elif stance == "lunge":
+            x, z, yaw = side * half * 0.8, 0.9 * leg * stride * side, 0.6 * yaw
+            heel = rng.uniform(18, 42) if z < 0 else 0.0
+        elif stance == "squat":
+            x, yaw = side * half * rng.uniform(2.0, 3.2), side * rng.uniform(20, 45)
+        elif stance == "cross":
+            x, z = -side * half * rng.uniform(0.0, 0.5), side * np.sign(stride) * rng.uniform(0.08, 0.14)
+        elif stance == "contrapposto" and side * stride > 0:
+            x, z, yaw = side * half * 1.35, rng.uniform(0.03, 0.14), side * rng.uniform(14, 32)
+        feet.append((x, z, yaw, heel))
+    return feet
+
+
+def _solve_leg(
+    skeleton: _Skeleton,
+    end: str,
+    hip: np.ndarray,
+    ankle: np.ndarray,
+    lengths: tuple[float, float],
+    toward: np.ndarray,
+) -> None:
+    """Two-bone inverse kinematics by the law of cosines; the knee points `toward` a direction [3]."""
+    thigh, shin = lengths
+    line = ankle - hip
+    distance = min(np.linalg.norm(line), 0.999 * (thigh + shin))
+    line /= np.linalg.norm(line)
+    angle = np.arccos(np.clip((thigh**2 + distance**2 - shin**2) / (2 * thigh * distance), -1, 1))
+    out = toward - (toward @ line) * line
+    knee = hip + thigh * (np.cos(angle) * line + np.sin(angle) * out / np.linalg.norm(out))
+    hinge = np.cross(toward, line)
+    rest = skeleton.rest("upperleg01", "lowerleg01", "foot", end=end)
+    axis = np.array([1.0, 0, 0])  # of the knees at rest
+    upper = _frame(knee - hip, hinge) @ _frame(rest[1] - rest[0], axis).T
+    lower = _frame(ankle - knee, hinge) @ _frame(rest[2] - rest[1], axis).T
+    for name, rotation in (("upperleg", upper), ("lowerleg", lower)):
+        skeleton.rotate(f"{name}01{end}", rotation)
+        skeleton.rotate(f"{name}02{end}", rotation)
+
+
+def _fraction(rotation: np.ndarray, share: float) -> np.ndarray:
+    """A share of a rotation [3, 3] about its own axis."""
+    return Rotation.from_rotvec(share * Rotation.from_matrix(rotation).as_rotvec()).as_matrix()
+
+
+def _shortest(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """The smallest rotation [3, 3] that turns direction `start` into `end`."""
+    axis = np.cross(start, end)
+    sine = np.linalg.norm(axis)
+    angle = np.arctan2(sine, start @ end)
+    return Rotation.from_rotvec(axis * (angle / max(sine, 1e-12))).as_matrix()

@@ -1,0 +1,290 @@
+"""Rendering of many people in several processes: resumable, with the same files for the same seed. Workers
+are spawned (a fork of a process that runs threads may hang): each imports the script that called
+:func:`render_people`, which therefore needs ``if __name__ == "__main__":``. Workers write to workspaces; the
+process that holds the lock moves finished subjects to their place."""
+
+import contextlib
+import logging
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+import torch
+from PIL import Image
+from pydantic import Field
+from rich.console import Console
+from rich.progress import track
+
+from ghgs_lit.config.options import Index, Options, Size
+from ghgs_lit.data.layout import position_name
+from ghgs_lit.data.sampling import RING_VIEW, ViewNumber, subject_rng
+from ghgs_lit.data.view import View, encode_depth
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import naming
+from ghgs_lit.kernels.cores import allowed_cores, use_known_start_method
+from ghgs_people import figures
+from ghgs_people.figures.mesh import Person
+from ghgs_people.photograph import Lights, Studio
+from ghgs_people.progress import Progress
+from ghgs_people.rig import STILL, Poses, Rig
+
+log = logging.getLogger(__name__)
+
+_GUARD = 'if __name__ == "__main__":'
+# Part of every cache key: to be increased when photographs of the same settings change.
+RENDER_VERSION = 2
+#: Lights of all people.
+LIGHTS = Lights()
+
+
+class PersonSource(Protocol):
+    """A source of people; it can be pickled."""
+
+    def load(self, name: str) -> Person: ...
+
+    def facing(self, name: str) -> float:
+        """Degrees by which the first camera is turned about y to face the person."""
+
+
+#: First letter of the names of generated people in poses of sport and dance.
+ACTIVE = "a"
+
+
+@dataclass(frozen=True)
+class SyntheticSource:
+    """Generated people, named ``p<index>``, and those in poses of sport and dance, ``a<index>``."""
+
+    seed: int
+
+    def load(self, name: str) -> Person:
+        return figures.generate(self.seed, int(name[1:]), name.startswith(ACTIVE))
+
+    def facing(self, name: str) -> float:
+        return 0.0
+
+
+class RenderOptions(Options):
+    """What is rendered of each person."""
+
+    group = "data.render"
+
+    size: Size = (512, 512)
+    """Side or [height, width] of the photographs in pixels."""
+    samples: int = Field(3, ge=1, le=16)
+    """Each pixel is the mean of samples x samples rays."""
+    positions: tuple[Index, ...] | None = None
+    """Ring positions to render; null: all."""
+    views: tuple[ViewNumber, ...] = Field((RING_VIEW, 2, 3, 4), min_length=1)
+    """Views at each position: 0 the ring camera, 1 the next, 3 the middle, 2 and 4 random between.
+    Targets need 0, 2, 3 and 4, stereo methods need 1."""
+    quality: int = Field(98, ge=1, le=100)
+    """Of the JPEG files."""
+    lights: Literal["studio", "none"] = "studio"
+    """studio: white lights around each person, for textures without light; none: textures as they are, for
+    scans, whose textures are photographs with the light of their day."""
+
+
+@dataclass(frozen=True)
+class _Job:
+    source: PersonSource
+    rig: Rig
+    settings: RenderOptions
+    seed: int
+    phase: str
+    name: str
+    workspace: Path
+
+
+def everything(rig: Rig, settings: RenderOptions) -> dict:
+    """All settings besides the seed that photographs of a person depend on, as plain data."""
+    cameras = {**asdict(rig), "variation": rig.variation.model_dump()}
+    lights = asdict(LIGHTS) if settings.lights == "studio" else settings.lights
+    return {"rig": cameras, "render": {**settings.model_dump(), "lights": lights}}
+
+
+def identity(rig: Rig, settings: RenderOptions, seed: int) -> dict:
+    """:func:`everything` with the seed, in the form of cache keys and stored settings."""
+    cameras, render = everything(rig, settings).values()
+    render["vids"] = render.pop("views")  # the name in stored data sets and in the keys of caches
+    still = STILL.model_dump()
+    # Names of caches do not depend on variations that are off.
+    varied = {name: value for name, value in cameras.pop("variation").items() if value != still[name]}
+    if varied:
+        cameras["variation"] = varied
+    return {"version": RENDER_VERSION, "seed": seed, "rig": cameras, "render": render}
+
+
+def render_subject(job: _Job) -> tuple[_Job, str]:
+    """Render one person into its workspace. Returns the job, and why the person is bad (empty: it is not)."""
+    try:
+        _render(job)
+    except InputError as error:
+        return job, str(error)
+    return job, ""
+
+
+def _render(job: _Job) -> None:
+    rng = subject_rng(job.seed, job.name)
+    person = job.rig.place(job.source.load(job.name), rng)
+    yaws, lights = job.rig.yaws(rng) + job.source.facing(job.name), LIGHTS.draw(rng)
+    if job.settings.lights == "none":
+        lights = None
+    height, width = job.settings.size
+    # A separate generator: heights, yaws and lights do not depend on what is varied.
+    rig, poses = job.rig.drawn(person, yaws, width / height, rng.spawn(1)[0])
+    studio = Studio(person, lights, job.settings.samples)
+    for position, number, view in photographs(studio, rig, job.settings, yaws, poses):
+        write_view(job.workspace, position_name(job.name, position), number, view, job.settings.quality)
+    if person.body_vertices is not None:
+        write_body(job.workspace, job.name, person.body_vertices)
+
+
+def photographs(
+    studio: Studio, rig: Rig, settings: RenderOptions, yaws: np.ndarray, poses: Poses
+) -> Iterator[tuple[int, int, View]]:
+    """Ring position, number and content of each view of ``settings``; ``yaws``, ``poses``: of all views."""
+    height, width = settings.size
+    for position in range(len(yaws)) if settings.positions is None else settings.positions:
+        index = (position, list(settings.views))
+        cameras = rig.cameras(yaws[index], height, width, poses[index])
+        shot = studio.shoot(cameras)
+        for n, number in enumerate(settings.views):
+            view = View(
+                image=np.round(shot.images[n] * 255).astype(np.uint8),
+                mask=shot.masks[n],
+                inverse_depth=encode_depth(shot.depths[n]),
+                intrinsics=cameras.intrinsics[n].numpy(),
+                extrinsics=cameras.extrinsics[n].numpy(),
+                matte=np.round(shot.alphas[n] * 255).astype(np.uint8),
+            )
+            yield position, number, view
+
+
+def render_people(
+    root: Path,
+    names: Mapping[str, Sequence[str]],
+    source: PersonSource,
+    rig: Rig,
+    settings: RenderOptions,
+    seed: int,
+    workers: int | None = None,
+    shown: bool = True,
+) -> int:
+    """Render people below ``root``; existing ones are kept. Returns the number of people rendered now.
+
+    It is safe to kill, to repeat, and to start twice at once: a second process waits for the first.
+    ``names``: people of each phase. ``workers``: number of processes (None: one for each core; 0: only this
+    one). ``shown``: whether there is a progress bar. InputError: ``root`` holds something else, the script
+    has no main guard, or people are bad: the others are rendered, then these are named."""
+    _check_main_guard()
+    positions = settings.positions
+    fits = positions is None or set(positions) <= set(range(rig.positions))
+    require(fits, "data.render.positions", f"some of 0 to {rig.positions - 1}", positions)
+    progress, made_with = Progress(Path(root)), identity(rig, settings, seed)
+    progress.check_settings(made_with)
+    if not any(progress.missing(phase, listed) for phase, listed in names.items()):
+        return 0
+    with progress.lock(), naming(progress.root):
+        progress.check_settings(made_with)  # another process may have written others meanwhile
+        progress.clear_workspaces()
+        progress.request(names)
+        todo = [
+            _Job(source, rig, settings, seed, phase, name, progress.workspace(phase, name))
+            for phase, listed in names.items()
+            for name in progress.missing(phase, listed)
+        ]
+        console, label, bad = Console(stderr=True), f"rendering into {root}", []
+        try:
+            with contextlib.closing(_run(todo, workers)) as finished:
+                for job, why in track(finished, label, total=len(todo), console=console, disable=not shown):
+                    if why:
+                        bad.append(why)
+                        log.warning("%s is not rendered: %s", job.name, why)
+                    else:
+                        progress.publish(job.workspace, job.phase, job.name)
+        finally:
+            progress.clear_workspaces()
+    if bad:
+        others = f" (and {len(bad) - 1} more, named above)" if len(bad) > 1 else ""
+        rest = (
+            f"; the other {len(todo) - len(bad)} of {len(todo)} are rendered" if len(todo) > len(bad) else ""
+        )
+        raise InputError(f"{sorted(bad)[0]}{others}{rest}")
+    return len(todo)
+
+
+def _run(jobs: list[_Job], workers: int | None) -> Iterator[tuple[_Job, str]]:
+    workers = min(len(jobs), allowed_cores() if workers is None else workers)
+    if workers < 2:
+        yield from map(render_subject, jobs)
+        return
+    use_known_start_method()
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, context, initializer=start_worker) as pool:
+        try:
+            futures = [pool.submit(render_subject, job) for job in jobs]
+            for future in as_completed(futures):
+                yield future.result()
+        except BrokenProcessPool as error:
+            raise RuntimeError(
+                f"a rendering process died: the script lacks `{_GUARD}`, or memory ran out (repeat to go on)"
+            ) from error
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _check_main_guard() -> None:
+    """Refuse to run in a worker that imports the calling script, which would wait for its parent forever."""
+    # Set by multiprocessing while a spawned process imports the main module of its parent.
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise InputError(
+            f"{sys.argv[0]}: expected `{_GUARD}` around what a script does (rendering processes import it), "
+            "or data.render_workers=0; found neither"
+        )
+
+
+def start_worker() -> None:
+    """Prepare a worker: one thread, Ctrl-C only in the parent, and an end with the parent."""
+    torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End this worker when its parent is killed (``kill``, ``kill -9``, the batch system)."""
+    multiprocessing.parent_process().join()
+    os._exit(1)
+
+
+def write_view(phase: Path, folder: str, number: int, view: View, quality: int = 98) -> None:
+    """Write one view; the JPEG keeps the full resolution of colours. The mask has three equal channels, as
+    the authors' loader reads channel 0. ``folder``: name of the subject's position, ``<id>_<position>``.
+    ``quality``: of the JPEG, 1 to 100."""
+    folders = {kind: phase / kind / folder for kind in ("img", "mask", "alpha", "depth", "parm")}
+    for path in folders.values():
+        path.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(view.image).save(folders["img"] / f"{number}.jpg", quality=quality, subsampling=0)
+    mask = np.repeat(view.mask[..., None].astype(np.uint8) * 255, 3, axis=-1)
+    Image.fromarray(mask).save(folders["mask"] / f"{number}.png")
+    if view.matte is not None:
+        Image.fromarray(view.matte).save(folders["alpha"] / f"{number}.png")
+    if view.inverse_depth is not None:
+        Image.fromarray(view.inverse_depth).save(folders["depth"] / f"{number}.png")
+    np.save(folders["parm"] / f"{number}_intrinsic.npy", view.intrinsics.astype(np.float64))
+    np.save(folders["parm"] / f"{number}_extrinsic.npy", view.extrinsics[:3].astype(np.float64))
+
+
+def write_body(phase: Path, name: str, vertices: np.ndarray) -> None:
+    """Write the vertices [n, 3] of a subject's body."""
+    folder = phase / "smpl" / name
+    folder.mkdir(parents=True, exist_ok=True)
+    np.save(folder / "vertices.npy", vertices.astype(np.float32))

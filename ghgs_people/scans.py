@@ -1,0 +1,156 @@
+"""Scans: textured meshes, as ``.obj`` like those of THuman2.0, or as ``.glb`` with several parts."""
+
+import io
+import json
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+from ghgs_lit.data.decoding import check_extent, read_vertices
+from ghgs_lit.data.images import listed_formats, read_image
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.readers import find_path, parts_of, require_folder
+from ghgs_people.figures.mesh import Person, TexturedMesh
+from ghgs_people.gltf import posed
+
+log = logging.getLogger(__name__)
+
+_MESH_SUFFIXES = (".glb", ".gltf", ".obj")
+_IMAGE_SUFFIXES = (".jpeg", ".jpg", ".png")
+
+
+@dataclass(frozen=True)
+class ScanSource:
+    """A folder ``<folder>/<id>/<id>.obj`` (with its ``material0.jpeg``) or ``<folder>/<id>/<id>.glb``."""
+
+    folder: Path
+
+    def names(self) -> list[str]:
+        """Ids of all scans, sorted. InputError: the folder is missing or holds no scans."""
+        require_folder(self.folder, "a folder of scans")
+        folders = [p for p in self.folder.iterdir() if p.is_dir() and not p.name.startswith(".")]
+        names = sorted(p.name for p in folders if _mesh_file(p) is not None)
+        others = sorted(p.name for p in folders if p.name not in names and _has_meshes(p))
+        if others:
+            example = f"{others[0]}/{others[0]}.obj"
+            log.warning(
+                "%s: no scans, since their meshes are not named as %s: %s",
+                self.folder,
+                example,
+                ", ".join(others),
+            )
+        if not names:
+            raise InputError(f"{self.folder}: expected <id>/<id>.obj or <id>/<id>.glb; found none")
+        return names
+
+    def load(self, name: str) -> Person:
+        """A scan as stored, with its ``body_vertices.npy`` if there is one. InputError: the mesh is missing
+        or unreadable, or a part has no texture."""
+        folder = self.folder / name
+        path = _mesh_file(folder) if folder.is_dir() else None
+        if path is None:
+            raise InputError(f"{folder}: expected {name}.obj or {name}.glb; found neither")
+        body_path = find_path(folder, "body_vertices.npy")
+        body = None if body_path is None else read_vertices(body_path)
+        return Person(name=name, parts=load_parts(path), body_vertices=body)
+
+    def facing(self, name: str) -> float:
+        """0 degrees: it is not known where these scans face."""
+        return 0.0
+
+
+def _mesh_file(folder: Path) -> Path | None:
+    path = find_path(folder, folder.name, _MESH_SUFFIXES)
+    return path if path is not None and path.is_file() else None
+
+
+def _has_meshes(folder: Path) -> bool:
+    return any(path.suffix.lower() in (*_MESH_SUFFIXES, ".ply", ".fbx", ".stl") for path in folder.iterdir())
+
+
+class _Beside(trimesh.resolvers.FilePathResolver):
+    """Files that a mesh names, as any system spells them: an MTL file, textures, buffers."""
+
+    def get(self, key: str) -> bytes:
+        """The content of a file; one that is named with folders of another machine lies beside the mesh.
+        FileNotFoundError: there is none."""
+        name, folder = str(key).strip().strip('"'), Path(self.parent)
+        # Escapes of a URI, folders of another machine, and options of map_Kd, which stand before the name.
+        for spelling in (name, unquote(name), parts_of(name)[-1], *name.split()[-1:]):
+            path = find_path(folder, spelling) if spelling else None
+            if path is not None and path.is_file():
+                return path.read_bytes()
+        raise FileNotFoundError(name)
+
+
+def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
+    """All textured meshes of a file in its world frame, where joints and morph targets put them."""
+    kind = path.suffix.lower()[1:]
+    tree = None if kind == "obj" else posed(path)
+    content = path.read_bytes() if tree is None else json.dumps(tree).encode()
+    try:
+        with listed_formats():
+            file, kind = io.BytesIO(content), kind if tree is None else "gltf"
+            scene = trimesh.load_scene(file, kind, _Beside(str(path)), process=False)
+    except Exception as error:  # trimesh raises whatever its parsers raise
+        raise InputError(f"{path}: expected a readable mesh; found {error!r}") from error
+    parts = []
+    for node in sorted(scene.graph.nodes_geometry):
+        transform, geometry = scene.graph[node]
+        mesh = scene.geometry[geometry]
+        if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
+            parts.append(_part(path, geometry, mesh, transform, len(scene.geometry) == 1))
+    if not parts:
+        raise InputError(f"{path}: expected triangles; found none")
+    return tuple(parts)
+
+
+def _part(
+    path: Path, name: str, mesh: trimesh.Trimesh, transform: np.ndarray, is_alone: bool
+) -> TexturedMesh:
+    texture = _texture(path, getattr(mesh.visual, "material", None), is_alone)
+    if texture is None:
+        raise InputError(f"{path}: expected a texture for the mesh {name!r}; found none")
+    uv = getattr(mesh.visual, "uv", None)
+    if texture.shape[:2] == (1, 1) and uv is None:
+        uv = np.zeros((len(mesh.vertices), 2))
+    if uv is None or len(uv) != len(mesh.vertices):
+        raise InputError(f"{path}: expected texture coordinates for the mesh {name!r}; found none")
+    vertices = trimesh.transform_points(mesh.vertices, transform)
+    check_extent(f"{path}: {name}", vertices)
+    arrays = vertices.astype(np.float32), np.asarray(mesh.faces, np.int64), np.asarray(uv, np.float32)
+    return TexturedMesh(*arrays, texture)
+
+
+def _texture(path: Path, material: object, is_alone: bool) -> np.ndarray | None:
+    """Texture [h, w, 3] uint8 of a material, None if it has none. ``is_alone``: of the file's only mesh,
+    which may be that of an image beside it. InputError: its alpha cuts parts away."""
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    if image is not None and image.format is None:  # not from a file: trimesh replaced a missing material
+        image = None
+    factor = getattr(material, "baseColorFactor", None)
+    if image is None and factor is not None:  # one plain colour, as buttons and eyes often have
+        return np.asarray(factor, np.uint8).reshape(1, 1, -1)[..., :3]
+    if image is None and is_alone and path.suffix.lower() == ".obj":
+        image = _image_beside(path)
+    if image is None:
+        return None
+    mode = str(getattr(material, "alphaMode", None) or "OPAQUE").upper()
+    require(mode == "OPAQUE" or not image.has_transparency_data, str(path), "opaque textures", mode)
+    texture = np.asarray(image.convert("RGB"))
+    if factor is not None:
+        texture = np.round(texture * (np.asarray(factor, np.float64)[:3] / 255)).astype(np.uint8)
+    return texture
+
+
+def _image_beside(path: Path) -> Image.Image | None:
+    """The texture of a scan without its ``.mtl``: ``material0.*``, or the only image."""
+    images = sorted(p for p in path.parent.iterdir() if p.suffix.lower() in _IMAGE_SUFFIXES)
+    named = [p for p in images if p.stem.lower() == "material0"]
+    chosen = named[:1] or (images if len(images) == 1 else [])
+    return read_image(chosen[0]) if chosen else None

@@ -1,0 +1,316 @@
+"""What is written of a prediction, read by other programs' readers."""
+
+import dataclasses
+import json
+import re
+import sys
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+import trimesh
+from gaussforge import GaussForge
+from plyfile import PlyData
+from scipy.spatial.transform import Rotation
+
+from ghgs_capture.calibration import calibrate
+from ghgs_capture.export import OutputOptions, output_options, write_prediction
+from ghgs_capture.export.maps import depth_unit
+from ghgs_capture.export.subject import (
+    AXES,
+    exported_subject,
+    file_names,
+    for_other_renderers,
+    rotate_world,
+    turn,
+)
+from ghgs_capture.formats.json_and_toml import read_json
+from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.projection import project
+from ghgs_lit.metrics import psnr
+from ghgs_lit.metrics.functional import box_of
+from ghgs_lit.ply import read_ply
+from ghgs_lit.rendering import Renderer, render
+from ghgs_lit.types import Batch, Cameras
+from ghgs_lit.visualization.turntable import up_direction
+from tests.helpers.splats import body, camera_ring, cloud
+from tests.helpers.training import Standin, example_batch
+
+CONFIG = {"formats": ["ply"], "up": None, "smooth": False, "turntable": {"frames": 2, "fps": 12}}
+
+
+def test_every_photograph_gets_a_file():
+    """Names that differ in signs alone, or in case, which some file systems ignore."""
+    views = ["left 1", "left_1", "left/1", "Left_1", "left_1_2", "b"]
+    names = file_names(views)
+    assert len({name.casefold() for name in names}) == len(views)
+    assert (names[0], names[5]) == ("left_1", "b")
+
+
+@pytest.fixture
+def subject():
+    """A batch of one subject, with a prediction of it."""
+    batch = example_batch(subjects=1)
+    return batch, Standin()(dataclasses.replace(batch, targets=None))
+
+
+def test_everything_is_written_and_reported(subject, tmp_path):
+    """The report names each file with its size; other programs read depths, points and photographs."""
+    batch, prediction = subject
+    depth = prediction.depth.detach() + torch.rand(batch.masks.shape)
+    prediction = dataclasses.replace(prediction, depth=depth)
+    options = OutputOptions(("ply", "turntable", "depth", "points", "inputs"), frames=2)
+    paths = write_prediction(tmp_path, batch, prediction, Renderer(), options, {"seconds": {"predict": 1}})
+    report = json.loads((tmp_path / "report.json").read_text())
+    written = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
+    assert {str(p.relative_to(tmp_path)) for p in paths} == written == {*report["files"], "report.json"}
+    assert report["gaussians"] == len(prediction.gaussians)
+    assert report["seconds"]["predict"] == 1
+    assert {f"write {name}" for name in options.formats} < set(report["seconds"])
+    valid = batch.masks[0].numpy()
+    depth = depth[0].numpy()
+    unit = report["depth_png_unit"]
+    picture = iio.imread(tmp_path / "depth" / "001_0.png")
+    assert picture.dtype == np.uint16
+    assert np.abs(picture * unit - np.where(valid[1], depth[1], 0)).max() <= unit / 2 * 1.001
+    exact = np.load(tmp_path / "depth.npz")
+    assert np.array_equal(exact["depth"][valid], depth[valid])
+    assert np.isnan(exact["depth"][~valid]).all()
+    points = trimesh.load(tmp_path / "points.ply")
+    camera, positions = batch.cameras[0, 0], torch.tensor(np.asarray(points.vertices)).float()
+    pixels, z = project(positions, camera.intrinsics, camera.extrinsics)
+    count, (rows, columns) = valid[0].sum(), valid[0].nonzero()
+    assert np.allclose(pixels[:count], np.stack([columns, rows], -1) + 0.5, atol=1e-3)
+    assert np.allclose(z[:count], depth[0][valid[0]], atol=1e-5)
+    colors = batch.images[0].movedim(1, -1).numpy()[valid]
+    assert np.abs(points.colors[:, :3] / 255 - colors).max() <= 0.5 / 255 * 1.001
+    photograph = iio.imread(tmp_path / "inputs" / "000_0.png")
+    assert np.array_equal(photograph[..., 3] > 0, valid[0])
+    cameras = json.loads((tmp_path / "cameras.json").read_text())["cameras"]
+    stored = read_json(tmp_path / "cameras.json")
+    read = calibrate(stored.cameras["001_0"], stored.convention, (16, 16))
+    assert np.allclose(read.intrinsics, batch.cameras.intrinsics[0, 1], atol=1e-6)
+    assert np.allclose(cameras["001_0"]["extrinsics"], batch.cameras.extrinsics[0, 1], atol=1e-7)
+
+
+def test_mattes_are_the_alpha_of_the_photographs(subject, tmp_path):
+    """Colours of a PNG are the subject's own; on black they give the photograph that the model saw."""
+    batch, prediction = subject
+    share = torch.rand(batch.masks.shape, generator=torch.Generator().manual_seed(1)) * batch.masks
+    batch = dataclasses.replace(batch, images=batch.images * share[:, :, None], alpha=share)
+    write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions(("inputs",)))
+    picture = iio.imread(tmp_path / "inputs" / "000_0.png") / 255
+    assert np.abs(picture[..., 3] - share[0, 0].numpy()).max() <= 0.5 / 255 * 1.001
+    seen = batch.images[0, 0].movedim(0, -1).numpy()
+    assert np.abs(picture[..., :3] * picture[..., 3:] - seen).max() <= 1 / 255 * 1.001
+
+
+def test_up_turns_everything_and_changes_no_picture(subject, tmp_path):
+    """With up=z the cameras' up is +z; Gaussians, points and cameras fit one another as before."""
+    batch, prediction = subject
+    options = OutputOptions(("ply", "points", "inputs"), up="z")
+    write_prediction(tmp_path, batch, prediction, Renderer(), options)
+    gaussians, own = read_ply(tmp_path / "gaussians.ply"), batch.cameras[0]
+    written = json.loads((tmp_path / "cameras.json").read_text())["cameras"].values()
+    extrinsics = torch.tensor([camera["extrinsics"] for camera in written])
+    cameras = Cameras(own.intrinsics, extrinsics, own.height, own.width)
+    assert torch.allclose(up_direction(cameras), torch.tensor([0, 0, 1.0]).double(), atol=1e-5)
+    assert -extrinsics[:, 1, 2].mean() > 0.9  # the images' rows run downwards
+    before = render(prediction.gaussians, batch.cameras, backend="reference").image
+    after = render(gaussians, cameras[None], backend="reference").image
+    assert torch.allclose(before, after, atol=1e-4)
+    points = torch.tensor(np.asarray(trimesh.load(tmp_path / "points.ply").vertices)).float()
+    count = int(batch.masks[0, 0].sum())
+    pixels, _ = project(points[:count], cameras.intrinsics[0], cameras.extrinsics[0])
+    assert torch.allclose(pixels.round(decimals=2) % 1, torch.tensor(0.5), atol=0.02)
+
+
+@pytest.mark.parametrize("end", AXES)
+@pytest.mark.parametrize(
+    "up", [(0, 1, 0), (0, 0, 1), (0, -1, 0), (0, 0, -1), (1, 0, 0), (0.6, -0.64, 0.48), (0, -1, 1e-9)]
+)
+def test_a_world_is_turned_as_scipy_turns_it(up, end):
+    """Opposite directions, too; pictures stay as they were."""
+    up = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float64), dim=0)
+    axis = torch.tensor(AXES[end], dtype=torch.float64)
+    quaternion = turn(up, axis)
+    rotation = Rotation.from_quat(quaternion.numpy(), scalar_first=True)
+    assert np.allclose(rotation.apply(up.numpy()), axis.numpy(), atol=1e-7)
+    gaussians, cameras = cloud(20), camera_ring(2, 16, 20)
+    turned, moved = rotate_world(quaternion, gaussians, cameras)
+    assert np.allclose(turned.means, rotation.apply(gaussians.means.numpy()), atol=1e-6)
+    images = [render(*pair, backend="reference").image for pair in ((gaussians, cameras), (turned, moved))]
+    assert torch.allclose(*images, atol=1e-4)
+
+
+@pytest.mark.parametrize(("largest", "unit"), [(2.5, 1e-3), (300.0, 1e-2), (0.3, 1e-4), (0.0, 1e-3)])
+def test_depths_of_any_scale_fit_into_16_bits(largest, unit):
+    assert depth_unit(largest) == pytest.approx(unit)
+    assert largest / depth_unit(largest) <= 65535
+
+
+def test_gaussians_that_are_not_finite_are_counted_and_left_out(subject, tmp_path):
+    """A viewer fails on a file with NaN; our renderer does not draw such Gaussians."""
+    batch, prediction = subject
+    prediction.gaussians.means.data[3, 1] = torch.nan
+    write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions())
+    assert json.loads((tmp_path / "report.json").read_text())["gaussians_not_finite"] == 1
+    vertices = PlyData.read(tmp_path / "gaussians.ply")["vertex"]
+    assert len(vertices) == len(prediction.gaussians) - 1
+    assert np.isfinite(vertices["y"]).all()
+
+
+def test_a_subject_without_gaussians_is_written(subject, tmp_path):
+    """Empty masks give empty files and a report without numbers."""
+    batch, _ = subject
+    batch = dataclasses.replace(batch, masks=torch.zeros_like(batch.masks), targets=None)
+    options = OutputOptions(("ply", "splat", "html", "turntable", "depth", "points", "inputs"), frames=1)
+    write_prediction(tmp_path, batch, Standin()(batch), Renderer(), options)
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["gaussians"] == 0
+    assert set(report["psnr_box_of_inputs"].values()) == {None}
+    with pytest.raises(
+        InputError, match="formats: expected Gaussians that gaussforge converts to spz; found 0: "
+    ):
+        write_prediction(tmp_path, batch, Standin()(batch), Renderer(), OutputOptions(("spz",)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"formats": ["obj"]}, "formats: expected one of all, ply, .*; found 'obj'"),
+        ({"up": "x"}, "up: expected one of None, y, -y, z; found 'x'"),
+        (
+            {"formats": "all", "turntable": {"frames": 0, "fps": 1}},
+            r"turntable\.frames: expected at least 1 for formats=mp4; found 0",
+        ),
+        ({"turntable": {"frames": -1, "fps": 1}}, r"turntable\.frames: expected .*; found -1"),
+    ],
+)
+def test_wrong_options_are_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        output_options(CONFIG | changes)
+
+
+def test_options_are_read():
+    """One name, a list with repetitions, and all."""
+    assert output_options(CONFIG | {"formats": "ply"}).formats == ("ply",)
+    assert output_options(CONFIG | {"formats": ["ply", "depth", "ply"]}).formats == ("ply", "depth")
+    assert "inputs" in output_options(CONFIG | {"formats": ["all"]}).formats
+    batch = example_batch()
+    with pytest.raises(InputError, match="a batch of one subject; found 2"):
+        write_prediction(None, batch, Standin()(batch), Renderer(), OutputOptions())
+
+
+def test_a_missing_package_is_named_before_any_work(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gaussforge", None)
+    line = r"formats=spz: expected the package gaussforge \(pip install 'ghgs-lit\[formats\]'\); found none"
+    with pytest.raises(InputError, match=line):
+        output_options(CONFIG | {"formats": ["ply", "spz"]})
+
+
+@pytest.mark.parametrize(("antialiased", "size"), [(False, 0.3), (True, 1.0)])
+def test_smooth_files_have_no_gaps_on_larger_screens(tmp_path, antialiased, size):
+    """At four times the resolution a smooth file shows the same picture, enlarged; another shows dots."""
+    gaussians, cameras = body(1500, 60), camera_ring(2, 60, 60)
+    gaussians = dataclasses.replace(gaussians, scales=gaussians.scales * size, antialiased=antialiased)
+    rendering = render(gaussians, cameras)
+    batch = Batch(rendering.image.clamp(0, 1), rendering.alpha[:, :, 0] > 0.5, cameras)
+    prediction = dataclasses.replace(Standin()(batch), gaussians=gaussians)
+    alphas = {}
+    for smooth in (False, True):
+        write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions(smooth=smooth))
+        large = render(read_ply(tmp_path / "gaussians.ply"), cameras.resized(240, 240)).alpha[0, :, 0]
+        alphas[smooth] = torch.nn.functional.avg_pool2d(large, 4)
+    wanted = rendering.alpha[0, :, 0]
+    errors = {smooth: float((alpha - wanted).abs()[wanted > 0.5].mean()) for smooth, alpha in alphas.items()}
+    assert errors[True] < 0.1
+    assert antialiased or errors[False] > 3 * errors[True]
+
+
+def made_for_thin_pixels(size: int = 60):
+    """Discs of about a pixel, made for a low-pass of 0.1 px^2 with antialiasing, and their photographs."""
+    gaussians, cameras = body(1500, size), camera_ring(2, size, size)
+    gaussians = dataclasses.replace(gaussians, low_pass=0.1, antialiased=True)
+    rendering = render(gaussians, cameras)
+    batch = Batch(rendering.image.clamp(0, 1), rendering.alpha[:, :, 0] > 0.5, cameras)
+    return batch, dataclasses.replace(Standin()(batch), gaussians=gaussians)
+
+
+def test_other_viewers_draw_what_ours_draws(tmp_path):
+    """They add 0.3 px^2 and are not antialiased: their files make up for it, the PLY says it."""
+    batch, prediction = made_for_thin_pixels()
+    wanted, boxes = batch.images[0], box_of(batch.masks[0])
+    write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions(("ply", "splat"), frames=0))
+    exact = render(read_ply(tmp_path / "gaussians.ply"), batch.cameras).image[0]
+    assert psnr(exact, wanted, boxes).min() > 60
+    data = GaussForge().convert((tmp_path / "gaussians.splat").read_bytes(), "splat", "ply")["data"]
+    (tmp_path / "viewer.ply").write_bytes(data)
+    adapted = render(read_ply(tmp_path / "viewer.ply"), batch.cameras).image[0]
+    as_is = dataclasses.replace(prediction.gaussians, low_pass=0.3, antialiased=False)
+    blurred = render(as_is, batch.cameras).image[0]
+    gain = psnr(adapted.clamp(0, 1), wanted, boxes) - psnr(blurred.clamp(0, 1), wanted, boxes)
+    assert gain.min() > 4
+
+
+def test_other_viewers_see_the_inputs_as_ours_does():
+    """Better than scales and opacities alone make it; between the inputs these discs, whose colours are
+    drawn at random, lose less than 1 dB; places and rotations stay."""
+    batch, prediction = made_for_thin_pixels()
+    ours = prediction.gaussians
+    subject = exported_subject(batch, prediction, Renderer(), OutputOptions())
+    found, converted = subject.for_other_renderers, for_other_renderers(ours, subject.pixel)
+    between = camera_ring(5, 60, 60)[:, 1:]
+    for cameras, gain in ((batch.cameras, 2.0), (between, -1.0)):
+        wanted, nearer, before = (render(g, cameras).image[0] for g in (ours, found, converted))
+        boxes = box_of(render(ours, cameras).alpha[0, :, 0] > 0.5)
+        assert (psnr(nearer, wanted, boxes) > psnr(before, wanted, boxes) + gain).all()
+    assert torch.equal(found.means, ours.means)
+    assert torch.equal(found.quaternions, ours.quaternions)
+
+
+def test_gaussians_for_other_viewers_stay_as_they_are():
+    gaussians = body(50, 60)
+    assert for_other_renderers(gaussians, 0.01) is gaussians
+
+
+def test_no_picture_of_a_turntable_cuts_the_subject(tmp_path):
+    """Also where optical axes meet elsewhere: crops have their principal point anywhere."""
+    gaussians, cameras = body(1500, 60), camera_ring(3, 60, 60)
+    shift = torch.tensor([0.0, 0.7, 0.0])  # what is photographed is above the point that all cameras look at
+    gaussians = dataclasses.replace(gaussians, means=gaussians.means + shift)
+    intrinsics = cameras.intrinsics.clone()
+    intrinsics[..., 1, 2] -= 0.7 / 3.0 * intrinsics[..., 1, 1]
+    cameras = dataclasses.replace(cameras, intrinsics=intrinsics)
+    rendering = render(gaussians, cameras)
+    batch = Batch(rendering.image.clamp(0, 1), rendering.alpha[:, :, 0] > 0.5, cameras)
+    assert batch.masks.any()
+    prediction = dataclasses.replace(Standin()(batch), gaussians=gaussians)
+    options = OutputOptions(("turntable", "html"), frames=5)
+    write_prediction(tmp_path, batch, prediction, Renderer(), options)
+    for frame in range(5):
+        picture = iio.imread(tmp_path / "turntable" / f"{frame:03d}.png").max(-1)
+        assert picture.max() > 100
+        assert max(border.max() for border in (picture[0], picture[-1], picture[:, 0], picture[:, -1])) == 0
+    target = re.search(r'"target": \[([^]]*)\]', (tmp_path / "viewer.html").read_text())[1]
+    assert np.allclose([float(value) for value in target.split(",")], shift, atol=0.05)
+
+
+def test_only_files_of_earlier_predictions_are_replaced(subject, tmp_path):
+    """Files of an earlier prediction stay known over runs that write others."""
+    batch, prediction = subject
+
+    def write(*formats):
+        return write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions(formats, frames=0))
+
+    write("points", "inputs")
+    write("ply")
+    write("points", "inputs")
+    (tmp_path / "depth.npz").write_text("somebody's")
+    with pytest.raises(InputError, match=r"depth\.npz: expected no file, or one that an earlier prediction"):
+        write("ply", "depth")
+    assert (tmp_path / "depth.npz").read_text() == "somebody's"
+    (tmp_path / "report.json").write_text("{}")
+    with pytest.raises(InputError, match=r"found 'another file'"):
+        write("ply")

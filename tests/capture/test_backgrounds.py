@@ -1,0 +1,139 @@
+"""Static backgrounds: they mend masks that err in large parts, and leave all others as they are."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from ghgs_capture.backgrounds import Backgrounds
+from ghgs_capture.capture import Capture
+from ghgs_capture.crops import Photograph
+from ghgs_capture.verbs.predict import mended_by
+
+SIDE, COUNT = 200, 8
+ROWS, COLUMNS = np.mgrid[:SIDE, :SIDE]
+SKIN, SHIRT = (190, 120, 100), (30, 60, 160)
+#: What stands beside the subject's way: its pattern is its own.
+OBJECT = (slice(60, 110), slice(115, 145))
+
+
+def behind(seed=0):
+    rng = np.random.default_rng(seed)
+    image = gaussian_filter(rng.normal(0, 1, (SIDE, SIDE, 1)), (3, 3, 0))
+    image = 110 + 25 * image / image.std() + np.zeros((1, 1, 3))
+    image[OBJECT] += 60 * np.sin(COLUMNS[OBJECT] / 2)[..., None]
+    return image.clip(0, 255)
+
+
+def parts(number, step=10):
+    """Head and body of the subject at an instant, as masks."""
+    middle = 35 + step * number
+    head = np.hypot(ROWS - 50, COLUMNS - middle) < 16
+    return head, (np.abs(COLUMNS - middle) < 18) & (ROWS > 66) & (ROWS < 170)
+
+
+def instant(number, mask=None, image=None, step=10, shirt=SHIRT, background=None):
+    """The capture of one camera, with some noise."""
+    head, body = parts(number, step)
+    shown = behind() if background is None else background.copy()
+    shown[head], shown[body] = SKIN, shirt
+    shown = shown if image is None else image(shown)
+    noise = np.random.default_rng(number).normal(0, 2, shown.shape)
+    mask = head | body if mask is None else mask
+    matte = mask * np.uint8(255)
+    pixels = (shown + noise).clip(0, 255).astype(np.uint8)
+    return Capture(str(number), (Photograph("left", pixels, matte, np.eye(3), np.eye(4)),))
+
+
+def mended(capture, captures):
+    (photograph,) = Backgrounds.of(captures).applied(capture).photographs
+    return photograph
+
+
+def is_kept(capture, captures):
+    return mended(capture, captures) is capture.photographs[0]
+
+
+def whole():
+    return [instant(number) for number in range(COUNT)]
+
+
+def test_masks_that_are_right_are_not_touched():
+    captures = whole()
+    assert all(is_kept(capture, captures) for capture in captures)
+
+
+def test_an_object_taken_for_the_subject_is_removed():
+    captures, (head, body) = whole(), parts(5)
+    wrong = head | body
+    wrong[OBJECT] = True
+    captures[5] = instant(5, wrong)
+    found = mended(captures[5], captures).mask
+    assert (found ^ (head | body)).sum() < 0.2 * (wrong ^ (head | body)).sum()
+    assert found[head | body].mean() > 0.99
+
+
+def test_a_part_that_is_left_out_comes_back_and_is_said(capsys):
+    captures, (head, body) = whole(), parts(3)
+    captures[3] = instant(3, body)
+    mended_by(Backgrounds.of(captures), captures[2])
+    found = mended_by(Backgrounds.of(captures), captures[3]).photographs[0].mask
+    line = "instant 3: the background mends masks of left (refine_masks=0 leaves them)\n"
+    assert capsys.readouterr().out == line
+    assert found[head].mean() > 0.95
+    assert (found & ~(head | body)).sum() < 0.1 * head.sum()
+
+
+def test_outlines_that_are_off_stay():
+    """By a pixel everywhere: that is for mattes."""
+    captures, (head, body) = whole(), parts(3)
+    smaller = (head | body) & np.roll(head | body, 2, 0) & np.roll(head | body, 2, 1)
+    captures[3] = instant(3, smaller)
+    assert is_kept(captures[3], captures)
+
+
+def test_a_shirt_of_the_walls_colour_stays():
+    """It has another pattern, or none."""
+    captures = [instant(number, shirt=(110, 110, 110)) for number in range(COUNT)]
+    assert all(is_kept(capture, captures) for capture in captures)
+    black = np.zeros((SIDE, SIDE, 3))
+    captures = [instant(number, shirt=(2, 2, 2), background=black) for number in range(COUNT)]
+    assert all(is_kept(capture, captures) for capture in captures)
+
+
+def test_a_shadow_is_not_the_subject():
+    def shaded(image):
+        there = (ROWS > 150) & (COLUMNS > 85) & (COLUMNS < 160) & ~np.logical_or(*parts(3))
+        image[there] *= 0.6
+        return image
+
+    captures = whole()
+    captures[3] = instant(3, image=shaded)
+    assert is_kept(captures[3], captures)
+
+
+def test_what_never_moves_has_no_background():
+    """Behind it there is nothing to see, and beside it all is as ever."""
+    captures = [instant(number, step=0) for number in range(COUNT)]
+    _, body = parts(0)
+    captures[3] = instant(3, body, step=0)
+    found = Backgrounds.of(captures).cameras["left"]
+    assert not found.known[body].any()
+    assert is_kept(captures[0], captures)
+
+
+@pytest.mark.parametrize("change", ["few", "another size", "another camera"])
+def test_without_a_background_masks_stay(change):
+    captures, (_, body) = whole(), parts(3)
+    captures[3] = wrong = instant(3, body)
+    if change == "few":
+        captures = captures[:5]
+    else:
+        (photograph,) = wrong.photographs
+        other = {"name": "right"} if change == "another camera" else {}
+        if change == "another size":
+            other = {"image": photograph.image[:-1], "matte": photograph.matte[:-1]}
+        wrong = dataclasses.replace(wrong, photographs=(dataclasses.replace(photograph, **other),))
+    assert is_kept(wrong, captures)
+    assert change != "few" or not Backgrounds.of(captures).cameras

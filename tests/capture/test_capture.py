@@ -1,0 +1,286 @@
+"""From files to the batch of a model and back to the user's world."""
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+from ghgs_capture.folder import CaptureFolder
+from ghgs_capture.masks import matte_of_file
+from ghgs_capture.photographs import Pixels
+from ghgs_lit import Capture, predict
+from ghgs_lit.geometry.frame import Frame
+from ghgs_lit.geometry.masks import on_black
+from ghgs_lit.geometry.projection import project
+from ghgs_lit.geometry.undistortion import undistorting_grid
+from ghgs_lit.metrics.functional import box_of, psnr
+from ghgs_lit.refinement import Refinement
+from ghgs_lit.rendering import Renderer
+from tests.helpers.figures import PARTS, Figure
+from tests.helpers.models import make_model
+from tests.helpers.rigs import SIZE, opencv_pixels, rig
+
+HEAD = torch.tensor([PARTS[1][0]], dtype=torch.float64)
+
+
+def pixel_of(photograph, point=HEAD):
+    k, e = torch.from_numpy(photograph.intrinsics)[None], torch.from_numpy(photograph.extrinsics)[None]
+    return project(point, k, e)[0][0].numpy()
+
+
+def test_crops_hold_the_subject_and_their_cameras_follow(tmp_path):
+    """A point projects to the same place of the subject before and after the crop."""
+    figure = Figure(height=160, width=120)
+    capture = Capture.read(tmp_path, figure.write(tmp_path))
+    batch = capture.batch((84, 56))
+    assert batch.images.shape == (1, 4, 3, 84, 56)
+    assert (batch.images[0].movedim(1, -1)[batch.alpha[0] == 0] == 0).all()
+    for v, photograph in enumerate(capture.photographs):
+        mask = batch.masks[0, v].numpy()
+        extents = [np.ptp(np.nonzero(mask.any(axis))[0]) + 1 for axis in (1, 0)]
+        assert 0.75 <= max(extents[0] / 84, extents[1] / 56) <= 0.85
+        before = np.argwhere(photograph.mask)[:, ::-1] + 0.5
+        after = np.argwhere(mask)[:, ::-1] + 0.5
+        place = (pixel_of(photograph) - before.min(0)) / np.ptp(before, axis=0)
+        camera = batch.cameras[0, v]
+        pixel = project(HEAD, camera.intrinsics[None], camera.extrinsics[None])[0][0].numpy()
+        assert np.abs(place - (pixel - after.min(0)) / np.ptp(after, axis=0)).max() < 0.04
+
+
+def test_a_subject_cut_by_the_border_is_cut_in_the_crop(tmp_path):
+    """Black beyond the border would say that the subject ends there."""
+    figure = Figure()
+    figure.images, figure.masks = figure.images[:, :90], figure.masks[:, :90]
+    for camera in figure.cameras.values():
+        camera["height"] = 90
+    batch = Capture.read(tmp_path, figure.write(tmp_path)).batch((84, 84))
+    assert batch.masks[0, :, -1].any(-1).all()
+
+
+@pytest.mark.parametrize(
+    ("scale", "origin"), [(0.11, (0, 0, 0)), (110.0, (3e3, -2e3, 5e3)), (1.0, (4e5, 5e6, 100))]
+)
+def test_figurines_and_statues_are_predicted_alike(tmp_path, scale, origin):
+    """The same photographs in another unit and place give the same Gaussians there."""
+    model = make_model("model=hull").eval()
+    first = Capture.read(tmp_path / "a", Figure().write(tmp_path / "a"))
+    other = Capture.read(tmp_path / "b", Figure(scale=scale, origin=origin).write(tmp_path / "b"))
+    person, moved = (predict(capture, model, 56) for capture in (first, other))
+    assert float(moved.gaussians.metre) == pytest.approx(scale * float(person.gaussians.metre), rel=1e-5)
+    expected = person.gaussians.means.double() * scale + torch.tensor(origin).double()
+    error = (moved.gaussians.means.double() - expected).norm(dim=-1).median() / scale
+    assert error < 1e-5
+    ratio = (moved.gaussians.scales / scale / person.gaussians.scales).median()
+    assert ratio == pytest.approx(1, abs=0.05)
+    camera = moved.batch.cameras[0, 0]
+    assert camera.centers.double().numpy() == pytest.approx(
+        _center(other.photographs[0]), rel=1e-4, abs=1e-3 * scale
+    )
+
+
+def test_python_refines_as_the_command_line_does(tmp_path):
+    """All that brings a prediction nearer to the photographs can be asked for, and says what it gained."""
+    capture, model = Capture.read(tmp_path, Figure().write(tmp_path)), make_model("model=hull").eval()
+    plain, refined = (predict(capture, model, 28, refine=steps) for steps in (0, 2))
+    assert plain.refined is None
+    expected = Refinement(2, Renderer())(plain.gaussians, plain.batch)
+    assert torch.equal(refined.gaussians.means, expected.means)
+    before, after = refined.refined.inputs
+    assert after > before
+    others = plain.batch.of_views(range(plain.batch.images.shape[1] - 1))
+    frame = Frame.of(others)
+    alone = frame.leave(model(frame.enter(others)), others.cameras.extrinsics.dtype).gaussians
+    hidden = plain.batch.of_views([plain.batch.images.shape[1] - 1])
+    drawn = Renderer()(alone, hidden.cameras).image[0].clamp(0, 1)
+    wanted = float(psnr(drawn.detach(), on_black(hidden)[0], box_of(hidden.masks[0])))
+    assert refined.refined.held_out[0] == pytest.approx(wanted, abs=1e-3)
+
+
+def _center(photograph):
+    return -photograph.extrinsics[:3, :3].T @ photograph.extrinsics[:3, 3]
+
+
+@pytest.mark.parametrize("orientation", [3, 6, 8])
+@pytest.mark.parametrize("calibrated", ["shown", "stored"])
+def test_exif_turns_do_not_move_the_subject(tmp_path, orientation, calibrated):
+    """A phone stores pixels as its sensor has them; calibrations are of these or of the turned ones."""
+    figure = Figure()
+    path = figure.write(tmp_path)
+    right = Capture.read(tmp_path, path)
+    turns = {3: 2, 6: 3, 8: 1}[orientation]
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    for name, image in zip(figure.names, figure.images, strict=True):
+        stored = np.ascontiguousarray(np.rot90(image, -turns))
+        Image.fromarray(stored).save(tmp_path / f"{name}.png", exif=exif)
+    options = {}
+    if calibrated == "stored":
+        cameras = {n: _stored(c, turns) for n, c in figure.cameras.items()}
+        figure.names = []
+        figure.write(tmp_path, cameras=cameras)
+        options = {"calibration": {"exif": "stored"}} if turns == 2 else {}
+    for one, other in zip(
+        right.photographs, Capture.read(tmp_path, path, **options).photographs, strict=True
+    ):
+        np.testing.assert_array_equal(one.image, other.image)
+        np.testing.assert_array_equal(one.mask, other.mask)
+        np.testing.assert_allclose(pixel_of(one), pixel_of(other), atol=1e-9)
+
+
+def _stored(camera, turns):
+    """The camera of the stored pixels, of the photograph turned back."""
+    width, height = camera["width"], camera["height"]
+    k, e = np.array(camera["intrinsics"]), np.array(camera["extrinsics"])
+    for _ in range(turns):  # back, clockwise: new x = height - old y, new y = old x
+        k = np.array([[k[1, 1], 0, height - k[1, 2]], [0, k[0, 0], k[0, 2]], [0, 0, 1]])
+        e = np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ e
+        width, height = height, width
+    return {"intrinsics": k.tolist(), "extrinsics": e.tolist(), "width": width, "height": height}
+
+
+def test_photographs_may_differ_in_size(tmp_path):
+    """One camera gives half the size; its intrinsics follow, and the batch is the same but for its grain."""
+    figure = Figure()
+    path = figure.write(tmp_path)
+    before = Capture.read(tmp_path, path).batch((56, 56))
+    small = Image.fromarray(figure.images[1]).resize((48, 64), Image.Resampling.BOX)
+    small.save(tmp_path / "cam1.png")
+    Image.fromarray(figure.masks[1]).resize((48, 64), Image.Resampling.NEAREST).save(
+        tmp_path / "cam1_mask.png"
+    )
+    after = Capture.read(tmp_path, path).batch((56, 56))
+    assert (before.masks ^ after.masks).float().mean() < 0.03
+    np.testing.assert_allclose(before.cameras.intrinsics[0, 1], after.cameras.intrinsics[0, 1], rtol=0.05)
+
+
+@pytest.mark.parametrize("source", ["alpha", "folder", "labels", "backgrounds", "beside"])
+def test_masks_come_from_many_places(tmp_path, source):
+    figure = Figure()
+    images = tmp_path / "images"
+    path = figure.write(images, masks=source == "beside")
+    options = {}
+    for name, image, mask, background in zip(
+        figure.names, figure.images, figure.masks, figure.backgrounds, strict=True
+    ):
+        if source == "alpha":
+            Image.fromarray(np.dstack((image, mask * np.uint8(255)))).save(images / f"{name}.png")
+        elif source in ("folder", "labels"):
+            (tmp_path / "masks").mkdir(exist_ok=True)
+            values = mask * np.uint8(255 if source == "folder" else 7)
+            Image.fromarray(values).save(tmp_path / "masks" / f"{name}.png")
+            options = {"masks": tmp_path / "masks"}
+        elif source == "backgrounds":
+            (tmp_path / "empty").mkdir(exist_ok=True)
+            noise = np.random.default_rng(1).integers(-3, 4, background.shape)
+            Image.fromarray((background + noise).astype(np.uint8)).save(tmp_path / "empty" / f"{name}.png")
+            options = {"backgrounds": tmp_path / "empty"}
+    found = np.stack([p.mask for p in Capture.read(images, path, **options).photographs])
+    if source == "backgrounds":
+        assert (found & figure.masks).sum() / (found | figure.masks).sum() > 0.9
+    else:
+        np.testing.assert_array_equal(found, figure.masks)
+
+
+def test_soft_masks_are_mattes(tmp_path):
+    """Grey values of a mask are shares; the background has no part in what a model sees of the rim."""
+    figure = Figure()
+    path = figure.write(tmp_path)
+    sharp = Capture.read(tmp_path, path).batch((42, 42))
+    assert ((sharp.alpha > 0.1) & (sharp.alpha < 0.9)).sum() > 100  # of a larger photograph's mask
+    assert torch.equal(sharp.masks, sharp.alpha > 127.5 / 255)
+    for name, image, mask in zip(figure.names, figure.images, figure.masks, strict=True):
+        matte = gaussian_filter(mask * 255.0, 1.5).round().astype(np.uint8)
+        Image.fromarray(matte).save(tmp_path / f"{name}_mask.png")
+        Image.fromarray(np.where(mask[..., None], image, 255).astype(np.uint8)).save(tmp_path / f"{name}.png")
+    capture = Capture.read(tmp_path, path)
+    np.testing.assert_array_equal(capture.photographs[-1].matte, matte)
+    soft = capture.batch((42, 42))
+    assert (soft.images <= soft.alpha[:, :, None] + 2 / 255).all()  # premultiplied
+    assert ((soft.alpha > 0) & (soft.alpha < 1)).sum() > ((sharp.alpha > 0) & (sharp.alpha < 1)).sum()
+
+
+def test_mattes_of_16_bits_are_read(tmp_path):
+    """Their range is that of 16 bits."""
+    pixels = Pixels(np.zeros((2, 3, 3), np.uint8), None, 0)
+    Image.fromarray(np.array([[0, 65535, 32768], [257, 40000, 1]], np.uint16)).save(tmp_path / "matte.png")
+    found = matte_of_file(tmp_path / "matte.png", pixels)
+    assert found.tolist() == [[0, 255, 128], [1, 156, 0]]
+
+
+@pytest.mark.parametrize("fisheye", [False, True])
+def test_undistorted_photographs_are_pinhole_photographs(fisheye):
+    """Where the grid reads a pixel is where OpenCV's model of the lens projects its ray."""
+    camera = rig()["cam_01"]
+    distortion = np.array([0.05, -0.02, 0.003, 0.004]) if fisheye else camera["D"] * 5
+    k = camera["K"] + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    height, width = SIZE
+    grid = undistorting_grid(k, distortion, height, width, fisheye)[0].double().numpy()
+    rows, columns = np.indices(SIZE)[:, ::61, ::47].reshape(2, -1)
+    rays = np.stack((columns + 0.5, rows + 0.5, np.ones(len(rows))), -1) @ np.linalg.inv(k).T
+    places = opencv_pixels(rays, np.eye(3), np.zeros(3), k, distortion, fisheye)
+    ours = (grid[rows, columns] + 1) / 2 * [width, height]
+    assert np.abs(ours - places).max() < 0.02
+
+
+def test_a_bent_photograph_is_straightened(tmp_path):
+    """OpenCV bends the photographs of a pinhole camera; reading them undoes it."""
+    figure = Figure()
+    distortion = [-0.2, 0.05, 0.002, -0.001, 0.0]
+    straight = Capture.read(tmp_path, figure.write(tmp_path))
+    for v, (name, camera) in enumerate(figure.cameras.items()):
+        k = np.array(camera["intrinsics"]) - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+        rows, columns = np.indices(figure.masks[v].shape).astype(np.float64)
+        bent = np.stack((columns, rows), -1).reshape(-1, 1, 2)
+        source = cv2.undistortPoints(bent, k, np.array(distortion), P=k).reshape(*rows.shape, 2)
+        image, mask = (
+            cv2.remap(
+                a, source[..., 0].astype(np.float32), source[..., 1].astype(np.float32), cv2.INTER_LINEAR
+            )
+            for a in (figure.images[v], figure.masks[v].astype(np.uint8) * 255)
+        )
+        Image.fromarray(image).save(tmp_path / f"{name}.png")
+        Image.fromarray(mask).save(tmp_path / f"{name}_mask.png")
+        camera["distortion"] = distortion
+    figure.names = []
+    bent = CaptureFolder(tmp_path, figure.write(tmp_path)).photographs(tmp_path.name)
+    for one, other in zip(straight.photographs, bent, strict=True):
+        assert (one.mask ^ other.mask).sum() < 0.08 * one.mask.sum()
+        crossed = np.array(Image.open(tmp_path / f"{one.name}_mask.png")) > 127
+        assert (one.mask ^ other.mask).sum() < 0.5 * (one.mask ^ crossed).sum()
+
+
+def test_a_folder_for_each_instant_and_one_for_each_camera(tmp_path):
+    figure = Figure()
+    path = figure.write(tmp_path / "instants" / "000")
+    shutil.copytree(path.parent, tmp_path / "instants" / "001")
+    folder = CaptureFolder(tmp_path / "instants", path)
+    assert folder.instants == ["000", "001"]
+    for name in figure.names:
+        for kind in ("cameras", "masks"):
+            (tmp_path / kind / name).mkdir(parents=True)
+        for instant in ("000", "001"):
+            source = tmp_path / "instants" / instant
+            shutil.copy(source / f"{name}.png", tmp_path / "cameras" / name / f"{instant}.png")
+            shutil.copy(source / f"{name}_mask.png", tmp_path / "masks" / name / f"{instant}.png")
+    other = CaptureFolder(tmp_path / "cameras", path, masks=tmp_path / "masks")
+    assert other.instants == ["000", "001"]
+    for one, two in zip(folder.photographs("001"), other.photographs("001"), strict=True):
+        assert one.name == two.name
+        np.testing.assert_array_equal(one.image, two.image)
+        np.testing.assert_array_equal(one.mask, two.mask)
+
+
+@pytest.mark.parametrize("turns", [1, 3])
+def test_a_mask_of_the_stored_pixels_is_turned_as_its_photograph(tmp_path, turns):
+    """Photographs of phones are turned when they are read; their masks may be stored either way."""
+    stored = np.zeros((4, 6), np.uint8)
+    stored[0, :2] = 255
+    shown = np.rot90(stored, turns)
+    pixels = Pixels(np.zeros((*shown.shape, 3), np.uint8), None, turns)
+    for name, mask in (("stored", stored), ("shown", np.ascontiguousarray(shown))):
+        Image.fromarray(mask).save(tmp_path / f"{name}.png")
+        np.testing.assert_array_equal(matte_of_file(tmp_path / f"{name}.png", pixels), shown)

@@ -1,0 +1,278 @@
+"""Cameras and colour gains that several instants share: what is found, and the file that says so."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from ghgs_capture import rig as rig_module
+from ghgs_capture.capture import Capture
+from ghgs_capture.folder import CaptureFolder
+from ghgs_capture.formats.json_and_toml import json_text
+from ghgs_capture.prediction import predict
+from ghgs_capture.rig import Rig, corrected_rig, shared_gains, turned_from
+from ghgs_lit.errors import InputError
+from ghgs_lit.model import GHGS
+from ghgs_lit.rendering import Renderer
+from tests.helpers.cameras import camera_ring
+from tests.helpers.figures import Figure
+
+NAMES = [f"cam{v}" for v in range(4)]
+
+
+def some_rig(figure):
+    """Other cameras than the figure's: turned, shifted and zoomed."""
+    extrinsics, turn = {}, np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    for number, name in enumerate(NAMES):
+        pose = np.array(figure.cameras[name]["extrinsics"])
+        angle = 0.01 * (number + 1)
+        small = np.cos(angle) * np.eye(3) + np.sin(angle) * turn
+        small[2, 2] = 1
+        pose[:3, :3] = pose[:3, :3] @ small
+        pose[:3, 3] += [0.01, -0.02, 0.03 * number]
+        extrinsics[name] = pose
+    return Rig(extrinsics, {name: 1 + 0.01 * n for n, name in enumerate(NAMES)}, dict.fromkeys(NAMES, 1.0))
+
+
+def same(one, other):
+    for first, second in zip(one.photographs, other.photographs, strict=True):
+        np.testing.assert_allclose(first.intrinsics, second.intrinsics, atol=1e-9)
+        np.testing.assert_allclose(first.extrinsics, second.extrinsics, atol=1e-9)
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_the_file_of_a_rig_gives_the_corrected_cameras(tmp_path, orientation):
+    """Also of photographs that are turned upright, with a lens that bends."""
+    figure = Figure()
+    cameras = {
+        name: {**camera, "distortion": [0.05, -0.01, 0.0, 0.0]} for name, camera in figure.cameras.items()
+    }
+    path = figure.write(tmp_path / "images", cameras=cameras)
+    turns = {1: 0, 6: 3}[orientation]
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    for name, image in zip(figure.names, figure.images, strict=True):
+        stored = np.ascontiguousarray(np.rot90(image, -turns))
+        Image.fromarray(stored).save(tmp_path / "images" / f"{name}.png", exif=exif)
+    folder = CaptureFolder(tmp_path / "images", path)
+    given = Capture(folder.instants[0], folder.photographs(folder.instants[0]))
+    rig = some_rig(figure)
+    (tmp_path / "rig.json").write_text(json_text(rig.calibrations(folder, [given])))
+    read = Capture.read(tmp_path / "images", tmp_path / "rig.json")
+    same(read, rig.applied(given))
+    assert np.abs(read.photographs[1].extrinsics - given.photographs[1].extrinsics).max() > 0.01
+    for one, other in zip(given.photographs, read.photographs, strict=True):
+        # Another focal length bends a little otherwise.
+        assert np.abs(one.image.astype(int) - other.image).mean() < 2
+
+
+def captures(tmp_path, count=4):
+    path = Figure().write(tmp_path)
+    return [Capture(str(n), Capture.read(tmp_path, path).photographs) for n in range(count)]
+
+
+class Asked:
+    """In place of :class:`CameraRefinement`: notes what it is given, and moves every camera."""
+
+    batches = ()
+
+    def __init__(self, rounds, model, renderer, shared):
+        assert shared
+        Asked.rounds = rounds
+
+    def __call__(self, batch):
+        Asked.batches = (*Asked.batches, batch)
+        poses = batch.cameras.extrinsics.clone()
+        poses[..., 0, 3] += 0.01
+        return dataclasses.replace(batch, cameras=dataclasses.replace(batch.cameras, extrinsics=poses))
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    Asked.batches = ()
+    monkeypatch.setattr(rig_module, "CameraRefinement", Asked)
+    return Asked
+
+
+@pytest.fixture(scope="module")
+def model():
+    return GHGS.from_checkpoint()
+
+
+@pytest.mark.parametrize(("doubted", "corrected"), [(1, False), (2, True)])
+def test_auto_corrects_where_half_of_the_instants_contradict(
+    tmp_path, monkeypatch, asked, model, doubted, corrected
+):
+    """One instant with a wrong mask does not move the cameras of all."""
+    monkeypatch.setattr(
+        rig_module, "doubt_of_cameras", lambda capture, batch: "they miss" * (int(capture.name) < doubted)
+    )
+    rig = corrected_rig(captures(tmp_path), model, (56, 56), "auto", 0, Renderer())
+    assert (rig is not None) == corrected == bool(asked.batches)
+    if rig:
+        assert rig.why == "in 2 of 4 instants they miss"
+        assert asked.rounds == 4
+        assert asked.batches[0].masks.shape[:2] == (4, 4)
+        assert rig.moved.keys() == set(NAMES)
+
+
+def test_an_instant_that_lacks_a_camera_takes_no_part(tmp_path, asked, model):
+    three, *whole = captures(tmp_path)
+    three = Capture("three", three.photographs[:3])
+    rig = corrected_rig([three, *whole], model, (56, 56), 3, 0, Renderer())
+    assert asked.batches[0].subjects == ("1", "2", "3")
+    assert asked.rounds == 3
+    assert list(rig.extrinsics) == NAMES
+    given = whole[0].photographs[0].extrinsics
+    moved = rig.applied(three).photographs[0].extrinsics - given
+    assert moved[0, 3] == pytest.approx(0.01)
+
+
+def test_a_camera_that_most_instants_lack_stays_as_it_is(tmp_path, asked, model):
+    """It is in the file of the rig, too: the next capture may have it."""
+    whole = captures(tmp_path)
+    three = [Capture(c.name, c.photographs[:3]) for c in whole[:3]]
+    rig = corrected_rig([*three, whole[3]], model, (56, 56), 3, 0, Renderer())
+    assert list(rig.extrinsics) == NAMES[:3]
+    last = rig.applied(whole[3]).photographs[3]
+    np.testing.assert_array_equal(last.extrinsics, whole[3].photographs[3].extrinsics)
+    folder = CaptureFolder(tmp_path, tmp_path / "cameras.json")
+    found = rig.calibrations(folder, [*three, whole[3]])
+    assert list(found) == NAMES
+    np.testing.assert_allclose(found["cam3"][0].extrinsics, last.extrinsics, atol=1e-12)
+
+
+#: Two cameras 15 % off, one a little blue; the product over the cameras is 1.
+GAINS = np.array([[0.85, 0.85, 0.85], [1.15, 1.15, 1.15], [1.0, 1.0, 1.0], [1.0, 1.0, 1.1]])
+GAINS = GAINS / np.exp(np.log(GAINS).mean(0))
+
+
+def seen_with(path, gains, seed=0):
+    """A figure's photographs, which no gain makes too bright, by cameras with these gains."""
+    figure = Figure(seed=seed)
+    dim = np.round((60 + 0.45 * figure.images) * np.reshape(gains, (-1, 1, 1, 3)))
+    figure.images = dim.astype(np.uint8)
+    return figure.write(path)
+
+
+def test_gains_are_found_once_written_and_used_by_the_next_capture(tmp_path, asked, monkeypatch):
+    """Of three instants one has other exposures, which does not count."""
+    model = GHGS.from_checkpoint()
+    for instant, gains in enumerate((GAINS, GAINS, GAINS[::-1])):
+        cameras = seen_with(tmp_path / "images" / str(instant), gains, seed=instant)
+    folder = CaptureFolder(tmp_path / "images", cameras)
+    given = [Capture(name, folder.photographs(name)) for name in folder.instants]
+    rig = corrected_rig(given, model, (112, 112), 1, 0, Renderer())
+    assert list(rig.gains) == NAMES
+    found = np.array(list(rig.gains.values()))
+    np.testing.assert_allclose(found, GAINS, rtol=0.03)
+    np.testing.assert_allclose(found.prod(0), 1, rtol=1e-5)
+
+    path = tmp_path / "rig.json"
+    path.write_text(json_text(rig.calibrations(folder, given)))
+    next_one = CaptureFolder(tmp_path / "images" / "1", path)
+    capture = Capture("next", next_one.photographs(*next_one.instants))
+    monkeypatch.setattr("ghgs_lit.rounds.rounds.equalized", None)  # what an instant would guess with
+    result = predict(capture, model, (112, 112), refine_cameras=0, refine_masks=0)
+    plain = given[1].batch((112, 112))
+    np.testing.assert_allclose(result.batch.log_gains[0].exp(), found, rtol=1e-6)
+    factors = torch.from_numpy(found).float()[..., None, None]
+    torch.testing.assert_close(result.batch.images[0] * factors, plain.images[0])
+    again = corrected_rig([capture, capture], model, (112, 112), 1, 0, Renderer())
+    assert not again.gains
+    assert asked.batches[-1].log_gains is not None
+    for name, (camera, _) in again.calibrations(next_one, [capture]).items():
+        np.testing.assert_array_equal(camera.gains, rig.gains[name])
+
+
+def test_gains_of_some_cameras_alone_are_not_used(tmp_path):
+    """An instant then finds them itself, from photographs as they are, to the bit."""
+    path = seen_with(tmp_path, GAINS)
+    cameras = json.loads(path.read_text())["cameras"]
+    for name, gains in list(zip(NAMES, GAINS.tolist(), strict=True))[:3]:
+        cameras[name]["gains"] = gains
+    (tmp_path / "some.json").write_text(json.dumps({"cameras": cameras}))
+    some, without = (Capture.read(tmp_path, tmp_path / name) for name in ("some.json", "cameras.json"))
+    np.testing.assert_array_equal(some.photographs[0].gains, GAINS[0])
+    assert some.photographs[3].gains is None
+    one, other = (capture.batch((56, 56)) for capture in (some, without))
+    assert one.log_gains is None
+    assert torch.equal(one.images, other.images)
+    photograph = Capture(some.name, some.photographs[:3]).batch((56, 56))
+    assert not torch.equal(photograph.images, one.images[:, :3])
+
+
+@pytest.mark.parametrize(
+    ("gains", "says"),
+    [
+        ([1.0, 1.0], "expected an array 3; found 2"),
+        (0.9, "expected an array 3; found "),
+        ([1.0, 1.0, "red"], "expected an array 3; found could not convert"),
+        ([1.0, 1.0, float("nan")], "expected finite numbers"),
+        ([1.0, 0.0, 1.0], "expected numbers from 0.5 to 2; found"),
+        ([1.0, 2.1, 1.0], "expected numbers from 0.5 to 2; found"),
+    ],
+)
+def test_wrong_gains_of_a_file_are_refused(tmp_path, gains, says):
+    figure = Figure()
+    path = figure.write(
+        tmp_path, cameras={**figure.cameras, "cam2": {**figure.cameras["cam2"], "gains": gains}}
+    )
+    with pytest.raises(InputError) as refused:
+        Capture.read(tmp_path, path)
+    assert str(refused.value).startswith(f"{path}: cam2: gains: {says}")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("each", "expected"),
+    [
+        ([-1.5, 0.5, 0.5, 0.5], [-0.6931, 0.231, 0.231, 0.231]),
+        ([0.3, 0.1, 0.1, 0.1], [0.15, -0.05, -0.05, -0.05]),
+    ],
+)
+def test_gains_are_bounded_with_a_mean_of_one(tmp_path, monkeypatch, model, each, expected):
+    """Too large ones of all cameras shrink alike, so that files that are written can be read."""
+    batch = captures(tmp_path, 1)[0].batch((56, 56))
+    logs = torch.tensor(each)[None, :, None].expand(1, 4, 3)
+    monkeypatch.setattr(rig_module, "log_gains", lambda gaussians, batch: logs)
+    found = shared_gains(batch, model)
+    np.testing.assert_allclose(np.log(found), np.repeat(np.array(expected)[:, None], 3, 1), atol=1e-3)
+    np.testing.assert_allclose(found.prod(0), 1, rtol=1e-6)
+    assert 0.5 <= found.min() < 1 < found.max() <= 2
+
+
+def test_exposures_that_change_are_left_to_each_instant(tmp_path, monkeypatch, model):
+    """A camera that gets brighter by a third over eight instants; noise of 2 % is none."""
+    batch = rig_module._together([capture.batch((56, 56)) for capture in captures(tmp_path, 8)])
+    logs = torch.zeros(8, 4, 3)
+    logs[:, 1] = torch.linspace(0, 0.3, 8)[:, None]
+    for noise, change in ((0.02, 0.0), (0.0, 1.0)):
+        torch.manual_seed(0)
+        seen = change * logs + noise * torch.randn(8, 4, 3)
+        monkeypatch.setattr(rig_module, "log_gains", lambda gaussians, batch, seen=seen: seen)
+        assert (shared_gains(batch, model) is None) == bool(change)
+
+
+def looking(*yaws, raised=0.4):
+    """Poses [n, 4, 4] of cameras around a place at these degrees."""
+    rings = [camera_ring(1, 90, 90, 1, (90.0, 90.0), raised=raised, start=yaw) for yaw in yaws]
+    return np.stack([ring.extrinsics[0, 0].double().numpy() for ring in rings])
+
+
+def test_cameras_of_a_rig_are_known_in_any_world_order_and_number():
+    """Also where photographs are turned upright; others by as many degrees as they are off."""
+    rig, world, quarter = looking(0, 70, 200, 250), np.eye(4), np.eye(4)
+    world[:3, :3], world[:3, 3] = Rotation.random(random_state=3).as_matrix(), [1.0, -2.0, 0.5]
+    quarter[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    for same_rig in (rig, rig[::-1], rig[1:], rig[[2]], quarter @ rig):
+        assert turned_from(rig, same_rig @ world) < 0.1
+    off = looking(0, 90, 200, 250)
+    between = np.degrees(Rotation.from_matrix(off[1, :3, :3] @ rig[1, :3, :3].T).magnitude())
+    assert turned_from(rig, off @ world) == pytest.approx(between, abs=0.1)
+    assert turned_from(rig, looking(0, -70, -200, -250) @ world) > 15  # a mirrored rig is another one
+    assert turned_from(rig, looking(0, 70, 200, 250, raised=1.6) @ world) > 10

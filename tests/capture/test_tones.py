@@ -1,0 +1,125 @@
+"""A camera with a tone curve of its own is named and its photographs are mended; others stay as they are."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from ghgs_capture.capture import Capture
+from ghgs_capture.prediction import predict
+from ghgs_capture.temporal import Temporal
+from ghgs_lit.model import GHGS
+from ghgs_lit.rendering import Renderer
+from tests.helpers.figures import Figure
+from tests.helpers.verbs import ghgs
+
+KEYS = {"size": 112, "refine_cameras": 0, "refine_masks": 0}
+NAMES = ["cam0", "cam1", "cam2", "cam3"]
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("taken")
+    return Capture.read(folder, Figure().write(folder))
+
+
+def seen_with(capture, gammas, gains=(1, 1, 1, 1)):
+    """The capture with photographs whose colours are to these powers, times these gains."""
+    photographs = []
+    for photograph, gamma, gain in zip(capture.photographs, gammas, gains, strict=False):
+        colors = np.clip(gain * (photograph.image / 255) ** gamma, 0, 1)
+        photographs.append(dataclasses.replace(photograph, image=np.round(255 * colors).astype(np.uint8)))
+    return dataclasses.replace(capture, photographs=tuple(photographs))
+
+
+def but(view, gamma):
+    return [gamma if place == view else 1.0 for place in range(4)]
+
+
+@pytest.mark.parametrize("gamma", [0.8, 1.2])
+@pytest.mark.parametrize("view", range(4))
+def test_the_gamma_of_one_camera_is_named_and_undone(taken, view, gamma):
+    """The photographs that the model sees are those without it, up to the estimate and rounding."""
+    result = predict(seen_with(taken, but(view, gamma)), **KEYS)
+    assert result.tones == {NAMES[view]: pytest.approx(gamma, rel=0.03)}
+    right = taken.batch((112, 112)).images
+    assert (result.batch.images - right).abs().max() < 0.02
+    assert result.seconds["tones"] > 0
+
+
+@pytest.mark.parametrize("gains", [(1, 1, 1, 1), (0.7, 1, 1, 1), (0.6, 0.9, 1.1, 0.75)])
+def test_equal_tones_stay_as_they_are_whatever_the_exposures(taken, gains):
+    """To the bit: it is the prediction without a look."""
+    given = seen_with(taken, [1.0] * 4, gains)
+    found, plain = predict(given, **KEYS), predict(given, **KEYS, tones={})
+    assert found.tones == plain.tones == {}
+    assert torch.equal(found.batch.images, plain.batch.images)
+    assert torch.equal(found.gaussians.means, plain.gaussians.means)
+
+
+def test_any_unit_and_origin_tell_the_same(tmp_path):
+    figure = Figure(scale=1000.0, origin=(3e6, 0, 0))
+    far = Capture.read(tmp_path, figure.write(tmp_path))
+    assert predict(seen_with(far, but(2, 1.2)), **KEYS).tones == {"cam2": pytest.approx(1.2, rel=0.03)}
+
+
+def test_two_photographs_do_not_tell_which_one_it_is(taken):
+    two = seen_with(dataclasses.replace(taken, photographs=taken.photographs[:2]), [1.2, 1.0])
+    assert predict(two, **KEYS).tones == {}
+
+
+def test_what_was_predicted_before_a_look_is_no_instant_of_a_sequence(taken):
+    """With and without a look the instant is the first one."""
+    model, wrong = GHGS.from_checkpoint(), seen_with(taken, but(1, 0.8))
+    found, told = (Temporal(model, 4, Renderer()) for _ in range(2))
+    first = predict(wrong, **KEYS, temporal=found)
+    second = predict(wrong, **KEYS, temporal=told, tones=first.tones)
+    assert torch.equal(first.gaussians.colors, second.gaussians.colors)
+    assert torch.equal(first.batch.images, second.batch.images)
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A folder with two instants of photographs of which cam2 has a gamma of 0.8, and their cameras."""
+    monkeypatch.chdir(tmp_path)
+    for instant in ("000", "001"):
+        figure = Figure()
+        figure.images[2] = np.round(255 * (figure.images[2] / 255) ** 0.8)
+        cameras = figure.write(tmp_path / "images" / instant)
+    return f"cameras={cameras}", "device=cpu"
+
+
+PREDICTED = (
+    "out=splats",
+    "size=112",
+    "formats=[ply]",
+    "turntable.frames=0",
+    "refine_masks=0",
+    "refine_cameras=0",
+)
+LINE = "photograph cam2 has a gamma of about 0.80 beside the others: a tone curve, profile or contrast of its"
+
+
+@pytest.mark.parametrize(("images", "folders"), [("images/000", ["."]), ("images", ["000", "001"])])
+def test_predict_says_what_it_undoes_once_and_reports_it_of_each_instant(here, capsys, images, folders):
+    assert ghgs("predict", f"images={images}", *here, *PREDICTED) == 0
+    assert capsys.readouterr().out.count(f"{LINE} own, undone (refine_tones=0 leaves it)\n") == 1
+    for folder in folders:
+        with open(f"splats/{folder}/report.json") as file:
+            assert json.load(file)["tones"] == {"cam2": pytest.approx(0.8, rel=0.03)}
+
+
+def test_predict_leaves_what_it_is_told_to_leave(here, capsys):
+    assert ghgs("predict", "images=images/000", *here, *PREDICTED, "refine_tones=0") == 0
+    assert "gamma" not in capsys.readouterr().out
+    with open("splats/report.json") as file:
+        assert "tones" not in json.load(file)
+
+
+def test_the_doctor_says_it(here, capsys):
+    assert ghgs("doctor", "task=cameras", "images=images", here[0], "hydra.run.dir=found") == 0
+    said = capsys.readouterr().out
+    assert "photograph cam2 has a gamma of about 0.8" in said
+    assert said.count(" of its own, which ghgs predict undoes\n") == 1

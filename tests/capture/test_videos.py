@@ -1,0 +1,267 @@
+"""Videos of a sequence: right ones and what goes wrong in them."""
+
+import csv
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from imageio_ffmpeg import get_ffmpeg_exe
+from PIL import Image
+from scipy.ndimage import binary_dilation
+
+from ghgs_capture.videos import Reader, read_video
+from ghgs_lit.errors import InputError
+from tests.helpers.sequences import (
+    FIGURE,
+    FPS,
+    FRAMES,
+    SIDE,
+    alike,
+    all_numbers,
+    frames_of,
+    mask,
+    numbers,
+    opened,
+)
+from tests.helpers.videos import number_of, write_video
+
+
+def test_videos_are_read_in_order(place):
+    """Every frame with its mask, by instants named by their frames; and the first again after the last."""
+    folder = opened(place)
+    assert all_numbers(folder) == {f"{n:06d}": alike(n) for n in range(FRAMES)}
+    assert folder.note == ""
+    first = folder.photographs("000000")
+    assert numbers(first) == alike(0)
+    for camera, photograph in enumerate(first):
+        assert photograph.matte.shape == (SIDE, SIDE)
+        assert (photograph.mask ^ FIGURE.masks[camera]).mean() < 0.01
+        beside = ~binary_dilation(FIGURE.masks[camera], iterations=3)
+        assert (photograph.matte[beside] == 0).all()  # coding leaves no haze
+
+
+@pytest.mark.parametrize("suffix", [".mov", ".mkv", ".avi", ".webm"])
+def test_frames_have_their_numbers_in_every_kind_of_file(tmp_path, suffix):
+    """With frames that are stored in another order than shown, sought from the end to the beginning."""
+    options = {"codec": "libvpx"} if suffix == ".webm" else {"codec": "libx264"}
+    path = tmp_path / f"a{suffix}"
+    write_video(path, frames_of(0), **options)
+    video = read_video(path)
+    assert (video.count, video.size) == (FRAMES, (SIDE, SIDE))
+    assert video.rate == pytest.approx(FPS, rel=0.01)
+    reader = Reader(video, "gray")
+    for number in [*range(FRAMES), *reversed(range(FRAMES))]:
+        assert number_of(reader.frame(number)) == number
+
+
+def test_frames_that_were_cut_off_do_not_count(tmp_path):
+    """A phone that cuts a video leaves the frames before in its file, and says that they are not shown."""
+    write_video(tmp_path / "whole.mp4", frames_of(0), codec="libx264")
+    cut = [get_ffmpeg_exe(), "-v", "error", "-ss", "0.15", "-i", tmp_path / "whole.mp4"]
+    subprocess.run([*cut, "-c", "copy", tmp_path / "cut.mp4"], check=True)
+    video = read_video(tmp_path / "cut.mp4")
+    reader = Reader(video, "gray")
+    assert [number_of(reader.frame(n)) for n in range(video.count)] == list(range(2, FRAMES))
+
+
+def test_a_long_video_is_sought(tmp_path):
+    """Also where one frame of many is decoded at a time."""
+    rng = np.random.default_rng(0)
+    order = rng.permutation(400) % 7
+    write_video(tmp_path / "a.mp4", (np.full((16, 16, 3), 30 * n, np.uint8) for n in order), fps=20)
+    video = read_video(tmp_path / "a.mp4")
+    for step, wanted in ((1, (350, 20, 21, 399, 0)), (25, (50, 75, 325, 350, 0))):
+        reader = Reader(video, "gray", step)
+        assert [round(float(reader.frame(n).mean()) / 30) for n in wanted] == [order[n] for n in wanted]
+
+
+def test_a_frame_that_a_camera_dropped_shifts_no_other(place):
+    """Its instant is predicted from the other three."""
+    keep = ["-vf", "select=not(eq(n\\,2))", "-fps_mode", "passthrough"]
+    write_video(place / "images" / "cam1.mp4", frames_of(1), output_params=keep)
+    found = all_numbers(opened(place))
+    assert found == {
+        f"{n:06d}": alike(n, [name for name in FIGURE.names if n != 2 or name != "cam1"])
+        for n in range(FRAMES)
+    }
+
+
+def test_masks_of_the_frames_that_there_are(place):
+    """Drawn of one after another they know of no dropped frame: masks of other frames are no use."""
+    keep = ["-vf", "select=not(eq(n\\,2))", "-fps_mode", "passthrough"]
+    write_video(place / "images" / "cam1.mp4", frames_of(1), output_params=keep)
+    drawn = [np.roll(mask(1), 2 * number, 0) for number in range(FRAMES)]
+    write_video(place / "masks" / "cam1.mp4", drawn[:2] + drawn[3:])
+    for number in (1, 3, 5):
+        found = {p.name: p.mask for p in opened(place).photographs(f"{number:06d}")}
+        assert (found["cam1"] ^ (drawn[number] > 127)).mean() < 0.01
+
+
+def test_videos_of_different_length(place, capsys):
+    write_video(place / "images" / "cam2.mp4", frames_of(2, 4))
+    folder = opened(place)
+    assert list(all_numbers(folder)) == ["000000", "000001", "000002", "000003"]
+    counts = "cam0 6, cam1 6, cam2 4, cam3 6 frames"
+    assert folder.note == f"videos differ in length ({counts}): the 4 instants that all show are used"
+
+
+def test_another_size_than_the_calibrations(place):
+    write_video(place / "images" / "cam1.mp4", (frame[:48] for frame in frames_of(1)))
+    with pytest.raises(InputError, match=r"cam1\.mp4: .*cam1.*64x64.*found 48x64"):
+        opened(place)
+
+
+def test_another_size_of_a_mask_video(place, capsys):
+    write_video(place / "masks" / "cam1.mp4", [mask(1)[:48]] * FRAMES)
+    assert all_numbers(opened(place))["000003"] == alike(3, ["cam0", "cam2", "cam3"])
+    assert "instant 000003 is without cam1: " in capsys.readouterr().out
+
+
+def test_another_rate(place):
+    write_video(place / "images" / "cam3.mp4", frames_of(3), fps=15)
+    line = r"sequence\.sync: expected as many frames a second .*found .*'cam2': 10\.0, 'cam3': 15\.0"
+    with pytest.raises(InputError, match=line):
+        opened(place)
+
+
+def test_a_broken_video(place):
+    (place / "images" / "cam1.mp4").write_bytes(b"no video" * 100)
+    with pytest.raises(
+        InputError, match=r"cam1\.mp4: expected a video with frames that ffmpeg can decode; found"
+    ):
+        opened(place)
+
+
+def test_a_broken_frame(place, capsys):
+    """Of a video whose frames stand alone one that is damaged is left out, and no other."""
+    path = place / "images" / "cam1.avi"
+    (place / "images" / "cam1.mp4").unlink()
+    write_video(path, frames_of(1), codec="mjpeg")
+    content = bytearray(path.read_bytes())
+    starts = [i for i in range(len(content)) if content[i : i + 3] == b"\xff\xd8\xff"]
+    content[starts[2] : starts[3] - 8] = bytes(starts[3] - 8 - starts[2])
+    path.write_bytes(content)
+    found = all_numbers(opened(place))
+    assert found["000002"] == alike(2, ["cam0", "cam2", "cam3"])
+    assert [found[f"{n:06d}"] for n in (0, 1, 3, 4, 5)] == [alike(n) for n in (0, 1, 3, 4, 5)]
+    assert "instant 000002 is without cam1: " in capsys.readouterr().out
+
+
+def test_empty_masks_for_a_while(place, capsys):
+    """Of one camera: the others predict. Of two: the instants are left out, and the rest is not."""
+    for camera, name, last in ((0, "cam0", 1), (1, "cam1", 2)):
+        masks = [mask(camera) * (not 1 <= number <= last) for number in range(FRAMES)]
+        write_video(place / "masks" / f"{name}.mp4", masks)
+    found = all_numbers(opened(place))
+    assert found == {"000000": alike(0), "000002": alike(2, ["cam0", "cam2", "cam3"])} | {
+        f"{n:06d}": alike(n) for n in (3, 4, 5)
+    }
+    out = capsys.readouterr().out
+    assert out.count("\n") == 2
+    assert "instant 000001 is left out: " in out
+    assert "3 photographs or more; found '2 (cam0: " in out
+    assert "instant 000002 is without cam1: " in out
+    assert "found 0 pixels" in out
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_masks_of_videos_in_folders_count_from_0_or_from_1(place, first):
+    shutil.rmtree(place / "masks")
+    for camera, name in enumerate(FIGURE.names):
+        (place / "masks" / name).mkdir(parents=True)
+        for number in range(FRAMES):
+            found = np.roll(FIGURE.masks[camera], number, 0)
+            Image.fromarray(found).save(place / "masks" / name / f"{number + first:05d}.png")
+    folder = opened(place)
+    for number in (0, 5):
+        for camera, photograph in enumerate(folder.photographs(f"{number:06d}")):
+            assert (photograph.mask == np.roll(FIGURE.masks[camera], number, 0)).all()
+    (place / "masks" / "cam1" / f"{(FRAMES - 1 if first else 0) + first:05d}.png").unlink()
+    with pytest.raises(InputError, match="masks numbered from 0 to 5 or from 1 to 6; found '5 masks'"):
+        opened(place)
+
+
+def test_masks_beside_videos_count_where_nothing_else_is_said(place):
+    """Beside photographs they do, too: a background that is given comes first."""
+    for camera, name in enumerate(FIGURE.names):
+        shutil.move(place / "masks" / f"{name}.mp4", place / "images" / f"{name}_mask.mp4")
+        (place / "backgrounds").mkdir(exist_ok=True)
+        background = FIGURE.images[camera].copy()
+        background[FIGURE.masks[camera]] += np.uint8(128)
+        background[:16] += np.uint8(128)
+        Image.fromarray(background).save(place / "backgrounds" / f"{name}.png")
+    for camera, photograph in enumerate(opened(place, masks=None).photographs("000003")):
+        assert (photograph.mask ^ FIGURE.masks[camera]).mean() < 0.01
+    other = opened(place, masks=None, backgrounds=place / "backgrounds").photographs("000003")
+    assert all(photograph.mask[:12, 16:].mean() > 0.9 for photograph in other)
+
+
+def test_offsets(place):
+    """A camera that began two frames before the others is two frames ahead."""
+    found = all_numbers(opened(place, sequence={"sync": {"cam1": 2}}))
+    assert found == {f"{n:06d}": alike(n) | {"cam1": n + 2} for n in range(4)}
+    found = all_numbers(opened(place, sequence={"sync": {"cam1": -2, "cam2": 1}}))
+    assert found == {f"{n:06d}": alike(n) | {"cam1": n - 2, "cam2": n + 1} for n in (2, 3, 4)}
+
+
+def write_csv(place, rows, header=("camera", "frame", "seconds")):
+    with (place / "times.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([header, *rows])
+    return {"sync": str(place / "times.csv")}
+
+
+def test_time_stamps(place):
+    """The nearest frame; a frame that is too far is missing, and its instant is predicted without it."""
+    late = {"cam0": 0.0, "cam1": 0.04, "cam2": -0.2, "cam3": 0.0}
+    rows = [(c, n, n / FPS + late[c]) for c in FIGURE.names for n in range(FRAMES) if (c, n) != ("cam3", 2)]
+    found = all_numbers(opened(place, sequence=write_csv(place, rows)))
+    assert found == {
+        f"{n:06d}": {name: n + 2 * (name == "cam2") for name in FIGURE.names if (name, n) != ("cam3", 2)}
+        for n in range(4)
+    }
+
+
+def test_time_stamps_say_how_rates_fit(place):
+    write_video(place / "images" / "cam3.mp4", frames_of(3, 3), fps=FPS // 2)
+    write_video(place / "masks" / "cam3.mp4", [mask(3)] * 3)
+    rows = [(c, n, n / FPS * (2 if c == "cam3" else 1)) for c in FIGURE.names for n in range(FRAMES)]
+    found = all_numbers(opened(place, sequence=write_csv(place, rows)))
+    assert found["000004"] == alike(4) | {"cam3": 2}
+    assert found["000003"] == alike(3, ["cam0", "cam1", "cam2"])
+
+
+ROWS = [(name, n, n / FPS) for name in FIGURE.names for n in range(FRAMES)]
+WRONG = {
+    "a camera is missing": (ROWS[:-FRAMES], "the times of cam0, cam1, cam2, cam3"),
+    "other names": ([("left", n, t) for _, n, t in ROWS], "the times of .*found 'left'"),
+    "one more": ([*ROWS, ("cam9", 0, 0.0)], "the times of cam0, .*found '.*cam9'"),
+    "no number": ([*ROWS, ("cam0", "x", 0.0)], "camera,frame,seconds with numbers; found"),
+    "no time": ([*ROWS, ("cam0", 3, "nan")], "camera,frame,seconds with numbers; found"),
+    "no frame": ([*ROWS, ("cam0", "", 0.3)], "camera,frame,seconds with numbers; found"),
+    "400 digits": ([*ROWS, ("cam0", "9" * 400, 0.3)], "camera,frame,seconds with numbers; found"),
+    "a part of a line": ([*ROWS, ("cam0",)], "camera,frame,seconds with numbers; found"),
+    "nothing": ([], "the times of cam0, cam1, cam2, cam3; found ''"),
+    "no shared time": ([(c, n, t + 9 * (c == "cam1")) for c, n, t in ROWS], "times that all cameras share"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_time_stamps(place, name):
+    rows, line = WRONG[name]
+    with pytest.raises(InputError, match=rf"times\.csv: expected .*{line}"):
+        opened(place, sequence=write_csv(place, rows))
+
+
+def test_other_columns(place):
+    with pytest.raises(InputError, match=r"times\.csv: expected camera,frame,seconds"):
+        opened(place, sequence=write_csv(place, ROWS, ("camera", "frame", "time")))
+
+
+def test_videos_without_ffmpeg(place, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(
+        InputError, match=r"expected the package imageio_ffmpeg .*ghgs-lit\[video\].*found none"
+    ):
+        opened(place)

@@ -1,0 +1,275 @@
+"""Photographs of analytic shapes: depth, silhouettes, antialiasing, light."""
+
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+import ghgs_lit
+from ghgs_lit.data.sampling import subject_rng
+from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.projection import pixel_centers, project, unproject_maps
+from ghgs_lit.types import Cameras
+from ghgs_people.figures.mesh import Person, TexturedMesh, sample_texture
+from ghgs_people.figures.meshing import smooth_normals
+from ghgs_people.photograph import Lights, Studio
+from ghgs_people.rig import Rig
+
+LIGHT = Lights(count=6, ambient=1.0, exposure=1.0).draw(
+    np.random.default_rng(0)
+)  # ambient only: flat colours
+
+
+def plain(color=(255, 255, 255), size=4) -> np.ndarray:
+    """A texture of one colour."""
+    return np.tile(np.array(color, np.uint8), (size, size, 1))
+
+
+def mesh_part(mesh: trimesh.Trimesh, texture=None) -> TexturedMesh:
+    """A mesh in one plain colour."""
+    vertices = np.asarray(mesh.vertices, np.float32)
+    uv = np.full((len(vertices), 2), 0.5, np.float32)
+    return TexturedMesh(vertices, np.asarray(mesh.faces), uv, plain() if texture is None else texture)
+
+
+def quad(z=0.0, half=0.5, texture=None, x=0.0) -> TexturedMesh:
+    """A square that faces +z, its texture upright seen from +z."""
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float32)
+    vertices = np.concatenate((corners * half + [x, 0], np.full((4, 1), z)), 1).astype(np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    return TexturedMesh(vertices, faces, (corners + 1) / 2, plain() if texture is None else texture)
+
+
+def front_camera(size=48, distance=2.0, focal=1.0, shift=0.0) -> Cameras:
+    """At (0, 0, distance), looking along -z, y up."""
+    extrinsics = torch.diag(torch.tensor([1.0, -1, -1, 1]))
+    extrinsics[2, 3] = distance
+    intrinsics = torch.tensor([[focal * size, 0, size / 2 + shift], [0, focal * size, size / 2], [0, 0, 1]])
+    return Cameras(intrinsics[None], extrinsics[None], size, size)
+
+
+def shoot(parts, cameras, samples=3, lights=LIGHT):
+    """Image, mask and depth from the first of the cameras."""
+    photographs = Studio(Person("p", tuple(parts), None), lights, samples).shoot(cameras)
+    return photographs.images[0], photographs.masks[0], photographs.depths[0]
+
+
+def test_sphere_depth_and_coverage_are_analytic():
+    """Depth and coverage are metric: compared with ray-sphere intersection in float64 and dense sampling."""
+    radius, size, distance = 0.6, 56, 2.0
+    sphere = trimesh.creation.icosphere(subdivisions=5, radius=radius)
+    camera = front_camera(size, distance, shift=3.3)
+    image, mask, depth = shoot([mesh_part(sphere)], camera, samples=5)
+
+    def discriminant(offsets):
+        rays_x = (offsets[None, :] - size / 2 - 3.3) / size
+        rays_y = (offsets[:, None] - size / 2) / size
+        squared = rays_x**2 + rays_y**2 + 1
+        return distance**2 - squared * (distance**2 - radius**2), squared
+
+    inside, squared = discriminant(np.arange(size) + 0.5)
+    expected = (distance - np.sqrt(np.maximum(inside, 0))) / squared
+    clear = mask & (inside > 0.05)  # off the rim, where a facetted sphere departs from a round one
+    assert clear.sum() > 300
+    np.testing.assert_allclose(depth[clear], expected[clear], atol=1e-3)
+    fine, _ = discriminant((np.arange(size * 20) + 0.5) / 20)
+    coverage = (fine > 0).reshape(size, 20, size, 20).mean((1, 3))
+    assert np.abs(image[..., 0] - coverage).max() < 0.16  # 5 x 5 samples of a pixel
+    assert abs(image[..., 0].sum() - coverage.sum()) < 2e-3 * coverage.sum()
+    sure = np.abs(coverage - 0.5) > 0.1
+    assert (mask == (coverage >= 0.5))[sure].all()
+
+
+def test_square_covers_exactly_the_pixels_it_should():
+    """No shift by half a pixel: edges at pixel boundaries are sharp, others have their exact coverage."""
+    size = 32
+    image, mask, depth = shoot([quad(half=0.5)], front_camera(size))  # ± 0.5 * 32 / 2 = ± 8 pixels
+    expected = np.zeros((size, size))
+    expected[8:24, 8:24] = 1
+    np.testing.assert_allclose(image[..., 0], expected, atol=1e-6)
+    assert (mask == expected.astype(bool)).all()
+    np.testing.assert_allclose(depth, 2.0 * expected, atol=1e-6)
+    third = 0.5 * 17 / 16 - 0.5 / 48  # edge at 8.333 pixels from the centre
+    image, mask, depth = shoot([quad(half=third)], front_camera(size))
+    np.testing.assert_allclose(image[16, 7, 0], 1 / 3, atol=1e-6)
+    assert mask.sum() == 16 * 16
+    taken = Studio(Person("p", (quad(half=third),), None), LIGHT).shoot(front_camera(size))
+    np.testing.assert_allclose(taken.alphas[0, 16, 6:9], [0, 1 / 3, 1], atol=1e-6)
+    np.testing.assert_allclose(taken.alphas[0, 7, 7], 1 / 9, atol=1e-6)
+    # The surface is white: a photograph on black is its matte. What shows at all has a depth.
+    np.testing.assert_allclose(taken.images[0, ..., 0], taken.alphas[0], atol=1e-6)
+    np.testing.assert_allclose(depth, 2.0 * (taken.alphas[0] > 0), atol=1e-6)
+
+
+def test_depth_never_mixes_two_surfaces():
+    """At edges the depth is that of one surface, never a mean that floats between two."""
+    near = quad(z=0.5, half=0.2, x=0.05)
+    far = quad(z=-0.5, half=0.9)
+    for samples in (1, 2, 3, 4):
+        _, mask, depth = shoot([near, far], front_camera(40), samples)
+        values = depth[mask]
+        assert ((np.abs(values - 1.5) < 1e-5) | (np.abs(values - 2.5) < 1e-5)).all()
+        assert (np.abs(values - 1.5) < 1e-5).sum() > 50
+
+
+def test_depth_of_pixel_centers_lies_on_a_slanted_plane():
+    """With an odd number of samples depth is exact at pixel centres: unprojected points lie on the plane."""
+    part = quad(half=0.6)
+    turned = trimesh.transformations.rotation_matrix(0.7, [0.3, 1, 0.1])[:3, :3].astype(np.float32)
+    part = TexturedMesh(part.vertices @ turned.T, part.faces, part.uv, part.texture)
+    camera = front_camera(48)
+    _, mask, depth = shoot([part], camera)
+    points = unproject_maps(torch.from_numpy(depth), camera[0]).numpy()[mask]
+    assert len(points) > 200
+    # At the rim a pixel whose centre misses takes the nearest hit, at most half a pixel away.
+    distance = np.abs(points @ turned[:, 2])
+    assert np.quantile(distance, 0.9) < 1e-6
+    assert distance.max() < 0.03
+
+
+def test_vertices_project_into_the_mask_from_every_side():
+    """Photographs agree with their cameras: vertices project into the mask, depths lie on the surface."""
+    rng = subject_rng(3, "capsule")
+    capsule = trimesh.creation.capsule(height=1.2, radius=0.25, count=[64, 64])
+    capsule.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
+    rig = Rig()
+    person = rig.place(Person("capsule", (mesh_part(capsule),), None), rng)
+    cameras = rig.cameras(rig.yaws(rng)[::3, 0], 84, 56)
+    photographs = Studio(person, LIGHT).shoot(cameras)
+    vertices = torch.from_numpy(person.parts[0].vertices)
+    tall = vertices[:, 1].max().item()
+    radius = tall * 0.25 / 1.7
+    for n in range(len(photographs.masks)):
+        pixels, z = project(vertices, cameras.intrinsics[n], cameras.extrinsics[n])
+        column, row = pixels.floor().long().unbind(-1)
+        mask = photographs.masks[n]
+        grown = mask | np.roll(mask, 1, 0) | np.roll(mask, -1, 0) | np.roll(mask, 1, 1) | np.roll(mask, -1, 1)
+        assert grown[row, column].all()
+        assert 1.5 < z.min() < z.max() < 2.5
+        points = unproject_maps(torch.from_numpy(photographs.depths[n]), cameras[n]).numpy()[mask]
+        axis = np.stack(
+            (points[:, 0], points[:, 1] - np.clip(points[:, 1], radius, tall - radius), points[:, 2])
+        )
+        assert np.abs(np.linalg.norm(axis, axis=0) - radius).max() < 1.5e-3  # facets of 1 mm
+
+
+def test_texture_is_upright_and_bilinear():
+    """Textures are neither flipped nor shifted by half a texel, and repeat."""
+    texture = plain((0, 0, 0), 2)
+    texture[0, 0] = (255, 0, 0)  # top left
+    texture[1, 1] = (0, 255, 0)  # bottom right
+    image, _, _ = shoot([quad(half=0.5, texture=texture)], front_camera(32), samples=1)
+    assert image[12, 12, 0] > 0.8 > 0.2 > image[12, 12, 1]
+    assert image[19, 19, 1] > 0.8 > 0.2 > image[19, 19, 0]
+    uv = np.array([[0.25, 0.75], [0.5, 0.75], [0.5, 0.5], [1.25, 1.75]], np.float32)
+    np.testing.assert_allclose(sample_texture(texture, uv)[:, 0], [1, 0.5, 0.25, 1], atol=1e-6)
+
+
+def test_light_is_lambertian_seam_free_and_the_same_for_every_view():
+    """Shading follows its formula, UV seams are invisible, and all views of a point agree."""
+    sphere = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
+    exploded = TexturedMesh(  # every face has its own vertices, as along UV seams
+        np.asarray(sphere.triangles, np.float32).reshape(-1, 3),
+        np.arange(len(sphere.faces) * 3).reshape(-1, 3),
+        np.zeros((len(sphere.faces) * 3, 2), np.float32),
+        plain(),
+    )
+    normals = smooth_normals(exploded.vertices, exploded.faces)
+    np.testing.assert_allclose(normals, exploded.vertices / 0.5, atol=7e-3)
+    lights = Lights().draw(np.random.default_rng(1))
+    rig = Rig(look_at=(0, 0, 0))
+    cameras = rig.cameras(np.array([0.0, 30.0]), 64, 64)
+    photographs = Studio(Person("s", (exploded,), None), lights).shoot(cameras)
+    for n in range(2):
+        inner = photographs.masks[n] & (photographs.depths[n] < 1.75)  # off the rim
+        assert inner.sum() > 200
+        points = unproject_maps(torch.from_numpy(photographs.depths[n]), cameras[n]).numpy()[inner]
+        expected = lights.shade(points / np.linalg.norm(points, axis=-1, keepdims=True))
+        np.testing.assert_allclose(photographs.images[n][inner][:, 0], expected, atol=0.01)
+    directions = np.random.default_rng(0).normal(size=(20000, 3))
+    mean = lights.shade(directions / np.linalg.norm(directions, axis=-1, keepdims=True)).mean()
+    assert abs(mean - Lights().exposure) < 0.01
+
+
+def test_both_sides_are_lit_and_winding_does_not_matter():
+    """Scans with flipped faces are lit like others."""
+    lights = Lights(count=1, ambient=0.2, jitter=0.0).draw(np.random.default_rng(0))
+    part = quad()
+    flipped = TexturedMesh(part.vertices, part.faces[:, ::-1].copy(), part.uv, part.texture)
+    one, _, _ = shoot([part], front_camera(16), lights=lights)
+    other, _, _ = shoot([flipped], front_camera(16), lights=lights)
+    np.testing.assert_array_equal(one, other)
+
+
+def test_camera_beside_and_inside_the_subject():
+    """An empty view gives empty maps; vertices behind the camera do not make the window too small."""
+    away = front_camera(16)
+    away.intrinsics[:, 0, 2] += 1000
+    _, mask, depth = shoot([quad()], away)
+    assert not mask.any()
+    assert not depth.any()
+    _, mask, depth = shoot([quad(z=0.0, half=5), quad(z=3.0, half=5)], front_camera(16))
+    assert mask.all()
+    np.testing.assert_allclose(depth, 2.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("value", [0.0, -5.0, float("nan")])
+def test_bad_focal_length_is_refused(value):
+    """The message names the camera, in place of an empty photograph."""
+    camera = front_camera(16)
+    camera.intrinsics[:, 0, 0] = value
+    with pytest.raises(InputError, match="camera 0: expected finite values and focal lengths above 0"):
+        shoot([quad()], camera)
+
+
+def test_ring_has_the_angles_of_the_layout():
+    """Cameras stand where stereo readers of the THuman2.0 layout expect each view."""
+    rig, rng = Rig(), subject_rng(0, "a")
+    yaws = rig.yaws(rng)
+    cameras = rig.cameras(yaws, 128, 128)
+    centers = cameras.centers.double().numpy() - np.array([0, 0.85, 0])
+    np.testing.assert_allclose(np.linalg.norm(centers, axis=-1), 2.0, atol=1e-5)
+    np.testing.assert_allclose(centers[..., 1], 2 * np.sin(np.radians(8)), atol=1e-5)
+    flat = centers[..., [0, 2]]
+    angle = np.degrees(np.arctan2(flat[..., 0], flat[..., 1]))
+    turn = (angle - angle[:, :1]) % 360
+    np.testing.assert_allclose(turn[:, 1], 22.5, atol=1e-3)
+    np.testing.assert_allclose(turn[:, 3], 11.25, atol=1e-3)
+    assert ((turn[:, 2] > 0) & (turn[:, 2] < 11.25) & (turn[:, 4] > 11.25) & (turn[:, 4] < 22.5)).all()
+    np.testing.assert_allclose((angle[1:, 0] - angle[:-1, 0]) % 360, 22.5, atol=1e-3)
+    assert abs(yaws[0, 0]) <= 11
+    pixel, z = project(torch.tensor([0.0, 0.85, 0]), cameras.intrinsics[0, 0], cameras.extrinsics[0, 0])
+    np.testing.assert_allclose(pixel, [64, 64 + 25 / 8], atol=1e-4)
+    assert abs(z - 2) < 1e-5
+    rotation = cameras.extrinsics[..., :3, :3].double()
+    np.testing.assert_allclose(rotation @ rotation.mT, np.broadcast_to(np.eye(3), rotation.shape), atol=1e-6)
+    assert (torch.linalg.det(rotation) > 0.99).all()
+    assert pixel_centers(2, 2, pixel)[0, 0].tolist() == [0.5, 0.5]
+
+
+def test_placing_scales_and_moves_body_and_clothes_alike():
+    """Subjects stand on the ground at the asked height, with the body still inside the clothes."""
+    box = trimesh.creation.box((0.4, 3.0, 0.2))
+    part = mesh_part(box)
+    part = TexturedMesh(part.vertices + np.float32([5, 7, -2]), part.faces, part.uv, part.texture)
+    person = Person("b", (part,), part.vertices[::2].copy())
+    placed = Rig().place(person, subject_rng(0, "b"))
+    low, high = placed.parts[0].vertices.min(0), placed.parts[0].vertices.max(0)
+    assert 1.75 <= high[1] <= 1.85
+    np.testing.assert_allclose([low[1], low[0] + high[0], low[2] + high[2]], 0, atol=1e-5)
+    np.testing.assert_allclose(placed.body_vertices, placed.parts[0].vertices[::2], atol=1e-6)
+    kept = Rig(height=None).place(person, subject_rng(0, "b"))
+    np.testing.assert_allclose(np.ptp(kept.parts[0].vertices[:, 1]), 3.0, atol=1e-5)
+
+
+def test_without_embree_only_rendering_is_refused(monkeypatch):
+    """Some machines have no wheel of it: what renders no mesh works there: nothing imports it before."""
+    monkeypatch.setitem(sys.modules, "embreex.rtcore_scene", None)
+    with pytest.raises(InputError, match="expected the package embreex, or photographs that are rendered"):
+        Studio(Person("p", (quad(),), None), LIGHT)
+    sources = [path.read_text() for path in Path(ghgs_lit.__file__).parent.rglob("*.py")]
+    assert not [text for text in sources if re.search(r"^(?:import|from) embreex", text, re.M)]

@@ -1,0 +1,174 @@
+"""Scans on disk: loaded as they are, rendered with one transform, and bad ones are named."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
+
+from ghgs_lit.data.layout import Layout
+from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.types import Cameras
+from ghgs_people.scans import ScanSource
+from tests.helpers.people import TINY, render_boxes, rendered, write_obj_scan
+
+
+def test_obj_scans_are_loaded_as_they_are(tmp_path):
+    """Vertices, texture and body are those of the files; a lost .mtl does not matter."""
+    write_obj_scan(tmp_path, "a", (200, 90, 30))
+    person = ScanSource(tmp_path).load("a")
+    part = person.parts[0]
+    np.testing.assert_allclose(part.vertices.min(0), [1 - 0.205, 1.25, 2.85], atol=1e-5)
+    assert np.abs(part.texture.reshape(-1, 3).mean(0) - [200, 90, 30]).max() < 3
+    assert person.body_vertices.dtype == np.float32
+    assert len(person.body_vertices) == 8
+    (tmp_path / "a" / "material0.mtl").unlink()  # often lost: the picture beside the mesh is found anyway
+    assert ScanSource(tmp_path).load("a").parts[0].texture.shape == (4, 4, 3)
+
+
+def test_names_of_windows_programs(tmp_path):
+    """Upper case, backslashes, folders of another machine, options of map_Kd, names with spaces."""
+    write_obj_scan(tmp_path, "a", (200, 90, 30))
+    folder = tmp_path / "a"
+    (folder / "textures").mkdir()
+    (folder / "material0.jpeg").rename(folder / "textures" / "My Skin.JPEG")
+    Image.new("RGB", (4, 4)).save(folder / "black.png")  # beside the mesh, so that nothing is guessed
+    Image.new("RGB", (4, 4)).save(folder / "white.png")
+    (folder / "material0.mtl").rename(folder / "Material0.MTL")
+    (folder / "a.obj").rename(folder / "a.OBJ")
+    for said in (
+        "textures\\My Skin.jpeg",
+        "textures/my skin.jpeg",
+        ".\\textures\\My Skin.JPEG",
+        "textures\\My%20Skin.JPEG",
+    ):
+        (folder / "Material0.MTL").write_text(f"newmtl material0\nmap_Kd {said}\n")
+        texture = ScanSource(tmp_path).load("a").parts[0].texture
+        assert np.abs(texture.reshape(-1, 3).mean(0) - [200, 90, 30]).max() < 3
+    (folder / "textures" / "My Skin.JPEG").rename(folder / "skin.JPEG")
+    for said in ("C:\\Users\\me\\skin.jpeg", "-s 1 1 1 skin.jpeg", '"skin.jpeg"'):
+        (folder / "Material0.MTL").write_text(f"newmtl material0\nmap_Kd {said}\n")
+        assert np.abs(ScanSource(tmp_path).load("a").parts[0].texture[0, 0] - [200.0, 90, 30]).max() < 3
+    assert ScanSource(tmp_path).names() == ["a"]
+
+
+def test_folders_with_meshes_of_other_names_are_named(tmp_path, caplog):
+    """They were left out without a word; folders without meshes, and hidden ones, are no scans."""
+    for name in ("a", "b", "fits", ".c"):
+        write_obj_scan(tmp_path, name)
+    (tmp_path / "b" / "b.obj").rename(tmp_path / "b" / "scan.FBX")
+    (tmp_path / "fits" / "fits.obj").unlink()
+    assert ScanSource(tmp_path).names() == ["a"]
+    (line,) = caplog.messages
+    assert line.endswith("no scans, since their meshes are not named as b/b.obj: b")
+
+
+def test_a_lost_texture_of_several_is_not_guessed(tmp_path):
+    """The image beside the mesh is that of its only material, not of whichever lost its own."""
+    path = write_obj_scan(tmp_path, "a")
+    lines = path.read_text().splitlines()
+    second = next(i for i, line in enumerate(lines) if line.startswith("f ")) + 4
+    path.write_text("\n".join([*lines[:second], "usemtl other", *lines[second:]]))
+    mtl = "newmtl material0\nmap_Kd material0.jpeg\nnewmtl other\nmap_Kd lost.png\n"
+    (tmp_path / "a" / "material0.mtl").write_text(mtl)
+    with pytest.raises(InputError, match=r"a\.obj: expected a texture for the mesh .*; found none"):
+        ScanSource(tmp_path).load("a")
+
+
+def test_glb_scans_keep_parts_and_frames(tmp_path):
+    """Parts keep their transforms; a mesh without texture, or with one that cuts parts away, is refused."""
+    scene = trimesh.Scene()
+    for k, mode in enumerate(("OPAQUE", "OPAQUE", "MASK")):
+        mesh = trimesh.creation.box((0.1, 0.2, 0.3))
+        texture = Image.fromarray(np.full((4, 4, 4), 50 * k, np.uint8))
+        material = PBRMaterial(baseColorTexture=texture, alphaMode=mode)
+        mesh.visual = TextureVisuals(uv=np.zeros((len(mesh.vertices), 2)), material=material)
+        scene.add_geometry(
+            mesh, node_name=f"n{k}", transform=trimesh.transformations.translation_matrix([0, k, 0])
+        )
+    (tmp_path / "g").mkdir()
+    scene.export(tmp_path / "g" / "g.glb")
+    with pytest.raises(InputError, match=r"g\.glb: expected opaque textures; found 'MASK'"):
+        ScanSource(tmp_path).load("g")
+    scene.delete_geometry(list(scene.geometry)[2])
+    scene.export(tmp_path / "g" / "g.glb")
+    parts = ScanSource(tmp_path).load("g").parts
+    assert [part.texture.shape[2] for part in parts] == [3, 3]
+    np.testing.assert_allclose([part.vertices[:, 1].mean() for part in parts], [0, 1], atol=1e-6)
+    plain = trimesh.Scene([trimesh.creation.box()])
+    plain.export(tmp_path / "g" / "g.glb")
+    with pytest.raises(InputError, match=r"g\.glb: expected a texture for the mesh"):
+        ScanSource(tmp_path).load("g")
+
+
+@pytest.mark.parametrize(
+    "required", [["EXT_meshopt_compression", "KHR_mesh_quantization"], ["KHR_draco_mesh_compression"]]
+)
+def test_compression_that_is_not_read_is_named_with_its_cure(tmp_path, required):
+    (tmp_path / "g").mkdir()
+    content = json.dumps({"extensionsRequired": ["KHR_materials_unlit", *required]}).encode()
+    header = b"glTF" + np.array([2, 20 + len(content), len(content)], "<u4").tobytes() + b"JSON"
+    (tmp_path / "g" / "g.glb").write_bytes(header + content)
+    cure = r"g\.glb: expected a mesh without extensions \(npx @gltf-transform/cli dequantize "
+    line = rf"{cure}.*; found '{', '.join(required)}'"
+    with pytest.raises(InputError, match=line):
+        ScanSource(tmp_path).load("g")
+
+
+def test_bad_scans_are_named(tmp_path):
+    """Every defect of a scan is reported with its path."""
+    with pytest.raises(InputError, match="nowhere: expected a folder of scans; found no such folder"):
+        ScanSource(tmp_path / "nowhere").names()
+    with pytest.raises(InputError, match=r"expected <id>/<id>\.obj or <id>/<id>\.glb; found none"):
+        ScanSource(tmp_path).names()
+    path = write_obj_scan(tmp_path, "bare", textured=False)
+    with pytest.raises(InputError, match=r"bare\.obj: expected a texture for the mesh .*; found none"):
+        ScanSource(tmp_path).load("bare")
+    far = write_obj_scan(tmp_path, "far")
+    far.write_text(re.sub(r"(?m)^v \S+", "v 1e30", far.read_text(), count=1))
+    with pytest.raises(InputError, match=r"far\.obj: .*: expected coordinates below 1e\+06; found"):
+        ScanSource(tmp_path).load("far")
+    path.write_text("f 1 2 3\n")
+    with pytest.raises(InputError, match=r"bare\.obj: expected"):
+        ScanSource(tmp_path).load("bare")
+    with pytest.raises(InputError, match=r"other: expected other\.obj or other\.glb; found neither"):
+        ScanSource(tmp_path).load("other")
+    write_obj_scan(tmp_path, "body")
+    np.save(tmp_path / "body" / "body_vertices.npy", np.zeros((5, 2)))
+    with pytest.raises(InputError, match=r"body_vertices\.npy: expected an array nx3; found 5x2"):
+        ScanSource(tmp_path).load("body")
+
+
+def test_rendered_scans_share_one_transform(tmp_path):
+    """Depth and body vertices of a rendered scan meet: the body here is the box itself."""
+    render_boxes(tmp_path / "out", tmp_path / "scans", train=1, val=0)
+    layout = Layout(tmp_path / "out", "train")
+    body = layout.read_body("s0")
+    assert body[:, 1].min() == pytest.approx(0, abs=2e-3)  # stored in 16 bits beside the mesh
+    assert 1.75 <= np.ptp(body[:, 1]) <= 1.85
+    for position in layout.subjects["s0"][::5]:
+        for number in layout.views_at("s0", position):
+            view = layout.read_view("s0", position, number, depth=True)
+            height, width = view.mask.shape
+            cameras = Cameras(
+                torch.from_numpy(view.intrinsics), torch.from_numpy(view.extrinsics), height, width
+            )
+            points = unproject_maps(torch.from_numpy(view.depth), cameras).numpy()[view.mask]
+            assert (points > body.min(0) - 0.05).all()
+            assert (points < body.max(0) + 0.05).all()
+
+
+def test_a_split_chooses_among_rendered_scans(tmp_path):
+    """Another file measured the same subjects, and a missing one was not noticed."""
+    render_boxes(tmp_path / "out", tmp_path / "scans", train=2, val=1, settings=TINY.replace(positions=(0,)))
+    assert list(rendered(tmp_path / "out").subjects("val")) == ["s2"]
+    data = rendered(tmp_path / "out", split={"train": ["s2"], "val": ["s0", "s1"]})
+    assert [list(data.subjects(phase)) for phase in ("train", "val")] == [["s2"], ["s0", "s1"]]
+    with pytest.raises(InputError, match=r"none: expected a folder with split_train\.txt"):
+        rendered(tmp_path / "out", split=tmp_path / "none").subjects("val")

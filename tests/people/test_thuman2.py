@@ -1,0 +1,225 @@
+"""THuman2.0 on miniatures in its true layout: one test for each quirk that a loader can get wrong."""
+
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from ghgs_lit.config import build, compose
+from ghgs_lit.data.overlap import overlap
+from ghgs_lit.data.sampling import subject_rng
+from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.types import Cameras
+from ghgs_people import figures
+from ghgs_people.figures.mesh import Person
+from ghgs_people.photograph import Lights, Studio
+from ghgs_people.rig import Rig
+from ghgs_people.thuman2 import THuman2, THuman2Source, find_fits
+from scripts.miniatures import thuman2 as miniature
+from scripts.miniatures.scans import make_scans, scan_of
+from tests.helpers.captures import stored
+from tests.helpers.people import V4
+
+SIZE = 96
+COUNT = {"train": 1, "val": 1}
+RELEASE = {"name": "release", "training_views": [2, 3, 4]}
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory):
+    """Renders as the published scripts make them: one person a phase, all 16 x 5 views."""
+    return miniature.make(tmp_path_factory.mktemp("thuman2"), COUNT, SIZE, 0)
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory):
+    return make_scans(tmp_path_factory.mktemp("raw") / "THuman2.0_Release", COUNT, 64, 0)
+
+
+def module(root=None, **changes):
+    return THuman2(**{"root": root, "size": SIZE, "workers": 0, **changes}).build(V4, RELEASE)
+
+
+def seen_by(view, scan=None) -> np.ndarray:
+    """The mask of the miniature's person 0000 from the camera that was read."""
+    rng = subject_rng(0, "0000")
+    scan = scan_of("0000", 0)
+    person = Rig().place(Person("0000", (scan.mesh,), None), rng)
+    height, width = view.mask.shape
+    cameras = Cameras(
+        torch.from_numpy(view.intrinsics)[None], torch.from_numpy(view.extrinsics)[None], height, width
+    )
+    return Studio(person, Lights().draw(rng), samples=2).shoot(cameras).masks[0]
+
+
+def test_published_renders_have_integer_pixel_centres(rendered):
+    """The person seen from the camera that was read covers exactly the mask; half a pixel off it does not."""
+    view = stored(module(rendered), "train").view("0000", 2, 3)
+    np.testing.assert_array_equal(seen_by(view), view.mask)
+    ignored = stored(module(rendered, pixel_centers="half"), "train").view("0000", 2, 3)
+    assert (seen_by(ignored) != ignored.mask).sum() > 20
+
+
+def test_own_renders_have_half_pixel_centres(raw, tmp_path):
+    """pixel_centers=auto leaves the centres of our own renders alone."""
+    render = {"size": 48, "samples": 1, "views": (0, 3), "positions": (0, 1, 2, 3)}
+    limit = {"val": 1, "train": 1}
+    data = module(str(tmp_path), source=str(raw), limit=limit, render=render, render_workers=0)
+    assert data.dataset.render_missing() == 2
+    K = stored(data, "train").view("0000", 0, 0).intrinsics
+    np.testing.assert_allclose(K[:2, 2], [24, 24 + 48 * 25 / 1024], atol=1e-5)
+
+
+def test_the_principal_point_is_25_pixels_of_1024_below_the_middle_and_resizes(rendered):
+    """The published principal point, at any size."""
+    K = stored(module(rendered), "train").view("0000", 0, 0).intrinsics
+    np.testing.assert_allclose([K[0, 0], K[1, 1]], 0.8 * SIZE, rtol=1e-6)
+    np.testing.assert_allclose(K[:2, 2] - 0.5, [SIZE / 2, SIZE / 2 + SIZE * 25 / 1024], atol=1e-5)
+    half = stored(module(rendered), "train", (SIZE // 2, SIZE // 2)).view("0000", 0, 0).intrinsics
+    np.testing.assert_allclose(half[:2], K[:2] / 2, rtol=1e-6)
+
+
+def test_depth_is_inverse_and_scaled_by_2_to_the_15(rendered):
+    """Published depth files unproject to the body."""
+    reader = stored(module(rendered), "train")
+    view, body = reader.view("0000", 5, 0), reader.body("0000")
+    height, width = view.mask.shape
+    cameras = Cameras(torch.from_numpy(view.intrinsics), torch.from_numpy(view.extrinsics), height, width)
+    points = unproject_maps(torch.from_numpy(view.depth), cameras).numpy()[view.mask]
+    low, high = body.min(0) - 0.1, body.max(0) + 0.1
+    assert ((points > low) & (points < high)).all(-1).mean() > 0.99
+    assert np.median(np.linalg.norm(points[:, None] - body[None, ::20], axis=-1).min(1)) < 0.08
+
+
+def test_every_view_sees_the_body_in_its_mask(rendered):
+    """Cameras, bodies and masks of all 80 views agree."""
+    for phase in ("train", "val"):
+        photographs = stored(module(rendered), phase)
+        reader = photographs.reader
+        fits = [
+            overlap(photographs.body(name), photographs.view(name, position, view))
+            for name, positions in reader.subjects.items()
+            for position in positions
+            for view in reader.views_at(name, position)
+        ]
+        assert len(fits) == 80
+        assert min(fits) > 0.75
+
+
+def test_views_between_ring_cameras(rendered):
+    """16 cameras 22.5 degrees apart; view 1 is the next one, 3 the exact middle, 2 and 4 in the halves."""
+    photographs = stored(module(rendered), "train")
+    yaw = {}
+    for position in range(16):
+        for view in range(5):
+            E = photographs.view("0000", position, view).extrinsics.astype(np.float64)
+            center = -E[:3, :3].T @ E[:3, 3]
+            yaw[position, view] = np.degrees(np.arctan2(center[0], center[2]))
+            assert np.linalg.norm(center - [0, 0.85, 0]) == pytest.approx(2, abs=1e-4)
+            assert center[1] == pytest.approx(0.85 + 2 * np.sin(np.radians(8)), abs=1e-4)
+    for position in range(16):
+        turn = [(yaw[position, view] - yaw[position, 0]) % 360 for view in range(5)]
+        assert turn[1] == pytest.approx(22.5, abs=0.01)
+        assert turn[3] == pytest.approx(11.25, abs=0.01)
+        assert turn[2] < 11.25 < turn[4] < 22.5
+        assert (yaw[(position + 1) % 16, 0] - yaw[position, 1]) % 360 == pytest.approx(0, abs=0.01) or (
+            yaw[(position + 1) % 16, 0] - yaw[position, 1]
+        ) % 360 == pytest.approx(360, abs=0.01)
+
+
+def test_files_are_of_the_published_types(rendered):
+    """Three-channel masks of 0 and 255, 16-bit depth, 3 x 4 cameras; ``_hr`` files are not views."""
+    train = rendered / "train"
+    mask = np.asarray(Image.open(train / "mask/0000_004/2.png"))
+    assert mask.shape == (SIZE, SIZE, 3)
+    assert set(np.unique(mask)) == {0, 255}
+    assert np.asarray(Image.open(train / "depth/0000_004/2.png")).dtype == np.uint16
+    assert np.load(train / "parm/0000_004/2_extrinsic.npy").shape == (3, 4)
+    assert Image.open(train / "img/0000_004/2_hr.jpg").size == (2 * SIZE, 2 * SIZE)
+    assert stored(module(rendered), "train").reader.views_at("0000", 4) == [0, 1, 2, 3, 4]
+
+
+def test_the_first_camera_faces_the_person(raw):
+    """global_orient of the fit turns the ring: a person that looks elsewhere is still seen from the front."""
+    source = THuman2Source(raw, find_fits(raw, None))
+    for name in ("0000", "0426"):
+        scan = scan_of(name, 0)
+        assert (source.facing(name) - np.degrees(scan.yaw)) % 360 == pytest.approx(0, abs=1e-3) or (
+            source.facing(name) - np.degrees(scan.yaw)
+        ) % 360 == pytest.approx(360, abs=1e-3)
+    front = figures.generate(0, 0).body_vertices
+    person = source.load("0000")
+    turn = np.radians(source.facing("0000"))
+    back = np.array([[np.cos(turn), 0, -np.sin(turn)], [0, 1, 0], [np.sin(turn), 0, np.cos(turn)]])
+    turned = person.body_vertices @ back.T
+    ratio = np.ptp(turned, axis=0) / np.ptp(front, axis=0)
+    np.testing.assert_allclose(ratio, ratio[1], rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["THuman2.0_smplx", "THuman2.0_Smpl_X_Paras", "smplx_2", "smplx"])
+def test_folders_of_fits_go_by_several_names(raw, tmp_path, name):
+    """Fits are found under every published folder name."""
+    beside, inside = tmp_path / "a" / "scans", tmp_path / "b" / "scans"
+    for scans, fits in ((beside, beside.parent / name), (inside, inside / name)):
+        shutil.copytree(raw / "0000", scans / "0000")
+        shutil.copytree(raw.parent / "THuman2.0_smplx" / "0000", fits / "0000")
+        assert find_fits(scans, None) == fits
+        source = THuman2Source(scans, find_fits(scans, None))
+        assert source.names() == ["0000"]
+        assert len(source.load("0000").body_vertices) == 13380
+
+
+def test_scans_without_fits_have_no_body(raw, tmp_path):
+    """Scans alone can be rendered, without bodies."""
+    shutil.copytree(raw / "0000", tmp_path / "0000")
+    source = THuman2Source(tmp_path, find_fits(tmp_path, None))
+    assert source.load("0000").body_vertices is None
+    assert source.facing("0000") == 0
+
+
+def test_a_split_need_not_be_that_of_the_folders(rendered, tmp_path):
+    """data.split selects across the folders train and val."""
+    assert module(rendered).subjects("val") == {"0426": tuple(range(16))}
+    swapped = module(rendered, split={"train": ["0426"], "val": ["0000-0400"]})
+    assert list(swapped.subjects("train")) == ["0426"]
+    assert list(swapped.subjects("val")) == ["0000"]
+    assert swapped.training_batch(0).subjects == ("0426",)
+    (tmp_path / "split_train.txt").write_text("0426\n")
+    (tmp_path / "split_val.txt").write_text("0000\n")
+    assert list(module(rendered, split=str(tmp_path)).subjects("val")) == ["0000"]
+
+
+def composed(name, root, *overrides):
+    cfg = compose("train", [f"experiment={name}", f"data.root={root}", "data.workers=0", *overrides])
+    return build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=cfg.seed), cfg
+
+
+@pytest.mark.parametrize(
+    ("experiment", "size", "inputs", "targets"),
+    [
+        ("thuman2", 512, ["000/0", "004/0", "008/0", "012/0"], ["000/3"]),
+        ("thuman2_ghg", 1024, ["000/0", "006/0", "011/0"], ["003/0", "008/0", "013/0"]),
+        ("thuman2_rogsplat", 512, ["000/0", "004/0", "008/0", "012/0"], [f"{p:03d}/3" for p in range(16)]),
+    ],
+)
+def test_named_protocols(rendered, experiment, size, inputs, targets):
+    """Each experiment= has its publication's size, inputs and targets."""
+    data, cfg = composed(experiment, rendered)
+    assert data.dataset.size == (size, size)
+    assert list(cfg.evaluation.targets) == [data.targets.name]
+    batch = next(iter(data.evaluation_loader(targets=data.targets)))
+    assert list(batch.views[0]) == inputs
+    assert list(batch.targets.names[0]) == targets
+    assert batch.images.shape[-2:] == (size, size)
+    training = data.training_batch(0)
+    assert {name[-1] for name in training.targets.names[0]} <= {"2", "3", "4"}
+    assert len(training.targets.names[0]) == (3 if experiment == "thuman2_ghg" else 1)
+
+
+@pytest.mark.parametrize(("views", "inputs"), [(3, [0, 5, 10]), (4, [0, 4, 8, 12]), (5, [0, 3, 6, 9, 12])])
+def test_three_to_five_views(rendered, views, inputs):
+    """Other numbers of inputs are evenly spaced."""
+    batch = next(iter(module(rendered).evaluation_loader(views)))
+    assert list(batch.views[0]) == [f"{position:03d}/0" for position in inputs]
