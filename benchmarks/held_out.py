@@ -15,8 +15,9 @@ from pathlib import Path
 
 import torch
 
+from ghgs_capture import Capture
 from ghgs_capture.prediction import trained_size
-from ghgs_lit import GHGS, Capture
+from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_renderer, pick_device
 from ghgs_lit.config import build, compose, resolve
 from ghgs_lit.config.options import image_size

@@ -10,8 +10,8 @@ from lightning.pytorch.strategies import SingleDeviceStrategy
 from torch.utils.data import DataLoader
 
 from benchmarks import device as device_counts
+from ghgs_capture.verbs import predict
 from ghgs_lit.bounds import box, hull
-from ghgs_lit.cli import predict
 from ghgs_lit.config import conf_dir
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.measure import ModelMethod, measure

@@ -14,11 +14,11 @@ from ghgs_capture.export.subject import ExportedSubject, exported_subject
 from ghgs_capture.live import live_frames
 from ghgs_capture.prediction import crop_size, in_frame, predict_batch
 from ghgs_capture.temporal import Temporal
+from ghgs_capture.verbs import predict
 from ghgs_capture.verbs.photographs import sources_of
 from ghgs_capture.viewer.content import Content, read_content
 from ghgs_capture.viewer.live import Pause, Recording, show_live
 from ghgs_capture.viewer.server import Viewer
-from ghgs_lit.cli import predict
 from ghgs_lit.cli.inputs import build_renderer, load_model, model_of, pick_device
 from ghgs_lit.cli.runtime import output_dir, save_config, write_config
 from ghgs_lit.config import resolve

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from ghgs_capture import Capture
 from ghgs_capture.export.reports import require_free
 from ghgs_capture.folder import CaptureFolder
-from ghgs_lit import Capture
 from ghgs_lit.errors import InputError
 from tests.helpers.captures import truncate
 from tests.helpers.figures import Figure

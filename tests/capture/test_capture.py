@@ -9,10 +9,10 @@ import torch
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
+from ghgs_capture import Capture, predict
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.masks import matte_of_file
 from ghgs_capture.photographs import Pixels
-from ghgs_lit import Capture, predict
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.geometry.masks import on_black
 from ghgs_lit.geometry.projection import project

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from ghgs_capture import Capture
 from ghgs_capture.camera_report import diagnose
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.masks import matte_of_file
 from ghgs_capture.photographs import Pixels
-from ghgs_lit import Capture
 from ghgs_lit.errors import InputError
 from tests.helpers.calibrations import frame, write
 from tests.helpers.figures import Figure

@@ -23,7 +23,7 @@ print("\\n", code, *sys.modules)
 @pytest.mark.parametrize(
     ("arguments", "code", "absent"),
     [
-        (["--help"], 0, {"torch", "hydra", "numpy"}),
+        (["--help"], 0, {"torch", "numpy"}),
         (["predict", "--help"], 0, {"torch", "numpy"}),
         (["predict", "images=nowhere", "cameras=nowhere.json"], 1, {"torch", "scipy"}),
         (["predict", "checkpoint=nowhere.ckpt"], 1, {"torch", "scipy"}),

@@ -4,7 +4,7 @@ import importlib.metadata
 
 import torch
 
-from ghgs_lit.cli import doctor
+from ghgs_capture.verbs import doctor
 from ghgs_lit.diagnostics.machine import machine_lines, missing_extras
 from tests.helpers.verbs import ghgs
 

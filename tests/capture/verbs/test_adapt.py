@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+from ghgs_capture.verbs import adapt
 from ghgs_capture.verbs.adapt import _fill_of, with_rig
 from ghgs_capture.verbs.predict import rig_advice
-from ghgs_lit.cli import adapt
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.data.view import half_centers
@@ -88,7 +88,7 @@ def test_more_cameras_than_a_prediction_takes_are_refused(calibration):
 
 def test_weights_learn_and_are_written(calibration, tmp_path, monkeypatch, capsys):
     """The file predicts, holds other weights than those it began with, and both are measured alike."""
-    monkeypatch.setattr(jobs.people, "generate", lambda seed, index, active: box_person(f"p{index}"))
+    monkeypatch.setattr(jobs.figures, "generate", lambda seed, index, active: box_person(f"p{index}"))
     monkeypatch.setenv("GHGS_CACHE", str(tmp_path / "cache"))
     small = ["data.size=42", "data.people={train: 2, val: 1}", "data.active.train=0", "data.active.val=0"]
     small += ["data.render_workers=0", "data.render.samples=1", "minutes=0.02", "evaluation.pictures=0"]

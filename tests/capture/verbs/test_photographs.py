@@ -20,7 +20,7 @@ from tests.helpers.figures import PARTS, Figure
 from tests.helpers.models import config, make_model
 from tests.helpers.verbs import ghgs
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
+EXAMPLES = Path(__file__).parents[3] / "examples"
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, zoom
 
-from ghgs_capture import crops
-from ghgs_lit import Capture
+from ghgs_capture import Capture, crops
 from ghgs_lit.data import matting
 from ghgs_lit.data.matting import refined_matte
 from ghgs_lit.geometry.masks import signed_distance
