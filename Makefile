@@ -25,7 +25,7 @@ $(BIN)/.installed: pyproject.toml constraints.txt
 
 setup: $(BIN)/.installed ## Create the virtual environment with pinned versions, compile kernels
 
-demo: setup ## A person from four photographs; then train the four ablations, print the table
+demo: setup ## Train two models for a minute, print their table; a person from four photographs
 	PATH="$(abspath $(BIN)):$$PATH" bash scripts/demo.sh
 
 test: setup ## Run the whole test suite (CPU)

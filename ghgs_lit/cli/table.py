@@ -35,7 +35,6 @@ def _options(config: dict[str, Any]) -> t.TableOptions:
         reported=config["reported"],
         test=t.PairedTest.read(config["test"], "test"),
         unit=unit,
-        illustration=config["illustration"],
     )
 
 

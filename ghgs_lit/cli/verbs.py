@@ -148,8 +148,6 @@ class Table(Verb):
     """Also print the paper's own numbers (not with layout=ablation)."""
     test: PairedTest = PairedTest()
     """The test between rows."""
-    illustration: bool = False
-    """Add a line: this table illustrates the framework and is not a result."""
 
     def run(self, cfg: DictConfig) -> object:
         from ghgs_lit.cli import table

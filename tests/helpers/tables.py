@@ -73,10 +73,10 @@ def start_run(folder: Path, ablation, seed=1, **changes) -> None:
     (folder / "config.yaml").write_text(yaml.safe_dump(config_of(ablation, seed, **changes)))
 
 
-def tables_of(folder: Path, layout="ablation", by=(), others=(), illustration=False, **options):
+def tables_of(folder: Path, layout="ablation", by=(), others=(), **options):
     """The tables of the runs below a folder."""
     test = t.PairedTest(**options.pop("test", {}))
-    chosen = t.TableOptions(t.LAYOUTS[layout], test=test, illustration=illustration, **options)
+    chosen = t.TableOptions(t.LAYOUTS[layout], test=test, **options)
     return t.build_tables(t.read_sweep([folder], by), others, chosen)
 
 

@@ -40,7 +40,7 @@ def fill(table: Table, figures: Sequence[Mapping[str, Any]]) -> None:
     table.cells["mean"] = table.cells["mean"].fillna(reported["mean"])
     table.cells["lacking"] = [_lacking(table, cell) for cell in table.cells.itertuples()]
     table.cells["best"] = False
-    for column in [] if options.illustration else product(*_columns(table)):
+    for column in product(*_columns(table)):
         _mark_best(table, column)
     table.cells["test"], table.cells["marked"] = None, False
     if options.test.against != "none":

@@ -59,8 +59,7 @@ LAYOUTS = {
 @dataclass(frozen=True)
 class TableOptions:
     """What a table shows. ``views``, ``targets``, ``metrics``: a selection; None: those of the layout and the
-    runs. ``unit``: regular expression whose first group is the person, if subjects are frames of people.
-    ``illustration``: note that the numbers are not a result, and mark none as best."""
+    runs. ``unit``: regular expression whose first group is the person, if subjects are frames of people."""
 
     layout: Layout
     views: tuple[int, ...] | None = None
@@ -69,7 +68,6 @@ class TableOptions:
     reported: bool = True
     test: PairedTest = field(default_factory=PairedTest)
     unit: re.Pattern[str] | None = None
-    illustration: bool = False
 
 
 def _stem(metric: str) -> str:

@@ -14,10 +14,6 @@ FOOTNOTE = (
     " points: neighbours are then found on the image plane."
 )
 NO_SEMANTICS = "features carry no semantics: this encoder was never trained for semantics"
-ILLUSTRATION = (
-    "This is an illustration of the framework on a small model, not a result: rows of such short trainings"
-    " are equal but for chance, and none is bold."
-)
 MARK = "*"
 #: Share of equal neighbours above which the ablation of 3D unprojection compares nearly the same methods.
 MOSTLY_SHARED = 0.8
@@ -43,13 +39,12 @@ def write_caption(table: Table) -> str:
         said.append(f"{views.pop()} input views")
     spread = f" ± deviation over {seeds} seeds" if seeds > 1 else ""
     clear = " where it leads by more than the deviation" if seeds > 1 else ""
-    best = "" if table.options.illustration else f", best of the measured methods in bold{clear}"
-    return f"{', '.join(said)}; mean over subjects{spread}{best}."
+    return f"{', '.join(said)}; mean over subjects{spread}, best of the measured methods in bold{clear}."
 
 
 def write_notes(table: Table) -> list[str]:
     """Notes below the table."""
-    said = [f"**{ILLUSTRATION}**"] if table.options.illustration else []
+    said: list[str] = []
     if table.layout.rows == "ablation":
         said.append(FOOTNOTE)
         if not table.ours[0].variant.has_semantics:

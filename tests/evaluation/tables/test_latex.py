@@ -88,7 +88,7 @@ def test_every_layout_compiles(tmp_path):
     """A TeX engine accepts every layout, and no table is wider than the page."""
     parts = [PREAMBLE]
     for layout in ("ablation", "table1", "table2", "table3", "table4"):
-        table = of_layout(tmp_path / layout, layout, tuple(SWITCHES), (1, 2), illustration=True)
+        table = of_layout(tmp_path / layout, layout, tuple(SWITCHES), (1, 2))
         parts.append(to_latex(table, f"table:{layout}"))
     packages = r"\usepackage{booktabs,multirow,adjustbox,pifont}"
     head = rf"\documentclass[twocolumn]{{article}}{packages}\begin{{document}}"

@@ -8,7 +8,7 @@ import pytest
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.tables import read_sweep, to_csv, to_markdown, to_terminal
-from ghgs_lit.evaluation.tables.notes import FOOTNOTE, ILLUSTRATION, NO_SEMANTICS
+from ghgs_lit.evaluation.tables.notes import FOOTNOTE, NO_SEMANTICS
 from ghgs_lit.runs.results import read_results, summarize, write_results
 from tests.helpers.tables import body, start_run, tables_of, write_run
 
@@ -52,17 +52,6 @@ def test_only_a_lead_beyond_the_deviation_is_bold(tmp_path, lead, is_bold):
     (table,) = tables_of(tmp_path, views=(4,), metrics=("psnr",))
     assert [i for (i, *_), best in table.cells["best"].items() if best] == [3] * is_bold
     assert "in bold where it leads by more than the deviation" in table.caption
-
-
-def test_an_illustration_has_nothing_in_bold(tmp_path):
-    """Its rows are equal but for chance, which one seed cannot show."""
-    for name, psnr in (("full", 20.0), ("neither", 20.05)):
-        write_run(tmp_path / name, name, psnr)
-    shown, result = (tables_of(tmp_path, illustration=which)[0] for which in (True, False))
-    assert not shown.cells["best"].any()
-    assert result.cells["best"].any()
-    assert "bold" not in shown.caption
-    assert "equal but for chance" in shown.notes[0]
 
 
 def test_a_lower_metric_is_better_and_any_metric_can_be_a_column(tmp_path):
@@ -130,9 +119,9 @@ def test_a_branch_that_has_learned_parts_needs_no_footnote(tmp_path, weights, se
 def test_notes_and_caption_say_what_the_numbers_are(tmp_path):
     """Readers see data, protocol, code states and settings that differ."""
     write_run(tmp_path / "0", "full", 20.0, git={"commit": "a" * 40, "changed": False})
-    (table,) = tables_of(tmp_path, illustration=True)
+    (table,) = tables_of(tmp_path)
     text = to_markdown(table)
-    for said in (FOOTNOTE, NO_SEMANTICS, ILLUSTRATION, "`synthetic`", "2 subjects", "`release`", "`correct`"):
+    for said in (FOOTNOTE, NO_SEMANTICS, "`synthetic`", "2 subjects", "`release`", "`correct`"):
         assert said in text
     assert "states of the code" not in text
     write_run(
@@ -140,7 +129,6 @@ def test_notes_and_caption_say_what_the_numbers_are(tmp_path):
     )
     (table,) = tables_of(tmp_path)
     text = to_markdown(table)
-    assert ILLUSTRATION not in text
     # What a reviewer would ask: is it the same code and the same training?
     assert "2 states of the code: aaaaaaaaa, bbbbbbbbb with changes" in text
     assert "differ also in `optimizer.lr` (absent, 0.1)" in text
