@@ -62,3 +62,33 @@ def tanh(x):
     squared = x * x
     series = x * (1 + squared * (-1 / 3 + squared * (2 / 15 - squared * (17 / 315))))
     return tl.where(tl.abs(x) < 0.2, series, tl.where(x < 0, -size, size))
+
+
+@triton.jit
+def to_camera(extrinsics, view, x, y, z):
+    """World points in axes of the cameras ``view``."""
+    a, b, c, shift = load4(extrinsics, 4 * view)
+    right = a * x + b * y + c * z + shift
+    a, b, c, shift = load4(extrinsics, 4 * view + 1)
+    below = a * x + b * y + c * z + shift
+    a, b, c, shift = load4(extrinsics, 4 * view + 2)
+    return right, below, a * x + b * y + c * z + shift
+
+
+@triton.jit
+def cells(place, size):
+    """The two cells around a place along an axis of a map, and their weights: 0 beyond its border."""
+    first = tl.floor(place - 0.5)
+    share = place - 0.5 - first
+    at = first.to(tl.int32)
+    before = tl.where(at >= 0, 1 - share, 0.0)
+    after = tl.where(at < size - 1, share, 0.0)
+    return tl.maximum(at, 0), tl.minimum(at + 1, size - 1), before, after
+
+
+@triton.jit
+def between(plane, top, bottom, left, right, above, below, before, after):
+    """Bilinear value of a map between two rows, which begin at ``top`` and ``bottom``, and two columns."""
+    upper = before * tl.load(plane + top + left) + after * tl.load(plane + top + right)
+    lower = before * tl.load(plane + bottom + left) + after * tl.load(plane + bottom + right)
+    return above * upper + below * lower

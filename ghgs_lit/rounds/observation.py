@@ -5,13 +5,14 @@ from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from ghgs_lit.geometry.masks import coverage, on_black
 from ghgs_lit.geometry.projection import at_least_float32, project
 from ghgs_lit.geometry.rotations import rotate, unit
+from ghgs_lit.kernels import gpu
 from ghgs_lit.kernels.pool import is_supported
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.rendering import render
@@ -74,30 +75,82 @@ def observe(gaussians: Gaussians, batch: Batch, rendering: Rendering | None = No
 
 def _compare(gaussians: Gaussians, batch: Batch, rendering: Rendering) -> Float[Tensor, "N V c"]:
     views, photo, mask = batch.images.shape[1], at_least_float32(batch.images), coverage(batch)
-    if is_supported(gaussians.means, gaussians.colors, photo, batch.cameras.extrinsics):
+    cameras = batch.cameras
+    seen = (gaussians.means, gaussians.colors, gaussians.image, cameras.intrinsics, cameras.extrinsics)
+    maps = (photo, mask, rendering.image, rendering.alpha, rendering.depth)
+    if gpu.is_supported(*seen[:2], *seen[3:], *maps):
+        return _observe(*seen, *maps, _BEHIND, gaussians.splits)
+    if is_supported(gaussians.means, gaussians.colors, photo, cameras.extrinsics):
         values = photo.new_empty(len(gaussians), views, CHANNELS)
-        cpu.compare(gaussians, batch.cameras, photo, mask, rendering, _BEHIND, values)
+        cpu.compare(gaussians, cameras, photo, mask, rendering, _BEHIND, values)
         return values
-    maps = (photo, photo - rendering.image, mask[:, :, None], rendering.alpha, rendering.depth)
-    found, z, can_see = looked_up(gaussians, batch.cameras, torch.cat(maps, 2))
+    return _compared(*seen, *maps, _BEHIND, gaussians.splits)
+
+
+def _compared(
+    means: Float[Tensor, "N 3"],
+    colors: Float[Tensor, "N 3"],
+    image: Int[Tensor, " N"],
+    intrinsics: Float[Tensor, "B V 3 3"],
+    extrinsics: Float[Tensor, "B V 4 4"],
+    photo: Float[Tensor, "B V 3 H W"],
+    mask: Float[Tensor, "B V H W"],
+    drawn: Float[Tensor, "B V 3 H W"],
+    alpha: Float[Tensor, "B V 1 H W"],
+    depth: Float[Tensor, "B V 1 H W"],
+    scale: float,
+    splits: Sequence[int],
+) -> Float[Tensor, "N V c"]:
+    """Values of :func:`observe` in plain PyTorch.
+
+    Args:
+        means: of the Gaussians, in metres.
+        colors: of the Gaussians.
+        image: numbers of the images (``b * V + v``) that the Gaussians belong to.
+        intrinsics: of the views, in pixels.
+        extrinsics: of the views.
+        photo: photographs.
+        mask: share of each pixel that shows the subject.
+        drawn: rendered colours, as are the next two.
+        alpha: rendered opacities.
+        depth: rendered depths in metres.
+        scale: of the distance behind the rendered surface, in metres.
+        splits: number of Gaussians of each element."""
+    views, cameras = photo.shape[1], Cameras(intrinsics, extrinsics, *photo.shape[-2:])
+    maps = torch.cat((photo, photo - drawn, mask[:, :, None], alpha, depth), 2)
+    found, z, can_see = _values_at(means, splits, cameras, maps)
     color, error, mask, alpha, depth = found.split((3, 3, 1, 1, 1), -1)
-    behind = torch.tanh((z - depth) / _BEHIND)
-    values = torch.cat((color - gaussians.colors[:, None], error, mask, alpha, behind), -1)
+    behind = torch.tanh((z - depth) / scale)
+    values = torch.cat((color - colors[:, None], error, mask, alpha, behind), -1)
     values = torch.cat((torch.where(can_see, values, 0), can_see.to(values)), -1)
     place = torch.arange(views, device=values.device)
-    own_first = (gaussians.image[:, None] + place) % views
+    own_first = (image[:, None] + place) % views
     values = values.gather(1, own_first[..., None].expand_as(values))
     is_own = (place == 0).to(values).expand(len(values), -1)
     return torch.cat((values, is_own[..., None]), -1)
+
+
+_observe = gpu.operator(
+    "observe(Tensor means, Tensor colors, Tensor image, Tensor intrinsics, Tensor extrinsics, Tensor photo, "
+    "Tensor mask, Tensor drawn, Tensor alpha, Tensor depth, float scale, int[] splits) -> Tensor",
+    _compared,
+    "ghgs_lit.rounds.cuda",
+)
 
 
 def looked_up(
     gaussians: Gaussians, cameras: Cameras, maps: Float[Tensor, "B V c H W"]
 ) -> tuple[Float[Tensor, "N V c"], Float[Tensor, "N V 1"], Bool[Tensor, "N V 1"]]:
     """Values of maps at projected means in each view, z-depths, and whether the view can see the means."""
+    return _values_at(gaussians.means, gaussians.splits, cameras, maps)
+
+
+def _values_at(
+    means: Tensor, splits: Sequence[int], cameras: Cameras, maps: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     b, views, channels = maps.shape[:3]
     # One row of points for each element; those with fewer have points at 0 at the end.
-    means = pad_sequence(gaussians.means.split(gaussians.splits), batch_first=True)
+    means = pad_sequence(means.split(splits), batch_first=True)
     means = means[:, None].expand(-1, views, -1, -1)
     pixels, z = project(means, cameras.intrinsics[:, :, None], cameras.extrinsics[:, :, None])
     size = pixels.new_full((2,), cameras.width)
@@ -108,7 +161,7 @@ def looked_up(
     can_see = (z > 0) & ((pixels >= 0) & (pixels <= size)).all(-1)
     of_image = found.view(b, views, channels, -1).permute(0, 3, 1, 2)
     each = (of_image, z.mT[..., None], can_see.mT[..., None])
-    return tuple(_packed(values, gaussians.splits) for values in each)
+    return tuple(_packed(values, splits) for values in each)
 
 
 def _packed(values: Tensor, splits: Sequence[int]) -> Tensor:

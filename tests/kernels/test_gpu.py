@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+import ghgs_lit.model  # noqa: F401  (it has all operators)
 from ghgs_lit.kernels import gpu
 from tests.helpers.kernels import kernels
 

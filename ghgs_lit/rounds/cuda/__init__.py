@@ -1,0 +1,1 @@
+"""Rounds for GPUs: observations of Gaussians in one kernel."""

@@ -1,0 +1,65 @@
+"""Observations of Gaussians for a GPU, in Triton: a row of a program is a Gaussian in a view. See
+:func:`ghgs_lit.rounds.observation.compared`; bilinear values are as of ``grid_sample``."""
+
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from ghgs_lit.kernels.tiles import between, cells, contiguous, load3, rows_of, tanh, to_camera
+
+ROWS = 128
+CHANNELS = tl.constexpr(11)
+
+
+@triton.jit
+def observe_rows(
+    means, colors, image, intrinsics, extrinsics, photo, mask, drawn, alpha, depth, out,
+    count, views, height, width, scale, ROWS: tl.constexpr,
+):  # fmt: skip
+    """Write ``ROWS`` rows of ``out`` [N, V, 11]; ``count``: N V. See :func:`observe`."""
+    i = rows_of(count, ROWS)
+    gaussian, turn = i // views, i % views
+    own = tl.load(image + gaussian)
+    view = own // views * views + (own + turn) % views
+    x, y, z = load3(means, gaussian)
+    x, y, z = to_camera(extrinsics, view, x, y, z)
+    fx, skew, cx = load3(intrinsics, 3 * view)
+    _, fy, cy = load3(intrinsics, 3 * view + 1)
+    is_front = z > 0
+    x, y = x / tl.where(is_front, z, 1.0), y / tl.where(is_front, z, 1.0)
+    u, v = fx * x + skew * y + cx, fy * y + cy
+    can_see = is_front & (u >= 0) & (u <= width) & (v >= 0) & (v <= height)
+    left, right, before, after = cells(tl.where(can_see, u, 0.0), width)
+    top, bottom, above, below = cells(tl.where(can_see, v, 0.0), height)
+    top, bottom = top * width, bottom * width
+    area = height.to(tl.int64) * width
+    row = out + i * CHANNELS
+    for k in tl.static_range(3):
+        plane = (3 * view + k) * area
+        color = between(photo + plane, top, bottom, left, right, above, below, before, after)
+        shown = between(drawn + plane, top, bottom, left, right, above, below, before, after)
+        tl.store(row + k, tl.where(can_see, color - tl.load(colors + 3 * gaussian + k), 0.0))
+        tl.store(row + 3 + k, tl.where(can_see, color - shown, 0.0))
+    plane = view * area
+    share = between(mask + plane, top, bottom, left, right, above, below, before, after)
+    opacity = between(alpha + plane, top, bottom, left, right, above, below, before, after)
+    surface = between(depth + plane, top, bottom, left, right, above, below, before, after)
+    tl.store(row + 6, tl.where(can_see, share, 0.0))
+    tl.store(row + 7, tl.where(can_see, opacity, 0.0))
+    tl.store(row + 8, tl.where(can_see, tanh((z - surface) / scale), 0.0))
+    tl.store(row + 9, can_see.to(tl.float32))
+    tl.store(row + 10, (turn == 0).to(tl.float32))
+
+
+def observe(*inputs) -> Tensor:
+    """The operator of :mod:`ghgs_lit.rounds.observation`."""
+    *tensors, scale, _ = inputs
+    means, photo = tensors[0], tensors[5]
+    views, _, height, width = photo.shape[1:]
+    out = means.new_empty(len(means), views, CHANNELS.value)
+    rows = len(means) * views
+    if rows > 0:
+        observe_rows[(triton.cdiv(rows, ROWS),)](
+            *contiguous(*tensors), out, rows, views, height, width, scale, ROWS=ROWS
+        )
+    return out
