@@ -48,19 +48,18 @@ def key_of(group):
 OUTSIDE = ["os.system", "subprocess.run", "builtins.eval", "torch.load", "lightning.pytorch.Trainer"]
 
 
-@pytest.mark.parametrize("group", sorted(KINDS))
-def test_no_function_or_class_is_a_kind_by_its_path(group):
+def test_no_function_or_class_is_a_kind_by_its_path():
     """A checkpoint said ``_target_: ghgs_lit.runs.job._run_process`` with a command, and the command ran."""
     paths = [*everything_callable(), *OUTSIDE]
     assert len(paths) > 1500
-    for path in paths:
-        with pytest.raises(InputError, match=rf"{group}.*(kind|expected one of)"):
-            build({**NAMES.get(group, {}), "kind": path}, key_of(group))
+    for number, path in enumerate(paths):  # of each group a share, and what is not ours
+        for group in list(KINDS) if path in OUTSIDE else list(KINDS)[number % len(KINDS) :: len(KINDS)]:
+            with pytest.raises(InputError, match=rf"{group}.*(kind|expected one of)"):
+                build({**NAMES.get(group, {}), "kind": path}, key_of(group))
 
 
 @pytest.mark.parametrize("group", sorted(KINDS))
-@pytest.mark.parametrize("key", ["_target_", "_partial_", "_args_", "_convert_", "_recursive_"])
-def test_the_words_of_hydras_instantiate_mean_nothing(group, key, tmp_path):
+def test_the_words_of_hydras_instantiate_mean_nothing(group, tmp_path):
     """At every node, and nested; what a file says is data."""
     verb = verb_with(group)
     node = composed(verb, *["model=recurrent", "logger=wandb"] * (verb == "train")).get(group)
@@ -68,8 +67,9 @@ def test_the_words_of_hydras_instantiate_mean_nothing(group, key, tmp_path):
         name = next(iter(node))
         node = node[name]
     call = {"_target_": "pathlib.Path.touch", "_args_": [str(tmp_path / "called")]}
-    with pytest.raises(InputError, match=f"{key}|expected"):
-        build({**dict(node), key: call}, key_of(group), **EXTRA.get(group, {}))
+    for key in ("_target_", "_partial_", "_args_", "_convert_", "_recursive_"):
+        with pytest.raises(InputError, match=f"{key}|expected"):
+            build({**dict(node), key: call}, key_of(group), **EXTRA.get(group, {}))
     for name in node:
         if name == "kind":
             continue
