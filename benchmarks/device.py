@@ -18,7 +18,7 @@ from typing import Any
 from unittest import mock
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -130,7 +130,7 @@ def step(
     with probe.of("backward"):
         total.backward()
     with probe.of("optimizer"):
-        nn.utils.clip_grad_norm_(model.parameters(), options.clip)
+        options.clip_gradients(model)
         optimizer.step()
     return probe.counts
 

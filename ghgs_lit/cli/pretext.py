@@ -37,8 +37,8 @@ def pretrain(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> 
     fits = not any(side % patch_size for side in data.dataset.size)
     require(fits, "data.size", f"sides divisible by the patch size {patch_size}", list(data.dataset.size))
     model = Pretext(SemanticOptions.read(options, "encoder.semantic").build(patch_size))
-    step = resume_step(config, model)
     module = PretextModule(model, build(config["optimizer"], "optimizer"), config)
+    step = resume_step(config, module)
     quiet()
     trainer = build_trainer(config, directory, StopAtStep())
     try:

@@ -15,7 +15,6 @@ from lightning.pytorch.callbacks import Callback, Checkpoint
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
-from torch import nn
 
 from ghgs_lit.cli.inputs import build_data, check_size, choices, overrides, said
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
@@ -57,25 +56,25 @@ def say_which_model() -> None:
         print("training model=hull, which learns in minutes; model=paper is the paper's method", flush=True)
 
 
-def prepare_start(config: dict[str, Any], model: GHGS, directory: Path) -> int | None:
+def prepare_start(config: dict[str, Any], module: GHGSModule, directory: Path) -> int | None:
     """Load ``init_from`` or ``resume``; return the step to resume at, None for a new run."""
     start.check_start(config, directory)
     if config["init_from"] is not None and config["resume"] is None:
         lines = start.initialize(
-            model, config["init_from"], config["init_strict"], config["allow_random_encoder"]
+            module.model, config["init_from"], config["init_strict"], config["allow_random_encoder"]
         )
         if rank_zero_only.rank == 0:
             print(start.report(lines, config["init_from"], directory / "init_from.txt"), flush=True)
             if differing := switches.differences(config, read_config(config["init_from"])):
                 print(f"the weights were trained in a different model: {', '.join(differing)}", flush=True)
-    return resume_step(config, model)
+    return resume_step(config, module)
 
 
-def resume_step(config: dict[str, Any], model: nn.Module) -> int | None:
+def resume_step(config: dict[str, Any], module: L.LightningModule) -> int | None:
     """Load the weights of ``resume``; return the step to resume at, None for a new run."""
     if config["resume"] is None:
         return None
-    step, changed = start.check_resume(config["resume"], model, config)
+    step, changed = start.check_resume(config["resume"], module, config)
     if rank_zero_only.rank == 0:
         print("\n".join([f"resume {config['resume']}: at step {step}", *changed]), flush=True)
     return step
@@ -145,17 +144,18 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
     data = build_data(config)
     model = GHGS.from_config(config)
     check_size(data, model)
-    step = prepare_start(config, model, directory)
-    config = start.with_origin(config, model)
     renderer, losses = build(config["renderer"], "renderer"), build(config["loss"], "loss")
     data.trains_on_depths &= getattr(losses, "reads_depths", True)  # a plug-in's may not say
     module = GHGSModule(
         model, renderer, losses, build(config["optimizer"], "optimizer"), config, config.get("token_budgets")
     )
+    step = prepare_start(config, module, directory)
+    config = start.with_origin(config, model)
+    module.config = {**module.config, **config}
     quiet()
     cost = TrainingCost()
     trainer = build_trainer(config, directory, cost, StopAtStep(), NeighborsAtStart())
-    module.lpips = build(config["metrics"], "metrics").to(trainer.strategy.root_device).lpips
+    module.metrics = build(config["metrics"], "metrics").to(trainer.strategy.root_device)
     # The last check, because it makes missing photographs.
     check_evaluation(config, data)
     try:

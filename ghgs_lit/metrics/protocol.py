@@ -1,6 +1,7 @@
 """A measuring protocol: which metrics are computed, how, and under which names."""
 
 import warnings
+from collections.abc import Iterable
 from typing import Literal
 
 import torch
@@ -17,7 +18,6 @@ from ghgs_lit.metrics.functional import (
     PSNR_CAP,
     decibels,
     mean_inside,
-    mean_over,
     region_of,
     sharpness,
     spill,
@@ -121,12 +121,20 @@ class ImageMetrics:
 
     @property
     def names(self) -> list[str]:
-        """The names of the values, in order."""
-        values = []
+        """The names of the values of a call, in order."""
+        return self._of_protocol
+
+    @property
+    def _of_protocol(self) -> list[str]:
+        names = []
         for region in self.options.regions:
-            values += [name if region == "image" else f"{name}_{region}" for name in MEASURED[region]]
-        values += list(OUTLINE) * ("edge" in self.options.regions)
-        return values + ["lpips"] * (self.lpips is not None)
+            for metric in MEASURED[region]:
+                names.append(metric if region == "image" else f"{metric}_{region}")
+        if "edge" in self.options.regions:
+            names += OUTLINE
+        if self.lpips is not None:
+            names.append("lpips")
+        return names
 
     @property
     def definitions(self) -> dict[str, str]:
@@ -160,29 +168,64 @@ class ImageMetrics:
             said["lpips"] = f"{NETWORK} on {'[0, 1]' if options.is_release else '[-1, 1]'}, whole image"
         return said
 
-    @torch.no_grad()
     def __call__(
         self, image: Float[Tensor, "n 3 h w"], target: Float[Tensor, "n 3 h w"], mask: Bool[Tensor, "n h w"]
     ) -> dict[str, Tensor]:
-        options = self.options
-        image = image if options.is_release else image.clamp(0, 1)
-        if options.protocol == "files":
-            image, target = ((255 * values).round() / 255 for values in (image, target))
-        errors = squared_error(image, target)
-        measured = {metric for region in options.regions for metric in MEASURED[region]}
-        similarity = ssim_map(image, target, options.ssim_padding).mean(1) if "ssim" in measured else None
-        difference = flip_map(image, target) if "flip" in measured else None
+        """All metrics of the protocol.
+
+        Args:
+            image: renders, RGB in [0, 1] or a little outside.
+            target: the photographs, RGB in [0, 1].
+            mask: of the subject in the photographs.
+
+        Returns:
+            One value per image by each of :attr:`names`; nan where a region is empty."""
+        return self.measure(image, target, mask, self._of_protocol)
+
+    @torch.no_grad()
+    def measure(
+        self,
+        image: Float[Tensor, "n 3 h w"],
+        target: Float[Tensor, "n 3 h w"],
+        mask: Bool[Tensor, "n h w"],
+        names: Iterable[str],
+    ) -> dict[str, Tensor]:
+        """Some metrics of the protocol, without the work for all others.
+
+        Args:
+            image, target, mask: as of a call.
+            names: of metrics (:data:`MEASURED` with a region, :data:`OUTLINE`, ``lpips``).
+
+        Returns:
+            One value per image by each of the names."""
+        if not self.options.is_release:
+            image = image.clamp(0, 1)
+        if self.options.protocol == "files":
+            image = (255 * image).round() / 255
+            target = (255 * target).round() / 255
+        maps: dict[str, Tensor] = {}
+        regions: dict[str, Tensor | None] = {}
         values = {}
-        for name in options.regions:
-            suffix = "" if name == "image" else f"_{name}"
-            region = region_of(mask, name)
-            values[f"psnr{suffix}"] = decibels(mean_over(errors, region))
-            if "ssim" in MEASURED[name]:
-                values[f"ssim{suffix}"] = mean_inside(similarity, region)
-            if "flip" in MEASURED[name]:
-                values[f"flip{suffix}"] = mean_over(difference, region)
-        if "edge" in options.regions:
-            values |= {name: function(image, target, mask) for name, function in OUTLINE.items()}
-        if self.lpips is not None:
-            values["lpips"] = self.lpips(image, target)
+        for name in names:
+            if name == "lpips":
+                values[name] = self.lpips(image, target)
+                continue
+            if name in OUTLINE:
+                values[name] = OUTLINE[name](image, target, mask)
+                continue
+            metric, _, region = name.partition("_")
+            if metric not in maps:
+                maps[metric] = self._map(metric, image, target)
+            if region not in regions:
+                regions[region] = region_of(mask, region or "image")
+            mean = mean_inside(maps[metric], regions[region])
+            values[name] = decibels(mean) if metric == "psnr" else mean
         return values
+
+    def _map(self, metric: str, image: Tensor, target: Tensor) -> Tensor:
+        """A metric of each pixel, before it is averaged over a region."""
+        if metric == "psnr":
+            return squared_error(image, target)
+        if metric == "ssim":
+            return ssim_map(image, target, self.options.ssim_padding).mean(1)
+        return flip_map(image, target)

@@ -12,7 +12,7 @@ from torchmetrics import MeanMetric
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.kernels.watching import time_mark
-from ghgs_lit.training.optimization import Optimization
+from ghgs_lit.training.optimization import Optimization, hold_rates, plain_rates
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION
 
@@ -26,7 +26,9 @@ class BudgetedModule(L.LightningModule):
     """A module whose learning rate follows the used share of the run's budget.
 
     Args:
-        model: trained; checkpoints hold its tensors.
+        model: trained. All other parts with weights, such as a loss, are trained, clipped, frozen and saved
+            with it; checkpoints hold the model's tensors under ``model.``, others under the part's name.
+        optimization: options of the optimizer and its schedule.
         config: the run's full configuration as plain data, of which ``seed`` is read; checkpoints contain it
             together with the model's own. None: only that of the model.
 
@@ -51,12 +53,14 @@ class BudgetedModule(L.LightningModule):
         # After a restart the scheduler updates it only after a step.
         self.used_budget = self.progress()
         # This run's options of the optimizer replace those of a resumed checkpoint.
-        optimizer, schedule = self.optimizers(), self.lr_schedulers()
+        optimizer = self.optimizers()
+        schedule = self.lr_schedulers()
         for number, (group, option) in enumerate(zip(optimizer.param_groups, self._options, strict=True)):
             # The rate itself includes the schedule's factor of the next step.
             rate = group["lr"] * option["lr"] / schedule.base_lrs[number]
             group.update(option, lr=rate, initial_lr=option["lr"])
             schedule.base_lrs[number] = option["lr"]
+        hold_rates(optimizer)
 
     def on_train_batch_start(self, *args: Any) -> None:
         # Lightning's own count is one ahead in a run that goes on from the end of another session.
@@ -84,12 +88,30 @@ class BudgetedModule(L.LightningModule):
             raise InputError("trainer.max_steps: expected steps or trainer.max_time; found neither")
         return min(max(shares), 1.0)
 
+    def log_numbers(self, size: int, **numbers: float) -> None:
+        """Log the learning rate, the used budget and further numbers of a step under ``train/``.
+
+        Args:
+            size: elements of the batch.
+            **numbers: by name."""
+        numbers = {
+            "learning_rate": self.optimizers().param_groups[0]["lr"],
+            "budget": self.used_budget,
+            **numbers,
+        }
+        values = {}
+        for name, number in numbers.items():
+            # Made where the model is: a number that is copied to a GPU makes the host wait.
+            is_there = isinstance(number, torch.Tensor)
+            values[f"train/{name}"] = number if is_there else torch.full((), number, device=self.device)
+        self.log_dict(values, batch_size=size)
+
     @property
     def _scaler(self) -> torch.amp.GradScaler | None:
         return getattr(self.trainer.precision_plugin, "scaler", None)
 
     def configure_optimizers(self) -> dict[str, Any]:
-        optimizer = self.optimization.optimizer(self.model, fused=self._scaler is None)
+        optimizer = self.optimization.optimizer(self, fused=self._scaler is None)
         groups = optimizer.param_groups
         self._options = [{k: v for k, v in group.items() if k != "params"} for group in groups]
 
@@ -107,8 +129,11 @@ class BudgetedModule(L.LightningModule):
         self.on_train_batch_end()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add plain data only, so that the file loads with ``torch.load(weights_only=True)``."""
+        """Add plain data only, so that the file loads with ``torch.load(weights_only=True)``.
+
+        Args:
+            checkpoint: of Lightning; gets the configuration and the names of weights that are not trained."""
         checkpoint["format_version"] = FORMAT_VERSION
         checkpoint["config"] = self.config
-        parameters = self.model.named_parameters()
-        checkpoint["frozen"] = [f"model.{name}" for name, p in parameters if not p.requires_grad]
+        checkpoint["frozen"] = [name for name, p in self.named_parameters() if not p.requires_grad]
+        plain_rates(checkpoint)

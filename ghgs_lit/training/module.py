@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.config import build
@@ -14,15 +15,18 @@ from ghgs_lit.errors import require
 from ghgs_lit.geometry.unprojection import seen_surfaces
 from ghgs_lit.heads.inspection import offsets_at_limit, seen_attributes
 from ghgs_lit.losses import Losses
-from ghgs_lit.metrics import depth_error_mm, surface_error_mm
-from ghgs_lit.metrics.functional import box_of, psnr, ssim
+from ghgs_lit.metrics import MetricsOptions, depth_error_mm, surface_error_mm
 from ghgs_lit.model import GHGS
 from ghgs_lit.plan.presets import View, seeing
 from ghgs_lit.training.base import BudgetedModule, image_mean
-from ghgs_lit.training.guard import Guard, Step
+from ghgs_lit.training.faults import Step
+from ghgs_lit.training.guard import Guard
 from ghgs_lit.training.optimization import Optimization
-from ghgs_lit.types import Batch, Cameras, DepthMaps, Gaussians, Prediction, Rendering
+from ghgs_lit.types import Batch, Cameras, DepthMaps, Gaussians, Prediction, Rendering, Targets
 from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint
+
+#: Metrics of validations, as the run's protocol defines them; LPIPS where it has one.
+VALIDATED = ("psnr", "psnr_box", "ssim", "lpips")
 
 
 def drawn_budget(budgets: Sequence[str | int], numbers: Sequence[int]) -> str | int:
@@ -32,14 +36,24 @@ def drawn_budget(budgets: Sequence[str | int], numbers: Sequence[int]) -> str | 
         budgets: ``all``: all patches (``skip=none``, ``exact``); ``window``: those of the smallest rectangle
             that holds the subject (``balanced``); a number: the subject's patches and those at most this many
             patches away (``fast``). Budgets that are listed twice are drawn twice as often.
-        numbers: seed; equal numbers give the same budget."""
+        numbers: seed; equal numbers give the same budget.
+
+    Returns:
+        One of the budgets."""
     # A separate key: the same numbers seed the other draws of the step.
     generator = np.random.default_rng(np.random.SeedSequence(numbers, spawn_key=(1,)))
     return budgets[int(generator.integers(len(budgets)))]
 
 
 def token_budget(model: GHGS, budget: str | int | None) -> AbstractContextManager[None]:
-    """Set a budget of :func:`drawn_budget` while the context lasts; None: leave the model unchanged."""
+    """Set which patches the encoder sees while the context lasts.
+
+    Args:
+        model: that predicts in the context.
+        budget: of :func:`drawn_budget`; None: as the model is configured.
+
+    Returns:
+        The context."""
     return nullcontext() if budget is None else seeing(model.encoder, View.of_budget(budget))
 
 
@@ -57,11 +71,20 @@ def _surface_error(batch: Batch, gaussians: Gaussians) -> Tensor:
 
 
 class GHGSModule(BudgetedModule):
-    """Trains a model through a renderer. ``optimization``, ``config``: as of :class:`BudgetedModule`.
-    ``token_budgets``: budgets for :func:`drawn_budget` in each training step; None: as configured.
-    ``lpips``: of images and targets [n, 3, h, w], n values, measured in validations; None: not measured."""
+    """Trains a model through a renderer.
 
-    lpips: Callable[[Tensor, Tensor], Tensor] | None = None
+    Args:
+        model: as of :class:`BudgetedModule`.
+        renderer: draws Gaussians as seen from cameras.
+        losses: gives the weighted total, and each term by name, of a prediction, its rendering and the batch.
+            Weights of its own are trained with the model's.
+        optimization: as of :class:`BudgetedModule`.
+        config: as of :class:`BudgetedModule`.
+        token_budgets: budgets for :func:`drawn_budget` in each training step; None: as configured.
+
+    Attributes:
+        metrics: the protocol of validations, which measure :data:`VALIDATED`, on the device of the training;
+            at first without LPIPS."""
 
     def __init__(
         self,
@@ -77,36 +100,58 @@ class GHGSModule(BudgetedModule):
         self.losses = losses
         self.token_budgets = token_budgets
         self.guard = Guard(optimization.skip_nonfinite)
-        self.val_psnr, self.val_psnr_box = image_mean(), image_mean()
+        self.metrics = MetricsOptions(lpips="off").build()
+        self.means = nn.ModuleDict({name: image_mean() for name in VALIDATED})
         model.keeps_drafts = True  # validation measures each round
 
     @classmethod
     def load_from_checkpoint(
         cls, checkpoint_path: str | Path, map_location: Any = None, **parts: Any
     ) -> "GHGSModule":
-        """The module of a checkpoint of ``ghgs train`` or of any Trainer. ``parts``: ``renderer``, ``losses``
-        and ``optimization`` in place of those of the configuration. InputError: the checkpoint cannot be
-        used, or a part is neither configured nor given."""
+        """The module of a checkpoint of ``ghgs train`` or of any Trainer.
+
+        Args:
+            checkpoint_path: the file.
+            map_location: device of the weights; None: the CPU.
+            **parts: ``renderer``, ``losses`` and ``optimization`` in place of those of the configuration. A
+                part with weights gets those of the checkpoint.
+
+        Returns:
+            The module, in training mode.
+
+        Raises:
+            InputError: the checkpoint cannot be used, or a part is neither configured nor given."""
         checkpoint = read_checkpoint(checkpoint_path)
         config = checkpoint["config"]
         for name, group in {"losses": "loss", "optimization": "optimizer", "renderer": "renderer"}.items():
-            if name in parts:
-                continue
-            place = f"{checkpoint_path}: config.{group}"
-            require(group in config, place, f"options of it, or {name}=...", "nothing")
-            parts[name] = build(config[group], group)
+            if name not in parts:
+                place = f"{checkpoint_path}: config.{group}"
+                require(group in config, place, f"options of it, or {name}=...", "nothing")
+                parts[name] = build(config[group], group)
             if state := model_state(checkpoint, f"{name}."):  # a loss with weights of its own
                 load_strictly(parts[name], state, checkpoint_path)
         model = GHGS.from_checkpoint(checkpoint_path, map_location or "cpu")
         return cls(model.train(), config=config, **parts)
 
     def forward(self, batch: Batch) -> tuple[Prediction, Rendering]:
-        """The prediction for a batch, and its Gaussians rendered from the batch's target cameras."""
+        """Predict and render.
+
+        Args:
+            batch: with targets.
+
+        Returns:
+            The prediction for the batch, and its Gaussians rendered from the batch's target cameras."""
         prediction = self.model(batch)
         return prediction, self.renderer(prediction.gaussians, batch.targets.cameras)
 
     def forward_losses(self, step: Step) -> tuple[Prediction, Tensor, dict[str, Tensor]]:
-        """The prediction of a step, its loss and the loss's terms, with the random numbers of its seed."""
+        """Run the forward pass of a step, with the random numbers of its seed.
+
+        Args:
+            step: the inputs.
+
+        Returns:
+            The prediction, its loss without dimensions, and the loss's unweighted terms by name."""
         torch.manual_seed(step.seed)
         with token_budget(self.model, step.budget):
             prediction, rendering = self(step.batch)
@@ -130,57 +175,61 @@ class GHGSModule(BudgetedModule):
         size = len(batch.images)
         self.log("loss/total", total.detach(), prog_bar=True, batch_size=size)
         self.log_dict({f"loss/{name}": v.detach() for name, v in values.items()}, batch_size=size)
-        numbers = {
-            "learning_rate": self.optimizers().param_groups[0]["lr"],
-            "budget": self.used_budget,
-            "skipped_steps": float(self.guard.skipped),
-            "gaussians": len(prediction.gaussians) / size,
-        }
-        # Made where the model is: a number that is copied to a GPU makes the host wait.
-        filled = {f"train/{n}": torch.full((), value, device=self.device) for n, value in numbers.items()}
-        self.log_dict(filled, batch_size=size)
+        skipped = float(self.guard.skipped)
+        self.log_numbers(size, skipped_steps=skipped, gaussians=len(prediction.gaussians) / size)
         return total
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
         head = getattr(self.model, "gaussian_head", None)
         with seen_attributes(head) as seen:
             prediction, rendering = self(batch)
-        image, target = rendering.image.flatten(0, 1).clamp(0, 1), batch.targets.images.flatten(0, 1)
-        size, box = len(batch.images), box_of(batch.targets.masks.flatten(0, 1))
-        self.val_psnr.update(psnr(image, target))
-        self.val_psnr_box.update(psnr(image, target, box))
-        self.log("val/psnr", self.val_psnr, prog_bar=True, on_epoch=True, batch_size=size)
-        self.log("val/psnr_box", self.val_psnr_box, on_epoch=True, batch_size=size)
-        means = {"val/ssim": ssim(image, target).mean(), **self._rounds(batch, prediction)}
+        size = len(batch.images)
+        for name, values in self._measured(rendering.image, batch.targets, VALIDATED).items():
+            self.means[name].update(values)
+            is_first = name == VALIDATED[0]
+            self.log(f"val/{name}", self.means[name], prog_bar=is_first, on_epoch=True, batch_size=size)
+        means = self._rounds(batch, prediction)
         if seen and head.has_offset_limit:
             means["val/offsets_at_limit"] = offsets_at_limit(seen[-1])
-        if self.lpips is not None:
-            means["val/lpips"] = self.lpips(image, target).mean()
         if batch.depths is not None:
             means["val/depth_error_mm"] = _depth_error(batch, prediction.depth_maps)
             means["val/surface_mm"] = _surface_error(batch, prediction.gaussians)
         self.log_dict(means, on_epoch=True, batch_size=size, sync_dist=self.trainer.world_size > 1)
         return {"prediction": prediction, "rendering": rendering}
 
+    def _measured(
+        self, image: Float[Tensor, "b t 3 h w"], targets: Targets, names: Sequence[str]
+    ) -> dict[str, Tensor]:
+        """Values of each target view [b * t] by name, without LPIPS where the protocol has none."""
+        known = [name for name in names if name != "lpips" or self.metrics.lpips is not None]
+        flat = (values.flatten(0, 1) for values in (image, targets.images, targets.masks))
+        return self.metrics.measure(*flat, known)
+
     def _rounds(self, batch: Batch, prediction: Prediction) -> dict[str, Tensor]:
+        """PSNR in dB and depth error in mm before each round."""
         found = {}
-        for number, draft in enumerate(prediction.drafts):
-            image = self.renderer(draft, batch.targets.cameras).image.clamp(0, 1).flatten(0, 1)
-            found[f"val/psnr_before_round_{number + 1}"] = psnr(
-                image, batch.targets.images.flatten(0, 1)
-            ).mean()
+        for number, draft in enumerate(prediction.drafts, start=1):
+            image = self.renderer(draft, batch.targets.cameras).image
+            psnr = self._measured(image, batch.targets, ("psnr",))["psnr"]
+            found[f"val/psnr_before_round_{number}"] = psnr.mean()
             if batch.depths is not None:
-                error = _depth_error(batch, prediction.rounds[number])
-                found[f"val/depth_error_mm_before_round_{number + 1}"] = error
+                error = _depth_error(batch, prediction.rounds[number - 1])
+                found[f"val/depth_error_mm_before_round_{number}"] = error
         return found
 
     def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
-        """Clip to ``optimizer.clip`` and log the norm before; the arguments are not used. Gradients are
-        already unscaled. After an overflow, a scaler of the loss skips the step and halves its factor; the
-        guard handles losses that are not finite, and gradients that overflow without a factor. DivergedError:
-        the guard does not skip the step."""
-        self.optimization.drop_frozen_gradients(self.model, self.used_budget)
-        norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.optimization.clip, foreach=True)
+        """Clip the gradients of all weights to ``optimizer.clip`` and log their norm before.
+
+        Gradients are already unscaled. After an overflow, a scaler of the loss skips the step and halves its
+        factor; the guard handles losses that are not finite, and gradients that overflow without a factor.
+
+        Args:
+            optimizer, gradient_clip_val, gradient_clip_algorithm: of Lightning; not used.
+
+        Raises:
+            DivergedError: the guard does not skip the step."""
+        self.optimization.drop_frozen_gradients(self, self.used_budget)
+        norm = self.optimization.clip_gradients(self)
         loss_holds, norm_holds = self.guard.is_finite(self.trainer, norm)
         if loss_holds and norm_holds:
             self.log("train/gradient_norm", norm)

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import lightning.pytorch as L
 from torch import nn
 
 from ghgs_lit.config import build
@@ -25,10 +26,22 @@ def check_start(config: Mapping[str, Any], directory: Path) -> None:
     require(own, "init_from", "null where resume is given", config["init_from"])
 
 
-def check_resume(path: str | Path, model: nn.Module, config: Mapping[str, Any]) -> tuple[int, list[str]]:
-    """Check that a run can resume from a checkpoint, and load its weights into ``model``. Returns the step of
-    the checkpoint, and one line for each setting that ``config`` changes. InputError: not a checkpoint of a
-    training run, of another model (names the tensor) or optimizer, or damaged."""
+def check_resume(
+    path: str | Path, module: L.LightningModule, config: Mapping[str, Any]
+) -> tuple[int, list[str]]:
+    """Check that a run can resume from a checkpoint, and load its weights.
+
+    Args:
+        path: the checkpoint.
+        module: with a ``model``; gets the weights of all its parts.
+        config: the run's configuration as plain data.
+
+    Returns:
+        The step of the checkpoint, and one line for each setting that ``config`` changes.
+
+    Raises:
+        InputError: not a checkpoint of a training run, of another model or loss (names the tensor) or
+            optimizer, or damaged."""
     checkpoint = read_checkpoint(path, whole=True)
     for key in ("global_step", "optimizer_states"):
         if key not in checkpoint:
@@ -37,13 +50,18 @@ def check_resume(path: str | Path, model: nn.Module, config: Mapping[str, Any]) 
                 " (init_from=... starts from weights alone)"
             )
     check_training_state(path, checkpoint)
-    load_strictly(model, model_state(checkpoint), path)
-    _check_optimizer(path, checkpoint, model, config)
+    parts = dict(module.named_children())
+    for key in checkpoint["state_dict"]:
+        expected = f"weights of {' or '.join(parts)}"
+        require(str(key).split(".")[0] in parts, f"{path}: {key}", expected, "those of another part")
+    for name, part in parts.items():
+        load_strictly(part, model_state(checkpoint, f"{name}."), path)
+    _check_optimizer(path, checkpoint, module, config)
     return checkpoint["global_step"], differences(checkpoint["config"], config, MAY_CHANGE_ON_RESUME)
 
 
 def _check_optimizer(
-    path: str | Path, checkpoint: Mapping[str, Any], model: nn.Module, config: Mapping[str, Any]
+    path: str | Path, checkpoint: Mapping[str, Any], module: L.LightningModule, config: Mapping[str, Any]
 ) -> None:
     """Refuse to resume with Muon from AdamW's state, the reverse, or with other parameter groups."""
     states = checkpoint["optimizer_states"]
@@ -52,7 +70,7 @@ def _check_optimizer(
     scale = lookup(config, key)
     require(by_muon == (scale is not None), key, f"{'a number' if by_muon else 'null'}, as in {path}", scale)
     if "kind" in (node := config.get("optimizer") or {}):
-        groups = build(node, "optimizer").optimizer(model).param_groups
+        groups = build(node, "optimizer").optimizer(module).param_groups
         for state in states:
             check_optimizer_state(path, state, groups)
         check_schedules(path, checkpoint.get("lr_schedulers"), len(groups))

@@ -10,6 +10,8 @@ from torch.utils.data import DataLoader, Dataset
 from ghgs_lit.data.batches import StepSampler
 from ghgs_lit.data.datamodule import trained_batches
 from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.training.base import BudgetedModule
+from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import (
     Batch,
     Cameras,
@@ -82,6 +84,11 @@ class Standin(nn.Module):
         nothing = torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool), torch.zeros(0, dtype=torch.int64)
         maps = DepthMaps(depth, masks, torch.ones_like(depth))
         return Prediction(gaussians, depth, masks, Points(pixels, masks, *nothing), maps)
+
+
+def held(model: nn.Module) -> BudgetedModule:
+    """A LightningModule that has nothing but the model."""
+    return BudgetedModule(model, Optimization(lr=0.05), None)
 
 
 def flat_renderer(gaussians: Gaussians, cameras: Cameras) -> Rendering:

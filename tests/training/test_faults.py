@@ -8,7 +8,7 @@ from torch import nn
 
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.training import GHGSModule, Optimization
-from ghgs_lit.training.guard import Step, first_fault
+from ghgs_lit.training.faults import Step, first_fault
 from ghgs_lit.types import map_tensors
 from tests.helpers.losses import losses_of
 from tests.helpers.models import config, make_model

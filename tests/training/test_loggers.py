@@ -83,7 +83,7 @@ def run(tmp_path_factory):
         Optimization(lr=0.05, end_factor=0.0),
         {"seed": 1},
     )
-    subject.lpips = lambda image, target: (image - target).abs().mean((1, 2, 3))
+    subject.metrics.lpips = lambda image, target: (image - target).abs().mean((1, 2, 3))
     trainer = L.Trainer(
         accelerator="cpu", max_steps=8, max_epochs=-1, default_root_dir=folder, logger=loggers(folder),
         callbacks=[Costs(), PicturesOptions(subjects=1).build()],

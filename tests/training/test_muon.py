@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from ghgs_lit.training import Optimization
-from ghgs_lit.training.optimization import Muon, is_matrix, orthogonalized
+from ghgs_lit.training.muon import Muon, is_matrix, orthogonalized
 
 OPTIONS = {"lr": 0.01, "betas": (0.9, 0.98), "eps": 1e-8, "weight_decay": 0.1}
 

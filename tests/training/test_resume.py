@@ -21,7 +21,7 @@ from ghgs_lit.training.validation_pictures import PicturesOptions
 from ghgs_lit.weights import frozen
 from ghgs_lit.weights.checkpoint import read_checkpoint
 from tests.helpers.losses import losses_of
-from tests.helpers.training import Standin, StepData, _Steps, flat_renderer
+from tests.helpers.training import Standin, StepData, _Steps, flat_renderer, held
 
 STEPS = 16
 CONFIG = {"seed": 3, "resume": None, "init_from": None, "optimizer": {"lr": 0.05}}
@@ -252,13 +252,15 @@ def test_a_checkpoint_of_another_model_is_refused_by_its_tensor(tmp_path):
     content |= {"config": CONFIG, "format_version": 1, "global_step": 5, "optimizer_states": []}
     torch.save(content, path)
     with pytest.raises(InputError, match=r"a\.ckpt: shift.*\(3,\).*\(4,\)"):
-        check_resume(path, Standin(), CONFIG)
-    step, changed = check_resume(path, Other(), {**CONFIG, "optimizer": {"lr": 0.1}, "resume": str(path)})
+        check_resume(path, held(Standin()), CONFIG)
+    step, changed = check_resume(
+        path, held(Other()), {**CONFIG, "optimizer": {"lr": 0.1}, "resume": str(path)}
+    )
     assert (step, changed) == (5, ["optimizer.lr: 0.05 -> 0.1"])
     del content["optimizer_states"]
     torch.save(content, path)
     with pytest.raises(InputError, match=r"a\.ckpt.*optimizer_states.*init_from"):
-        check_resume(path, Other(), CONFIG)
+        check_resume(path, held(Other()), CONFIG)
 
 
 def test_changed_options_of_the_optimizer_apply(tmp_path, monkeypatch):
@@ -291,7 +293,7 @@ def test_averages_of_another_optimizer_are_refused(tmp_path, old, new):
     content |= {"config": CONFIG, "format_version": 1, "global_step": 5, "optimizer_states": states}
     torch.save(content, path)
     with pytest.raises(InputError, match=r"optimizer\.matrix_scale: expected .*a\.ckpt; found"):
-        check_resume(path, Standin(), {**CONFIG, "optimizer": dict(now)})
+        check_resume(path, held(Standin()), {**CONFIG, "optimizer": dict(now)})
 
 
 def test_groups_of_another_optimizer_are_refused(tmp_path):
@@ -304,21 +306,21 @@ def test_groups_of_another_optimizer_are_refused(tmp_path):
     content |= {"config": now, "format_version": 1, "global_step": 5, "optimizer_states": [state]}
     torch.save(content, path)
     with pytest.raises(InputError, match=r"a\.ckpt: optimizer_states\.param_groups: expected .*; found \["):
-        check_resume(path, model, now)
+        check_resume(path, held(model), now)
 
 
 def test_an_optimizer_whose_state_was_damaged_is_refused(tmp_path):
     """Broken averages of the gradient would be trained on in silence: the file has checksums of all."""
     path = tmp_path / "checkpoints" / "last.ckpt"
     fit(tmp_path, Cut())
-    step, _ = check_resume(path, Standin(), CONFIG)
+    step, _ = check_resume(path, held(Standin()), CONFIG)
     assert step == 15
     state = torch.load(path, weights_only=True)["optimizer_states"][0]["state"][0]
     content, average = path.read_bytes(), state["exp_avg"].numpy().tobytes()
     assert content.count(average) == 1
     path.write_bytes(content.replace(average, bytes(reversed(average))))
     with pytest.raises(InputError, match=r"last\.ckpt: expected .* written; found"):
-        check_resume(path, Standin(), CONFIG)
+        check_resume(path, held(Standin()), CONFIG)
 
 
 def test_a_run_counts_the_cost_of_all_its_sessions(tmp_path):

@@ -15,6 +15,7 @@ from ghgs_lit.weights.checkpoint import FORMAT_VERSION, read_checkpoint
 from ghgs_lit.weights.exporting import export_weights, write_inference
 from ghgs_lit.weights.reading import SHIPPED_FILE, open_file
 from tests.helpers.models import config, make_model
+from tests.helpers.training import held
 
 TRAINING = {"global_step": 5, "optimizer_states": [], "lr_schedulers": [], "loops": {}, "callbacks": {}}
 
@@ -34,7 +35,7 @@ def flip(path, near):
 READERS = {
     "predict and evaluate": lambda path: GHGS.from_checkpoint(path),
     "init_from": lambda path: initialize(make_model(), path),
-    "resume": lambda path: check_resume(path, make_model(), config()),
+    "resume": lambda path: check_resume(path, held(make_model()), config()),
     "export": lambda path: export_weights(path, None, path.with_name("release.pth")),
     "inference": lambda path: write_inference(path, path.with_name("b.ckpt"), "float16"),
 }
@@ -184,7 +185,7 @@ def test_what_no_checkpoint_holds_is_named(tmp_path, changes, message):
 def test_a_state_of_training_of_another_form_is_refused(tmp_path, key, value):
     torch.save(content(**{key: value}), tmp_path / "a.ckpt")
     with pytest.raises(InputError, match=rf"a\.ckpt: {key}.*: expected .*; found"):
-        check_resume(tmp_path / "a.ckpt", make_model(), config())
+        check_resume(tmp_path / "a.ckpt", held(make_model()), config())
 
 
 def test_a_missing_version_of_lightning_is_this_one(tmp_path):

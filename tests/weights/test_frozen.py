@@ -14,13 +14,14 @@ from ghgs_lit.weights import frozen
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION, read_checkpoint
 from ghgs_lit.weights.exporting import export_weights, write_inference
 from tests.helpers.models import config, make_model
+from tests.helpers.training import held
 
 FROZEN = "encoder.trainable=none"
 TRAINING = {"global_step": 5, "optimizer_states": [], "lr_schedulers": [], "loops": {}, "callbacks": {}}
 READERS = {
     "predict and evaluate": GHGS.from_checkpoint,
     "init_from": lambda path: initialize(make_model(FROZEN), path),
-    "resume": lambda path: check_resume(path, make_model(FROZEN), config(FROZEN)),
+    "resume": lambda path: check_resume(path, held(make_model(FROZEN)), config(FROZEN)),
     "export": lambda path: export_weights(path, path.with_name("vggt.pt"), None),
     "inference": lambda path: write_inference(path, path.with_name("half.ckpt"), "float16"),
 }

@@ -60,8 +60,7 @@ class PretextModule(BudgetedModule):
         loss = cross_entropy(*self.model(batch)[:2])
         size = len(batch.images)
         self.log("loss/parts", loss.detach(), prog_bar=True, batch_size=size)
-        rate = self.optimizers().param_groups[0]["lr"]
-        self.log_dict({"train/learning_rate": rate, "train/budget": self.used_budget}, batch_size=size)
+        self.log_numbers(size)
         return loss
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
@@ -79,7 +78,7 @@ class PretextModule(BudgetedModule):
 
     def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
         """Clip to ``optimizer.clip`` and log the norm before. DivergedError: the norm is not finite."""
-        norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.optimization.clip, foreach=True)
+        norm = self.optimization.clip_gradients(self)
         if not norm.isfinite():
             raise DivergedError(
                 f"step {self.global_step}: expected a finite gradient; found a norm of {norm}"

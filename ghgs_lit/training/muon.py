@@ -1,0 +1,212 @@
+"""Muon: orthogonal steps for matrices, AdamW for everything else.
+
+Muon's steps for matrices are orthogonal (K. Jordan et al., 2024, github.com/KellerJordan/Muon): they change
+all directions of a matrix equally, not only the few that dominate the gradient. Step lengths are those of J.
+Liu et al., "Muon is Scalable for LLM Training", 2025.
+
+``torch.optim.Muon`` takes the same steps, one matrix after the other, in bfloat16, and refuses weights of
+convolutions. Here these are matrices with a row for each output channel, products are float32, and matrices
+of similar size are multiplied together: the weights that come with the package have 134 matrices, for which
+PyTorch's asks a GPU for 4 000 launches and this module for about a hundred."""
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+#: Newton-Schulz: odd polynomials that take singular values in (0, 1] close to 1 (Jordan et al.).
+COEFFICIENTS = (3.4445, -4.7750, 2.0315)
+ITERATIONS = 5
+MOMENTUM = 0.95
+#: Approximate root mean square of AdamW's steps (Liu et al., section 2.2).
+ROOT_MEAN_SQUARE = 0.2
+#: Parameters with fewer rows or columns (tokens, biases, heads of one or two channels) are left to AdamW.
+SMALLEST_SIDE = 3
+#: Matrices whose smaller side has at most so many rows are padded to powers of two, and share products.
+PADDED_SIDE = 128
+#: Smallest side of padded matrices.
+LEAST_PADDED = 16
+
+
+def is_matrix(parameter: nn.Parameter) -> bool:
+    """Whether Muon moves a parameter.
+
+    Args:
+        parameter: of any shape; the first dimension of a convolution's weight counts as rows.
+
+    Returns:
+        True for matrices, and weights of convolutions, with at least 3 rows and 3 columns."""
+    if parameter.dim() < 2:
+        return False
+    rows = parameter.shape[0]
+    return min(rows, parameter.numel() // max(rows, 1)) >= SMALLEST_SIDE
+
+
+def orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
+    """Replace singular values by values of about 1 (0.7 to 1.2).
+
+    Zeros around a matrix change none of its singular vectors, so that small matrices of many sizes are padded
+    and go through the iterations together. A result differs by rounding with the matrices beside it.
+
+    Args:
+        matrices: of any sizes, float32 or wider, all of one type on one device.
+
+    Returns:
+        A matrix of the same size for each. Singular values below 1e-3 of a matrix's largest become less than
+        1; zeros stay 0."""
+    results = list(matrices)
+    small = []
+    by_shape: dict[torch.Size, list[int]] = {}
+    for number, matrix in enumerate(matrices):
+        if min(matrix.shape) <= PADDED_SIDE:
+            small.append(number)
+        else:
+            by_shape.setdefault(matrix.shape, []).append(number)
+    for numbers in by_shape.values():
+        stacked = torch.stack([matrices[number] for number in numbers])
+        for number, result in zip(numbers, _orthogonalized(stacked), strict=True):
+            results[number] = result
+    if small:
+        for number, result in zip(small, _small([matrices[n] for n in small]), strict=True):
+            results[number] = result
+    return results
+
+
+def _small(matrices: list[Tensor]) -> list[Tensor]:
+    """:func:`orthogonalized` of matrices with a side of at most :data:`PADDED_SIDE`."""
+    packing = _packing(tuple(tuple(matrix.shape) for matrix in matrices), matrices[0].device)
+    values = torch.cat([*(matrix.reshape(-1) for matrix in matrices), matrices[0].new_zeros(1)])
+    products = []
+    for places in packing.places:
+        padded = values.index_select(0, places.view(-1)).view(places.shape)
+        products.append(_orthogonalized(padded).reshape(-1))
+    values = torch.cat(products).index_select(0, packing.back)
+    parts = values.split([matrix.numel() for matrix in matrices])
+    return [part.view(matrix.shape) for part, matrix in zip(parts, matrices, strict=True)]
+
+
+class _Packing(NamedTuple):
+    """Where values of matrices lie in padded ones.
+
+    Args:
+        places: for each size, [n, rows, columns] with the place of each value in all matrices one after the
+            other, and the place behind the last one for zeros.
+        back: the place of each value in all padded matrices one after the other."""
+
+    places: tuple[Tensor, ...]
+    back: Tensor
+
+
+@lru_cache(maxsize=4)
+def _packing(shapes: tuple[tuple[int, int], ...], device: torch.device) -> _Packing:
+    """The packing of matrices of these shapes, which are the same in almost all steps."""
+    classes: dict[tuple[int, int], list[Tensor]] = {}
+    first = 0
+    for shape in shapes:
+        places = torch.arange(first, first + shape[0] * shape[1], dtype=torch.int32).view(shape)
+        first += places.numel()
+        wide = places if shape[0] <= shape[1] else places.mT
+        side = max(_power_of_two(wide.shape[0]), LEAST_PADDED)
+        # A CPU minds padding, a GPU the number of products.
+        width = _power_of_two(wide.shape[1]) if device.type == "cpu" else 0
+        classes.setdefault((side, width), []).append(wide)
+    padded = []
+    for (side, _), members in classes.items():
+        width = max(wide.shape[1] for wide in members)
+        places = torch.full((len(members), side, width), first, dtype=torch.int32)
+        for number, wide in enumerate(members):
+            places[number, : wide.shape[0], : wide.shape[1]] = wide
+        padded.append(places)
+    order = torch.cat([places.view(-1) for places in padded]).long()
+    back = torch.empty(first + 1, dtype=torch.int32)
+    back[order] = torch.arange(len(order), dtype=torch.int32)
+    return _Packing(tuple(places.to(device) for places in padded), back[:-1].to(device))
+
+
+def _power_of_two(count: int) -> int:
+    """The smallest power of two that is not below ``count``."""
+    return 1 << (count - 1).bit_length()
+
+
+def _orthogonalized(matrices: Tensor) -> Tensor:
+    """:func:`orthogonalized` of matrices [n, R, C], by polynomials of the smaller Gram matrices."""
+    if matrices.shape[1] > matrices.shape[2]:
+        return _orthogonalized(matrices.mT).mT
+    a, b, c = COEFFICIENTS
+    largest = torch.linalg.vector_norm(matrices, torch.inf, dim=(1, 2), keepdim=True)
+    matrices = matrices / largest.clamp(min=torch.finfo(matrices.dtype).tiny)  # no square underflows
+    gram = matrices @ matrices.mT
+    square = gram.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None]  # squared Frobenius norms
+    square = square.clamp(min=1)  # below it only for zeros, as the largest value is 1
+    gram = gram / square
+    factor = square.rsqrt() * torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
+    for iteration in range(ITERATIONS):
+        # The polynomial is a + rest; a is added by the products.
+        rest = torch.baddbmm(gram, gram, gram, beta=b, alpha=c)
+        factor = torch.baddbmm(factor, rest, factor, beta=a)
+        if iteration < ITERATIONS - 1:
+            gram = torch.baddbmm(gram, rest, gram, beta=a)
+            gram = torch.baddbmm(gram, gram, rest, beta=a)
+    return factor @ matrices
+
+
+class Muon(torch.optim.AdamW):
+    """Muon for the matrices among parameters, AdamW for all others.
+
+    Args:
+        parameters: to be moved.
+        matrix_lr: learning rate of matrices, whose steps are as long as AdamW's with this rate. A number, or,
+            as AdamW's ``lr``, a tensor without dimensions on the parameters' device, so that a recorded step
+            follows the schedule.
+        **options: of AdamW; weight decay is for both."""
+
+    def __init__(self, parameters: Iterable[nn.Parameter], matrix_lr: float | Tensor, **options: Any):
+        parameters = list(parameters)
+        others = [p for p in parameters if not is_matrix(p)]
+        matrices = [p for p in parameters if is_matrix(p)]
+        groups = [{"params": others, "orthogonal": False}]
+        groups.append({"params": matrices, "orthogonal": True, "lr": matrix_lr})
+        super().__init__([group for group in groups if group["params"]], **options)
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Tensor] | None = None) -> Tensor | None:
+        """Take a step; the gradients of matrices are removed.
+
+        Args:
+            closure: computes the loss and the gradients once more before the step.
+
+        Returns:
+            The loss of ``closure``; None without one."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for group in self.param_groups:
+            if group["orthogonal"]:
+                self._step_matrices(group)
+        super().step()
+        return loss
+
+    def _step_matrices(self, group: dict[str, Any]) -> None:
+        """Take a step of the matrices, and remove their gradients, so that AdamW skips them."""
+        moved = [parameter for parameter in group["params"] if parameter.grad is not None]
+        if not moved:
+            return
+        for parameter in moved:
+            state = self.state[parameter]
+            if not state:  # AdamW expects a step when it loads a state
+                state.update(step=torch.zeros(()), momentum=torch.zeros_like(parameter))
+        gradients = [parameter.grad for parameter in moved]
+        averages = [self.state[parameter]["momentum"] for parameter in moved]
+        torch._foreach_add_([self.state[parameter]["step"] for parameter in moved], 1)
+        torch._foreach_lerp_(averages, gradients, 1 - MOMENTUM)
+        directions = torch._foreach_lerp(gradients, averages, MOMENTUM)  # Nesterov momentum
+        steps = orthogonalized([direction.flatten(1) for direction in directions])
+        torch._foreach_mul_(steps, [-ROOT_MEAN_SQUARE * max(step.shape) ** 0.5 for step in steps])
+        torch._foreach_mul_(steps, group["lr"])
+        torch._foreach_mul_(moved, 1 - group["lr"] * group["weight_decay"])
+        torch._foreach_add_(moved, [x.view_as(p) for x, p in zip(steps, moved, strict=True)])
+        for parameter in moved:
+            parameter.grad = None
