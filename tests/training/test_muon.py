@@ -6,8 +6,12 @@ import pytest
 import torch
 from torch import nn
 
-from ghgs_lit.training import Optimization
+from ghgs_lit.model import GHGS
+from ghgs_lit.training import Optimization, muon
 from ghgs_lit.training.muon import Muon, is_matrix, orthogonalized
+from ghgs_lit.training.optimization import hold_rates, plain_rates
+from ghgs_lit.training.restoring import check_optimizer_state, check_schedules
+from tests.helpers.pretend_device import DEVICE, pretend_device
 
 OPTIONS = {"lr": 0.01, "betas": (0.9, 0.98), "eps": 1e-8, "weight_decay": 0.1}
 
@@ -80,11 +84,89 @@ def test_matrices_of_one_size_do_not_meet():
     torch.testing.assert_close(orthogonalized(scaled), alone, atol=1e-4, rtol=0)
 
 
+@pytest.mark.parametrize("kind", ["cpu", "gpu"])
+def test_padding_and_company_change_nothing(kind, monkeypatch):
+    """Small ones of all shapes together, as on a CPU and on a GPU, and large ones beside them; float64."""
+    if kind == "gpu":
+        monkeypatch.setattr(muon, "_power_of_two", lambda count: 128)
+    muon._packing.cache_clear()
+    generator = torch.Generator().manual_seed(5)
+    shapes = [
+        (3, 3),
+        (5, 7),
+        (7, 5),
+        (16, 16),
+        (16, 576),
+        (17, 40),
+        (128, 64),
+        (64, 1176),
+        (130, 129),
+        (129, 130),
+    ]
+    shapes += [(131, 140), (131, 140)]
+    several = [torch.randn(shape, dtype=torch.float64, generator=generator) for shape in shapes]
+    for matrix, found in zip(several, orthogonalized(several), strict=True):
+        torch.testing.assert_close(found, muon._orthogonalized(matrix[None])[0], atol=1e-10, rtol=0)
+    muon._packing.cache_clear()
+
+
+@pytest.mark.parametrize(("ours", "most"), [(True, 150), (False, 1500)])
+def test_a_gpu_is_asked_for_a_tenth_of_pytorchs_launches(ours, most):
+    """Of a step with the weights that come with the package: 134 matrices, of which PyTorch's takes 61."""
+    model = GHGS.from_checkpoint()
+    with pretend_device() as log:
+        trained = [p for p in model.to(DEVICE).parameters() if p.requires_grad]
+        options = Optimization(lr=1e-3, matrix_scale=1.0)
+        if ours:
+            optimizer = options.optimizer(model)
+            hold_rates(optimizer)
+        else:
+            flat = [p for p in trained if is_matrix(p) and p.dim() == 2]
+            optimizer = torch.optim.Muon(flat, lr=1e-3, adjust_lr_fn="match_rms_adamw")
+        for _ in range(2):  # the first makes the state
+            for parameter in trained:
+                parameter.grad = torch.ones_like(parameter)
+            log.clear()
+            options.clip_gradients(model)
+            optimizer.step()
+    assert log.waits.total() == 0
+    assert most * 0.9 < log.launches <= most
+    if ours:  # as a recorded step needs it
+        assert all(group["lr"].device == DEVICE for group in optimizer.param_groups)
+        assert all(state["step"].device == DEVICE for state in optimizer.state.values())
+
+
+def test_rates_on_the_device_follow_the_schedule_and_are_saved_as_numbers():
+    """A recorded step reads the same tensor again; files stay as they were."""
+    with pretend_device():
+        model = Small().to(DEVICE)
+        optimizer = Optimization(lr=0.01, matrix_scale=2.0).optimizer(model)
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 1 / (1 + step))
+        hold_rates(optimizer)
+        rates = [group["lr"] for group in optimizer.param_groups]
+        for seed in range(2):
+            for parameter in model.parameters():
+                parameter.grad = torch.full_like(parameter, seed)
+            optimizer.step()
+            schedule.step()
+        assert [group["lr"] for group in optimizer.param_groups] == rates
+        assert [rate.item() for rate in rates] == pytest.approx([0.01 / 3, 0.02 / 3])
+        files = {"optimizer_states": [optimizer.state_dict()], "lr_schedulers": [schedule.state_dict()]}
+        plain_rates(files)
+    assert [group["lr"] for group in files["optimizer_states"][0]["param_groups"]] == pytest.approx(
+        [0.01 / 3, 0.02 / 3]
+    )
+    assert files["lr_schedulers"][0]["_last_lr"] == pytest.approx([0.01 / 3, 0.02 / 3])
+    check_schedules("a.ckpt", files["lr_schedulers"], 2)
+    groups = Optimization(lr=0.01, matrix_scale=2.0).optimizer(Small()).param_groups
+    check_optimizer_state("a.ckpt", files["optimizer_states"][0], groups)
+
+
 def test_matrices_move_as_with_pytorchs_muon():
     """PyTorch's Muon iterates in bfloat16: equal up to its rounding over five steps."""
     ours, theirs = Small(), Small()
     matrices = [theirs.square, theirs.tall, theirs.wide]
-    muon = Muon(ours.parameters(), matrix_lr=0.02, **OPTIONS)
+    optimizer = Muon(ours.parameters(), matrix_lr=0.02, **OPTIONS)
     reference = torch.optim.Muon(
         matrices, lr=0.02, weight_decay=0.1, momentum=0.95, nesterov=True, adjust_lr_fn="match_rms_adamw"
     )
@@ -92,7 +174,7 @@ def test_matrices_move_as_with_pytorchs_muon():
     for seed in range(5):
         for model in (ours, theirs):
             set_gradients(model, seed)
-        muon.step()
+        optimizer.step()
         reference.step()
     for one, other, start in zip((ours.square, ours.tall, ours.wide), matrices, before, strict=True):
         assert (one - other).norm() < 0.02 * (other - start).norm()
@@ -111,17 +193,17 @@ def test_a_convolution_is_a_matrix_of_its_output_channels():
 def test_everything_else_moves_as_with_adamw():
     """Bit for bit, and no parameter is left out or moved twice."""
     ours, theirs = Small(), Small()
-    muon = Muon(ours.parameters(), matrix_lr=0.02, **OPTIONS)
+    optimizer = Muon(ours.parameters(), matrix_lr=0.02, **OPTIONS)
     adamw = torch.optim.AdamW(theirs.parameters(), **OPTIONS)
     for seed in range(3):
         for model in (ours, theirs):
             set_gradients(model, seed)
-        muon.step()
+        optimizer.step()
         adamw.step()
     for name in ("output", "token", "bias"):
         assert torch.equal(getattr(ours, name), getattr(theirs, name)), name
     for name in ("conv", "square", "tall", "wide"):
-        assert set(muon.state[getattr(ours, name)]) == {"step", "momentum"}
+        assert set(optimizer.state[getattr(ours, name)]) == {"step", "momentum"}
 
 
 def test_a_resumed_run_goes_on_with_the_same_numbers():

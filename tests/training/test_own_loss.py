@@ -1,0 +1,205 @@
+"""A loss with weights of its own, from a file outside of the package: nothing of a training forgets them."""
+
+import shutil
+import sys
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+
+import lightning.pytorch as L
+import pytest
+import torch
+
+from ghgs_lit import GHGS
+from ghgs_lit.config import build, compose, registry, resolve
+from ghgs_lit.errors import InputError
+from ghgs_lit.training import GHGSModule, Optimization
+from ghgs_lit.training.averaging import AveragingOptions
+from ghgs_lit.training.checkpoints import AtomicCheckpointIO
+from ghgs_lit.training.faults import Fault, Step
+from ghgs_lit.training.guard import _write
+from ghgs_lit.training.replay import replay
+from ghgs_lit.training.start import check_resume
+from tests.helpers.models import config, make_model
+from tests.helpers.scenes import make_batch, training_batch
+from tests.helpers.training import Standin, StepData, flat_renderer
+
+FILE = Path(__file__).parents[1] / "fixtures" / "own_loss.py"
+NODE = {"kind": "balanced"}
+TRAINED = {"losses.log_variance", "losses.mixing"}
+
+
+@pytest.fixture(autouse=True)
+def plugin(tmp_path, monkeypatch):
+    """The user's file is known, as with GHGS_PLUGINS in a shell."""
+    shutil.copy(FILE, tmp_path / "own_loss.py")
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+    monkeypatch.setenv(registry.VARIABLE, str(tmp_path / "own_loss.py"))
+    registry.load_plugins()
+    yield
+    sys.modules.pop("own_loss", None)
+
+
+def module(model=None, settings=None, **options) -> GHGSModule:
+    """A training with the user's loss; equal each time."""
+    torch.manual_seed(0)
+    options = {"lr": 0.05, "warmup": 0.0, "weight_decay": 0.0, **options}
+    losses = build(NODE, "loss")
+    return GHGSModule(model or Standin(), flat_renderer, losses, Optimization(**options), settings)
+
+
+def trainer(folder, steps, *callbacks, **options) -> L.Trainer:
+    return L.Trainer(
+        accelerator="cpu", max_steps=steps, max_epochs=-1, default_root_dir=folder, logger=False,
+        enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
+        limit_val_batches=0, callbacks=list(callbacks), plugins=[AtomicCheckpointIO()], **options,
+    )  # fmt: skip
+
+
+def weights(subject) -> dict[str, torch.Tensor]:
+    return {name: value.detach().clone() for name, value in subject.state_dict().items()}
+
+
+class Seen(L.Callback):
+    """Weights after each step, and the norm of the gradient that the optimizer gets."""
+
+    def __init__(self):
+        self.weights, self.norms = [], []
+
+    def on_before_zero_grad(self, run, pl_module, optimizer):
+        slopes = [p.grad for p in pl_module.parameters() if p.grad is not None]
+        if slopes:
+            self.norms.append(float(torch.stack([slope.norm() for slope in slopes]).norm()))
+
+    def on_train_batch_end(self, run, pl_module, *_):
+        self.weights.append(weights(pl_module))
+
+
+class Save(L.Callback):
+    """A checkpoint in the middle of a run."""
+
+    def __init__(self, path, step):
+        self.path, self.step = path, step
+
+    def on_train_batch_end(self, run, *_):
+        if run.global_step == self.step:
+            run.save_checkpoint(self.path)
+
+
+@pytest.mark.parametrize("scale", [None, 1.0])
+def test_its_weights_move_in_each_step(tmp_path, scale):
+    """With AdamW and Muon; what is frozen stays."""
+    subject, seen = module(matrix_scale=scale), Seen()
+    before = weights(subject)
+    trainer(tmp_path, 3, seen).fit(subject, StepData())
+    for name in TRAINED:
+        values = [before[name], *(step[name] for step in seen.weights)]
+        assert not any(torch.equal(*pair) for pair in pairwise(values))
+    assert torch.equal(seen.weights[-1]["losses.network.weight"], before["losses.network.weight"])
+
+
+def test_the_norm_that_is_clipped_is_that_of_all_weights(tmp_path):
+    """Gradients of model and loss together are at most as long as ``optimizer.clip``."""
+    subject, seen = module(clip=1e-3), Seen()
+    trainer(tmp_path, 2, seen).fit(subject, StepData())
+    assert seen.norms[-1] == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_its_weights_can_be_frozen_for_a_share_of_the_run(tmp_path):
+    """By their names in the checkpoint; those of the model keep the names that they have in it."""
+    until = {"losses.mixing": 0.5, "shift": 0.5}
+    subject, seen = module(freeze_until=until), Seen()
+    before = weights(subject)
+    trainer(tmp_path, 4, seen).fit(subject, StepData())
+    for name, changes in (("losses.mixing", 2), ("model.shift", 2), ("losses.log_variance", 4)):
+        assert sum(not torch.equal(step[name], before[name]) for step in seen.weights) == changes, name
+    with pytest.raises(InputError, match=r"optimizer\.freeze_until\.losses\.other"):
+        trainer(tmp_path, 2).fit(module(freeze_until={"losses.other": 0.5}), StepData())
+
+
+def test_a_run_goes_on_with_them(tmp_path):
+    """Weights and the optimizer's averages, bit for bit; a loss without such weights is refused by name."""
+    path, whole, seen = tmp_path / "last.ckpt", module(matrix_scale=1.0), Seen()
+    trainer(tmp_path, 6, Save(path, 3), seen).fit(whole, StepData())
+    again = module(matrix_scale=1.0)
+    settings = {"optimizer": {"kind": "adamw", "lr": 0.05, "matrix_scale": 1.0}}
+    assert check_resume(path, again, settings)[0] == 3
+    assert torch.equal(again.losses.mixing, seen.weights[2]["losses.mixing"])
+    trainer(tmp_path, 6).fit(again, StepData(), ckpt_path=path)
+    for name, value in weights(again).items():
+        assert torch.equal(value, weights(whole)[name]), name
+    other = GHGSModule(Standin(), flat_renderer, lambda *_: None, Optimization())
+    with pytest.raises(InputError, match=r"last\.ckpt: losses\.log_variance: expected weights of model"):
+        check_resume(path, other, settings)
+
+
+def test_the_average_is_of_all_weights(tmp_path):
+    """Lightning's, beside one that is computed here; a run that goes on has both it and the weights."""
+    subject, seen = module(), Seen()
+    run = trainer(tmp_path, 4, AveragingOptions(decay=0.75).build(), seen)
+    run.fit(subject, StepData())
+    expected = seen.weights[0]
+    for step in seen.weights[1:]:
+        expected = {name: 0.75 * value + 0.25 * step[name] for name, value in expected.items()}
+    for name, value in subject.named_parameters():
+        torch.testing.assert_close(value.detach(), expected[name], msg=name)
+    assert not torch.equal(subject.losses.mixing, seen.weights[-1]["losses.mixing"])
+
+
+def test_a_run_with_an_average_goes_on(tmp_path):
+    """From a checkpoint in the middle, bit for bit."""
+
+    middle = tmp_path / "two.ckpt"
+    results = []
+    for path in (None, middle):
+        subject = module()
+        saving = [Save(middle, 2)] if path is None else []
+        run = trainer(tmp_path, 4, AveragingOptions(decay=0.75).build(), *saving)
+        run.fit(subject, StepData(), ckpt_path=path)
+        results.append(subject)
+    for name, value in results[0].named_parameters():
+        assert torch.equal(value, dict(results[1].named_parameters())[name]), name
+
+
+def test_a_checkpoint_brings_the_loss_and_does_without_it(tmp_path, monkeypatch):
+    """The whole module is read with its weights, and the model alone where nobody knows the loss."""
+    settings = {**config(), "loss": NODE}
+    subject = module(make_model(), settings)
+    subject.losses.mixing.data.add_(1)
+    run = trainer(tmp_path, 1)
+    run.strategy.connect(subject)
+    run.save_checkpoint(tmp_path / "last.ckpt", weights_only=True)
+    parts = {"renderer": flat_renderer, "optimization": Optimization()}
+    for given in ({}, {"losses": build(NODE, "loss")}):
+        again = GHGSModule.load_from_checkpoint(tmp_path / "last.ckpt", **parts, **given)
+        assert torch.equal(again.losses.mixing, subject.losses.mixing)
+    monkeypatch.delenv(registry.VARIABLE)
+    registry._REGISTERED.clear()
+    model = GHGS.from_checkpoint(tmp_path / "last.ckpt")
+    with torch.no_grad():
+        assert len(model(make_batch(1, 3, 28, 28)).gaussians) > 0
+
+
+def test_a_fault_in_its_weights_is_found(tmp_path):
+    """A step that is not finite because of the loss names it."""
+
+    class Spoil(L.Callback):
+        def on_train_batch_start(self, run, pl_module, *_):
+            pl_module.losses.log_variance.data[1] = torch.nan
+
+    with pytest.raises(InputError, match=r"weights of losses \(losses\.log_variance\)"):
+        trainer(tmp_path, 2, Spoil()).fit(module(), StepData())
+
+
+def test_a_saved_step_has_its_weights(tmp_path, monkeypatch):
+    """Run again elsewhere, the loss is as it was."""
+    nodes = resolve(compose("train"))
+    settings = {**config(), "loss": NODE, "renderer": nodes["renderer"], "optimizer": nodes["optimizer"]}
+    subject = module(make_model(), settings)
+    subject.losses.mixing.data[0, 0] = torch.inf
+    subject._trainer = SimpleNamespace(optimizers=[], global_step=7)
+    _write(tmp_path / "step.pt", subject, Step(training_batch(), 1), Fault("", "", "", ""))
+    number, _, fault = replay(tmp_path / "step.pt")
+    assert number == 7
+    assert (fault.where, fault.place) == ("weights of", "losses.mixing")
