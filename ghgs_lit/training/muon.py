@@ -196,12 +196,10 @@ class Muon(torch.optim.AdamW):
             return
         for parameter in moved:
             state = self.state[parameter]
-            if not state:  # AdamW expects a step when it loads a state
-                place = parameter.device if group["capturable"] else None
-                state.update(step=torch.zeros((), device=place), momentum=torch.zeros_like(parameter))
+            if not state:  # AdamW expects a step when it loads a state; nothing here depends on it
+                state.update(step=torch.zeros(()), momentum=torch.zeros_like(parameter))
         gradients = [parameter.grad for parameter in moved]
         averages = [self.state[parameter]["momentum"] for parameter in moved]
-        torch._foreach_add_([self.state[parameter]["step"] for parameter in moved], 1)
         torch._foreach_lerp_(averages, gradients, 1 - MOMENTUM)
         directions = torch._foreach_lerp(gradients, averages, MOMENTUM)  # Nesterov momentum
         steps = orthogonalized([direction.flatten(1) for direction in directions])
