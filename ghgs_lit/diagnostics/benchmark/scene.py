@@ -45,7 +45,7 @@ def ellipsoid_batch(share: float, views: int, size: int | tuple[int, int], batch
     target is the first input view. ``share``: part of the frame that the subject covers. ``size``: side, or
     height and width, in pixels."""
     size = (size, size) if isinstance(size, int) else size
-    cameras = ring(views, *size)[None].expand(batch)
+    cameras = ring(views, *size)[None][torch.zeros(batch, dtype=torch.long)]
     masks = ellipse(share, size).expand(batch, views, -1, -1).contiguous()
     noise = torch.rand(batch, views, 3, *size, generator=torch.Generator().manual_seed(0))
     images = noise * masks[:, :, None]
