@@ -58,7 +58,7 @@ NOT_RUN = [
     (r"python benchmarks/encoder\.py (?!--size vggt_small)", "measures models of the published size"),
 ]
 if importlib.util.find_spec("smplx") is None:
-    NOT_RUN.append((r"ghgs .*data\.smpl_model=", "needs the package smplx"))
+    NOT_RUN.append((r"ghgs .*data\.smpl_model=|SMPL_MODEL=/", "needs the package smplx"))
 
 CPU = "encoder=vggt_nano optimizer=from_scratch trainer=cpu"
 TINY = "data.people='{train: 2, val: 2}' data.size=56 data.render.samples=1 data.render_workers=0"
@@ -76,6 +76,7 @@ SMALL = [
     (r"refine=15", "refine=2", "two steps"),
     (r"^(ghgs predict .*)", r"\1 turntable.frames=2", "two pictures"),
     (r"^(ghgs predict data=.*)", r"\1 data.size=112", "112 x 112 pixels"),
+    (r"(?<==)/data/", "", "folders beside this one"),
     (r"data\.active\.train=\d+", "data.active.train=1", "one person"),
     (r"^(ghgs pretext .*)", rf"\1 {TINY} {SHORT}", "two people of 56 x 56 pixels, two steps"),
     (r"^(python benchmarks/part_awareness\.py.*)", rf"\1 {TINY}", "two people of 56 x 56 pixels"),
@@ -175,6 +176,13 @@ BEFORE = {
     "docs/evidence/models.md": _RENDERED,
     "docs/evidence/photographs.md": _RENDERED,
     "docs/evidence/rounds.md": _RENDERED,
+    "docs/first_week.md": (
+        _SCANS.format("THuman2.0_Release"),
+        f"python scripts/miniature.py data=zju_mocap data.root=zju_mocap {FEW}",
+        f"python scripts/miniature.py data=humman data.root=humman {FEW}",
+        "cp humman_body_models/smpl/SMPL_NEUTRAL.pkl .",
+        _SWEEP,
+    ),
     "docs/outputs.md": _CHECKPOINTS,
     "docs/photographs.md": (
         f"{_RUN} hydra.run.dir=runs/mine",

@@ -20,7 +20,6 @@ from ghgs_lit.model import GHGS
 from ghgs_lit.runs import job
 from ghgs_lit.runs.grid import Rehearsal
 from ghgs_lit.training import GHGSModule, start
-from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
 if TYPE_CHECKING:
@@ -41,10 +40,26 @@ class _Clock(Callback):
 
 
 class _Rehearsed:
-    """What one configuration needs; ``reasons``: why it would be refused, as keys in order of appearance."""
+    """What one configuration needs.
 
-    def __init__(self, config: Mapping[str, Any], reasons: dict[str, None], notes: dict[str, None]) -> None:
-        self.config, self.reasons, self.notes = dict(config), reasons, notes
+    Args:
+        config: Of the run.
+        reasons: Why runs would be refused, as keys in order of appearance.
+        notes: What else they should know, likewise.
+        listed: Data and phases whose files were looked for, which several configurations share.
+    """
+
+    def __init__(
+        self,
+        config: Mapping[str, Any],
+        reasons: dict[str, None],
+        notes: dict[str, None],
+        listed: set[str],
+    ) -> None:
+        self.config = dict(config)
+        self.reasons = reasons
+        self.notes = notes
+        self.listed = listed
 
     def attempt(self, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
         """The result of a call; None where it refuses its input, which is noted."""
@@ -83,16 +98,42 @@ class _Rehearsed:
         if hasattr(data.dataset, "render_first") and not _is_rendered(data, {"train", "val", split}):
             self.notes[f"data={data.dataset.name}: people are rendered before the first step"] = None
             return False
+        before = len(self.reasons)
         batch = self.attempt(data.training_batch, 0)
         self.attempt(check_evaluation, self.config, data)
-        return batch is not None and self._check_bodies(batch)
+        if batch is not None and batch.body_vertices is None:
+            self._lacks_body(data, batch.subjects[0])
+        if len(self.reasons) == before:  # what was read is there: now the files of everybody
+            for phase in dict.fromkeys(("train", split)):
+                self.attempt(self._check_files, data, phase)
+        return len(self.reasons) == before
 
-    def _check_bodies(self, batch: Batch) -> bool:
-        wants = bool(lookup(self.config, "loss.weights.chamfer"))
-        if wants and batch.body_vertices is None:
-            expected = "loss.weights.chamfer: expected 0 for data without body vertices"
-            self.reasons[f"{expected}; found {lookup(self.config, 'loss.weights.chamfer')}"] = None
-        return not wants or batch.body_vertices is not None
+    def _lacks_body(self, data: "PhotographsDataModule", name: str) -> None:
+        """Note that a subject of the training has no body, if the loss needs bodies."""
+        weight = lookup(self.config, "loss.weights.chamfer")
+        if weight:
+            place = data.builder("train").inputs.reader.body_place(name)
+            expected = f"body vertices for loss.weights.chamfer={weight} (0 does without)"
+            self.reasons[f"{place}: expected {expected}; found none"] = None
+
+    def _check_files(self, data: "PhotographsDataModule", phase: str) -> None:
+        """Note the first file of a phase that is not there, and the first body that the loss lacks."""
+        key = json.dumps([self.config["data"], phase], sort_keys=True, default=str)
+        if key in self.listed:
+            return
+        self.listed.add(key)
+        reader = data.builder(phase).inputs.reader
+        missing: list[Path] = []
+        bodies: list[str] = []
+        for name in reader.subjects:
+            missing += [path for path in reader.files(name) if not path.exists()]
+            body = reader.body_place(name)
+            bodies += [name] * (isinstance(body, Path) and not body.exists())
+        if missing:
+            more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
+            self.reasons[f"{missing[0]}: expected a file of the data set; found none{more}"] = None
+        if bodies and phase == "train":
+            self._lacks_body(data, bodies[0])
 
     def step_seconds(self, data: "PhotographsDataModule", folder: Path) -> float | None:
         """Seconds of a training step of one process, which reads its own photographs."""
@@ -119,6 +160,7 @@ def rehearse(configs: Sequence[Mapping[str, Any]]) -> Rehearsal:
     nothing is missing; nothing is rendered or written."""
     reasons: dict[str, None] = {}
     notes: dict[str, None] = {}
+    listed: set[str] = set()
     tried, seconds = set(), None
     quiet()
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
@@ -129,7 +171,7 @@ def rehearse(configs: Sequence[Mapping[str, Any]]) -> Rehearsal:
             key = json.dumps(needs, sort_keys=True, default=str)
             if key in tried:
                 continue
-            run = _Rehearsed({**config, "data": {**config["data"], "workers": 0}}, reasons, notes)
+            run = _Rehearsed({**config, "data": {**config["data"], "workers": 0}}, reasons, notes, listed)
             data = run.check(Path(folder))
             if not tried and data is not None and not reasons:
                 seconds = run.step_seconds(data, Path(folder))

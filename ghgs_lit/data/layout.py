@@ -17,8 +17,10 @@ and ``done/<phase>/<subject>`` (an empty file for each complete subject, written
 """
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -197,6 +199,27 @@ class Layout(Reader):
                 yield from folder.iterdir() if folder.is_dir() else ()
         body = self._body(name)
         yield from () if body is None else (body,)
+
+    def files(self, name: str) -> Iterator[Path]:
+        own = self.subjects[name]
+        views = {position: self.views_at(name, position) for position in own}
+        counts = Counter(view for position in own for view in views[position])
+        usual = {view for view, count in counts.items() if 2 * count > len(own)}
+        for position in sorted(self._usual_positions.union(own)):
+            for view in sorted(usual.union(views.get(position, ()))):
+                yield self._file(name, "img", position, str(view), _IMAGE_SUFFIXES)
+                yield self._file(name, "mask", position, f"{view}.png")
+                yield self._file(name, "parm", position, f"{view}_intrinsic.npy")
+                yield self._file(name, "parm", position, f"{view}_extrinsic.npy")
+
+    @cached_property
+    def _usual_positions(self) -> set[int]:
+        """Positions that half of the subjects have, or more."""
+        counts = Counter(position for positions in self.subjects.values() for position in positions)
+        return {position for position, count in counts.items() if 2 * count >= len(self.subjects)}
+
+    def body_place(self, name: str) -> Path:
+        return self._body(name) or self._folders[name] / f"{_BODY_MODELS[0]}/{name}/vertices.npy"
 
     def read_body(self, name: str) -> np.ndarray | None:
         path = self._body(name)

@@ -61,6 +61,14 @@ class Reader(ABC):
         of their decoding. None: not known, and the subject is never packed (:mod:`ghgs_lit.data.packed`)."""
         return ()
 
+    def files(self, name: str) -> Iterable[Path]:
+        """Files that a subject's photographs are read from, whether they are there or not."""
+        return [source for source in self.sources(name) if isinstance(source, Path)]
+
+    def body_place(self, name: str) -> Path | str:
+        """File of a subject's body, whether it is there or not; a text where an option has to name it."""
+        return f"the body of {name}"
+
     def checked_view(self, name: str, position: int, view: int, depth: bool) -> View:
         """One photograph as :meth:`read_view`.
 

@@ -97,4 +97,7 @@ class TrainerOptions(Options):
                 **arguments,
             )
         except (MisconfigurationException, RuntimeError, TypeError, ValueError) as error:
+            if "No supported gpu backend" in str(error):
+                expected = "a GPU, or cpu on a machine without (trainer=cpu)"
+                raise InputError(f"trainer.accelerator: expected {expected}; found no GPU") from None
             raise InputError(f"trainer: {error}") from None

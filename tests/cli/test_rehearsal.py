@@ -4,10 +4,12 @@ import re
 import shutil
 import sys
 
+import numpy as np
 import pytest
 import torch
 
 from ghgs_lit.cli import rehearsal
+from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.weights.checkpoint import write_checkpoint
 from tests.cli.test_main import call
@@ -53,12 +55,12 @@ def test_all_that_is_missing_is_said_at_once(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("overrides", "expected"),
     [
-        (["trainer=gpu"], r"trainer: .*gpu"),
+        (["trainer=gpu"], r"trainer\.accelerator: expected a GPU, or cpu .*; found no GPU"),
         (["init_from=none.ckpt"], r"none\.ckpt: expected"),
         (["init_from=other.ckpt"], r"init_from: expected weights that fit the model; found none in other"),
         (
             ["loss=paper", "data.root=bare"],
-            r"loss\.weights\.chamfer: expected 0 for data without body vertices; found 1\.0",
+            r"vertices\.npy: expected body vertices for loss\.weights\.chamfer=1\.0 \(0 .*\); found none",
         ),
         (["encoder.trainable=none"], r"init_from: expected a checkpoint with the encoder's weights"),
         (["evaluation.split=bench"], r"evaluation\.split: expected one of train, val; found 'bench'"),
@@ -75,6 +77,36 @@ def test_one_thing_that_is_missing_is_the_one_that_is_said(
     found = rehearsed(f"data.root={rendered}", *overrides)
     assert len(found.reasons) == 1
     assert re.search(expected, found.reasons[0]), found.reasons
+    assert found.step is None
+
+
+@pytest.mark.parametrize(
+    ("lacking", "said"),
+    [
+        ("img/{name}_004", r"img/{name}_004/0\.jpg: expected a file of the data set; found none \("),
+        ("img/{name}_001/0.*", r"img/{name}_001/0\.jpg: expected a file of the data set; found none$"),
+        ("mask/{name}_001/0.png", r"mask/{name}_001/0\.png: expected a file of the data set; found none$"),
+        ("parm/{name}_001/0_intrinsic.npy", r"0_intrinsic\.npy: expected a file of the data set; found none"),
+        ("smpl/{name}", r"smpl/{name}/vertices\.npy: expected body vertices for loss\.weights\.chamfer=1\.0"),
+    ],
+)  # fmt: skip
+def test_files_that_a_later_step_would_read_are_named(tmp_path, rendered, lacking, said):
+    """A run found them after hours: the first batch is of somebody else."""
+    root = tmp_path / "some"
+    shutil.copytree(rendered, root)
+    names = sorted({path.name.rpartition("_")[0] for path in (root / "train" / "img").iterdir()})
+    for name in names:  # every one has a body
+        folder = root / "train" / "smpl" / name
+        folder.mkdir(parents=True, exist_ok=True)
+        np.save(folder / "vertices.npy", np.random.default_rng(0).normal(size=(9, 3)) * 0.2)
+    run = resolve(compose("train", [*SMALL, f"data.root={root}", "loss=paper"]))
+    first = {name.split("/")[0] for name in build_data(run).training_batch(0).subjects}
+    name = next(name for name in names if name not in first)
+    (path,) = (root / "train").glob(lacking.format(name=name))
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    found = rehearsal.rehearse([run])
+    assert len(found.reasons) == 1
+    assert re.search(said.format(name=name), found.reasons[0].replace("{name}", name)), found.reasons
     assert found.step is None
 
 

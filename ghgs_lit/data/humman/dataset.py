@@ -148,6 +148,9 @@ class HuMManReader(FrameReader):
             yield frame.parameters
             yield self._body.file
 
+    def body_place(self, name: str) -> Path | str:
+        return "data.smpl_model" if self._body is None else self.frames[name].parameters
+
     def place(self, name: str, position: int, view: int) -> str:
         return str(self.frames[name].file(self.data.masks, position))
 

@@ -124,6 +124,10 @@ class ZJUMoCapReader(FrameReader):
         body = self._body(frame)
         yield from () if body is None else (body,)
 
+    def body_place(self, name: str) -> Path:
+        frame = self.frames[name]
+        return self._body(frame) or frame.folder / _BODIES[0] / f"{frame.number}.npy"
+
     def _body(self, frame: _Frame) -> Path | None:
         """The file of a frame's vertices, if its sequence has any."""
         folder = next((f for b in _BODIES if (f := frame.folder / b).is_dir()), None)
