@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -28,6 +28,9 @@ from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import versions
 from ghgs_lit.types import Batch, Gaussians, Prediction
 from ghgs_lit.visualization.pictures import palette, sheet
+
+if TYPE_CHECKING:
+    from ghgs_capture.verbs import Predict
 
 SHEET = "sheet.png"  #: The picture to look at
 
@@ -87,20 +90,22 @@ FORMATS: dict[str, Format] = {
 }
 
 
-def output_options(config: Mapping[str, Any]) -> OutputOptions:
-    """The options of a verb's configuration, checked before any work. ``config``: plain data with ``formats``
-    (``all``: all of them), ``up``, ``smooth`` and ``turntable``. InputError: an unknown format, a value out
-    of range, or a package that is not installed."""
-    formats = config["formats"]
+def output_options(verb: "Predict") -> OutputOptions:
+    """What a verb writes, checked before any work.
+
+    Raises:
+        InputError: an unknown format, no frames for a video, or a package that is not installed.
+    """
+    formats = verb.formats
     formats = [formats] if isinstance(formats, str) else formats
     formats = tuple(FORMATS) if "all" in formats else tuple(dict.fromkeys(formats))
     for name in formats:
         choice("formats", name, ("all", *FORMATS))
         if FORMATS[name].package is not None:
             installed(FORMATS[name].package, FORMATS[name].extra, f"formats={name}")
-    frames = config["turntable"]["frames"]
+    frames = verb.turntable.frames
     require(frames > 0 or "mp4" not in formats, "turntable.frames", "at least 1 for formats=mp4", frames)
-    return OutputOptions(formats, config["up"], config["smooth"], frames, config["turntable"]["fps"])
+    return OutputOptions(formats, verb.up, verb.smooth, frames, verb.turntable.fps)
 
 
 def output_files(options: OutputOptions, views: Sequence[str]) -> list[str]:

@@ -91,7 +91,7 @@ class Predict(Photographs, Measured):
     def run(self, cfg: DictConfig) -> object:
         from ghgs_capture.verbs import predict
 
-        return predict.run(cfg)
+        return predict.run(self, cfg)
 
 
 class View(Predict):
@@ -129,7 +129,7 @@ class View(Predict):
     def run(self, cfg: DictConfig) -> object:
         from ghgs_capture.verbs import view
 
-        return view.run(cfg)
+        return view.run(self, cfg)
 
 
 class Adapt(Photographs, Training):
@@ -148,7 +148,7 @@ class Adapt(Photographs, Training):
     def run(self, cfg: DictConfig) -> object:
         from ghgs_capture.verbs import adapt
 
-        return adapt.run(cfg)
+        return adapt.run(self, cfg)
 
 
 class Doctor(Photographs):
@@ -173,4 +173,4 @@ class Doctor(Photographs):
     def run(self, cfg: DictConfig) -> object:
         from ghgs_capture.verbs import doctor
 
-        return doctor.run(cfg)
+        return doctor.run(self, cfg)

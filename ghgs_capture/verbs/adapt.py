@@ -25,6 +25,7 @@ from ghgs_lit.weights.exporting import write_inference
 from ghgs_lit.weights.reading import file_of
 
 if TYPE_CHECKING:
+    from ghgs_capture.verbs import Adapt
     from ghgs_lit.data.datamodule import PhotographsDataModule
 
 # Training people are as tall in a photograph as the user's subject, give or take this share.
@@ -33,10 +34,10 @@ _SPREAD = 0.1
 _MINUTES = 3
 
 
-def run(cfg: DictConfig) -> float | str | None:
+def run(options: "Adapt", cfg: DictConfig) -> float | str | None:
     """Run the verb; return the mean PSNR of validation people in the rig. Interrupted: Ctrl-C or SIGTERM."""
-    config = resolve(cfg) | model_of(cfg.checkpoint, cfg)
-    files_to_write(config, ["out"])
+    config = resolve(cfg) | model_of(options.checkpoint, cfg)
+    files_to_write(options, ["out"])
     return run_job(with_rig(config), RunDirectory(output_dir()), adapt)
 
 

@@ -1,6 +1,7 @@
 """``ghgs doctor``: diagnose cameras, this machine or a device; one function for each task."""
 
 import os
+from typing import TYPE_CHECKING
 
 import rich
 from omegaconf import DictConfig
@@ -25,19 +26,23 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.visualization.pictures import save_png
 
+if TYPE_CHECKING:
+    from ghgs_capture.verbs import Doctor
+
 _LISTED = 6  #: Number of interpretations of a calibration that are listed
 
 
-def run(cfg: DictConfig) -> None:
+def run(options: "Doctor", cfg: DictConfig) -> None:
     """Run the task of the verb."""
-    {"cameras": cameras, "machine": machine, "selfcheck": selfcheck_device}[cfg.task](cfg)
+    tasks = {"cameras": cameras, "machine": machine, "selfcheck": selfcheck_device}
+    tasks[options.task](options, cfg)
 
 
-def cameras(cfg: DictConfig) -> None:
+def cameras(options: "Doctor", cfg: DictConfig) -> None:
     """Check whether photographs, masks and calibration fit together. Writes ``cameras.png``, and
     ``cameras.json`` where another interpretation of the calibration fits. InputError: the cameras do not."""
     tasks = "images=<folder of photographs> cameras=<calibration>, task=machine or task=selfcheck"
-    require(cfg.images is not None, "images", tasks, None)
+    require(options.images is not None, "images", tasks, None)
     directory = output_dir()
     folder = capture_folder(save_config(cfg, directory))
     inputs = {os.path.realpath(path) for path in folder.input_files}
@@ -69,14 +74,14 @@ def cameras(cfg: DictConfig) -> None:
         announce(calibration)
     if not diagnosis.consistent:
         found = "; ".join(diagnosis.lines)
-        raise InputError(f"{cfg.cameras}: expected cameras that fit the masks; found {found}")
+        raise InputError(f"{options.cameras}: expected cameras that fit the masks; found {found}")
 
 
-def machine(cfg: DictConfig) -> None:
+def machine(options: "Doctor", _: DictConfig) -> None:
     """Print what this machine has and which features lack a package or device."""
     console = Console(soft_wrap=True)
     for title, lines in (
-        ("This machine", machine_lines(pick_device(resolve(cfg)["device"]))),
+        ("This machine", machine_lines(pick_device(options.device))),
         ("Missing", list(missing_extras()) or [("nothing", "")]),
     ):
         listing = Table("", "", title=title, title_justify="left", show_header=False, box=None)
@@ -85,11 +90,11 @@ def machine(cfg: DictConfig) -> None:
         console.print(listing)
 
 
-def selfcheck_device(cfg: DictConfig) -> None:
+def selfcheck_device(options: "Doctor", cfg: DictConfig) -> None:
     """Check whether a device computes as the CPU does: print each outcome, and write all of them with facts
     of the machine to ``selfcheck.md``. InputError: a check failed."""
     config = resolve(cfg)
-    device = pick_device(config["device"])
+    device = pick_device(options.device)
     outcomes = []
     for outcome in selfcheck(config, device):
         outcomes.append(outcome)

@@ -39,6 +39,7 @@ from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import read_config
 
 if TYPE_CHECKING:  # it would import Lightning, which takes seconds
+    from ghgs_capture.verbs import Predict
     from ghgs_lit.data.datamodule import PhotographsDataModule
 
 
@@ -49,13 +50,13 @@ OTHER_RIG = 5.0
 
 
 @torch.no_grad()
-def run(cfg: DictConfig) -> None:
+def run(options: "Predict", cfg: DictConfig) -> None:
     """Run the verb."""
-    directory = output_dir() if cfg.out is None else resolved(cfg.out)
-    is_capture = cfg.images is not None or cfg.cameras is not None
+    directory = output_dir() if options.out is None else resolved(options.out)
+    is_capture = options.images is not None or options.cameras is not None
     config = resolve(cfg if is_capture else inputs.with_trained_data(cfg))
-    config |= inputs.model_of(cfg.checkpoint, cfg)
-    (predict_photographs if is_capture else predict_subject)(config, directory)
+    config |= inputs.model_of(options.checkpoint, cfg)
+    (predict_photographs if is_capture else predict_subject)(options, config, directory)
     announce(directory)
 
 
@@ -72,45 +73,51 @@ def subject_batch(
     return data.evaluation_batch(subject, split, targets=targets)
 
 
-def predict_subject(config: dict[str, Any], directory: Path) -> None:
+def predict_subject(options: "Predict", config: dict[str, Any], directory: Path) -> None:
     """Predict a subject of a data set."""
     expected = "0 without images=...: photographs of data sets are on black"
-    require(config["refine_masks"] in (0, "auto"), "refine_masks", expected, config["refine_masks"])
-    options, device = export.output_options(config), inputs.pick_device(config["device"])
+    require(options.refine_masks in (0, "auto"), "refine_masks", expected, options.refine_masks)
+    output = export.output_options(options)
+    device = inputs.pick_device(options.device)
     renderer, model = inputs.build_renderer(config, device), inputs.load_model(config, device)
     data = inputs.build_data(config)
     inputs.check_size(data, model)
     write_config(config, directory)
-    data.prepare_data([config["split"]])
-    batch = subject_batch(data, config["subject"], config["split"], config.get("targets")).to(device)
-    rounds = 0 if config["refine_cameras"] == "auto" else config["refine_cameras"]
-    result = predict_batch(batch, model, renderer, rounds, config["refine"])
-    write_result(directory, result, model, renderer, config, options)
+    data.prepare_data([options.split])
+    batch = subject_batch(data, options.subject, options.split, config.get("targets")).to(device)
+    rounds = 0 if options.refine_cameras == "auto" else options.refine_cameras
+    result = predict_batch(batch, model, renderer, rounds, options.refine)
+    write_result(directory, result, model, renderer, options.checkpoint, output)
 
 
-def predict_photographs(config: dict[str, Any], directory: Path) -> None:
+def predict_photographs(options: "Predict", config: dict[str, Any], directory: Path) -> None:
     """Predict each instant of a folder of photographs; several instants get a folder each and shared files.
     InputError: no instant can be read."""
-    folder, options = capture_folder(config), export.output_options(config)
+    folder = capture_folder(config)
+    output = export.output_options(options)
     several, read = len(folder.instants) > 1, folder.input_files
     directories = {name: directory / name if several else directory for name in folder.instants}
-    others = ["rig.json"] if config["refine_cameras"] else []
-    together = export.Instants(len(directories), options, others) if several else None
+    others = ["rig.json"] if options.refine_cameras else []
+    together = export.Instants(len(directories), output, others) if several else None
     for name, path in directories.items():
-        export.require_free(path, export.output_files(options, list(folder.paths[name])), read)
+        export.require_free(path, export.output_files(output, list(folder.paths[name])), read)
     if together:
         export.require_free(directory, together.files, read)
     if folder.note:
         print(folder.note, flush=True)
-    if config["check_cameras"]:
+    if options.check_cameras:
         check_cameras(folder)
-    device = inputs.pick_device(config["device"])
+    device = inputs.pick_device(options.device)
     renderer, model = inputs.build_renderer(config, device), inputs.load_model(config, device)
-    trained = read_config(config["checkpoint"])
-    size = crop_size(config["size"], trained, model)
+    trained = read_config(options.checkpoint)
+    size = crop_size(options.size, trained, model)
     write_config(config, directory)
-    refining = {name: config[name] for name in ("refine_cameras", "refine_masks", "refine")}
-    refining["tones"] = config["refine_tones"] or {}
+    refining: dict[str, Any] = {
+        "refine_cameras": options.refine_cameras,
+        "refine_masks": options.refine_masks,
+        "refine": options.refine,
+        "tones": options.refine_tones or {},
+    }
     temporal = Temporal(partial(in_frame, model), model.skip.every, renderer)
     totals: Counter[str] = Counter()
     count, begin = 0, time.perf_counter()
@@ -124,7 +131,7 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         capture = rig.applied(capture) if rig else capture
         result = predict(capture, model, size, **refining, renderer=renderer, temporal=temporal)
         result.seconds["read"] = waited
-        seconds = write_result(directories[capture.name], result, model, renderer, config, options)
+        seconds = write_result(directories[capture.name], result, model, renderer, options.checkpoint, output)
         if together:
             together.add(directories[capture.name], result.batch, result.prediction, renderer)
         count += 1
@@ -262,12 +269,12 @@ def write_result(
     result: TimedPrediction,
     model: GHGS,
     renderer: Renderer,
-    config: dict[str, Any],
+    checkpoint: str,
     options: export.OutputOptions,
 ) -> dict[str, float]:
     """Write the files of a result and print what was done; return the seconds of each stage."""
     prediction, seconds = result.prediction, dict(result.seconds)
-    facts: dict[str, Any] = {"checkpoint": config["checkpoint"], "seconds": seconds, "why": result.why}
+    facts: dict[str, Any] = {"checkpoint": checkpoint, "seconds": seconds, "why": result.why}
     why = {name: f"; {doubt} ({name}=0 leaves it)" for name, doubt in result.why.items()}
     if result.changed:
         shares = ", ".join(f"{share:.1%}" for share in result.changed)

@@ -3,7 +3,9 @@
 import ipaddress
 import math
 import time
+from collections.abc import Mapping
 from functools import partial
+from typing import TYPE_CHECKING
 
 import torch
 from omegaconf import DictConfig
@@ -28,25 +30,31 @@ from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import read_config
 from ghgs_lit.weights.reading import SHIPPED
 
+if TYPE_CHECKING:
+    from ghgs_capture.verbs import View
 
-def run(cfg: DictConfig) -> None:
+
+def run(options: "View", cfg: DictConfig) -> None:
     """Show ``path``; without it predict first, or with ``live`` again and again. Ctrl-C ends it."""
-    has_source = cfg.live or any(cfg.get(key) is not None for key in ("path", "checkpoint", "images"))
+    sources = (options.path, options.checkpoint, options.images)
+    has_source = options.live or any(source is not None for source in sources)
     require(has_source, "path", "a directory of ghgs predict or a PLY, or checkpoint=<file>", None)
-    is_folder = not isinstance(cfg.images, DictConfig)
-    require(cfg.live or is_folder, "images", "a folder, or live=true beside cameras", cfg.images)
-    if cfg.path is None and cfg.checkpoint is None:
+    is_folder = not isinstance(options.images, Mapping)
+    require(options.live or is_folder, "images", "a folder, or live=true beside cameras", options.images)
+    if options.path is None and options.checkpoint is None:
         cfg.checkpoint = SHIPPED
-    if cfg.live:
-        _run_live(cfg)
+        options = options.replace(checkpoint=SHIPPED)
+    if options.live:
+        _run_live(options, cfg)
         return
-    if cfg.path is None:
-        predict.run(cfg)
+    if options.path is None:
+        predict.run(options, cfg)
     else:
         save_config(cfg, output_dir())
     # A new prediction is already in the frame of ``up``, and its cameras tell which axis that is.
-    viewer = _opened(cfg, read_content(cfg.path or output_dir(), cfg.up if cfg.path else None))
-    end = time.monotonic() + (cfg.seconds or math.inf)
+    content = read_content(options.path or output_dir(), options.up if options.path else None)
+    viewer = _opened(options, content)
+    end = time.monotonic() + (options.seconds or math.inf)
     try:
         while time.monotonic() < end:
             time.sleep(0.2)
@@ -55,36 +63,39 @@ def run(cfg: DictConfig) -> None:
 
 
 @torch.no_grad()
-def _run_live(cfg: DictConfig) -> None:
-    require(cfg.path is None, "path", "null with live=true", cfg.path)
-    config, pause = resolve(cfg), Pause()
+def _run_live(options: "View", cfg: DictConfig) -> None:
+    require(options.path is None, "path", "null with live=true", options.path)
+    config = resolve(cfg)
+    pause = Pause()
     frames = live_frames(**sources_of(config), sleep=pause)
-    config |= model_of(config["checkpoint"], cfg)
-    options, device = output_options(config), pick_device(config["device"])
+    config |= model_of(options.checkpoint, cfg)
+    output = output_options(options)
+    device = pick_device(options.device)
     renderer, model = build_renderer(config, device), load_model(config, device)
-    size = crop_size(config["size"], read_config(config["checkpoint"]), model)
+    size = crop_size(options.size, read_config(options.checkpoint), model)
     write_config(config, output_dir())
     # To decide at each instant what ``auto`` should refine would take as long as a prediction.
-    masks, cameras = (0 if n == "auto" else n for n in (config["refine_masks"], config["refine_cameras"]))
+    masks = 0 if options.refine_masks == "auto" else options.refine_masks
+    cameras = 0 if options.refine_cameras == "auto" else options.refine_cameras
     forward = partial(in_frame, model)
     temporal = Temporal(forward, model.skip.every, renderer)
 
     def predicted(batch: Batch) -> ExportedSubject:
         batch = batch.to(device)
-        result = predict_batch(batch, model, renderer, cameras, config["refine"], forward, temporal)
-        return exported_subject(result.batch, result.prediction, renderer, options)
+        result = predict_batch(batch, model, renderer, cameras, options.refine, forward, temporal)
+        return exported_subject(result.batch, result.prediction, renderer, output)
 
     crop = partial(Capture.batch, size=size, refine_masks=masks)
-    recording = None if config["out"] is None else Recording(resolved(config["out"]))
-    print(f"waiting for an instant in {config['images']}", flush=True)
-    page = partial(_opened, cfg, layers=False)
-    until, delay = cfg.seconds or math.inf, cfg.delay or math.inf
+    recording = None if options.out is None else Recording(resolved(options.out))
+    print(f"waiting for an instant in {options.images}", flush=True)
+    page = partial(_opened, options, layers=False)
+    until, delay = options.seconds or math.inf, options.delay or math.inf
     show_live(frames, pause, crop, predicted, page, recording, until, delay)
 
 
-def _opened(cfg: DictConfig, content: Content, layers: bool = True) -> Viewer:
-    viewer = Viewer(content, cfg.host, cfg.port, layers)
-    print(f"viewer: {viewer.address} ({_reach(cfg.host)}); Ctrl-C ends it", flush=True)
+def _opened(options: "View", content: Content, layers: bool = True) -> Viewer:
+    viewer = Viewer(content, options.host, options.port, layers)
+    print(f"viewer: {viewer.address} ({_reach(options.host)}); Ctrl-C ends it", flush=True)
     return viewer
 
 

@@ -4,7 +4,7 @@ import itertools
 import math
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import lightning.pytorch as L
 import torch
@@ -26,21 +26,24 @@ from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import read_config
 
+if TYPE_CHECKING:
+    from ghgs_lit.cli.verbs import Benchmark
 
-def run(cfg: DictConfig) -> None:
+
+def run(options: "Benchmark", cfg: DictConfig) -> None:
     """Run the verb. Exit code 1 if a preset exceeds its error budget."""
     directory = output_dir()
     config = save_config(with_trained_data(cfg), directory)
     check_options(config, overrides())
-    L.seed_everything(config["seed"], workers=True, verbose=False)
-    device = pick_device(config["device"])
-    with threads(config["threads"]):
-        content = _presets(configured_cases(config, device), config, device)
+    L.seed_everything(options.seed, workers=True, verbose=False)
+    device = pick_device(options.device)
+    with threads(options.threads):
+        content = _presets(configured_cases(config, device), options, config, device)
         content = {"machine": machine_facts(device), **content}
     tables = report.tables_of(content["rows"])
     print_tables(tables)
     print(*content["decisions"], sep="\n", flush=True)
-    source = provenance(config, seed=config["seed"], verb="benchmark", choices=choices())
+    source = provenance(config, seed=options.seed, verb="benchmark", choices=choices())
     announce(report.write_numbers(directory, {**content, "provenance": source}, tables))
     if content["broken"]:
         for said in content["broken"]:
@@ -72,26 +75,28 @@ def configured_cases(config: Mapping[str, Any], device: torch.device) -> list[Ca
     return cases_of(source, presets, config["knobs"] or {}, shared, device, config["seed"])
 
 
-def _presets(cases: list[Case], config: dict[str, Any], device: torch.device) -> dict[str, Any]:
+def _presets(
+    cases: list[Case], options: "Benchmark", config: dict[str, Any], device: torch.device
+) -> dict[str, Any]:
     data = build_data(config)
-    data.prepare_data([config["split"]])
-    loader = data.evaluation_loader(split=config["split"])
-    number = config["subjects"] and math.ceil(config["subjects"] / data.dataset.batch_size)
+    data.prepare_data([options.split])
+    loader = data.evaluation_loader(split=options.split)
+    number = options.subjects and math.ceil(options.subjects / data.dataset.batch_size)
     batches: list[Batch] = [batch.to(device) for batch in itertools.islice(loader, number)]
     if batches[0].targets is None:
         raise InputError(f"targets={config['targets']['name']}: expected target photographs; found none")
     metrics = build(config["metrics"], "metrics").to(device)
-    records = record_cases(cases, batches, metrics, device, **config["timing"])
+    records = record_cases(cases, batches, metrics, device, options.timing.repeats)
     rows = report.rows_of(records)
     _, views, _, height, width = batches[0].images.shape
     subjects = sum(len(batch.images) for batch in batches)
     number = sum(p.numel() for p in cases[0].model.parameters()) / 1e6
-    weights = config["checkpoint"] or f"{choices().get('encoder', 'encoder')}, random weights"
-    weights = f"{weights} ({number:.1f} M parameters, precision {config['precision']})"
-    photographs = f"{subjects} subjects of {config['data']['name']}, {views} views of {height} x {width}"
+    weights = options.checkpoint or f"{choices().get('encoder', 'encoder')}, random weights"
+    weights = f"{weights} ({number:.1f} M parameters, precision {options.precision})"
+    photographs = f"{subjects} subjects of {data.dataset.name}, {views} views of {height} x {width}"
     return {
         "about": f"{weights}; {photographs}",
-        "random_weights": config["checkpoint"] is None,
+        "random_weights": options.checkpoint is None,
         "rows": rows,
         "broken": report.broken_budgets(rows),
         "decisions": [

@@ -1,7 +1,7 @@
 """``ghgs evaluate``: measure a checkpoint, baselines, or both on the same targets."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import lightning.pytorch as L
 import torch
@@ -20,11 +20,16 @@ from ghgs_lit.refinement import CameraRefinement, Refinement
 from ghgs_lit.runs.results import METHOD, read_results
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
+if TYPE_CHECKING:
+    from ghgs_lit.cli.verbs import Evaluate
 
-def trained_method(config: Mapping[str, Any], device: torch.device) -> tuple[ModelMethod, dict[str, Any]]:
-    """The model of ``config["checkpoint"]`` with the configured refinement, and facts about it."""
+
+def trained_method(
+    options: "Evaluate", config: Mapping[str, Any], device: torch.device
+) -> tuple[ModelMethod, dict[str, Any]]:
+    """The model of a checkpoint with the chosen refinement, and facts about it."""
     renderer, model = inputs.build_renderer(config, device), inputs.load_model(config, device)
-    checkpoint = read_checkpoint(config["checkpoint"])
+    checkpoint = read_checkpoint(options.checkpoint)
     facts: dict[str, Any] = {
         "checkpoint_config": checkpoint["config"],
         "model_config": {node: config[node] for node in inputs.MODEL_NODES if node in config},
@@ -32,8 +37,8 @@ def trained_method(config: Mapping[str, Any], device: torch.device) -> tuple[Mod
     }
     if "global_step" in checkpoint:
         facts["training"] = {"steps": checkpoint["global_step"]}
-    steps, rounds = config.get("refine"), config.get("refine_cameras")
-    refinement = Refinement(steps, renderer) if steps else None
+    rounds = options.refine_cameras
+    refinement = Refinement(options.refine, renderer) if options.refine else None
     cameras = CameraRefinement(rounds, model, renderer) if rounds else None
     return ModelMethod(model, renderer, refinement, cameras), facts
 
@@ -47,32 +52,34 @@ def baselines_of(
     return {name: baseline(name, renderer, untrained, config["per_scene"]) for name in names}
 
 
-def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], dict[str, Any]]:
-    path = config["checkpoint"]
-    if path is None and not config["baselines"]:
+def _methods(
+    options: "Evaluate", config: dict[str, Any], device: Any
+) -> tuple[dict[str, Method], dict[str, Any]]:
+    path = options.checkpoint
+    if path is None and not options.baselines:
         raise InputError("checkpoint: expected a checkpoint or baselines=[...]; found neither")
     methods: dict[str, Method] = {}
     facts: dict[str, Any] = {"checkpoint": path}
     if path is not None:
-        methods["model"], found = trained_method(config, device)
+        methods["model"], found = trained_method(options, config, device)
         model = methods["model"].model
         expected = "1: ghgs evaluate measures each subject by itself (skip=temporal is of ghgs predict)"
         require(model.skip.every == 1, "skip.every", expected, model.skip.every)
         facts |= found
-    methods |= baselines_of(config["baselines"], config, device)
+    methods |= baselines_of(options.baselines, config, device)
     return methods, facts
 
 
-def run(cfg: DictConfig) -> None:
+def run(options: "Evaluate", cfg: DictConfig) -> None:
     """Run the verb."""
     directory = output_dir()
     config = inputs.with_chosen_targets(resolve(inputs.with_trained_data(cfg)))
-    if config["checkpoint"] is not None:
-        config |= inputs.model_of(config["checkpoint"], cfg)
+    if options.checkpoint is not None:
+        config |= inputs.model_of(options.checkpoint, cfg)
     write_config(config, directory)
-    L.seed_everything(config["seed"], workers=True, verbose=False)
-    device = inputs.pick_device(config["device"])
-    methods, facts = _methods(config, device)
+    L.seed_everything(options.seed, workers=True, verbose=False)
+    device = inputs.pick_device(options.device)
+    methods, facts = _methods(options, config, device)
     data = inputs.build_data(config)
     for method in methods.values():
         if isinstance(method, ModelMethod):

@@ -1,5 +1,7 @@
 """``ghgs export``: write a checkpoint under the published names, or a small one for prediction."""
 
+from typing import TYPE_CHECKING
+
 import torch
 from omegaconf import DictConfig
 
@@ -13,6 +15,9 @@ from ghgs_lit.weights.checkpoint import read_config
 from ghgs_lit.weights.exporting import export_weights, write_inference
 from ghgs_lit.weights.reading import file_of
 from ghgs_lit.weights.switches import differences
+
+if TYPE_CHECKING:
+    from ghgs_lit.cli.verbs import Export
 
 _PATCHES = 8  # along each side of the photographs on which two models are compared
 
@@ -31,11 +36,12 @@ def parity(checkpoint: str, exported: str) -> dict[str, float]:
     return prediction_differences(*results, batch.masks)
 
 
-def run(cfg: DictConfig) -> None:
+def run(options: "Export", cfg: DictConfig) -> None:
     """Run the verb."""
-    config = save_config(cfg, output_dir())
-    checkpoint, keys = config["checkpoint"], ("vggt", "release", "inference")
-    paths = files_to_write(config, keys, [file_of(checkpoint)])
+    save_config(cfg, output_dir())
+    checkpoint = options.checkpoint
+    keys = ("vggt", "release", "inference")
+    paths = files_to_write(options, keys, [file_of(checkpoint)])
     vggt, release, inference = map(paths.get, keys)
     require(bool(paths), "vggt", "vggt=<file>, release=<file> or inference=<file>", None)
     if vggt is not None or release is not None:
@@ -44,7 +50,7 @@ def run(cfg: DictConfig) -> None:
         if release is not None and differing:
             print(f"differs from the release: {', '.join(differing)}", flush=True)
     if inference is not None:
-        write_inference(checkpoint, inference, config["dtype"])
+        write_inference(checkpoint, inference, options.dtype)
         found = parity(checkpoint, inference)
         sizes = (file_of(path).stat().st_size / 1e6 for path in (checkpoint, inference))
         print("{:.1f} MB to {:.1f} MB".format(*sizes), flush=True)

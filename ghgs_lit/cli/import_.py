@@ -1,7 +1,7 @@
 """``ghgs import``: convert published weights to a checkpoint of this package."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 from torch import Tensor
@@ -12,6 +12,9 @@ from ghgs_lit.model import GHGS
 from ghgs_lit.weights.importing import import_weights
 from ghgs_lit.weights.switches import differences
 
+if TYPE_CHECKING:
+    from ghgs_lit.cli.verbs import Import
+
 
 def empty_state(config: Mapping[str, Any], release: str | None) -> dict[str, Tensor]:
     """Tensors that published weights fill, on the meta device: the model's, or without the authors'
@@ -20,14 +23,14 @@ def empty_state(config: Mapping[str, Any], release: str | None) -> dict[str, Ten
     return {name: tensor for name, tensor in state.items() if release or name.startswith("encoder.")}
 
 
-def run(cfg: DictConfig) -> None:
+def run(options: "Import", cfg: DictConfig) -> None:
     """Run the verb."""
     config = save_config(cfg, output_dir())
     model = {key: config[key] for key in MODEL_NODES if key in config}
-    sources = (config["vggt"], config["release"])
-    out = files_to_write(config, ["out"], [path for path in sources if path is not None])["out"]
-    report = import_weights(empty_state(model, config["release"]), model, out, *sources, config["dtype"])
+    sources = (options.vggt, options.release)
+    out = files_to_write(options, ["out"], [path for path in sources if path is not None])["out"]
+    report = import_weights(empty_state(model, options.release), model, out, *sources, options.dtype)
     print("\n".join(report), flush=True)
-    if config["release"] is not None and (differing := differences(config)):
+    if options.release is not None and (differing := differences(config)):
         print(f"differs from the release: {', '.join(differing)}", flush=True)
     announce(out)

@@ -2,29 +2,34 @@
 
 import logging
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
 from ghgs_lit.cli.runtime import announce, output_dir
 from ghgs_lit.config import build
+from ghgs_lit.config.nodes import Check
 from ghgs_lit.data.check import inspect, show, write
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.reader import PHASES
 from ghgs_lit.errors import InputError
 from ghgs_lit.files import resolved
 
+if TYPE_CHECKING:
+    from ghgs_lit.cli.verbs import Prepare
+
 log = logging.getLogger(__name__)
 
 
-def run(cfg: DictConfig) -> None:
+def run(options: "Prepare", cfg: DictConfig) -> None:
     """Run the task of the verb."""
-    data = build(cfg.data, key="data", views=cfg.views, targets=cfg.targets, seed=cfg.seed)
+    data = build(cfg.data, key="data", views=cfg.views, targets=cfg.targets, seed=options.seed)
     root = resolved(data.dataset.root or ".")
-    if cfg.task == "render":
+    if options.task == "render":
         render(data)
         announce(root)
     else:
-        check(data, output_dir(), **cfg.check)
+        check(data, output_dir(), options.check)
 
 
 def render(data: PhotographsDataModule) -> None:
@@ -34,9 +39,9 @@ def render(data: PhotographsDataModule) -> None:
         log.info("%s: %d subjects", phase, len(data.subjects(phase)) if data.dataset.has(phase) else 0)
 
 
-def check(data: PhotographsDataModule, folder: Path, min_iou: float, min_agreement: float) -> None:
+def check(data: PhotographsDataModule, folder: Path, expected: Check) -> None:
     """Read all data once, print tables, write ``check.json`` and a contact sheet. InputError: data is bad."""
-    report = inspect(data, min_iou, min_agreement)
+    report = inspect(data, expected.min_iou, expected.min_agreement)
     show(report)
     announce(write(report, folder))
     if report.problems:

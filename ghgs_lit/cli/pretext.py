@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.cli.train import build_trainer, fit, quiet, resume_step, run_job
+from ghgs_lit.cli.verb import Training
 from ghgs_lit.config import build, resolve
 from ghgs_lit.encoder.semantic import SemanticOptions
 from ghgs_lit.errors import require
@@ -19,7 +20,7 @@ from ghgs_lit.training.checkpoints import StopAtStep
 from ghgs_lit.training.pretext.module import Pretext, PretextModule
 
 
-def run(cfg: DictConfig) -> float | str | None:
+def run(_: Training, cfg: DictConfig) -> float | str | None:
     """Train the branch; return its part accuracy on validation people. Interrupted: Ctrl-C or SIGTERM."""
     return run_job(resolve(cfg), RunDirectory(output_dir()), pretrain)
 

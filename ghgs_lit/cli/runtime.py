@@ -7,6 +7,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from ghgs_lit.cli.verb import Verb
 from ghgs_lit.config import resolve
 from ghgs_lit.config.compose import HEADER, saved_text
 from ghgs_lit.errors import require
@@ -35,16 +36,15 @@ def save_config(cfg: DictConfig, directory: Path) -> dict[str, Any]:
     return config
 
 
-def files_to_write(
-    config: dict[str, Any], keys: Sequence[str], read: Sequence[str | Path] = ()
-) -> dict[str, Path]:
+def files_to_write(options: Verb, keys: Sequence[str], read: Sequence[str | Path] = ()) -> dict[str, Path]:
     """Paths of the files that ``keys`` of a verb name, by key, without those that are null. InputError: a
     file exists and ``overwrite`` is false, it is one of ``read``, or two keys name one."""
-    paths = {key: Path(config[key]).expanduser() for key in keys if config[key] is not None}
+    named = {key: getattr(options, key) for key in keys}
+    paths = {key: Path(path).expanduser() for key, path in named.items() if path is not None}
     taken = {resolved(path) for path in read}
     for key, path in paths.items():
         require(resolved(path) not in taken, key, "a file of its own", str(path))
-        require_free(path, key, config["overwrite"])
+        require_free(path, key, options.overwrite)
         taken.add(resolved(path))
     return paths
 

@@ -1,6 +1,7 @@
 """``ghgs stress``: compare stages with float64 on adversarial inputs, or repeat a saved training step."""
 
 import sys
+from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
@@ -14,21 +15,24 @@ from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.training.replay import replay
 
+if TYPE_CHECKING:
+    from ghgs_lit.cli.verbs import Stress
 
-def run(cfg: DictConfig) -> None:
+
+def run(options: "Stress", cfg: DictConfig) -> None:
     """Run the verb. Exit code 1 if an error budget is exceeded or the repeated step is not finite."""
     directory = output_dir()
     config = save_config(cfg, directory)
-    if config["dump"] is not None:
-        step, recorded, fault = replay(config["dump"])
+    if options.dump is not None:
+        step, recorded, fault = replay(options.dump)
         print(f"step {step}, when it was saved: {recorded}")
         print(f"step {step}, now: {fault or 'all values are finite'}")
         if fault is not None:
             raise SystemExit(1)
         return
-    tasks = tasks_of(config["stages"], config["families"], config["quick"])
-    require(bool(tasks), "families", "a family that one of the stages has", config["families"])
-    rows = run_tasks(tasks, allowed_cores() if config["workers"] is None else config["workers"])
+    tasks = tasks_of(options.stages, options.families, options.quick)
+    require(bool(tasks), "families", "a family that one of the stages has", options.families)
+    rows = run_tasks(tasks, allowed_cores() if options.workers is None else options.workers)
     print_tables(report.tables_of(rows))
     print(report.said_of(rows))
     source = provenance(config, seed=0, verb="stress", choices=choices())

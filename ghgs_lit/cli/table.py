@@ -2,51 +2,56 @@
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
+from ghgs_lit.config.nodes import EvaluationOptions
+from ghgs_lit.config.options import Options
+from ghgs_lit.config.registry import read_node
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation import tables as t
 from ghgs_lit.files import resolved, write_text_atomically
 
+if TYPE_CHECKING:
+    from ghgs_lit.cli.verbs import Table
 
-def _listed(config: dict[str, Any], key: str) -> tuple | None:
+
+def _listed(options: Options, key: str) -> tuple | None:
     """The values of a key that holds one or a list; None: none. InputError: one is there twice."""
-    value = config[key.rpartition(".")[2]]
+    value = getattr(options, key.rpartition(".")[2])
     values = (value,) if isinstance(value, str | int) else tuple(value or ())
     require(len(set(values)) == len(values), key, "different values", list(values))
     return values or None
 
 
-def _options(config: dict[str, Any]) -> t.TableOptions:
-    evaluation = config["evaluation"]
+def _options(options: "Table", evaluation: EvaluationOptions) -> t.TableOptions:
     try:
-        unit = re.compile(config["test"]["unit"] or "(.+)")
+        unit = re.compile(options.test.unit or "(.+)")
     except re.error as error:
         raise InputError(f"test.unit: expected a regular expression; found {error}") from None
     require(unit.groups >= 1, "test.unit", "a regular expression with a group", unit.pattern)
     return t.TableOptions(
-        layout=t.LAYOUTS[config["layout"]],
+        layout=t.LAYOUTS[options.layout],
         views=_listed(evaluation, "evaluation.views"),
         targets=_listed(evaluation, "evaluation.targets"),
-        metrics=_listed(config, "columns"),
-        reported=config["reported"],
-        test=t.PairedTest.read(config["test"], "test"),
+        metrics=_listed(options, "columns"),
+        reported=options.reported,
+        test=options.test,
         unit=unit,
     )
 
 
-def run(cfg: DictConfig) -> None:
+def run(verb: "Table", cfg: DictConfig) -> None:
     """Print and write the tables."""
     directory = output_dir()
     config = save_config(cfg, directory)
-    options = _options(config)
+    options = _options(verb, read_node(config["evaluation"], "evaluation"))
     # Resolved: a run that is found by two paths counts once.
-    folders = [resolved(path) for path in _listed(config, "runs") or ()]
-    others = [t.read_others(Path(p).expanduser()) for p in _listed(config, "others") or ()]
-    sweep = t.read_sweep(folders, _listed(config, "by") or ())
+    folders = [resolved(path) for path in _listed(verb, "runs") or ()]
+    others = [t.read_others(Path(p).expanduser()) for p in _listed(verb, "others") or ()]
+    sweep = t.read_sweep(folders, _listed(verb, "by") or ())
     tables = t.build_tables(sweep, others, options)
     labels = [f"table:{options.layout.name}" + (f"-{i}" if i else "") for i in range(len(tables))]
     latex = "\n".join(t.to_latex(table, label) for table, label in zip(tables, labels, strict=True))

@@ -6,7 +6,7 @@ import time
 import warnings
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import lightning.pytorch as L
 from hydra.core.hydra_config import HydraConfig
@@ -36,6 +36,9 @@ from ghgs_lit.training.checkpoints import AtomicCheckpointIO, StopAtStep
 from ghgs_lit.training.cost import TrainingCost
 from ghgs_lit.weights import switches
 from ghgs_lit.weights.checkpoint import read_config
+
+if TYPE_CHECKING:
+    from ghgs_lit.cli.verbs import Train
 
 
 def quiet() -> None:
@@ -107,11 +110,11 @@ def environments() -> list[ClusterEnvironment]:
         raise InputError(f"trainer: {error}") from None
 
 
-def run(cfg: DictConfig) -> float | str | None:
+def run(options: "Train", cfg: DictConfig) -> float | str | None:
     """Train and measure (in a sweep: unless done); return the mean PSNR. Interrupted: Ctrl-C or SIGTERM."""
     config, run_directory = resolve(cfg), RunDirectory(output_dir())
     config["chosen"] = chosen_options(config, HydraConfig.get())
-    require(not config["dry_run"], "dry_run", "false without a grid (-m, or sweep=<file>)", True)
+    require(not options.dry_run, "dry_run", "false without a grid (-m, or sweep=<file>)", True)
     job.check_config(config)
     if job.in_sweep():
         job.check_launcher(config, HydraConfig.get().runtime.choices["hydra/launcher"])

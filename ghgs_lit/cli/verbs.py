@@ -36,7 +36,7 @@ class Train(Training):
     def run(self, cfg: DictConfig) -> object:
         from ghgs_lit.cli import train
 
-        return train.run(cfg)
+        return train.run(self, cfg)
 
 
 class Pretext(Training):
@@ -49,7 +49,7 @@ class Pretext(Training):
     def run(self, cfg: DictConfig) -> object:
         from ghgs_lit.cli import pretext
 
-        return pretext.run(cfg)
+        return pretext.run(self, cfg)
 
 
 class Evaluate(Measured):
@@ -74,7 +74,7 @@ class Evaluate(Measured):
     def run(self, cfg: DictConfig) -> object:
         from ghgs_lit.cli import evaluate
 
-        return evaluate.run(cfg)
+        return evaluate.run(self, cfg)
 
 
 class Benchmark(Measured):
@@ -101,7 +101,7 @@ class Benchmark(Measured):
     def run(self, cfg: DictConfig) -> object:
         from ghgs_lit.cli import benchmark
 
-        return benchmark.run(cfg)
+        return benchmark.run(self, cfg)
 
 
 class Stress(Verb):
@@ -123,7 +123,7 @@ class Stress(Verb):
     def run(self, cfg: DictConfig) -> object:
         from ghgs_lit.cli import stress
 
-        return stress.run(cfg)
+        return stress.run(self, cfg)
 
 
 class Table(Verb):
@@ -152,7 +152,7 @@ class Table(Verb):
     def run(self, cfg: DictConfig) -> object:
         from ghgs_lit.cli import table
 
-        return table.run(cfg)
+        return table.run(self, cfg)
 
 
 class Prepare(Verb):
@@ -171,7 +171,7 @@ class Prepare(Verb):
     def run(self, cfg: DictConfig) -> object:
         from ghgs_lit.cli import prepare
 
-        return prepare.run(cfg)
+        return prepare.run(self, cfg)
 
 
 class Import(Verb):
@@ -193,7 +193,7 @@ class Import(Verb):
     def run(self, cfg: DictConfig) -> object:
         from ghgs_lit.cli import import_
 
-        return import_.run(cfg)
+        return import_.run(self, cfg)
 
 
 class Export(Verb):
@@ -218,4 +218,4 @@ class Export(Verb):
     def run(self, cfg: DictConfig) -> object:
         from ghgs_lit.cli import export
 
-        return export.run(cfg)
+        return export.run(self, cfg)

@@ -12,6 +12,7 @@ import gc
 import importlib
 import importlib.metadata
 import importlib.util
+import json
 import os
 import pkgutil
 import sys
@@ -254,6 +255,10 @@ def class_of(group: str, kind: Any, key: str) -> type[Options]:
     return _imported(known[kind])
 
 
+#: Options of the nodes that were read, by class, key and values.
+_READ: dict[tuple[type[Options], str, str], Options] = {}
+
+
 def read_node(node: Any, key: str) -> Options:
     """The checked options of a node: a mapping of plain data, with ``kind`` where its group has kinds.
     ``key``: its dotted key, such as ``bounds`` or ``callbacks.best``. InputError: names the first wrong key,
@@ -263,7 +268,12 @@ def read_node(node: Any, key: str) -> Options:
         raise InputError(f"{key}: expected a mapping of its keys; found {shown(node)}")
     values = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else dict(node)
     kind = None if None in KINDS[group] else values.pop("kind", None)
-    return class_of(group, kind, key).read(values, key)
+    cls = class_of(group, kind, key)
+    # Options do not change: a node is read once in a process, whoever asks for it.
+    text = json.dumps(values, sort_keys=True, default=repr)
+    if (cls, key, text) not in _READ:
+        _READ[cls, key, text] = cls.read(values, key)
+    return _READ[cls, key, text]
 
 
 def build(node: Any, key: str, **extra: Any) -> Any:

@@ -57,7 +57,7 @@ class Cycle:
 
 class Module:
     @staticmethod
-    def run(cfg):
+    def run(options, cfg):
         atexit.register(print, "hook")
         Cycle()
         print("said", end=" ")

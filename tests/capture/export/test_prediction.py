@@ -26,6 +26,7 @@ from ghgs_capture.export.subject import (
     turn,
 )
 from ghgs_capture.formats.json_and_toml import read_json
+from ghgs_capture.verbs import Predict
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.metrics import psnr
@@ -180,7 +181,7 @@ def test_a_subject_without_gaussians_is_written(subject, tmp_path):
     ("changes", "message"),
     [
         ({"formats": ["obj"]}, "formats: expected one of all, ply, .*; found 'obj'"),
-        ({"up": "x"}, "up: expected one of None, y, -y, z; found 'x'"),
+        ({"up": "x"}, "up: expected one of y, -y, z or null; found 'x'"),
         (
             {"formats": "all", "turntable": {"frames": 0, "fps": 1}},
             r"turntable\.frames: expected at least 1 for formats=mp4; found 0",
@@ -190,14 +191,14 @@ def test_a_subject_without_gaussians_is_written(subject, tmp_path):
 )
 def test_wrong_options_are_refused(changes, message):
     with pytest.raises(InputError, match=message):
-        output_options(CONFIG | changes)
+        output_options(Predict(**(CONFIG | changes)))
 
 
 def test_options_are_read():
     """One name, a list with repetitions, and all."""
-    assert output_options(CONFIG | {"formats": "ply"}).formats == ("ply",)
-    assert output_options(CONFIG | {"formats": ["ply", "depth", "ply"]}).formats == ("ply", "depth")
-    assert "inputs" in output_options(CONFIG | {"formats": ["all"]}).formats
+    assert output_options(Predict(formats="ply")).formats == ("ply",)
+    assert output_options(Predict(formats=["ply", "depth", "ply"])).formats == ("ply", "depth")
+    assert "inputs" in output_options(Predict(formats=["all"])).formats
     batch = example_batch()
     with pytest.raises(InputError, match="a batch of one subject; found 2"):
         write_prediction(None, batch, Standin()(batch), Renderer(), OutputOptions())
@@ -207,7 +208,7 @@ def test_a_missing_package_is_named_before_any_work(monkeypatch):
     monkeypatch.setitem(sys.modules, "gaussforge", None)
     line = r"formats=spz: expected the package gaussforge \(pip install 'ghgs-lit\[formats\]'\); found none"
     with pytest.raises(InputError, match=line):
-        output_options(CONFIG | {"formats": ["ply", "spz"]})
+        output_options(Predict(formats=["ply", "spz"]))
 
 
 @pytest.mark.parametrize(("antialiased", "size"), [(False, 0.3), (True, 1.0)])
