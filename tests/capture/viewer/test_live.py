@@ -236,7 +236,7 @@ def test_cameras_are_shown_live_alone(tmp_path, capsys):
 
 
 def test_photographs_need_no_checkpoint(tmp_path, capsys, monkeypatch):
-    def refuse(cfg):
+    def refuse(options, cfg):
         raise InputError(f"predicts with {cfg.checkpoint}")
 
     monkeypatch.setattr("ghgs_capture.verbs.predict.run", refuse)
