@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ghgs_lit.config import options
-from ghgs_lit.config.options import Share, Size, Text, Workers
+from ghgs_lit.config.options import Share, Size, Text
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.data.pickles import load_pickle
 from ghgs_lit.errors import InputError
@@ -101,7 +101,6 @@ class THuman2(Scans):
 
     name: Text = "thuman2"
     size: Size = (512, 512)
-    workers: Workers = 8
     render: RenderOptions = RenderOptions(
         size=1024, samples=2, views=(0, 1, 2, 3, 4), quality=95, lights="none"
     )

@@ -12,7 +12,7 @@ import rich
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import Dataset
 
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.layout import Completeness
@@ -21,9 +21,9 @@ from ghgs_lit.data.reader import PHASES, Photographs, Reader
 from ghgs_lit.data.sampling import CAMERAS, RING_VIEW, TargetProtocol
 from ghgs_lit.data.silhouettes import SEARCH, height, implausible, silhouette, twins
 from ghgs_lit.data.view import View
+from ghgs_lit.data.workers import loader_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.silhouettes import Silhouette
-from ghgs_lit.kernels.cores import use_known_start_method
 
 _LINE = re.compile(r"(?P<place>.*?): expected (?P<expected>.*); found (?P<found>.*)", re.DOTALL)
 # Rows of a table on the terminal; check.json has all.
@@ -158,7 +158,7 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
             report.problems.append(str(error))
             continue
         photographs = Photographs(reader, None, min(dataset.cache_images_mb, _CACHE_MB))
-        found = Phase(reader, _read(photographs, targets, min_iou, dataset.workers, f"checking {phase}"))
+        found = Phase(reader, _read(photographs, targets, min_iou, data, f"checking {phase}"))
         _compare_masks(found.seen, reader, min_agreement)
         report.phases[phase] = found
         report.problems += reader.problems + [seen.problem for seen in found.seen if seen.problem]
@@ -174,7 +174,11 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
 
 
 def _read(
-    photographs: Photographs, targets: TargetProtocol, min_iou: float, workers: int, label: str
+    photographs: Photographs,
+    targets: TargetProtocol,
+    min_iou: float,
+    data: PhotographsDataModule,
+    label: str,
 ) -> list[Seen]:
     reader = photographs.reader
     # Views that the protocol may ask for are read even if no file of theirs exists.
@@ -184,8 +188,7 @@ def _read(
     if not listed:
         return []
     items = _Readings(photographs, listed, _pictured(reader), min_iou)
-    use_known_start_method()
-    loader = DataLoader(items, batch_size=None, num_workers=min(workers, len(items)))
+    loader = loader_of(items, min(data.workers(len(items)), len(items)))
     return list(track(loader, label, total=len(items), console=Console(stderr=True)))
 
 

@@ -3,17 +3,16 @@
 import dataclasses
 import logging
 import math
-import warnings
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from lightning import LightningDataModule, Trainer
 from torch.utils.data import DataLoader
-from torch.utils.data import Dataset as TorchDataset
 
 from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.batches import BatchBuilder, EvaluationBatches, StepSampler, TrainingBatches
+from ghgs_lit.data.options import LoadingOptions
 from ghgs_lit.data.packed import Packing, folder_of, packed_reader
 from ghgs_lit.data.reader import PHASES, Photographs
 from ghgs_lit.data.sampling import (
@@ -24,12 +23,9 @@ from ghgs_lit.data.sampling import (
     ViewProtocol,
     evaluation_samples,
 )
+from ghgs_lit.data.workers import automatic_workers, loader_of
 from ghgs_lit.errors import InputError, choice
-from ghgs_lit.kernels.cores import use_known_start_method
 from ghgs_lit.types import Batch
-
-if TYPE_CHECKING:  # its options build this class
-    from ghgs_lit.data.dataset import DataOptions
 
 log = logging.getLogger(__name__)
 
@@ -72,7 +68,7 @@ class PhotographsDataModule(LightningDataModule):
 
     def __init__(
         self,
-        dataset: "DataOptions",
+        dataset: LoadingOptions,
         views: ViewProtocol | Mapping[str, Any],
         targets: Targets,
         seed: int = 0,
@@ -137,12 +133,11 @@ class PhotographsDataModule(LightningDataModule):
         builder = dataclasses.replace(builder or self.builder("train"), depths=self.trains_on_depths)
         return TrainingBatches(builder, sampler, self.augmentation, length, rank, world)
 
-    def _packed_builder(self, length: int, rank: int) -> BatchBuilder:
-        """Builder of training batches that reads packed files. ``length``: batches of an epoch."""
+    def _packed_builder(self, batches: float, rank: int) -> BatchBuilder:
+        """Builder of training batches that reads packed files. ``batches``: those of the whole run."""
         plain = self.builder("train")
-        steps = planned_batches(self.trainer, length)
         views = max(self.views.training_counts) + self.targets.per_step
-        reads = steps * self.dataset.batch_size * views
+        reads = batches * self.dataset.batch_size * views
         inputs = self._packed(plain.inputs, self.trains_on_depths, reads, rank)
         if plain.targets is plain.inputs:
             return BatchBuilder(inputs, inputs)
@@ -183,10 +178,14 @@ class PhotographsDataModule(LightningDataModule):
         rank = self.trainer.global_rank if self.trainer else 0
         once = math.ceil(len(sampler.subjects) / (self.dataset.batch_size * world))
         length = self.dataset.steps_per_epoch or once
-        batches = self._training_batches(sampler, length, rank, world, self._packed_builder(length, rank))
-        return self._loader(
-            batches, sampler=StepSampler(batches, lambda: trained_batches(self.trainer, length))
-        )
+        planned = planned_batches(self.trainer, length)
+        builder = self._packed_builder(planned, rank)
+        batches = self._training_batches(sampler, length, rank, world, builder)
+        workers = self.workers(planned)
+        if self.dataset.workers == "auto" and rank == 0:
+            log.info("data.workers=auto: %d loading processes beside each that trains", workers)
+        steps = StepSampler(batches, lambda: trained_batches(self.trainer, length))
+        return loader_of(batches, workers, sampler=steps)
 
     def evaluation_loader(
         self,
@@ -201,7 +200,7 @@ class PhotographsDataModule(LightningDataModule):
         protocols = _protocols(self.targets if targets is None else targets)
         specs = self._evaluation_samples(self.subjects(split), protocols, views)
         batches = EvaluationBatches(self.builder(split), specs, batch_size or self.dataset.batch_size)
-        return self._loader(batches)
+        return loader_of(batches, self.workers(len(batches)))
 
     def evaluation_batch(
         self,
@@ -234,16 +233,11 @@ class PhotographsDataModule(LightningDataModule):
             )
         return targets
 
-    def _loader(self, batches: TorchDataset, **options: Any) -> DataLoader:
-        use_known_start_method()
-        with warnings.catch_warnings():
-            # Each loader would warn of more workers than cores, which were asked for.
-            warnings.filterwarnings("ignore", "This DataLoader will create")
-            return DataLoader(
-                batches,
-                batch_size=None,
-                num_workers=self.dataset.workers,
-                persistent_workers=self.dataset.workers > 0,
-                pin_memory=torch.cuda.is_available(),
-                **options,
-            )
+    def workers(self, batches: float) -> int:
+        """Number of loading processes for this many batches, where ``data.workers`` does not say it."""
+        if self.dataset.workers != "auto":
+            return self.dataset.workers
+        if self.trainer is None:
+            return automatic_workers(batches, 1, torch.cuda.is_available())
+        on_gpu = self.trainer.strategy.root_device.type != "cpu"
+        return automatic_workers(batches, self.trainer.num_devices, on_gpu)

@@ -1,19 +1,13 @@
 """Options of data sets: location, reading and batching."""
 
-from abc import abstractmethod
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
-
-from pydantic import Field
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from ghgs_lit.config import options
-from ghgs_lit.config.options import Amount, Count, Index, Options, Size, Text, Workers
+from ghgs_lit.config.options import Count, Options
 from ghgs_lit.data.augmentation import Augmentation
-from ghgs_lit.data.reader import PHASES, Reader
+from ghgs_lit.data.options import LoadingOptions
 from ghgs_lit.data.sampling import TargetProtocol, ViewProtocol
-from ghgs_lit.errors import InputError
-from ghgs_lit.readers import require_folder
 
 if TYPE_CHECKING:  # it imports Lightning, which takes seconds
     from ghgs_lit.data.datamodule import PhotographsDataModule
@@ -32,38 +26,8 @@ class Limit(Options):
         return getattr(self, phase, None)
 
 
-class DataOptions(Options):
-    """Base options of data sets. ``published``: number of people of each phase in the publication, if any.
-    ``static_cameras``: whether there are no views between the cameras (view numbers are 0). ``ring``: number
-    of positions on a full ring of cameras, among which inputs are evenly spaced."""
-
-    group = "data"
-    published: ClassVar[Mapping[str, int]] = {}
-    static_cameras: ClassVar[bool] = False
-    ring: ClassVar[int] = 16
-
-    name: Text
-    """Name of the data set in results and messages."""
-    size: Size
-    """Side or [height, width] of the inputs in pixels."""
-    target_size: Size | None = None
-    """Side or [height, width] of the targets in pixels; null: as size."""
-    resampling: Literal["area", "release"] = "area"
-    """area: means over exact areas, everything stays at its place. release: as the authors' code reads
-    (photographs by Pillow's bicubic filter, masks by OpenCV's nearest neighbour)."""
-    batch_size: int = Field(1, ge=1, le=1024)
-    """Samples of one step in each process, all in memory at once: at most 1024."""
-    steps_per_epoch: Count | None = None
-    """Training steps of an epoch; null: one pass over the subjects."""
-    cache_images_mb: Amount = 512
-    """MiB of decoded photographs kept in memory by each process."""
-    packed_gb: Amount = 16
-    """Largest size in GB (10^9 bytes) of the decoded photographs of training that are kept on the disk, in
-    the data's folder or the user's cache, and mapped into memory; 0: none are."""
-    evaluation_positions: tuple[tuple[Index, ...], ...] = ()
-    """Lists of input positions, such as [[0, 6, 11]] for 3 views; other numbers of views: evenly spaced."""
-    workers: Workers = 0
-    """Loading processes; 0: none."""
+class DataOptions(LoadingOptions):
+    """Options of data sets, which build their data module."""
 
     def build(
         self,
@@ -77,47 +41,6 @@ class DataOptions(Options):
 
         return PhotographsDataModule(self, views, targets, seed, augmentation)
 
-    @abstractmethod
-    def reader(self, phase: str, strict: bool = True) -> Reader:
-        """Reader of a split; ``strict`` as for :class:`Reader`."""
-
-    def has(self, phase: str) -> bool:
-        """Whether a phase has subjects; data without ``train`` can be evaluated."""
-        return True
-
-    @property
-    def split_names(self) -> tuple[str, ...]:
-        """Names of the splits: ``train``, ``val``, and further ones for evaluation."""
-        return PHASES
-
-    def prepare(self, splits: Sequence[str] = PHASES) -> None:
-        """Make missing data of these splits; called once, before any process reads."""
-        return
-
-    def make(self) -> None:
-        """Make all data that can be made (``ghgs prepare task=render``)."""
-        self.prepare()
-
-    def check_targets(self, targets: TargetProtocol) -> None:
-        """Refuse a target protocol whose views this data set never has."""
-        return
-
-    @property
-    def folder(self) -> Path:
-        """Folder of the data, ``root`` of a subclass. InputError: ``data.root`` is null or not a folder."""
-        folder = required_folder("data.root", "the folder of the data set", self.root)
-        require_folder(folder)
-        return folder
-
-    @property
-    def facts(self) -> dict[str, str]:
-        """Provenance of the files for results."""
-        return {"name": self.name}
-
-    def split_facts(self, split: str) -> dict[str, str]:
-        """Provenance of a split for results."""
-        return {"split": split}
-
 
 class DataSet(DataOptions):
     """Options of a data set in the user's folder."""
@@ -126,10 +49,3 @@ class DataSet(DataOptions):
     """Folder of the data."""
     limit: Limit = Limit()
     """Subjects used of each phase."""
-
-
-def required_folder(key: str, expected: str, value: str | None) -> Path:
-    """Path configured at ``key``, which need not exist. InputError: it is null."""
-    if value is None:
-        raise InputError(f"{key}: expected {expected}; found null")
-    return Path(value).expanduser()

@@ -4,6 +4,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 from ghgs_lit.data.datamodule import trained_batches
 from ghgs_lit.data.humman.dataset import HuMMan
@@ -94,6 +95,8 @@ def test_each_process_of_several_loads_its_own_samples(boxes, rank):
     """Its number and how many there are come from the trainer: four subjects, two steps."""
     data = rendered(boxes, batch_size=1)
     data.trainer = SimpleNamespace(world_size=2, global_rank=rank, max_steps=-1, max_epochs=None)
+    data.trainer.num_devices = 2
+    data.trainer.strategy = SimpleNamespace(root_device=torch.device("cpu"))
     batches = data.train_dataloader().dataset
     assert (batches.rank, batches.world, len(batches)) == (rank, 2, 2)
     drawn = data.training_sampler()

@@ -3,7 +3,6 @@
 import os
 import time
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import hydra
@@ -55,11 +54,10 @@ def job(cfg) -> float | str | None:
 
 def load_and_record(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float:
     """:func:`record_execution` after two batches."""
-    if workers := config["data"]["workers"]:
-        from ghgs_lit.data.datamodule import PhotographsDataModule
+    if config["data"]["workers"] != "auto":
+        from ghgs_lit.data.workers import loader_of
 
-        data = SimpleNamespace(dataset=SimpleNamespace(workers=workers))
-        assert list(PhotographsDataModule._loader(data, [1, 2])) == [1, 2]
+        assert list(loader_of([1, 2], config["data"]["workers"])) == [1, 2]
     return record_execution(config, directory, stats)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from ghgs_lit.config import options
-from ghgs_lit.config.options import Count, Index, Options, Size, Text, Workers
+from ghgs_lit.config.options import Count, Index, Options, Size, Text
 from ghgs_lit.data.dataset import DataSet
 from ghgs_lit.data.decoding import (
     check_array,
@@ -179,7 +179,6 @@ class HuMMan(DataSet):
 
     name: Text = "humman"
     size: Size = (360, 640)
-    workers: Workers = 8
     split: SequenceNames
     """Sequences of each phase."""
     frames: tuple[Index, Index, Count] = (0, 97, 6)

@@ -15,7 +15,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from ghgs_lit.config.options import Count, Index, Options, Size, Text, Workers
+from ghgs_lit.config.options import Count, Index, Options, Size, Text
 from ghgs_lit.data.dataset import DataSet
 from ghgs_lit.data.decoding import check_center, check_name, read_array, read_map, read_photograph
 from ghgs_lit.data.reader import FrameReader
@@ -179,7 +179,6 @@ class ZJUMoCap(DataSet):
 
     name: Text = "zju_mocap"
     size: Size = (512, 512)
-    workers: Workers = 8
     split: FramesByPhase
     """Sequences of each phase, and which of their frames."""
     cameras: Annotated[int, Field(ge=2)] | None = 20
