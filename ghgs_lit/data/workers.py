@@ -1,6 +1,7 @@
 """Processes that load batches: how many there are, how they start and how they end."""
 
 import multiprocessing
+import signal
 import warnings
 from typing import Any
 
@@ -56,5 +57,11 @@ def loader_of(batches: Dataset, workers: int, **options: Any) -> DataLoader:
             num_workers=workers,
             persistent_workers=workers > 0,
             pin_memory=torch.cuda.is_available(),
+            worker_init_fn=_leave_interrupts,
             **options,
         )
+
+
+def _leave_interrupts(number: int) -> None:
+    """Ctrl-C reaches every process of a terminal; the one that trains ends the others."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

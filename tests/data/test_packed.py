@@ -32,7 +32,7 @@ def root(boxes, tmp_path) -> Path:
 
 def batches(root, gb=1, **options):
     """The first steps of a training."""
-    data = rendered(root, packed_gb=gb, **{"steps_per_epoch": 4, "batch_size": 2, **options})
+    data = rendered(root, packed_gb=gb, **{"steps_per_epoch": 4, "batch_size": 2, "workers": 0, **options})
     return list(data.train_dataloader())
 
 
@@ -197,7 +197,7 @@ def test_short_trainings_write_nothing(root):
     from lightning import Trainer
 
     def steps(count):
-        data = rendered(root, steps_per_epoch=4)
+        data = rendered(root, steps_per_epoch=4, workers=0)
         data.trainer = Trainer(max_steps=count, accelerator="cpu", logger=False, enable_checkpointing=False)
         return data.train_dataloader()
 
