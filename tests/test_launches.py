@@ -34,12 +34,12 @@ _VERSION = "2.13."
 LIMITS = {
     ("model=paper", 1): Asked(1617, 3, 3090, 4),
     ("model=paper", 8): Asked(1772, 3, 3314, 4),
-    ("model=hull", 1): Asked(1977, 3, 3504, 4),
-    ("model=hull", 8): Asked(2132, 3, 3729, 4),
-    ("model=recurrent", 1): Asked(2752, 4, 4545, 5),
-    ("model=recurrent", 8): Asked(2954, 4, 4817, 5),
-    ("shipped", 1): Asked(2960, 4, 4545, 5),
-    ("shipped", 8): Asked(3173, 4, 4817, 5),
+    ("model=hull", 1): Asked(1823, 3, 3350, 4),
+    ("model=hull", 8): Asked(1978, 3, 3575, 4),
+    ("model=recurrent", 1): Asked(2444, 4, 4237, 5),
+    ("model=recurrent", 8): Asked(2646, 4, 4509, 5),
+    ("shipped", 1): Asked(2592, 4, 4237, 5),
+    ("shipped", 8): Asked(2805, 4, 4509, 5),
 }
 
 

@@ -9,9 +9,10 @@ from torch import Tensor
 from ghgs_lit.geometry import cpu
 from ghgs_lit.geometry.masks import surface_colors
 from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, pixel_centers, sample
+from ghgs_lit.kernels import gpu
 from ghgs_lit.kernels.pool import even_parts, is_supported
 from ghgs_lit.kernels.precision import exact
-from ghgs_lit.types import Batch, Cameras, DepthBounds
+from ghgs_lit.types import Batch, DepthBounds
 
 #: Samples in memory at once.
 _SAMPLES = 1 << 22
@@ -42,22 +43,56 @@ def consistency_of(
     """:func:`photo_consistency` of some pixels of the subject. ``pixels``: ascending indices among those of
     all images. ``near``, ``far``: bounds of these pixels in metres."""
     near, far = at_least_float32(near), at_least_float32(far)
-    shares = (torch.arange(steps, device=near.device, dtype=near.dtype) + 0.5) / steps
     # An error of half a pixel, as in bfloat16, would give another colour.
     with exact(batch.masks.device.type):
         views = [x.to(near) if x.is_floating_point() else x for x in batch.once(_pairs)]
-        if is_supported(near, far):
-            size = tuple(batch.masks.shape[2:])
+        on_gpu = gpu.is_supported(near, far)
+        if not on_gpu and is_supported(near, far):
+            size, shares = tuple(batch.masks.shape[2:]), _shares(steps, near)
             return cpu.sweep(batch.once(_padded), pixels, near, far, size, *views, shares, TOLERANCE)
-        colors, result = batch.once(_smooth).to(near), near.new_zeros(len(pixels), steps)
-        for part in even_parts(len(pixels), _SAMPLES // (steps * (batch.masks.shape[1] - 1))):
-            depth = near[part, None] + (far - near)[part, None] * shares
-            result[part] = _best_match(pixels[part], depth, colors, *views)
-        return result
+        sweep = _sweep if on_gpu else _swept
+        return sweep(pixels, near, far, batch.once(_smooth).to(near), *views, steps, TOLERANCE)
+
+
+def _shares(steps: int, like: Tensor) -> Tensor:
+    """Middles of ``steps`` equal parts of the way from near to far."""
+    return (torch.arange(steps, device=like.device, dtype=like.dtype) + 0.5) / steps
+
+
+def _swept(
+    pixels: Int[Tensor, " N"],
+    near: Float[Tensor, " N"],
+    far: Float[Tensor, " N"],
+    colors: Float[Tensor, "B V 4 H W"],
+    turn: Float[Tensor, "B V V 3 3"],
+    shift: Float[Tensor, "B V V 3"],
+    compared: Bool[Tensor, "B V V"],
+    steps: int,
+    tolerance: float,
+) -> Float[Tensor, "N S"]:
+    """:func:`consistency_of` in plain PyTorch.
+
+    Args:
+        pixels: indices among those of all images.
+        near: least depths in metres.
+        far: largest depths in metres.
+        colors: smoothed photographs and their masks (:func:`_smoothed`).
+        turn: matrices from pixels of a view (second axis) to another (third axis), as is the next.
+        shift: what is added in the other view.
+        compared: whether two views are compared.
+        steps: S, the number of depths.
+        tolerance: mean difference of colours at which the agreement is 1 / e."""
+    shares, result = _shares(steps, near), near.new_zeros(len(pixels), steps)
+    for part in even_parts(len(pixels), _SAMPLES // (steps * (colors.shape[1] - 1))):
+        depth = near[part, None] + (far - near)[part, None] * shares
+        result[part] = _best_match(pixels[part], depth, colors, turn, shift, compared, tolerance)
+    return result
 
 
 def _pairs(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
-    turn, shift, facing = _relations(batch.cameras)
+    cameras = [at_least_float32(x) for x in (batch.cameras.intrinsics, batch.cameras.extrinsics)]
+    relate = _relate if gpu.is_supported(*cameras) else _relations
+    turn, shift, facing = relate(*cameras)
     return turn, shift, ~(facing < WIDEST)
 
 
@@ -72,8 +107,9 @@ def _best_match(
     turn: Float[Tensor, "B V V 3 3"],
     shift: Float[Tensor, "B V V 3"],
     compared: Bool[Tensor, "B V V"],
+    tolerance: float,
 ) -> Float[Tensor, "n S"]:
-    """Agreement of pixels of any images, at their depths, with the best other view."""
+    """Agreement of pixels of any images, at their depths, with the best other view; see :func:`_swept`."""
     views, _, height, width = colors.shape[1:]
     image, place = pixels // (height * width), pixels % (height * width)
     centers = F.pad(pixel_centers(height, width, depth).flatten(0, 1)[place], (0, 1), value=1.0)
@@ -83,11 +119,19 @@ def _best_match(
     pair = image[:, None] * views + k
     rays = (turn.flatten(0, 2)[pair] * centers[:, None, None]).sum(-1)
     other = image[:, None] // views * views + k
-    found = _match(flat, other, own, rays, shift.flatten(0, 2)[pair], depth)
+    found = _match(flat, other, own, rays, shift.flatten(0, 2)[pair], depth, tolerance)
     return torch.where(compared.flatten()[pair][..., None], found, 0).amax(1)
 
 
-def _match(images: Tensor, image: Tensor, own: Tensor, rays: Tensor, shift: Tensor, depth: Tensor) -> Tensor:
+def _match(
+    images: Tensor,
+    image: Tensor,
+    own: Tensor,
+    rays: Tensor,
+    shift: Tensor,
+    depth: Tensor,
+    tolerance: float,
+) -> Tensor:
     """Agreement [n, o, S] of colours ``own`` [n, 3] with ``images`` [m, 4, H, W]. ``image``: [n, o], those
     that each pixel is compared with. ``rays``, ``shift``: [n, o, 3], in these. ``depth``: [n, S]."""
     points = rays[:, :, None] * depth[:, None, :, None] + shift[:, :, None]
@@ -96,14 +140,20 @@ def _match(images: Tensor, image: Tensor, own: Tensor, rays: Tensor, shift: Tens
     pixels = points[..., :2] / torch.where(front, z, 1.0)[..., None]
     seen = sample(images, image[..., None].expand(z.shape), pixels)
     difference = (seen[..., :3] - own[:, None, None]).abs().mean(-1)
-    return torch.exp(-difference / TOLERANCE) * seen[..., 3] * front
+    return torch.exp(-difference / tolerance) * seen[..., 3] * front
 
 
 def _smooth(batch: Batch) -> Tensor:
+    images = batch.once(surface_colors)
+    return (_smoothing if gpu.is_supported(images) else _smoothed)(images, batch.masks)
+
+
+def _smoothed(
+    images: Float[Tensor, "B V 3 H W"], masks: Bool[Tensor, "B V H W"]
+) -> Float[Tensor, "B V 4 H W"]:
     """Mean colours of the subject's pixels in 3 x 3, and the mask as a fourth channel. Pixels that are not
     finite are left out of the mask: they would spread through sums and samples."""
-    images = batch.once(surface_colors)
-    inside = (batch.masks & images.sum(2).isfinite())[:, :, None]
+    inside = (masks & images.sum(2).isfinite())[:, :, None]
     both = torch.cat((torch.where(inside, images, 0), inside.to(images.dtype)), 2)
     for axis in (-2, -1):  # several times as fast as an average pool
         both = _sum_of_three(both, axis)
@@ -120,12 +170,26 @@ def _sum_of_three(values: Tensor, axis: int) -> Tensor:
     return found
 
 
-def _relations(cameras: Cameras) -> tuple[Tensor, Tensor, Tensor]:
+def _relations(
+    intrinsics: Float[Tensor, "B V 3 3"], extrinsics: Float[Tensor, "B V 4 4"]
+) -> tuple[Tensor, Tensor, Tensor]:
     """``turn`` and ``shift`` [B, j, k] in ``z_k p_k = z_j turn p_j + shift`` for pixels ``p`` of views j and
     k, and the cosine between the axes of the views."""
-    intrinsics, extrinsics = at_least_float32(cameras.intrinsics), at_least_float32(cameras.extrinsics)
     rotation, translation = extrinsics[..., :3, :3], extrinsics[..., :3, 3:]
     relative = rotation[:, None] @ rotation[:, :, None].mT
     turn = intrinsics[:, None] @ relative @ inverse_intrinsics(intrinsics)[:, :, None]
     shift = intrinsics[:, None] @ (translation[:, None] - relative @ translation[:, :, None])
-    return turn, shift[..., 0], relative[..., 2, 2]
+    return turn, shift[..., 0], relative[..., 2, 2].clone()
+
+
+_KERNELS = "ghgs_lit.geometry.cuda"
+_relate = gpu.operator(
+    "relations(Tensor intrinsics, Tensor extrinsics) -> (Tensor, Tensor, Tensor)", _relations, _KERNELS
+)
+_smoothing = gpu.operator("smoothed(Tensor images, Tensor masks) -> Tensor", _smoothed, _KERNELS)
+_sweep = gpu.operator(
+    "swept(Tensor pixels, Tensor near, Tensor far, Tensor colors, Tensor turn, Tensor shift, "
+    "Tensor compared, int steps, float tolerance) -> Tensor",
+    _swept,
+    _KERNELS,
+)

@@ -1,14 +1,21 @@
 """What kernels in Triton share: functions of tiles, which hold one number for each row. Only kernels import
 it, since no other PyTorch than CUDA's comes with Triton."""
 
+from typing import Any
+
 import triton
 import triton.language as tl
 from torch import Tensor
 
+#: Rows of a program.
+ROWS = 128
 
-def contiguous(*tensors: Tensor | None) -> list[Tensor | None]:
-    """The tensors as kernels read them."""
-    return [None if x is None else x.contiguous() for x in tensors]
+
+def start(kernel: Any, count: int, *arguments: Any, **flags: bool) -> None:
+    """Start ``kernel(count, *arguments, **flags, ROWS=ROWS)`` for ``count`` rows, with contiguous tensors."""
+    if count > 0:
+        read = [x.contiguous() if isinstance(x, Tensor) else x for x in arguments]
+        kernel[(triton.cdiv(count, ROWS),)](count, *read, **flags, ROWS=ROWS)
 
 
 @triton.jit
@@ -77,13 +84,15 @@ def to_camera(extrinsics, view, x, y, z):
 
 @triton.jit
 def cells(place, size):
-    """The two cells around a place along an axis of a map, and their weights: 0 beyond its border."""
-    first = tl.floor(place - 0.5)
-    share = place - 0.5 - first
-    at = first.to(tl.int32)
-    before = tl.where(at >= 0, 1 - share, 0.0)
-    after = tl.where(at < size - 1, share, 0.0)
-    return tl.maximum(at, 0), tl.minimum(at + 1, size - 1), before, after
+    """The two cells around a place along an axis of a map, and their weights: 0 beyond its border. NaN, and
+    places far away, are beyond it."""
+    place = tl.where(place > -2, tl.where(place < size + 2, place, size + 2), -2) - 0.5
+    first = tl.floor(place)
+    share, at = place - first, first.to(tl.int32)
+    before = tl.where((at >= 0) & (at < size), 1 - share, 0.0)
+    after = tl.where((at >= -1) & (at < size - 1), share, 0.0)
+    left, right = tl.maximum(tl.minimum(at, size - 1), 0), tl.maximum(tl.minimum(at + 1, size - 1), 0)
+    return left, right, before, after
 
 
 @triton.jit

@@ -3,15 +3,13 @@
 Formulas are those of :mod:`ghgs_lit.heads.activations` and :mod:`ghgs_lit.heads.surface`. A Gaussian reads at
 most 45 numbers, so that its gradient computes again what it needs."""
 
-import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
 from ghgs_lit.heads import activations, surface
-from ghgs_lit.kernels.tiles import clamp, contiguous, load3, load4, rows_of, store3, store4, tanh
+from ghgs_lit.kernels.tiles import clamp, load3, load4, rows_of, start, store3, store4, tanh
 
-ROWS = 128
 SIGMOID, TANH = tl.constexpr(activations.SIGMOID_LIMIT), tl.constexpr(activations.TANH_LIMIT)
 SHORTEST = tl.constexpr(activations.SHORTEST)
 FAR, RANGE = tl.constexpr(surface.OTHER), tl.constexpr(surface.OTHER - surface.SAME)
@@ -147,8 +145,8 @@ def _offset_back(slope, x, limit, unit, HAS_LIMIT: tl.constexpr):
 
 @triton.jit
 def activate_rows(
-    offset, scale, rotation, opacity, color, image, pixel, depth, valid, points, photo, share, intrinsics,
-    extrinsics, means, quaternions, scales, opacities, colors, count, height, width,
+    count, offset, scale, rotation, opacity, color, image, pixel, depth, valid, points, photo, share,
+    intrinsics, extrinsics, means, quaternions, scales, opacities, colors, height, width,
     limit, unit, inward, floor, span, across, thickness, least, bias, change,
     HAS_LIMIT: tl.constexpr, HAS_COLOR: tl.constexpr, HAS_SHARE: tl.constexpr, ON_SURFACE: tl.constexpr,
     ROWS: tl.constexpr,
@@ -185,9 +183,9 @@ def activate_rows(
 
 @triton.jit
 def activate_back_rows(
-    offset, scale, rotation, opacity, color, image, pixel, depth, valid, share, intrinsics, extrinsics,
+    count, offset, scale, rotation, opacity, color, image, pixel, depth, valid, share, intrinsics, extrinsics,
     of_means, of_quaternions, of_scales, of_opacities, of_colors,
-    d_offset, d_scale, d_rotation, d_opacity, d_color, d_points, count, height, width,
+    d_offset, d_scale, d_rotation, d_opacity, d_color, d_points, height, width,
     limit, unit, inward, floor, span, across, thickness, least, bias, change,
     HAS_LIMIT: tl.constexpr, HAS_COLOR: tl.constexpr, HAS_SHARE: tl.constexpr, ON_SURFACE: tl.constexpr,
     ROWS: tl.constexpr,
@@ -229,32 +227,28 @@ def activate_back_rows(
     tl.store(d_opacity + i, _back(slope, _sigmoid(raw)[1], raw, SIGMOID))
 
 
-def _start(kernel, tensors, maps: Tensor, count: int, constants, color, share, on_surface: bool) -> None:
-    """Launch ``kernel`` for ``count`` Gaussians."""
+def _flags(constants: list[float], color: Tensor | None, share: Tensor | None, on_surface: bool) -> dict:
     flags = {"HAS_LIMIT": constants[0] > 0, "HAS_COLOR": color is not None, "HAS_SHARE": share is not None}
-    if count > 0:
-        kernel[(triton.cdiv(count, ROWS),)](
-            *tensors, count, *maps.shape[-2:], *constants, **flags, ON_SURFACE=on_surface, ROWS=ROWS
-        )
+    return {**flags, "ON_SURFACE": on_surface}
 
 
 def activate(*inputs) -> tuple[Tensor, ...]:
     """The operator of :mod:`ghgs_lit.heads.cuda`."""
     *tensors, constants, on_surface = inputs
-    tensors = contiguous(*tensors)
     offset, color, image, depth, share = (tensors[k] for k in (0, 4, 5, 7, 11))
     out = [offset.new_empty(len(image), *size) for size in ((3,), (4,), (3,), (), (3,))]
-    _start(activate_rows, (*tensors, *out), depth, len(image), constants, color, share, on_surface)
+    flags = _flags(constants, color, share, on_surface)
+    start(activate_rows, len(image), *tensors, *out, *depth.shape[-2:], *constants, **flags)
     return tuple(out)
 
 
 def activate_back(*inputs) -> list[Tensor]:
     """The operator of :mod:`ghgs_lit.heads.cuda`."""
     *tensors, constants, on_surface, slopes = inputs
-    tensors = contiguous(*tensors)
     offset, color, image, depth, points, share = (tensors[k] for k in (0, 4, 5, 7, 9, 11))
-    found = [offset.new_empty(0) if x is None else torch.empty_like(x) for x in tensors[:5]]
-    found.append(torch.zeros_like(points))
-    given = (*tensors[:9], *tensors[11:], *contiguous(*slopes), *found)
-    _start(activate_back_rows, given, depth, len(image), constants, color, share, on_surface)
+    found = [offset.new_empty(0 if x is None else x.shape) for x in tensors[:5]]
+    found.append(points.new_zeros(points.shape))
+    given = (*tensors[:9], *tensors[11:], *slopes, *found)
+    flags = _flags(constants, color, share, on_surface)
+    start(activate_back_rows, len(image), *given, *depth.shape[-2:], *constants, **flags)
     return found

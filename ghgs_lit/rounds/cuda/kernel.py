@@ -5,16 +5,15 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from ghgs_lit.kernels.tiles import between, cells, contiguous, load3, rows_of, tanh, to_camera
+from ghgs_lit.kernels.tiles import between, cells, load3, rows_of, start, tanh, to_camera
 
-ROWS = 128
 CHANNELS = tl.constexpr(11)
 
 
 @triton.jit
 def observe_rows(
-    means, colors, image, intrinsics, extrinsics, photo, mask, drawn, alpha, depth, out,
-    count, views, height, width, scale, ROWS: tl.constexpr,
+    count, means, colors, image, intrinsics, extrinsics, photo, mask, drawn, alpha, depth, out,
+    views, height, width, scale, ROWS: tl.constexpr,
 ):  # fmt: skip
     """Write ``ROWS`` rows of ``out`` [N, V, 11]; ``count``: N V. See :func:`observe`."""
     i = rows_of(count, ROWS)
@@ -29,10 +28,10 @@ def observe_rows(
     x, y = x / tl.where(is_front, z, 1.0), y / tl.where(is_front, z, 1.0)
     u, v = fx * x + skew * y + cx, fy * y + cy
     can_see = is_front & (u >= 0) & (u <= width) & (v >= 0) & (v <= height)
-    left, right, before, after = cells(tl.where(can_see, u, 0.0), width)
-    top, bottom, above, below = cells(tl.where(can_see, v, 0.0), height)
+    left, right, before, after = cells(u, width)
+    top, bottom, above, below = cells(v, height)
     top, bottom = top * width, bottom * width
-    area = height.to(tl.int64) * width
+    area = height * width
     row = out + i * CHANNELS
     for k in tl.static_range(3):
         plane = (3 * view + k) * area
@@ -57,9 +56,5 @@ def observe(*inputs) -> Tensor:
     means, photo = tensors[0], tensors[5]
     views, _, height, width = photo.shape[1:]
     out = means.new_empty(len(means), views, CHANNELS.value)
-    rows = len(means) * views
-    if rows > 0:
-        observe_rows[(triton.cdiv(rows, ROWS),)](
-            *contiguous(*tensors), out, rows, views, height, width, scale, ROWS=ROWS
-        )
+    start(observe_rows, len(means) * views, *tensors, out, views, height, width, scale)
     return out

@@ -1,0 +1,1 @@
+"""Photo-consistency for GPUs: one kernel for all depths of all pixels."""
