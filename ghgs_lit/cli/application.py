@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.cli import messages
 from ghgs_lit.config import VERSION_BASE, conf_dir
-from ghgs_lit.config.compose import check_ablation, plain, read_verb
+from ghgs_lit.config.compose import check_ablation, plain, read_verb, store_defaults
 from ghgs_lit.config.outside import check_outside_files
 from ghgs_lit.config.registry import check, verb_class
 from ghgs_lit.files import require_no_links, write_text_atomically
@@ -119,6 +119,7 @@ def run(verb: str, argv: list[str]) -> int:
             return _help(verb, overrides, found.config_dir)
         sys.argv = [argv[0], *flags, messages.NO_FILES_OF_HYDRA, *_for_hydra(verb, overrides)]
         messages.check_deletions(overrides)
+        store_defaults(verb)
         with interruptible():
             hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=verb)(task)()
         sys.stdout.flush()

@@ -22,6 +22,8 @@ _OF_MODELS = ("bounds", "depth_head", "unprojection", "recalibration", "gaussian
 
 def defaults_of(verb: str) -> dict[str, str | None]:
     """Default option of each config group that a verb composes; None where there is none."""
+    if not (conf_dir() / f"{verb}.yaml").is_file():  # a plug-in's, with its own keys alone
+        return {}
     shipped = OmegaConf.to_container(OmegaConf.load(conf_dir() / f"{verb}.yaml"))
     chosen: dict[str, str | None] = {}
     for entry in shipped["defaults"]:

@@ -6,13 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import hydra
+from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf
+from pydantic import BaseModel
 
 from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.config.options import did_you_mean
-from ghgs_lit.config.registry import KINDS, check, verb_class
+from ghgs_lit.config.registry import KINDS, check, verb_class, verbs
 from ghgs_lit.errors import InputError, require
 
 if TYPE_CHECKING:
@@ -58,8 +60,29 @@ def _is_own() -> bool:
     return any(entry.path.removeprefix("file://") == str(conf_dir()) for entry in searched)
 
 
+def store_defaults(verb: str) -> None:
+    """Give Hydra the configuration of a plug-in's verb: its own keys, at their defaults.
+
+    A file ``<verb>.yaml`` in ``--config-dir`` comes before it, and may add groups.
+    """
+    if (conf_dir() / f"{verb}.yaml").is_file():
+        return
+    node: dict[str, Any] = {"defaults": ["_self_", {"override hydra/output": "ghgs"}]}
+    for name, field in verb_class(verb).model_fields.items():
+        default = field.get_default(call_default_factory=True)
+        if field.is_required():
+            default = MISSING
+        elif isinstance(default, BaseModel):
+            default = default.model_dump(mode="json")
+        node[name] = list(default) if isinstance(default, tuple) else default
+    node["hydra"] = {"job": {"name": verb}}
+    ConfigStore.instance().store(name=verb, node=node)
+
+
 def compose(verb: str, overrides: Sequence[str] = (), with_hydra: bool = False) -> DictConfig:
     """The configuration of ``ghgs <verb> <overrides>``, with or without the node ``hydra``."""
+    if verb in verbs():
+        store_defaults(verb)
     with _application():
         return hydra.compose(verb, overrides=list(overrides), return_hydra_config=with_hydra)
 

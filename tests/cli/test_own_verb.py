@@ -1,0 +1,70 @@
+"""A verb of one's own: one class in a file outside of the package."""
+
+import sys
+
+import pytest
+
+from ghgs_lit.config import registry
+from tests.helpers.verbs import ghgs
+
+FILE = '''
+from ghgs_lit.cli.verb import Verb
+from ghgs_lit.config.options import Count, Text
+from ghgs_lit.config.registry import register_verb
+
+
+@register_verb("greet")
+class Greet(Verb):
+    """Greet somebody, several times."""
+
+    example = "ghgs greet name=Ada"
+
+    name: Text
+    """Who is greeted."""
+    times: Count = 2
+    """How often."""
+
+    def run(self, cfg):
+        print(" ".join([f"hello {self.name}"] * self.times))
+'''
+
+
+@pytest.fixture(autouse=True)
+def plug_in(tmp_path, monkeypatch):
+    """The file in the user's folder, which the environment names."""
+    (tmp_path / "own_verb.py").write_text(FILE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(registry, "_REGISTERED", dict(registry._REGISTERED))
+    monkeypatch.setenv(registry.VARIABLE, "own_verb.py")
+    yield
+    sys.modules.pop("own_verb", None)
+
+
+def test_it_runs_with_its_own_keys(tmp_path, capsys):
+    """Without a YAML; its directory and its saved start are those of any verb."""
+    assert ghgs("greet", "name=Ada", "times=3", f"hydra.run.dir={tmp_path / 'run'}") == 0
+    assert capsys.readouterr().out == "hello Ada hello Ada hello Ada\n"
+    assert "times: 3" in (tmp_path / "run" / ".hydra" / "config.yaml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["times=2"], "ghgs greet: name: expected a value"),
+        (["name=Ada", "times=0"], "ghgs greet: times: expected an integer >= 1; found 0"),
+        (["name=Ada", "time=2"], "did you mean times?"),
+    ],
+)
+def test_wrong_keys_are_refused_in_one_line(tmp_path, capsys, arguments, message):
+    assert ghgs("greet", *arguments, f"hydra.run.dir={tmp_path / 'run'}") == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_help_lists_it(capsys):
+    assert ghgs("--help") == 0
+    assert "greet somebody, several times" in capsys.readouterr().out
+    assert ghgs("greet", "--help") == 0
+    assert "Who is greeted." in capsys.readouterr().out
