@@ -70,7 +70,15 @@ class ModelMethod:
 
 
 def not_finite(batch: Batch, prediction: Prediction) -> tuple[int, ...]:
-    """Number of non-finite Gaussians and depths of each subject; a warning names subjects with any."""
+    """Count what is not finite; a warning names the subjects that have any.
+
+    Args:
+        batch: Of B subjects; its masks say where depths count.
+        prediction: Of that batch.
+
+    Returns:
+        Number of non-finite Gaussians and depths of each subject.
+    """
     splats = (~prediction.gaussians.is_finite).split(prediction.gaussians.splits)
     depths = (batch.masks & ~prediction.depth_valid).flatten(1).sum(1)
     counts = tuple((torch.stack([found.sum() for found in splats]) + depths).tolist())
@@ -128,12 +136,28 @@ def _rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[Row]:
 
 
 def decisions_of(rows: Iterable[Row]) -> list[Decision]:
-    """Choice of ``skip=auto`` for each subject and number of views in the rows; empty without it."""
+    """Choices of ``skip=auto`` in the rows of a measurement.
+
+    Args:
+        rows: As of :func:`measure`.
+
+    Returns:
+        One for each method, subject and number of views; empty without ``skip=auto``.
+    """
     chosen = {(row["method"], row["subject"], row["views"]): row for row in rows if "skip" in row}
     return [Decision(row["skip"], row["encoder_products"]) for row in chosen.values()]
 
 
 def _draw(batch: Batch, estimate: Estimate, element: int, pictures: Path, name: str) -> None:
+    """Save a picture of one subject for each protocol: inputs, depths, targets, renders and errors.
+
+    Args:
+        batch: With targets of one or more protocols.
+        estimate: Of that batch.
+        element: Number of the subject in the batch.
+        pictures: Folder of the PNG files.
+        name: Of the method, for the files' names.
+    """
     for protocol in dict.fromkeys(batch.targets.protocols):
         chosen = [p == protocol for p in batch.targets.protocols]
         part = dataclasses.replace(batch, targets=batch.targets.of_protocol(protocol))
@@ -153,8 +177,23 @@ def measure(
     picture_count: int = 0,
 ) -> list[Row]:
     """Measure a method: one row for each subject and target, with one prediction for all protocols.
-    ``seconds`` of a row: prediction and all renders of a batch, divided by its subjects. ``pictures``: folder
-    for pictures of the first ``picture_count`` subjects, or None. InputError: a batch has no targets."""
+
+    Args:
+        method: Predicts a batch.
+        name: Of the method, for the rows.
+        loader: Batches with targets.
+        metrics: What is measured on images.
+        device: Where batches are predicted and measured.
+        pictures: Folder for pictures; None: none are drawn.
+        picture_count: Number of subjects that are drawn, the first ones.
+
+    Returns:
+        Rows with what they are about, metrics, and ``seconds``: those of prediction and all renders of a
+        batch, divided by its subjects.
+
+    Raises:
+        InputError: A batch has no targets.
+    """
     rows: list[Row] = []
     for batch in loader:
         batch = batch.to(device)
@@ -184,7 +223,25 @@ def measure_all(
     pictures: Path | None = None,
     picture_count: int = 0,
 ) -> list[Row]:
-    """Measure all methods on the same photographs; rows by number of views, then protocol, then method."""
+    """Measure all methods on the same photographs.
+
+    Args:
+        methods: Methods by name.
+        data: Gives the batches of an evaluation.
+        views: Numbers of input views, each measured by itself.
+        targets: Target protocols by name.
+        split: Split of the data that is measured.
+        metrics: What is measured on images.
+        device: Where batches are predicted and measured.
+        pictures: Folder for pictures; None: none are drawn.
+        picture_count: Number of subjects that are drawn for each method and number of views.
+
+    Returns:
+        Rows as of :func:`measure`, by number of views, then protocol, then method.
+
+    Raises:
+        InputError: A batch has no targets.
+    """
     rows: list[Row] = []
     for count in views:
         loader = data.evaluation_loader(views=count, targets=list(targets.values()), split=split)

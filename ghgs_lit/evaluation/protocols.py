@@ -11,8 +11,18 @@ from ghgs_lit.errors import choice, require
 
 
 def target_protocols(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Protocols that ``evaluation.targets`` lists, by name, with the values of their file in ``conf/targets``
-    or, for the one that ``targets=`` selects, the configured values. InputError: there is no such file."""
+    """Protocols that ``evaluation.targets`` lists.
+
+    Args:
+        config: Resolved configuration with ``evaluation`` and ``targets``.
+
+    Returns:
+        Values of each protocol by name: those of its file in ``conf/targets`` or, for the one that
+        ``targets=`` selects, the configured ones.
+
+    Raises:
+        InputError: There is no such file.
+    """
     names = config["evaluation"]["targets"]
     protocols = read_options("targets", names, config["targets"], "evaluation.targets")
     return {
@@ -22,9 +32,16 @@ def target_protocols(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def check_evaluation(config: Mapping[str, Any], data: PhotographsDataModule) -> None:
-    """Check that an evaluation can be measured; data is prepared, no photograph is read. ``config``: with
-    ``evaluation``, ``metrics`` and ``targets``. InputError: a value is impossible, a metric cannot be
-    computed, the split has no subjects, or a subject lacks an input or a target."""
+    """Check that an evaluation can be measured; data is prepared, no photograph is read.
+
+    Args:
+        config: Resolved configuration with ``evaluation``, ``metrics`` and ``targets``.
+        data: The data that is measured.
+
+    Raises:
+        InputError: A value is impossible, a metric cannot be computed, the split has no subjects, or a
+            subject lacks an input or a target.
+    """
     evaluation = config["evaluation"]
     for key in ("views", "targets"):
         found = evaluation[key]
@@ -45,6 +62,17 @@ def check_evaluation(config: Mapping[str, Any], data: PhotographsDataModule) -> 
 
 
 def _check_targets(data: PhotographsDataModule, split: str, views: int, protocol: TargetProtocol) -> None:
+    """Check that each subject has the target photographs of a protocol.
+
+    Args:
+        data: The data that is measured.
+        split: Split of it.
+        views: Number of input views.
+        protocol: Which photographs are targets.
+
+    Raises:
+        InputError: Names the first view that is not there.
+    """
     reader = data.builder(split).targets.reader
     for batch in data.evaluation_loader(views=views, targets=protocol, split=split).dataset.specs:
         for spec in batch:

@@ -35,9 +35,23 @@ def measure_and_write(
     device: torch.device,
     **facts: Any,
 ) -> Path:
-    """Measure methods as configured, print the means and write ``metrics.json`` (whose path is returned),
-    ``metrics.csv`` and ``pictures/``. Call :func:`check_evaluation` before. ``config``: the run's full
-    configuration. ``facts``: further provenance."""
+    """Measure methods as configured, print the means and write ``metrics.json``, ``metrics.csv`` and
+    ``pictures/``. Call :func:`check_evaluation` before.
+
+    Args:
+        methods: Methods by name; the trained model is called ``METHOD``.
+        data: Gives the batches of an evaluation.
+        config: The run's full configuration.
+        directory: The run's directory.
+        device: Where batches are predicted and measured.
+        **facts: Further provenance.
+
+    Returns:
+        Path of ``metrics.json``.
+
+    Raises:
+        InputError: A metric cannot be computed, or the split has no subjects.
+    """
     evaluation = config["evaluation"]
     targets = target_protocols(config)
     metrics = build(config["metrics"], "metrics").to(device)
@@ -69,7 +83,11 @@ def measure_and_write(
 
 
 def print_summary(rows: list[Row]) -> None:
-    """Print means over subjects as a table."""
+    """Print means over subjects as a table.
+
+    Args:
+        rows: As of :func:`ghgs_lit.evaluation.measure.measure`.
+    """
     names = [name for name in PRINTED if name in metric_names(rows)]
     about = ["method", "views", "targets"]
     lines = []

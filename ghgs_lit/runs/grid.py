@@ -45,7 +45,14 @@ class PlannedRun:
 
 
 def time_budget(config: Mapping[str, Any]) -> float | None:
-    """Seconds of ``trainer.max_time`` (``days:hours:minutes:seconds`` or a mapping); None without one."""
+    """Seconds of ``trainer.max_time``.
+
+    Args:
+        config: Resolved configuration; the time is ``days:hours:minutes:seconds`` or a mapping.
+
+    Returns:
+        Seconds; None: no limit.
+    """
     value = config["trainer"].get("max_time")
     if value is None:
         return None
@@ -56,7 +63,14 @@ def time_budget(config: Mapping[str, Any]) -> float | None:
 
 
 def step_seconds(directory: Path) -> tuple[float, int] | None:
-    """Mean seconds of a training step over the finished runs in ``directory``, and their number."""
+    """Mean time of a training step of the finished runs of a sweep.
+
+    Args:
+        directory: Of the sweep.
+
+    Returns:
+        Seconds of a step, and the number of runs; None: no run has finished.
+    """
     steps = seconds = count = 0
     for path in sorted(directory.rglob("metrics.json")):
         sessions = [s for s in RunDirectory(path.parent).sessions() if s.get("steps")]
@@ -67,7 +81,15 @@ def step_seconds(directory: Path) -> tuple[float, int] | None:
 
 
 def expected_seconds(config: Mapping[str, Any], step: float | None) -> float | None:
-    """Training time of a run by its budgets and the measured seconds of a ``step``; None if unknown."""
+    """Training time of a run by its budgets.
+
+    Args:
+        config: Resolved configuration of the run.
+        step: Measured seconds of a step; None: not measured.
+
+    Returns:
+        Seconds; None: not known.
+    """
     steps = config["trainer"].get("max_steps", -1)
     known = [time_budget(config), steps * step if steps > 0 and step is not None else None]
     return min((seconds for seconds in known if seconds is not None), default=None)
@@ -119,8 +141,17 @@ Rehearse = Callable[[Sequence[Mapping[str, Any]]], Rehearsal]
 
 
 def print_plan(planned: Sequence[PlannedRun], directory: Path, rehearse: Rehearse) -> None:
-    """Print the runs with their states, the training time of the remaining ones, the output paths and what
-    is missing. InputError: something is missing."""
+    """Print the runs with their states, the training time of the remaining ones, the output paths and what is
+    missing.
+
+    Args:
+        planned: All runs of the sweep.
+        directory: Of the sweep.
+        rehearse: Tries what the runs need that are not done.
+
+    Raises:
+        InputError: Something is missing.
+    """
     found = rehearse([item.config for item in planned if not item.run.done])
     measured = step_seconds(directory)
     step = measured[0] if measured else found.step
@@ -147,7 +178,12 @@ def print_plan(planned: Sequence[PlannedRun], directory: Path, rehearse: Rehears
 
 
 def print_results(planned: Sequence[PlannedRun], directory: Path) -> None:
-    """Print the runs with their states and results, then the path of the sweep."""
+    """Print the runs with their states and results, then the path of the sweep.
+
+    Args:
+        planned: All runs of the sweep.
+        directory: Of the sweep.
+    """
     shown = ["" if (m := item.run.metric) is None else f"{m:.2f}" for item in planned]
     sessions = [str(len(item.run.sessions())) for item in planned]
     _print_states(planned, {"PSNR": shown, "sessions": sessions}, "")
@@ -161,8 +197,21 @@ Launch = Callable[[Sequence[Sequence[str]], int], Sequence[JobReturn]]
 
 
 def sweep(sweeper: BasicSweeper, arguments: Sequence[str], rehearse: Rehearse) -> list[Sequence[JobReturn]]:
-    """Run the grid of ``arguments`` and the sweeper's parameters, or with ``dry_run`` :func:`print_plan`
-    after ``rehearse``. Interrupted: Ctrl-C or SIGTERM; no further run is started."""
+    """Run the grid of a command, or with ``dry_run`` print its plan.
+
+    Args:
+        sweeper: Hydra's, with configuration, launcher and parameters.
+        arguments: Overrides of the command line.
+        rehearse: Tries what runs need, for ``dry_run``.
+
+    Returns:
+        What the jobs returned, as Hydra asks for it.
+
+    Raises:
+        InputError: A configuration, a directory or the launcher is refused; with ``dry_run`` something is
+            missing.
+        Interrupted: Ctrl-C or SIGTERM; no further run is started.
+    """
     directory = resolved(str(sweeper.config.hydra.sweep.dir))
     with interruptible():
         try:
@@ -178,6 +227,17 @@ def sweep(sweeper: BasicSweeper, arguments: Sequence[str], rehearse: Rehearse) -
 def _sweep(
     sweeper: BasicSweeper, arguments: Sequence[str], directory: Path, rehearse: Rehearse
 ) -> list[Sequence[JobReturn]]:
+    """:func:`sweep` in a directory, without the handling of signals.
+
+    Args:
+        sweeper: Hydra's, with configuration, launcher and parameters.
+        arguments: Overrides of the command line.
+        directory: Of the sweep.
+        rehearse: Tries what runs need, for ``dry_run``.
+
+    Returns:
+        What the jobs returned.
+    """
     config, loader = sweeper.config, sweeper.hydra_context.config_loader
     combos = combinations(sweeper.params, arguments, loader)
     planned = plan(combos, lambda overrides: loader.load_sweep_config(config, overrides), directory)
@@ -203,8 +263,16 @@ def _sweep(
 def combinations(
     params: Mapping[str, Any] | None, arguments: Sequence[str], loader: ConfigLoader | None = None
 ) -> list[list[str]]:
-    """Overrides of each job; values of the command line replace the sweep's own. ``loader`` resolves
-    ``glob(*)`` to the options of a group."""
+    """Overrides of each job; values of the command line replace the sweep's own.
+
+    Args:
+        params: ``hydra.sweeper.params``: values of keys, separated by commas; None: none.
+        arguments: Overrides of the command line.
+        loader: Resolves ``glob(*)`` to the options of a group.
+
+    Returns:
+        A list of overrides for each combination of values.
+    """
     parser = OverridesParser.create(config_loader=loader)
     given = parser.parse_overrides(list(arguments))
     keys = {override.get_key_element() for override in given}
@@ -216,8 +284,19 @@ def combinations(
 def plan(
     combos: Sequence[Sequence[str]], compose: Callable[[list[str]], DictConfig], directory: Path
 ) -> list[PlannedRun]:
-    """Distinct runs of the jobs in the sweep's directory, in order; ``compose`` makes the configuration of a
-    job's overrides. InputError: a configuration is bad or lacks a value."""
+    """Distinct runs of the jobs of a sweep.
+
+    Args:
+        combos: Overrides of each job.
+        compose: Makes the configuration of a job's overrides, with the node ``hydra``.
+        directory: Of the sweep.
+
+    Returns:
+        Runs in the order of the jobs; jobs of one configuration are one run.
+
+    Raises:
+        InputError: A configuration is bad or lacks a value.
+    """
     planned: dict[str, PlannedRun] = {}
     for overrides in combos:
         cfg = compose(list(overrides))
@@ -243,7 +322,14 @@ def _quoted(text: str) -> str:
 
 
 def check_directories(planned: Sequence[PlannedRun]) -> None:
-    """Check that each run has a directory of its own. InputError: two share one, or it has another run."""
+    """Check that each run has a directory of its own.
+
+    Args:
+        planned: All runs of the sweep.
+
+    Raises:
+        InputError: Two share a directory, or it has another run.
+    """
     runs = {}
     for item in planned:
         other = runs.setdefault(item.run.path, item)
@@ -254,7 +340,13 @@ def check_directories(planned: Sequence[PlannedRun]) -> None:
 
 
 def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Path) -> None:
-    """Write each run's configuration, by which tables recognise planned runs, and what sets it apart."""
+    """Write each run's configuration, by which tables recognise planned runs, and what sets it apart.
+
+    Args:
+        planned: All runs of the sweep.
+        config: Configuration of the command, for ``multirun.yaml``.
+        directory: Of the sweep.
+    """
     titles = {RunDirectory(path.parent).title for path in directory.glob(f"*/{SWEPT}")}
     shared = _shared(planned)
     for item in planned:
@@ -271,9 +363,22 @@ def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Pat
 
 
 def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = None) -> list[JobReturn]:
-    """Launch runs until each one has finished, here or elsewhere, or failed. A job that returns ``BUSY``
-    (another process works on its run) is launched again once that process has ended. ``launch`` starts jobs,
-    given their overrides and the number of the first; ``batch``: jobs at once, None: all."""
+    """Launch runs until each one has finished, here or elsewhere, or failed.
+
+    A job that returns ``BUSY`` (another process works on its run) is launched again once that process has
+    ended.
+
+    Args:
+        planned: All runs of the sweep; those that are done are not launched.
+        launch: Starts jobs, given their overrides and the number of the first.
+        batch: Jobs at once; None: all.
+
+    Returns:
+        What the jobs returned, in the order in which they ended.
+
+    Raises:
+        InputError: ``batch`` is less than 1.
+    """
     todo = [item for item in planned if not item.run.done]
     print(f"{len(planned)} runs: {len(planned) - len(todo)} done before, {len(todo)} to do", flush=True)
     returns: list[JobReturn] = []

@@ -76,9 +76,20 @@ def register_resolvers() -> None:
 
 
 def train_once(run: RunDirectory, config: dict[str, Any], train: Train) -> float | str | None:
-    """Train ``run`` from where it stands, and return its metric, also if it is done. ``BUSY``: in a sweep,
-    another process works on it. InputError: outside of a sweep, another process works on it; its directory
-    holds another run or other files."""
+    """Train a run from where it stands, in the process that locks it.
+
+    Args:
+        run: Its directory.
+        config: Resolved configuration.
+        train: Trains and measures; returns the metric.
+
+    Returns:
+        The metric, also of a run that is done; ``BUSY``: in a sweep, another process works on it.
+
+    Raises:
+        InputError: Outside of a sweep, another process works on it; its directory holds another run or other
+            files.
+    """
     run = run.of(config)
     with run.claim(wait=_waits()) as claimed:
         if not claimed and in_sweep():
@@ -95,8 +106,19 @@ def train_once(run: RunDirectory, config: dict[str, Any], train: Train) -> float
 
 
 def train_beside(run: RunDirectory, config: dict[str, Any], train: Train) -> float | str | None:
-    """Train ``run`` as one of several processes, the first of which is in :func:`train_once`. InputError:
-    there is no such process."""
+    """Train a run as one of several processes, the first of which is in :func:`train_once`.
+
+    Args:
+        run: Its directory.
+        config: Resolved configuration.
+        train: Trains and measures; returns the metric.
+
+    Returns:
+        What ``train`` returns, or the metric of a run that is done.
+
+    Raises:
+        InputError: There is no first process.
+    """
     run, end = run.of(config), time.monotonic() + _PATIENCE
     while (session := run.session_beside()) is None:
         if run.done and (in_sweep() or run.goes_on(config)):
@@ -108,14 +130,29 @@ def train_beside(run: RunDirectory, config: dict[str, Any], train: Train) -> flo
 
 
 def check_launcher(config: Mapping[str, Any], launcher: str) -> None:
-    """Check that a job of a sweep can train in several processes. InputError: only SLURM starts these."""
+    """Check that a job of a sweep can train in several processes, which only SLURM starts.
+
+    Args:
+        config: Resolved configuration with ``trainer``.
+        launcher: Chosen option of ``hydra/launcher``.
+
+    Raises:
+        InputError: The launcher starts one process, the training wants several.
+    """
     fits = "slurm" in launcher or process_count(config["trainer"]) == 1
     expected = "1 in a sweep, or hydra/launcher=slurm, which starts processes"
     require(fits, "trainer.devices", expected, config["trainer"].get("devices"))
 
 
 def check_config(config: Mapping[str, Any]) -> None:
-    """Check that a run can train. InputError: ``skip=auto``, or a frozen encoder without weights."""
+    """Check that a run can train.
+
+    Args:
+        config: Resolved configuration.
+
+    Raises:
+        InputError: It has ``skip=auto``, or a frozen encoder without weights.
+    """
     one_preset = not lookup(config, "skip.choices")
     require(one_preset, "skip", "the preset to train with, or one and token_budgets=[...]", "auto")
     _require_weights(config)

@@ -11,7 +11,14 @@ _RANKS = ("RANK", "LOCAL_RANK")
 
 
 def process_count(trainer: Mapping[str, Any]) -> int:
-    """Number of processes that train by the options ``trainer``: one for each device of each machine."""
+    """Number of processes that train: one for each device of each machine.
+
+    Args:
+        trainer: Options of the group ``trainer``.
+
+    Returns:
+        At least 1.
+    """
     devices = trainer.get("devices", 1)
     if isinstance(devices, (list, tuple)):
         count = len(devices)
@@ -32,7 +39,14 @@ def _device_count(accelerator: str) -> int:
 
 def settle_rank(trainer: Mapping[str, Any]) -> int:
     """Rank of this process among those of its training. What the environment says counts only where a
-    launcher has started several processes; elsewhere it is left over, and is forgotten."""
+    launcher has started several processes; elsewhere it is left over, and is forgotten.
+
+    Args:
+        trainer: Options of the group ``trainer``.
+
+    Returns:
+        The rank; 0: the first, or the only one.
+    """
     from lightning.pytorch.utilities import rank_zero_only  # here: it imports PyTorch
 
     if process_count(trainer) > 1 and (in_srun() or "WORLD_SIZE" in os.environ):
@@ -75,8 +89,14 @@ def is_queued_again() -> bool:
 
 
 def queue_again(number: int) -> bool:
-    """Let SLURM queue the job of a task again that was stopped by SIGUSR1, which announces the end of its
-    time; says whether it does."""
+    """Let SLURM queue the job of a task again that was stopped because its time is up.
+
+    Args:
+        number: Signal that stopped it; SIGUSR1 announces the end of a job's time.
+
+    Returns:
+        Whether the job is queued again.
+    """
     job = slurm_job()
     if number != signal.SIGUSR1 or job is None or not in_srun():
         return False

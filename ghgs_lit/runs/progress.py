@@ -35,7 +35,11 @@ class Lines:
         return True
 
     def say(self, text: str) -> None:
-        """Write one line with the time of day."""
+        """Write one line with the time of day.
+
+        Args:
+            text: Without the end of the line.
+        """
         line = f"{datetime.datetime.now():%H:%M:%S} {text}"
         if self.printed:
             print(line, flush=True)
@@ -45,12 +49,28 @@ class Lines:
 
 
 def clock(seconds: float) -> str:
-    """Seconds as ``1:02:03``."""
+    """A duration for people.
+
+    Args:
+        seconds: Rounded to whole ones.
+
+    Returns:
+        Text such as ``1:02:03``.
+    """
     return str(datetime.timedelta(seconds=round(seconds)))
 
 
 def track(items: Iterable[T], text: str, every: float = EVERY) -> Iterator[T]:
-    """Yield ``items`` with a bar, or with a line every ``every`` seconds that counts those done."""
+    """Yield items with a bar on a terminal, elsewhere with a line now and then that counts those done.
+
+    Args:
+        items: Whatever is worked on.
+        text: What is done with them.
+        every: Seconds between two lines.
+
+    Yields:
+        The items.
+    """
     if on_terminal():
         yield from bar(items, text, transient=True)
         return

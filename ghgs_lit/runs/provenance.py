@@ -16,7 +16,15 @@ PACKAGES = ("ghgs-lit", "torch", "lightning", "torchmetrics", "kornia", "numpy",
 
 
 def config_hash(config: Mapping[str, Any], without: Sequence[str] = WITHOUT_INFLUENCE) -> str:
-    """Twelve hexadecimal digits of a configuration, not of the keys ``without`` and of the order of keys."""
+    """Hash of a configuration, whatever the order of its keys.
+
+    Args:
+        config: Plain data.
+        without: Dotted keys that do not count, with those below them.
+
+    Returns:
+        Twelve hexadecimal digits.
+    """
     hashed = {key: value for key, value in flatten(config).items() if not is_below(key, without)}
     text = json.dumps(hashed, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
@@ -25,14 +33,30 @@ def config_hash(config: Mapping[str, Any], without: Sequence[str] = WITHOUT_INFL
 def differences(
     before: Mapping[str, Any], now: Mapping[str, Any], without: Sequence[str] = WITHOUT_INFLUENCE
 ) -> list[str]:
-    """Lines ``key: old value -> new value`` of what differs between configurations, but for ``without``."""
+    """What differs between configurations.
+
+    Args:
+        before: Plain data.
+        now: Plain data.
+        without: Dotted keys that do not count, with those below them.
+
+    Returns:
+        Lines ``key: old value -> new value``.
+    """
     old, new = flatten(before), flatten(now)
     keys = (key for key in sorted(old.keys() | new.keys()) if not is_below(key, without))
     return [f"{key}: {old.get(key)} -> {new.get(key)}" for key in keys if old.get(key) != new.get(key)]
 
 
 def version_of(name: str) -> str | None:
-    """Version of an installed package; None: it is not installed."""
+    """Version of a package.
+
+    Args:
+        name: Of the distribution.
+
+    Returns:
+        The version; None: it is not installed.
+    """
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
@@ -65,7 +89,15 @@ def git_state() -> dict[str, Any] | None:
 
 
 def provenance(config: Mapping[str, Any], **facts: Any) -> dict[str, Any]:
-    """Provenance as plain data, with ``facts`` of the verb (seed, protocol, seconds, ...)."""
+    """Where results come from: configuration with its hash, code, versions, machine and time.
+
+    Args:
+        config: The run's full configuration.
+        **facts: Of the verb, such as seed, protocol and seconds.
+
+    Returns:
+        Plain data for a results file.
+    """
     return {
         **facts,
         "config_hash": config_hash(config),

@@ -26,18 +26,39 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def mean(values: Iterable[float | None]) -> float | None:
-    """Mean of the values that are neither None nor nan; None without any."""
+    """Mean of the values that are neither None nor nan.
+
+    Args:
+        values: Numbers or None.
+
+    Returns:
+        The mean; None without any value.
+    """
     known = [v for v in values if v is not None and not math.isnan(v)]
     return sum(known) / len(known) if known else None
 
 
 def metric_names(rows: Sequence[Row]) -> list[str]:
-    """Names of the metrics in the rows, in order of appearance."""
+    """Names of the metrics in rows.
+
+    Args:
+        rows: Of a measurement.
+
+    Returns:
+        Names in order of appearance.
+    """
     return list(dict.fromkeys(name for row in rows for name in row if name not in KEYS))
 
 
 def by_protocol(rows: Sequence[Row]) -> dict[tuple, dict[str, list[Row]]]:
-    """Rows by (method, views, targets), then by subject."""
+    """Rows of each method on each protocol.
+
+    Args:
+        rows: Of a measurement.
+
+    Returns:
+        Rows by (method, views, targets), then by subject.
+    """
     groups: dict[tuple, dict[str, list[Row]]] = {}
     for row in rows:
         key = (row["method"], row["views"], row["targets"])
@@ -47,7 +68,14 @@ def by_protocol(rows: Sequence[Row]) -> dict[tuple, dict[str, list[Row]]]:
 
 def summarize(rows: Sequence[Row]) -> list[Row]:
     """Means over subjects for each method, number of views and target protocol. A subject's targets are
-    averaged first, so that each subject counts once."""
+    averaged first, so that each subject counts once.
+
+    Args:
+        rows: Of a measurement.
+
+    Returns:
+        One row for each, with the number of ``subjects`` and the means.
+    """
     names = metric_names(rows)
     return [
         {
@@ -60,7 +88,14 @@ def summarize(rows: Sequence[Row]) -> list[Row]:
 
 
 def plain(value: Any) -> Any:
-    """``value`` as plain data for JSON; infinite numbers and nan become None."""
+    """A value as plain data for JSON.
+
+    Args:
+        value: Mappings, lists, tuples, texts, numbers.
+
+    Returns:
+        The same with keys of text; infinite numbers and nan become None.
+    """
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, Mapping):
@@ -71,7 +106,19 @@ def plain(value: Any) -> Any:
 
 
 def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str, Any]) -> Path:
-    """Write ``metrics.csv``, then ``metrics.json``, which marks the run as complete. InputError: no rows."""
+    """Write ``metrics.csv``, then ``metrics.json``, which marks the run as complete.
+
+    Args:
+        directory: Of the run.
+        rows: Of its measurement.
+        provenance: As of :func:`ghgs_lit.runs.provenance.provenance`.
+
+    Returns:
+        Path of ``metrics.json``.
+
+    Raises:
+        InputError: There are no rows.
+    """
     if not rows:
         raise InputError("evaluation: expected at least one subject and target; found none")
     # Columns that distinguish the rows of concatenated tables.
@@ -124,7 +171,19 @@ class _Results(BaseModel):
 
 
 def validated(model: type[Model], content: Any, where: str) -> Model:
-    """``content`` as a pydantic model. InputError: names ``where`` and the first wrong key."""
+    """Check content by a pydantic model.
+
+    Args:
+        model: What is expected.
+        content: Plain data.
+        where: What it is, for messages.
+
+    Returns:
+        The content as the model.
+
+    Raises:
+        InputError: Names ``where`` and the first wrong key.
+    """
     try:
         return model.model_validate(content)
     except ValidationError as error:
@@ -137,8 +196,18 @@ def validated(model: type[Model], content: Any, where: str) -> Model:
 
 
 def read_results(path: Path) -> dict[str, Any]:
-    """Read a ``metrics.json``. InputError: it is not complete or of another format version, or its
-    configuration does not fit its ``config_hash``."""
+    """Read a ``metrics.json``.
+
+    Args:
+        path: Of the file.
+
+    Returns:
+        Its content.
+
+    Raises:
+        InputError: It is not complete or of another format version, or its configuration does not fit its
+            ``config_hash``.
+    """
     content = read_json(path, "a metrics.json")
     found = content.get("format_version") if isinstance(content, dict) else type(content).__name__
     if found != FORMAT_VERSION:

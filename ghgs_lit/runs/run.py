@@ -83,7 +83,14 @@ class RunDirectory:
         self._is_mine = False
 
     def of(self, config: Mapping[str, Any]) -> "RunDirectory":
-        """The directory as one of the run of ``config``."""
+        """The directory as one of the run of a configuration.
+
+        Args:
+            config: Resolved configuration of the run.
+
+        Returns:
+            A directory whose results count only if they are of that configuration.
+        """
         return RunDirectory(self.path, config_hash(config))
 
     @property
@@ -155,7 +162,14 @@ class RunDirectory:
 
     @contextlib.contextmanager
     def claim(self, wait: bool = False) -> Iterator[bool]:
-        """Lock the run for this process; yields whether that succeeded (:func:`ghgs_lit.files.lock`)."""
+        """Lock the run for this process (:func:`ghgs_lit.files.lock`).
+
+        Args:
+            wait: Wait for a process that has locked it.
+
+        Yields:
+            Whether the run is locked for this process.
+        """
         with lock(self._lock, wait) as self._is_mine:
             try:
                 yield self._is_mine
@@ -171,8 +185,17 @@ class RunDirectory:
         return validated(Identity, read_json(path, "a run's identity"), str(path))
 
     def start(self, config: Mapping[str, Any]) -> str | None:
-        """The checkpoint that the run of ``config`` starts from in this directory; None: from the first step.
-        Nothing is written. InputError: what another run wrote is there, or files of somebody else."""
+        """The checkpoint that a run starts from in this directory. Nothing is written.
+
+        Args:
+            config: Resolved configuration of the run.
+
+        Returns:
+            Path of the checkpoint; None: from the first step.
+
+        Raises:
+            InputError: What another run wrote is there, or files of somebody else.
+        """
         resume = config.get("resume")
         if self._has(resume) or self.goes_on(config):
             own = resume if self._has(resume) else self.checkpoint
@@ -190,7 +213,14 @@ class RunDirectory:
 
     def goes_on(self, config: Mapping[str, Any]) -> bool:
         """Whether the directory has the run that the same command began; only the length of a run that is not
-        complete, and what is measured after it, may differ."""
+        complete, and what is measured after it, may differ.
+
+        Args:
+            config: Resolved configuration of the command.
+
+        Returns:
+            Whether the run goes on.
+        """
         marker, resume = self.marker, config.get("resume")
         if marker is None or resume is None or marker.resume != resume:
             return False
@@ -223,9 +253,18 @@ class RunDirectory:
         )
 
     def begin(self, config: Mapping[str, Any]) -> dict[str, Any]:
-        """Make the directory that of the run of ``config``; returns it with the checkpoint to start from as
-        ``resume``. Where there is none, what was written is trained again, and deleted. Call it where the run
-        is claimed. InputError: as for :meth:`start`."""
+        """Make the directory that of a run. Where there is no checkpoint to start from, what was written is
+        trained again, and deleted. Call it where the run is claimed.
+
+        Args:
+            config: Resolved configuration of the run.
+
+        Returns:
+            The configuration with the checkpoint to start from as ``resume``.
+
+        Raises:
+            InputError: As for :meth:`start`.
+        """
         start, marker, is_same = self.start(config), self.marker, self.goes_on(config)
         if not self._has(start):
             self._clear(with_sessions=not is_same)
@@ -255,8 +294,13 @@ class RunDirectory:
             shutil.rmtree(path) if is_folder else path.unlink()
 
     def discard(self, others: Iterable[str], since: float) -> None:
-        """Remove a directory in which nothing was begun: it holds only files of a start after ``since``
-        (seconds), those of a run and ``others``, and no process works in it."""
+        """Remove a directory in which nothing was begun: it holds only files of a start, those of a run and
+        ``others``, and no process works in it.
+
+        Args:
+            others: Names of further files that may be there.
+            since: Time of the start in seconds; older files are not removed.
+        """
         known = {".lock", MARKER, "config.yaml", SESSIONS, *others}
 
         def is_unused() -> bool:
@@ -282,9 +326,14 @@ class RunDirectory:
 
     @contextlib.contextmanager
     def session(self, resumed: str | None = None) -> Iterator[dict[str, Any]]:
-        """Log start and end of this process in ``sessions.jsonl``, and the checkpoint that it ``resumed``
-        (relative to the run if it is its own). Yields a dict for numbers such as steps and seconds, which are
-        logged at the end."""
+        """Log start and end of this process in ``sessions.jsonl``.
+
+        Args:
+            resumed: Checkpoint that it resumed; logged relative to the run if it is its own.
+
+        Yields:
+            A dict for numbers such as steps and seconds, which are logged at the end.
+        """
         if self._has(resumed):
             resumed = str(resolved(resumed).relative_to(self.path))
         process = {"host": socket.gethostname(), "pid": os.getpid(), "launch": launch()}
@@ -321,7 +370,15 @@ def _owner_of(curves: Path) -> str | None:
 
 
 def begun_by_job(folder: Path, pattern: str) -> list[RunDirectory]:
-    """Runs with ``run.json`` at ``pattern`` below ``folder`` that the present job of SLURM has worked on."""
+    """Runs that the present job of SLURM has worked on.
+
+    Args:
+        folder: Below which they are.
+        pattern: Of their ``run.json`` below the folder.
+
+    Returns:
+        The runs; none outside of SLURM.
+    """
     runs = [RunDirectory(path.parent) for path in folder.glob(pattern)]
     return [run for run in runs if slurm_job() is not None and run.marker.job == slurm_job()]
 

@@ -39,7 +39,14 @@ class _Handler:
 
 
 def interrupt(number: int) -> None:
-    """Raise :class:`Interrupted`."""
+    """Raise :class:`Interrupted`.
+
+    Args:
+        number: Of the signal.
+
+    Raises:
+        Interrupted: Always.
+    """
     raise Interrupted(number)
 
 
@@ -50,8 +57,13 @@ def handlers() -> dict[int, Any]:
 
 
 def handle(act: Callable[[int], Any], before: Mapping[int, Any]) -> None:
-    """Let ``act(number)`` handle signals, except those that others handle by ``before``. Handlers of submitit
-    and ``nohup`` stay: under submitit SIGTERM does not end a job."""
+    """Let a function handle signals, except those that others handle. Handlers of submitit and ``nohup``
+    stay: under submitit SIGTERM does not end a job.
+
+    Args:
+        act: Gets the number of the signal.
+        before: Handlers by signal, as of :func:`handlers`.
+    """
     if threading.current_thread() is not threading.main_thread():
         return  # signals belong to the main thread
     for number, handler in before.items():
@@ -73,8 +85,14 @@ def interruptible() -> Iterator[None]:
 
 
 def print_how_to_go_on(stop: Interrupted, what: str, place: str, is_queued: bool) -> None:
-    """Print to stderr what was stopped, and the key ``place`` with which the same command goes on with it;
-    ``is_queued``: SLURM will run it again."""
+    """Print to stderr what was stopped, and how it goes on.
+
+    Args:
+        stop: The interruption; it counts as explained from then on.
+        what: What was stopped.
+        place: The key with which the same command goes on.
+        is_queued: Whether SLURM will run it again.
+    """
     stop.explained = True
     name = signal.Signals(stop.number).name
     how = "SLURM queues its job again" if is_queued else f"to go on, the same command with {place}"

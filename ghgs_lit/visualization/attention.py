@@ -17,9 +17,20 @@ _QUERY = (255, 60, 220)
 def chosen_token(
     tokens: Tokens, points: Points, element: int, at: tuple[int, int, int] | None = None
 ) -> int | None:
-    """Index of the token with a valid point that is nearest to a place; None where its view has none. ``at``:
-    ``(view, row, column)`` on the grid of tokens; None: the middle of the subject in its first view.
-    InputError: ``at`` is outside the grid."""
+    """The token with a valid point that is nearest to a place.
+
+    Args:
+        tokens: Packed tokens of a batch.
+        points: Their points, of which some are invalid.
+        element: Number of the subject in the batch.
+        at: ``(view, row, column)`` on the grid of tokens; None: the middle of the subject in its first view.
+
+    Returns:
+        Index of the packed token; None where its view has no valid one.
+
+    Raises:
+        InputError: ``at`` is outside the grid.
+    """
     views, height, width = tokens.grid[1:]
     if at is not None:
         expected = f"view, row, column below {(views, height, width)}"
@@ -39,7 +50,15 @@ def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> 
 
     The first row shows the neighbours, the nearest brightest; captions count them in each view. Then one row
     for each layer shows the weights, averaged over heads, the largest brightest, and beside them those with
-    ``s = 1`` where they differ; captions give shares of views. ``batch``: with photographs of whole patches.
+    ``s = 1`` where they differ; captions give shares of views.
+
+    Args:
+        batch: With photographs of whole patches.
+        tokens: Packed tokens of the batch.
+        attention: Of one of these tokens.
+
+    Returns:
+        Picture [h, w, 3] RGB uint8.
     """
     views = tokens.grid[1]
     element = int(tokens.image[attention.query]) // views
@@ -67,6 +86,17 @@ def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> 
 def _tiles(
     images: list[np.ndarray], tokens: Tokens, attention: TokenAttention, strengths: Tensor
 ) -> list[np.ndarray]:
+    """The views of a subject with coloured neighbours.
+
+    Args:
+        images: Photographs of the views [h, w, 3] uint8.
+        tokens: Packed tokens of the batch.
+        attention: Names the query and its k neighbours.
+        strengths: Brightness of each neighbour [k], in [0, 1].
+
+    Returns:
+        One picture for each view.
+    """
     scale = max(1, -(-_SIDE // images[0].shape[0]))
     side, views = tokens.patch_size * scale, tokens.grid[1]
 

@@ -12,11 +12,20 @@ Cloud = tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]
 
 
 def clouds(batch: Batch, prediction: Prediction, element: int, limit: int = 6000) -> dict[str, Cloud]:
-    """Point clouds of one subject by name: positions in metres and colours in [0, 1].
+    """Point clouds of one subject.
 
     ``points``: unprojected pixels in their colours; ``body``: body vertices, where the data has them;
-    ``points_and_body``: both, whose distance the Chamfer term measures. Empty clouds are left out. ``limit``:
-    largest number of points and of vertices."""
+    ``points_and_body``: both, whose distance the Chamfer term measures. Empty clouds are left out.
+
+    Args:
+        batch: Photographs, masks and bodies are read.
+        prediction: Of that batch.
+        element: Number of the subject in the batch.
+        limit: Largest number of points and of vertices.
+
+    Returns:
+        Positions [n, 3] in metres and colours [n, 3] in [0, 1] by name.
+    """
     valid = prediction.points.valid[element] & batch.masks[element]
     colors = batch.images[element].movedim(1, -1)
     found = {"points": (prediction.points.pixels[element][valid], colors[valid])}

@@ -18,20 +18,45 @@ ERROR_GAIN = 4.0  #: Factor of errors before they are shown
 
 @cache
 def palette(name: str) -> np.ndarray:
-    """256 RGB colours [256, 3] uint8 of a colour map of matplotlib."""
+    """Colours of a colour map of matplotlib.
+
+    Args:
+        name: Such as ``viridis``.
+
+    Returns:
+        256 RGB colours [256, 3] uint8.
+    """
     import matplotlib
 
     return (matplotlib.colormaps[name](np.linspace(0, 1, 256))[:, :3] * 255).astype(np.uint8)
 
 
 def to_uint8(image: Tensor) -> np.ndarray:
-    """A picture of an image [3, h, w]; values outside [0, 1] are clamped."""
+    """A picture of an image.
+
+    Args:
+        image: RGB [3, h, w]; values outside [0, 1] are clamped, those that are not finite are black or white.
+
+    Returns:
+        Picture [h, w, 3] uint8.
+    """
     image = image.detach().float().cpu().nan_to_num(0).clamp(0, 1)
     return (image * 255).round().byte().permute(1, 2, 0).numpy()
 
 
 def colorize(values: Tensor, low: float, high: float, name: str, valid: Tensor | None = None) -> np.ndarray:
-    """Values [h, w] in colours of a palette from ``low`` to ``high``; black where not ``valid`` [h, w]."""
+    """Values in colours of a palette.
+
+    Args:
+        values: Any numbers [h, w].
+        low: Value of the first colour.
+        high: Value of the last colour.
+        name: Of the palette.
+        valid: Where values are shown [h, w]; black elsewhere. None: everywhere.
+
+    Returns:
+        Picture [h, w, 3] uint8.
+    """
     values = values.detach().float().cpu()
     scaled = ((values - low) / max(high - low, 1e-9)).nan_to_num(0).clamp(0, 1)
     picture = palette(name)[(scaled * 255).round().long().numpy()]
@@ -41,12 +66,28 @@ def colorize(values: Tensor, low: float, high: float, name: str, valid: Tensor |
 
 
 def error_map(image: Tensor, target: Tensor) -> np.ndarray:
-    """A picture of the mean absolute error over the channels of images [3, h, w], times ``ERROR_GAIN``."""
+    """A picture of the mean absolute error over the channels, times ``ERROR_GAIN``.
+
+    Args:
+        image: RGB [3, h, w] in [0, 1].
+        target: The same for the truth.
+
+    Returns:
+        Picture [h, w, 3] uint8.
+    """
     return colorize((image - target).abs().mean(0) * ERROR_GAIN, 0, 1, "inferno")
 
 
 def row(tiles: Sequence[np.ndarray], captions: Sequence[str]) -> np.ndarray:
-    """Tiles side by side, each below its caption."""
+    """Tiles side by side, each below its caption.
+
+    Args:
+        tiles: Pictures [h, w, 3] uint8 of any sizes.
+        captions: One for each tile.
+
+    Returns:
+        Picture [h, w, 3] uint8.
+    """
     height = max(tile.shape[0] for tile in tiles) + _CAPTION
     width = sum(tile.shape[1] for tile in tiles) + _GAP * (len(tiles) - 1)
     canvas = Image.new("RGB", (width, height), (24, 24, 24))
@@ -59,7 +100,14 @@ def row(tiles: Sequence[np.ndarray], captions: Sequence[str]) -> np.ndarray:
 
 
 def stack(rows: Sequence[np.ndarray]) -> np.ndarray:
-    """Rows below one another, padded on the right."""
+    """Rows below one another, padded on the right.
+
+    Args:
+        rows: Pictures [h, w, 3] uint8.
+
+    Returns:
+        Picture [h, w, 3] uint8.
+    """
     width = max(r.shape[1] for r in rows)
     return np.concatenate([np.pad(r, ((0, _GAP), (0, width - r.shape[1]), (0, 0))) for r in rows])
 
@@ -67,7 +115,17 @@ def stack(rows: Sequence[np.ndarray]) -> np.ndarray:
 def _depth_rows(
     batch: Batch, element: int, depth: Tensor | None, depth_valid: Tensor | None
 ) -> list[np.ndarray]:
-    """A row of predicted and a row of true depths of one subject, in the same colours: near is red."""
+    """A row of predicted and a row of true depths of one subject, in the same colours: near is red.
+
+    Args:
+        batch: With masks, and depths where they are known.
+        element: Number of the subject in the batch.
+        depth: Predicted depths [B, V, H, W], metres; None: no row of them.
+        depth_valid: Where they are defined [B, V, H, W]; None: in the masks.
+
+    Returns:
+        Up to two pictures [h, w, 3] uint8.
+    """
     masks, maps = batch.masks[element], {}
     if depth is not None:
         maps["depth"] = (depth[element], masks if depth_valid is None else masks & depth_valid[element])
@@ -118,5 +176,10 @@ def sheet(
 
 
 def save_png(picture: np.ndarray, path: Path) -> None:
-    """Write a picture [h, w, 3] uint8 as a PNG."""
+    """Write a picture as a PNG, whole or not at all.
+
+    Args:
+        picture: RGB [h, w, 3] uint8.
+        path: Of the file.
+    """
     write_atomically(path, lambda temporary: Image.fromarray(picture).save(temporary, format="PNG"))

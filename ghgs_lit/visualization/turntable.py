@@ -14,7 +14,14 @@ _SHARE = 0.95  #: Largest share of a picture's height and width that the subject
 
 
 def subject_points(gaussians: Gaussians) -> Tensor:
-    """Centres [n, 3] (float64) of one subject's opaque Gaussians (all, if none is), without outliers."""
+    """Centres of one subject's opaque Gaussians (all, if none is), without outliers.
+
+    Args:
+        gaussians: Of one subject.
+
+    Returns:
+        Points [n, 3], float64, in the world's unit.
+    """
     opaque = gaussians.opacities >= _OPAQUE
     points = (gaussians.means[opaque] if bool(opaque.any()) else gaussians.means).detach().double()
     if not len(points):
@@ -25,22 +32,45 @@ def subject_points(gaussians: Gaussians) -> Tensor:
 
 
 def center_of(points: Tensor, cameras: Cameras) -> Tensor:
-    """The middle [3] (float64) of the box around points [n, 3]; without any, where the optical axes meet."""
+    """The middle of the box around points; without any, where the optical axes meet.
+
+    Args:
+        points: Of the subject [n, 3], float64.
+        cameras: V cameras.
+
+    Returns:
+        Point [3], float64.
+    """
     return (points.amin(0) + points.amax(0)) / 2 if len(points) else look_at_point(cameras)
 
 
 def pixel_size(cameras: Cameras, center: Tensor) -> float:
-    """The side of a photograph's pixel at ``center`` [3] in the world's unit, mean over ``cameras`` [V]."""
+    """The side of a photograph's pixel at the subject, mean over cameras.
+
+    Args:
+        cameras: V cameras.
+        center: Point [3] of the subject.
+
+    Returns:
+        Length in the world's unit.
+    """
     depths = ((center - cameras.centers) * cameras.extrinsics[:, 2, :3].double()).sum(-1)
     return float((depths / cameras.intrinsics[:, 0, 0]).mean())
 
 
 def up_direction(cameras: Cameras) -> Tensor:
-    """The world's unit vector [3] (float64) that is up in the photographs of ``cameras`` [V].
+    """The direction that is up in photographs.
 
     Upright cameras may look up or down, but the rows of their images are level: up is perpendicular to all
     rows, and nearest to the mean upward column. A world axis within 3 degrees of it is returned instead, so
-    that small tilts of the cameras do not tilt an upright world."""
+    that small tilts of the cameras do not tilt an upright world.
+
+    Args:
+        cameras: V cameras.
+
+    Returns:
+        Unit vector [3] of the world, float64.
+    """
     rows, columns = cameras.extrinsics[:, 0, :3].double(), cameras.extrinsics[:, 1, :3].double()
     mean = -columns.mean(0)
     # Least squares; the small weight of the mean decides where all rows of images are parallel.
@@ -56,15 +86,33 @@ def up_direction(cameras: Cameras) -> Tensor:
 def turntable(cameras: Cameras, frames: int, points: Tensor | None = None) -> Cameras:
     """Cameras on one turn around the subject, at the mean distance and height of the given ones.
 
-    They start at the side of the first camera and have its lens. With ``points`` [n, 3] of the subject (n may
-    be 0) they turn about the middle of the points' box, look straight at it, and have a wider lens where that
-    of the first camera would cut points off. Without, they turn about where the optical axes meet."""
+    They start at the side of the first camera and have its lens. With points of the subject they turn about
+    the middle of the points' box, look straight at it, and have a wider lens where that of the first camera
+    would cut points off. Without, they turn about where the optical axes meet.
+
+    Args:
+        cameras: V cameras.
+        frames: Number of cameras on the turn.
+        points: Of the subject [n, 3], n may be 0; None: not known.
+
+    Returns:
+        ``frames`` cameras.
+    """
     angles = torch.arange(frames, dtype=torch.float64) * (2 * math.pi / max(frames, 1))
     return orbit(cameras, angles, points)
 
 
 def orbit(cameras: Cameras, angles: Tensor, points: Tensor | None = None) -> Cameras:
-    """Cameras [n] as of :func:`turntable`, at ``angles`` [n] (float64, radians) from the first one's side."""
+    """Cameras as of :func:`turntable`, at any angles.
+
+    Args:
+        cameras: V cameras.
+        angles: From the first camera's side [n], float64, radians.
+        points: Of the subject [m, 3], m may be 0; None: not known.
+
+    Returns:
+        n cameras.
+    """
     center = look_at_point(cameras) if points is None else center_of(points, cameras)
     frames, angles = len(angles), angles.to(center.device)
     up = up_direction(cameras)
@@ -89,7 +137,18 @@ def orbit(cameras: Cameras, angles: Tensor, points: Tensor | None = None) -> Cam
 
 
 def _fitted(intrinsics: Tensor, extrinsics: Tensor, points: Tensor, height: int, width: int) -> Tensor:
-    """Intrinsics [n, 3, 3] with the principal point in the middle and a lens that shows all points [m, 3]."""
+    """Intrinsics with the principal point in the middle and a lens that shows all points.
+
+    Args:
+        intrinsics: Of n cameras [n, 3, 3], pixels.
+        extrinsics: World to camera [n, 4, 4].
+        points: That must be seen [m, 3].
+        height: Of the pictures, pixels.
+        width: Of the pictures, pixels.
+
+    Returns:
+        Intrinsics [n, 3, 3].
+    """
     middle = intrinsics.new_tensor([width / 2, height / 2])
     intrinsics = intrinsics.clone()
     intrinsics[:, :2, 2] = middle

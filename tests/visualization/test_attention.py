@@ -17,7 +17,9 @@ from tests.helpers.scenes import make_batch
 def seen(model, batch):
     """The recalibration's arguments and result, and the prediction."""
     kept = []
-    hook = model.recalibration.register_forward_hook(lambda _, inputs, output: kept.append((inputs, output)))
+    hook = model.recalibration.register_forward_hook(
+        lambda _, inputs, output: kept.append((inputs[:2], output))
+    )
     with torch.no_grad():
         prediction = model(batch)
     hook.remove()

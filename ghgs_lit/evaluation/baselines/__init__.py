@@ -30,7 +30,20 @@ BASELINES = ("black", "nearest_view", *DEPTHS, "per_scene", "untrained")
 def baseline(
     name: str, renderer: Renderer, untrained: Callable[[], torch.nn.Module], per_scene: Mapping[str, Any]
 ) -> Method:
-    """The baseline ``name`` of ``BASELINES``; ``untrained`` builds a model with random weights."""
+    """The baseline of a name.
+
+    Args:
+        name: One of ``BASELINES``.
+        renderer: Draws Gaussians from the target cameras.
+        untrained: Builds a model with random weights, for ``untrained``.
+        per_scene: Options of :class:`PerScene`, for ``per_scene``.
+
+    Returns:
+        The method, which predicts a batch without training.
+
+    Raises:
+        InputError: There is no such baseline.
+    """
     choice("baselines", name, BASELINES)
     if name in DEPTHS:
         return partial(splatted, depth_of=DEPTHS[name], renderer=renderer)
@@ -42,12 +55,26 @@ def baseline(
 
 
 def black(batch: Batch) -> Estimate:
-    """A black image, which scores the background alone."""
+    """A black image, which scores the background alone.
+
+    Args:
+        batch: With targets of T photographs of h x w pixels.
+
+    Returns:
+        Zeros [B, T, 3, h, w].
+    """
     return Estimate(torch.zeros_like(batch.targets.images))
 
 
 def nearest_view(batch: Batch) -> Estimate:
-    """The input photograph whose viewing direction is nearest to that of the target, at its size."""
+    """The input photograph whose viewing direction is nearest to that of the target.
+
+    Args:
+        batch: With photographs [B, V, 3, H, W] and targets of h x w pixels.
+
+    Returns:
+        For each target that photograph, at the target's size.
+    """
     forward = batch.cameras.extrinsics[..., 2, :3]
     wanted = batch.targets.cameras.extrinsics[..., 2, :3]
     choice_of_view = torch.einsum("btk,bvk->btv", wanted, forward).argmax(-1)

@@ -23,13 +23,27 @@ HULL = VisualHull(dilation=0.005, samples=192)
 
 
 def hull_bounds(batch: Batch) -> DepthBounds:
-    """Depths at which each pixel's ray enters and leaves the visual hull."""
+    """Depths at which each pixel's ray enters and leaves the visual hull.
+
+    Args:
+        batch: Masks and cameras are read.
+
+    Returns:
+        Near and far [B, V, H, W], metres.
+    """
     return HULL(batch)
 
 
 def hull_depth(batch: Batch) -> Tensor:
-    """Depth of the visual hull's surface [B, V, H, W], metres; 0 outside the subject. Its splats resemble the
-    image-based visual hull (Matusik et al. 2000)."""
+    """Depth of the visual hull's surface. Its splats resemble the image-based visual hull (Matusik et al.
+    2000).
+
+    Args:
+        batch: Masks and cameras are read.
+
+    Returns:
+        Depths [B, V, H, W], metres; 0 outside the subject.
+    """
     return batch.once(hull_bounds).near * batch.masks
 
 
@@ -39,9 +53,17 @@ DEPTHS, WINDOW, SOFTNESS = 32, 0.02, 0.03
 
 
 def photo_depth(batch: Batch) -> Tensor:
-    """Depths of a plane sweep between the hull's surfaces [B, V, H, W], metres; 0 outside the subject. Mean
-    of the depths, weighted by their photo-consistency in a window (soft argmin of Kendall et al., ICCV 2017);
-    the middle of the hull where all depths are equally consistent."""
+    """Depths of a plane sweep between the hull's surfaces.
+
+    They are means of the sweep's depths, weighted by their photo-consistency in a window (soft argmin of
+    Kendall et al., ICCV 2017): the middle of the hull where all depths are equally consistent.
+
+    Args:
+        batch: Photographs, masks and cameras are read.
+
+    Returns:
+        Depths [B, V, H, W], metres; 0 outside the subject.
+    """
     bounds = batch.once(hull_bounds)
     consistency = photo_consistency(batch, bounds, DEPTHS)
     radius = max(round(WINDOW * max(batch.masks.shape[-2:])), 1)
@@ -76,8 +98,18 @@ _MATTE = 0.125
 def splats_at(
     batch: Batch, depth: Tensor, valid: Tensor, sigma: float = 0.3, opacity: float = 0.9
 ) -> Gaussians:
-    """Round splats at ``depth`` [B, V, H, W] in metres for the ``valid`` pixels [B, V, H, W], in their order.
-    ``sigma``: standard deviation in input pixels. ``opacity``: in (0, 1)."""
+    """Round splats at the points of pixels.
+
+    Args:
+        batch: Gives colours and cameras.
+        depth: Depths [B, V, H, W], metres.
+        valid: Pixels [B, V, H, W] that get a splat.
+        sigma: Standard deviation in pixels of the inputs.
+        opacity: Of all splats, in (0, 1).
+
+    Returns:
+        Gaussians in the order of the valid pixels.
+    """
     points = unproject_maps(depth, batch.cameras)[valid]
     focal = batch.cameras.intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2].mean(-1)
     scale = (sigma * depth / focal[..., None, None])[valid]
@@ -93,7 +125,16 @@ def splats_at(
 
 
 def discs_at(batch: Batch, depth: Tensor, valid: Tensor) -> Gaussians:
-    """Discs on the surface of depth maps, like the initial Gaussians of heads with ``axes=surface``."""
+    """Discs on the surface of depth maps, like the initial Gaussians of heads with ``axes=surface``.
+
+    Args:
+        batch: Gives colours, mattes and cameras.
+        depth: Depths [B, V, H, W], metres.
+        valid: Pixels [B, V, H, W] that get a disc.
+
+    Returns:
+        Gaussians in the order of the valid pixels.
+    """
     places = valid.flatten(0, 1).flatten(1).nonzero()
     image, pixel = places.unbind(1)
     focal = focal_lengths(batch.cameras).prod(-1).sqrt()
@@ -115,7 +156,17 @@ def discs_at(batch: Batch, depth: Tensor, valid: Tensor) -> Gaussians:
 
 
 def body_depth(batch: Batch) -> Tensor:
-    """Mean depth of the body's vertices in each view [B, V, H, W], metres. InputError: no bodies."""
+    """Mean depth of the body's vertices in each view.
+
+    Args:
+        batch: Body vertices and cameras are read.
+
+    Returns:
+        Depths [B, V, H, W], metres, the same for all pixels of a view.
+
+    Raises:
+        InputError: The data has no bodies.
+    """
     if batch.body_vertices is None:
         raise InputError("baselines: body_depth expects body vertices in the data; found none")
     means = [
@@ -126,14 +177,33 @@ def body_depth(batch: Batch) -> Tensor:
 
 
 def true_depth(batch: Batch) -> Tensor:
-    """Depth maps [B, V, H, W] of the data, metres. InputError: there are none."""
+    """Depth maps of the data.
+
+    Args:
+        batch: With depths, where the data knows them.
+
+    Returns:
+        Depths [B, V, H, W], metres.
+
+    Raises:
+        InputError: There are none.
+    """
     if batch.depths is None:
         raise InputError("baselines: true_depth expects depth maps in the data; found none")
     return batch.depths
 
 
 def splatted(batch: Batch, depth_of: Callable[[Batch], Tensor], renderer: Renderer) -> Estimate:
-    """Estimate by discs at ``depth_of(batch)`` [B, V, H, W], metres; with mattes also at the rim."""
+    """Estimate by discs at given depths; with mattes also at the rim.
+
+    Args:
+        batch: With targets.
+        depth_of: Gives depths [B, V, H, W] of a batch, metres; 0: no disc.
+        renderer: Draws the discs from the target cameras.
+
+    Returns:
+        Renders, depths and discs.
+    """
     batch = with_matte(batch, _MATTE)
     depth = depth_of(batch)
     valid = batch.masks & (depth > 0)
@@ -157,9 +227,12 @@ SIGMA, OPACITY = 0.5, 0.5
 
 @dataclass(frozen=True)
 class PerScene:
-    """``method(batch)``: 3D Gaussian splatting (Kerbl et al. 2023) on the inputs, a Gaussian for each pixel.
+    """3D Gaussian splatting (Kerbl et al. 2023) on the inputs, a Gaussian for each pixel, as a method.
+
     Gaussians start at :func:`photo_depth`. None is added or pruned: one for each pixel of each photograph is
-    more than the photographs determine. ``steps``: of the optimiser, at least 1."""
+    more than the photographs determine. ``renderer``: draws inputs and targets. ``steps``: of the optimiser,
+    at least 1.
+    """
 
     renderer: Renderer
     steps: int
@@ -170,7 +243,14 @@ class PerScene:
         return Refinement(self.steps, self.renderer, CHANGES)
 
     def begin(self, batch: Batch) -> Gaussians:
-        """Initial Gaussians."""
+        """Initial Gaussians.
+
+        Args:
+            batch: Photographs, masks and cameras are read.
+
+        Returns:
+            A round splat for each pixel of the subject.
+        """
         depth = photo_depth(batch)
         return splats_at(batch, depth, depth > 0, SIGMA, OPACITY)
 

@@ -38,9 +38,20 @@ PEERS = {"gps": "After GPS-Gaussian", "pixel": "Pixel-aligned"}
 
 
 def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOptions) -> list[Table]:
-    """One table for each setting (and each model, if rows are ablations). ``others``: results of other
-    methods, one frame for each file. InputError: nothing was measured on these targets, two runs claim one
-    cell, or results of other methods fit no table."""
+    """Tables of the measurements of a sweep: one for each setting, and for each model if rows are ablations.
+
+    Args:
+        sweep: Runs of ours.
+        others: Results of other methods, one frame for each file.
+        options: What the tables show.
+
+    Returns:
+        Tables in the order in which their settings first appear.
+
+    Raises:
+        InputError: Nothing was measured on these targets, two runs claim one cell, configurations in a cell
+            differ, or results of other methods fit no table.
+    """
     layout = options.layout
     if others and layout.rows == "ablation":
         raise InputError(f"others: expected layout=table1, table2 or table3; found {layout.name}")

@@ -11,20 +11,22 @@ import pandas as pd
 from ghgs_lit.config.keys import OF_A_PLACE, OF_A_RUN, is_below
 from ghgs_lit.config.nodes import PairedTest
 from ghgs_lit.errors import InputError
+from ghgs_lit.evaluation.tables.differences import ABSENT, differing, differing_text, telling_apart
 from ghgs_lit.evaluation.tables.layouts import CELL, Table, arrow, data_title, decimals
-from ghgs_lit.evaluation.tables.records import (
-    ABSENT,
-    TRAINING,
-    differing,
-    differing_text,
-    person_of,
-    telling_apart,
-)
+from ghgs_lit.evaluation.tables.records import TRAINING, person_of
 from ghgs_lit.evaluation.tables.significance import Comparison, compare, holm, pool, smallest_difference
 
 
 def fill(table: Table, figures: Sequence[Mapping[str, Any]]) -> None:
-    """Fill ``table.cells``; ``figures``: reported cells. InputError: runs with other numbers claim one."""
+    """Fill the cells of a table.
+
+    Args:
+        table: With rows, lines, groups and metrics; gets ``cells`` and ``comparisons``.
+        figures: Reported cells, each with ``line``, ``group``, ``metric`` and ``mean``.
+
+    Raises:
+        InputError: Runs with other numbers claim one cell and seed, or configurations in a cell differ.
+    """
     values, options = _values(table), table.options
     _refuse_rivals(table, values)
     # Runs with the same numbers count once.
@@ -102,6 +104,17 @@ def _differing(table: Table, sources: Sequence[str]) -> dict[str, list[str]]:
 def _rivals(
     table: Table, expected: str, sources: Sequence[str], keys: Mapping[str, Sequence[str]]
 ) -> InputError:
+    """The error that runs claim one cell.
+
+    Args:
+        table: Knows the runs' configurations.
+        expected: What was expected for the cell.
+        sources: Files of the runs.
+        keys: Keys in which their configurations differ, with the values.
+
+    Returns:
+        The error, with the keys of ``by`` that would give each a row.
+    """
     apart = ",".join(telling_apart([table.configs.get(source, {}) for source in sources], keys))
     rows = f"they differ in {differing_text(keys)}: by=[{apart}] gives each a row"
     rows = rows if keys else "their configurations are equal"
@@ -178,7 +191,17 @@ def _test(table: Table, people: pd.DataFrame, test: PairedTest) -> None:
 
 
 def _reference(table: Table, means: pd.Series, metric: str, against: str) -> tuple[int | None, bool]:
-    """Reference row of a column, and whether it was chosen by its figures."""
+    """Reference row of a column.
+
+    Args:
+        table: With lines and options.
+        means: Means of the rows that compete, by number of the line.
+        metric: Of the column.
+        against: ``full``: the row of the whole method, where there is one; ``best``: the best of the column.
+
+    Returns:
+        Number of the line, None without any, and whether it was chosen by its figures.
+    """
     full = [i for i in means.index if table.lines[i].is_ours and table.lines[i].variant.ablation == "full"]
     if against == "full" and len(full) == 1:
         return full[0], False

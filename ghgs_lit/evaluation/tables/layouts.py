@@ -76,18 +76,39 @@ def _stem(metric: str) -> str:
 
 
 def decimals(metric: str) -> int:
-    """Decimals of a metric, as in the paper."""
+    """Decimals of a metric, as in the paper.
+
+    Args:
+        metric: Name, with its region.
+
+    Returns:
+        Number of decimals.
+    """
     return DECIMALS.get(_stem(metric), 4)
 
 
 def arrow(metric: str) -> str:
-    """Whether higher (↑) or lower (↓) is better; empty if neither or unknown."""
+    """Which direction of a metric is better.
+
+    Args:
+        metric: Name, with its region.
+
+    Returns:
+        ↑: higher is better; ↓: lower; empty: neither, or not known.
+    """
     stem = _stem(metric)
     return "↑" if stem in HIGHER_IS_BETTER else "↓" if stem in LOWER_IS_BETTER else ""
 
 
 def title(metric: str) -> str:
-    """Title of a metric, such as ``PSNR box`` for ``psnr_box``."""
+    """Title of a metric.
+
+    Args:
+        metric: Name, with its region, such as ``psnr_box``.
+
+    Returns:
+        Text such as ``PSNR box``.
+    """
     stem, _, region = metric.partition("_")
     return TITLES.get(metric) or f"{stem.upper()} {region}".strip()
 
@@ -192,7 +213,14 @@ class Table:
         return [part for part in parts if part]
 
     def block_title(self, block: list[int]) -> str:
-        """Title of a block, for tables with reported rows."""
+        """Title of a block, for tables with reported rows.
+
+        Args:
+            block: Numbers of lines, as in :attr:`blocks`.
+
+        Returns:
+            Whether they are reported or measured.
+        """
         reported = f"as reported on {self.reported_on}, not measured here"
         return reported if self.lines[block[0]].is_reported else "measured here"
 
@@ -203,7 +231,14 @@ def _content() -> dict[str, Any]:
 
 
 def data_title(name: str) -> str:
-    """The paper's name of a data set in any spelling (``zju_mocap``), else ``name``."""
+    """The paper's name of a data set.
+
+    Args:
+        name: In any spelling, such as ``zju_mocap``.
+
+    Returns:
+        Its name in the paper, else ``name``.
+    """
     return _content()["data"].get(re.sub(r"[^a-z0-9]", "", name.lower()), name)
 
 
@@ -213,7 +248,14 @@ def reported_source() -> str:
 
 
 def reported_table(name: str) -> tuple[str, dict[str, dict[int | str, dict[str, float]]]]:
-    """Data set of one of the paper's tables, and its rows: method -> views or data -> metric -> figure."""
+    """Figures of one of the paper's tables.
+
+    Args:
+        name: Such as ``table2``.
+
+    Returns:
+        Data set of the table, and its rows: method, then views or data, then metric, then figure.
+    """
     table, metrics = _content()["tables"][name], _content()["metrics"]
     rows = {
         method: {group: dict(zip(metrics, figures, strict=True)) for group, figures in groups.items()}
@@ -223,5 +265,12 @@ def reported_table(name: str) -> tuple[str, dict[str, dict[int | str, dict[str, 
 
 
 def reported_data(name: str) -> list[str]:
-    """Groups of columns of a reported table: data sets or numbers of views."""
+    """Groups of columns of a reported table.
+
+    Args:
+        name: Such as ``table2``.
+
+    Returns:
+        Data sets or numbers of views.
+    """
     return list(dict.fromkeys(group for row in reported_table(name)[1].values() for group in row))

@@ -4,8 +4,9 @@ from typing import Any
 
 import pandas as pd
 
+from ghgs_lit.evaluation.tables.differences import differing, differing_text
 from ghgs_lit.evaluation.tables.layouts import Table, data_title, decimals, reported_source, title
-from ghgs_lit.evaluation.tables.records import ablation_sets, differing, differing_text
+from ghgs_lit.evaluation.tables.records import ablation_sets
 from ghgs_lit.evaluation.tables.significance import POWER, RATIO
 
 FOOTNOTE = (
@@ -20,7 +21,14 @@ MOSTLY_SHARED = 0.8
 
 
 def write_caption(table: Table) -> str:
-    """Caption in one line: data, protocol, model and number of seeds."""
+    """Caption of a table in one line: data, protocol, model and number of seeds.
+
+    Args:
+        table: With its cells.
+
+    Returns:
+        Text with Markdown.
+    """
     first, names = table.rows.iloc[0], dict.fromkeys(table.rows["data"])
     measured = table.measured
     counts = sorted({int(count) for count in measured["count"].dropna()})
@@ -43,7 +51,15 @@ def write_caption(table: Table) -> str:
 
 
 def write_notes(table: Table) -> list[str]:
-    """Notes below the table."""
+    """Notes below a table: what its rows are, where figures come from, what was tested, and what runs differ
+    in.
+
+    Args:
+        table: With its cells.
+
+    Returns:
+        Paragraphs with Markdown.
+    """
     said: list[str] = []
     if table.layout.rows == "ablation":
         said.append(FOOTNOTE)
@@ -65,7 +81,14 @@ def write_notes(table: Table) -> list[str]:
 
 
 def own_ablations(table: Table) -> dict[str, dict[str, Any]]:
-    """Keys that a user's own ablations set, with their values, by the name of the row."""
+    """What a user's own ablations set.
+
+    Args:
+        table: With measurements and configurations.
+
+    Returns:
+        By name of the row the dotted keys that the ablation sets, with their values.
+    """
     own: dict[str, dict[str, Any]] = {}
     for source, variant in _of(table.rows, "model")[["source", "variant"]].drop_duplicates().values:
         sets = ablation_sets(table.configs[source])

@@ -1,15 +1,6 @@
-"""Measurements of runs and of other methods as DataFrames: method, setting, values of each subject.
+"""Measurements of runs as DataFrames: method, setting, values of each subject.
 
-A run is identified by its configuration, never by the name of its directory. The file of another method
-(described in ``docs/tables.md``; ``docs/example_others.json`` is an example) is::
-
-    {"format": "ghgs_lit.others", "format_version": 1, "method": "RoGSplat",
-     "source": "their code at commit 8a196b6, run by us", "rows": [
-       {"data": "thuman2", "split": "val", "targets": "release", "protocol": "release", "views": 4,
-        "subject": "0501", "seed": 1, "metrics": {"psnr": 28.9, "ssim": 0.96}}]}
-
-A row with ``subject`` has the values of one subject and can be tested; others have means over ``subjects``
-subjects (optional). ``seed`` is optional.
+A run is identified by its configuration, never by the name of its directory.
 """
 
 import re
@@ -17,14 +8,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import pandas as pd
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, ConfigDict, Field
 
 from ghgs_lit.config import conf_dir
 from ghgs_lit.config.keys import (
-    EXPECTED_TO_DIFFER,
     OF_A_PLACE,
     OF_A_RUN,
     OF_TARGETS,
@@ -37,7 +27,7 @@ from ghgs_lit.config.keys import (
     switches_of,
 )
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.readers import read_json, read_yaml
+from ghgs_lit.readers import read_yaml
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.results import KEYS, METHOD, read_results, validated
 
@@ -47,8 +37,6 @@ TRAINING = ("steps", "seconds", "peak_gb")
 """Metrics of the training, which no subject has."""
 #: Keys of `ghgs evaluate` that change its results, beside model, data and metrics.
 _OF_EVALUATION = ("checkpoint", "refine", "refine_cameras")
-ABSENT = "absent"
-"""Text of a value that a configuration does not have."""
 _ROW = ["method", "views", "targets", "subject"]
 # Keys that identify an encoder of conf/encoder; models change its other keys.
 _ENCODER_KEYS = ("width", "heads", "depth", "layers", "vit")
@@ -113,7 +101,14 @@ def _shipped(group: str) -> dict[str, dict]:
 
 
 def encoder_name(config: Mapping[str, Any]) -> str:
-    """Option of conf/encoder in a configuration, or ``unnamed``, and whether it has a semantic branch."""
+    """Name of the encoder in a configuration.
+
+    Args:
+        config: Resolved configuration of a training.
+
+    Returns:
+        The option of conf/encoder with its sizes, or ``unnamed``, and whether it has a semantic branch.
+    """
     encoder = config.get("encoder")
     encoder = encoder if isinstance(encoder, Mapping) else {}
     branch = ", semantic branch" * (encoder.get("semantic") is not None)
@@ -132,7 +127,14 @@ def _model_name(config: Mapping[str, Any]) -> str:
 
 
 def ablation_sets(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Dotted keys that the chosen ablation of a training sets, with their values, where it says so."""
+    """What the chosen ablation of a training sets.
+
+    Args:
+        config: Resolved configuration of the training.
+
+    Returns:
+        Dotted keys with their values; empty where the configuration does not say.
+    """
     sets = lookup(config, "chosen.sets")
     return dict(sets) if isinstance(sets, Mapping) else {}
 
@@ -283,7 +285,14 @@ def _planned(path: Path, config: Mapping[str, Any], variant: Variant) -> Planned
 
 def keys_of_rows(configs: Iterable[Mapping[str, Any]]) -> list[str]:
     """Keys of views and targets in which runs that could share a row differ: runs on the same data by how
-    they were trained, those with a protocol of the same name by its targets."""
+    they were trained, those with a protocol of the same name by its targets.
+
+    Args:
+        configs: Of all runs.
+
+    Returns:
+        Dotted keys, each once.
+    """
     values: dict[tuple[str, ...], set[str]] = {}
     for config in configs:
         data = str(lookup(config, "data.name"))
@@ -308,7 +317,18 @@ def _variants(configs: Mapping[str, Mapping[str, Any]], by: Sequence[str]) -> di
 
 
 def files_below(folders: Sequence[Path], name: str) -> list[Path]:
-    """Files called ``name`` below folders, except in ``.hydra``. FileNotFoundError: a folder is missing."""
+    """Files of a name below folders, except in ``.hydra``.
+
+    Args:
+        folders: Searched one after another.
+        name: Of the files.
+
+    Returns:
+        Paths in the order of folders and names.
+
+    Raises:
+        FileNotFoundError: A folder is missing.
+    """
     for folder in folders:
         if not folder.is_dir():
             raise FileNotFoundError(f"{folder}: expected a directory of runs; found none")
@@ -317,9 +337,20 @@ def files_below(folders: Sequence[Path], name: str) -> list[Path]:
 
 
 def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
-    """All runs below folders, finished or not. ``by``: configuration keys that distinguish rows beside model,
-    encoder, ablation and the views and targets of the training. FileNotFoundError: a folder is missing.
-    InputError: there is no finished run, a ``metrics.json`` is damaged, or no run has a key of ``by``."""
+    """All runs below folders, finished or not.
+
+    Args:
+        folders: Directories of sweeps or runs.
+        by: Configuration keys that distinguish rows beside model, encoder, ablation and the views and targets
+            of the training.
+
+    Returns:
+        Measurements, planned runs and configurations.
+
+    Raises:
+        FileNotFoundError: A folder is missing.
+        InputError: There is no finished run, a ``metrics.json`` is damaged, or no run has a key of ``by``.
+    """
     runs = {str(path): _read_run(path) for path in files_below(folders, "metrics.json")}
     files = {str(path): _training_config(path) for path in files_below(folders, "config.yaml")}
     trainings = {path: config for path, config in files.items() if config is not None}
@@ -339,81 +370,14 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
 
 
 def person_of(subject: str, unit: re.Pattern[str] | None) -> str:
-    """Person of a subject: the first group of ``unit`` if it matches, else the subject."""
+    """Person of a subject.
+
+    Args:
+        subject: Name of a person, or of one frame of a person.
+        unit: Regular expression whose first group is the person; None: subjects are people.
+
+    Returns:
+        The first group if the expression matches, else the subject.
+    """
     match = unit.fullmatch(subject) if unit else None
     return match[1] if match else subject
-
-
-def differing(
-    configs: Sequence[Mapping[str, Any]], expected: Iterable[str] = EXPECTED_TO_DIFFER
-) -> dict[str, list[str]]:
-    """Keys in which ``configs`` differ, with their values as text, ``absent`` among them; except ``expected``
-    keys and those below them."""
-    flat = [flatten(config) for config in configs]
-    keys = dict.fromkeys(key for values in flat for key in values)
-    known = [key for key in keys if not is_below(key, expected)]
-    found = {key: list(dict.fromkeys(str(values.get(key, ABSENT)) for values in flat)) for key in known}
-    return {key: values for key, values in found.items() if len(values) > 1}
-
-
-def differing_text(keys: Mapping[str, Sequence[str]], limit: int = 6) -> str:
-    """Text such as ``optimizer.lr (0.001, 0.0001)`` of the first ``limit`` keys."""
-    shown = [f"`{key}` ({', '.join(values[:4])})" for key, values in list(keys.items())[:limit]]
-    more = len(keys) - len(shown)
-    return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
-
-
-def telling_apart(configs: Sequence[Mapping[str, Any]], keys: Mapping[str, Sequence[str]]) -> Iterable[str]:
-    """The first of ``keys`` whose values distinguish all different ``configs``, else all keys."""
-    count = len({config_hash(config, (*OF_A_RUN, *OF_A_PLACE)) for config in configs})
-    return next(([key] for key, values in keys.items() if len(values) == count), list(keys))
-
-
-_Text = Annotated[str, Field(min_length=1)]
-_Count = Annotated[int, Field(ge=1)]
-
-
-class _Exact(BaseModel):
-    model_config = ConfigDict(strict=True, extra="forbid")
-
-
-class _Row(_Exact):
-    data: _Text
-    split: _Text
-    targets: _Text
-    protocol: _Text
-    views: _Count
-    seed: int = 0
-    subject: _Text | None = None
-    subjects: _Count | None = None
-    metrics: Annotated[dict[str, FiniteFloat], Field(min_length=1)]
-
-
-class _Others(_Exact):
-    format: Literal["ghgs_lit.others"]
-    format_version: Literal[1]
-    method: _Text
-    source: _Text
-    rows: Annotated[list[_Row], Field(min_length=1)]
-
-
-def read_others(path: Path) -> pd.DataFrame:
-    """Rows of another method's results file, like those of :class:`Sweep`. ``said`` is the file's ``source``;
-    means have no ``subject`` and may have a ``count``. FileNotFoundError: there is no such file. InputError:
-    it does not have the format above; the message names the key."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected another method's results; found no such file")
-    others = validated(_Others, read_json(path), path.name)
-    rows = pd.DataFrame([row.model_dump() for row in others.rows])
-    cell = [*SETTING, "views", "seed"]
-    repeated = rows.duplicated([*cell, "subject"])
-    if repeated.any():
-        at = f"{path.name}.rows[{repeated.idxmax()}]"
-        raise InputError(f"{at}: expected each subject once a setting; found one again")
-    means = rows["subject"].isna()
-    if (means.groupby([rows[key] for key in cell]).nunique() > 1).any() or rows[~means]["subjects"].any():
-        raise InputError(f"{path.name}: expected subjects or one mean for each setting; found both")
-    metrics = pd.DataFrame(list(rows.pop("metrics")), dtype=float)
-    rows = rows.rename(columns={"subjects": "count"}).astype({"count": float})
-    variant = Variant("other", others.method)
-    return rows.assign(variant=variant, source=str(path), run=None, said=others.source).join(metrics)

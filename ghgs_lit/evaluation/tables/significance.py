@@ -59,8 +59,15 @@ class Pool:
 
 
 def pool(rows: Sequence[pd.DataFrame]) -> Pool:
-    """Pool the variance of rows of values by seed (index) and subject (columns). Each row counts with the
-    subjects that it has at all its seeds; rows may lack seeds."""
+    """Pool the variance of rows over seeds. Each row counts with the subjects that it has at all its seeds;
+    rows may lack seeds.
+
+    Args:
+        rows: Values of each row by seed (index) and subject (columns).
+
+    Returns:
+        The variance with its degrees of freedom, 0 if it is not known.
+    """
     means = [row.dropna(axis="columns").mean(axis="columns") for row in rows]
     table = pd.concat(means, axis="columns").to_numpy()
     table = table[(~np.isnan(table)).sum(axis=1) > 1]
@@ -107,13 +114,30 @@ def compare(
 
 
 def needed_errors(alpha: float, freedom: int, comparisons: int = 1) -> float:
-    """Standard errors by which rows must differ so that the smallest p of ``comparisons`` is significant at
-    level ``alpha`` of all together; ``freedom``: degrees of freedom, at least 1."""
+    """Standard errors by which rows must differ so that the smallest p of several comparisons is significant.
+
+    Args:
+        alpha: Level of all comparisons together.
+        freedom: Degrees of freedom, at least 1.
+        comparisons: Number of comparisons, at least 1.
+
+    Returns:
+        Quantile of the t distribution, two-sided.
+    """
     return float(stats.t.isf(alpha / 2 / comparisons, freedom))
 
 
 def smallest_difference(comparison: Comparison, alpha: float, comparisons: int) -> float:
-    """Difference that is significant with a probability of ``POWER``, by the noncentral t distribution."""
+    """Difference that is significant with a probability of ``POWER``, by the noncentral t distribution.
+
+    Args:
+        comparison: With its standard error and degrees of freedom.
+        alpha: Level of all comparisons together.
+        comparisons: Number of comparisons, at least 1.
+
+    Returns:
+        The difference, in the unit of the metric.
+    """
     needed, freedom = needed_errors(alpha, comparison.freedom, comparisons), comparison.freedom
 
     def excess(errors: float) -> float:
@@ -123,7 +147,14 @@ def smallest_difference(comparison: Comparison, alpha: float, comparisons: int) 
 
 
 def holm(values: Sequence[float]) -> list[float]:
-    """Holm's correction of the p-values of a table."""
+    """Holm's correction of the p-values of a table (Holm 1979).
+
+    Args:
+        values: p-values of all comparisons.
+
+    Returns:
+        Corrected ones in the same order, at most 1.
+    """
     order = np.argsort(values, kind="stable")
     scaled = np.asarray(values, dtype=np.float64)[order] * np.arange(len(values), 0, -1)
     corrected = np.empty(len(values))

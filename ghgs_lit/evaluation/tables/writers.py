@@ -41,19 +41,43 @@ def _cell(cell: Any, line: Line, write: Write) -> str:
 
 
 def texts(table: Table, write: Write) -> pd.DataFrame:
-    """Cells as printed: a row for each line, columns by group and metric."""
+    """Cells as printed.
+
+    Args:
+        table: With its cells.
+        write: Writes the number of a cell, with what follows it.
+
+    Returns:
+        A row for each line, columns by group and metric.
+    """
     cells = [_cell(cell, table.lines[cell.Index[0]], write) for cell in table.cells.itertuples()]
     return pd.Series(cells, table.cells.index).unstack(["group", "metric"])
 
 
 def heading(table: Table, group: int, metric: str) -> str:
-    """Title of a column after that of its group, if the layout has one."""
+    """Title of a column after that of its group, if the layout has one.
+
+    Args:
+        table: With its groups.
+        group: Number of the group of columns.
+        metric: Of the column.
+
+    Returns:
+        Text such as ``4-view PSNR ↑``.
+    """
     named = f"{table.groups[group].title} " if table.layout.heading != "none" else ""
     return named + f"{title(metric)} {arrow(metric)}".strip()
 
 
 def to_markdown(table: Table) -> str:
-    """The table with its caption above and its notes below."""
+    """The table with its caption above and its notes below.
+
+    Args:
+        table: With its cells.
+
+    Returns:
+        Markdown.
+    """
 
     numbers = texts(table, lambda number, tail, best: _bold(number + tail.replace(MARK, rf"\{MARK}"), best))
     rows = []
@@ -75,7 +99,14 @@ def _bold(text: str, best: bool) -> str:
 
 
 def to_terminal(table: Table) -> str:
-    """The same for a terminal: each group of columns has lines of its own, so that no table is wide."""
+    """The table for a terminal: each group of columns has lines of its own, so that no table is wide.
+
+    Args:
+        table: With its cells.
+
+    Returns:
+        Plain text with caption and notes.
+    """
     numbers = texts(table, lambda number, tail, best: _bold(number + tail, best))
     rows = []
     for line in (line for block in table.blocks for line in block):
@@ -90,7 +121,14 @@ def to_terminal(table: Table) -> str:
 
 
 def to_csv(tables: Sequence[Table]) -> str:
-    """All cells with all digits, one on each line; the mean is empty if a run is missing."""
+    """All cells with all digits, one on each line; the mean is empty if a run is missing.
+
+    Args:
+        tables: With their cells.
+
+    Returns:
+        CSV with the columns ``COLUMNS``.
+    """
     pairs = [(n, table, cell) for n, table in enumerate(tables, 1) for cell in table.cells.itertuples()]
     lines = [_line(*each) for each in pairs]
     frame = pd.DataFrame(lines, columns=COLUMNS)
@@ -141,12 +179,26 @@ _ARROWS = {"↑": r"($\uparrow$)", "↓": r"($\downarrow$)", "": ""}
 
 
 def escape(text: str) -> str:
-    """Plain text as LaTeX."""
+    """Plain text as LaTeX.
+
+    Args:
+        text: Any.
+
+    Returns:
+        The same with escaped characters.
+    """
     return "".join(_ESCAPES.get(c, c) for c in text)
 
 
 def prose(text: str) -> str:
-    """Markdown (``**bold**`` and names in backticks) as LaTeX."""
+    """Markdown as LaTeX.
+
+    Args:
+        text: With ``**bold**`` and names in backticks.
+
+    Returns:
+        LaTeX.
+    """
     parts = re.split(r"(`[^`]*`|\*\*[^*]+\*\*)", text)
     marks = {"`": (r"\texttt{", 1), "*": (r"\textbf{", 2)}
     return "".join(
@@ -206,7 +258,15 @@ def _tabular(table: Table) -> str:
 
 
 def to_latex(table: Table, label: str) -> str:
-    """A float with the table, its caption, notes in small print and label."""
+    """A float with the table, its caption, notes in small print and label.
+
+    Args:
+        table: With its cells.
+        label: Of the float.
+
+    Returns:
+        LaTeX, which needs the packages of ``PREAMBLE``.
+    """
     name = "table*" if len(table.groups) * len(table.metrics) >= _WIDE else "table"
     notes = [r"\par\smallskip", r"\parbox{\linewidth}{\footnotesize"]
     notes += [rf"{prose(note)}\par" for note in table.notes] + ["}"]

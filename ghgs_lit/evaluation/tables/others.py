@@ -1,0 +1,82 @@
+"""Measurements of other methods from a file of their own.
+
+The file (described in ``docs/tables.md``; ``docs/example_others.json`` is an example) is::
+
+    {"format": "ghgs_lit.others", "format_version": 1, "method": "RoGSplat",
+     "source": "their code at commit 8a196b6, run by us", "rows": [
+       {"data": "thuman2", "split": "val", "targets": "release", "protocol": "release", "views": 4,
+        "subject": "0501", "seed": 1, "metrics": {"psnr": 28.9, "ssim": 0.96}}]}
+
+A row with ``subject`` has the values of one subject and can be tested; others have means over ``subjects``
+subjects (optional). ``seed`` is optional.
+"""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pandas as pd
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.evaluation.tables.records import SETTING, Variant
+from ghgs_lit.readers import read_json
+from ghgs_lit.runs.results import validated
+
+_Text = Annotated[str, Field(min_length=1)]
+_Count = Annotated[int, Field(ge=1)]
+
+
+class _Exact(BaseModel):
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+
+class _Row(_Exact):
+    data: _Text
+    split: _Text
+    targets: _Text
+    protocol: _Text
+    views: _Count
+    seed: int = 0
+    subject: _Text | None = None
+    subjects: _Count | None = None
+    metrics: Annotated[dict[str, FiniteFloat], Field(min_length=1)]
+
+
+class _Others(_Exact):
+    format: Literal["ghgs_lit.others"]
+    format_version: Literal[1]
+    method: _Text
+    source: _Text
+    rows: Annotated[list[_Row], Field(min_length=1)]
+
+
+def read_others(path: Path) -> pd.DataFrame:
+    """Rows of another method's results file, like those of :class:`ghgs_lit.evaluation.tables.records.Sweep`.
+
+    Args:
+        path: JSON file of the format above.
+
+    Returns:
+        Rows; ``said`` is the file's ``source``; means have no ``subject`` and may have a ``count`` of
+        subjects.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        InputError: It does not have the format; the message names the key.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected another method's results; found no such file")
+    others = validated(_Others, read_json(path), path.name)
+    rows = pd.DataFrame([row.model_dump() for row in others.rows])
+    cell = [*SETTING, "views", "seed"]
+    repeated = rows.duplicated([*cell, "subject"])
+    if repeated.any():
+        at = f"{path.name}.rows[{repeated.idxmax()}]"
+        raise InputError(f"{at}: expected each subject once a setting; found one again")
+    means = rows["subject"].isna()
+    if (means.groupby([rows[key] for key in cell]).nunique() > 1).any() or rows[~means]["subjects"].any():
+        raise InputError(f"{path.name}: expected subjects or one mean for each setting; found both")
+    metrics = pd.DataFrame(list(rows.pop("metrics")), dtype=float)
+    rows = rows.rename(columns={"subjects": "count"}).astype({"count": float})
+    variant = Variant("other", others.method)
+    return rows.assign(variant=variant, source=str(path), run=None, said=others.source).join(metrics)
