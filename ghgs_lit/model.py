@@ -74,7 +74,7 @@ class GHGS(nn.Module):
             prediction = settled(lambda: self._predict(batch, plan, self._coarse(batch)))
         for layer in reversed(around):
             prediction = layer.leave(prediction)
-        return dataclasses.replace(prediction, decisions=plan.decisions)
+        return dataclasses.replace(plan.trimmed(prediction), decisions=plan.decisions)
 
     def plan(self, batch: Batch, findings: Sequence[Finding] = ()) -> Plan:
         """What the stages work on, read from a batch as they see it; a GPU is waited for once. ``findings``:

@@ -223,10 +223,12 @@ def test_predict_runs_there(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "overrides", [["model=hull"], ["model=paper"], ["model=hull", "skip=fast"]], ids=" ".join
+    "overrides",
+    [["model=hull"], ["model=paper"], ["model=hull", "skip=fast"], ["model=hull", "skip=auto"]],
+    ids=" ".join,
 )
-def test_the_host_waits_at_most_four_times(overrides):
-    """For the check of the batch, the subject's extent, and the numbers of tokens and Gaussians."""
+def test_the_host_waits_once(overrides):
+    """For the plan: the check of the batch, the subject's extent, the numbers of tokens and Gaussians."""
     waits = []
     for size in (1, 2):
         with torch.no_grad(), pretend_device(True) as log:
@@ -234,8 +236,7 @@ def test_the_host_waits_at_most_four_times(overrides):
             log.clear()
             model(batch)
         waits.append(log.waits.total())
-        assert waits[-1] <= 4 + ("skip=fast" in overrides), log.waits.most_common()
-    assert waits[0] == waits[1]
+        assert waits[-1] == 1, log.waits.most_common()
 
 
 def test_the_hull_of_larger_photographs_is_found_without_asking_for_the_number_of_rays(monkeypatch):

@@ -19,6 +19,7 @@ from ghgs_lit.bounds.silhouettes import (
     votes_outside,
 )
 from ghgs_lit.kernels.pool import even_parts, is_supported
+from ghgs_lit.plan.rows import size_class
 from ghgs_lit.types import Batch, Cameras, DepthBounds, true_places
 
 #: Depths in memory at once.
@@ -39,7 +40,7 @@ class VisualHull(SubjectBox):
         start = box if coarse.stride == 1 else self._valid(depths_in_box(coarse.cameras, lower, upper))
         # At least one cell: the rays of a cell's pixels run beside the ray of its centre.
         radius, rays = max(coarse.dilation, 1), batch.pixels if coarse.stride == 1 else None
-        count = sum(extent.cells(coarse.stride) for extent in batch.extents)
+        count = size_class(sum(extent.cells(coarse.stride) for extent in batch.extents))
         hull = hull_bounds(
             coarse.masks, coarse.cameras, start, radius, self.tolerance, self.samples, rays, voting, count
         )

@@ -77,10 +77,12 @@ class Attention(nn.Module):
     def _norm_and_rotate(self, x: Float[Tensor, "a t d"], norm: nn.Module, rotary: Rotary | None) -> Tensor:
         if rotary is None:
             return norm(x)
-        if torch.is_grad_enabled():
+        most = (
+            len(x) if torch.is_grad_enabled() else at_once(x.device, _ROTATED, _GPU_ROTATED) // x[0].numel()
+        )
+        if most >= len(x):
             return rotate(norm(x), rotary)
-        most = at_once(x.device, _ROTATED, _GPU_ROTATED)
-        for heads in even_parts(len(x), most // x[0].numel()):
+        for heads in even_parts(len(x), most):
             x[heads] = rotate(norm(x[heads]), rotary)
         return x
 
@@ -98,8 +100,8 @@ def _attend(
 #: Register tokens of each view in the ViT and in the aggregator.
 REGISTERS = 4
 
-#: Hidden values of the MLP in memory at once without a gradient.
-_HIDDEN = 1 << 23
+#: Hidden values of the MLP in memory at once without a gradient: on a CPU, on a GPU.
+_HIDDEN, _GPU_HIDDEN = 1 << 23, 1 << 28
 
 
 def draw_normal_(values: Tensor, std: float) -> Tensor:
@@ -149,7 +151,7 @@ class Block(nn.Module):
         if torch.is_grad_enabled():
             return self.ls2(x, self.mlp(self.norm2(x)))
         # x is the fresh result of ls1, so it can be changed in place, a part of the tokens at a time.
-        for rows in even_parts(len(x), _HIDDEN // (4 * x.shape[-1])):
+        for rows in even_parts(len(x), at_once(x.device, _HIDDEN, _GPU_HIDDEN) // (4 * x.shape[-1])):
             x[rows].addcmul_(self.mlp(self.norm2(x[rows])), self.ls2.gamma)
         return x
 

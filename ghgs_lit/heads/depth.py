@@ -112,7 +112,7 @@ class DepthHead(nn.Module):
             guide = photo_guide(batch, *maps)
         windows, p = plan.depth_windows, plan.patch_size
         wanted = None if windows is None else plan.shown.repeat_interleave(p, -2).repeat_interleave(p, -1)
-        value, confidence = _whole(decode(self.dpt, tokens, guide, windows), batch, wanted)
+        value, confidence = _whole(decode(self.dpt, tokens, guide, windows, plan.together), batch, wanted)
         if self.is_bounded:
             depth = bounded_depth(value + self.start, bounds.near, bounds.far, self.options.parameterization)
         else:

@@ -16,7 +16,7 @@ from ghgs_lit.errors import require
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.heads.guide import Guide, GuidePyramid
 from ghgs_lit.kernels.linear import linear
-from ghgs_lit.kernels.pool import even_parts
+from ghgs_lit.kernels.pool import at_once, even_parts
 from ghgs_lit.kernels.precision import exact, without_float16
 from ghgs_lit.plan.window import Span, Window, reach
 from ghgs_lit.types import Tokens
@@ -68,8 +68,9 @@ NORM_EPS = 1e-5
 #: Channels before the last convolution, as published.
 HIDDEN = 32
 
-#: Without a gradient: values of a map at full resolution in memory at once, and the smallest number of rows.
-_LARGEST, _ROWS = 1 << 21, 8
+#: Without a gradient: values of a map at full resolution in memory at once, on a CPU and on a GPU, and the
+#: smallest number of rows.
+_LARGEST, _GPU_LARGEST, _ROWS = 1 << 21, 1 << 28, 8
 
 
 Widths = tuple[int, tuple[int, int, int, int]]
@@ -268,7 +269,8 @@ class DPTHead(nn.Module):
             return [window]
         rows, columns = window
         row = x.shape[0] * x.shape[1] * (columns.stop - columns.start)
-        parts = even_parts(rows.stop - rows.start, max(_ROWS, _LARGEST // row))
+        most = at_once(x.device, _LARGEST, _GPU_LARGEST)
+        parts = even_parts(rows.stop - rows.start, max(_ROWS, most // row))
         return [Window(Span(rows.start + p.start, rows.start + p.stop, rows.full), columns) for p in parts]
 
     def windows(self, result: Window, grid: tuple[int, int]) -> Windows:

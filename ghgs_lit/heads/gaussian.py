@@ -9,7 +9,7 @@ from typing import Literal
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from pydantic import model_validator
 from torch import Tensor, nn
 
@@ -79,7 +79,8 @@ RAW_VALUES = sum(_WIDTHS)
 
 @dataclass(frozen=True)
 class RawGaussians:
-    """Attributes before their activations, and the descriptors that they are computed from."""
+    """Attributes before their activations, and the descriptors that they are computed from. ``real``: which
+    rows become Gaussians, others get opacity 0; None: all."""
 
     descriptors: Float[Tensor, "N c"]
     offset: Float[Tensor, "N 3"]
@@ -90,6 +91,7 @@ class RawGaussians:
     image: Int[Tensor, " N"]
     pixel: Int[Tensor, " N"]
     splits: tuple[int, ...]
+    real: Bool[Tensor, " N"] | None = None
 
     def changed(self, change: Float[Tensor, "N c"]) -> "RawGaussians":
         """The raw attributes plus ``change``: values of offset, scale, rotation, opacity and color."""
@@ -278,12 +280,13 @@ class GaussianHead(nn.Module):
         views, height, width = points.valid.shape[1:]
         rows = plan.subject.only(points.valid)
         image, pixel = rows.index // (height * width), rows.index % (height * width)
-        parts = decode(self.decoder, tokens, self._guide(batch, points, depth_maps), plan.windows)
+        guide = self._guide(batch, points, depth_maps)
+        parts = decode(self.decoder, tokens, guide, plan.windows, plan.together)
         of_part = self._of_subject if plan.pixels == "subject" else self._of_all
         raw = zip(*(of_part(part, image, pixel, rows) for part in parts), strict=True)
         values = [torch.cat(values) for values in raw]
         color = values[5] if len(values) > 5 else None
-        return RawGaussians(*values[:5], color, image, pixel, rows.splits(views))
+        return RawGaussians(*values[:5], color, image, pixel, rows.splits(views), rows.real)
 
     def activate(self, raw: RawGaussians, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
         """Gaussians from raw attributes, at the points of their pixels."""
@@ -301,6 +304,8 @@ class GaussianHead(nn.Module):
             else:
                 activate = cpu.activate if cpu.is_supported(*inputs) else footprint_gaussians
             found = activate(*given, constants, on_surface)
+        if raw.real is not None:
+            found = (*found[:3], found[3] * raw.real, *found[4:])
         constants = {"low_pass": options.low_pass, "antialiased": options.antialiased}
         return Gaussians(*found, raw.splits, raw.image, raw.pixel, **constants)
 
@@ -325,12 +330,16 @@ class GaussianHead(nn.Module):
         self, part: Part, image: Int[Tensor, " N"], pixel: Int[Tensor, " N"], rows: Rows
     ) -> Sequence[Tensor]:
         """:meth:`_of_subject`, but computed for every pixel of the part."""
-        row, column, _ = _in_part(part, pixel, rows)
+        row, column, within = _in_part(part, pixel, rows)
+        maps = part.maps.permute(0, 2, 3, 1)
+        if rows.real is not None:
+            index = (image[within] - part.images.start, row, column)
+            return [values[index] for values in (maps, *self._raw(maps))]
         # One image at a time, to save memory: hidden layers are wider than the maps.
         of_images = zip(*(values.split(rows.counts[part.images]) for values in (row, column)), strict=True)
         each = [
-            [values[index] for values in (maps, *self._raw(maps))]
-            for maps, index in zip(part.maps.permute(0, 2, 3, 1), of_images, strict=True)
+            [values[index] for values in (own, *self._raw(own))]
+            for own, index in zip(maps, of_images, strict=True)
         ]
         return [torch.cat(values) for values in zip(*each, strict=True)]
 

@@ -2,6 +2,7 @@
 attention of a block mixes tokens, so views need no padding."""
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -30,15 +31,28 @@ class KeptPatches:
         self._extents = extents(kept.flatten(0, 1)) if known is None else known
         counts = [extent.count for extent in self._extents]
         self._counts = [counts[first : first + views] for first in range(0, len(counts), views)]
+        self._kept, self._device = kept, device
         self.is_whole = sum(counts) == kept.numel()
         if self.is_whole:
             self.index = torch.arange(kept.numel(), device=device)
         else:
-            self.index = true_places(kept.to(device), sum(counts))
+            self.index = true_places(self.mask, sum(counts))
         self.image = self.index // (height * width)
         self.row = self.index // width % height
         self.column = self.index % width
         self._packed: dict[int, Int[Tensor, " N"]] = {}
+
+    @cached_property
+    def number(self) -> Int[Tensor, " p"]:
+        """The number of each kept one of all patches; 0 or more for others, without a meaning."""
+        return self.index if self.is_whole else (self.mask.flatten().cumsum(0) - 1).clamp(min=0)
+
+    @cached_property
+    def mask(self) -> Bool[Tensor, "b v h w"]:
+        """The kept patches, on the tokens' device."""
+        if self.is_whole:
+            return torch.ones(self.grid, dtype=torch.bool, device=self._device)
+        return self._kept.to(self._device)
 
     def lengths(self, special: int) -> list[int]:
         """Number of tokens of each image, with ``special`` special ones."""

@@ -1,5 +1,7 @@
 """The plan of a batch, and the one place where a prediction reads from a GPU what its masks hold."""
 
+import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,9 +13,9 @@ from torch import Tensor
 
 from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.plan.patches import KeptPatches
-from ghgs_lit.plan.rows import Rows
-from ghgs_lit.plan.window import Window, subject_windows
-from ghgs_lit.types import Decision, DecodedPixels, Extent, extent_numbers
+from ghgs_lit.plan.rows import Rows, rounds_up
+from ghgs_lit.plan.window import Span, Window, subject_windows
+from ghgs_lit.types import Decision, DecodedPixels, Extent, Prediction, extent_numbers, true_places
 
 #: From the numbers of patches [B, V] that each of several presets keeps: each element's decision, and the
 #: number of its preset.
@@ -33,6 +35,7 @@ class Plan:
         patch_size: in pixels.
         pixels: pixels that dense heads decode; ``all``: whole views.
         tokens: tokens that are recalibrated; ``all``: with those of the background, which need depths, too.
+        classes: numbers of rows, and windows, are size classes (:mod:`ghgs_lit.plan.rows`).
         decisions: what ``skip=auto`` chose for each element.
         flags: values of further tensors that were read with the masks."""
 
@@ -44,6 +47,7 @@ class Plan:
     patch_size: int
     pixels: DecodedPixels = "subject"
     tokens: DecodedPixels = "subject"
+    classes: bool = False
     decisions: tuple[Decision, ...] = ()
     flags: tuple[bool, ...] = ()
 
@@ -55,35 +59,74 @@ class Plan:
     @cached_property
     def subject(self) -> Rows:
         """The subject's pixels among those of all images."""
+        if self.classes:
+            return Rows.filled(self.masks.flatten(1), self.counts, self.views)
         return Rows.exact(self.masks, [extent.count for extent in self.extents], 1)
 
     @cached_property
     def peers(self) -> Rows:
         """Tokens that are recalibrated, among the packed ones, by element."""
-        views = self.masks.shape[1]
-        if self.tokens == "all":
-            wanted, counts = torch.ones_like(self.kept.index, dtype=torch.bool), self.kept.element_lengths(0)
-        else:
-            wanted = self.shown.flatten()[self.kept.index]
-            each = [extent.count for extent in self.shown_extents]
-            counts = [sum(each[first : first + views]) for first in range(0, len(each), views)]
-        return Rows.exact(wanted, counts, views)
+        everyone = self.tokens == "all"
+        counts = self.kept.element_lengths(0) if everyone else self._of_elements(self.shown_extents)
+        if self.classes:
+            rows = Rows.filled((self.kept.mask if everyone else self.shown).flatten(1), counts, self.views)
+            kept = self.kept
+            return rows if kept.is_whole else dataclasses.replace(rows, index=kept.number[rows.index])
+        every = torch.ones_like(self.kept.index, dtype=torch.bool)
+        return Rows.exact(every if everyone else self.shown.flatten()[self.kept.index], counts, self.views)
+
+    @property
+    def views(self) -> int:
+        """Number of views of each element."""
+        return self.masks.shape[1]
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Number of the subject's pixels in each element."""
+        return self._of_elements(self.extents)
+
+    def _of_elements(self, extents: Sequence[Extent]) -> tuple[int, ...]:
+        """Sums of the counts of each element's images."""
+        each = [extent.count for extent in extents]
+        return tuple(sum(each[first : first + self.views]) for first in range(0, len(each), self.views))
+
+    def trimmed(self, prediction: Prediction) -> Prediction:
+        """The prediction with Gaussians for the subject's pixels alone. On a GPU those of pixels whose depth
+        is not finite stay, with opacity 0."""
+        real = self.subject.real
+        if real is None or prediction.gaussians.splits != self.subject.splits(self.views):
+            return prediction
+        index = slice(0, self.counts[0]) if len(self.counts) == 1 else true_places(real, sum(self.counts))
+        every = (prediction.gaussians, *prediction.drafts)
+        gaussians, *drafts = (each.select(index, self.counts) for each in every)
+        return dataclasses.replace(prediction, gaussians=gaussians, drafts=tuple(drafts))
+
+    @property
+    def together(self) -> int:
+        """Number of consecutive images whose maps are decoded in one part."""
+        return self.views if self.classes else 1
 
     @property
     def depth_windows(self) -> list[Window | None] | None:
         """Windows in which depths are needed, of whole patches; None: everywhere."""
-        if "all" in (self.pixels, self.tokens):
-            return None
         # Whole patches: the token points of the release depend on pixels beside the mask.
-        p, size = self.patch_size, tuple(self.masks.shape[2:])
-        return [window and window.coarser(p).finer(p, size) for window in subject_windows(self.extents, size)]
+        return None if "all" in (self.pixels, self.tokens) else self._windows(self.patch_size)
 
     @property
     def windows(self) -> list[Window | None] | None:
         """Windows with the subject's pixels of each image; None: whole images are decoded."""
-        if self.pixels == "all":
-            return None
-        return subject_windows(self.extents, tuple(self.masks.shape[2:]))
+        return None if self.pixels == "all" else self._windows(self.patch_size if self.classes else 1)
+
+    def _windows(self, cell: int) -> list[Window | None]:
+        """Windows of whole cells around the subject, None without one; of ``classes`` the same for all."""
+        size = tuple(self.masks.shape[2:])
+        each = subject_windows(self.extents, size)
+        found = [window and window.coarser(cell).finer(cell, size) for window in each]
+        if not self.classes:
+            return found
+        hull = functools.reduce(Window.hull, filter(None, found), next(filter(None, found), None))
+        spans = [Span(0, 1, full) for full in size] if hull is None else hull
+        return [Window(*(span.coarser(cell).widened().finer(cell, span.full) for span in spans))] * len(found)
 
 
 def planned(
@@ -94,6 +137,7 @@ def planned(
     tokens: DecodedPixels = "subject",
     choose: Choose | None = None,
     flags: Sequence[Bool[Tensor, ""]] = (),
+    classes: bool | None = None,
 ) -> Plan:
     """The plan of a batch. The host waits for a GPU once.
 
@@ -104,12 +148,13 @@ def planned(
         pixels: of the preset.
         tokens: which ones the recalibration works on.
         choose: gives each element one of the ``choices``; None: all get the first.
-        flags: tensors whose values are to be read with those of the masks."""
+        flags: tensors whose values are to be read with those of the masks.
+        classes: whether numbers of rows are size classes; None: as the masks' device needs it."""
     b, v = masks.shape[:2]
     shown = patches_around_subject(masks, patch_size, 0)
     images, *grids = (each.flatten(0, 1) for each in (masks, shown, *choices))
     numbers = [extent_numbers(images), *map(extent_numbers, grids)]
-    found = _read([*numbers, *(flag.long() for flag in flags)])
+    found = _read([*numbers, *([torch.stack(list(flags))] if flags else [])])
     count = len(numbers)
     extents, shown_extents, *of_choices = (
         tuple(Extent(*values[first : first + 5]) for first in range(0, len(values), 5))
@@ -123,8 +168,10 @@ def planned(
         each = [of_choices[best[image // v]][image] for image in range(b * v)]
         kept_extents = tuple(each)
     patches = KeptPatches(kept, masks.device, kept_extents)
-    known = tuple(bool(values[0]) for values in found[count:])
-    return Plan(masks, shown, patches, extents, shown_extents, patch_size, pixels, tokens, decisions, known)
+    known = tuple(bool(value) for values in found[count:] for value in values)
+    classes = rounds_up(masks.device) if classes is None else classes
+    facts = (extents, shown_extents, patch_size, pixels, tokens, classes, decisions, known)
+    return Plan(masks, shown, patches, *facts)
 
 
 def _read(tensors: Sequence[Tensor]) -> list[list[int]]:

@@ -14,6 +14,11 @@ from ghgs_lit.types import true_places
 _STEPS = 8
 
 
+def rounds_up(device: torch.device) -> bool:
+    """Whether numbers of rows are size classes: a GPU repeats shapes, a CPU computes what counts."""
+    return device.type != "cpu"
+
+
 def size_class(count: int) -> int:
     """The smallest size class that holds ``count`` rows: 1 to 16, then eight of equal steps in each octave
     (18, 20, ..., 32, 36, ...), so that at most an eighth is added."""
@@ -51,14 +56,13 @@ class Rows:
         size = min(size_class(max(max(counts, default=0), 1)), of_group)
         number = torch.arange(of_group, device=wanted.device)
         ranks = wanted.cumsum(1)
-        # The n-th row that counts goes to place n, all others to one place more, which is cut off.
-        target = torch.where(wanted, ranks - 1, size)
-        places = number.new_zeros(groups, size + 1).scatter_(1, target, number.expand(groups, -1))
-        total, order = ranks[:, -1:], number[:size]
-        places = places.gather(1, torch.minimum(order, (total - 1).clamp(min=0)))
-        first = of_group * torch.arange(groups, device=wanted.device)
-        index = (places + first[:, None]).flatten()
-        return cls(index, (size,) * groups, images, (order < total).flatten())
+        # The n-th row that counts goes to place n from 1 on, and 0 for all others to place 0.
+        places = number.new_zeros(groups, size + 1).scatter_(1, ranks * wanted, number * wanted)
+        total, order = ranks[:, -1:], torch.arange(1, size + 1, device=wanted.device)
+        index = places.gather(1, torch.minimum(order, total))
+        if groups > 1:
+            index = index + torch.arange(0, wanted.numel(), of_group, device=wanted.device)[:, None]
+        return cls(index.flatten(), (size,) * groups, images, (order <= total).flatten())
 
     def only(self, valid: Bool[Tensor, "..."]) -> "Rows":
         """The rows that are ``valid``: others are left out, or no longer real where rows are filled."""
@@ -69,6 +73,14 @@ class Rows:
             return self
         counts = tuple(int(part.sum()) for part in found.split(self.counts))
         return dataclasses.replace(self, index=self.index[found], counts=counts)
+
+    def places(self, total: int) -> tuple[Bool[Tensor, " t"], Int[Tensor, " t"]]:
+        """Which of ``total`` pixels or tokens are rows that count, and the number of each one's row."""
+        numbers = torch.arange(len(self.index), device=self.index.device)
+        # Rows that do not count go to one place more, which is cut off.
+        target = self.index if self.real is None else torch.where(self.real, self.index, total)
+        found = numbers.new_full((total + 1,), -1).scatter_(0, target, numbers)[:total]
+        return found >= 0, found.clamp(min=0)
 
     def within(self, images: slice) -> slice:
         """The rows of consecutive images, which are whole groups."""

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.plan.rows import size_class
 from ghgs_lit.types import Extent
 
 
@@ -35,6 +36,12 @@ class Span(NamedTuple):
     def finer(self, factor: int, full: int) -> "Span":
         """The cells of these blocks of ``factor`` cells; the last block may be smaller."""
         return Span(self.start * factor, min(self.stop * factor, full), full)
+
+    def widened(self) -> "Span":
+        """These and more cells, so that their number is a size class."""
+        length = min(size_class(self.stop - self.start), self.full)
+        start = min(self.start, self.full - length)
+        return Span(start, start + length, self.full)
 
     def hull(self, other: "Span") -> "Span":
         return Span(min(self.start, other.start), max(self.stop, other.stop), self.full)
@@ -109,6 +116,8 @@ def _interpolate(maps: Tensor, axis: int, source: Span, target: Span) -> Tensor:
     return torch.lerp(below, above, weight) if torch.is_grad_enabled() else below.lerp_(above, weight)
 
 
+@lru_cache(maxsize=1024)  # on a GPU windows begin at patches, so that few differ
+@torch.inference_mode(False)  # the cached tensors may be used with a gradient later
 def _sources(
     source: Span, target: Span, dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor]:

@@ -6,7 +6,7 @@ from typing import Literal
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
@@ -18,6 +18,9 @@ from ghgs_lit.kernels.precision import exact
 
 #: How the similarity of two tokens changes their logit; see :class:`SemanticAttention`.
 Similarity = Literal["product", "product_clamped", "log", "none"]
+
+#: What logits are multiplied by, and what is added to them.
+Changes = tuple[Tensor, Tensor]
 
 #: The smallest similarity with ``log``, as its logarithm would be infinite at 0.
 S_MIN = 0.01
@@ -48,6 +51,8 @@ class SemanticAttention(nn.Module):
         require(dim % (4 * num_heads) == 0, "recalibration.num_heads", expected, num_heads)
         self.num_heads, self.similarity = num_heads, similarity
         inner = dim // 4
+        for name, value in (("one", 1.0), ("zero", 0.0)):  # on the CPU: not in checkpoints, need storage
+            self.register_buffer(name, torch.tensor(value, device="cpu"), persistent=False)
         self.norm1 = nn.LayerNorm(dim)
         self.q_proj = Linear(dim, inner)
         self.k_proj = Linear(dim, inner)
@@ -57,13 +62,22 @@ class SemanticAttention(nn.Module):
         self.mlp = nn.Sequential(Linear(dim, dim), nn.GELU(), Linear(dim, dim))
 
     def forward(
-        self, x: Float[Tensor, "N C"], neighbors: Sequence[Tensor], cosines: Sequence[Tensor] | None
+        self,
+        x: Float[Tensor, "N C"],
+        neighbors: Sequence[Tensor],
+        cosines: Sequence[Tensor] | None,
+        used: Bool[Tensor, "N k"] | None = None,
     ) -> Float[Tensor, "N C"]:
-        """Recalibrated tokens. ``x``: the tokens of all elements, one after the other. ``neighbors``: for
-        each element [n_b, k_b], as indices in it. ``cosines``: of the same shapes, if they are used."""
+        """Recalibrated tokens.
+
+        Args:
+            x: the tokens of all elements, one after the other.
+            neighbors: for each element [n_b, k_b], as indices in it.
+            cosines: of the same shapes, if they are used.
+            used: which neighbours of one element count, one of each token at least; None: all."""
         counts = [len(near) for near in neighbors]
         elements = zip(x.split(counts), neighbors, cosines or [None] * len(counts), strict=True)
-        results = [self._recalibrate_element(*element) for element in elements]
+        results = [self._recalibrate_element(*element, used) for element in elements]
         return results[0] if len(results) == 1 else torch.cat(results)
 
     def attention_weights(
@@ -77,7 +91,11 @@ class SemanticAttention(nn.Module):
         return self._weights(q, k[near], *(y.expand(near.shape) for y in changes))
 
     def _recalibrate_element(
-        self, x: Float[Tensor, "n C"], near: Int[Tensor, "n k"], cosines: Float[Tensor, "n k"] | None
+        self,
+        x: Float[Tensor, "n C"],
+        near: Int[Tensor, "n k"],
+        cosines: Float[Tensor, "n k"] | None,
+        used: Bool[Tensor, "n k"] | None,
     ) -> Float[Tensor, "n C"]:
         """Recalibrate one element: keys and values of all tokens first, then the tokens in parts."""
         linears = (self.q_proj, self.k_proj, self.v_proj, self.o_proj, self.mlp[0], self.mlp[2])
@@ -91,7 +109,7 @@ class SemanticAttention(nn.Module):
 
         def recalibrate(rows: slice) -> Float[Tensor, "m C"]:
             q = at_least_float32(q_proj(self.norm1(x[rows])))
-            y = self._attend(q, k, v, near[rows], None if cosines is None else cosines[rows])
+            y = self._attend(q, k, v, near[rows], self._changes(cosines, used, rows))
             residual = x[rows] + o_proj(y)
             # One expression, so that the input of each layer is freed before the next one runs.
             return residual + mlp_out(self.mlp[1](mlp_in(self.norm2(residual))))
@@ -104,20 +122,19 @@ class SemanticAttention(nn.Module):
         k: Float[Tensor, "n i"],
         v: Float[Tensor, "n i"],
         near: Int[Tensor, "m k"],
-        cosines: Float[Tensor, "m k"] | None,
+        changes: Changes | None,
     ) -> Float[Tensor, "m i"]:
         """Weighted values of the neighbours of ``m`` tokens (Eq. 3), in float32 or wider. On a CPU by a
         product with all tokens: faster than gathering, without a tensor of size m x k x C."""
         with exact(q.device.type):
             if q.device.type != "cpu" or self.num_heads * len(q) * len(k) > _SCORES:
-                return self._attend_gathered(q, k, v, near, cosines)
+                return self._attend_gathered(q, k, v, near, changes or self.factor_and_bias(None))
             q, k, v = (t.unflatten(1, (self.num_heads, -1)).transpose(0, 1) for t in (q, k, v))
             index = near[None].expand(len(q), -1, -1)
             scores = q * q.shape[-1] ** -0.5 @ k.mT
             logits = scores.gather(2, index)
-            if cosines is not None:
-                factor, bias = self.factor_and_bias(cosines)
-                logits = logits * factor + bias
+            if changes is not None:
+                logits = logits * changes[0] + changes[1]
             # Without a gradient the weights reuse the memory of the scores.
             weights = torch.zeros_like(scores) if torch.is_grad_enabled() else scores.zero_()
             weights = weights.scatter_(2, index, logits.softmax(-1))
@@ -129,11 +146,11 @@ class SemanticAttention(nn.Module):
         k: Float[Tensor, "n i"],
         v: Float[Tensor, "n i"],
         near: Int[Tensor, "m k"],
-        cosines: Float[Tensor, "m k"] | None,
+        changes: Changes,
     ) -> Float[Tensor, "m i"]:
         """Eq. 3 with gathered keys and values of neighbours; nothing is as large as the square of the tokens.
         If there are several parts, the backward pass computes each again."""
-        factor, bias = (x.expand(near.shape) for x in self.factor_and_bias(cosines))
+        factor, bias = (x.expand(near.shape) for x in changes)
 
         def attend(q: Tensor, k: Tensor, v: Tensor, index: Tensor, *others: Tensor) -> Tensor:
             weights = self._weights(q, k[index], *others)
@@ -161,14 +178,21 @@ class SemanticAttention(nn.Module):
         logits = products * (q.shape[1] // self.num_heads) ** -0.5 * factor[..., None] + bias[..., None]
         return logits.softmax(1)
 
-    def factor_and_bias(self, cosines: Float[Tensor, "*n"] | None) -> tuple[Tensor, Tensor]:
+    def _changes(self, cosines: Tensor | None, used: Tensor | None, rows: slice) -> Changes | None:
+        """:meth:`factor_and_bias` of some tokens; None: logits stay. Neighbours that are not used count
+        nothing."""
+        if cosines is None and used is None:
+            return None
+        factor, bias = self.factor_and_bias(None if cosines is None else cosines[rows])
+        return factor, bias if used is None else torch.where(used[rows], bias, -torch.inf)
+
+    def factor_and_bias(self, cosines: Float[Tensor, "*n"] | None) -> Changes:
         """What the semantic similarity multiplies a logit by, and what it adds."""
-        one = torch.ones((), device=self.q_proj.weight.device)
         if cosines is None:
-            return one, one * 0
+            return self.one, self.zero
         if self.similarity == "log":
-            return one, cosines.clamp(min=S_MIN).log()
-        return (cosines.clamp(min=0) if self.similarity == "product_clamped" else cosines), one * 0
+            return self.one, cosines.clamp(min=S_MIN).log()
+        return (cosines.clamp(min=0) if self.similarity == "product_clamped" else cosines), self.zero
 
 
 def _cast_once(linear: nn.Linear) -> Callable[[Tensor], Tensor]:

@@ -66,7 +66,7 @@ def _near(
     places, positions = recalibration.places(tokens), recalibration.positions(tokens, points)
     places = None if places is None else places[chosen]
     k = neighbor_count(recalibration.k, len(chosen))
-    return nearest_neighbors(positions[chosen], tokens.image[chosen], k, places)
+    return nearest_neighbors(positions[chosen], tokens.image[chosen], k, places, tokens.grid[1])
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,14 @@ _BLOCK, _GPU_BLOCK = 1 << 17, 1 << 23
 
 @torch.no_grad()
 def nearest_neighbors(
-    points: Float[Tensor, "n d"], view: Int[Tensor, " n"], k: int, places: Int[Tensor, " n"] | None = None
-) -> Int[Tensor, "n k"]:
+    points: Float[Tensor, "*b n d"],
+    view: Int[Tensor, "*b n"],
+    k: int,
+    places: Int[Tensor, "*b n"] | None = None,
+    views: int = 0,
+) -> Int[Tensor, "*b n k"]:
     """Indices of the ``min(k, n)`` nearest points of each point in any view, itself included, nearest first.
+    Of one element, or of several with the same number of points.
 
     Distances are computed from differences in float32 or wider: products would lose digits far from the
     origin.
@@ -26,37 +31,41 @@ def nearest_neighbors(
         k: number of neighbours, at least 1.
         places: a number of each token's place, which orders points at equal distances: nearest number first,
             so that opposite places alternate, and at each place the query's own view, then the next views.
-            None: ties by index."""
+            None: ties by index.
+        views: number of views of an element; read with ``places``."""
     points = at_least_float32(points)
-    n = points.shape[0]
+    n = points.shape[-2]
     k = min(k, n)
-    views = 0 if places is None or n == 0 else int(view.max() - view.min()) + 1
     # Filled, not concatenated: small results between freed blocks of distances would fragment the memory.
-    index = torch.empty(n, k, dtype=torch.int64, device=points.device)
-    for rows in even_parts(n, at_once(points.device, _BLOCK, _GPU_BLOCK) // max(n, 1)):
-        distance = torch.cdist(points[rows], points, compute_mode="donot_use_mm_for_euclid_dist")
+    index = torch.empty(*points.shape[:-1], k, dtype=torch.int64, device=points.device)
+    for rows in even_parts(n, at_once(points.device, _BLOCK, _GPU_BLOCK) // max(points[..., 0].numel(), 1)):
+        own = points[..., rows, :]
+        distance = torch.cdist(own, points, compute_mode="donot_use_mm_for_euclid_dist")
         ranks = None if places is None else _turns(places, view, views, rows)
-        index[rows] = _smallest(distance, ranks, k)
+        index[..., rows, :] = _smallest(distance, ranks, k)
     return index
 
 
-def _turns(places: Tensor, view: Tensor, views: int, block: slice) -> Int[Tensor, "m n"]:
+def _turns(places: Tensor, view: Tensor, views: int, block: slice) -> Int[Tensor, "*b m n"]:
     """Ranks of tokens at equal distances from the queries ``block``; see ``places``."""
-    apart = places - places[block, None]
-    return (2 * apart.abs() + (apart < 0)) * views + (view - view[block, None]) % views
+    apart = places[..., None, :] - places[..., block, None]
+    turn = (view[..., None, :] - view[..., block, None]) % views
+    return (2 * apart.abs() + (apart < 0)) * views + turn
 
 
-def _smallest(distance: Float[Tensor, "m n"], ranks: Int[Tensor, "m n"] | None, k: int) -> Int[Tensor, "m k"]:
+def _smallest(
+    distance: Float[Tensor, "*b m n"], ranks: Int[Tensor, "*b m n"] | None, k: int
+) -> Int[Tensor, "*b m k"]:
     """Columns of the ``k`` smallest values of each row, ascending, ties by rank or column; NaN is largest.
     ``topk`` does not define the order of equal values, so the rank is the lower half of the key; the upper
     half is the bits of the distance, since those of non-negative floats sort like their values."""
     if distance.dtype == torch.float64:
         if ranks is None:
-            return distance.sort(dim=1, stable=True).indices[:, :k]
-        order = ranks.argsort(dim=1)
-        return order.gather(1, distance.gather(1, order).sort(dim=1, stable=True).indices[:, :k])
+            return distance.sort(dim=-1, stable=True).indices[..., :k]
+        order = ranks.argsort(dim=-1)
+        return order.gather(-1, distance.gather(-1, order).sort(dim=-1, stable=True).indices[..., :k])
     if ranks is None:
-        ranks = torch.arange(distance.shape[1], device=distance.device)
+        ranks = torch.arange(distance.shape[-1], device=distance.device)
     # The sign of inf - inf is negative on some machines; abs() clears it.
     key = (distance.abs().view(torch.int32).long() << 32) | ranks
-    return key.topk(k, dim=1, largest=False).indices
+    return key.topk(k, dim=-1, largest=False).indices

@@ -1,7 +1,6 @@
 """Recalibration of latent embeddings by multi-view semantic consistency (paper, section 3.3)."""
 
 import dataclasses
-import itertools
 from typing import Annotated, Literal
 
 import torch
@@ -16,6 +15,7 @@ from ghgs_lit.kernels.linear import linear
 from ghgs_lit.kernels.pool import at_once, even_parts
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.plan import Plan
+from ghgs_lit.plan.rows import Rows
 from ghgs_lit.recalibration.attention import SemanticAttention, Similarity
 from ghgs_lit.recalibration.neighbors import nearest_neighbors
 from ghgs_lit.types import DecodedPixels, Points, Tokens
@@ -58,9 +58,10 @@ class Recalibration(nn.Module):
     def forward(self, tokens: Tokens, points: Points, plan: Plan) -> Tokens:
         """Tokens with recalibrated layers; semantic features and order are unchanged. ``plan``: its ``peers``
         take part if their points are valid, or if all tokens do."""
-        batch_size, takes_part = tokens.grid[0], self.takes_part(points)
-        rows = plan.peers.only(takes_part)
-        counts, chosen = rows.counts, rows.index
+        rows = plan.peers.only(self.takes_part(points))
+        if rows.real is not None:
+            return self._filled(tokens, points, rows)
+        batch_size, counts, chosen = tokens.grid[0], rows.counts, rows.index
 
         def part(values: Tensor) -> Tensor:
             return values if len(chosen) == len(values) else values[chosen]
@@ -70,22 +71,45 @@ class Recalibration(nn.Module):
         pairs = (part(values).split(counts) for values in (self.positions(tokens, points), tokens.image))
         elements = zip(*pairs, places, strict=True)
         neighbors = [
-            nearest_neighbors(where, view, neighbor_count(self.k, len(where)), number)
+            nearest_neighbors(where, view, neighbor_count(self.k, len(where)), number, tokens.grid[1])
             for where, view, number in elements
         ]
         cosines = None
         if self.block.similarity != "none":
             semantic = part(tokens.semantic).split(counts)
             cosines = [neighbor_cosines(*pair) for pair in zip(semantic, neighbors, strict=True)]
-        if takes_part.device.type != "cpu" and len({near.shape[1] for near in neighbors}) == 1:
-            # All elements at once: a GPU waits for calls.
-            starts = itertools.accumulate(counts, initial=0)
-            neighbors = [torch.cat([near + start for near, start in zip(neighbors, starts, strict=False)])]
-            cosines = cosines and [torch.cat(cosines)]
         layers = []
         for layer in tokens.latent:
             new = self.block(part(layer), neighbors, cosines).to(layer.dtype)
             layers.append(new if len(new) == len(layer) else layer.index_copy(0, chosen, new))
+        return dataclasses.replace(tokens, latent=tuple(layers))
+
+    def _filled(self, tokens: Tokens, points: Points, rows: Rows) -> Tokens:
+        """:meth:`forward` for elements with the same number of ``rows``, all at once. Rows that do not count
+        are out of reach of the others, and their results are not read."""
+        shape = (len(rows.counts), rows.counts[0])
+        places, real = self.places(tokens), rows.real.view(shape)
+        of_tokens = (self.positions(tokens, points), tokens.image)
+        where, image = (values[rows.index].unflatten(0, shape) for values in of_tokens)
+        where = where.masked_fill(~real[..., None], torch.inf)
+        places = None if places is None else places[rows.index].view(shape)
+        most = min(neighbor_count(self.k, shape[1]), shape[1])
+        near = nearest_neighbors(where, image, most, places, tokens.grid[1])
+        cosines = None
+        if self.block.similarity != "none":
+            semantic = tokens.semantic[rows.index].unflatten(0, shape)
+            cosines = [neighbor_cosines(semantic, near).flatten(0, 1)]
+        # Elements with fewer tokens have fewer neighbours.
+        wanted = real.sum(1, keepdim=True)
+        wanted = (wanted * float(self.k)).round().clamp(min=1) if self.k < 1 else wanted.clamp(1, most)
+        order = torch.arange(most, device=near.device)
+        used = (order < wanted[..., None]).expand(*shape, most).flatten(0, 1)
+        near = near + shape[1] * torch.arange(shape[0], device=near.device)[:, None, None]
+        takes_part, number = rows.places(len(tokens.image))
+        layers = []
+        for layer in tokens.latent:
+            new = self.block(layer[rows.index], [near.flatten(0, 1)], cosines, used).to(layer.dtype)
+            layers.append(torch.where(takes_part[:, None], new.index_select(0, number), layer))
         return dataclasses.replace(tokens, latent=tuple(layers))
 
     def takes_part(self, points: Points) -> Bool[Tensor, " N"]:
@@ -113,17 +137,22 @@ def neighbor_count(k: int | float, tokens: int) -> int:
 
 
 @torch.no_grad()
-def neighbor_cosines(semantic: Float[Tensor, "n s"], near: Int[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+def neighbor_cosines(
+    semantic: Float[Tensor, "*b n s"], near: Int[Tensor, "*b n k"]
+) -> Float[Tensor, "*b n k"]:
     """Cosines of the semantic features of tokens and their neighbours ``near`` (Eq. 4), float32 or wider; 0
-    for zeros."""
+    for zeros. One element, or several with the same number of tokens."""
     with exact(semantic.device.type):
         semantic = at_least_float32(semantic)
         # Allocated before temporary tensors, so that their memory can be freed.
         cosines = semantic.new_empty(near.shape)
         directions = unit(semantic)
         most = at_once(semantic.device, _COSINES, _GPU_COSINES)
-        for rows in even_parts(len(directions), most // max(1, len(directions))):
-            torch.gather(linear(directions[rows], directions), 1, near[rows], out=cosines[rows])
+        count = directions.shape[-2]
+        for rows in even_parts(count, most // max(1, len(directions.flatten(0, -2)))):
+            own = directions[..., rows, :]
+            products = linear(own, directions) if own.dim() == 2 else own @ directions.mT
+            torch.gather(products, -1, near[..., rows, :], out=cosines[..., rows, :])
     return cosines
 
 

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghgs_lit.geometry.masks import coverage, surface_colors
@@ -32,10 +32,14 @@ _EVERY = 3
 #: Steps of reweighting, and of that of slopes, which begins farther away.
 _STEPS, _STEPS_OF_SLOPES = 5, 15
 
+#: Which rows are Gaussians; None: all.
+Real = Bool[Tensor, " N"] | None
 
-def equalized(gaussians: Gaussians, batch: Batch) -> tuple[Gaussians, Batch]:
-    """Gaussians and their photographs, divided by the gains of their cameras."""
-    logs = log_gains(gaussians, batch)
+
+def equalized(gaussians: Gaussians, batch: Batch, real: Real = None) -> tuple[Gaussians, Batch]:
+    """Gaussians and their photographs, divided by the gains of their cameras. ``real``: which rows are
+    Gaussians; None: all."""
+    logs = log_gains(gaussians, batch, real)
     colors = gaussians.colors * torch.exp(-logs).flatten(0, 1)[gaussians.image]
     return dataclasses.replace(gaussians, colors=colors), divided(batch, logs)
 
@@ -47,12 +51,12 @@ def divided(batch: Batch, logs: Float[Tensor, "B V 3"]) -> Batch:
 
 
 @torch.no_grad()
-def log_gains(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
+def log_gains(gaussians: Gaussians, batch: Batch, real: Real = None) -> Float[Tensor, "B V 3"]:
     """Natural logarithms of each camera's gains; 0 if views share nothing. Their mean is about 0, as
     photographs do not tell which camera is right. Pairs of views are compared at the Gaussians that both see,
-    with Cauchy weights, so that wrong depths matter little."""
+    with Cauchy weights, so that wrong depths matter little. ``real``: as of :func:`equalized`."""
     with exact(gaussians.means.device.type):
-        own, logs, theirs, weights = _compared(gaussians, batch)
+        own, logs, theirs, weights = _compared(gaussians, batch, real)
         ratios = logs - theirs
         b, views = batch.masks.shape[:2]
         gains, element = ratios.new_zeros(b, views, 3), own // views
@@ -92,19 +96,21 @@ def _summed(own: Int[Tensor, " N"], images: int, *values: Float[Tensor, "N V 3"]
     return stacked.new_zeros(len(values), images, *stacked.shape[2:]).index_add_(1, own, stacked)
 
 
-def _thinned(gaussians: Gaussians) -> Gaussians:
+def _thinned(gaussians: Gaussians) -> tuple[Gaussians, Int[Tensor, " n"]]:
+    """One of :data:`_EVERY` Gaussians of each element, and their indices."""
     device, splits = gaussians.means.device, gaussians.splits
     ends = list(itertools.accumulate(splits))
     kept = [torch.arange(end - n, end, _EVERY, device=device) for n, end in zip(splits, ends, strict=True)]
-    return gaussians.select(torch.cat(kept), tuple(map(len, kept)))
+    index = torch.cat(kept)
+    return gaussians.select(index, tuple(map(len, kept))), index
 
 
 def _compared(
-    gaussians: Gaussians, batch: Batch
+    gaussians: Gaussians, batch: Batch, real: Real = None
 ) -> tuple[Int[Tensor, " N"], Float[Tensor, "N V 3"], Float[Tensor, "N V 3"], Float[Tensor, "N V 3"]]:
     """Own photograph of some Gaussians, logs of their colours in each view and in their own, and weights."""
     depth, views = render(gaussians, batch.cameras).depth, batch.masks.shape[1]
-    gaussians = _thinned(gaussians)
+    gaussians, index = _thinned(gaussians)
     shares = coverage(batch)[:, :, None]
     maps = torch.cat((batch.once(surface_colors) * shares, shares, depth), 2).to(batch.cameras.extrinsics)
     found, z, can_see = looked_up(gaussians, batch.cameras, maps)
@@ -113,6 +119,8 @@ def _compared(
     near = _NEAR if gaussians.metre is None else _NEAR * gaussians.metre[gaussians.image // views, None, None]
     weights = torch.where(can_see, torch.exp(-((z - depth) / near).square()), 0)
     weights = weights * (10 * share - 9).clamp(0, 1)
+    if real is not None:
+        weights = weights * real[index, None, None]
     weights = weights * (torch.minimum(color, 1 - color) / _DARK).clamp(0, 1)
     own = (gaussians.image % views)[:, None, None].expand(-1, 1, 3)
     logs = color.clamp(min=_DARK / 8).log()

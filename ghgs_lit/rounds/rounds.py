@@ -7,6 +7,7 @@ changes its raw attributes. Learned optimizers of splats also use the errors of 
 et al., ECCV 2024; ReSplat, Xu et al., 2025)."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -26,6 +27,7 @@ from ghgs_lit.heads.activations import bounded_tanh
 from ghgs_lit.heads.gaussian import RAW_VALUES, RawGaussians, float32_last
 from ghgs_lit.kernels.pool import at_once, even_parts, multiplies
 from ghgs_lit.kernels.precision import exact
+from ghgs_lit.plan.rows import size_class
 from ghgs_lit.rounds import cpu
 from ghgs_lit.rounds.gains import equalized
 from ghgs_lit.rounds.observation import CHANNELS, SLOPES, observe, slopes
@@ -37,10 +39,12 @@ SIDE = 5
 
 class Windows(NamedTuple):
     """Positions of Gaussians in maps cropped to the subject of each image. ``place``: index among the pixels
-    of all maps. ``shape``: number, height and width of the maps."""
+    of all maps. ``shape``: number, height and width of the maps. ``spare``: 1 if rows that are no Gaussian
+    have a place behind all pixels, else 0."""
 
     place: Int[Tensor, " N"]
     shape: tuple[int, int, int]
+    spare: int = 0
 
     @classmethod
     def of(cls, raw: RawGaussians, batch: Batch) -> "Windows":
@@ -48,12 +52,17 @@ class Windows(NamedTuple):
         filled = [extent for extent in batch.extents if extent.count]
         height = max((extent.bottom - extent.top for extent in filled), default=1)
         width = max((extent.right - extent.left for extent in filled), default=1)
+        if raw.real is not None:
+            height, width = size_class(height), size_class(width)
         corners = [(extent.top, extent.left) if extent.count else (0, 0) for extent in batch.extents]
         corners = torch.tensor(corners).to(raw.pixel.device, non_blocking=True)
         top, left = corners[raw.image].unbind(1)
         full = batch.masks.shape[-1]
         row, column = raw.pixel // full - top, raw.pixel % full - left
-        return cls((raw.image * height + row) * width + column, (len(corners), height, width))
+        place, shape = (raw.image * height + row) * width + column, (len(corners), height, width)
+        if raw.real is None:
+            return cls(place, shape)
+        return cls(torch.where(raw.real, place, math.prod(shape)), shape, spare=1)
 
 
 class Exchange(nn.Module):
@@ -79,10 +88,11 @@ class Exchange(nn.Module):
 
     def heard(self, known: Float[Tensor, "N w"], windows: Windows) -> Float[Tensor, "N c"]:
         """Features of the neighbours; 0 for pixels without a Gaussian."""
-        told, (count, height, width) = self.tell(known), windows.shape
-        maps = told.new_zeros(count * height * width, told.shape[1]).index_copy(0, windows.place, told)
-        maps = self.across(maps.view(count, height, width, told.shape[1]).permute(0, 3, 1, 2))
-        return maps.permute(0, 2, 3, 1).flatten(0, 2).index_select(0, windows.place)
+        told, size = self.tell(known), math.prod(windows.shape)
+        maps = told.new_zeros(size + windows.spare, told.shape[1]).index_copy(0, windows.place, told)
+        maps = self.across(maps[:size].view(*windows.shape, told.shape[1]).permute(0, 3, 1, 2))
+        place = windows.place.clamp(max=size - 1) if windows.spare else windows.place
+        return maps.permute(0, 2, 3, 1).flatten(0, 2).index_select(0, place)
 
 
 #: Gaussians that go through the network at once on a CPU.
@@ -218,7 +228,7 @@ class Rounds(nn.Module):
             step: size of the first step, in those after a depth head; one for all elements or one for
                 each."""
         if self.options.gains and batch.log_gains is None:
-            gaussians, batch = equalized(state.gaussians, batch)
+            gaussians, batch = equalized(state.gaussians, batch, state.raw.real)
             state = dataclasses.replace(state, gaussians=gaussians)
         states, memory = [state], torch.tanh(self.start(state.raw.descriptors))
         windows = None if self.exchange is None else Windows.of(state.raw, batch)
@@ -326,6 +336,8 @@ def _moved(
     change: Float[Tensor, "N c"],
 ) -> State:
     raw, maps, pixels = state.raw.changed(change), state.depth_maps, state.points.pixels
+    if raw.real is not None:
+        moved = moved * raw.real
     depth = maps.depth.flatten().index_add(0, rays.place, moved).view_as(maps.depth)
     maps = dataclasses.replace(maps, depth=depth)
     pixels = pixels.flatten(0, 3).index_add(0, rays.place, moved[:, None] * rays.direction).view_as(pixels)

@@ -32,7 +32,7 @@ def test_ties_on_the_image_plane_favor_no_view_and_no_side(dtype):
     tokens, points = scene(((144, 144, 144, 144),), grid=(12, 12))
     module = make_stage(neighborhood="image_plane", k=48)
     position = module.positions(tokens, points).to(dtype)
-    near = nearest_neighbors(position, tokens.image, 48, module.places(tokens))
+    near = nearest_neighbors(position, tokens.image, 48, module.places(tokens), tokens.grid[1])
     inside = (tokens.row - 5.5).abs().maximum((tokens.column - 5.5).abs()) < 2
     index = near[inside]
     turn = (tokens.image[index] - tokens.image[inside, None]) % 4
@@ -118,7 +118,8 @@ def test_at_each_place_of_the_image_plane_the_own_view_comes_first():
     """One more neighbour than there are views: it is of the query's own view, whichever that is."""
     tokens, points = scene(((16, 16, 16, 16),))
     module = make_stage(neighborhood="image_plane", k=5)
-    near = nearest_neighbors(module.positions(tokens, points), tokens.image, 5, module.places(tokens))
+    places, views = module.places(tokens), tokens.grid[1]
+    near = nearest_neighbors(module.positions(tokens, points), tokens.image, 5, places, views)
     turn = (tokens.image[near] - tokens.image[:, None]) % 4
     assert torch.equal(turn, torch.tensor([0, 1, 2, 3, 0]).expand(64, 5))
 

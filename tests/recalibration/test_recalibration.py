@@ -245,7 +245,7 @@ def test_gathered_neighbors_give_what_a_product_of_all_tokens_gives(similarity, 
     cosines = None if similarity == "none" else torch.rand(40, 9, dtype=torch.float64) * 2 - 1
 
     def results():
-        out = block._attend(*inputs, near, cosines)
+        out = block._attend(*inputs, near, block.factor_and_bias(cosines))
         return out, *torch.autograd.grad(out.square().sum(), inputs)
 
     expected = results()
@@ -272,7 +272,8 @@ def test_neighbors_that_the_ablation_keeps_are_counted(neighborhood):
         near = nearest_neighbors(points.tokens[chosen], tokens.image[chosen], 5)
         other = make_stage(k=5, neighborhood="image_plane")
         places = other.places(tokens)[chosen]
-        flat = nearest_neighbors(other.positions(tokens, points)[chosen], tokens.image[chosen], 5, places)
+        where, views = other.positions(tokens, points)[chosen], tokens.grid[1]
+        flat = nearest_neighbors(where, tokens.image[chosen], 5, places, views)
         same = [len(set(a) & set(b)) / 5 for a, b in zip(near.tolist(), flat.tolist(), strict=True)]
         assert one.shared == pytest.approx(sum(same) / len(same), abs=1e-6)
         assert 0.1 < one.shared < 0.9

@@ -73,8 +73,8 @@ DEFECTS = (
         "A.softmax(-1) → A.exp() / A.exp().sum(-1, keepdim=True)", "attention", "huge_features",
     ),
     Defect(
-        "distances in half precision", nearest_neighbors, "points[rows] → points[rows].half().float()",
-        "neighbours", "shifted",
+        "distances in half precision", nearest_neighbors,
+        "points[..., rows, :] → points[..., rows, :].half().float()", "neighbours", "shifted",
     ),
     Defect(
         "distances by products", nearest_neighbors,

@@ -70,8 +70,8 @@ _BLOCKS = {s: SemanticAttention(128, 2, s) for s in ("product", "product_clamped
 
 def _attention(v: Values) -> Values:
     """Eq. 3 with every use of the similarity."""
-    inputs = [v[name] for name in ("q", "k", "v", "index", "cosines")]
-    return {name: block._attend(*inputs) for name, block in _BLOCKS.items()}
+    inputs, cosines = [v[name] for name in ("q", "k", "v", "index")], v["cosines"]
+    return {name: block._attend(*inputs, block.factor_and_bias(cosines)) for name, block in _BLOCKS.items()}
 
 
 def _attention_slowly(v: Values) -> Values:
