@@ -192,11 +192,15 @@ class Extent(NamedTuple):
     left: int
     right: int
 
+    def coarser(self, stride: int, count: int) -> "Extent":
+        """The extent in cells of ``stride`` x ``stride`` pixels, of which ``count`` are touched."""
+        bottom, right = ((end - 1) // stride + 1 for end in (self.bottom, self.right))
+        return Extent(count, self.top // stride, bottom, self.left // stride, right)
+
     def cells(self, stride: int) -> int:
         """Number of cells of ``stride`` x ``stride`` pixels that the bounding box touches."""
-        rows, columns = ((self.top, self.bottom), (self.left, self.right))
-        sides = [(end - 1) // stride - start // stride + 1 for start, end in (rows, columns)]
-        return sides[0] * sides[1] if self.count else 0
+        _, top, bottom, left, right = self.coarser(stride, 0)
+        return (bottom - top) * (right - left) if self.count else 0
 
 
 def extents(masks: Bool[Tensor, "n H W"]) -> list[Extent]:

@@ -152,14 +152,14 @@ def planned(
         classes: whether numbers of rows are size classes; None: as the masks' device needs it."""
     b, v = masks.shape[:2]
     shown = patches_around_subject(masks, patch_size, 0)
-    images, *grids = (each.flatten(0, 1) for each in (masks, shown, *choices))
-    numbers = [extent_numbers(images), *map(extent_numbers, grids)]
-    found = _read([*numbers, *([torch.stack(list(flags))] if flags else [])])
-    count = len(numbers)
-    extents, shown_extents, *of_choices = (
+    asked = [masks, *choices]
+    numbers = [shown.flatten(2).sum(-1), *(extent_numbers(each.flatten(0, 1)) for each in asked)]
+    counts, *found = _read([*numbers, *([torch.stack(list(flags))] if flags else [])])
+    extents, *of_choices = (
         tuple(Extent(*values[first : first + 5]) for first in range(0, len(values), 5))
-        for values in found[:count]
+        for values in found[: len(asked)]
     )
+    shown_extents = tuple(e.coarser(patch_size, n) for e, n in zip(extents, counts, strict=True))
     decisions, kept, kept_extents = (), choices[0], of_choices[0]
     if choose is not None:
         sizes = [torch.tensor([e.count for e in each], device="cpu").view(b, v) for each in of_choices]
@@ -168,7 +168,7 @@ def planned(
         each = [of_choices[best[image // v]][image] for image in range(b * v)]
         kept_extents = tuple(each)
     patches = KeptPatches(kept, masks.device, kept_extents)
-    known = tuple(bool(value) for values in found[count:] for value in values)
+    known = tuple(bool(value) for values in found[len(asked) :] for value in values)
     classes = rounds_up(masks.device) if classes is None else classes
     facts = (extents, shown_extents, patch_size, pixels, tokens, classes, decisions, known)
     return Plan(masks, shown, patches, *facts)

@@ -6,7 +6,7 @@ from typing import Literal
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
@@ -66,7 +66,7 @@ class SemanticAttention(nn.Module):
         x: Float[Tensor, "N C"],
         neighbors: Sequence[Tensor],
         cosines: Sequence[Tensor] | None,
-        used: Bool[Tensor, "N k"] | None = None,
+        left_out: Float[Tensor, "N k"] | None = None,
     ) -> Float[Tensor, "N C"]:
         """Recalibrated tokens.
 
@@ -74,10 +74,11 @@ class SemanticAttention(nn.Module):
             x: the tokens of all elements, one after the other.
             neighbors: for each element [n_b, k_b], as indices in it.
             cosines: of the same shapes, if they are used.
-            used: which neighbours of one element count, one of each token at least; None: all."""
+            left_out: of one element, -inf where a neighbour does not count, else 0; one of each token counts
+                at least; None: all."""
         counts = [len(near) for near in neighbors]
         elements = zip(x.split(counts), neighbors, cosines or [None] * len(counts), strict=True)
-        results = [self._recalibrate_element(*element, used) for element in elements]
+        results = [self._recalibrate_element(*element, left_out) for element in elements]
         return results[0] if len(results) == 1 else torch.cat(results)
 
     def attention_weights(
@@ -95,7 +96,7 @@ class SemanticAttention(nn.Module):
         x: Float[Tensor, "n C"],
         near: Int[Tensor, "n k"],
         cosines: Float[Tensor, "n k"] | None,
-        used: Bool[Tensor, "n k"] | None,
+        left_out: Float[Tensor, "n k"] | None,
     ) -> Float[Tensor, "n C"]:
         """Recalibrate one element: keys and values of all tokens first, then the tokens in parts."""
         linears = (self.q_proj, self.k_proj, self.v_proj, self.o_proj, self.mlp[0], self.mlp[2])
@@ -109,7 +110,7 @@ class SemanticAttention(nn.Module):
 
         def recalibrate(rows: slice) -> Float[Tensor, "m C"]:
             q = at_least_float32(q_proj(self.norm1(x[rows])))
-            y = self._attend(q, k, v, near[rows], self._changes(cosines, used, rows))
+            y = self._attend(q, k, v, near[rows], self._changes(cosines, left_out, rows))
             residual = x[rows] + o_proj(y)
             # One expression, so that the input of each layer is freed before the next one runs.
             return residual + mlp_out(self.mlp[1](mlp_in(self.norm2(residual))))
@@ -178,13 +179,15 @@ class SemanticAttention(nn.Module):
         logits = products * (q.shape[1] // self.num_heads) ** -0.5 * factor[..., None] + bias[..., None]
         return logits.softmax(1)
 
-    def _changes(self, cosines: Tensor | None, used: Tensor | None, rows: slice) -> Changes | None:
-        """:meth:`factor_and_bias` of some tokens; None: logits stay. Neighbours that are not used count
-        nothing."""
-        if cosines is None and used is None:
+    def _changes(self, cosines: Tensor | None, left_out: Tensor | None, rows: slice) -> Changes | None:
+        """:meth:`factor_and_bias` of some tokens, with -inf for neighbours that are left out; None: logits
+        stay."""
+        if cosines is None and left_out is None:
             return None
         factor, bias = self.factor_and_bias(None if cosines is None else cosines[rows])
-        return factor, bias if used is None else torch.where(used[rows], bias, -torch.inf)
+        if left_out is None:
+            return factor, bias
+        return factor, left_out[rows] if bias is self.zero else bias + left_out[rows]
 
     def factor_and_bias(self, cosines: Float[Tensor, "*n"] | None) -> Changes:
         """What the semantic similarity multiplies a logit by, and what it adds."""

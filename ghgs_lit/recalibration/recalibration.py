@@ -101,20 +101,22 @@ class Recalibration(nn.Module):
             cosines = [neighbor_cosines(semantic, near).flatten(0, 1)]
         # Elements with fewer tokens have fewer neighbours.
         wanted = real.sum(1, keepdim=True)
-        wanted = (wanted * float(self.k)).round().clamp(min=1) if self.k < 1 else wanted.clamp(1, most)
-        order = torch.arange(most, device=near.device)
-        used = (order < wanted[..., None]).expand(*shape, most).flatten(0, 1)
-        near = near + shape[1] * torch.arange(shape[0], device=near.device)[:, None, None]
+        wanted = (wanted.double() * self.k).round().clamp(min=1) if self.k < 1 else wanted.clamp(1, most)
+        beyond = torch.arange(most, device=near.device) >= wanted[..., None]
+        left_out = torch.where(beyond, -torch.inf, 0.0).expand(*shape, most).flatten(0, 1)
+        if shape[0] > 1:
+            near = near + shape[1] * torch.arange(shape[0], device=near.device)[:, None, None]
         takes_part, number = rows.places(len(tokens.image))
         layers = []
         for layer in tokens.latent:
-            new = self.block(layer[rows.index], [near.flatten(0, 1)], cosines, used).to(layer.dtype)
+            new = self.block(layer[rows.index], [near.flatten(0, 1)], cosines, left_out).to(layer.dtype)
             layers.append(torch.where(takes_part[:, None], new.index_select(0, number), layer))
         return dataclasses.replace(tokens, latent=tuple(layers))
 
     def takes_part(self, points: Points) -> Bool[Tensor, " N"]:
         """Tokens that are recalibrated and can be neighbours."""
-        return points.tokens_valid | (self.tokens == "all")
+        valid = points.tokens_valid
+        return valid if self.tokens == "subject" else torch.ones_like(valid)
 
     def positions(self, tokens: Tokens, points: Points) -> Float[Tensor, "N d"]:
         """Position of each token in the space where neighbours are searched; see ``neighborhood``."""
