@@ -32,14 +32,14 @@ class Asked(NamedTuple):
 _VERSION = "2.13."
 
 LIMITS = {
-    ("model=paper", 1): Asked(1617, 3, 3090, 4),
-    ("model=paper", 8): Asked(1772, 3, 3314, 4),
-    ("model=hull", 1): Asked(1823, 3, 3350, 4),
-    ("model=hull", 8): Asked(1978, 3, 3575, 4),
-    ("model=recurrent", 1): Asked(2444, 4, 4237, 5),
-    ("model=recurrent", 8): Asked(2646, 4, 4509, 5),
-    ("shipped", 1): Asked(2592, 4, 4237, 5),
-    ("shipped", 8): Asked(2805, 4, 4509, 5),
+    ("model=paper", 1): Asked(1599, 1, 3092, 2),
+    ("model=paper", 8): Asked(1621, 1, 3187, 2),
+    ("model=hull", 1): Asked(1800, 1, 3329, 2),
+    ("model=hull", 8): Asked(1822, 1, 3426, 2),
+    ("model=recurrent", 1): Asked(2431, 2, 4230, 3),
+    ("model=recurrent", 8): Asked(2500, 2, 4374, 3),
+    ("shipped", 1): Asked(2582, 2, 4230, 3),
+    ("shipped", 8): Asked(2662, 2, 4374, 3),
 }
 
 

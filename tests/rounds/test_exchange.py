@@ -16,7 +16,7 @@ HEIGHT, WIDTH, KNOWN, CHANNELS = 13, 17, 6, 3
 def scene(masks):
     """The Gaussians of some of the subject's pixels, as a skip leaves them, and their batch."""
     image, row, column = torch.nonzero(masks, as_tuple=True)
-    raw = SimpleNamespace(image=image, pixel=row * WIDTH + column)
+    raw = SimpleNamespace(image=image, pixel=row * WIDTH + column, real=None)
     batch = SimpleNamespace(masks=masks[None], extents=extents(masks))
     return raw, batch
 
