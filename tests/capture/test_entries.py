@@ -9,19 +9,18 @@ from ghgs_capture.formats import read_cameras
 from ghgs_lit.errors import InputError
 from tests.helpers.calibrations import CAMERA, LENS, frame, one_camera, transforms, write
 
+SPELLINGS = [
+    *("D", "d", "dist", "Dist", "dists", "kc", "distortion", "distortions", "lens_distortion"),
+    *("distCoeff", "distCoeffs", "dist_coeff", "dist-coeffs", "distCoef", "dist_coefs", "dist_params"),
+    *("distortion_coefficients", "distortionCoefficients", "distortion_coefficient", "distortion_coeffs"),
+    *("distortion_coef", "distortion_params", "distortion_parameters", "lensDistortionCoefficients"),
+]
 
-@pytest.mark.parametrize(
-    "spelling",
-    [
-        *("D", "d", "dist", "Dist", "dists", "kc", "distortion", "distortions", "lens_distortion"),
-        *("distCoeff", "distCoeffs", "dist_coeff", "dist-coeffs", "distCoef", "dist_coefs", "dist_params"),
-        *("distortion_coefficients", "distortionCoefficients", "distortion_coefficient", "distortion_coeffs"),
-        *("distortion_coef", "distortion_params", "distortion_parameters", "lensDistortionCoefficients"),
-    ],
-)
-def test_a_lens_counts_under_every_name(tmp_path, spelling):
-    for value in (LENS, [LENS]):  # a list, or a row of a matrix as NumPy has it
-        np.testing.assert_array_equal(one_camera(tmp_path, **{spelling: value}).distortion, LENS)
+
+def test_a_lens_counts_under_every_name(tmp_path):
+    for spelling in SPELLINGS:
+        for value in (LENS, [LENS]):  # a list, or a row of a matrix as NumPy has it
+            np.testing.assert_array_equal(one_camera(tmp_path, **{spelling: value}).distortion, LENS)
 
 
 def test_a_lens_of_single_numbers_counts(tmp_path):
@@ -101,10 +100,10 @@ KINDS = pytest.mark.parametrize("kind", ["ghgs", "opencv", "nerfstudio"])
 
 
 @KINDS
-@pytest.mark.parametrize("value", ["no", "false", "0", "yes", 2, -1, 0.5, [1], {"on": True}])
-def test_flags_are_true_or_false(tmp_path, kind, value):
+@pytest.mark.parametrize("key", ["fisheye", "is_fisheye"])
+def test_flags_are_true_or_false(tmp_path, kind, key):
     """Text and 2 once counted as true: a lens of another model, without a word."""
-    for key in ("fisheye", "is_fisheye"):
+    for value in ("no", "0", 2, -1, 0.5, [1], {"on": True}):
         with pytest.raises(
             InputError, match=rf"{key}: expected true or false; found {re.escape(repr(value))}"
         ):
@@ -112,31 +111,31 @@ def test_flags_are_true_or_false(tmp_path, kind, value):
 
 
 @KINDS
-@pytest.mark.parametrize(("value", "found"), [(True, 1), (1, 1), (1.0, 1), (False, 0), (0, 0), (None, 0)])
-def test_flags_that_are_read(tmp_path, kind, value, found):
-    camera = read_entries(tmp_path, kind, {"fisheye": value, "k1": 0.1, "k2": 0, "k3": None})
-    assert camera.fisheye == bool(found)
-    np.testing.assert_array_equal(camera.distortion[:2], [0.1, 0])
+def test_flags_that_are_read(tmp_path, kind):
+    for value, found in ((True, 1), (1, 1), (1.0, 1), (False, 0), (0, 0), (None, 0)):
+        camera = read_entries(tmp_path, kind, {"fisheye": value, "k1": 0.1, "k2": 0, "k3": None})
+        assert camera.fisheye == bool(found)
+        np.testing.assert_array_equal(camera.distortion[:2], [0.1, 0])
+
+
+WRONG_TYPES = [
+    ({"w": 0, "h": 480}, "width: expected a whole number above 0; found 0"),
+    ({"w": 640.5, "h": 480}, "width: expected a whole number above 0; found 640.5"),
+    ({"w": True, "h": 480}, "w: expected a finite number; found True"),
+    ({"w": "wide", "h": 480}, "w: expected a finite number; found 'wide'"),
+    ({"k1": True}, "k1: expected a finite number; found True"),
+    ({"k1": [0.1]}, r"k1: expected a finite number; found \[0\.1\]"),
+    ({"D": [0.1, True, 0, 0]}, r"D: expected numbers; found \[0\.1, True"),
+    ({"D": "none"}, "D: expected an array"),
+    ({"D": {"k1": 0.1}}, "D: expected an array"),
+]
 
 
 @KINDS
-@pytest.mark.parametrize(
-    ("entries", "line"),
-    [
-        ({"w": 0, "h": 480}, "width: expected a whole number above 0; found 0"),
-        ({"w": 640.5, "h": 480}, "width: expected a whole number above 0; found 640.5"),
-        ({"w": True, "h": 480}, "w: expected a finite number; found True"),
-        ({"w": "wide", "h": 480}, "w: expected a finite number; found 'wide'"),
-        ({"k1": True}, "k1: expected a finite number; found True"),
-        ({"k1": [0.1]}, r"k1: expected a finite number; found \[0\.1\]"),
-        ({"D": [0.1, True, 0, 0]}, r"D: expected numbers; found \[0\.1, True"),
-        ({"D": "none"}, "D: expected an array"),
-        ({"D": {"k1": 0.1}}, "D: expected an array"),
-    ],
-)
-def test_values_have_types(tmp_path, kind, entries, line):
-    with pytest.raises(InputError, match=line):
-        read_entries(tmp_path, kind, entries)
+def test_values_have_types(tmp_path, kind):
+    for entries, line in WRONG_TYPES:
+        with pytest.raises(InputError, match=line):
+            read_entries(tmp_path, kind, entries)
 
 
 @KINDS

@@ -81,8 +81,10 @@ def written(folder, files):
     return ["--config-dir", str(folder / "conf")]
 
 
-@pytest.mark.parametrize("mode", ["single", "grid"])
-@pytest.mark.parametrize("case", REFUSED)
+@pytest.mark.parametrize(
+    ("case", "mode"),
+    [*((case, "single") for case in REFUSED), ("environment", "grid"), ("a group of Hydra", "grid")],
+)
 def test_what_a_file_says_to_hydra_is_held_to_a_list(monkeypatch, capsys, tmp_path, case, mode):
     """``env_set: {GHGS_PLUGINS: ...}`` of a file ran its code, and callbacks called functions."""
     files, message = REFUSED[case]

@@ -31,35 +31,18 @@ def test_yaml_and_options_of_a_verb_agree(verb):
             assert getattr(read, name) == field.get_default(call_default_factory=True), name
 
 
-@pytest.mark.parametrize("verb", verbs())
-def test_every_key_of_a_verb_has_a_meaning(verb):
+def test_every_key_of_a_verb_has_a_meaning():
     """``--help`` shows it."""
-    for cls in every_class(verb_class(verb)):
+    for cls in (cls for verb in verbs() for cls in every_class(verb_class(verb))):
         assert set(cls.model_fields) <= set(meanings(cls)), cls
 
 
 @pytest.mark.parametrize(
     ("verb", "override", "message"),
     [
-        ("train", "seed=true", "seed: expected an integer >= 0 and <= 4294967295; found True"),
         ("train", f"seed={10**400}", "seed: expected an integer >= 0 and <= 4294967295; found 1000"),
-        ("train", "seed=-1", "seed: expected an integer >= 0 and <= 4294967295; found -1"),
-        ("train", "seed=null", "seed: expected an integer >= 0 and <= 4294967295; found None"),
         ("train", "+sed=3", "sed: expected one of allow_random_encoder"),
-        (
-            "train",
-            "token_budgets=[some]",
-            "token_budgets: expected a list (each one of all, window or an integer",
-        ),
-        ("predict", "size=9000", "size: expected an integer >= 1 and <= 2072 or a list of 2 values"),
         ("predict", "refine=1e9", "refine: expected an integer >= 0 and <= 10000; found 1000000000.0"),
-        ("predict", "turntable.frames=1000000", "turntable.frames: expected an integer >= 0 and <= 2000"),
-        ("predict", "device=tpu", "device: expected one of auto, cpu, cuda; found 'tpu'"),
-        ("predict", "calibration.format=x", "calibration.format: expected one of auto, ghgs"),
-        ("predict", "calibration.unit=0", "calibration.unit: expected a number > 0 or null; found 0"),
-        ("view", "port=70000", "port: expected an integer >= 0 and <= 65535; found 70000"),
-        ("evaluate", "evaluation.views=[1]", "evaluation.views: expected an integer >= 2 or a list"),
-        ("benchmark", "timing.repeats=0", "timing.repeats: expected an integer >= 1 and <= 1000; found 0"),
         ("table", "runs=[]", "runs: expected a text or a list of paths; found []"),
     ],
 )

@@ -42,8 +42,10 @@ READERS = {
 
 
 @pytest.mark.parametrize("reader", READERS)
-@pytest.mark.parametrize("save", [AtomicCheckpointIO().save_checkpoint, torch.save])
-@pytest.mark.parametrize("where", ["weights", "configuration"])
+@pytest.mark.parametrize(
+    ("save", "where"),
+    [(AtomicCheckpointIO().save_checkpoint, "weights"), (torch.save, "configuration")],
+)
 def test_one_changed_bit_is_refused_by_every_reader(tmp_path, reader, save, where):
     """A flipped bit would be a slightly other model in silence."""
     path, made = tmp_path / "last.ckpt", content()
@@ -94,18 +96,19 @@ FILES_OF_WEIGHTS = {**READERS, "any file of weights": open_file}
 
 
 @pytest.mark.parametrize("reader", FILES_OF_WEIGHTS)
-@pytest.mark.parametrize("compression", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_compressed_records_are_refused_by_every_reader(tmp_path, reader, compression):
+def test_compressed_records_are_refused_by_every_reader(tmp_path, reader):
     """PyTorch maps records as they lie on the disk: all weights would be other numbers, in silence."""
     path = tmp_path / "a.ckpt"
     torch.save(content(), path)
     packed_again(path, zipfile.ZIP_STORED)
     assert GHGS.from_checkpoint(path)
-    packed_again(path, compression)
-    with pytest.raises(
-        InputError, match=r"a\.ckpt: expected .*; found a compressed or encrypted record \(a/"
-    ):
-        FILES_OF_WEIGHTS[reader](path)
+    kinds = (zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
+    for compression in kinds if reader == "any file of weights" else kinds[:1]:
+        packed_again(path, compression)
+        with pytest.raises(
+            InputError, match=r"a\.ckpt: expected .*; found a compressed or encrypted record \(a/"
+        ):
+            FILES_OF_WEIGHTS[reader](path)
 
 
 def test_a_file_that_unpacks_without_limit_is_refused_before_it_is_read(tmp_path):
@@ -149,8 +152,13 @@ TENSOR = torch.ones(2, 2)
     [
         *(
             ({"config": {**config(), node: value}}, rf"config\.{node}: expected a mapping")
-            for node in ("data", "model", "skip", "encoder", "callbacks")
-            for value in ([], "text", 3)
+            for node, value in (
+                ("data", []),
+                ("model", "text"),
+                ("skip", 3),
+                ("encoder", []),
+                ("callbacks", 3),
+            )
         ),
         ({"state_dict": {3: TENSOR}}, "state_dict: expected names of tensors; found 3"),
         ({"state_dict": {"model.a": TENSOR.to_sparse()}}, "model.a: expected a dense tensor"),
@@ -169,23 +177,23 @@ def test_what_no_checkpoint_holds_is_named(tmp_path, changes, message):
         GHGS.from_checkpoint(tmp_path / "a.ckpt")
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("global_step", "5"),
-        ("optimizer_states", {}),
-        ("optimizer_states", [3]),
-        ("lr_schedulers", "text"),
-        ("loops", "text"),
-        ("callbacks", []),
-        ("epoch", "text"),
-        ("optimizer_states", [{"state": 3}]),
-    ],
-)
-def test_a_state_of_training_of_another_form_is_refused(tmp_path, key, value):
-    torch.save(content(**{key: value}), tmp_path / "a.ckpt")
-    with pytest.raises(InputError, match=rf"a\.ckpt: {key}.*: expected .*; found"):
-        check_resume(tmp_path / "a.ckpt", held(make_model()), config())
+FOREIGN_STATES = [
+    ("global_step", "5"),
+    ("optimizer_states", {}),
+    ("optimizer_states", [3]),
+    ("lr_schedulers", "text"),
+    ("loops", "text"),
+    ("callbacks", []),
+    ("epoch", "text"),
+    ("optimizer_states", [{"state": 3}]),
+]
+
+
+def test_a_state_of_training_of_another_form_is_refused(tmp_path):
+    for key, value in FOREIGN_STATES:
+        torch.save(content(**{key: value}), tmp_path / "a.ckpt")
+        with pytest.raises(InputError, match=rf"a\.ckpt: {key}.*: expected .*; found"):
+            check_resume(tmp_path / "a.ckpt", held(make_model()), config())
 
 
 def test_a_missing_version_of_lightning_is_this_one(tmp_path):
