@@ -104,11 +104,20 @@ class Augmentation(Options):
             ] * 2
         return drawn, tuple(max(1, round(r * side)) for r, side in zip(ratios, drawn, strict=True))
 
+    def is_exact(self, seed: int, step: int) -> bool:
+        """Whether the inputs of a training step are as they are read."""
+        limits = (
+            *(self.exposure, self.white_balance, self.gamma, self.cut, self.calibration),
+            *(self.mask_offset, self.mask_ragged, self.mask_hole_chance),
+        )
+        is_last = self.exact_from is not None and step >= self.exact_from
+        is_perfect = is_last or not any(limits)
+        return is_perfect or np.random.default_rng([seed, _CHANCE, step]).uniform() >= self.chance
+
     def imperfect(self, batch: Batch, seed: int, step: int, indices: Sequence[int]) -> Batch:
         """The batch of a training step with the imperfections of captures, in a share ``chance`` of the
         steps. ``indices``: numbers of the samples in the run."""
-        is_last = self.exact_from is not None and step >= self.exact_from
-        if is_last or np.random.default_rng([seed, _CHANCE, step]).uniform() >= self.chance:
+        if self.is_exact(seed, step):
             return batch
         return self.imperfections(
             batch, [np.random.default_rng([seed, _IMPERFECTIONS, step, index]) for index in indices]

@@ -91,11 +91,13 @@ class TrainingBatches(Dataset):
     def __len__(self) -> int:
         return self.length
 
+    def sizes(self, step: int) -> tuple[Size, Size]:
+        """(height, width) of the inputs and of the targets at a step."""
+        inputs, targets = self.builder.inputs.size, self.builder.targets.size
+        return self.augmentation.draw_sizes(inputs, targets, self.sampler.seed, step)
+
     def __getitem__(self, step: int) -> Batch:
-        sizes = self.augmentation.draw_sizes(
-            self.builder.inputs.size, self.builder.targets.size, self.sampler.seed, step
-        )
-        batch = self.builder.batch(self.sampler.batch(step, self.rank, self.world), *sizes)
+        batch = self.builder.batch(self.sampler.batch(step, self.rank, self.world), *self.sizes(step))
         indices = self.sampler.indices(step, self.rank, self.world)
         return self.augmentation.imperfect(batch, self.sampler.seed, step, indices)
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from scipy import sparse
 
 #: Largest relative difference of depths of one surface at neighbouring pixels.
-_SAME_SURFACE = 0.02
+SAME_SURFACE = 0.02
 
 
 def area_image(image: np.ndarray, height: int, width: int) -> np.ndarray:
@@ -43,13 +43,13 @@ def centered_depth(inverse: np.ndarray, height: int, width: int) -> np.ndarray:
     planes) among those of the four old pixels that are known and on the nearest surface."""
     if inverse.shape == (height, width):
         return inverse
-    rows, down = _neighbors(inverse.shape[0], height)
-    columns, across = _neighbors(inverse.shape[1], width)
+    rows, down = neighbors(inverse.shape[0], height)
+    columns, across = neighbors(inverse.shape[1], width)
     known = inverse.astype(np.float32)
     corners = [known[rows[i][:, None], columns[j]] for i in (0, 1) for j in (0, 1)]
     weights = [down[i][:, None] * across[j] for i in (0, 1) for j in (0, 1)]
     front = np.maximum.reduce([np.where(w > 0, c, 0) for c, w in zip(corners, weights, strict=True)])
-    least = np.maximum((1 - _SAME_SURFACE) * front, 0.5)  # 0 is unknown
+    least = np.maximum((1 - SAME_SURFACE) * front, 0.5)  # 0 is unknown
     total, mean = np.zeros_like(front), np.zeros_like(front)
     for corner, weight in zip(corners, weights, strict=True):
         counted = weight * (corner >= least)
@@ -73,13 +73,13 @@ def release_mask(mask: np.ndarray, height: int, width: int) -> np.ndarray:
 def _area_means(layers: np.ndarray, height: int, width: int) -> np.ndarray:
     """Means [height, width, c] float32 over the areas of new pixels, with exact weights."""
     h, w, channels = layers.shape
-    lines = _area_weights(h, height) @ layers.reshape(h, w * channels).astype(np.float32)
+    lines = area_weights(h, height) @ layers.reshape(h, w * channels).astype(np.float32)
     lines = np.moveaxis(lines.reshape(height, w, channels), 1, 0).reshape(w, height * channels)
-    return np.moveaxis((_area_weights(w, width) @ lines).reshape(width, height, channels), 0, 1)
+    return np.moveaxis((area_weights(w, width) @ lines).reshape(width, height, channels), 0, 1)
 
 
 @lru_cache(maxsize=16)
-def _area_weights(old: int, new: int) -> "sparse.csr_array":
+def area_weights(old: int, new: int) -> "sparse.csr_array":
     """Share [new, old] of each new pixel that each old one covers; rows sum to 1."""
     from scipy import sparse  # here: a wrong path is refused before it is needed
 
@@ -90,7 +90,7 @@ def _area_weights(old: int, new: int) -> "sparse.csr_array":
     return sparse.coo_array((shares, places), shape=(new, old)).tocsr()
 
 
-def _neighbors(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
+def neighbors(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
     """Indices [2, new] of the old pixels around the centres of the new ones, and linear weights [2, new]."""
     place = (np.arange(new) + 0.5) * old / new - 0.5
     first = np.floor(place)
@@ -99,7 +99,7 @@ def _neighbors(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
     return indices, np.stack((1 - second, second))
 
 
-_DEPTH_SCALE = 1 << 15
+DEPTH_SCALE = 1 << 15
 
 
 @dataclass(frozen=True)
@@ -136,13 +136,13 @@ class View:
 def _depths() -> np.ndarray:
     """Depth [65536] float32 in metres of each inverse depth; 0 for 0."""
     inverse = np.arange(1, 1 << 16)
-    return np.concatenate(([0], _DEPTH_SCALE / inverse)).astype(np.float32)
+    return np.concatenate(([0], DEPTH_SCALE / inverse)).astype(np.float32)
 
 
 def encode_depth(depth: np.ndarray) -> np.ndarray:
     """Inverse depth uint16 of metres; 0 stays 0. At 2 m a step is 0.12 mm; nearer than 0.5 m saturates."""
     known = depth > 0
-    inverse = np.round(_DEPTH_SCALE / np.where(known, depth, 1))
+    inverse = np.round(DEPTH_SCALE / np.where(known, depth, 1))
     return np.where(known, np.clip(inverse, 1, 65535), 0).astype(np.uint16)
 
 
