@@ -59,10 +59,13 @@ class ModelMethod:
             batch = self.cameras(batch)
         with seen_calls(getattr(self.model, "recalibration", None)) as seen:
             prediction = self.model(batch)
-        gaussians, depth = prediction.gaussians, prediction.depth
+        gaussians = prediction.gaussians
+        depth = prediction.depth
         if self.refinement is not None:
-            gaussians, depth = self.refinement(gaussians, batch), None
-        image, valid = self.renderer(gaussians, batch.targets.cameras).image, prediction.depth_valid
+            gaussians = self.refinement(gaussians, batch)
+            depth = None
+        image = self.renderer(gaussians, batch.targets.cameras).image
+        valid = prediction.depth_valid
         lost = not_finite(batch, prediction)
         # Smaller copies of photographs (coarse to fine) go through the stages first.
         last = seen[-1] if seen else None
@@ -81,7 +84,7 @@ def not_finite(batch: Batch, prediction: Prediction) -> tuple[int, ...]:
     """
     splats = (~prediction.gaussians.is_finite).split(prediction.gaussians.splits)
     depths = (batch.masks & ~prediction.depth_valid).flatten(1).sum(1)
-    counts = tuple((torch.stack([found.sum() for found in splats]) + depths).tolist())
+    counts = tuple((torch.stack([lost.sum() for lost in splats]) + depths).tolist())
     names = batch.subjects or tuple(map(str, range(len(counts))))
     lost = [f"{name}: {count}" for name, count in zip(names, counts, strict=True) if count]
     if lost:
@@ -106,7 +109,8 @@ def _surface_errors(batch: Batch, gaussians: Gaussians) -> list[float | None]:
 
 
 def _rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[Row]:
-    targets, (b, t) = batch.targets, batch.targets.images.shape[:2]
+    targets = batch.targets
+    (b, t) = batch.targets.images.shape[:2]
     flat = metrics(estimate.image.flatten(0, 1), targets.images.flatten(0, 1), targets.masks.flatten(0, 1))
     values = {name: value.reshape(b, t).tolist() for name, value in flat.items()}
     surfaces = [] if estimate.gaussians is None else _surface_errors(batch, estimate.gaussians)
@@ -162,7 +166,8 @@ def _draw(batch: Batch, estimate: Estimate, element: int, pictures: Path, name: 
         chosen = [p == protocol for p in batch.targets.protocols]
         part = dataclasses.replace(batch, targets=batch.targets.of_protocol(protocol))
         picture = sheet(part, estimate.image[:, chosen], element, estimate.depth, estimate.depth_valid)
-        views, subject = batch.images.shape[1], batch.subjects[element]
+        views = batch.images.shape[1]
+        subject = batch.subjects[element]
         save_png(picture, pictures / f"{name}_v{views}_{protocol}_{subject}.png")
 
 
@@ -245,9 +250,9 @@ def measure_all(
     rows: list[Row] = []
     for count in views:
         loader = data.evaluation_loader(views=count, targets=list(targets.values()), split=split)
-        found: list[Row] = []
+        measured: list[Row] = []
         for name, method in methods.items():
             batches = track(loader, f"measuring {name}, {count} views")
-            found += measure(method, name, batches, metrics, device, pictures, picture_count)
-        rows += [row for kind in targets for row in found if row["targets"] == kind]
+            measured += measure(method, name, batches, metrics, device, pictures, picture_count)
+        rows += [row for kind in targets for row in measured if row["targets"] == kind]
     return rows

@@ -44,8 +44,8 @@ def check_evaluation(config: Mapping[str, Any], data: PhotographsDataModule) -> 
     """
     evaluation = config["evaluation"]
     for key in ("views", "targets"):
-        found = evaluation[key]
-        require(isinstance(found, list) and bool(found), f"evaluation.{key}", "a list with a value", found)
+        values = evaluation[key]
+        require(isinstance(values, list) and bool(values), f"evaluation.{key}", "a list with a value", values)
     views = evaluation["views"]
     require(len(set(views)) == len(views), "evaluation.views", "different numbers from 2 on", views)
     protocols = {

@@ -57,7 +57,8 @@ def measure_and_write(
     metrics = build(config["metrics"], "metrics").to(device)
     for name, reason in metrics.left_out.items():
         print_once(f"{name} is left out: {reason}")
-    views, split = evaluation["views"], evaluation["split"]
+    views = evaluation["views"]
+    split = evaluation["split"]
     pictures = directory / "pictures", evaluation["pictures"]
     rows = measure_all(methods, data, views, targets, split, metrics, device, *pictures)
     if METHOD in methods:

@@ -152,9 +152,9 @@ def print_plan(planned: Sequence[PlannedRun], directory: Path, rehearse: Rehears
     Raises:
         InputError: Something is missing.
     """
-    found = rehearse([item.config for item in planned if not item.run.done])
+    rehearsal = rehearse([item.config for item in planned if not item.run.done])
     measured = step_seconds(directory)
-    step = measured[0] if measured else found.step
+    step = measured[0] if measured else rehearsal.step
     times = [expected_seconds(item.config, step) for item in planned]
     budgets = [_budget(item.config, seconds) for item, seconds in zip(planned, times, strict=True)]
     states = _print_states(planned, {"trains for": budgets}, "; nothing was run")
@@ -168,11 +168,11 @@ def print_plan(planned: Sequence[PlannedRun], directory: Path, rehearse: Rehears
     reason = "; ".join(basis) or "no trainer.max_time, and no step was measured or tried"
     print(f"expected training time of the remaining runs, one after another: {known} ({reason})")
     print(f"outputs: {directory}/<run>/ with {OUTPUTS}", flush=True)
-    for note in found.notes:
+    for note in rehearsal.notes:
         print(f"note: {note}")
-    for reason in found.reasons:
+    for reason in rehearsal.reasons:
         print(f"would be refused: {reason}", flush=True)
-    count = len(found.reasons)
+    count = len(rehearsal.reasons)
     if count:
         raise InputError(f"dry_run: expected runs that lack nothing; found {count} missing, as said above")
 
@@ -238,7 +238,8 @@ def _sweep(
     Returns:
         What the jobs returned.
     """
-    config, loader = sweeper.config, sweeper.hydra_context.config_loader
+    config = sweeper.config
+    loader = sweeper.hydra_context.config_loader
     combos = combinations(sweeper.params, arguments, loader)
     planned = plan(combos, lambda overrides: loader.load_sweep_config(config, overrides), directory)
     if len(planned) < len(combos):
@@ -303,11 +304,14 @@ def plan(
         check_ablation(cfg, cfg.hydra)
         with open_dict(cfg):
             cfg.hydra.job.num = len(planned)
-            subdirectory, verb, hydra_node = str(cfg.hydra.sweep.subdir), cfg.hydra.job.name, cfg.hydra
+            subdirectory = str(cfg.hydra.sweep.subdir)
+            verb = cfg.hydra.job.name
+            hydra_node = cfg.hydra
             del cfg["hydra"]
         config = resolve(cfg, verb if verb in verbs() else None)
         config["chosen"] = chosen_options(config, hydra_node)
-        name, shown = config_hash(config), tuple(filter_overrides(overrides))
+        name = config_hash(config)
+        shown = tuple(filter_overrides(overrides))
         # The job writes to the planned directory, whatever number a launcher gives it.
         places = {"dir": str(directory), "subdir": subdirectory}
         fixed = (f"hydra.sweep.{key}={_quoted(place)}" for key, place in places.items())
@@ -318,7 +322,7 @@ def plan(
 
 def _quoted(text: str) -> str:
     """``text`` as a value of an override."""
-    return "'" + re.sub(r"(\\*)('|$)", lambda found: 2 * found[1] + ("\\'" if found[2] else ""), text) + "'"
+    return "'" + re.sub(r"(\\*)('|$)", lambda match: 2 * match[1] + ("\\'" if match[2] else ""), text) + "'"
 
 
 def check_directories(planned: Sequence[PlannedRun]) -> None:
@@ -333,8 +337,8 @@ def check_directories(planned: Sequence[PlannedRun]) -> None:
     runs = {}
     for item in planned:
         other = runs.setdefault(item.run.path, item)
-        found = f"{item.run.path} for {' '.join(other.shown)} and {' '.join(item.shown)}"
-        require(other is item, "hydra.sweep.subdir", "a directory for each configuration", found)
+        shared = f"{item.run.path} for {' '.join(other.shown)} and {' '.join(item.shown)}"
+        require(other is item, "hydra.sweep.subdir", "a directory for each configuration", shared)
         if not item.run.done:
             item.run.start(item.config)
 

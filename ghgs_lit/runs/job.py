@@ -53,12 +53,12 @@ def register_resolvers() -> None:
         if name.startswith("sweep_"):
             command = list(_root_.hydra.overrides.task)
             sweeps = {run.path.parent for run in begun_by_job(runs, f"sweep_*/*/{MARKER}")}
-            found = [sweep for sweep in sweeps if lookup(read_yaml(sweep / PLAN), _TASK) == command]
+            folders = [sweep for sweep in sweeps if lookup(read_yaml(sweep / PLAN), _TASK) == command]
         else:
             own = hash_of_run(_root_=_root_)
             begun = begun_by_job(runs, f"*/{MARKER}")
-            found = [run.path for run in begun if run.marker.config_hash == own]
-        return max((path.name for path in found), default=name)
+            folders = [run.path for run in begun if run.marker.config_hash == own]
+        return max((path.name for path in folders), default=name)
 
     def sqlite(path: str) -> str:
         place = resolved(path)
@@ -119,7 +119,8 @@ def train_beside(run: RunDirectory, config: dict[str, Any], train: Train) -> flo
     Raises:
         InputError: There is no first process.
     """
-    run, end = run.of(config), time.monotonic() + _PATIENCE
+    run = run.of(config)
+    end = time.monotonic() + _PATIENCE
     while (session := run.session_beside()) is None:
         if run.done and (in_sweep() or run.goes_on(config)):
             return run.metric

@@ -23,7 +23,9 @@ class Lines:
     """Progress lines, appended to the file ``log``, if any, and printed (not beside a bar)."""
 
     def __init__(self, log: Path | None = None, every: float = EVERY, printed: bool = True) -> None:
-        self.log, self.every, self.printed = log, every, printed
+        self.log = log
+        self.every = every
+        self.printed = printed
         self._next = time.monotonic()
 
     def due(self) -> bool:
@@ -75,7 +77,8 @@ def track(items: Iterable[T], text: str, every: float = EVERY) -> Iterator[T]:
         yield from bar(items, text, transient=True)
         return
     total = f" of {len(items)}" if hasattr(items, "__len__") else ""
-    lines, started = Lines(every=every), time.monotonic()
+    lines = Lines(every=every)
+    started = time.monotonic()
     for done, item in enumerate(items):
         if lines.due() and done:
             lines.say(f"{text}: {done}{total}, {clock(time.monotonic() - started)}")

@@ -65,8 +65,8 @@ def version_of(name: str) -> str | None:
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the installed packages that results depend on."""
-    found = {name: version for name in PACKAGES if (version := version_of(name)) is not None}
-    return {"python": platform.python_version(), **found}
+    installed = {name: version for name in PACKAGES if (version := version_of(name)) is not None}
+    return {"python": platform.python_version(), **installed}
 
 
 def git_state() -> dict[str, Any] | None:

@@ -215,7 +215,8 @@ def read_results(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: expected format_version {FORMAT_VERSION}; found {found} ({again})")
     source = validated(_Results, content, str(path)).provenance
     if isinstance(source.get("config"), dict):
-        fitting, hashed = config_hash(source["config"]), source.get("config_hash")
+        fitting = config_hash(source["config"])
+        hashed = source.get("config_hash")
         expected = f"a configuration that fits its config_hash {hashed}"
         require(fitting == hashed, f"{path}: provenance.config", expected, f"one of {fitting}")
     return content

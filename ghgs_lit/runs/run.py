@@ -98,14 +98,14 @@ class RunDirectory:
         """Content of ``metrics.json``; None if it is missing, unreadable or of another configuration."""
         path = self.path / "metrics.json"
         try:
-            found = read_results(path) if path.is_file() else None
+            results = read_results(path) if path.is_file() else None
         except InputError:
             return None
-        if found is None or self.config_hash is None:
-            return found
+        if results is None or self.config_hash is None:
+            return results
         # A verb may complete the configuration of its command, whose hash is that of the run.
-        hashes = [lookup(found["provenance"], key) for key in ("config_hash", "run.config_hash")]
-        return found if self.config_hash in hashes else None
+        hashes = [lookup(results["provenance"], key) for key in ("config_hash", "run.config_hash")]
+        return results if self.config_hash in hashes else None
 
     @property
     def done(self) -> bool:
@@ -151,7 +151,8 @@ class RunDirectory:
         runs, called :attr:`title`. ``.run`` in it says whose it is."""
         if not (self.title and (self.path.parent / PLAN).is_file()):
             return self.path / "tensorboard"
-        folder, marker = self.path.parent / "tensorboard" / self.title, self.marker
+        folder = self.path.parent / "tensorboard" / self.title
+        marker = self.marker
         is_free = marker is None or _owner_of(folder) in (None, marker.id)
         return folder if is_free else folder.with_name(f"{self.title},run={marker.id}")
 
@@ -221,7 +222,8 @@ class RunDirectory:
         Returns:
             Whether the run goes on.
         """
-        marker, resume = self.marker, config.get("resume")
+        marker = self.marker
+        resume = config.get("resume")
         if marker is None or resume is None or marker.resume != resume:
             return False
         if config.get("overwrite") and not (is_queued_again() and marker.job == slurm_job()):
@@ -265,7 +267,9 @@ class RunDirectory:
         Raises:
             InputError: As for :meth:`start`.
         """
-        start, marker, is_same = self.start(config), self.marker, self.goes_on(config)
+        start = self.start(config)
+        marker = self.marker
+        is_same = self.goes_on(config)
         if not self._has(start):
             self._clear(with_sessions=not is_same)
         known = marker if is_same or self._has(start) else None
@@ -284,7 +288,8 @@ class RunDirectory:
     def _clear(self, with_sessions: bool) -> None:
         """Delete what training wrote; only in a run's folder that this process has claimed."""
         names = self._there(*WRITTEN, SESSIONS) if with_sessions else self._there(*WRITTEN)
-        paths, marker = [self.path / name for name in names], self.marker
+        paths = [self.path / name for name in names]
+        marker = self.marker
         if marker is not None and _owner_of(self.curves) == marker.id:
             paths.append(self.curves)
         if paths and not (self._is_mine and marker is not None):
@@ -316,13 +321,13 @@ class RunDirectory:
     def sessions(self) -> list[dict[str, Any]]:
         """An entry for each process that worked on the run; a killed one has no ``outcome``."""
         path = self.path / SESSIONS
-        found: list[dict[str, Any]] = []
+        sessions: list[dict[str, Any]] = []
         for entry in read_lines_of_json(path) if path.exists() else ():
             if "started" in entry:
-                found.append(entry)
-            elif found:
-                found[-1] |= entry
-        return found
+                sessions.append(entry)
+            elif sessions:
+                sessions[-1] |= entry
+        return sessions
 
     @contextlib.contextmanager
     def session(self, resumed: str | None = None) -> Iterator[dict[str, Any]]:

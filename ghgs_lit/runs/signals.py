@@ -28,7 +28,8 @@ class _Handler:
     """Signal handler that calls ``act(number)`` only in the process that made it, not in forked workers."""
 
     def __init__(self, act: Callable[[int], Any]) -> None:
-        self.act, self.process = act, os.getpid()
+        self.act = act
+        self.process = os.getpid()
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         if os.getpid() == self.process:
@@ -52,8 +53,8 @@ def interrupt(number: int) -> None:
 
 def handlers() -> dict[int, Any]:
     """Present handlers of these signals, without those that were not set from Python."""
-    found = {number: signal.getsignal(number) for number in STOP}
-    return {number: handler for number, handler in found.items() if handler is not None}
+    present = {number: signal.getsignal(number) for number in STOP}
+    return {number: handler for number, handler in present.items() if handler is not None}
 
 
 def handle(act: Callable[[int], Any], before: Mapping[int, Any]) -> None:

@@ -74,10 +74,10 @@ def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> 
         del kinds[", s = 1"]
     for layer in range(len(attention.weights)):
         tiles, captions = [], []
-        for said, all_weights in kinds.items():
+        for what, all_weights in kinds.items():
             weights = all_weights[layer].float().mean(0).cpu()
             shares = [float(weights[(near == v).cpu()].sum()) for v in range(views)]
-            captions += [f"layer {layer}{said}: {100 * share:.0f}%" for share in shares]
+            captions += [f"layer {layer}{what}: {100 * share:.0f}%" for share in shares]
             tiles += _tiles(images, tokens, attention, weights / weights.max())
         rows.append(row(tiles, captions))
     return stack(rows)
@@ -98,7 +98,8 @@ def _tiles(
         One picture for each view.
     """
     scale = max(1, -(-_SIDE // images[0].shape[0]))
-    side, views = tokens.patch_size * scale, tokens.grid[1]
+    side = tokens.patch_size * scale
+    views = tokens.grid[1]
 
     def box(token: int) -> tuple[int, int, int, int]:
         left, top = int(tokens.column[token]) * side, int(tokens.row[token]) * side

@@ -28,15 +28,15 @@ def clouds(batch: Batch, prediction: Prediction, element: int, limit: int = 6000
     """
     valid = prediction.points.valid[element] & batch.masks[element]
     colors = batch.images[element].movedim(1, -1)
-    found = {"points": (prediction.points.pixels[element][valid], colors[valid])}
+    parts = {"points": (prediction.points.pixels[element][valid], colors[valid])}
     if batch.body_vertices is not None:
         body = batch.body_vertices[element]
-        found["body"] = (body, body.new_tensor(BODY_COLOR).expand(len(body), 3))
-    found = {name: _thinned(cloud, limit) for name, cloud in found.items()}
-    if "body" in found:
-        pairs = zip(found["points"], found["body"], strict=True)
-        found["points_and_body"] = tuple(torch.cat(pair) for pair in pairs)
-    return {name: cloud for name, cloud in found.items() if len(cloud[0])}
+        parts["body"] = (body, body.new_tensor(BODY_COLOR).expand(len(body), 3))
+    parts = {name: _thinned(cloud, limit) for name, cloud in parts.items()}
+    if "body" in parts:
+        pairs = zip(parts["points"], parts["body"], strict=True)
+        parts["points_and_body"] = tuple(torch.cat(pair) for pair in pairs)
+    return {name: cloud for name, cloud in parts.items() if len(cloud[0])}
 
 
 def _thinned(cloud: Cloud, limit: int) -> Cloud:

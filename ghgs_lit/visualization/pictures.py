@@ -91,7 +91,8 @@ def row(tiles: Sequence[np.ndarray], captions: Sequence[str]) -> np.ndarray:
     height = max(tile.shape[0] for tile in tiles) + _CAPTION
     width = sum(tile.shape[1] for tile in tiles) + _GAP * (len(tiles) - 1)
     canvas = Image.new("RGB", (width, height), (24, 24, 24))
-    draw, left = ImageDraw.Draw(canvas), 0
+    draw = ImageDraw.Draw(canvas)
+    left = 0
     for tile, caption in zip(tiles, captions, strict=True):
         draw.text((left + 2, 1), caption, fill=(230, 230, 230))
         canvas.paste(Image.fromarray(tile), (left, _CAPTION))
@@ -126,7 +127,8 @@ def _depth_rows(
     Returns:
         Up to two pictures [h, w, 3] uint8.
     """
-    masks, maps = batch.masks[element], {}
+    masks = batch.masks[element]
+    maps = {}
     if depth is not None:
         maps["depth"] = (depth[element], masks if depth_valid is None else masks & depth_valid[element])
     if batch.depths is not None:

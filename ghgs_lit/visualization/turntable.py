@@ -114,7 +114,8 @@ def orbit(cameras: Cameras, angles: Tensor, points: Tensor | None = None) -> Cam
         n cameras.
     """
     center = look_at_point(cameras) if points is None else center_of(points, cameras)
-    frames, angles = len(angles), angles.to(center.device)
+    frames = len(angles)
+    angles = angles.to(center.device)
     up = up_direction(cameras)
     offsets = cameras.centers.double() - center
     heights = offsets @ up

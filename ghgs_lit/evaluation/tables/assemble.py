@@ -109,24 +109,28 @@ def _table(rows: pd.DataFrame, sweep: Sweep, options: TableOptions) -> Table:
     on = reported_table(reported)[0] if reported else None
     table = Table(options, rows, planned, sweep.configs, stub, groups, metrics, lines, reported_on=on)
     fill(table, figures)
-    table.caption, table.notes = write_caption(table), write_notes(table)
+    table.caption = write_caption(table)
+    table.notes = write_notes(table)
     return table
 
 
 def _planned_here(rows: pd.DataFrame, sweep: Sweep, layout: Layout) -> list[Planned]:
-    models, data = {variant.trained for variant in rows["variant"]}, set(rows["data"])
+    models = {variant.trained for variant in rows["variant"]}
+    data = set(rows["data"])
     planned = [p for p in sweep.planned if layout.columns == "data" or p.data in data]
     return [p for p in planned if layout.rows != "ablation" or p.variant.trained in models]
 
 
 def _groups(rows: pd.DataFrame, planned: list[Planned], options: TableOptions) -> list[Group]:
-    layout, views = options.layout, options.views or options.layout.views
+    layout = options.layout
+    views = options.views or options.layout.views
     if layout.columns == "views":
         name = data_title(rows["data"].iloc[0])
         return [Group(name if layout.heading == "data" else f"{n}-view", n) for n in views]
     names = reported_data(layout.reported) if options.reported else []
     names += [*rows["data"], *(p.data for p in planned)]
-    titles, text = dict.fromkeys(map(data_title, names)), "{}, {}-view" if len(views) > 1 else "{}"
+    titles = dict.fromkeys(map(data_title, names))
+    text = "{}, {}-view" if len(views) > 1 else "{}"
     return [Group(text.format(name, n), n, name) for name in titles for n in views]
 
 
@@ -185,5 +189,5 @@ def _label(variant: Variant, models: list[Variant]) -> str:
         return [v.model, v.encoder, v.ablation, *(f"{key}={value}" for key, value in v.extra)]
 
     different = [len(set(values)) > 1 for values in zip(*map(parts, models), strict=True)]
-    told = [p for p, differs in zip(parts(variant), different, strict=True) if differs and p not in PEERS]
-    return PEERS.get(variant.model, "Ours") + (f" ({', '.join(told)})" if told else "")
+    titles = [p for p, differs in zip(parts(variant), different, strict=True) if differs and p not in PEERS]
+    return PEERS.get(variant.model, "Ours") + (f" ({', '.join(titles)})" if titles else "")

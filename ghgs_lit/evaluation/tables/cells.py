@@ -27,7 +27,8 @@ def fill(table: Table, figures: Sequence[Mapping[str, Any]]) -> None:
     Raises:
         InputError: Runs with other numbers claim one cell and seed, or configurations in a cell differ.
     """
-    values, options = _values(table), table.options
+    values = _values(table)
+    options = table.options
     _refuse_rivals(table, values)
     # Runs with the same numbers count once.
     cell_and_seed = [*CELL, "seed"]
@@ -44,7 +45,8 @@ def fill(table: Table, figures: Sequence[Mapping[str, Any]]) -> None:
     table.cells["best"] = False
     for column in product(*_columns(table)):
         _mark_best(table, column)
-    table.cells["test"], table.cells["marked"] = None, False
+    table.cells["test"] = None
+    table.cells["marked"] = False
     if options.test.against != "none":
         _test(table, _by_person(values, options.unit), options.test)
 
@@ -57,7 +59,8 @@ def _values(table: Table) -> pd.DataFrame:
     """One row for each value: ``CELL``, ``seed``, ``source``, ``run``, ``subject``, ``count``, ``value``."""
     lines = {line.variant: i for i, line in enumerate(table.lines) if not line.is_reported}
     numbers = {(g.views, g.data): i for i, g in enumerate(table.groups)}
-    rows, facts = table.rows, ["line", "group", "seed", "source", "run", "subject"]
+    rows = table.rows
+    facts = ["line", "group", "seed", "source", "run", "subject"]
     about = zip(rows["views"], rows["data"], strict=True)
     groups = [numbers.get((n, None), numbers.get((n, data_title(data)), -1)) for n, data in about]
     rows = rows.assign(line=[lines[variant] for variant in rows["variant"]], group=groups)
@@ -126,7 +129,8 @@ def _rivals(
 def _lacking(table: Table, cell: Any) -> tuple[int, ...]:
     """Seeds of planned runs that a cell of ours, which has other seeds, still lacks."""
     line, group, _ = cell.Index
-    line, group = table.lines[line], table.groups[group]
+    line = table.lines[line]
+    group = table.groups[group]
     if not line.is_ours or not isinstance(cell.seeds, tuple):
         return ()
     planned = (p for p in table.planned if p.variant == line.variant)

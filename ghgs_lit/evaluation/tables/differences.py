@@ -25,8 +25,8 @@ def differing(
     flat = [flatten(config) for config in configs]
     keys = dict.fromkeys(key for values in flat for key in values)
     known = [key for key in keys if not is_below(key, expected)]
-    found = {key: list(dict.fromkeys(str(values.get(key, ABSENT)) for values in flat)) for key in known}
-    return {key: values for key, values in found.items() if len(values) > 1}
+    texts = {key: list(dict.fromkeys(str(values.get(key, ABSENT)) for values in flat)) for key in known}
+    return {key: values for key, values in texts.items() if len(values) > 1}
 
 
 def differing_text(keys: Mapping[str, Sequence[str]], limit: int = 6) -> str:

@@ -256,7 +256,8 @@ def reported_table(name: str) -> tuple[str, dict[str, dict[int | str, dict[str, 
     Returns:
         Data set of the table, and its rows: method, then views or data, then metric, then figure.
     """
-    table, metrics = _content()["tables"][name], _content()["metrics"]
+    table = _content()["tables"][name]
+    metrics = _content()["metrics"]
     rows = {
         method: {group: dict(zip(metrics, figures, strict=True)) for group, figures in groups.items()}
         for method, groups in table["rows"].items()

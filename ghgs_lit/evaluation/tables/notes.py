@@ -29,25 +29,26 @@ def write_caption(table: Table) -> str:
     Returns:
         Text with Markdown.
     """
-    first, names = table.rows.iloc[0], dict.fromkeys(table.rows["data"])
+    first = table.rows.iloc[0]
+    names = dict.fromkeys(table.rows["data"])
     measured = table.measured
     counts = sorted({int(count) for count in measured["count"].dropna()})
     seeds = max(map(len, measured["seeds"]), default=0)
-    said = [
+    parts = [
         f"Data {' and '.join(f'`{name}`' for name in names)}",
         f"{' or '.join(map(str, counts)) or 'no'} subjects of `{first['split']}`",
         f"targets `{first['targets']}`",
         f"metrics `{first['protocol']}`",
     ]
     if table.layout.rows == "ablation":
-        said += [f"model `{first['variant'].model}`", f"encoder `{first['variant'].encoder}`"]
-        said += [f"`{key}={value}`" for key, value in first["variant"].extra]
+        parts += [f"model `{first['variant'].model}`", f"encoder `{first['variant'].encoder}`"]
+        parts += [f"`{key}={value}`" for key, value in first["variant"].extra]
     views = {group.views for group in table.groups}
     if table.layout.heading != "views" and len(views) == 1:
-        said.append(f"{views.pop()} input views")
+        parts.append(f"{views.pop()} input views")
     spread = f" ± deviation over {seeds} seeds" if seeds > 1 else ""
     clear = " where it leads by more than the deviation" if seeds > 1 else ""
-    return f"{', '.join(said)}; mean over subjects{spread}, best of the measured methods in bold{clear}."
+    return f"{', '.join(parts)}; mean over subjects{spread}, best of the measured methods in bold{clear}."
 
 
 def write_notes(table: Table) -> list[str]:
@@ -60,24 +61,24 @@ def write_notes(table: Table) -> list[str]:
     Returns:
         Paragraphs with Markdown.
     """
-    said: list[str] = []
+    notes: list[str] = []
     if table.layout.rows == "ablation":
-        said.append(FOOTNOTE)
+        notes.append(FOOTNOTE)
         if not table.ours[0].variant.has_semantics:
-            said.append(f"(a) {NO_SEMANTICS}.")
+            notes.append(f"(a) {NO_SEMANTICS}.")
     for name, sets in own_ablations(table).items():
-        said.append(f"`{name}`: {', '.join(f'`{key}={value}`' for key, value in sets.items())}.")
+        notes.append(f"`{name}`: {', '.join(f'`{key}={value}`' for key, value in sets.items())}.")
     if "flip" in table.metrics and "lpips" not in table.metrics:
-        said.append("FLIP replaces the paper's LPIPS, which at least one run could not compute.")
+        notes.append("FLIP replaces the paper's LPIPS, which at least one run could not compute.")
     if table.reported_on:
-        said.append(
+        notes.append(
             f"Reported: figures that {reported_source()}, prints for {table.reported_on}, measured by its"
             " authors on their data, split and views. They were not measured here, and are not comparable"
             " with figures on other data or protocols."
         )
-    said += _about_others(table)
-    said += _about_test(table)
-    return said + _about_neighbors(table) + _about_training(table) + _about_runs(table)
+    notes += _about_others(table)
+    notes += _about_test(table)
+    return notes + _about_neighbors(table) + _about_training(table) + _about_runs(table)
 
 
 def own_ablations(table: Table) -> dict[str, dict[str, Any]]:
@@ -102,7 +103,7 @@ def _of(rows: pd.DataFrame, kind: str) -> pd.DataFrame:
 
 
 def _about_others(table: Table) -> list[str]:
-    said = []
+    notes = []
     ours = set(_of(table.rows, "model").groupby(["source", "views"]).size())
     for name, rows in _of(table.rows, "other").groupby("variant", sort=False):
         untested = "" if rows["subject"].notna().all() else "; means only where untested"
@@ -110,8 +111,8 @@ def _about_others(table: Table) -> list[str]:
         subjects = rows[rows["subject"].notna()].groupby(["data", "views", "seed"]).size()
         counts = sorted({int(count) for count in (*means, *subjects)} - ours)
         fewer = f"; of {' or '.join(map(str, counts))} subjects" if counts else ""
-        said.append(f"{name.name}: {rows['said'].iloc[0]}{untested}{fewer}.")
-    return said
+        notes.append(f"{name.name}: {rows['said'].iloc[0]}{untested}{fewer}.")
+    return notes
 
 
 def _range(counts: list[int]) -> str:
@@ -129,7 +130,8 @@ def _about_test(table: Table) -> list[str]:
         else:
             why = "rows have fewer than two subjects in common"
         return [f"No differences are marked: {why}."]
-    against, test = "its column's best row", table.options.test
+    against = "its column's best row"
+    test = table.options.test
     if test.against == "full":
         full = [line for line in table.ours if line.variant.ablation == "full"]
         against = "the row of the whole method" if len(full) == 1 else against
@@ -164,18 +166,19 @@ def _could_show(table: Table) -> list[str]:
 
 def _about_training(table: Table) -> list[str]:
     """Rows that were trained for different numbers of steps, or with different seeds."""
-    ours, stubs = _of(table.rows, "model"), {line.variant: " ".join(line.stub) for line in table.lines}
-    said = []
+    ours = _of(table.rows, "model")
+    stubs = {line.variant: " ".join(line.stub) for line in table.lines}
+    notes = []
     if "steps" in ours and ours["steps"].nunique() > 1:
         steps = ours.dropna(subset="steps").groupby("variant", sort=False)["steps"].agg(list)
         rows = [f"{stubs[variant]}: {_range([round(n) for n in each])}" for variant, each in steps.items()]
-        said.append(f"Rows were trained for different numbers of steps ({'; '.join(rows)}).")
+        notes.append(f"Rows were trained for different numbers of steps ({'; '.join(rows)}).")
     seeds = ours.groupby("variant", sort=False)["seed"].unique().map(sorted)
     if seeds.map(tuple).nunique() > 1:
         lines = [line.variant for line in table.ours if line.variant in seeds]
         rows = [f"{stubs[variant]}: {', '.join(map(str, seeds[variant]))}" for variant in lines]
-        said.append(f"Rows are of different seeds ({'; '.join(rows)}).")
-    return said
+        notes.append(f"Rows are of different seeds ({'; '.join(rows)}).")
+    return notes
 
 
 def _about_neighbors(table: Table) -> list[str]:
@@ -194,15 +197,15 @@ def _about_neighbors(table: Table) -> list[str]:
 
 
 def _about_runs(table: Table) -> list[str]:
-    said = []
+    notes = []
     if table.measured["lacking"].map(bool).any():
-        said.append("(2/3): from 2 of 3 seeds; the others have no results yet.")
+        notes.append("(2/3): from 2 of 3 seeds; the others have no results yet.")
     runs = ((p, p.variant) for p in table.planned if not p.done)
     names = (f"{data_title(p.data)} {v.model} {v.ablation} seed {p.seed}" for p, v in runs)
     unfinished = list(dict.fromkeys(names))
     if unfinished:
         more = f" and {len(unfinished) - 4} more" if len(unfinished) > 4 else ""
-        said.append(f"No results yet (in progress or cut off): {'; '.join(unfinished[:4])}{more}.")
+        notes.append(f"No results yet (in progress or cut off): {'; '.join(unfinished[:4])}{more}.")
     groups: dict[tuple, list] = {}
     ours = _of(table.rows, "model")[["source", "variant", "data"]].drop_duplicates()
     for source, variant, data in ours.values:
@@ -213,8 +216,8 @@ def _about_runs(table: Table) -> list[str]:
     for shown in ("checkpoint", *by_rows, *(key for sets in own_ablations(table).values() for key in sets)):
         keys.pop(shown, None)
     if keys:
-        said.append(f"Runs side by side differ also in {differing_text(keys)}.")
+        notes.append(f"Runs side by side differ also in {differing_text(keys)}.")
     states = sorted(table.rows["git"].dropna().unique()) if "git" in table.rows else []
     if len(states) > 1:
-        said.append(f"The runs are of {len(states)} states of the code: {', '.join(states)}.")
-    return said
+        notes.append(f"The runs are of {len(states)} states of the code: {', '.join(states)}.")
+    return notes

@@ -156,7 +156,8 @@ def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()
     recalibration = config.get("recalibration")
     require(isinstance(recalibration, Mapping), f"{source}: recalibration", "a mapping", recalibration)
     compat = lookup(config, "compat.name")
-    ablation, encoder = ablation_of(config), encoder_name(config)
+    ablation = ablation_of(config)
+    encoder = encoder_name(config)
     model = [_model_name(config)]
     model += [f"compat {compat}"] * (compat not in (None, "none"))
     # What an ablation of one's own changes is a row of the model's table, not another model. The paper's
@@ -301,7 +302,7 @@ def keys_of_rows(configs: Iterable[Mapping[str, Any]]) -> list[str]:
             values.setdefault((key, data), set()).add(str(lookup(config, key)))
         for key in OF_TARGETS:
             values.setdefault((key, data, protocol), set()).add(str(lookup(config, key)))
-    return list(dict.fromkeys(key for (key, *_), found in values.items() if len(found) > 1))
+    return list(dict.fromkeys(key for (key, *_), different in values.items() if len(different) > 1))
 
 
 def _variants(configs: Mapping[str, Mapping[str, Any]], by: Sequence[str]) -> dict[str, Variant]:

@@ -138,7 +138,8 @@ def smallest_difference(comparison: Comparison, alpha: float, comparisons: int) 
     Returns:
         The difference, in the unit of the metric.
     """
-    needed, freedom = needed_errors(alpha, comparison.freedom, comparisons), comparison.freedom
+    needed = needed_errors(alpha, comparison.freedom, comparisons)
+    freedom = comparison.freedom
 
     def excess(errors: float) -> float:
         return stats.nct.sf(needed, freedom, errors) - POWER

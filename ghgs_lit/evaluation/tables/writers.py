@@ -28,7 +28,8 @@ def _cell(cell: Any, line: Line, write: Write) -> str:
     """A cell as printed: number, deviation over seeds, mark, interval of its difference, missing seeds."""
     if pd.isna(cell.mean):
         return write(line.absent, "", False)
-    digits, tail = decimals(cell.Index[2]), ""
+    digits = decimals(cell.Index[2])
+    tail = ""
     if pd.notna(cell.deviation):
         tail = f" ± {cell.deviation:.{digits}f}"
     if cell.marked:
@@ -116,8 +117,8 @@ def to_terminal(table: Table) -> str:
             rows.append([mark + first, *more, group.title, *numbers.loc[line][number]])
     names = [*table.stub, "", *(f"{title(metric)} {arrow(metric)}" for metric in table.metrics)]
     text = tabulate(rows, names, disable_numparse=True)
-    said = (each.replace("`", "").replace("**", "") for each in (table.caption, *table.notes))
-    return "\n\n".join((next(said), text, *said)) + "\n"
+    paragraphs = (each.replace("`", "").replace("**", "") for each in (table.caption, *table.notes))
+    return "\n\n".join((next(paragraphs), text, *paragraphs)) + "\n"
 
 
 def to_csv(tables: Sequence[Table]) -> str:
@@ -137,8 +138,11 @@ def to_csv(tables: Sequence[Table]) -> str:
 
 
 def _line(number: int, table: Table, cell: Any) -> dict[str, Any]:
-    line, group = table.lines[cell.Index[0]], table.groups[cell.Index[1]]
-    variant, setting, reported = line.variant, table.rows.iloc[0], line.is_reported
+    line = table.lines[cell.Index[0]]
+    group = table.groups[cell.Index[1]]
+    variant = line.variant
+    setting = table.rows.iloc[0]
+    reported = line.is_reported
     about = {
         "table": number,
         "method": line.stub[0] if table.layout.rows == "methods" else "ours",
@@ -229,7 +233,8 @@ def _row(cells: Iterable[str]) -> str:
 
 def _head(table: Table) -> list[str]:
     """Rows of titles, with a rule below each group of columns."""
-    stub, width = list(map(escape, table.stub)), len(table.metrics)
+    stub = list(map(escape, table.stub))
+    width = len(table.metrics)
     metrics = [f"{escape(title(metric))}{_ARROWS[arrow(metric)]}" for metric in table.metrics]
     if table.layout.heading == "none":
         return [_row([*stub, *metrics * len(table.groups)])]
@@ -242,11 +247,13 @@ def _head(table: Table) -> list[str]:
 
 def _tabular(table: Table) -> str:
     """The ``tabular`` environment, with rules above blocks."""
-    numbers, body = texts(table, _number), []
+    numbers = texts(table, _number)
+    body = []
     for block in table.blocks:
         body.append(r"\midrule")
         if len(table.blocks) > 1:
-            count, name = len(table.stub) + numbers.shape[1], escape(table.block_title(block))
+            count = len(table.stub) + numbers.shape[1]
+            name = escape(table.block_title(block))
             body += [rf"\multicolumn{{{count}}}{{l}}{{\emph{{{name}}}}} \\", r"\midrule"]
         for line in block:
             names = map(escape, table.lines[line].stub)
