@@ -29,14 +29,15 @@ DecodedPixels = Literal["all", "subject"]
 
 
 def map_tensors(value: _T, fn: Callable[[Tensor], Tensor]) -> _T:
-    """Apply ``fn`` to every tensor inside nested dataclasses, tuples, lists and dicts."""
+    """Apply ``fn`` to every tensor inside nested dataclasses, tuples, named ones too, lists and dicts."""
     if isinstance(value, Tensor):
         return fn(value)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         changes = {f.name: map_tensors(getattr(value, f.name), fn) for f in dataclasses.fields(value)}
         return dataclasses.replace(value, **changes)
     if isinstance(value, (tuple, list)):
-        return type(value)(map_tensors(item, fn) for item in value)
+        items = [map_tensors(item, fn) for item in value]
+        return type(value)(*items) if hasattr(value, "_fields") else type(value)(items)
     if isinstance(value, dict):
         return {key: map_tensors(item, fn) for key, item in value.items()}
     return value

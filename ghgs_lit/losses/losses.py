@@ -29,7 +29,7 @@ class LossWeights(Options):
 
 
 class Losses(Options):
-    """``losses(prediction, rendering, batch)`` gives the weighted total and each unweighted term by name."""
+    """The weighted sum of the terms of :mod:`ghgs_lit.losses.terms` whose weight is above 0."""
 
     group = "loss"
     weights: LossWeights = LossWeights()
@@ -51,6 +51,18 @@ class Losses(Options):
     def __call__(
         self, prediction: Prediction, rendering: Rendering, batch: Batch
     ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss of a training step.
+
+        Args:
+            prediction: of the model for the batch.
+            rendering: its Gaussians from the target cameras.
+            batch: with targets, and body vertices or depth maps where a term reads them.
+
+        Returns:
+            The weighted total, and each term before its weight by name, all without dimensions.
+
+        Raises:
+            InputError: the data has no body vertices or depth maps for a term that reads them."""
         values = {name: self._term(name, prediction, rendering, batch) for name in self.weights.used}
         total = sum(self.weights.used[name] * value for name, value in values.items())
         return total, values

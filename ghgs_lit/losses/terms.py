@@ -1,6 +1,7 @@
 """The terms of the training loss.
 
-Every term takes ``(prediction, rendering, batch)`` and returns a scalar in float32 or wider."""
+Every term takes a prediction, its Gaussians rendered from the batch's target cameras, and the batch, and
+returns a scalar without dimensions, in float32 or wider."""
 
 import torch
 from jaxtyping import Float
@@ -18,16 +19,37 @@ Scalar = Float[Tensor, ""]
 
 
 def render_l1(prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
-    """Mean |render - photograph| over the whole image (first term of the paper's L_render)."""
+    """Mean |render - photograph| over the whole image (first term of the paper's L_render).
+
+    Args:
+        prediction: not used.
+        rendering: images [B, T, 3, h, w].
+        batch: with targets of that shape, in [0, 1].
+
+    Returns:
+        The mean over all pixels and channels, in units of the images."""
     return (at_least_float32(rendering.image) - at_least_float32(batch.targets.images)).abs().mean()
 
 
 def render_ssim(prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
     """1 - SSIM over the whole image, without padding, as the authors train (second term of L_render).
 
-    On a CPU only windows in which the images differ are computed; in all others the term is 0."""
-    image, target = rendering.image.flatten(0, 1), batch.targets.images.flatten(0, 1)
-    reach, (count, channels, height, width) = SSIM_WINDOW - 1, image.shape
+    On a CPU only windows in which the images differ are computed; in all others the term is 0.
+
+    Args:
+        prediction: not used.
+        rendering: images [B, T, 3, h, w].
+        batch: with targets of that shape, in [0, 1].
+
+    Returns:
+        The mean over all windows and channels, in [0, 2].
+
+    Raises:
+        InputError: the images are smaller than a window."""
+    image = rendering.image.flatten(0, 1)
+    target = batch.targets.images.flatten(0, 1)
+    reach = SSIM_WINDOW - 1
+    count, channels, height, width = image.shape
     if image.device.type == "cpu" and have_values(image, target):
         (seen,) = extents((image != target).any(1).any(0, keepdim=True))
         rows = slice(max(seen.top - reach, 0), seen.bottom + reach)
@@ -37,9 +59,19 @@ def render_ssim(prediction: Prediction, rendering: Rendering, batch: Batch) -> S
 
 
 def chamfer(prediction: Prediction, rendering: Rendering, batch: Batch, points: int | None = None) -> Scalar:
-    """Chamfer distance of the subject's unprojected pixels to the body vertices (L_geom), batch mean. The
-    points are those before the Gaussian head's offset. ``points``: how many of each set are matched; None:
-    all. InputError: the data has no body vertices."""
+    """Chamfer distance of the subject's unprojected pixels to the body vertices (L_geom).
+
+    Args:
+        prediction: its points are those before the Gaussian head's offset, in metres.
+        rendering: not used.
+        batch: with body vertices in metres.
+        points: how many of each set are matched, drawn at random; None: all.
+
+    Returns:
+        The mean over the batch, in square metres.
+
+    Raises:
+        InputError: the data has no body vertices."""
     if batch.body_vertices is None:
         raise InputError("loss.weights.chamfer: expected 0 for data without body vertices; found more")
     used = prediction.points.valid & batch.masks
@@ -51,10 +83,21 @@ def chamfer(prediction: Prediction, rendering: Rendering, batch: Batch, points: 
 
 
 def depth(prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
-    """Mean |z - true z| in metres over the subject's pixels with a true depth; 0 where there are none.
+    """Mean |z - true z| over the subject's pixels with a true depth.
 
     With rounds, the sum over the depths before the first round and after each, as RAFT's sequence loss (Teed
-    and Deng, ECCV 2020) without its weights. InputError: the data has no depth maps."""
+    and Deng, ECCV 2020) without its weights.
+
+    Args:
+        prediction: depths of each round [B, V, H, W] in metres.
+        rendering: not used.
+        batch: with true depths in metres, 0 where they are not known.
+
+    Returns:
+        Metres; 0 where no pixel has a true depth.
+
+    Raises:
+        InputError: the data has no depth maps."""
     if batch.depths is None:
         raise InputError("loss.weights.depth: expected 0 for data without depth maps; found more")
     used = (coverage(batch) > 0) & prediction.depth_valid & (batch.depths > 0)

@@ -80,17 +80,20 @@ def _filter(maps: Tensor, along_y: Tensor, along_x: Tensor) -> Tensor:
 
 
 def _filter_sensitivity(ycc: Tensor, ppd: float) -> Tensor:
-    """Blur each opponent channel as the eye does at ``ppd`` pixels per degree (section 4.1.1)."""
+    """Blur each channel of YCxCz [n, 3, h, w] as the eye does at ``ppd`` pixels a degree (section 4.1.1)."""
     widest = max(b for terms in _SENSITIVITY.values() for _, b in terms)
     radius = math.ceil(3 * math.sqrt(widest / (2 * math.pi**2)) * ppd)
     x = torch.arange(-radius, radius + 1, dtype=ycc.dtype, device=ycc.device) / ppd
     filtered = []
     for channel, terms in zip(ycc.split(1, dim=1), _SENSITIVITY.values(), strict=True):
         kernels = [torch.exp(-(math.pi**2) * x.square() / b) for _, b in terms]
-        masses = [a * math.sqrt(math.pi / b) * k.sum() ** 2 for (a, b), k in zip(terms, kernels, strict=True)]
-        parts = [
-            _filter(channel, k / k.sum(), k / k.sum()) * mass for k, mass in zip(kernels, masses, strict=True)
-        ]
+        masses = []
+        parts = []
+        for (amplitude, width), kernel in zip(terms, kernels, strict=True):
+            total = kernel.sum()
+            mass = amplitude * math.sqrt(math.pi / width) * total**2
+            masses.append(mass)
+            parts.append(_filter(channel, kernel / total, kernel / total) * mass)
         filtered.append(sum(parts) / sum(masses))
     return torch.cat(filtered, dim=1)
 
@@ -112,7 +115,14 @@ def _color_difference(first: Tensor, second: Tensor, ppd: float) -> Float[Tensor
 
 
 def _features(lightness: Tensor, ppd: float) -> tuple[Tensor, Tensor]:
-    """Strength of edges and of points in a lightness channel [n, 1, h, w] (section 4.2)."""
+    """Strength of edges and of points in lightness.
+
+    Args:
+        lightness: [n, 1, h, w] in [0, 1].
+        ppd: pixels per degree.
+
+    Returns:
+        Two maps [n, h, w]: edges and points (section 4.2)."""
     sigma = 0.5 * _FEATURE_WIDTH * ppd
     radius = math.ceil(3 * sigma)
     x = torch.arange(-radius, radius + 1, dtype=lightness.dtype, device=lightness.device)
@@ -128,16 +138,24 @@ def _features(lightness: Tensor, ppd: float) -> tuple[Tensor, Tensor]:
 
 
 def flip_map(image: Float[Tensor, "n 3 h w"], target: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n h w"]:
-    """FLIP of each pixel, in [0, 1]; input values outside [0, 1] are clamped first."""
+    """FLIP of each pixel.
+
+    Args:
+        image: sRGB; values outside [0, 1] are clamped.
+        target: sRGB; values outside [0, 1] are clamped.
+
+    Returns:
+        Maps in [0, 1], 0 where the images are equal."""
     # Images one by one: rounding can depend on the position in memory, and equal images must give 0.
     with exact(image.device.type):
-        image, target = at_least_float32(image).clamp(0, 1), at_least_float32(target).clamp(0, 1)
+        image = at_least_float32(image).clamp(0, 1)
+        target = at_least_float32(target).clamp(0, 1)
         to_xyz, _ = _xyz_matrices(image)
-        first, second = (_opponent(_transform_colors(_linear_rgb(i), to_xyz)) for i in (image, target))
+        first = _opponent(_transform_colors(_linear_rgb(image), to_xyz))
+        second = _opponent(_transform_colors(_linear_rgb(target), to_xyz))
         color = _color_difference(first, second, PIXELS_PER_DEGREE)
-        edges, points = zip(
-            *(_features((i[:, :1] + 16) / 116, PIXELS_PER_DEGREE) for i in (first, second)), strict=True
-        )
-        difference = torch.maximum((edges[0] - edges[1]).abs(), (points[0] - points[1]).abs())
+        edges, points = _features((first[:, :1] + 16) / 116, PIXELS_PER_DEGREE)
+        target_edges, target_points = _features((second[:, :1] + 16) / 116, PIXELS_PER_DEGREE)
+        difference = torch.maximum((edges - target_edges).abs(), (points - target_points).abs())
         feature = (difference / math.sqrt(2)).clamp(0, 1) ** _FEATURE_EXPONENT
         return color.clamp(0, 1) ** (1 - feature)

@@ -35,7 +35,14 @@ SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 
 
 def mean_over(values: Float[Tensor, "n h w"], region: Bool[Tensor, "n h w"] | None) -> Float[Tensor, " n"]:
-    """Mean of each map over its region (None: everywhere); nan where the region is empty."""
+    """Mean of each map over its region.
+
+    Args:
+        values: maps of a metric.
+        region: the pixels that count; None: all.
+
+    Returns:
+        A mean for each map; nan where the region is empty."""
     if region is None:
         return values.mean((-2, -1))
     count = region.sum((-2, -1))
@@ -46,11 +53,17 @@ def mean_over(values: Float[Tensor, "n h w"], region: Bool[Tensor, "n h w"] | No
 def mean_inside(
     values: Float[Tensor, "n hh ww"], region: Bool[Tensor, "n h w"] | None
 ) -> Float[Tensor, " n"]:
-    """:func:`mean_over` for maps without the image's border, which is cut off the region, too."""
+    """:func:`mean_over` for maps that may lack the image's border.
+
+    Args:
+        values: maps, as large as the image or smaller by the same border on opposite sides.
+        region: the pixels of the image that count, whose border is cut off, too; None: all.
+
+    Returns:
+        A mean for each map; nan where what is left of the region is empty."""
     if region is not None:
-        top, left = (
-            (big - small) // 2 for big, small in zip(region.shape[1:], values.shape[1:], strict=True)
-        )
+        top = (region.shape[1] - values.shape[1]) // 2
+        left = (region.shape[2] - values.shape[2]) // 2
         region = region[:, top : top + values.shape[1], left : left + values.shape[2]]
     return mean_over(values, region)
 
@@ -61,11 +74,18 @@ def box_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
 
 
 def crop_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
-    """A window of :data:`CROP` around the middle of each mask's box, in the image; empty for empty masks."""
+    """A window of :data:`CROP` around the middle of each mask's box.
+
+    Args:
+        mask: of the subject.
+
+    Returns:
+        The window, moved into the image, as a mask; empty where the mask is empty."""
 
     def span(hit: Bool[Tensor, "n k"], share: float) -> Bool[Tensor, "n k"]:
         count = hit.shape[1]
-        side, index = round(share * count), torch.arange(count, device=hit.device)
+        side = round(share * count)
+        index = torch.arange(count, device=hit.device)
         first, last = first_and_last(hit)
         start = (first - (side - (last - first + 1)) // 2).clamp(0, count - side)[:, None]
         return (index >= start) & (index < start + side) & hit.any(-1, keepdim=True)
@@ -75,12 +95,29 @@ def crop_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
 
 
 def grown(mask: Bool[Tensor, "n h w"], pixels: int) -> Bool[Tensor, "n h w"]:
-    """Each mask with all pixels at most so many rows and columns away."""
+    """Dilate masks.
+
+    Args:
+        mask: True where something is.
+        pixels: largest distance in rows and in columns.
+
+    Returns:
+        Each mask with all pixels at most so far away."""
     return F.max_pool2d(mask[:, None].float(), 2 * pixels + 1, 1, pixels)[:, 0].bool()
 
 
 def region_of(mask: Bool[Tensor, "n h w"], name: str) -> Bool[Tensor, "n h w"] | None:
-    """The pixels of one of :data:`REGIONS` (None: all), from the subject's mask."""
+    """The pixels of a region.
+
+    Args:
+        mask: of the subject.
+        name: one of :data:`REGIONS`.
+
+    Returns:
+        A mask; None for the whole image.
+
+    Raises:
+        InputError: there is no such region."""
     choice("region", name, REGIONS)
     if name == "image":
         return None
@@ -94,12 +131,25 @@ def region_of(mask: Bool[Tensor, "n h w"], name: str) -> Bool[Tensor, "n h w"] |
 def squared_error(
     image: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"]
 ) -> Float[Tensor, "n h w"]:
-    """Squared error of each pixel, averaged over the channels."""
+    """Squared error of each pixel, averaged over the channels.
+
+    Args:
+        image: renders.
+        target: photographs in [0, 1].
+
+    Returns:
+        Maps in float32 or wider."""
     return (at_least_float32(image) - at_least_float32(target)).square().mean(1)
 
 
 def decibels(mse: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """``-10 log10(MSE)``, at most ``PSNR_CAP``; nan stays nan."""
+    """PSNR of a mean squared error.
+
+    Args:
+        mse: for a data range of 1.
+
+    Returns:
+        ``-10 log10(MSE)``, at most :data:`PSNR_CAP`; nan stays nan."""
     return -10 * mse.clamp(min=10 ** (-PSNR_CAP / 10)).log10()
 
 
@@ -108,11 +158,20 @@ def psnr(
     target: Float[Tensor, "n c h w"],
     region: Bool[Tensor, "n h w"] | None = None,
 ) -> Float[Tensor, " n"]:
-    """Peak signal-to-noise ratio in dB, at most ``PSNR_CAP``."""
+    """Peak signal-to-noise ratio.
+
+    Args:
+        image: renders.
+        target: photographs in [0, 1].
+        region: the pixels that count; None: all.
+
+    Returns:
+        dB for each image, at most :data:`PSNR_CAP`; nan where the region is empty."""
     return decibels(mean_over(squared_error(image, target), region))
 
 
 def _gaussian_window(like: Tensor) -> Float[Tensor, " size"]:
+    """Weights of SSIM's window along one side, with sum 1."""
     x = torch.arange(SSIM_WINDOW, dtype=like.dtype, device=like.device) - (SSIM_WINDOW - 1) / 2
     weights = torch.exp(-x.square() / (2 * SSIM_SIGMA**2))
     return weights / weights.sum()
@@ -121,7 +180,15 @@ def _gaussian_window(like: Tensor) -> Float[Tensor, " size"]:
 def correlate(
     maps: Float[Tensor, "n c h w"], along_y: Float[Tensor, " ky"], along_x: Float[Tensor, " kx"]
 ) -> Float[Tensor, "n c hh ww"]:
-    """Filter every map with a separable kernel, without padding."""
+    """Filter every map with a separable kernel, without padding.
+
+    Args:
+        maps: to filter.
+        along_y: kernel along columns.
+        along_x: kernel along rows.
+
+    Returns:
+        Maps smaller by the kernels' lengths minus 1."""
     n, c, h, w = maps.shape
     # All maps are channels of one depthwise convolution: ten times faster on a CPU than a batch of maps.
     flat = maps.reshape(1, n * c, h, w)
@@ -133,13 +200,20 @@ def correlate(
 def ssim_map(
     image: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"], padding: str = "valid"
 ) -> Float[Tensor, "n c hh ww"]:
-    """Structural similarity (Wang et al. 2004), K = 0.01, 0.03, moments in float32 or wider. InputError:
-    images smaller than the window, unless padded with zeros.
+    """Structural similarity (Wang et al. 2004), K = 0.01, 0.03, moments in float32 or wider.
 
     Args:
+        image: renders.
+        target: photographs in [0, 1].
         padding: ``valid`` gives only the pixels whose window lies inside the image (scikit-image averages
             these); the others keep the image's size: ``reflect`` mirrors the image at its border
-            (torchmetrics), ``zeros`` surrounds it with black (the authors' evaluation)."""
+            (torchmetrics), ``zeros`` surrounds it with black (the authors' evaluation).
+
+    Returns:
+        The similarity of each window in [-1, 1].
+
+    Raises:
+        InputError: images smaller than the window, unless padded with zeros; no such padding."""
     choice("ssim.padding", padding, PADDINGS)
     found = tuple(image.shape[-2:])
     large = padding == "zeros" or min(found) >= SSIM_WINDOW
@@ -165,16 +239,36 @@ def ssim(
     padding: str = "valid",
     region: Bool[Tensor, "n h w"] | None = None,
 ) -> Float[Tensor, " n"]:
-    """Mean of :func:`ssim_map` over the channels and over the pixels of ``region`` that the map covers."""
+    """Mean structural similarity.
+
+    Args:
+        image: renders.
+        target: photographs in [0, 1].
+        padding: as of :func:`ssim_map`.
+        region: the pixels that count, where the map covers them; None: all.
+
+    Returns:
+        The mean over channels and pixels of each image; nan where the region is empty.
+
+    Raises:
+        InputError: as :func:`ssim_map`."""
     return mean_inside(ssim_map(image, target, padding).mean(1), region)
 
 
 def spill(
     image: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"], mask: Bool[Tensor, "n h w"]
 ) -> Float[Tensor, " n"]:
-    """Light that is drawn beside the subject, farther than :data:`BESIDE` pixels from its mask, per mille of
-    the subject's light in the target; nan where that has none. Images lie on black."""
-    drawn, true = at_least_float32(image).clamp(min=0).mean(1), at_least_float32(target).mean(1)
+    """Light that is drawn beside the subject, farther than :data:`BESIDE` pixels from its mask.
+
+    Args:
+        image: renders on black.
+        target: photographs on black, in [0, 1].
+        mask: of the subject.
+
+    Returns:
+        Per mille of the subject's light in the target; nan where that has none."""
+    drawn = at_least_float32(image).clamp(min=0).mean(1)
+    true = at_least_float32(target).mean(1)
     light = torch.where(mask, true, 0).sum((-2, -1))
     beside = torch.where(grown(mask, BESIDE), 0, drawn).sum((-2, -1))
     return torch.where(light > 0, 1000 * beside / torch.where(light > 0, light, 1), torch.nan)
@@ -183,8 +277,16 @@ def spill(
 def sharpness(
     image: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"], mask: Bool[Tensor, "n h w"]
 ) -> Float[Tensor, " n"]:
-    """Energy of the Laplacian inside the subject, :data:`INNER` pixels or more from its outline, over the
-    target's: 1 is right, less is blurred, more is ragged. nan where the target has none."""
+    """Energy of the Laplacian inside the subject, :data:`INNER` pixels or more from its outline.
+
+    Args:
+        image: renders.
+        target: photographs in [0, 1].
+        mask: of the subject.
+
+    Returns:
+        The energy over the target's: 1 is right, less is blurred, more is ragged; nan where the target has
+        none."""
     inner = (mask & ~grown(~mask, INNER))[:, 1:-1, 1:-1]
     with exact(image.device.type):
         energies = []
@@ -200,8 +302,18 @@ def sharpness(
 def depth_error_mm(
     depth: Float[Tensor, "n h w"], truth: Float[Tensor, "n h w"], region: Bool[Tensor, "n h w"]
 ) -> Float[Tensor, ""]:
-    """Mean |z - true z| in millimetres over the pixels of ``region`` with a true depth; nan if there are
-    none. ``depth``, ``truth``: metres; a truth of 0 is unknown."""
+    """Mean |z - true z| over pixels with a true depth.
+
+    Args:
+        depth: predicted, in metres.
+        truth: in metres; 0 is unknown.
+        region: the pixels that count.
+
+    Returns:
+        Millimetres; nan if no pixel counts.
+
+    Raises:
+        InputError: depths of different shapes."""
     region = region & (truth > 0)
     require(depth.shape == truth.shape, "depth", f"shape {tuple(truth.shape)}", tuple(depth.shape))
     return 1000 * (at_least_float32(depth)[region] - at_least_float32(truth)[region]).abs().mean()
@@ -214,13 +326,22 @@ _OPAQUE = 0.5
 def surface_error_mm(
     means: Float[Tensor, "n 3"], opacities: Float[Tensor, " n"], surface: Float[Tensor, "m 3"]
 ) -> Float[Tensor, ""]:
-    """Distance in millimetres of Gaussians to the surface, weighted by opacity, and of the surface to the
-    nearest Gaussian of opacity 0.5 or more; the mean of both. It sees where Gaussians end, after all offsets,
-    where :func:`depth_error_mm` ends before them; points of the surface are about a pixel apart, and so is
-    the least value. nan without Gaussians or surface; infinite without opaque ones. ``means``, ``surface``:
-    in metres."""
+    """Distance of Gaussians to the surface, and of the surface to the nearest Gaussian; the mean of both.
+
+    It sees where Gaussians end, after all offsets, where :func:`depth_error_mm` ends before them; points of
+    the surface are about a pixel apart, and so is the least value.
+
+    Args:
+        means: of Gaussians, in metres; those that are not finite are left out.
+        opacities: in [0, 1], by which distances to the surface are weighted; those to a Gaussian are to one
+            of opacity 0.5 or more.
+        surface: points, in metres.
+
+    Returns:
+        Millimetres; nan without Gaussians or surface, infinite without opaque Gaussians."""
     finite = means.isfinite().all(1) & opacities.isfinite()
-    means, opacities = at_least_float32(means[finite]), at_least_float32(opacities[finite])
+    means = at_least_float32(means[finite])
+    opacities = at_least_float32(opacities[finite])
     surface = at_least_float32(surface)
     if len(means) == 0 or len(surface) == 0 or not bool(opacities.sum() > 0):
         return surface.new_tensor(torch.nan)
@@ -243,9 +364,16 @@ def flicker(
     depths: Float[Tensor, "2 t h w"],
     cameras: Cameras,
 ) -> Float[Tensor, " t"]:
-    """Mean absolute change of each camera's error at the points visible at both instants; nan if none is.
-    ``errors``: renders minus photographs, of images in [0, 1]. ``points``: of the surface, in the world,
-    metres. ``depths``: true z-depths in metres, 0 where there is none. ``cameras``: [2, t]."""
+    """Mean absolute change of each camera's error at the points visible at both instants.
+
+    Args:
+        errors: renders minus photographs, of images in [0, 1].
+        points: of the surface at both instants, in the world, in metres.
+        depths: true z-depths in metres, 0 where there is none.
+        cameras: [2, t].
+
+    Returns:
+        A value for each camera, in units of the images; nan if no point is visible."""
     pixels, z = project(points[:, None], cameras.intrinsics[:, :, None], cameras.extrinsics[:, :, None])
     image = torch.arange(2 * z.shape[1], device=z.device).view(2, -1, 1).expand(z.shape)
     # Beside the silhouette the 0 of the background makes the depth too small: such points are left out.
@@ -259,8 +387,16 @@ def flicker(
 def flicker_in_place(
     errors: Float[Tensor, "2 t c h w"], masks: Bool[Tensor, "2 t h w"]
 ) -> Float[Tensor, " t"]:
-    """Mean absolute change of each camera's error in the box around both instants' masks; nan if it is empty.
-    Cameras must stand still; no truth but the photographs is needed."""
+    """Mean absolute change of each camera's error in the box around both instants' masks.
+
+    No truth but the photographs is needed.
+
+    Args:
+        errors: renders minus photographs, of images in [0, 1], by cameras that stand still.
+        masks: of the subject.
+
+    Returns:
+        A value for each camera, in units of the images; nan if the box is empty."""
     box = box_of(masks.any(0))
     change = torch.where(box, (errors[1] - errors[0]).abs().mean(1), 0)
     return change.sum((1, 2)) / box.sum((1, 2))

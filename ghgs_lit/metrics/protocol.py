@@ -35,8 +35,13 @@ OUTLINE = {"spill": spill, "sharpness": sharpness}
 
 
 class LPIPS:
-    """LPIPS of whole images, one value each. ``signed``: map [0, 1] to [-1, 1], for which the network was
-    calibrated; the authors' evaluation does not. InputError: torchvision or the weights are not available."""
+    """LPIPS of whole images, by torchmetrics.
+
+    Args:
+        signed: map [0, 1] to [-1, 1], for which the network was calibrated; the authors' evaluation does not.
+
+    Raises:
+        InputError: torchvision or the weights are not available."""
 
     def __init__(self, signed: bool = True):
         installed("torchvision", "lpips", "LPIPS")
@@ -54,10 +59,19 @@ class LPIPS:
     def __call__(
         self, image: Float[Tensor, "n 3 h w"], target: Float[Tensor, "n 3 h w"]
     ) -> Float[Tensor, " n"]:
+        """Compare images on the network's device.
+
+        Args:
+            image: renders; values outside of the network's range are clamped.
+            target: photographs in [0, 1].
+
+        Returns:
+            A distance for each image."""
         # With ``signed`` the network refuses values outside [0, 1], which renders can have.
         low, high = (0, 1) if self.signed else (-1, None)
-        singles = (images.float().clamp(low, high).split(1) for images in (image, target))
-        return torch.stack([self.network(a, b) for a, b in zip(*singles, strict=True)])
+        images = image.float().clamp(low, high).split(1)
+        targets = target.float().clamp(low, high).split(1)
+        return torch.stack([self.network(*pair) for pair in zip(images, targets, strict=True)])
 
 
 class MetricsOptions(Options):
@@ -91,19 +105,30 @@ class MetricsOptions(Options):
         return {"release": "zeros", "files": "valid"}.get(self.protocol, "reflect")
 
     def build(self) -> "ImageMetrics":
+        """The metrics; InputError: as of :class:`ImageMetrics`."""
         return ImageMetrics(self)
 
 
 class ImageMetrics:
-    """All metrics of a protocol: ``metrics(image, target, mask)`` gives one value per image by name.
+    """All metrics of a protocol.
 
-    The names are ``psnr``, ``ssim``, ``flip`` and ``lpips`` for the whole image, with ``_box``, ``_subject``,
-    ``_crop`` or ``_edge`` added for the other regions (those of :data:`MEASURED`; LPIPS for the whole image
-    only), and those of :data:`OUTLINE`. ``protocol`` is reported with every number; ``left_out`` has the
-    reason for each missing metric."""
+    Their names are ``psnr``, ``ssim``, ``flip`` and ``lpips`` for the whole image, with ``_box``,
+    ``_subject``, ``_crop`` or ``_edge`` added for the other regions (those of :data:`MEASURED`; LPIPS for the
+    whole image only), and those of :data:`OUTLINE`.
+
+    Args:
+        options: the protocol.
+
+    Attributes:
+        protocol: its name, which is reported with every number.
+        left_out: the reason for each missing metric.
+
+    Raises:
+        InputError: LPIPS is required, and is not available."""
 
     def __init__(self, options: MetricsOptions):
-        self.options, self.protocol = options, options.protocol
+        self.options = options
+        self.protocol = options.protocol
         self.lpips: LPIPS | None = None
         self.left_out: dict[str, str] = {}
         if options.lpips != "off":
@@ -115,6 +140,7 @@ class ImageMetrics:
                 self.left_out["lpips"] = str(error)
 
     def to(self, device: torch.device | str) -> "ImageMetrics":
+        """Move the network of LPIPS; returns these metrics."""
         if self.lpips is not None:
             self.lpips.network = self.lpips.network.to(device)
         return self

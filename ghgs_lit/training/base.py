@@ -45,10 +45,20 @@ class BudgetedModule(L.LightningModule):
         self.ready = time_mark(torch.device("cpu"))
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
+        """Copy a batch without a wait where its memory is pinned.
+
+        Args:
+            batch: of the data.
+            device: of the training.
+            dataloader_idx: not used.
+
+        Returns:
+            The batch there."""
         # Lightning copies unknown structures one tensor at a time, and waits for each.
         return batch.to(device, non_blocking=device.type != "cpu")
 
     def on_train_start(self) -> None:
+        """Continue at the budget's used share, with this run's options of the optimizer."""
         self.ready = time_mark(self.device)
         # After a restart the scheduler updates it only after a step.
         self.used_budget = self.progress()
@@ -63,27 +73,49 @@ class BudgetedModule(L.LightningModule):
         hold_rates(optimizer)
 
     def on_train_batch_start(self, *args: Any) -> None:
+        """Correct Lightning's count of steps."""
         # Lightning's own count is one ahead in a run that goes on from the end of another session.
         self.trainer.fit_loop.epoch_loop._batches_that_stepped = self.global_step
 
     def step_seed(self, batch_idx: int) -> int:
         """Seed of the random numbers of this step: the same after an interruption, and in all processes, so
-        that none waits for one that has drawn more rounds."""
+        that none waits for one that has drawn more rounds.
+
+        Args:
+            batch_idx: of Lightning, which tells the parts of an accumulated step apart.
+
+        Returns:
+            A number of 32 bits, of the run's seed, the step and the part."""
+        return int(np.random.SeedSequence(self.step_numbers(batch_idx)).generate_state(1)[0])
+
+    def step_numbers(self, batch_idx: int) -> list[int]:
+        """Seed of the run, step, and part of an accumulated step, of which all that is drawn in a step is a
+        function."""
         part = batch_idx % self.trainer.accumulate_grad_batches
-        numbers = [self.config.get("seed", 0), self.global_step, part]
-        return int(np.random.SeedSequence(numbers).generate_state(1)[0])
+        return [self.config.get("seed", 0), self.global_step, part]
 
     def progress(self) -> float:
-        """Used share of the budget in [0, 1]: of steps or of time, whichever is larger."""
+        """Used share of the budget.
+
+        Returns:
+            The share in [0, 1] of steps or of time, whichever is larger; the same in all processes.
+
+        Raises:
+            InputError: the run has no budget."""
         trainer = self.trainer
-        shares = [self.global_step / trainer.max_steps] if trainer.max_steps > 0 else []
-        for timer in (c for c in trainer.callbacks if isinstance(c, Timer)):
-            used, left = timer.time_elapsed(), timer.time_remaining()
-            if left is not None:
-                share = torch.tensor(used / max(used + left, 1e-9), device=self.device)
+        shares = []
+        if trainer.max_steps > 0:
+            shares.append(self.global_step / trainer.max_steps)
+        for timer in trainer.callbacks:
+            if not isinstance(timer, Timer) or timer.time_remaining() is None:
+                continue
+            used = timer.time_elapsed()
+            share = used / max(used + timer.time_remaining(), 1e-9)
+            if trainer.world_size > 1 and used > 0:
                 # Clocks of processes differ, but learning rates must not.
-                together = trainer.world_size > 1 and used > 0
-                shares.append(float(trainer.strategy.reduce(share, reduce_op="max") if together else share))
+                mine = torch.tensor(share, device=self.device)
+                share = float(trainer.strategy.reduce(mine, reduce_op="max"))
+            shares.append(share)
         if not shares:
             raise InputError("trainer.max_steps: expected steps or trainer.max_time; found neither")
         return min(max(shares), 1.0)
@@ -111,6 +143,7 @@ class BudgetedModule(L.LightningModule):
         return getattr(self.trainer.precision_plugin, "scaler", None)
 
     def configure_optimizers(self) -> dict[str, Any]:
+        """The optimizer of all weights and its schedule, which follows the used budget."""
         optimizer = self.optimization.optimizer(self, fused=self._scaler is None)
         groups = optimizer.param_groups
         self._options = [{k: v for k, v in group.items() if k != "params"} for group in groups]
@@ -123,9 +156,11 @@ class BudgetedModule(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_train_batch_end(self, *args: Any) -> None:
+        """Note when the step ended."""
         self.ready = time_mark(self.device)  # called after all callbacks
 
     def on_validation_end(self) -> None:
+        """The next step does not wait for data as long as the validation took."""
         self.on_train_batch_end()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:

@@ -19,6 +19,7 @@ class ProgressOptions(Options):
     """Progress of the run over its budget of steps or time."""
 
     def build(self) -> "RunProgress":
+        """The callback."""
         return RunProgress()
 
 
@@ -27,6 +28,7 @@ class RunProgress(Callback):
     the lines in both cases."""
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Open the log and the bar."""
         has_bar = on_terminal()
         self._lines = Lines(Path(trainer.default_root_dir) / "train.log", printed=not has_bar)
         columns = (BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
@@ -37,6 +39,7 @@ class RunProgress(Callback):
         self._last = (time.monotonic(), trainer.global_step, pl_module.used_budget)
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
+        """Show or write how far the run is, if it is due."""
         if not self._bar.disable:  # numbers of a step make the host wait for a GPU
             text = "  ".join([f"step {trainer.global_step}", *_numbers(trainer)])
             self._bar.update(self._task, completed=pl_module.used_budget, description=text)
@@ -45,6 +48,7 @@ class RunProgress(Callback):
             self._say(trainer, pl_module)
 
     def _say(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Write a line: step, values, seconds a step and the time that is left."""
         now = (time.monotonic(), trainer.global_step, pl_module.used_budget)
         total = f" of {trainer.max_steps}" if trainer.max_steps > 0 else ""
         parts = [f"step {now[1]}{total}", *_numbers(trainer)]
@@ -59,14 +63,17 @@ class RunProgress(Callback):
         self._last = now
 
     def on_train_end(self, *args: Any) -> None:
+        """Close the bar."""
         self._bar.stop()
 
     def on_exception(self, *args: Any) -> None:
+        """Close the bar, so that the terminal is whole."""
         if hasattr(self, "_bar"):  # training had begun
             self._bar.stop()
 
 
 def _numbers(trainer: L.Trainer) -> list[str]:
+    """Values that are shown beside the bar; waits for the device."""
     return [f"{name} {value:.4g}" for name, value in trainer.progress_bar_metrics.items()]
 
 
@@ -75,11 +82,13 @@ class NeighborsAtStart(Callback):
     and how many of these would be the same in the other setting of ``recalibration.neighborhood``."""
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Watch the recalibration."""
         self._stack = ExitStack()
         stage = getattr(pl_module.model, "recalibration", None)
         self._seen = self._stack.enter_context(seen_calls(stage))
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
+        """Print what was seen in the first step."""
         self._stack.close()
         if self._seen and trainer.is_global_zero:
             around = neighborhoods(*self._seen[-1])
@@ -92,5 +101,6 @@ class NeighborsAtStart(Callback):
         self._seen = []
 
     def on_exception(self, *args: Any) -> None:
+        """Watch no longer."""
         if hasattr(self, "_stack"):
             self._stack.close()

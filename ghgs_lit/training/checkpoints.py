@@ -35,22 +35,42 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike, storage_options: Any | None = None
     ) -> None:
-        """Replace the file at ``path`` atomically; ``storage_options`` are not used."""
+        """Replace a file atomically.
+
+        Args:
+            checkpoint: the content.
+            path: the file.
+            storage_options: not used."""
         content = self._frozen.stored(checkpoint, Path(path).absolute().parent)
         write_atomically(path, lambda temporary: torch.save(content, temporary))
 
     def load_checkpoint(
         self, path: str | os.PathLike, map_location: Any = "cpu", weights_only: bool | None = True
     ) -> dict[str, Any]:
-        """Load tensors, mapped from the disk, and plain data only; the other arguments are not used."""
+        """Load tensors, mapped from the disk, and plain data only.
+
+        Args:
+            path: the file.
+            map_location: not used.
+            weights_only: not used.
+
+        Returns:
+            The content, with the frozen weights that the checkpoint shares.
+
+        Raises:
+            InputError: the file is no checkpoint, or its frozen weights are missing."""
         content = frozen.joined(path, open_file(path))
         content.setdefault("pytorch-lightning_version", L.__version__)
         return content
 
 
 def validates_now(trainer: L.Trainer) -> bool:
-    """Whether a validation follows this step, if validations are counted in steps."""
-    every, by_steps = trainer.val_check_batch, trainer.check_val_every_n_epoch is None
+    """Whether a validation follows this step, if validations are counted in steps.
+
+    Args:
+        trainer: in a callback at the end of a step."""
+    every = trainer.val_check_batch
+    by_steps = trainer.check_val_every_n_epoch is None
     if not (by_steps and trainer.enable_validation and isinstance(every, int)):
         return False
     return (trainer.fit_loop.total_batch_idx + 1) % every == 0
@@ -79,11 +99,15 @@ class CheckpointOptions(Options):
     """Minutes between two checkpoints, beside every_n_train_steps."""
 
     def build(self) -> "Checkpoints":
+        """The callback."""
         return Checkpoints(self)
 
 
 class Checkpoints(ModelCheckpoint):
-    """Lightning's ModelCheckpoint in ``<run>/checkpoints``; a file replaces the previous one of its name."""
+    """Lightning's ModelCheckpoint in ``<run>/checkpoints``; a file replaces the previous one of its name.
+
+    Args:
+        options: names and intervals."""
 
     def __init__(self, options: CheckpointOptions):
         arguments = dict(options)
@@ -154,8 +178,10 @@ _SAME = 1.0
 class StopAtStep(Checkpoint):
     """On Ctrl-C or a signal of a batch system: finishes the step and its validation, writes ``last.ckpt`` and
     stops. The same signal again, or Ctrl-C, stops at once. Several processes stop after the same step. As the
-    last ``Checkpoint``, Lightning calls it after all other callbacks, whose state is saved. ``received``: the
-    signal or 0."""
+    last ``Checkpoint``, Lightning calls it after all other callbacks, whose state is saved.
+
+    Attributes:
+        received: number of the signal; 0: none."""
 
     def __init__(self) -> None:
         self.received = 0
@@ -176,6 +202,7 @@ class StopAtStep(Checkpoint):
         handle(self._note, self._before)
 
     def _note(self, number: int) -> None:
+        """Handle a signal."""
         # SIGTERM after SIGUSR1 comes from a batch system that waits, not from somebody who does not.
         insists = number in (self.received, signal.SIGINT)
         if self.received and insists and time.monotonic() - self._since > _SAME:
@@ -199,6 +226,7 @@ class StopAtStep(Checkpoint):
             self._save(trainer)
 
     def _save(self, trainer: L.Trainer) -> None:
+        """Write ``last.ckpt`` if a process has received a signal."""
         number = self.received
         if trainer.world_size > 1:
             mine = torch.tensor(number, device=trainer.strategy.root_device)

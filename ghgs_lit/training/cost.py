@@ -21,6 +21,7 @@ class CostsOptions(Options):
     """``time_ms/*``: milliseconds of each part of a step; ``memory_mb/*``: of the process and of the GPU."""
 
     def build(self) -> "Costs":
+        """The callback."""
         return Costs()
 
 
@@ -34,36 +35,53 @@ class Costs(Callback, Watcher):
         self._inside = False  # a step, not a validation
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Watch all stages."""
         self._begin_interval(pl_module)
         places = {name: f"model.{name}" for name in (*STAGES, "rounds")}
         places |= {"render": "renderer", "loss": "losses"}
         self._stack.enter_context(watched(pl_module, places, self))
 
     def _begin_interval(self, pl_module: L.LightningModule) -> None:
-        self._watch, self._steps = Stopwatch(pl_module.device), 0
+        """Measure anew."""
+        self._watch = Stopwatch(pl_module.device)
+        self._steps = 0
 
     def begin(self, stage: str, inputs: Inputs = ((), {})) -> None:
+        """A part of a step begins.
+
+        Args:
+            stage: its name, one of :data:`PARTS`.
+            inputs: not used."""
         if self._inside:
             self._watch.begin(stage)
 
     def end(self, stage: str, result: Any = None) -> None:
+        """A part of a step ends.
+
+        Args:
+            stage: its name.
+            result: not used."""
         if self._inside:
             self._watch.end(stage)
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
+        """A step began where the last one ended, with the wait for data."""
         self._inside = True
         for stage in ("step", "data"):
             self._watch.begin(stage, since=pl_module.ready)
         self.end("data")
 
     def on_before_backward(self, *args: Any) -> None:
+        """The backward pass begins."""
         self.begin("backward")
 
     def on_after_backward(self, *args: Any) -> None:
+        """The backward pass ends."""
         self.end("backward")
         self.begin("optimizer")
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
+        """Log the means since the last log, if it is due."""
         self.end("optimizer")
         self.end("step")
         self._inside = False
@@ -80,6 +98,7 @@ class Costs(Callback, Watcher):
                 torch.cuda.reset_peak_memory_stats(pl_module.device)
 
     def teardown(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        """Watch no longer."""
         self._stack.close()
 
 
@@ -95,16 +114,22 @@ class TrainingCost(Callback):
         self._device = torch.device("cpu")
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        self._started, self._device = time.perf_counter(), pl_module.device
+        """Start the clock."""
+        self._started = time.perf_counter()
+        self._device = pl_module.device
         if self._device.type != "cuda":
             forget_peak()  # runs of a sweep share a process
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
+        """Note the peak of memory."""
         if self._device.type == "cuda":  # its peak may be reset at any step
             self._peak = self.peak_bytes
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        self._earlier, self._peak, self._started = self.seconds, self.peak_bytes, None
+        """Stop the clock."""
+        self._earlier = self.seconds
+        self._peak = self.peak_bytes
+        self._started = None
 
     @property
     def seconds(self) -> float:
@@ -121,7 +146,10 @@ class TrainingCost(Callback):
         return max(self._peak, now)
 
     def state_dict(self) -> dict[str, Any]:
+        """Seconds and peak so far, for the checkpoint."""
         return {"seconds": self.seconds, "peak_bytes": self.peak_bytes}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._earlier, self._peak = state_dict["seconds"], state_dict["peak_bytes"]
+        """Go on from the numbers of a checkpoint."""
+        self._earlier = state_dict["seconds"]
+        self._peak = state_dict["peak_bytes"]

@@ -56,7 +56,8 @@ class Guard:
         flags = torch.stack([losses.isfinite().all(), norm.isfinite()]).float()
         if trainer.world_size > 1:
             flags = trainer.strategy.reduce(flags, reduce_op="min")
-        return tuple(bool(flag) for flag in flags.tolist())
+        losses_hold, norm_holds = flags.tolist()
+        return bool(losses_hold), bool(norm_holds)
 
     def accept(self) -> None:
         """Note that the step was finite, or that a scaler of the loss skips it."""

@@ -31,6 +31,11 @@ class _StepsTaken:
     """Counts steps taken, as checkpoints and pictures do; for Lightning the first step is 0."""
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Log values.
+
+        Args:
+            metrics: values by name.
+            step: of Lightning, one less than the number of steps taken."""
         super().log_metrics(metrics, None if step is None else step + 1)
 
 
@@ -38,7 +43,10 @@ class CsvLog(_StepsTaken, CSVLogger):
     """Lightning's ``metrics.csv``, continued by a run that resumes in the same folder."""
 
     def resume(self, step: int) -> None:
-        """Keep the rows up to ``step``, as later steps are trained again."""
+        """Keep the rows of earlier steps, as later ones are trained again.
+
+        Args:
+            step: number of steps taken, from where the run goes on."""
         path = Path(self.log_dir) / "metrics.csv"
         rows = read_rows(path) if path.is_file() else []
         # A killed run may have left an incomplete last line.
@@ -54,7 +62,10 @@ class TensorBoardLog(_StepsTaken, TensorBoardLogger):
     """TensorBoard's event files, continued by a run that resumes in the same folder."""
 
     def resume(self, step: int) -> None:
-        """Drop what was logged after ``step``: from the files, and from a TensorBoard that has read them."""
+        """Drop what was logged later, from the files, and from a TensorBoard that has read them.
+
+        Args:
+            step: number of steps taken, from where the run goes on."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
         for path in sorted(Path(self.log_dir).glob("events.out.tfevents.*")):
@@ -63,15 +74,22 @@ class TensorBoardLog(_StepsTaken, TensorBoardLogger):
         self.experiment.file_writer.add_event(Event(session_log=start), step + 1)
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Log without the epoch that Lightning adds; what is no loss or validation below ``work/``. A
-        killed process loses nothing that it logged."""
+        """Log without the epoch that Lightning adds. A killed process loses nothing that it logged.
+
+        Args:
+            metrics: values by name; what is no loss or validation comes below ``work/``.
+            step: of Lightning."""
         shown = {_sorted_last(name): value for name, value in metrics.items() if name != "epoch"}
         super().log_metrics(shown, step)
         self.experiment.flush()
 
     def log_results(self, values: Mapping[str, Value], summary: Sequence[Mapping[str, Any]]) -> None:
-        """Describe the run for the tab HParams, which shows its last validation beside ``values``, and write
-        the final measurement to the tab Text: as scalars, its numbers would be charts of one point."""
+        """Describe the run for the tab HParams, which shows its last validation beside its settings, and
+        write the measurement to the tab Text: as scalars, its numbers would be charts of one point.
+
+        Args:
+            values: of :func:`hyperparameters`.
+            summary: of ``metrics.json``."""
         validated = [name for name in COMPARED if name != "flip" and summary[0].get(name) is not None]
         compared = [f"val/{name}" for name in validated]
         for part in hparams(dict(values), dict.fromkeys(compared, 0.0)):
@@ -80,10 +98,12 @@ class TensorBoardLog(_StepsTaken, TensorBoardLogger):
 
 
 def _sorted_last(name: str) -> str:
+    """A tag that TensorBoard shows below losses and validations."""
     return name if name.split("/")[0] in _FIRST else f"work/{name}"
 
 
 def _drop_events_after(path: Path, step: int) -> None:
+    """Write a file of events again without those after a step."""
     from tensorboard.backend.event_processing.event_file_loader import RawEventFileLoader
     from tensorboard.compat.proto.event_pb2 import Event
     from tensorboard.summary.writer.record_writer import RecordWriter
@@ -102,6 +122,7 @@ class CsvOptions(Options):
     """Logged values in ``<run>/csv/metrics.csv``."""
 
     def build(self, save_dir: str) -> CsvLog:
+        """The logger of the run in ``save_dir``."""
         return CsvLog(save_dir, name="csv", version="", flush_logs_every_n_steps=1)
 
 
@@ -110,6 +131,7 @@ class TensorBoardOptions(Options):
     apart>``, since TensorBoard names runs by their folders."""
 
     def build(self, save_dir: str) -> TensorBoardLog:
+        """The logger of the run in ``save_dir``."""
         return TensorBoardLog(RunDirectory(Path(save_dir)).curves, name="", version="")
 
 
@@ -118,7 +140,11 @@ class WandbLog(WandbLogger):
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Log at the number of steps taken, by which steps that are trained again replace nothing."""
+        """Log at the number of steps taken, by which steps that are trained again replace nothing.
+
+        Args:
+            metrics: values by name.
+            step: of Lightning."""
         taken = None if step is None else step + 1
         self.experiment.log({**metrics, "trainer/global_step": taken}, step=taken)
 
@@ -127,6 +153,7 @@ class WandbOptions(Options):
     """Weights & Biases (extra ``wandb``); ``WANDB_PROJECT`` and ``WANDB_MODE`` of the environment count."""
 
     def build(self, save_dir: str) -> WandbLog:
+        """The logger of the run in ``save_dir``; InputError: the extra is not installed."""
         installed("wandb", "wandb", "logger.wandb")
         project = os.environ.get("WANDB_PROJECT", "ghgs_lit")
         identity = RunDirectory(Path(save_dir)).marker
@@ -135,7 +162,11 @@ class WandbOptions(Options):
 
 @rank_zero_only
 def resume(loggers: Sequence[Logger], step: int) -> None:
-    """Continue the logs of a run that resumes at ``step`` in the same folder."""
+    """Continue the logs of a run in the same folder.
+
+    Args:
+        loggers: of the run.
+        step: number of steps taken, from where it goes on."""
     for logger in loggers:
         if isinstance(logger, (CsvLog, TensorBoardLog)):
             logger.resume(step)
@@ -145,8 +176,13 @@ def resume(loggers: Sequence[Logger], step: int) -> None:
 def log_results(
     loggers: Sequence[Logger], values: Mapping[str, Value], summary: Sequence[Mapping[str, Any]], step: int
 ) -> None:
-    """Log the :func:`hyperparameters` ``values``, which CSV has in ``config.yaml``, and :func:`final_numbers`
-    of the weights after ``step``. ``summary``: of ``metrics.json``."""
+    """Log what sets a run apart, which CSV has in ``config.yaml``, and its final numbers.
+
+    Args:
+        loggers: of the run.
+        values: of :func:`hyperparameters`.
+        summary: of ``metrics.json``.
+        step: number of steps after which the weights were measured."""
     results = final_numbers(summary)
     for logger in loggers:
         if isinstance(logger, TensorBoardLog):
@@ -159,7 +195,10 @@ def log_results(
 
 
 def close(loggers: Sequence[Logger]) -> None:
-    """Write remaining values and end the loggers' threads, since runs of a sweep share a process."""
+    """Write remaining values and end the loggers' threads, since runs of a sweep share a process.
+
+    Args:
+        loggers: of a run that has ended."""
     for logger in loggers:
         # Unused loggers must not start now.
         if isinstance(logger, TensorBoardLogger) and logger._experiment is not None:
@@ -169,13 +208,20 @@ def close(loggers: Sequence[Logger]) -> None:
 
 
 def final_numbers(summary: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """``hparam/psnr`` of the first protocol, ``hparam_v4_midway/psnr`` of others; only defined values."""
-    return {
-        (f"hparam_v{row['views']}_{row['targets']}" if number else "hparam") + f"/{name}": float(row[name])
-        for number, row in enumerate(summary)
-        for name in COMPARED
-        if row.get(name) is not None
-    }
+    """Values by which runs are compared.
+
+    Args:
+        summary: of ``metrics.json``, a row for each protocol.
+
+    Returns:
+        ``hparam/psnr`` of the first protocol, ``hparam_v4_midway/psnr`` of others; only defined values."""
+    numbers = {}
+    for number, row in enumerate(summary):
+        prefix = f"hparam_v{row['views']}_{row['targets']}" if number else "hparam"
+        for name in COMPARED:
+            if row.get(name) is not None:
+                numbers[f"{prefix}/{name}"] = float(row[name])
+    return numbers
 
 
 def hyperparameters(
@@ -187,7 +233,10 @@ def hyperparameters(
     Args:
         config: the run's.
         choices: the option of each config group.
-        overrides: of a run of a grid those that set it apart, else all."""
+        overrides: of a run of a grid those that set it apart, else all.
+
+    Returns:
+        Values by key; those that are no plain value as text."""
     found: dict[str, Value] = {}
     for key in dict.fromkeys([*map(key_of, overrides), *_ALWAYS]):
         value = choices[key] if key in choices else lookup(config, key)

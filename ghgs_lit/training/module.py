@@ -58,11 +58,13 @@ def token_budget(model: GHGS, budget: str | int | None) -> AbstractContextManage
 
 
 def _depth_error(batch: Batch, maps: DepthMaps) -> Tensor:
+    """Mean error of predicted depths of subjects in mm."""
     valid = batch.masks & maps.valid
     return depth_error_mm(maps.depth.flatten(0, 1), batch.depths.flatten(0, 1), valid.flatten(0, 1))
 
 
 def _surface_error(batch: Batch, gaussians: Gaussians) -> Tensor:
+    """Mean distance of Gaussians and true surfaces in mm, over the batch."""
     errors = []
     for element, surface in enumerate(seen_surfaces(batch)):
         own = gaussians[element]
@@ -159,16 +161,23 @@ class GHGSModule(BudgetedModule):
         return prediction, total, values
 
     def _step(self, batch: Batch, batch_idx: int) -> Step:
+        """All inputs of a training step."""
         device = self.device.type
         autocast = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else None
         budget = None
         if self.token_budgets is not None:  # the same in all processes, so that none waits for another
-            part = batch_idx % self.trainer.accumulate_grad_batches
-            numbers = [self.config.get("seed", 0), self.global_step, part]
-            budget = drawn_budget(self.token_budgets, numbers)
+            budget = drawn_budget(self.token_budgets, self.step_numbers(batch_idx))
         return Step(batch, self.step_seed(batch_idx), budget, autocast)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Run a step and log its loss, without a wait for the device.
+
+        Args:
+            batch: with targets.
+            batch_idx: of Lightning.
+
+        Returns:
+            The total loss, without dimensions."""
         step = self._step(batch, batch_idx)
         prediction, total, values = self.forward_losses(step)
         self.guard.note(step, total)
@@ -180,6 +189,14 @@ class GHGSModule(BudgetedModule):
         return total
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
+        """Predict, render and measure.
+
+        Args:
+            batch: with targets.
+            batch_idx: not used.
+
+        Returns:
+            ``prediction`` and ``rendering``, for callbacks."""
         head = getattr(self.model, "gaussian_head", None)
         with seen_attributes(head) as seen:
             prediction, rendering = self(batch)
@@ -241,8 +258,10 @@ class GHGSModule(BudgetedModule):
         self.guard.accept()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add the number of skipped steps to what :class:`BudgetedModule` adds."""
         super().on_save_checkpoint(checkpoint)
         checkpoint["skipped_steps"] = self.guard.skipped
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Go on counting skipped steps."""
         self.guard.skipped = checkpoint.get("skipped_steps", 0)

@@ -48,6 +48,7 @@ def replay(path: str | Path) -> tuple[int, str, Fault | None]:
 
 
 def _step(values: Mapping[str, Any]) -> Step:
+    """The inputs of a step from plain data."""
     autocast = getattr(torch, values["autocast"]) if values["autocast"] else None
     batch, targets = values["batch"], values["batch"]["targets"]
     if targets is not None:

@@ -20,11 +20,19 @@ _KEPT = ({"step", "momentum"}, {"step", "exp_avg", "exp_avg_sq"})
 
 
 def check_training_state(path: str | Path, checkpoint: Mapping[str, Any]) -> None:
-    """Refuse a checkpoint whose training state does not have Lightning's form."""
+    """Refuse a checkpoint whose training state does not have Lightning's form.
+
+    Args:
+        path: of the checkpoint, for messages.
+        checkpoint: its content.
+
+    Raises:
+        InputError: names the entry."""
     kinds = {"epoch": int, "global_step": int, "skipped_steps": int, "loops": Mapping, "callbacks": Mapping}
     kinds |= {"optimizer_states": list, "lr_schedulers": list}
     for key in kinds.keys() & checkpoint.keys():
-        value, kind = checkpoint[key], kinds[key]
+        value = checkpoint[key]
+        kind = kinds[key]
         fits = isinstance(value, kind) and (kind is not int or _is_count(value))
         require(
             fits, f"{path}: {key}", "a number of 0 or more" if kind is int else f"a {kind.__name__}", value
@@ -39,8 +47,17 @@ def check_optimizer_state(
     path: str | Path, state: Mapping[str, Any], groups: Sequence[Mapping[str, Any]]
 ) -> None:
     """Refuse the state of an optimizer with another number of parameters, tensors of other shapes or values
-    that are not finite. ``groups``: the parameter groups of this run's optimizer."""
-    place, own = f"{path}: optimizer_states", [len(group["params"]) for group in groups]
+    that are not finite.
+
+    Args:
+        path: of the checkpoint, for messages.
+        state: of the optimizer in the checkpoint.
+        groups: the parameter groups of this run's optimizer.
+
+    Raises:
+        InputError: names the entry."""
+    place = f"{path}: optimizer_states"
+    own = [len(group["params"]) for group in groups]
     lists = [group.get("params") for group in state["param_groups"]]
     found = [len(numbers) if isinstance(numbers, list) else None for numbers in lists]
     expected = f"as many groups and parameters as this run has, {own}"
@@ -70,7 +87,15 @@ def _check_kept(place: str, value: Any, parameter: Parameter) -> None:
 
 
 def check_schedules(path: str | Path, states: Any, count: int) -> None:
-    """Refuse states of LambdaLR that this run cannot go on from. ``count``: parameter groups of the run."""
+    """Refuse states of LambdaLR that this run cannot go on from.
+
+    Args:
+        path: of the checkpoint, for messages.
+        states: in the checkpoint.
+        count: of parameter groups of the run.
+
+    Raises:
+        InputError: names the entry."""
     place = f"{path}: lr_schedulers"
     require(isinstance(states, list), place, "a list of states", type(states).__name__)
     for state in states:
@@ -88,7 +113,14 @@ def check_schedules(path: str | Path, states: Any, count: int) -> None:
 
 
 def check_restored(trainer: L.Trainer, checkpoint: Mapping[str, Any]) -> None:
-    """Refuse states of loops and callbacks whose form differs from what this run's have at the start."""
+    """Refuse states of loops and callbacks whose form differs from what this run's have at the start.
+
+    Args:
+        trainer: of the run, before it has started.
+        checkpoint: that it goes on from.
+
+    Raises:
+        InputError: names the entry."""
     path = trainer.ckpt_path
     loops = checkpoint.get("loops") or {}
     require("fit_loop" in loops, f"{path}: loops", "a fit_loop", sorted(map(str, loops)))

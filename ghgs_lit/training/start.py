@@ -18,8 +18,15 @@ from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpo
 
 
 def check_start(config: Mapping[str, Any], directory: Path) -> None:
-    """Refuse ``init_from`` together with ``resume``, unless the run resumes in its own ``directory``: then
-    its configuration still has the ``init_from`` that it began with."""
+    """Refuse ``init_from`` together with ``resume``, unless the run resumes in its own directory: then its
+    configuration still has the ``init_from`` that it began with.
+
+    Args:
+        config: the run's, as plain data.
+        directory: of the run.
+
+    Raises:
+        InputError: both are given."""
     if config["resume"] is None or config["init_from"] is None:
         return
     own = resolved(config["resume"]).is_relative_to(directory.resolve())
@@ -79,23 +86,33 @@ def _check_optimizer(
 def initialize(
     model: nn.Module, path: str | Path, strict: bool = False, random_frozen: bool = False
 ) -> list[str]:
-    """Load the weights at ``path`` that fit into ``model``; returns one line for each tensor.
+    """Load the weights of a checkpoint that fit into a model.
 
-    A line says ``loaded``, ``wrong shape`` or ``missing`` (both stay as initialised) or ``ignored`` (not in
-    the model). ``strict``: every tensor must fit, those of other stages apart where the file has the encoder
-    alone. ``random_frozen``: parameters that are not trained may stay as initialised. InputError: not a
-    checkpoint of this project; nothing fits; a parameter that is not trained would stay as initialised; with
-    ``strict``, a tensor that does not fit or is missing (names it).
-    """
+    Args:
+        model: gets the weights.
+        path: the checkpoint.
+        strict: every tensor must fit, those of other stages apart where the file has the encoder alone.
+        random_frozen: parameters that are not trained may stay as initialised.
+
+    Returns:
+        A line for each tensor, which says ``loaded``, ``wrong shape`` or ``missing`` (both stay as
+        initialised) or ``ignored`` (not in the model).
+
+    Raises:
+        InputError: not a checkpoint of this project; nothing fits; a parameter that is not trained would stay
+            as initialised; with ``strict``, a tensor that does not fit or is missing (names it)."""
     checkpoint = read_checkpoint(path, whole=True)
-    state, own = model_state(checkpoint), model.state_dict()
+    state = model_state(checkpoint)
+    own = model.state_dict()
     if strict:
         alone = checkpoint["config"].keys() & set(STAGES) == {"encoder"}
         others = {name: own[name] for name in own if alone and not name.startswith("encoder.")}
         load_strictly(model, others | state, path)
-    fitting, lines = {}, []
-    for key in [*own, *(key for key in state if key not in own)]:
-        here, there = (shape_of(s[key]) if key in s else None for s in (own, state))
+    fitting = {}
+    lines = []
+    for key in {**own, **state}:
+        here = shape_of(own[key]) if key in own else None
+        there = shape_of(state[key]) if key in state else None
         if here is None:
             lines.append(f"ignored      {key} {there}: the model has no such tensor")
         elif there is None:
@@ -117,25 +134,42 @@ def initialize(
 
 
 def with_origin(config: Mapping[str, Any], model: nn.Module) -> Mapping[str, Any]:
-    """``config`` with ``encoder.weights``, the origin of the semantic features, from the checkpoint that the
-    run starts from, if it has one and all these weights fit; tables read it."""
+    """Take over the origin of the semantic features, which tables read.
+
+    Args:
+        config: the run's, as plain data.
+        model: of the run.
+
+    Returns:
+        ``config`` with ``encoder.weights`` from the checkpoint that the run starts from, if it has one and
+        all these weights fit; else ``config``."""
     path = config["resume"] or config["init_from"]
     if path is None:
         return config
     checkpoint = read_checkpoint(path)
-    origin, state = lookup(checkpoint["config"], "encoder.weights"), model_state(checkpoint)
+    origin = lookup(checkpoint["config"], "encoder.weights")
+    state = model_state(checkpoint)
     has_branch = lookup(config, "encoder.semantic") is not None
-    fits = has_branch == (lookup(checkpoint["config"], "encoder.semantic") is not None) and all(
-        name in state and state[name].shape == tensor.shape
-        for name, tensor in model.state_dict().items()
-        if name.startswith("encoder.semantic." if has_branch else "encoder.")
-    )
-    return {**config, "encoder": {**config["encoder"], "weights": origin}} if origin and fits else config
+    fits = has_branch == (lookup(checkpoint["config"], "encoder.semantic") is not None)
+    source = "encoder.semantic." if has_branch else "encoder."
+    for name, tensor in model.state_dict().items():
+        if name.startswith(source):
+            fits &= name in state and state[name].shape == tensor.shape
+    if not origin or not fits:
+        return config
+    return {**config, "encoder": {**config["encoder"], "weights": origin}}
 
 
 def report(lines: list[str], path: str | Path, written: Path) -> str:
-    """At most 22 lines on the ``lines`` of :func:`initialize`, of which loaded tensors are only counted; all
-    are written to the file ``written``."""
+    """Sum up what was loaded.
+
+    Args:
+        lines: of :func:`initialize`.
+        path: the checkpoint.
+        written: a file that gets all lines.
+
+    Returns:
+        At most 22 lines, in which loaded tensors are only counted."""
     written.write_text("\n".join(lines) + "\n")
     others = [line for line in lines if not line.startswith("loaded")]
     loaded = len(lines) - len(others)

@@ -71,7 +71,16 @@ class TrainerOptions(Options):
     """Times of Lightning's hooks, written to <run>/fit-profile.txt."""
 
     def build(self, **arguments: Any) -> L.Trainer:
-        """The Trainer with further ``arguments``. InputError: it refuses its options."""
+        """The Trainer.
+
+        Args:
+            **arguments: of Lightning's Trainer, beside the options.
+
+        Returns:
+            A Trainer that counts validations in steps and has no limit of epochs.
+
+        Raises:
+            InputError: Lightning refuses the options."""
         options = dict(self)
         if self.precision == "tf32":
             options["precision"] = "32-true"

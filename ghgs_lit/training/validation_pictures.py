@@ -38,6 +38,7 @@ class PicturesOptions(Options):
     middle of the subject in its first view."""
 
     def build(self) -> "Pictures":
+        """The callback."""
         return Pictures(self)
 
 
@@ -45,20 +46,26 @@ class Pictures(Callback):
     """Logs ``view/sheet/<subject>``, ``view/attention/<subject>``, in TensorBoard's tabs of distributions
     ``values/*`` and in its mesh tab ``<subject>/points``. A sheet has inputs, depths, targets, renders and
     errors. Attention is of one token of the recalibration. Clouds are the predicted points and the body's
-    vertices."""
+    vertices.
+
+    Args:
+        options: whom to draw."""
 
     def __init__(self, options: PicturesOptions):
         self.options = options
         self._left = 0
-        self._hook, self._seen = None, None
+        self._hook = None
+        self._seen = None
 
     def on_validation_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Watch the recalibration while there are subjects to draw."""
         self._left = 0 if trainer.sanity_checking else self.options.subjects
         stage = getattr(pl_module.model, "recalibration", None)
         if self._left and isinstance(stage, Recalibration):
             self._hook = stage.register_forward_pre_hook(self._see)
 
     def _see(self, stage: Recalibration, inputs: tuple) -> None:
+        """Keep the tokens and points that the recalibration gets."""
         self._seen = (stage, *inputs[:2])
 
     @rank_zero_only
@@ -70,7 +77,15 @@ class Pictures(Callback):
         batch: Batch,
         *args: Any,
     ) -> None:
-        prediction, image = outputs["prediction"], outputs["rendering"].image
+        """Draw the next subjects.
+
+        Args:
+            trainer, pl_module: of the run.
+            outputs: of :meth:`ghgs_lit.training.module.GHGSModule.validation_step`.
+            batch: that was validated.
+            *args: not used."""
+        prediction = outputs["prediction"]
+        image = outputs["rendering"].image
         for element in range(min(self._left, len(batch.images))):
             number = self.options.subjects - self._left
             name = batch.subjects[element] if batch.subjects else f"subject_{number}"
@@ -85,12 +100,14 @@ class Pictures(Callback):
         self._forget()
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Watch no longer."""
         self._forget()
 
     def _forget(self) -> None:
         if self._hook is not None:
             self._hook.remove()
-        self._hook, self._seen = None, None
+        self._hook = None
+        self._seen = None
 
     def _show_attention(self, trainer: L.Trainer, batch: Batch, element: int, name: str) -> None:
         if self._seen is None:
@@ -118,8 +135,14 @@ class Pictures(Callback):
 
 
 def distributions(prediction: Prediction) -> dict[str, Tensor]:
-    """Finite values of all Gaussians of a prediction, by name: opacities, standard deviations in millimetres
-    and, where their pixels are known, the distances from these pixels' points, in millimetres."""
+    """Values of all Gaussians.
+
+    Args:
+        prediction: of a model.
+
+    Returns:
+        Finite values by name: opacities, standard deviations in millimetres and, where their pixels are
+        known, the distances from these pixels' points, in millimetres."""
     gaussians = prediction.gaussians
     found = {"opacity": gaussians.opacities, "scale_mm": 1000 * gaussians.scales}
     if gaussians.pixel is not None:

@@ -72,23 +72,41 @@ def has_parts(batch: Batch) -> bool:
 
 
 def token_parts(shares: Float[Tensor, "n P"], tokens: Tokens) -> Int[Tensor, " N"]:
-    """The part with the largest of ``shares`` (:func:`part_shares`) in the patch of each token; -1: none."""
+    """The part that the patch of each token shows.
+
+    Args:
+        shares: of :func:`part_shares`.
+        tokens: of the same batch.
+
+    Returns:
+        An index into :data:`PARTS`, of the largest share; -1: none."""
     _, _, h, w = tokens.grid
     own = shares[(tokens.image * h + tokens.row) * w + tokens.column]
     return torch.where(own.any(1), own.argmax(1), -1)
 
 
 def part_shares(batch: Batch, patch_size: int) -> Float[Tensor, "n P"]:
-    """Shares of :data:`PARTS` among the subject's pixels of each patch, ordered by image, row and column; 0
-    without such a pixel. ``batch``: with true depths and vertices of built-in bodies; sides are divisible by
-    the patch size. InputError: no depths, no bodies, or other bodies."""
+    """Shares of :data:`PARTS` among the subject's pixels of each patch.
+
+    Args:
+        batch: with true depths and vertices of bodies whose parts are known; sides are divisible by the patch
+            size.
+        patch_size: side of a patch in pixels.
+
+    Returns:
+        Shares of each patch, ordered by image, row and column; 0 without a pixel of the subject.
+
+    Raises:
+        InputError: no depths, no bodies, or other bodies."""
     require(batch.depths is not None, "data", "true depths, which the labels are made from", "none")
     require(batch.body_vertices is not None, "data", "people with bodies, as data=synthetic", "none")
     b, v, height, width = batch.depths.shape
-    valid, points = batch.masks & (batch.depths > 0), unproject_maps(batch.depths, batch.cameras)
-    found = torch.cat(
-        [parts_of_points(points[i][valid[i]], body) for i, body in enumerate(batch.body_vertices)]
-    )
+    valid = batch.masks & (batch.depths > 0)
+    points = unproject_maps(batch.depths, batch.cameras)
+    parts = []
+    for element, body in enumerate(batch.body_vertices):
+        parts.append(parts_of_points(points[element][valid[element]], body))
+    found = torch.cat(parts)
     grid = (b, v, height // patch_size, width // patch_size)
     numbers = torch.arange(grid[0] * grid[1] * grid[2] * grid[3], device=found.device)
     patch = F.interpolate(numbers.view(grid).double(), scale_factor=patch_size).long()[valid]

@@ -21,8 +21,15 @@ from ghgs_lit.types import Batch
 def neighbor_shows_part(
     features: Float[Tensor, "n c"], parts: Int[Tensor, " n"], views: Int[Tensor, " n"]
 ) -> Bool[Tensor, " n"]:
-    """Whether the most similar patch (cosine) of the other views shows the same part as a patch; false
-    without other views. ``features``: of the patches of one person. ``views``: the view of each patch."""
+    """Whether the most similar patch (cosine) of the other views shows the same part as a patch.
+
+    Args:
+        features: of the patches of one person.
+        parts: the part that each patch shows.
+        views: the view of each patch.
+
+    Returns:
+        A value for each patch; false without other views."""
     directions = unit(features)
     cosines = (directions @ directions.T).masked_fill(views[:, None] == views, -torch.inf)
     best, nearest = cosines.max(1) if len(features) else (cosines.new_zeros(0), views)
@@ -30,14 +37,23 @@ def neighbor_shows_part(
 
 
 class Pretext(nn.Module):
-    """A semantic branch under its name in a model."""
+    """A semantic branch under its name in a model.
+
+    Args:
+        branch: to be trained."""
 
     def __init__(self, branch: SemanticBranch):
         super().__init__()
         self.encoder = nn.ModuleDict({"semantic": branch})
 
     def forward(self, batch: Batch) -> tuple[Float[Tensor, "N P"], Float[Tensor, "N P"], KeptPatches]:
-        """Logarithms of predicted shares, true shares, and their patches."""
+        """Predict which parts the patches of subjects show.
+
+        Args:
+            batch: with true depths and bodies whose parts are known.
+
+        Returns:
+            Logarithms of predicted shares, true shares, and their patches."""
         branch = self.encoder["semantic"]
         kept = KeptPatches(branch.subject(batch.masks), batch.images.device)
         shares = part_shares(batch, branch.patch_size)[kept.index]
@@ -45,18 +61,31 @@ class Pretext(nn.Module):
 
 
 def cross_entropy(log_shares: Float[Tensor, "N P"], shares: Float[Tensor, "N P"]) -> Tensor:
-    """Mean cross-entropy over the patches with a part; 0 without any."""
+    """Mean cross-entropy over the patches with a part.
+
+    Args:
+        log_shares: logarithms of predicted shares of the parts.
+        shares: true shares, all 0 in a patch without a part.
+
+    Returns:
+        A value without dimensions; 0 without any patch."""
     return -(shares * log_shares).sum() / shares.any(1).sum().clamp_min(1)
 
 
 class PretextModule(BudgetedModule):
-    """Trains a semantic branch to tell body parts; arguments as of :class:`BudgetedModule`."""
+    """Trains a semantic branch to tell body parts.
+
+    Args:
+        model: the branch.
+        optimization: as of :class:`BudgetedModule`.
+        config: as of :class:`BudgetedModule`."""
 
     def __init__(self, model: Pretext, optimization: Optimization, config: Mapping[str, Any]):
         super().__init__(model, optimization, config)
         self.part_accuracy = MeanMetric()
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Run a step and log its loss; returns it."""
         loss = cross_entropy(*self.model(batch)[:2])
         size = len(batch.images)
         self.log("loss/parts", loss.detach(), prog_bar=True, batch_size=size)
@@ -64,8 +93,10 @@ class PretextModule(BudgetedModule):
         return loss
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        """Measure a batch, person by person."""
         log_shares, shares, kept = self.model(batch)
-        features, part = features_of(log_shares), shares.argmax(1)
+        features = features_of(log_shares)
+        part = shares.argmax(1)
         element = kept.image // batch.images.shape[1]
         for b in range(len(batch.images)):
             rows = shares.any(1) & (element == b)
@@ -77,7 +108,13 @@ class PretextModule(BudgetedModule):
         self.log("val/parts", cross_entropy(log_shares, shares), on_epoch=True, batch_size=size)
 
     def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
-        """Clip to ``optimizer.clip`` and log the norm before. DivergedError: the norm is not finite."""
+        """Clip to ``optimizer.clip`` and log the norm before.
+
+        Args:
+            optimizer, gradient_clip_val, gradient_clip_algorithm: of Lightning; not used.
+
+        Raises:
+            DivergedError: the norm is not finite."""
         norm = self.optimization.clip_gradients(self)
         if not norm.isfinite():
             raise DivergedError(
