@@ -10,7 +10,9 @@ from torch.utils.data import DataLoader, Dataset
 from ghgs_lit.data.batches import StepSampler
 from ghgs_lit.data.datamodule import trained_batches
 from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.training import GHGSModule
 from ghgs_lit.training.base import BudgetedModule
+from ghgs_lit.training.checkpoints import Checkpoints
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import (
     Batch,
@@ -23,6 +25,7 @@ from ghgs_lit.types import (
     Targets,
 )
 from tests.helpers.cameras import camera_ring
+from tests.helpers.losses import losses_of
 
 
 def ring(count: int, size: int, radius: float = 2.0, start: float = 0.0) -> Cameras:
@@ -133,3 +136,40 @@ class StepData(L.LightningDataModule):
     def val_dataloader(self) -> DataLoader:
         batches = [example_batch(seed=1000 + i) for i in range(2)]
         return DataLoader(batches, batch_size=None, collate_fn=lambda b: b)
+
+
+CONFIG = {"encoder": {"width": 3, "layers": [0, 1]}, "seed": 1, "resume": None}
+
+
+def module(renderer=flat_renderer, lr=0.05, **weights) -> GHGSModule:
+    """A training of the stand-in; ``weights``: of the losses."""
+    weights = weights or {"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 1.0, "depth": 0.5}
+    return GHGSModule(
+        Standin(), renderer, losses_of(weights), Optimization(lr=lr, warmup=0.1, end_factor=0.0), CONFIG
+    )
+
+
+def trainer(folder, steps=12, callbacks=(), **options) -> L.Trainer:
+    """On the CPU, without logs; ``options`` replace these."""
+    defaults = {
+        "logger": False,
+        "enable_checkpointing": any(isinstance(c, Checkpoints) for c in callbacks),
+        "enable_progress_bar": False,
+        "val_check_interval": 6,
+    }
+    return L.Trainer(
+        accelerator="cpu",
+        max_steps=steps,
+        max_epochs=-1,
+        default_root_dir=folder,
+        callbacks=list(callbacks),
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        check_val_every_n_epoch=None,
+        **{**defaults, **options},
+    )
+
+
+def loader(count=3) -> DataLoader:
+    """Different batches, always the same."""
+    return DataLoader([example_batch(seed=s) for s in range(count)], batch_size=None, collate_fn=lambda b: b)

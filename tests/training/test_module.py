@@ -17,54 +17,30 @@ from torch.utils.data import DataLoader
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.errors import InputError
 from ghgs_lit.kernels.precision import exact
-from ghgs_lit.metrics.functional import box_of, psnr, ssim
 from ghgs_lit.model import GHGS
 from ghgs_lit.training import DivergedError, GHGSModule, Optimization
 from ghgs_lit.training.callbacks import RunProgress
-from ghgs_lit.training.checkpoints import CheckpointOptions, Checkpoints
+from ghgs_lit.training.checkpoints import CheckpointOptions
 from ghgs_lit.training.cost import Costs
 from ghgs_lit.training.trainer import TrainerOptions
 from ghgs_lit.training.validation_pictures import PicturesOptions
-from ghgs_lit.types import DepthMaps, Targets
+from ghgs_lit.types import Targets
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION, write_checkpoint
 from tests.helpers.losses import losses_of
 from tests.helpers.models import config, make_model
 from tests.helpers.scenes import make_batch
-from tests.helpers.training import Standin, example_batch, flat_renderer, infinitely_steep
+from tests.helpers.training import (
+    CONFIG,
+    Standin,
+    example_batch,
+    flat_renderer,
+    infinitely_steep,
+    loader,
+    module,
+    trainer,
+)
 
 RELEASE = Optimization(lr=1e-4, warmup=0.01, end_factor=5e-4)
-CONFIG = {"encoder": {"width": 3, "layers": [0, 1]}, "seed": 1, "resume": None}
-
-
-def module(renderer=flat_renderer, lr=0.05, **weights) -> GHGSModule:
-    weights = weights or {"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 1.0, "depth": 0.5}
-    return GHGSModule(
-        Standin(), renderer, losses_of(weights), Optimization(lr=lr, warmup=0.1, end_factor=0.0), CONFIG
-    )
-
-
-def trainer(folder, steps=12, callbacks=(), **options) -> L.Trainer:
-    defaults = {
-        "logger": False,
-        "enable_checkpointing": any(isinstance(c, Checkpoints) for c in callbacks),
-        "enable_progress_bar": False,
-        "val_check_interval": 6,
-    }
-    return L.Trainer(
-        accelerator="cpu",
-        max_steps=steps,
-        max_epochs=-1,
-        default_root_dir=folder,
-        callbacks=list(callbacks),
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        check_val_every_n_epoch=None,
-        **{**defaults, **options},
-    )
-
-
-def loader(count=3) -> DataLoader:
-    return DataLoader([example_batch(seed=s) for s in range(count)], batch_size=None, collate_fn=lambda b: b)
 
 
 @pytest.mark.parametrize(("step", "rate"), [(0, 4e-6), (2000, 1e-4), (100_000, 5.05e-5), (200_000, 5.0e-8)])
@@ -318,61 +294,6 @@ def test_two_seeds_of_training_differ_and_one_repeats(tmp_path):
         trainer(tmp_path, 2, [Curve()], limit_val_batches=0).fit(subject, loader())
     assert curves[0] == curves[1]
     assert all(one != other for one, other in zip(curves[1], curves[2], strict=True))
-
-
-def test_validation_measures_clamped_renders(tmp_path):
-    """PSNR and SSIM are of the pictures that are seen, as `ghgs evaluate` measures them."""
-
-    def brighter(gaussians, cameras, by=3.0):
-        drawn = flat_renderer(gaussians, cameras)
-        pattern = torch.linspace(-1, by, drawn.image.shape[-1])
-        return dataclasses.replace(drawn, image=drawn.image + pattern)
-
-    subject, batch = module(brighter), example_batch()
-    run = trainer(tmp_path, steps=1)
-    (found,) = run.validate(
-        subject, DataLoader([batch], batch_size=None, collate_fn=lambda b: b), verbose=False
-    )
-    image = subject(batch)[1].image.detach().clamp(0, 1).flatten(0, 1)
-    target = batch.targets.images.flatten(0, 1)
-    assert found["val/ssim"] == pytest.approx(float(ssim(image, target, "reflect").mean()), rel=1e-4)
-    assert found["val/psnr"] == pytest.approx(float(psnr(image, target).mean()), rel=1e-4)
-    box = box_of(batch.targets.masks.flatten(0, 1))
-    assert found["val/psnr_box"] == pytest.approx(float(psnr(image, target, box).mean()), rel=1e-4)
-
-
-def test_depth_error_is_of_pixels_with_a_prediction(tmp_path):
-    """Where the model says that a depth is not valid, it has none that could be wrong."""
-
-    class Half(Standin):
-        def forward(self, batch):
-            found = super().forward(batch)
-            valid = batch.masks & (torch.arange(batch.masks.shape[-1]) < 8)
-            depth = torch.where(valid, 2.15, 9.0)
-            return dataclasses.replace(found, depth_maps=DepthMaps(depth, valid, torch.ones_like(depth)))
-
-    subject = GHGSModule(Half(), flat_renderer, losses_of({"render_l1": 1.0}), Optimization(lr=0.05), CONFIG)
-    (found,) = trainer(tmp_path, steps=1).validate(subject, loader(1), verbose=False)
-    assert found["val/depth_error_mm"] == pytest.approx(50, abs=0.01)  # the truth is 2.1 m
-
-
-def test_rounds_are_measured_as_the_result_is(tmp_path):
-    """Renders of the Gaussians before each round are clamped, too, and depths are those before it."""
-
-    def brighter(gaussians, cameras):
-        drawn = flat_renderer(gaussians, cameras)
-        return dataclasses.replace(drawn, image=drawn.image + torch.linspace(-1, 2, drawn.image.shape[-1]))
-
-    class Twice(Standin):
-        def forward(self, batch):
-            found = super().forward(batch)
-            maps = DepthMaps(torch.full_like(found.depth, 2.2), batch.masks, torch.ones_like(found.depth))
-            return dataclasses.replace(found, drafts=(found.gaussians,), rounds=(maps, found.depth_maps))
-
-    subject = GHGSModule(Twice(), brighter, losses_of({"render_l1": 1.0}), Optimization(lr=0.05), CONFIG)
-    (found,) = trainer(tmp_path, steps=1).validate(subject, loader(1), verbose=False)
-    assert found["val/psnr_before_round_1"] == pytest.approx(found["val/psnr"], rel=1e-6)
-    assert found["val/depth_error_mm_before_round_1"] == pytest.approx(100, abs=0.01)
 
 
 def test_a_trainer_of_ones_own_needs_no_configuration(tmp_path):

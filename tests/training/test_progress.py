@@ -13,7 +13,7 @@ from ghgs_lit.types import Targets
 from tests.helpers.losses import losses_of
 from tests.helpers.models import make_model
 from tests.helpers.scenes import make_batch
-from tests.training.test_module import loader, module, trainer
+from tests.helpers.training import loader, module, trainer
 
 
 def test_lines_say_how_far_the_run_is(tmp_path, capsys, monkeypatch):
