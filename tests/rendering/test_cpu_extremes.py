@@ -117,20 +117,20 @@ def test_exactly_near_and_exactly_far_are_seen():
     assert float(render(few(), views, "cpu", far=1.9999).alpha.max()) == 0
 
 
-@pytest.mark.parametrize("scale", [0.1, 1e8, 1e20])
 @pytest.mark.parametrize("far_off", [1e8, 1e30, 3e38, INF])
-def test_far_off_screen(far_off, scale):
+def test_far_off_screen(far_off):
     """Gaussians at huge distances from the frame give no NaN or infinity."""
-    gaussians = few(
-        means=[[0, 0, 0], [far_off, 0, 0], [0, -far_off, 0]], scales=[[0.1] * 3, [scale] * 3, [scale] * 3]
-    )
-    gaussians = with_gradients(gaussians)
-    rendering = render(gaussians, camera_ring(1, 40, 40), "cpu")
-    rendering.image.sum().backward()
-    assert torch.isfinite(rendering.image).all()
-    assert all(torch.isfinite(getattr(gaussians, name).grad).all() for name in FIELDS)
-    if scale < 1:
-        assert torch.equal(rendering.image, render(few(), camera_ring(1, 40, 40), "cpu").image)
+    for scale in (0.1, 1e8, 1e20):
+        gaussians = few(
+            means=[[0, 0, 0], [far_off, 0, 0], [0, -far_off, 0]], scales=[[0.1] * 3, [scale] * 3, [scale] * 3]
+        )
+        gaussians = with_gradients(gaussians)
+        rendering = render(gaussians, camera_ring(1, 40, 40), "cpu")
+        rendering.image.sum().backward()
+        assert torch.isfinite(rendering.image).all()
+        assert all(torch.isfinite(getattr(gaussians, name).grad).all() for name in FIELDS)
+        if scale < 1:
+            assert torch.equal(rendering.image, render(few(), camera_ring(1, 40, 40), "cpu").image)
 
 
 def test_beyond_the_limit_of_the_jacobian():
