@@ -32,14 +32,14 @@ class Asked(NamedTuple):
 _VERSION = "2.13."
 
 LIMITS = {
-    ("model=paper", 1): Asked(1599, 1, 3092, 2),
-    ("model=paper", 8): Asked(1621, 1, 3187, 2),
-    ("model=hull", 1): Asked(1800, 1, 3329, 2),
-    ("model=hull", 8): Asked(1822, 1, 3426, 2),
-    ("model=recurrent", 1): Asked(2431, 2, 4230, 3),
-    ("model=recurrent", 8): Asked(2500, 2, 4374, 3),
-    ("shipped", 1): Asked(2582, 2, 4230, 3),
-    ("shipped", 8): Asked(2662, 2, 4374, 3),
+    ("model=paper", 1): Asked(1491, 1, 2984, 2),
+    ("model=paper", 8): Asked(1513, 1, 3079, 2),
+    ("model=hull", 1): Asked(1613, 1, 3142, 2),
+    ("model=hull", 8): Asked(1635, 1, 3239, 2),
+    ("model=recurrent", 1): Asked(2244, 2, 4043, 3),
+    ("model=recurrent", 8): Asked(2313, 2, 4187, 3),
+    ("shipped", 1): Asked(2395, 2, 4043, 3),
+    ("shipped", 8): Asked(2475, 2, 4187, 3),
 }
 
 

@@ -4,7 +4,7 @@ coarse grid with the masks, dilated because real masks are noisy. Nothing here h
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from pydantic import Field
 from torch import Tensor
 
@@ -24,6 +24,7 @@ from ghgs_lit.config.options import Index, Options
 from ghgs_lit.geometry.frame import subject_center
 from ghgs_lit.geometry.masks import first_and_last
 from ghgs_lit.geometry.projection import focal_lengths, project
+from ghgs_lit.kernels import gpu
 from ghgs_lit.kernels.pool import is_supported
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds
@@ -102,7 +103,7 @@ def subject_box(
         # Half a cell's diagonal in pixels, for points as near as 0.6 times the depth of the box's middle.
         pixels = focal * cell.norm(dim=-1, keepdim=True) / 2 / (0.6 * depth).clamp(min=NEAREST)
         grow = pixels.nan_to_num(nan=0.0).amax(1).clamp(max=max(masks.shape[-2:])).ceil().int()
-        grown = dilate(masks, radius + grow[:, None, None, None])
+        grown = dilate(masks, radius, grow)
         kept = _carve(votes_outside(grown, voting), cameras, lower, cell, tolerance)
         is_left = kept.flatten(1).any(-1)[:, None]
         # For each axis, the slices with a kept cell.
@@ -120,14 +121,32 @@ def _carve(
     steps = torch.arange(CELLS, device=lower.device, dtype=lower.dtype) + 0.5
     position = lower[..., None] + cell[..., None] * steps
     matrices = projection_matrices(cameras)
-    if is_supported(matrices, position):
-        return cpu.carve(outside, matrices, position, tolerance)
+    if gpu.is_supported(matrices, position):
+        return _carving(outside, matrices, position, tolerance)
+    carve = cpu.carve if is_supported(matrices, position) else _carved
+    return carve(outside, matrices, position, tolerance)
+
+
+def _carved(
+    outside: UInt8[Tensor, "B V h w"],
+    matrices: Float[Tensor, "B V 3 4"],
+    position: Float[Tensor, "B 3 n"],
+    tolerance: int,
+) -> Bool[Tensor, "B n n n"]:
+    """:func:`ghgs_lit.bounds.cpu.carve` in PyTorch."""
     x, y, z = (matrices[..., axis, None] * position[:, None, None, axis] for axis in range(3))
     z = z + matrices[..., 3, None]
     pixel = (x[..., :, None] + y[..., None, :])[..., None] + z[..., None, None, :]
-    image = torch.arange(outside[..., 0, 0].numel(), device=lower.device).view(*outside.shape[:2], 1, 1, 1)
-    votes = look_up(outside.flatten(0, 1), image, *pixel.unbind(2))
+    image = torch.arange(outside[..., 0, 0].numel(), device=position.device)
+    votes = look_up(outside.flatten(0, 1), image.view(*outside.shape[:2], 1, 1, 1), *pixel.unbind(2))
     return votes.sum(1) <= tolerance
+
+
+_carving = gpu.operator(
+    "carved(Tensor outside, Tensor matrices, Tensor position, int tolerance) -> Tensor",
+    _carved,
+    "ghgs_lit.bounds.cuda",
+)
 
 
 def _project_one(points: Float[Tensor, "B 3"], cameras: Cameras) -> tuple[Tensor, Tensor]:

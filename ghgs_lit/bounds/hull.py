@@ -18,6 +18,7 @@ from ghgs_lit.bounds.silhouettes import (
     ray_directions,
     votes_outside,
 )
+from ghgs_lit.kernels import gpu
 from ghgs_lit.kernels.pool import even_parts, is_supported
 from ghgs_lit.plan.rows import size_class
 from ghgs_lit.types import Batch, Cameras, DepthBounds, true_places
@@ -72,9 +73,12 @@ def hull_bounds(
         count: the masks have no more pixels than this, so that a GPU need not be asked; None: unknown."""
     voting = masks.flatten(2).any(-1) if voting is None else voting
     outside = votes_outside(dilate(masks, radius), voting)
+    directions, matrices = ray_directions(cameras), projection_matrices(cameras)
+    if gpu.is_supported(start.near, directions, matrices):
+        tables = (outside, masks, matrices, directions, cameras.centers)
+        return DepthBounds(*_marching(*tables, start.near, start.far, samples, tolerance))
     near, far = (bound.clone(memory_format=torch.contiguous_format) for bound in (start.near, start.far))
     steps = (torch.arange(samples, device=near.device, dtype=near.dtype) + 0.5) / samples
-    directions, matrices = ray_directions(cameras), projection_matrices(cameras)
     if is_supported(near, directions, matrices):
         cpu.march(outside, masks, matrices, directions, cameras.centers, near, far, steps, tolerance)
         return DepthBounds(near, far)
@@ -120,6 +124,34 @@ def _march(
     last = depth.gather(1, samples - 1 - inside.flip(1).argmax(1, keepdim=True))[:, 0] + half
     near.view(-1)[rays] = torch.where(hit, first, begin)
     far.view(-1)[rays] = torch.where(hit, last, end)
+
+
+def _marched(
+    outside: UInt8[Tensor, "B V h w"],
+    masks: Bool[Tensor, "B V h w"],
+    matrices: Float[Tensor, "B V 3 4"],
+    directions: Float[Tensor, "B V h w 3"],
+    centers: Float[Tensor, "B V 3"],
+    near: Float[Tensor, "B V h w"],
+    far: Float[Tensor, "B V h w"],
+    samples: int,
+    tolerance: int,
+) -> tuple[Float[Tensor, "B V h w"], Float[Tensor, "B V h w"]]:
+    """:func:`_march` for all pixels of ``masks``: new bounds within ``near`` and ``far``."""
+    start = DepthBounds(near, far)
+    found = [bound.clone(memory_format=torch.contiguous_format) for bound in (near, far)]
+    steps = (torch.arange(samples, device=near.device, dtype=near.dtype) + 0.5) / samples
+    rays = masks.flatten().nonzero()[:, 0]
+    _march(rays, outside, matrices, directions, centers, start, *found, steps, tolerance)
+    return tuple(found)
+
+
+_marching = gpu.operator(
+    "marched(Tensor outside, Tensor masks, Tensor matrices, Tensor directions, Tensor centers, Tensor near, "
+    "Tensor far, int samples, int tolerance) -> (Tensor, Tensor)",
+    _marched,
+    "ghgs_lit.bounds.cuda",
+)
 
 
 def _enlarge(values: Tensor, stride: int, size: tuple[int, int]) -> Tensor:

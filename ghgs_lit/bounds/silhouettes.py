@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 
 from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, pixel_centers, world_to_camera
+from ghgs_lit.kernels import gpu
 from ghgs_lit.types import Cameras, DepthBounds
 
 
@@ -83,19 +84,30 @@ def silhouettes(
     return Silhouettes(masks, full.resized(height, width), stride, ceil(dilation * max(height, width)))
 
 
-def dilate(masks: Bool[Tensor, "*batch h w"], radius: int | Tensor) -> Bool[Tensor, "*batch h w"]:
-    """Masks grown by ``radius`` pixels along both axes, at a cost that does not depend on the radius, which
-    is one for all masks or broadcasts with them."""
-    grown = masks
-    for dim in (-2, -1):
-        size = masks.shape[dim]
-        index = torch.arange(size, device=masks.device)
-        index = index[:, None] if dim == -2 else index
-        counts = F.pad(grown.cumsum(dim, dtype=torch.int32), (0, 0, 1, 0) if dim == -2 else (1, 0))
-        high, low = (index + radius + 1).clamp(max=size), (index - radius).clamp(min=0)
-        high, low = (counts.gather(dim, ends.long().expand(masks.shape)) for ends in (high, low))
-        grown = high > low
-    return grown
+def dilate(
+    masks: Bool[Tensor, "*batch h w"], radius: int, more: Int[Tensor, " b"] | None = None
+) -> Bool[Tensor, "*batch h w"]:
+    """Masks grown by ``radius`` pixels along both axes, and those of each element by ``more``."""
+    along = _grow if gpu.is_supported(masks, more) else _grown
+    return along(along(masks, radius, more, -2), radius, more, -1)
+
+
+def _grown(masks: Tensor, radius: int, more: Tensor | None, axis: int) -> Tensor:
+    """:func:`dilate` along one axis, at a cost that does not depend on the radius."""
+    if more is not None:
+        radius = radius + more.view(-1, *[1] * (masks.dim() - 1))
+    size = masks.shape[axis]
+    index = torch.arange(size, device=masks.device)
+    index = index[:, None] if axis == -2 else index
+    counts = F.pad(masks.cumsum(axis, dtype=torch.int32), (0, 0, 1, 0) if axis == -2 else (1, 0))
+    high, low = (index + radius + 1).clamp(max=size), (index - radius).clamp(min=0)
+    high, low = (counts.gather(axis, ends.long().expand(masks.shape)) for ends in (high, low))
+    return high > low
+
+
+_grow = gpu.operator(
+    "dilated(Tensor masks, int radius, Tensor? more, int axis) -> Tensor", _grown, "ghgs_lit.bounds.cuda"
+)
 
 
 def votes_outside(dilated: Bool[Tensor, "B V h w"], voting: Bool[Tensor, "B V"]) -> UInt8[Tensor, "B V h w"]:

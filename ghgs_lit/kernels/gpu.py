@@ -22,9 +22,11 @@ PLAIN: dict[str, Callable[..., Any]] = {}
 
 
 def is_supported(*tensors: Tensor | None) -> bool:
-    """Whether kernels compute with these: all float32, on a GPU on which Triton works."""
+    """Whether kernels compute with these: float32 and whole numbers, on a GPU on which Triton works."""
     given = [x for x in tensors if x is not None]
-    if not all(x.device.type in DEVICES and x.dtype == torch.float32 for x in given):
+    if any(x.device.type not in DEVICES for x in given):
+        return False
+    if any(x.is_floating_point() and x.dtype != torch.float32 for x in given):
         return False
     return given[0].device.type != "cuda" or _triton_works()
 

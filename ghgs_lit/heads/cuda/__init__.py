@@ -85,6 +85,6 @@ def activate(
     on_surface: bool,
 ) -> tuple[Tensor, ...]:
     """:func:`ghgs_lit.heads.activations.footprint_gaussians`, differentiable in ``raw`` and ``points``; see
-    :func:`is_supported`. A pixel has one Gaussian at most."""
+    :func:`is_supported`."""
     seen = (image, pixel, maps.depth, maps.valid, points, photo, share)
     return _Activate.apply(*raw, *seen, cameras.intrinsics, cameras.extrinsics, list(constants), on_surface)

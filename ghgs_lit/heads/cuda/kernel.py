@@ -196,7 +196,11 @@ def activate_back_rows(
     place = view * height * width + at
     own, footprint = _depth_and_footprint(depth, intrinsics, view, place)
     x, y, z = load3(of_means, i)
-    store3(d_points, place, x, y, z)
+    # Added, since a plan may list a pixel more than once; not by rows that repeat the last one.
+    is_own = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS) < count
+    tl.atomic_add(d_points + 3 * place, x, is_own)
+    tl.atomic_add(d_points + 3 * place + 1, y, is_own)
+    tl.atomic_add(d_points + 3 * place + 2, z, is_own)
     w, a, b, c = load4(of_quaternions, i)
     if ON_SURFACE:
         # Rotations and products with unit quaternions are transposed by the conjugate.

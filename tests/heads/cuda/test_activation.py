@@ -83,6 +83,15 @@ def test_rotations_near_none_at_all():
     )
 
 
+def test_a_pixel_that_is_listed_twice_has_the_sum_of_both_gradients():
+    """Plans of a GPU fill up the rows of a batch with the last one."""
+    raw, *others = scene(1, 3, 28, 28)
+    rows = torch.cat((torch.arange(len(raw.image)), torch.tensor([len(raw.image) - 1] * 9)))
+    values = {name: getattr(raw, name)[rows] for name in ("descriptors", *RAW, "image", "pixel")}
+    raw = dataclasses.replace(raw, **values, splits=(len(rows),))
+    assert_as_exact_as_pytorch(make_head(axes="surface", guide=True, color_limit=0.1), raw, *others)
+
+
 def strided(x):
     """The same values in every second place of the last axis."""
     return torch.stack((x, torch.zeros_like(x)), -1)[..., 0]

@@ -1,0 +1,1 @@
+"""Bounds for GPUs: each search of a hull is one kernel."""

@@ -1,0 +1,136 @@
+"""Searches of the bounds for a GPU, in Triton: formulas of :mod:`ghgs_lit.bounds.silhouettes`, ``box`` and
+``hull``. ``outside``: 1 where a view says "outside"."""
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from ghgs_lit.bounds.silhouettes import NEAREST
+from ghgs_lit.kernels.tiles import load3, load4, rows_of, start
+
+LEAST = tl.constexpr(NEAREST)
+
+
+@triton.jit
+def _cell(x, inverse, size):
+    """The index along an axis of the cell at a homogeneous place, or of the nearest one; 0 for NaN."""
+    place = x * inverse
+    place = tl.where(place > 0, place, 0.0)
+    return tl.where(place < size - 1, place, size - 1).to(tl.int32)
+
+
+@triton.jit
+def _vote(outside, view, x, y, w, height, width):
+    """Entries of a table at homogeneous pixels."""
+    inverse = 1 / tl.where(w > LEAST, w, LEAST)
+    row, column = _cell(y, inverse, height), _cell(x, inverse, width)
+    return tl.load(outside + (view * height + row) * width + column).to(tl.int32)
+
+
+@triton.jit
+def dilated_rows(
+    count, masks, more, out, radius, area, size, stride, HAS_MORE: tl.constexpr, ROWS: tl.constexpr
+):
+    """Write ``ROWS`` pixels, grown along the axis of ``size`` pixels that are ``stride`` apart. ``area``:
+    pixels of an element."""
+    i = rows_of(count, ROWS)
+    place = i // stride % size
+    reach = tl.zeros_like(place).to(tl.int32) + radius
+    if HAS_MORE:
+        reach += tl.load(more + i // area)
+    reach = tl.minimum(reach, size)
+    found = tl.load(masks + i).to(tl.int32)
+    for step in range(1, tl.max(reach, 0) + 1):
+        is_near = step <= reach
+        after, before = is_near & (place + step < size), is_near & (place >= step)
+        found |= tl.load(masks + i + step * stride, after, 0).to(tl.int32)
+        found |= tl.load(masks + i - step * stride, before, 0).to(tl.int32)
+    tl.store(out + i, found != 0)
+
+
+@triton.jit
+def carved_rows(
+    count, outside, matrices, position, kept, views, cells, height, width, tolerance, ROWS: tl.constexpr
+):
+    """Write ``ROWS`` cells of the grids; ``position`` [B, 3, n]: their centres along each axis."""
+    i = rows_of(count, ROWS)
+    element = i // cells // cells // cells
+    at = position + element * 3 * cells
+    x = tl.load(at + i // cells // cells % cells)
+    y, z = tl.load(at + cells + i // cells % cells), tl.load(at + 2 * cells + i % cells)
+    votes = tl.zeros_like(i).to(tl.int32)
+    for v in range(views):
+        view = element * views + v
+        a, b, c, d = load4(matrices, 3 * view)
+        e, f, g, h = load4(matrices, 3 * view + 1)
+        k, m, n, o = load4(matrices, 3 * view + 2)
+        right, below = a * x + b * y + (c * z + d), e * x + f * y + (g * z + h)
+        votes += _vote(outside, view, right, below, k * x + m * y + (n * z + o), height, width)
+    tl.store(kept + i, votes <= tolerance)
+
+
+@triton.jit
+def marched_rows(
+    count, outside, masks, matrices, directions, centers, near, far, new_near, new_far,
+    samples, views, height, width, tolerance, ROWS: tl.constexpr,
+):  # fmt: skip
+    """Write the bounds of ``ROWS`` rays, one for each pixel of a mask; those of others are copied."""
+    i = rows_of(count, ROWS)
+    image = i // (height * width)
+    begin, end = tl.load(near + i), tl.load(far + i)
+    length = end - begin
+    x, y, z = load3(directions, i)
+    cx, cy, cz = load3(centers, image)
+    first = tl.zeros_like(i).to(tl.int32) + samples
+    last = tl.zeros_like(i).to(tl.int32) - 1
+    for step in range(samples):
+        depth = begin + (step + 0.5) / samples * length
+        votes = tl.zeros_like(first)
+        for other in range(1, views):
+            view = image // views * views + (image + other) % views
+            a, b, c, d = load4(matrices, 3 * view)
+            e, f, g, h = load4(matrices, 3 * view + 1)
+            k, m, n, o = load4(matrices, 3 * view + 2)
+            right = (a * cx + b * cy + c * cz + d) + depth * (a * x + b * y + c * z)
+            below = (e * cx + f * cy + g * cz + h) + depth * (e * x + f * y + g * z)
+            front = (k * cx + m * cy + n * cz + o) + depth * (k * x + m * y + n * z)
+            votes += _vote(outside, view, right, below, front, height, width)
+        is_allowed = votes <= tolerance
+        first = tl.where(is_allowed & (first == samples), step, first)
+        last = tl.where(is_allowed, step, last)
+    is_hit = (first < samples) & (tl.load(masks + i) != 0)
+    half = length / (2 * samples)
+    found = begin + (first + 0.5) / samples * length - half
+    tl.store(new_near + i, tl.where(is_hit, found, begin))
+    found = begin + (last + 0.5) / samples * length + half
+    tl.store(new_far + i, tl.where(is_hit, found, end))
+
+
+def dilated(masks: Tensor, radius: int, more: Tensor | None, axis: int) -> Tensor:
+    """The operator of :mod:`ghgs_lit.bounds.silhouettes`."""
+    height, width = masks.shape[-2:]
+    out = masks.new_empty(masks.shape)
+    size, stride = (height, width) if axis == -2 else (width, 1)
+    given = (masks, more, out, radius, masks[0].numel() if len(masks) else 0, size, stride)
+    start(dilated_rows, masks.numel(), *given, HAS_MORE=more is not None)
+    return out
+
+
+def carved(outside: Tensor, matrices: Tensor, position: Tensor, tolerance: int) -> Tensor:
+    """The operator of :mod:`ghgs_lit.bounds.box`."""
+    _, views, height, width = outside.shape
+    cells = position.shape[2]
+    kept = outside.new_empty(len(outside), cells, cells, cells, dtype=torch.bool)
+    given = (outside, matrices, position, kept, views, cells, height, width, tolerance)
+    start(carved_rows, kept.numel(), *given)
+    return kept
+
+
+def marched(*inputs) -> tuple[Tensor, Tensor]:
+    """The operator of :mod:`ghgs_lit.bounds.hull`."""
+    *tensors, samples, tolerance = inputs
+    _, views, height, width = tensors[0].shape
+    near, far = (x.new_empty(x.shape) for x in tensors[-2:])
+    start(marched_rows, near.numel(), *tensors, near, far, samples, views, height, width, tolerance)
+    return near, far
