@@ -25,6 +25,7 @@ from ghgs_lit.kernels.recording import CudaTape, Recorder
 from ghgs_lit.kernels.watching import Inputs, Watcher
 from ghgs_lit.kernels.watching import watched as stages_watched
 from ghgs_lit.model import GHGS
+from ghgs_lit.playback import Playback
 from ghgs_lit.rendering.capacity import deferred
 from ghgs_lit.stages import STAGES
 from ghgs_lit.types import Batch, map_tensors
@@ -85,11 +86,24 @@ def _predicted(
 
 
 def prediction(call: Call) -> None:
-    """A prediction of the weights that come with the package, eager"""
-    model = GHGS.from_checkpoint().to(call.gpu.device)
+    """A prediction of the weights that come with the package, eager and played back"""
+    model = _recording(call, GHGS.from_checkpoint().to(call.gpu.device))
     for size in call.sizes.batches:
         batch = replace(call.batch(size, call.sizes.side), targets=None).to(call.gpu.device)
-        _predicted(call, f"{call.sizes.side}², batch of {size}", model, batch)
+        for capture in ("off", "auto"):
+            model.options = model.options.model_copy(update={"capture": capture})
+            _predicted(call, f"{call.sizes.side}², batch of {size}, capture={capture}", model, batch)
+        call.add(
+            f"batch of {size}, recorder",
+            reason=model.playback.recorder.reason,
+            **model.playback.recorder.counts,
+        )
+
+
+def _recording(call: Call, model: GHGS) -> GHGS:
+    """The model with recordings on this device."""
+    model.playback = Playback(Recorder(tape=CudaTape(call.gpu.device.type)))
+    return model
 
 
 def paper(call: Call) -> None:
@@ -123,6 +137,7 @@ PIECES = (*STAGES, "gaussian_head.activate", "rounds")
 def graphs(call: Call) -> None:
     """CUDA graphs: each piece of a prediction, then the whole"""
     model = GHGS.from_checkpoint().to(call.gpu.device)
+    model.options = model.options.model_copy(update={"capture": "off"})
     for size in call.sizes.batches:
         batch = replace(call.batch(size, call.sizes.side), targets=None).to(call.gpu.device)
         seen = _FirstInputs()

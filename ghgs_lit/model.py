@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from ghgs_lit.geometry.padding import bounds_of
 from ghgs_lit.heads.dpt import LEVELS, DPTHead
 from ghgs_lit.kernels.precision import PRECISIONS, precision_of
 from ghgs_lit.plan import Plan, SkipOptions, planned
+from ghgs_lit.playback import Playback
 from ghgs_lit.rendering.capacity import settled
 from ghgs_lit.rounds import CoarseDepths, Rounds, State, coarse_depths, prediction_of, replaced
 from ghgs_lit.stages import HEADS, OPTIONS, STAGES
@@ -52,6 +53,8 @@ class GHGS(nn.Module):
         self.auto = self.skip.build()
         #: The nodes that :meth:`from_config` built the model from; empty if the stages were given.
         self.config: dict[str, Any] = {}
+        #: Predictions that were recorded; nothing of it is part of a checkpoint.
+        self.playback = Playback()
         #: Whether predictions outside of training contain the Gaussians before each round.
         self.keeps_drafts = False
         #: Whether to refuse photographs, depths and bodies with NaN or values out of range.
@@ -71,7 +74,7 @@ class GHGS(nn.Module):
             batch = layer.enter(batch)
         plan = self.plan(batch, [finding for layer in around for finding in layer.findings])
         with precision_of(self.precision, batch.masks.device):
-            prediction = settled(lambda: self._predict(batch, plan, self._coarse(batch)))
+            prediction = self._predicted(batch, plan, self._coarse(batch))
         for layer in reversed(around):
             prediction = layer.leave(prediction)
         return dataclasses.replace(plan.trimmed(prediction), decisions=plan.decisions)
@@ -98,9 +101,35 @@ class GHGS(nn.Module):
         batch.note(plan.extents, plan.subject.index)
         return plan
 
+    def _predicted(self, batch: Batch, plan: Plan, coarse: CoarseDepths | None) -> Prediction:
+        """:meth:`_predict`, played back where it can be; renderings have room enough."""
+        if self.options.capture == "auto" and not self.training and self.playback.fits(batch, plan):
+            return self.playback(self, batch, plan, coarse, self._settings())
+        return settled(lambda: self._predict(batch, plan, coarse))
+
     def _predict(self, batch: Batch, plan: Plan, coarse: CoarseDepths | None = None) -> Prediction:
-        bounds = bounds_of(self.bounds, batch)
-        tokens = self._encode(batch, bounds, plan)
+        bounds = self.bounded(batch)
+        return self.decoded(batch, bounds, self.encoded(batch, bounds, plan), plan, coarse)
+
+    def bounded(self, batch: Batch) -> DepthBounds | None:
+        """Near and far of each pixel's ray; None for stages without bounds."""
+        return bounds_of(self.bounds, batch)
+
+    def encoded(self, batch: Batch, bounds: DepthBounds | None, plan: Plan) -> Tokens:
+        """Tokens in the precision of the heads, which may differ from that of the encoder."""
+        tokens = self.encoder(batch.images, batch.masks, bounds, plan)
+        heads = (parameter for name in HEADS for parameter in getattr(self, name).parameters())
+        return tokens.in_precision(next(heads, tokens.semantic).dtype)
+
+    def decoded(
+        self,
+        batch: Batch,
+        bounds: DepthBounds | None,
+        tokens: Tokens,
+        plan: Plan,
+        coarse: CoarseDepths | None = None,
+    ) -> Prediction:
+        """What the stages after the encoder make of its tokens, and the rounds of that."""
         depth_maps = self._depths(tokens, batch, bounds, plan, coarse)
         points = self.unprojection(depth_maps, tokens, batch)
         tokens = self.recalibration(tokens, points, plan)
@@ -132,16 +161,26 @@ class GHGS(nn.Module):
             return None
 
         def predict(small: Batch) -> DepthMaps:
-            return self._predict(small, self.plan(small)).depth_maps
+            return self._predicted(small, self.plan(small), None).depth_maps
 
         sizes = (self.rounds.options.height, self.encoder.patch_size)
         return coarse_depths(batch, *sizes, self.options.matte, predict)
 
-    def _encode(self, batch: Batch, bounds: DepthBounds | None, plan: Plan) -> Tokens:
-        """Tokens in the precision of the heads, which may differ from that of the encoder."""
-        tokens = self.encoder(batch.images, batch.masks, bounds, plan)
-        heads = (parameter for name in HEADS for parameter in getattr(self, name).parameters())
-        return tokens.in_precision(next(heads, tokens.semantic).dtype)
+    def _settings(self) -> Hashable:
+        """All that may be changed after a model was made and decides what it computes, but its weights."""
+        found: list[Hashable] = [self.skip.pixels, self.keeps_drafts]
+        for name in (*STAGES, "rounds"):
+            of_stage = getattr(getattr(self, name), "__dict__", {}).items()
+            found += [(name, *item) for item in of_stage if isinstance(item[1], (str, int, float, tuple))]
+        return repr(found)
+
+    def _apply(self, *arguments: Any, **options: Any) -> "GHGS":
+        self.playback.recorder.clear()  # weights move
+        return super()._apply(*arguments, **options)
+
+    def load_state_dict(self, *arguments: Any, **options: Any) -> Any:
+        self.playback.recorder.clear()
+        return super().load_state_dict(*arguments, **options)
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], empty: bool = False) -> "GHGS":

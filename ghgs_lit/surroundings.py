@@ -121,6 +121,9 @@ class ModelOptions(Options):
     matte: float | None = Field(None, ge=0, le=0.5)
     """Pixels that show a larger share of the subject become Gaussians, whose colours and opacities know that
     share; null: masks decide, mattes are ignored."""
+    capture: Literal["auto", "off"] = "auto"
+    """auto: on CUDA, predictions of scenes of one size class are recorded as CUDA graphs and played back;
+    off: every operator is called each time."""
 
 
 class Surrounding:

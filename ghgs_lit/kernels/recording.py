@@ -88,6 +88,10 @@ class Recorder:
         self._lock = threading.RLock()
         self.clear()
 
+    def __reduce__(self) -> tuple:
+        """Copies of a model record anew."""
+        return type(self), (self.limit, self.eager, type(self.tape)(self.tape.device))
+
     def clear(self) -> None:
         """Forget all recordings: after weights have moved."""
         self._recordings: OrderedDict[Hashable, _Recording] = OrderedDict()

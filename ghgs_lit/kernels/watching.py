@@ -27,11 +27,21 @@ class Watcher:
         """``stage`` ends with ``result``."""
 
 
+_watchers: list[Watcher] = []
+
+
+def is_watched() -> bool:
+    """Whether the stages of a model are watched now, so that each must be called."""
+    return bool(_watchers)
+
+
 @contextmanager
 def watched(model: nn.Module, stages: Mapping[str, str], watcher: Watcher) -> Iterator[None]:
     """Call ``watcher`` at every call of stages while the context lasts. ``stages``: from names for the
     watcher to dotted paths in ``model``; a stage that is None or missing is left out."""
     with ExitStack() as stack:
+        _watchers.append(watcher)
+        stack.callback(_watchers.remove, watcher)
         for name, path in stages.items():
             parent, _, attribute = path.rpartition(".")
             owner = attrgetter(parent)(model) if parent else model

@@ -42,6 +42,13 @@ class KeptPatches:
         self.column = self.index % width
         self._packed: dict[int, Int[Tensor, " N"]] = {}
 
+    @classmethod
+    def whole(cls, grid: Sequence[int], device: torch.device) -> "KeptPatches":
+        """All patches of a grid [b, v, h, w] of views."""
+        images, (height, width) = grid[0] * grid[1], grid[2:]
+        kept = torch.ones(*grid, dtype=torch.bool, device=device)
+        return cls(kept, device, [Extent(height * width, 0, height, 0, width)] * images)
+
     @cached_property
     def number(self) -> Int[Tensor, " p"]:
         """The number of each kept one of all patches; 0 or more for others, without a meaning."""

@@ -102,6 +102,27 @@ class Plan:
         return dataclasses.replace(prediction, gaussians=gaussians, drafts=tuple(drafts))
 
     @property
+    def is_of_class(self) -> bool:
+        """Whether sizes are those of a class, and every image can have a row of it."""
+        return self.classes and min(self.subject.counts[0], self.peers.counts[0]) >= self.views
+
+    def extents_of_class(self) -> tuple[tuple[Extent, ...], tuple[Extent, ...]]:
+        """Extents of the subject, and of the patches that show it, with which a plan has the same sizes and
+        windows for every scene of the class: each image has a share of its element's rows, in the window of
+        all."""
+        window, grid = self._windows(self.patch_size)[0], Window.whole(tuple(self.shown.shape[2:]))
+        return self._shared(self.subject, window), self._shared(self.peers, grid)
+
+    def _shared(self, rows: Rows, window: Window) -> tuple[Extent, ...]:
+        """The rows of each element, shared by its images in one window."""
+        extents: list[Extent] = []
+        for size in rows.counts:
+            share = Extent(size // self.views, *window.rows[:2], *window.columns[:2])
+            first = share._replace(count=size - (self.views - 1) * share.count)
+            extents += [first, *[share] * (self.views - 1)]
+        return tuple(extents)
+
+    @property
     def together(self) -> int:
         """Number of consecutive images whose maps are decoded in one part."""
         return self.views if self.classes else 1

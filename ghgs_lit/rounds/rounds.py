@@ -10,7 +10,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import lru_cache, reduce
 from typing import Annotated, NamedTuple
 
 import torch
@@ -55,14 +55,20 @@ class Windows(NamedTuple):
         if raw.real is not None:
             height, width = size_class(height), size_class(width)
         corners = [(extent.top, extent.left) if extent.count else (0, 0) for extent in batch.extents]
-        corners = torch.tensor(corners).to(raw.pixel.device, non_blocking=True)
-        top, left = corners[raw.image].unbind(1)
+        top, left = _on_device(tuple(corners), raw.pixel.device)[raw.image].unbind(1)
         full = batch.masks.shape[-1]
         row, column = raw.pixel // full - top, raw.pixel % full - left
         place, shape = (raw.image * height + row) * width + column, (len(corners), height, width)
         if raw.real is None:
             return cls(place, shape)
         return cls(torch.where(raw.real, place, math.prod(shape)), shape, spare=1)
+
+
+@lru_cache(maxsize=64)
+@torch.inference_mode(False)  # a training step may have them in its graph
+def _on_device(numbers: tuple, device: torch.device) -> Tensor:
+    """Numbers of the host; what is recorded finds them where they are."""
+    return torch.tensor(numbers).to(device, non_blocking=True)
 
 
 class Exchange(nn.Module):

@@ -1,0 +1,125 @@
+"""Predictions whose work is recorded on a GPU for each class of scenes, and played back.
+
+What follows a plan (:mod:`ghgs_lit.plan`) depends on sizes alone, and on a GPU these are size classes. So two
+pieces of a prediction, the bounds and all that comes after the encoder, are the same work for every batch of
+a class. Recorded once as CUDA graphs (:mod:`ghgs_lit.kernels.recording`), each starts at once instead of by
+thousands of calls. The encoder stays eager: it has few and large kernels, and its semantic branch works on as
+many patches as a scene shows."""
+
+import dataclasses
+from collections.abc import Hashable
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from ghgs_lit.kernels.recording import Recorder
+from ghgs_lit.kernels.watching import is_watched
+from ghgs_lit.plan import Plan
+from ghgs_lit.plan.patches import KeptPatches
+from ghgs_lit.rendering.capacity import Rooms, deferred, settled
+from ghgs_lit.rounds import CoarseDepths
+from ghgs_lit.types import Batch, DecodedPixels, DepthBounds, Extent, Prediction, Tokens
+
+
+class Pieces(Protocol):
+    """A prediction in pieces, as :class:`ghgs_lit.model.GHGS` has them."""
+
+    def bounded(self, batch: Batch) -> DepthBounds | None:
+        """Bounds of all pixels."""
+
+    def encoded(self, batch: Batch, bounds: DepthBounds | None, plan: Plan) -> Tokens:
+        """Tokens of the patches that the plan keeps."""
+
+    def decoded(
+        self,
+        batch: Batch,
+        bounds: DepthBounds | None,
+        tokens: Tokens,
+        plan: Plan,
+        coarse: CoarseDepths | None,
+    ) -> Prediction:
+        """All that comes after the encoder."""
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What the pieces read of a batch and its plan, as inputs of a recording: tensors, and numbers of the
+    class."""
+
+    batch: Batch
+    shown: Bool[Tensor, "B V h w"]
+    extents: tuple[Extent, ...]
+    shown_extents: tuple[Extent, ...]
+    patch_size: int
+    pixels: DecodedPixels
+    tokens: DecodedPixels
+
+    @classmethod
+    def of(cls, batch: Batch, plan: Plan) -> "_Scene":
+        bare = dataclasses.replace(batch, targets=None, body_vertices=None, subjects=(), views=())
+        facts = (plan.patch_size, plan.pixels, plan.tokens)
+        return cls(bare, plan.shown, *plan.extents_of_class(), *facts)
+
+    def read(self) -> tuple[Batch, Plan]:
+        """A batch and its plan, for which no value of a tensor is needed."""
+        batch = dataclasses.replace(self.batch, cameras=dataclasses.replace(self.batch.cameras))
+        facts = (self.extents, self.shown_extents, self.patch_size, self.pixels, self.tokens, True)
+        kept = KeptPatches.whole(self.shown.shape, self.shown.device)
+        plan = Plan(batch.masks, self.shown, kept, *facts)
+        batch.note(plan.extents, plan.subject.index)
+        vars(batch.cameras)["has_skew"] = False
+        return batch, plan
+
+
+class Playback:
+    """Predictions of a model, played back where they can be. ``recorder``: makes and keeps recordings, two
+    for each class."""
+
+    def __init__(self, recorder: Recorder | None = None):
+        self.recorder = recorder or Recorder(limit=16)
+
+    def fits(self, batch: Batch, plan: Plan) -> bool:
+        """Whether recordings of this batch are worth a try: its sizes are those of a class, on a device that
+        records, and no gradient is wanted."""
+        here = batch.masks.device.type == self.recorder.tape.device
+        sized = type(batch) is Batch and plan.is_of_class and plan.kept.is_whole
+        return here and sized and not torch.is_grad_enabled() and not is_watched()
+
+    def __call__(
+        self,
+        pieces: Pieces,
+        batch: Batch,
+        plan: Plan,
+        coarse: CoarseDepths | None,
+        key: Hashable,
+    ) -> Prediction:
+        """The prediction for a batch that :meth:`fits`; Gaussians fill their size class.
+
+        Args:
+            pieces: the model.
+            batch: as the stages see it.
+            plan: of the batch.
+            coarse: depths from smaller copies, if there are any.
+            key: all else that the prediction depends on, but weights that stay where they are."""
+        scene = _Scene.of(batch, plan)
+        bounds = self.recorder(lambda inputs: pieces.bounded(inputs.read()[0]), scene, ("bounds", key))
+        tokens = pieces.encoded(batch, bounds, plan)
+
+        def decode(inputs: _Decoded) -> tuple[Prediction, Rooms]:
+            scene, bounds, tokens, coarse = inputs
+            batch, plan = scene.read()
+            with deferred() as rooms:
+                return pieces.decoded(batch, bounds, tokens, plan, coarse), rooms
+
+        inputs = (scene, bounds, tokens, coarse)
+        prediction, rooms = self.recorder(decode, inputs, ("decoded", key))
+        if rooms.suffice():
+            return prediction
+        self.recorder.forget(inputs, ("decoded", key))
+        return settled(lambda: pieces.decoded(batch, bounds, tokens, plan, coarse))
+
+
+_Decoded = tuple[_Scene, DepthBounds | None, Tokens, CoarseDepths | None]

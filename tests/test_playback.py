@@ -1,0 +1,124 @@
+"""Predictions that are played back, on the pretend device with a stand-in for CUDA graphs."""
+
+import copy
+import dataclasses
+
+import pytest
+import torch
+
+from benchmarks.device import drawing_nothing
+from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
+from ghgs_lit.kernels.recording import Recorder
+from ghgs_lit.kernels.watching import Watcher, watched
+from ghgs_lit.playback import Playback
+from ghgs_lit.rendering.capacity import Rooms
+from tests.helpers.models import close, make_model
+from tests.helpers.pretend_device import DEVICE, pretend_device
+from tests.helpers.tape import OperatorTape
+
+
+@pytest.fixture(autouse=True)
+def there():
+    """Without a gradient, on the pretend device, on one thread."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    with torch.no_grad(), pretend_device(), drawing_nothing():
+        yield
+    torch.set_num_threads(threads)
+
+
+def recording(*overrides):
+    """A model that records."""
+    model = make_model(*overrides).eval().to(DEVICE)
+    model.playback = Playback(Recorder(tape=OperatorTape()))
+    return model
+
+
+def scene(share=0.15, color=1.0, views=2, holes=0):
+    """Photographs of an ellipsoid that covers a ``share`` of them, with holes in the middle of a mask."""
+    batch = ellipsoid_batch(share, views, 28, 1)
+    batch.masks[0, 0, 14, 14 : 14 + holes] = False
+    return dataclasses.replace(batch, images=color * batch.images).to(DEVICE)
+
+
+def counts(model):
+    return dict(model.playback.recorder.counts)
+
+
+def eager(model, batch):
+    """The prediction with ``model.capture=off``."""
+    before = model.options
+    model.options = before.model_copy(update={"capture": "off"})
+    found = model(batch)
+    model.options = before
+    return found
+
+
+@pytest.mark.parametrize("kind", ["model=paper", "model=recurrent"])
+def test_other_scenes_of_a_class_are_predicted_as_eagerly(kind):
+    """Other masks and colours; as many Gaussians as each has pixels."""
+    model = recording(kind)
+    for holes, color in ((0, 1.0), (1, 0.9), (2, 0.8), (3, 1.0)):
+        batch = scene(holes=holes, color=color)
+        found, wanted = model(batch), eager(model, batch)
+        assert len(found.gaussians) == int(batch.masks.cpu().sum()) == len(wanted.gaussians)
+        close(found.gaussians.to("cpu"), wanted.gaussians.to("cpu"))
+        torch.testing.assert_close(found.depth.cpu(), wanted.depth.cpu(), rtol=1e-5, atol=1e-5)
+    assert counts(model) == {"eager": 2, "recorded": 2, "played": 4}
+
+
+def test_what_changes_a_prediction_is_another_class():
+    """Sizes, the number of rounds, what the encoder sees."""
+    model = recording("model=recurrent", "encoder.semantic=null")
+    for _ in range(2):
+        model(scene())
+    model.rounds.count = 1
+    found = model(scene())
+    assert len(found.rounds) == 2
+    model(scene(views=3))
+    model(scene(0.3))
+    assert counts(model) == {"recorded": 2, "eager": 8}
+
+
+def test_what_is_watched_or_has_a_gradient_is_called():
+    """Watchers are told of every stage, and a recording has no gradient."""
+    model = recording("model=paper")
+    for _ in range(2):
+        model(scene())
+    before = counts(model)
+    with watched(model, {"head": "gaussian_head"}, Watcher()):
+        model(scene())
+    with torch.enable_grad():
+        assert model(scene()).gaussians.means.requires_grad
+    eager(model, scene())
+    model.train()(scene())
+    assert counts(model) == before
+
+
+def test_too_little_room_is_answered_by_an_eager_call(monkeypatch):
+    """And the recording, which would have as little room again, is forgotten."""
+    model, batch = recording("model=recurrent"), scene()
+    for _ in range(3):
+        wanted = model(batch)
+    suffice = iter([False])
+    monkeypatch.setattr(Rooms, "suffice", lambda self: next(suffice, True))
+    close(model(batch).gaussians.to("cpu"), wanted.gaussians.to("cpu"))
+    before = counts(model)
+    model(batch)
+    assert counts(model)["recorded"] == before["recorded"] + 1
+
+
+def test_weights_that_move_are_recorded_again():
+    """A recording reads them where they were; a copy of the model has recordings of its own."""
+    model, batch = recording("model=paper"), scene()
+    for _ in range(2):
+        model(batch)
+    twin = copy.deepcopy(model)
+    assert not twin.playback.recorder._recordings
+    assert len(model.playback.recorder._recordings) == 2
+    model.to(DEVICE)
+    assert not model.playback.recorder._recordings
+    for _ in range(2):
+        model(batch)
+    model.load_state_dict(model.state_dict())
+    assert not model.playback.recorder._recordings
