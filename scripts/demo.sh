@@ -18,8 +18,8 @@ hull="$(dirname "$(dirname "$(grep -lx -e '- model=hull' "$out"/*/.hydra/overrid
 cat <<TEXT
 
 Table:        $out/table/table.md
-              The hull of the masks says where depths are, which training within a box has to find out in more than a
-              minute. The paper's ablation takes hours: "Reproduce the table" in README.md
+              model=hull is told by the masks where depths are; within a box they take longer than a minute to
+              learn. The paper's ablation takes hours: "Reproduce the table" in README.md
 Pictures:     $out/*/pictures
 TensorBoard:  tensorboard --logdir $out/tensorboard
 Splat:        ghgs predict checkpoint=$hull/checkpoints/last.ckpt (of the model trained here)
