@@ -178,9 +178,9 @@ class GHGS(nn.Module):
         self.playback.recorder.clear()  # weights move
         return super()._apply(*arguments, **options)
 
-    def load_state_dict(self, *arguments: Any, **options: Any) -> Any:
-        self.playback.recorder.clear()
-        return super().load_state_dict(*arguments, **options)
+    def _load_from_state_dict(self, *arguments: Any, **options: Any) -> None:
+        self.playback.recorder.clear()  # weights may be replaced
+        super()._load_from_state_dict(*arguments, **options)
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], empty: bool = False) -> "GHGS":

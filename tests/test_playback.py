@@ -5,6 +5,7 @@ import dataclasses
 
 import pytest
 import torch
+from torch import nn
 
 from benchmarks.device import drawing_nothing
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
@@ -120,5 +121,6 @@ def test_weights_that_move_are_recorded_again():
     assert not model.playback.recorder._recordings
     for _ in range(2):
         model(batch)
-    model.load_state_dict(model.state_dict())
+    around = nn.ModuleDict({"model": model})
+    around.load_state_dict(around.state_dict(), assign=True)
     assert not model.playback.recorder._recordings
