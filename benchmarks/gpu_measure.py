@@ -19,7 +19,7 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.device import drawing_nothing
-from ghgs_lit import surroundings
+from ghgs_lit import model as models
 from ghgs_lit.kernels import precision
 from tests.helpers.pretend_device import DEVICE, Log, pretend_device
 
@@ -111,9 +111,9 @@ def rehearsal() -> Iterator[Gpu]:
             stack.enter_context(mock.patch.object(torch.cuda, name, value))
         stack.enter_context(mock.patch.object(torch, "compile", lambda function, **_: function))
         stack.enter_context(mock.patch.object(precision, "has_bfloat16", return_value=True))
-        of = surroundings.precision_of  # as on CUDA: tf32, too
+        of = models.precision_of  # as on CUDA: tf32, too
         on_cuda = partial(of, device=torch.device("cuda"))
-        stack.enter_context(mock.patch.object(surroundings, "precision_of", lambda name, _: on_cuda(name)))
+        stack.enter_context(mock.patch.object(models, "precision_of", lambda name, _: on_cuda(name)))
         without = partial(torch.autocast, enabled=False)  # it has no half precision
         stack.enter_context(mock.patch.object(torch, "autocast", lambda device, *_, **__: without(device)))
         yield Gpu(DEVICE, is_real=False)
