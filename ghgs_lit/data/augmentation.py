@@ -91,7 +91,17 @@ class Augmentation(Options):
         return self.sizes is not None or self.target_scale is not None
 
     def draw_sizes(self, size: Size, target: Size, seed: int, step: int) -> tuple[Size, Size]:
-        """Sizes of the inputs and targets of a step, from their sizes without variation."""
+        """Sizes of the inputs and targets of a step.
+
+        Args:
+            size: (height, width) of the inputs in pixels without variation.
+            target: (height, width) of the targets in pixels without variation, which drawn ones never exceed.
+            seed: of the run.
+            step: of training, the same number in all processes.
+
+        Returns:
+            (height, width) in pixels of the inputs and of the targets.
+        """
         rng = np.random.default_rng([seed, _SIZES, step])
         chosen, share = rng.uniform(size=2)
         drawn = size if self.sizes is None else self.sizes[int(chosen * len(self.sizes))]
@@ -115,8 +125,17 @@ class Augmentation(Options):
         return is_perfect or np.random.default_rng([seed, _CHANCE, step]).uniform() >= self.chance
 
     def imperfect(self, batch: Batch, seed: int, step: int, indices: Sequence[int]) -> Batch:
-        """The batch of a training step with the imperfections of captures, in a share ``chance`` of the
-        steps. ``indices``: numbers of the samples in the run."""
+        """The batch of a step with the imperfections of captures, in a share ``chance`` of the steps.
+
+        Args:
+            batch: samples as they are read.
+            seed: of the run.
+            step: of training.
+            indices: numbers of the samples in the run.
+
+        Returns:
+            The same batch in exact steps; otherwise as :meth:`imperfections`.
+        """
         if self.is_exact(seed, step):
             return batch
         return self.imperfections(

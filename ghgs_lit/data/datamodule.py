@@ -205,9 +205,18 @@ class PhotographsDataModule(LightningDataModule):
         split: str = "val",
         batch_size: int | None = None,
     ) -> DataLoader:
-        """One fixed sample for each subject. ``views``: number of inputs (None: the view protocol's).
-        ``targets``: a protocol or its mapping, or several, whose targets follow one another in each sample.
-        None: this module's values."""
+        """One fixed sample for each subject.
+
+        Args:
+            views: number of inputs; None: the view protocol's.
+            targets: a protocol or its mapping, or several, whose targets follow one another in each sample;
+                None: this module's.
+            split: name of the subjects' split.
+            batch_size: samples of a batch; None: the data set's.
+
+        Raises:
+            InputError: the data has no such split, positions or views.
+        """
         protocols = _protocols(self.targets if targets is None else targets)
         specs = self._evaluation_samples(self.subjects(split), protocols, views)
         batches = EvaluationBatches(self.builder(split), specs, batch_size or self.dataset.batch_size)
@@ -220,8 +229,14 @@ class PhotographsDataModule(LightningDataModule):
         views: int | None = None,
         targets: Targets | Sequence[Targets] | None = None,
     ) -> Batch:
-        """The sample of one subject; no other is read. Arguments as for :meth:`evaluation_loader`, except
-        that ``targets=None`` gives a batch without targets."""
+        """The sample of one subject; no other is read.
+
+        Args:
+            subject: name of the subject.
+            split: its split.
+            views: number of inputs; None: the view protocol's.
+            targets: as for :meth:`evaluation_loader`, but None gives a batch without targets.
+        """
         protocols = [] if targets is None else _protocols(targets)
         available = {subject: self.subjects(split)[subject]}
         return self.builder(split).batch(self._evaluation_samples(available, protocols, views))

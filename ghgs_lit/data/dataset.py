@@ -36,7 +36,14 @@ class DataOptions(LoadingOptions):
         seed: int = 0,
         augmentation: Augmentation | Mapping[str, Any] | None = None,
     ) -> "PhotographsDataModule":
-        """Data module; arguments as for :class:`PhotographsDataModule`."""
+        """The data module of these options.
+
+        Args:
+            views: choice of the inputs.
+            targets: choice of the targets.
+            seed: of all that is drawn.
+            augmentation: variation of training batches; None: none.
+        """
         from ghgs_lit.data.datamodule import PhotographsDataModule
 
         return PhotographsDataModule(self, views, targets, seed, augmentation)

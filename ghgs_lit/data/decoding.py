@@ -153,7 +153,17 @@ def check_view(place: Path | str, view: View) -> None:
 
 
 def check_center(path: Path, intrinsics: np.ndarray, height: int, width: int) -> None:
-    """Refuse a photograph resized after calibration. InputError: its principal point is far off centre."""
+    """Refuse a photograph that was resized after its calibration.
+
+    Args:
+        path: of the photograph, for the message.
+        intrinsics: [3, 3] in pixels.
+        height: of the photograph in pixels.
+        width: of the photograph in pixels.
+
+    Raises:
+        InputError: the principal point is farther from the centre than a quarter of a side.
+    """
     if np.abs(intrinsics[:2, 2] / [width, height] - 0.5).max() > _OFF_CENTRE:
         raise InputError(
             f"{path}: expected a photograph of the calibration's size, its principal point "

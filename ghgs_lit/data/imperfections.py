@@ -29,9 +29,17 @@ _PATCHES, _NOISE = ((3, 0.35), (12, 0.15), (40, 0.06)), 0.02
 def color_gains(
     views: int, exposure: float, white_balance: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "V 3"]:
-    """Random factors of stored colours. Their geometric mean over cameras is 1, because photographs show only
-    differences between cameras. ``exposure``, ``white_balance``: greatest deviation in stops of a camera, and
-    of red and blue from green."""
+    """Random factors of stored colours, geometric mean 1 over cameras: photographs show only differences.
+
+    Args:
+        views: number of cameras V.
+        exposure: greatest deviation of a camera in stops, at least 0.
+        white_balance: greatest deviation of red and of blue from green in stops, at least 0.
+        rng: where deviations are drawn from.
+
+    Returns:
+        Factors [V, 3] above 0.
+    """
     deviation = rng.uniform(-1, 1, (views, 3))
     deviation -= deviation.mean(0)
     deviation /= np.maximum(1, np.abs(deviation).max(0))
@@ -65,10 +73,19 @@ def imperfect_mask(
     hole_chance: float,
     rng: np.random.Generator,
 ) -> Bool[np.ndarray, "h w"]:
-    """Mask with the errors of a segmentation; unchanged if nothing would be left of it. ``offset``: greatest
-    growth or shrinkage in pixels. ``ragged``: greatest height of bumps of the outline in pixels. ``hole``:
-    greatest diameter of a missing round piece, over the subject's height. ``hole_chance``: probability of a
-    missing piece."""
+    """Mask with the errors of a segmentation; unchanged if nothing would be left of it.
+
+    Args:
+        mask: [h, w] bool, true on the subject.
+        offset: greatest growth or shrinkage in pixels, at least 0.
+        ragged: greatest height of bumps of the outline in pixels, at least 0.
+        hole: greatest diameter of a missing round piece, over the subject's height.
+        hole_chance: probability of a missing piece, in [0, 1].
+        rng: where errors are drawn from, as many numbers for all limits.
+
+    Returns:
+        Mask [h, w] bool.
+    """
     grow, height, missing, size, place = rng.uniform(size=5)
     bumps = rng.uniform(-1, 1, [side // _BUMP + 2 for side in mask.shape])
     if not mask.any():
@@ -129,8 +146,19 @@ def miscalibrated(
 
     A camera's error, drawn up to ``pixels``, is the motion of the corners of its mask's box (the photograph's
     for an empty mask) at the subject's distance, root mean square. The common error of all cameras is
-    removed, because photographs show only differences between cameras. InputError: the point that the cameras
-    look at is not before all of them.
+    removed, because photographs show only differences between cameras.
+
+    Args:
+        cameras: true cameras [V].
+        masks: masks of the subject [V, H, W].
+        pixels: greatest error in pixels, above 0.
+        rng: where errors are drawn from.
+
+    Returns:
+        Cameras [V] of the same sizes and dtypes.
+
+    Raises:
+        InputError: the point that the cameras look at is not before all of them.
     """
     count = len(masks)
     directions = torch.from_numpy(rng.standard_normal((count, 6)))

@@ -129,11 +129,18 @@ class Rendered(DataOptions):
 class Layout(Reader):
     """Subjects of one phase of a rendered data set.
 
-    ``names``: subjects to read (None: all); those that the phase's folder lacks are read from the other one,
-    because the split may have changed. ``limit``: number of subjects, the first ones (None: all).
-    ``pixel_centers`` of the renderer: ``half`` (+0.5, as this package), ``integer`` (as the published
-    scripts) or ``auto`` (integer unless rendered here). InputError: the root or phase is missing, empty, not
-    completely rendered, or lacks one of ``names``.
+    Args:
+        root: folder of the data set.
+        phase: ``train`` or ``val``.
+        names: subjects to read; those that the phase's folder lacks are read from the other one, because the
+            split may have changed; None: all.
+        limit: number of subjects, the first ones; None: all.
+        pixel_centers: of the renderer: ``half`` (+0.5, as this package), ``integer`` (as the published
+            scripts) or ``auto`` (integer unless rendered here).
+        strict: raise the first problem, or collect all.
+
+    Raises:
+        InputError: the root or phase is missing, empty, not completely rendered, or lacks one of ``names``.
     """
 
     def __init__(

@@ -36,8 +36,17 @@ class Reader(ABC):
 
     @abstractmethod
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
-        """Read one photograph at its stored size. ``position``: camera, or position on the ring; ``view``:
-        its number there; ``depth``: also read the depth map, if any. InputError: a file is missing or bad."""
+        """Read one photograph at its stored size.
+
+        Args:
+            name: of the subject.
+            position: number of the camera, or position on the ring.
+            view: its number at the position; 0 except on rings with further views between cameras.
+            depth: also read the depth map, if there is any.
+
+        Raises:
+            InputError: a file is missing or bad.
+        """
 
     @abstractmethod
     def read_body(self, name: str) -> np.ndarray | None:
@@ -125,8 +134,15 @@ class FrameReader(Reader):
 
 
 class Photographs:
-    """Photographs of a reader, resized and cached. ``size``: (height, width); None keeps the stored size.
-    ``cache_mb``: MiB of decoded views and bodies kept in each process; the least recently used go first."""
+    """Photographs of a reader, resized and cached.
+
+    Args:
+        reader: finds and decodes them.
+        size: (height, width) in pixels; None: as stored.
+        cache_mb: MiB of decoded views and bodies kept in each process, at least 0; the least recently used go
+            first.
+        resampling: as for :func:`ghgs_lit.data.view.resize_view`.
+    """
 
     def __init__(
         self,
@@ -143,8 +159,18 @@ class Photographs:
     def view(
         self, name: str, position: int, view: int = 0, depth: bool = True, size: tuple[int, int] | None = None
     ) -> View:
-        """One photograph, resized with its intrinsics to ``size`` (height, width; None: ``self.size``).
-        InputError: a file is missing or bad, the reader gives a wrong :class:`View`, or the mask is empty."""
+        """One photograph, resized with its intrinsics.
+
+        Args:
+            name: of the subject.
+            position: number of the camera, or position on the ring.
+            view: its number at the position.
+            depth: also read the depth map, if there is any.
+            size: (height, width) in pixels; None: ``self.size``.
+
+        Raises:
+            InputError: a file is missing or bad, the reader gives a wrong view, or the mask is empty.
+        """
         size = size or self.size
 
         def read() -> View:

@@ -6,6 +6,7 @@ drawn as for photographs that are read; pixels agree with theirs up to the round
 
 import copy
 import functools
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -23,6 +24,8 @@ from ghgs_lit.data.view import DEPTH_SCALE, SAME_SURFACE, View, area_weights, ne
 from ghgs_lit.errors import require
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.types import Batch, Cameras, Targets, map_tensors
+
+log = logging.getLogger(__name__)
 
 Size = tuple[int, int]
 #: Largest share of the device's free memory that photographs may take.
@@ -119,6 +122,8 @@ class ResidentPhotographs:
             self.extrinsics[number] = torch.from_numpy(view.extrinsics)
             for name, map_ in maps.items():
                 whole[name][number] = map_.to(device)
+        size = sum(map_.nbytes for map_ in whole.values()) / 1e9
+        log.info("%d photographs of training stay on %s: %.2g GB", count, device, size)
         self.images, self.masks = whole["images"], whole["masks"]
         self.mattes, self.inverse = whole.get("mattes"), whole.get("inverse")
 

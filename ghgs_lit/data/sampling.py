@@ -227,8 +227,18 @@ def evaluation_samples(
     positions: Sequence[Sequence[int]] = (),
 ) -> list[SampleSpec]:
     """One fixed sample for each subject, with the targets of all ``protocols`` one after another.
-    ``positions``: lists of input positions; evenly spaced if none has ``count``. InputError: input positions
-    repeat, or a subject lacks one."""
+
+    Args:
+        subjects: camera positions by name.
+        count: number of inputs, above 0.
+        protocols: choices of targets.
+        ring: number of positions of a full ring.
+        seed: of targets that are drawn.
+        positions: lists of input positions; evenly spaced if none has ``count``.
+
+    Raises:
+        InputError: input positions repeat, or a subject lacks one.
+    """
     inputs = next((list(listed) for listed in positions if len(listed) == count), even_positions(ring, count))
     expected = f"different positions of a ring of {ring}"
     require(count > 0 and len(set(inputs)) == count, f"evaluation with {count} views", expected, inputs)

@@ -15,9 +15,21 @@ Split = str | Path | Mapping[str, Sequence[str] | None]
 def split_names(
     source: Path, names: Sequence[str], split: Split | None, val_fraction: float, seed: int
 ) -> dict[str, list[str]]:
-    """Divide the scans of a folder. ``split``: as for :func:`read_split` (None: the split files in
-    ``source``, if any). ``val_fraction``: share of ``names`` for ``val`` without a split, at least one if
-    above 0. InputError: the split is missing or malformed, names scans that do not exist, or overlaps."""
+    """Divide the scans of a folder.
+
+    Args:
+        source: folder of the scans.
+        names: ids of all scans.
+        split: as for :func:`read_split`; None: the split files in ``source``, if there are any.
+        val_fraction: share of ``names`` for ``val`` without a split, in [0, 1]; at least one scan if above 0.
+        seed: of the draw without a split.
+
+    Returns:
+        Ids by phase.
+
+    Raises:
+        InputError: the split is missing or malformed, names scans that do not exist, or overlaps.
+    """
     if split is None and not (source / "split_train.txt").exists():
         order = np.random.default_rng(seed).permutation(len(names))
         count = max(round(val_fraction * len(names)), val_fraction > 0)

@@ -152,17 +152,31 @@ def half_centers(intrinsics: np.ndarray) -> np.ndarray:
 
 
 def opencv_view(image: np.ndarray, mask: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray) -> View:
-    """View from an OpenCV calibration, with a black background. ``image``: [h, w, 3] uint8. ``mask``: [h, w]
-    bool. ``intrinsics``: [3, 3], pixel centres at integers. ``extrinsics``: [4, 4]."""
+    """View from an OpenCV calibration, with a black background.
+
+    Args:
+        image: [h, w, 3] uint8, RGB.
+        mask: [h, w] bool, true on the subject.
+        intrinsics: [3, 3] in pixels, pixel centres at integers.
+        extrinsics: [4, 4], world to camera, metres.
+    """
     image = np.where(mask[..., None], image, 0)
     return View(image, mask, None, half_centers(intrinsics).astype(np.float32), extrinsics.astype(np.float32))
 
 
 def resize_view(view: View, height: int, width: int, resampling: str = "area") -> View:
-    """Resize a photograph with its mask and depth map, and scale its intrinsics. ``resampling``: ``area``
-    keeps everything in place; ``release``, as the authors' code, resizes photographs by Pillow's bicubic
-    filter and masks by OpenCV's nearest neighbour. Mattes are resized like photographs, and the mask is then
-    where they are at least half. Depth is taken at the centres of new pixels in both."""
+    """Resize a photograph with its mask and depth map, and scale its intrinsics.
+
+    Mattes are resized like photographs, and the mask is then where they are at least half. Depth is taken at
+    the centres of new pixels.
+
+    Args:
+        view: the photograph.
+        height: new height in pixels.
+        width: new width in pixels.
+        resampling: ``area`` keeps everything in place; ``release``, as the authors' code, resizes photographs
+            by Pillow's bicubic filter and masks by OpenCV's nearest neighbour.
+    """
     h, w = view.mask.shape
     if (h, w) == (height, width):
         return view
