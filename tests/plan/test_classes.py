@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from ghgs_lit.plan import plan
+from ghgs_lit.plan import plan, planned
 from ghgs_lit.plan.rows import Rows, size_class
 from ghgs_lit.rendering import render
 from tests.helpers.losses import losses_of
 from tests.helpers.models import close, make_model
-from tests.helpers.scenes import hard_subjects, stack, training_batch
+from tests.helpers.scenes import hard_subjects, make_batch, stack, training_batch
 
 #: A share of the tokens as neighbours: their number differs between the elements of a batch.
 KINDS = [("model=paper",), ("model=hull", "recalibration.k=0.3"), ("model=recurrent", "recalibration.k=0.3")]
@@ -58,6 +58,25 @@ def test_filled_rows_repeat_a_row_that_counts():
     counts, number = rows.places(200)
     assert torch.equal(counts, wanted.flatten())
     assert torch.equal(rows.index[number[counts]], wanted.flatten().nonzero()[:, 0])
+
+
+def test_shapes_repeat_where_subjects_differ_a_little():
+    """Of photographs of another instant: a recorded graph needs the same shapes."""
+    masks = make_batch(2, 3, 112, 112).masks
+    other = masks & (torch.rand(masks.shape, generator=torch.Generator().manual_seed(0)) < 0.995)
+    counted = [planned(each, 14, [kept_of(each)], classes=False) for each in (masks, other)]
+    rounded = [planned(each, 14, [kept_of(each)], classes=True) for each in (masks, other)]
+    assert counted[0].subject.counts != counted[1].subject.counts
+    assert rounded[0].subject.counts == rounded[1].subject.counts
+    assert rounded[0].peers.counts == rounded[1].peers.counts
+    assert rounded[0].windows == rounded[1].windows
+    for window, hull in zip(counted[0].windows, rounded[0].windows, strict=True):
+        assert hull.hull(window) == hull
+
+
+def kept_of(masks):
+    """All patches of 14 pixels."""
+    return torch.ones(*masks.shape[:2], masks.shape[2] // 14, masks.shape[3] // 14, dtype=torch.bool)
 
 
 @torch.no_grad()
