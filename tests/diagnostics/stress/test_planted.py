@@ -1,131 +1,36 @@
 """Defects planted one at a time in the code of the stages: the stress test reports each of them."""
 
 import ast
+import importlib
 import inspect
-import sys
+import json
 import textwrap
 from collections.abc import Callable
-from dataclasses import dataclass
+from operator import attrgetter
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks.planted_defects import change_code
-from ghgs_lit.bounds.agreement import trusted_views
+from benchmarks.planted_defects import CODE, change_code, found
 from ghgs_lit.diagnostics.stress.measure import measure
 from ghgs_lit.diagnostics.stress.stages import STAGES, heads
-from ghgs_lit.geometry import projection, rotations, undistortion
-from ghgs_lit.geometry.padding import Padding
-from ghgs_lit.metrics import functional
-from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
-from ghgs_lit.refinement import refinement
-from ghgs_lit.rendering import reference
 from ghgs_lit.rendering.cpu import backend
-from ghgs_lit.rounds import gains
+
+#: As those of ``benchmarks/planted_defects.json``, with the stage, family and dtype that show them.
+DEFECTS = json.loads(Path(__file__).with_name("planted.json").read_text())
 
 
-@dataclass(frozen=True)
-class Defect:
-    """A change of the code of ``function``, and a stage, a family and a dtype that show it."""
-
-    says: str
-    function: Callable
-    change: str
-    stage: str
-    family: str
-    dtype: str = "float32"
-
-    def plant(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """Change the function wherever it is known, until the test ends."""
-        function = inspect.unwrap(self.function)
-        tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
-        change_code(tree, self.change)
-        changed: dict[str, Callable] = {}
-        exec(ast.unparse(tree), vars(sys.modules[function.__module__]), changed)
-        code = inspect.unwrap(changed[function.__name__]).__code__
-        monkeypatch.setattr(function, "__code__", code)
-
-
-DEFECTS = (
-    Defect(
-        "a bare square root", rotations.unit, "squared = A.masked_fill(B, 1.0) → squared = A",
-        "unit vectors", "zero_quaternion",
-    ),
-    Defect(
-        "squares that overflow", rotations.unit, "scaled = x / A → scaled = x",
-        "unit vectors", "huge_quaternion",
-    ),
-    Defect(
-        "an epsilon that hides what is short", rotations.unit,
-        "scaled * A → x / (x.norm(dim=-1, keepdim=True) + 1e-8)", "cosine", "tiny_features",
-    ),
-    Defect(
-        "geometry in half precision", projection.unproject, "x * depth → x * depth.half().to(depth)",
-        "unprojection", "ordinary",
-    ),
-    Defect(
-        "a product that autocast catches", projection._camera_axes,
-        "return A → return (extrinsics[..., :3, :3] @ points[..., None])[..., 0].movedim(-1, 0)",
-        "projection", "ordinary", "bfloat16",
-    ),
-    Defect(
-        "a softmax without its maximum", SemanticAttention._attend,
-        "A.softmax(-1) → A.exp() / A.exp().sum(-1, keepdim=True)", "attention", "huge_features",
-    ),
-    Defect(
-        "distances in half precision", nearest_neighbors,
-        "points[..., rows, :] → points[..., rows, :].half().float()", "neighbours", "shifted",
-    ),
-    Defect(
-        "distances by products", nearest_neighbors,
-        "'donot_use_mm_for_euclid_dist' → 'use_mm_for_euclid_dist'", "neighbours", "shifted",
-    ),
-    Defect(
-        "the map of another subject", projection.sample,
-        "2 * image.to(pixels) + 1 → 2 * (image.to(pixels) + 1) % (2 * count) + 1",
-        "samples of maps", "ordinary",
-    ),
-    Defect(
-        "a quaternion over its squared length", rotations.quaternion_to_matrix,
-        "q.norm(dim=-1, keepdim=True) → q.square().sum(-1, keepdim=True)",
-        "quaternion and covariance", "ordinary",
-    ),
-    Defect(
-        "a window whose sum is not 1", functional._gaussian_window, "A / A.sum() → A",
-        "L1 and SSIM", "ordinary",
-    ),
-    Defect(
-        "a border on the wrong side", Padding.pad_batch,
-        "A.cropped(self.top, self.left, B, C) → A.cropped(self.top, -self.left, B, C)",
-        "padding", "ordinary",
-    ),
-    Defect(
-        "a wrong mask that keeps its vote", trusted_views, "voting & ~A → voting | ~A",
-        "bounds and hull", "wrong_mask",
-    ),
-    Defect(
-        "a Jacobian without its clamp", reference.project,
-        "torch.minimum(torch.maximum(A, B), C) → A", "compositing", "beside",
-    ),
-    Defect(
-        "a lens half a pixel beside its place", undistortion.undistorting_grid,
-        
-        "torch.linspace(0.5, A - 0.5, B, dtype=C) → torch.linspace(0, A - 1, B, dtype=C)",
-        "undistortion", "ordinary",
-    ),
-    Defect(
-        "the logarithm of black", gains._compared, "color.clamp(min=A).log() → color.log()",
-        "gains", "black",
-    ),
-    Defect(
-        "gains of the rounds that nothing holds", gains._solved, "prior * identity → 1e-9 * identity",
-        "pipeline shipped", "ordinary",
-    ),
-    Defect(
-        "colours that move beyond their limit", refinement.Descent._changed, "c.limit * A → A",
-        "refinement", "ordinary",
-    ),
-)  # fmt: skip
+def plant(at: str, change: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Change a function wherever it is known, until the test ends."""
+    file, name = found(CODE, at)
+    module = importlib.import_module(file.removesuffix(".py").replace("/", "."))
+    function = inspect.unwrap(attrgetter(name)(module))
+    tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    change_code(tree, change)
+    changed: dict[str, Callable] = {}
+    exec(ast.unparse(tree), vars(module), changed)
+    monkeypatch.setattr(function, "__code__", inspect.unwrap(changed[function.__name__]).__code__)
 
 
 def failures(stage: str, family: str, dtype: str) -> int:
@@ -133,12 +38,13 @@ def failures(stage: str, family: str, dtype: str) -> int:
     return sum(row["failures"] for row in measure(STAGES[stage], family, range(3), [dtype]))
 
 
-@pytest.mark.parametrize("defect", DEFECTS, ids=lambda defect: defect.says)
+@pytest.mark.parametrize("defect", DEFECTS, ids=lambda defect: defect["what"])
 def test_a_changed_line_is_reported(defect, monkeypatch):
     """Without the defect the same cases pass."""
-    assert failures(defect.stage, defect.family, defect.dtype) == 0
-    defect.plant(monkeypatch)
-    assert failures(defect.stage, defect.family, defect.dtype) > 0
+    case = defect["stage"], defect["family"], defect["dtype"]
+    assert failures(*case) == 0
+    plant(defect["at"], defect["change"], monkeypatch)
+    assert failures(*case) > 0
 
 
 def test_a_confidence_without_its_limit_is_reported(monkeypatch):
