@@ -68,6 +68,7 @@ class Losses(Options):
         return total, values
 
     def _term(self, name: str, prediction: Prediction, rendering: Rendering, batch: Batch) -> Tensor:
+        """A term by name, before its weight."""
         if name == "chamfer":
             return terms.chamfer(prediction, rendering, batch, self.chamfer_points)
         return getattr(terms, name)(prediction, rendering, batch)

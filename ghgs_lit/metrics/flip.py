@@ -103,6 +103,7 @@ def _color_difference(first: Tensor, second: Tensor, ppd: float) -> Float[Tensor
     to_xyz, to_rgb = _xyz_matrices(first)
 
     def perceived(ycc: Tensor) -> Tensor:
+        """Colours that the eye sees."""
         rgb = _transform_colors(_from_opponent(_filter_sensitivity(ycc, ppd)), to_rgb).clamp(0, 1)
         return _hunt_lab(_transform_colors(rgb, to_xyz))
 

@@ -83,6 +83,7 @@ def crop_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
         The window, moved into the image, as a mask; empty where the mask is empty."""
 
     def span(hit: Bool[Tensor, "n k"], share: float) -> Bool[Tensor, "n k"]:
+        """Rows or columns of the window, from those that the mask hits."""
         count = hit.shape[1]
         side = round(share * count)
         index = torch.arange(count, device=hit.device)
@@ -228,7 +229,8 @@ def ssim_map(
         weights = _gaussian_window(moments)
         blurred = correlate(moments, weights, weights)
         mx, my, squares, product = blurred.chunk(4, dim=1)
-        both, of_means = mx * my, mx * mx + my * my
+        both = mx * my
+        of_means = mx * mx + my * my
         c1, c2 = 0.01**2, 0.03**2
         return (2 * both + c1) / (of_means + c1) * (2 * (product - both) + c2) / (squares - of_means + c2)
 

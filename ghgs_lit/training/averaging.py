@@ -19,6 +19,7 @@ class AveragingOptions(Options):
     """Share of the average that each step keeps."""
 
     def build(self) -> "Averaging":
+        """The callback."""
         return Averaging(self.decay)
 
 

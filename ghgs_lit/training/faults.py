@@ -77,6 +77,7 @@ class _Faults(list[Fault], Watcher):
         return map_tensors(inputs, view)
 
     def end(self, stage: str, result: Any = None) -> None:
+        """Check the result of a stage."""
         self.see("result of", stage, result)
 
     def see(self, where: str, place: str, value: Any, stage: str | None = None) -> None:
@@ -94,11 +95,13 @@ class _Faults(list[Fault], Watcher):
 
 
 def _stage_of(place: str) -> str:
+    """The stage that a tensor belongs to, from its name."""
     first = place.split(".")[0]
     return first if first in _STAGES else "model"
 
 
 def _tensors(value: Any, name: str) -> Iterator[tuple[str, Tensor]]:
+    """Names and values of all floating point tensors in lists, mappings and dataclasses."""
     if isinstance(value, Tensor) and value.is_floating_point():
         yield name, value
     elif isinstance(value, (tuple, list)):
@@ -181,8 +184,10 @@ def _watch(module: L.LightningModule, faults: _Faults, stack: ExitStack) -> None
 
 
 def _one_subject(batch: Batch, element: int) -> Batch:
+    """One element of a batch, alone."""
     one = slice(element, element + 1)
-    bodies, targets = batch.body_vertices, batch.targets
+    bodies = batch.body_vertices
+    targets = batch.targets
     part = map_tensors(dataclasses.replace(batch, body_vertices=None), lambda t: t[one])
     return dataclasses.replace(
         part,

@@ -50,7 +50,8 @@ def replay(path: str | Path) -> tuple[int, str, Fault | None]:
 def _step(values: Mapping[str, Any]) -> Step:
     """The inputs of a step from plain data."""
     autocast = getattr(torch, values["autocast"]) if values["autocast"] else None
-    batch, targets = values["batch"], values["batch"]["targets"]
+    batch = values["batch"]
+    targets = batch["targets"]
     if targets is not None:
         targets = Targets(**{**targets, "cameras": Cameras(**targets["cameras"])})
     batch = Batch(**{**batch, "cameras": Cameras(**batch["cameras"]), "targets": targets})

@@ -124,7 +124,8 @@ def check_restored(trainer: L.Trainer, checkpoint: Mapping[str, Any]) -> None:
     path = trainer.ckpt_path
     loops = checkpoint.get("loops") or {}
     require("fit_loop" in loops, f"{path}: loops", "a fit_loop", sorted(map(str, loops)))
-    found, own = loops["fit_loop"], trainer.fit_loop.state_dict()
+    found = loops["fit_loop"]
+    own = trainer.fit_loop.state_dict()
     require(isinstance(found, Mapping), f"{path}: loops.fit_loop", "a mapping", type(found).__name__)
     # Loops of other versions of Lightning have others; it leaves them as they are.
     _check_form(f"{path}: loops.fit_loop", found, {key: own[key] for key in own.keys() & found.keys()})

@@ -110,6 +110,7 @@ class Pictures(Callback):
         self._seen = None
 
     def _show_attention(self, trainer: L.Trainer, batch: Batch, element: int, name: str) -> None:
+        """Publish whom the chosen token of an element attends to."""
         if self._seen is None:
             return
         stage, tokens, points = self._seen
@@ -152,6 +153,7 @@ def distributions(prediction: Prediction) -> dict[str, Tensor]:
 
 
 def _show_distributions(trainer: L.Trainer, prediction: Prediction) -> None:
+    """Log the :func:`distributions` to TensorBoard."""
     loggers = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
     for name, values in distributions(prediction).items() if loggers else ():
         for logger in loggers if len(values) else ():
@@ -170,6 +172,7 @@ def _publish(trainer: L.Trainer, tag: str, picture: np.ndarray, file: str) -> No
 
 
 def _show_clouds(trainer: L.Trainer, batch: Batch, prediction: Prediction, element: int, name: str) -> None:
+    """Log the point clouds of an element to TensorBoard."""
     loggers = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
     for kind, (positions, colors) in clouds(batch, prediction, element).items() if loggers else ():
         for logger in loggers:
