@@ -17,10 +17,12 @@ from ghgs_lit.kernels.cores import allowed_cores
 
 _ENOUGH = 6  #: Least number of photographs for a background
 #: Levels of 255 by which photographs of a background differ at most, and the subject at least.
-_STEADY, _DIFFERENT = 20.0, 12.0
+_STEADY = 20.0
+_DIFFERENT = 12.0
 _DEVIATIONS = 4.0  #: Deviations of the noise beyond which a pixel differs
 #: Shares of area: of the mask, for a large part; of the largest part, below which one is a speck.
-_LARGE, _SPECK = 0.03, 0.05
+_LARGE = 0.03
+_SPECK = 0.05
 _DARK = 0.3  #: Least share of the light that a shadow leaves
 #: Correlation of brightness above which a part shows the background: a grey shirt is no grey wall.
 _ALIKE = 0.9
@@ -37,7 +39,8 @@ class _Background:
     def of(cls, photographs: Sequence[Photograph]) -> "_Background":
         """The mean of those photographs (of one size) that agree best at each pixel."""
         images = np.stack([photograph.image for photograph in photographs]).astype(np.float32)
-        count, reach = max(3, len(images) // 4), _reach(images.shape[1:3])
+        count = max(3, len(images) // 4)
+        reach = _reach(images.shape[1:3])
         light = images.sum(-1)
         for found, photograph in zip(light, photographs, strict=True):
             found[ndimage.binary_dilation(photograph.mask, iterations=reach)] = np.inf

@@ -24,7 +24,8 @@ MOST_GAIN = 2.0
 #: Between the camera axes of OpenGL (y up, z backward) and OpenCV (y down, z forward).
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 # Video is coded in blocks of 16 pixels: a sensor's 1088 are 1080 in the pictures of some programs.
-_CODED, _SHOWN = 1088, 1080
+_CODED = 1088
+_SHOWN = 1080
 # Distance from the origin beyond which a rotation's seventh digit moves a centre by more than 0.1 mm.
 _FAR = 1e3
 # Pixels by which a side may differ from the calibration's ratio of sides: rounding of a resize.

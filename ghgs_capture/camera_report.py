@@ -19,9 +19,11 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, subject_sphere
 
 #: Least agreement of every view of a right calibration, and by how much a better meaning must win.
-AGREES, BETTER = 0.9, 0.05
+AGREES = 0.9
+BETTER = 0.05
 #: Agreement below which a view is sought that disagrees, and how much of the disagreement it may leave.
-_SOUND, _REST = 0.97, 1 / 3
+_SOUND = 0.97
+_REST = 1 / 3
 _SAME = 0.01  # Difference of agreement that tells nothing
 _BESIDE = 3  # Pixels beside a mask in which it may lack a part
 _SIDE = 320  # Longer side of the photographs that are compared, in pixels
@@ -205,11 +207,13 @@ def _for_some(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
             mended = (*views[:i], changed, *views[i + 1 :])
             yield Hypothesis(f"{view.name} alone: {says}", "", mended, (view.name,))
     for i, j in itertools.combinations(range(len(views)), 2):
-        one, other = views[i], views[j]
+        one = views[i]
+        other = views[j]
         swapped = list(views)
         swapped[i] = replace(one, camera=other.camera)
         swapped[j] = replace(other, camera=one.camera)
-        names, blames = f"{one.name} and {other.name}", (one.name, other.name)
+        names = f"{one.name} and {other.name}"
+        blames = (one.name, other.name)
         # Outlines of the masks may follow edges of the other photograph rather than of their own.
         if one.mask.shape == other.mask.shape and (
             _contrast(one, other.mask) * _contrast(other, one.mask)
@@ -316,17 +320,21 @@ def _edges(found: Hypothesis, names: tuple[str, str], folder: CaptureFolder) -> 
 
     photographs = found.photographs(folder)
     silhouettes = [Silhouette(p.mask, p.intrinsics, p.extrinsics) for p in photographs]
-    more, sphere, edges = min(names, key=found.shares.__getitem__), subject_sphere(silhouettes), {}
+    more = min(names, key=found.shares.__getitem__)
+    sphere = subject_sphere(silhouettes)
+    edges = {}
     for place, view in enumerate(found.views):
         if view.name not in names:
             continue
-        one, others = silhouettes[place], silhouettes[:place] + silhouettes[place + 1 :]
+        one = silhouettes[place]
+        others = silhouettes[:place] + silhouettes[place + 1 :]
         close, around = (ndimage.binary_dilation(one.mask, iterations=n * _BESIDE) for n in (1, 2))
         cells = np.argwhere(one.mask if view.name == more else around & ~close)
         meets = HullSearch().meets(one, cells[:, ::-1] + 0.5, others, *sphere)
         part = np.zeros_like(one.mask)
         part[tuple(cells[meets != (view.name == more)].T)] = True
-        near, outline = ndimage.binary_dilation(part, iterations=2 * _BESIDE), _outline(one.mask)
+        near = ndimage.binary_dilation(part, iterations=2 * _BESIDE)
+        outline = _outline(one.mask)
         gradient = _gradient(photographs[place].image)
         here, elsewhere = (gradient[outline & which] for which in (near, ~near))
         edges[view.name] = (

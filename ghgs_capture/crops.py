@@ -52,7 +52,8 @@ def crop_to_subject(photograph: Photograph, size: tuple[int, int], refine_masks:
     intrinsics = photograph.intrinsics.copy()
     intrinsics[:2, 2] -= [left, top]
     intrinsics[:2] *= factors[:, None]
-    image, matte = _cut(photograph.image, spans), _cut(photograph.matte, spans)
+    image = _cut(photograph.image, spans)
+    matte = _cut(photograph.matte, spans)
     # Before resizing, so that the rim has nothing of the background.
     if refine_masks:
         image, matte = _refined(photograph.name, image, matte, size, refine_masks)
@@ -70,7 +71,8 @@ def _refined(
     from ghgs_lit.data.matting import refined_matte  # here: photographs are read while PyTorch is imported
 
     sides = [min(_FINER * side, whole) for side, whole in zip(size, matte.shape, strict=True)]
-    image, matte = area_image(image, *sides), area_image(matte, *sides)
+    image = area_image(image, *sides)
+    matte = area_image(matte, *sides)
     subject, refined = refined_matte(image, matte, pixels * sides[0] / size[0])
     share = (refined > 127).sum() / max((matte > 127).sum(), 1)
     if 0.5 <= share <= 2:

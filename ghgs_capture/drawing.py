@@ -10,8 +10,10 @@ from ghgs_lit.geometry.silhouettes import Silhouette, hull_in_view, subject_sphe
 from ghgs_lit.visualization.pictures import row, stack
 
 # Cells of the hull along the longer side of a photograph, and steps of an epipolar line.
-_CELLS, _STEPS = 160, 200
-_MASK, _HULL = (0, 255, 90), (255, 60, 40)
+_CELLS = 160
+_STEPS = 200
+_MASK = (0, 255, 90)
+_HULL = (255, 60, 40)
 _COLORS = ((255, 220, 0), (0, 200, 255), (255, 120, 255), (255, 160, 60), (160, 255, 120))
 
 
@@ -24,7 +26,8 @@ def camera_sheet(
     must be, near the subject's depth: it passes the same part of the body in every photograph. ``images``:
     [h, w, 3] uint8. ``views``: masks of the photographs' sizes with their cameras."""
     focus, radius = subject_sphere(views)
-    small, tiles = [_smaller(view) for view in views], []
+    small = [_smaller(view) for view in views]
+    tiles = []
     for i, (image, view) in enumerate(zip(images, views, strict=True)):
         hull = Image.fromarray(hull_in_view(small, i)).resize(view.mask.shape[::-1], Image.Resampling.NEAREST)
         picture = image.copy()
@@ -34,7 +37,8 @@ def camera_sheet(
     rows = [row(tiles, [f"{name}: mask green, hull of the others red" for name in names])]
     for i, view in enumerate(views):
         order = [i, *(j for j in range(len(views)) if j != i)]
-        points, depths = _extremes(view.mask), view.depths_around(focus, radius, _STEPS)
+        points = _extremes(view.mask)
+        depths = view.depths_around(focus, radius, _STEPS)
         tiles = [_dots(images[i], points)]
         tiles += [_lines(images[j], view, views[j], points, depths) for j in order[1:]]
         rows.append(row(tiles, [f"points of {names[i]}", *(f"on {names[j]}" for j in order[1:])]))

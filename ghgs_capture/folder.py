@@ -93,7 +93,9 @@ class CaptureFolder:
 
     @functools.cached_property
     def _found(self) -> tuple[dict[str, dict[str, Source]], str]:
-        folder, cameras, part = self.images, self.file.cameras, self._part
+        folder = self.images
+        cameras = self.file.cameras
+        part = self._part
         if isinstance(folder, Mapping):
             return {"": dict(folder)}, ""
         names = composed_names(self._said.names)
@@ -110,7 +112,8 @@ class CaptureFolder:
     @functools.cached_property
     def paths(self) -> dict[str, dict[str, Source]]:
         """``{instant: {camera: path or frame}}`` of the instants that ``sequence`` selects."""
-        found, part = self._found[0], self._part
+        found = self._found[0]
+        part = self._part
         names = list(found)[part.start : part.stop : part.step]
         expected = f"a part of {len(found)} instants"
         require(bool(names), "sequence.start", expected, f"none from {part.start} to {part.stop}")
@@ -200,10 +203,12 @@ class CaptureFolder:
         self, name: str, camera: StoredCamera, pixels: Pixels, matte: np.ndarray, convention: Convention
     ) -> Photograph:
         """One view, undistorted and upright, with the camera that a convention gives it."""
-        image, turns = pixels.image, 0
+        image = pixels.image
+        turns = 0
         if self.keeps_stored(camera, pixels):
             turns = pixels.turns
-            image, matte = np.rot90(image, -turns), np.rot90(matte, -turns)
+            image = np.rot90(image, -turns)
+            matte = np.rot90(matte, -turns)
         size = image.shape[:2]
         calibration = calibrate(camera, convention, size)
         if calibration.distortion.any():
@@ -212,10 +217,12 @@ class CaptureFolder:
             # All that undistortion depends on, as the key of a cache that instants share.
             lens = tuple(calibration.intrinsics.ravel()), tuple(calibration.distortion), calibration.fisheye
             image, matte = undistort(image, matte, _grid(*lens, *size))
-            expected, lens = "a lens distortion that leaves some of the subject", calibration.distortion
+            expected = "a lens distortion that leaves some of the subject"
+            lens = calibration.distortion
             require(bool((matte > 127).any()), camera.origin, expected, lens.tolist())
         found = quarter_turned(calibration, turns, size)
-        image, matte = np.rot90(image, turns), np.rot90(matte, turns)
+        image = np.rot90(image, turns)
+        matte = np.rot90(matte, turns)
         return Photograph(name, image, matte, found.intrinsics, found.extrinsics, found.gains)
 
     def _matte(self, name: str, camera: StoredCamera, path: Source, pixels: Pixels) -> np.ndarray:

@@ -107,12 +107,14 @@ def find_frames(
         camera = cameras[name]
         calibrate(replace(camera, origin=f"{video.path}: {camera.origin}"), convention, video.size)
     if isinstance(sync, str):
-        numbers, step = _by_time(videos, Path(sync).expanduser(), names), 1
+        numbers = _by_time(videos, Path(sync).expanduser(), names)
+        step = 1
     else:
         numbers = _by_number(videos, {names.get(str(key), str(key)): n for key, n in (sync or {}).items()})
     frames = {}
     for name, video in videos.items():
-        reader, drawn = Reader(video, "rgb24", step), _masks_of(video, folder, masks, step)
+        reader = Reader(video, "rgb24", step)
+        drawn = _masks_of(video, folder, masks, step)
         frames[name] = {n: VideoFrame(reader, n, drawn.get(n)) for n in video.numbers.tolist()}
     instants = {
         f"{instant:0{_DIGITS}d}": {name: frames[name][n] for name, n in shown.items() if n in frames[name]}
@@ -146,7 +148,8 @@ def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) 
     """The frame of each camera nearest to each of the first camera's, within half of its frame time."""
     import pandas as pd  # here: it takes time to import
 
-    columns, rows = {"camera": str, "frame": int, "seconds": float}, read_rows(path)
+    columns = {"camera": str, "frame": int, "seconds": float}
+    rows = read_rows(path)
     try:
         table = pd.DataFrame(rows, columns=list(columns)).astype(columns)
         if not np.isfinite(table.seconds).all():
@@ -173,13 +176,15 @@ def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) 
 
 def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict[int, VideoFrame | Path]:
     """The masks of a video by frame number; empty if there are none beside it."""
-    name, place = composed(video.path.stem), folder if masks is None else masks
+    name = composed(video.path.stem)
+    place = folder if masks is None else masks
     marked = f"{name}{MASK_ENDING}"
     names = (marked,) if os.path.realpath(place) == os.path.realpath(folder) else (name, marked)
     path = image_named(place, *names, suffixes=SUFFIXES)
     if path is not None:
         drawn = read_video(path)
-        reader, numbers = Reader(drawn, "gray", step), drawn.numbers.tolist()
+        reader = Reader(drawn, "gray", step)
+        numbers = drawn.numbers.tolist()
         # Masks made frame by frame lack those that the camera dropped.
         known = video.numbers.tolist() if len(numbers) == len(video.numbers) else numbers
         return {n: VideoFrame(reader, its) for n, its in zip(known, numbers, strict=True)}

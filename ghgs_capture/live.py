@@ -25,7 +25,9 @@ from ghgs_lit.config.nodes import Sequence
 from ghgs_lit.errors import InputError, require
 
 #: Seconds between looks for a frame and for a folder, and of waiting for a camera at the end.
-_FRAME_POLL, _FOLDER_POLL, _PATIENCE = 0.002, 0.02, 2.0
+_FRAME_POLL = 0.002
+_FOLDER_POLL = 0.02
+_PATIENCE = 2.0
 
 
 def opened(devices: Mapping[str, int | str]) -> dict[str, Any]:
@@ -49,7 +51,9 @@ def newest_frames(
     and when the newest were taken. A thread takes frames as they come, so that none waits in a camera's
     buffer, and decodes only those that are asked for. Ends, and releases the cameras, where fewer than
     ``least`` give frames."""
-    wanted, stopped, ready = threading.Event(), threading.Event(), SimpleQueue()
+    wanted = threading.Event()
+    stopped = threading.Event()
+    ready = SimpleQueue()
     wanted.set()  # the first frames
 
     def take() -> None:
@@ -124,7 +128,8 @@ def live_frames(
         idle: seconds without a new instant after which a folder of instants ends; None: never.
         clock, sleep: tells seconds, and waits.
         options: as for :class:`CaptureFolder`."""
-    said, part = options.get("calibration", {}), options.get("sequence", {})
+    said = options.get("calibration", {})
+    part = options.get("sequence", {})
     if is_folder := not isinstance(images, Mapping):
         folder = Path(images).expanduser()
         require(folder.is_dir(), str(images), "a folder", "no such folder")
@@ -159,9 +164,12 @@ def live_frames(
 def _watched(
     frames: Iterator[tuple[dict[str, Frame], int, float]], stored: CameraFile, options: Mapping[str, Any]
 ) -> Iterator[Arrived]:
-    number, dropped, said = -1, 0, ""
+    number = -1
+    dropped = 0
+    said = ""
     for images, passed, taken in frames:
-        number, dropped = number + passed + 1, dropped + passed
+        number = number + passed + 1
+        dropped += passed
         try:
             capture = Capture(f"{number:06d}", CaptureFolder(images, stored, **options).photographs(""))
         except InputError as error:
@@ -181,7 +189,9 @@ def _played(
     first = next(iter(folder.paths[names[0]].values())).video.video
     # Instants are named by the frame of the first camera.
     due = (np.array([int(name) for name in names]) - int(names[0])) / first.rate
-    begin, place, dropped = clock(), 0, 0
+    begin = clock()
+    place = 0
+    dropped = 0
     while place < len(names):
         newest = max(place, int(np.searchsorted(due, clock() - begin, side="right")) - 1)
         dropped += newest - place
@@ -204,12 +214,16 @@ def _arriving(
     clock: Callable[[], float],
     sleep: Callable[[float], None],
 ) -> Iterator[Arrived]:
-    done, before, unread, last = [], {}, {}, clock()
+    done = []
+    before = {}
+    unread = {}
+    last = clock()
     while idle is None or clock() - last < idle:
         folders = (path.name for path in places[0].iterdir() if path.is_dir() and path.name[0] != ".")
         sizes = {name: [_sizes(place / name) for place in places] for name in folders if counted(name) > done}
         still = [name for name, found in sizes.items() if before.get(name) == found != unread.get(name)]
-        newest, before = max(filter(is_whole, still), key=counted, default=None), sizes
+        newest = max(filter(is_whole, still), key=counted, default=None)
+        before = sizes
         if newest is None:
             sleep(_FOLDER_POLL)
             continue
@@ -218,7 +232,8 @@ def _arriving(
         except InputError:  # until its files change: masks may come later
             unread[newest] = sizes[newest]
             continue
-        done, last = counted(newest), clock()
+        done = counted(newest)
+        last = clock()
         files = [path for place in places if (place / newest).is_dir() for path in (place / newest).iterdir()]
         age = max(time.time() - max(path.stat().st_ctime for path in files), 0.0)
         yield Arrived(capture, sum(counted(name) < done for name in sizes), last - age)

@@ -17,7 +17,8 @@ from ghgs_lit.errors import choice, installed, require
 SEGMENTERS = ("rembg",)  #: Choices of ``segment``
 _LABELS = 32  # Labels of body parts are numbers below this; alpha and probabilities reach 255
 # By how many deviations of the noise a pixel differs from the background, and by how much at least.
-_DEVIATIONS, _LEAST_DIFFERENCE = 6.0, 12.0
+_DEVIATIONS = 6.0
+_LEAST_DIFFERENCE = 12.0
 _SPECK = 0.05  # Regions below this share of the largest one's area are not of the subject
 
 

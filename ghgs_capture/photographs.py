@@ -48,7 +48,8 @@ def read_pixels(path: Path) -> Pixels:
     orientation = orientation_of(image, path)
     found = f"EXIF orientation {orientation}"
     require(orientation in _TURNS, str(path), "a photograph that is not mirrored", found)
-    turns, alpha = _TURNS[orientation], None
+    turns = _TURNS[orientation]
+    alpha = None
     colors = np.rot90(rgb_of(image, path), turns)
     if image.has_transparency_data:
         alpha = np.rot90(np.asarray(image.convert("RGBA").getchannel("A")), turns)
@@ -100,7 +101,8 @@ def require_all_read(
         known: further names: of cameras or instants.
         suffixes: of what is read, for the message."""
     for path in sorted(folder.iterdir()):
-        name, kind = composed(path.name), path.suffix.lower().removeprefix(".")
+        name = composed(path.name)
+        kind = path.suffix.lower().removeprefix(".")
         begins = {name[:end] for end, letter in enumerate(f"{name}.") if letter == "."}
         is_other = path.name.startswith(".") or path.is_dir() or path.stem.lower().endswith(MASK_ENDING)
         if is_other or kind in _COMPANIONS.split() or not begins.isdisjoint(read):
@@ -155,7 +157,8 @@ def _by_instant(folder: Path, by_camera: Mapping[str, dict[str, Path]]) -> dict[
     first, *others = by_camera
     for other in others:
         shared = by_camera[first].keys() & by_camera[other].keys()
-        expected, found = f"photographs named as those of {first}", ", ".join(list(by_camera[other])[:3])
+        expected = f"photographs named as those of {first}"
+        found = ", ".join(list(by_camera[other])[:3])
         require(bool(shared), f"{folder}: {other}", expected, f"others: {found}")
     instants = sorted({instant for paths in by_camera.values() for instant in paths}, key=counted)
     return {

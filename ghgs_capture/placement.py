@@ -19,7 +19,8 @@ _NARROW = 10.0
 _GAP = 100.0
 # Two copies of a photograph, stored with losses: least common share of their masks, and mean difference of
 # levels of 255 within them.
-_SAME, _ALIKE = 0.98, 2.0
+_SAME = 0.98
+_ALIKE = 2.0
 
 
 def copies(photographs: Sequence[Photograph]) -> tuple[str, str] | None:
@@ -27,7 +28,8 @@ def copies(photographs: Sequence[Photograph]) -> tuple[str, str] | None:
     for one, other in itertools.combinations(photographs, 2):
         if one.image.shape != other.image.shape:
             continue
-        both, either = one.mask & other.mask, one.mask | other.mask
+        both = one.mask & other.mask
+        either = one.mask | other.mask
         differences = np.abs(one.image.astype(np.int16) - other.image)[both]
         if both.sum() > _SAME * either.sum() and differences.mean() < _ALIKE:
             return one.name, other.name

@@ -106,7 +106,8 @@ def _predicted(
     temporal: Temporal | None,
 ) -> TimedPrediction:
     """:func:`predict` of photographs with their colours as they are."""
-    seconds, why = {}, {}
+    seconds = {}
+    why = {}
     if refine_masks == "auto":
         why["refine_masks"] = doubt_of_masks(capture, size)
         refine_masks = ENOUGH if why["refine_masks"] else 0
@@ -145,9 +146,13 @@ def predict_batch(
         refine: steps of :class:`Refinement`; 0: none.
         forward: predicts a batch without targets; None: the model.
         temporal: takes the place of ``forward`` where instants before are known."""
-    forward, moved, seconds, start = forward or model, (), {}, time.perf_counter()
+    forward = forward or model
+    moved = ()
+    seconds = {}
+    start = time.perf_counter()
     if refine_cameras:
-        given, batch = batch, CameraRefinement(refine_cameras, model, renderer)(batch)
+        given = batch
+        batch = CameraRefinement(refine_cameras, model, renderer)(batch)
         moved = tuple(pixels_moved(given, batch)[0])
         seconds["refine_cameras"] = time.perf_counter() - start
         start = time.perf_counter()
@@ -157,7 +162,9 @@ def predict_batch(
     seconds["predict"] = time.perf_counter() - start
     refined = None
     if refine:
-        refinement, before, start = Refinement(refine, renderer), prediction.gaussians, time.perf_counter()
+        refinement = Refinement(refine, renderer)
+        before = prediction.gaussians
+        start = time.perf_counter()
         prediction = replace(prediction, gaussians=refinement(before, batch))
         seconds["refine"] = time.perf_counter() - start
         untold = replace(batch, targets=None)
@@ -191,7 +198,8 @@ def crop_size(size: int | tuple[int, int] | None, config: Mapping[str, Any], mod
     """(height, width) of the crops that a checkpoint's model sees; None: as it was trained. Warns of larger
     ones, which make results worse, not sharper, where the model does not work from coarse to fine
     (``rounds.height``). InputError: the model cannot take this size."""
-    trained, patch = image_size("size", trained_size(config)), model.encoder.patch_size
+    trained = image_size("size", trained_size(config))
+    patch = model.encoder.patch_size
     height, width = trained if size is None else image_size("size", size)
     multiple = side_multiple(model.options, patch)
     expected = f"sides divisible by the patch size {multiple}"

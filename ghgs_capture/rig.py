@@ -67,7 +67,8 @@ class Rig:
             # The motion is the same before the photograph is turned upright.
             corrected = self._corrected(photograph)
             moved = np.linalg.inv(photograph.extrinsics) @ corrected.extrinsics
-            lens, pose = given.intrinsics * self._zoom_of(name), given.extrinsics @ moved
+            lens = given.intrinsics * self._zoom_of(name)
+            pose = given.extrinsics @ moved
             changed = replace(given, intrinsics=lens, extrinsics=pose, gains=corrected.gains)
             found[name] = changed, size
         return found
@@ -91,7 +92,8 @@ def corrected_rig(
         refine_masks: as for :func:`ghgs_capture.prediction.predict`."""
     names = Counter(_names(capture) for capture in captures).most_common(1)[0][0]
     captures = [capture for capture in captures if _names(capture) == names]
-    batches, doubts = [], []
+    batches = []
+    doubts = []
     for capture in captures:
         masks = refine_masks
         if masks == "auto":
@@ -105,7 +107,8 @@ def corrected_rig(
         rounds = ENOUGH
     batch = _together(batches).to(next(model.parameters()).device)
     corrected = CameraRefinement(rounds, model, renderer, shared=True)(batch)
-    before, after = batch.cameras, corrected.cameras
+    before = batch.cameras
+    after = corrected.cameras
     if torch.equal(before.extrinsics, after.extrinsics) and torch.equal(before.intrinsics, after.intrinsics):
         return None
     why = f"in {len(contradicted)} of {len(captures)} instants {contradicted[0]}" if contradicted else ""

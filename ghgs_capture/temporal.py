@@ -79,7 +79,9 @@ class Temporal:
         anew: how many instants were predicted anew."""
 
     def __init__(self, predict: Callable[[Batch], Prediction], every: int, renderer: Renderer):
-        self.predict, self.every, self.renderer = predict, every, renderer
+        self.predict = predict
+        self.every = every
+        self.renderer = renderer
         self.anew = 0
         self.reset()
 
@@ -97,7 +99,9 @@ class Temporal:
             return self.predict(batch)
         if last is not None and _are_equal(last.batch, batch):
             return last.prediction
-        levels, fits, before = pyramid(at_least_float32(on_black(batch))[0]), True, None
+        levels = pyramid(at_least_float32(on_black(batch))[0])
+        fits = True
+        before = None
         if last is not None and last.batch.views == batch.views and self._age < self.every:
             self._age += 1
             self._follow(last, batch, levels)
@@ -108,7 +112,9 @@ class Temporal:
             before = self._descent.gaussians if fits else None
         prediction = self.predict(batch)
         # What moves too fast is not followed at every instant.
-        self.anew, self._age, self._crossing = self.anew + 1, 0 if fits else self.every, None
+        self.anew = self.anew + 1
+        self._age = 0 if fits else self.every
+        self._crossing = None
         self._descent = Descent(prediction.gaussians, batch, _CHANGES)
         drawn, self._misfit = self._improved(batch)
         if before is not None:
@@ -119,16 +125,19 @@ class Temporal:
     def _cross(self, before: Gaussians, batch: Batch) -> None:
         """Let the Gaussians take the place of those before over some instants."""
         own = self._descent.gaussians
-        both, instants = own.with_more(before), min(_CROSSING, self.every - 1)
+        both = own.with_more(before)
+        instants = min(_CROSSING, self.every - 1)
         self._crossing = _Crossing(len(own), both.opacities, instants)
         changes = {name: change for name, change in _CHANGES.items() if name != "opacities"}
         self._descent = Descent(self._crossing.shared(both, 0), batch, changes)
 
     def _follow(self, last: _Last, batch: Batch, levels: list[Tensor]) -> None:
         """Move the Gaussians to the instant of ``batch``, and those of a new prediction on their way."""
-        crossing, start = self._crossing, _moved(self._descent.start, last, batch, levels)
+        crossing = self._crossing
+        start = _moved(self._descent.start, last, batch, levels)
         if crossing is not None and self._age >= crossing.instants:
-            self._descent.start, self._crossing = start, None
+            self._descent.start = start
+            self._crossing = None
             self._descent = Descent(crossing.arrived(self._descent.gaussians), batch, _CHANGES)
         else:
             self._descent.start = start if crossing is None else crossing.shared(start, self._age)
@@ -191,7 +200,8 @@ def _shown(
     points: Float[Tensor, "N 3"], cameras: Cameras, depth: Float[Tensor, "V 1 H W"]
 ) -> Bool[Tensor, "N V"]:
     """Which views show points: those whose rendered surface is at the depth of the point."""
-    lens, pose = cameras.intrinsics[:, None], cameras.extrinsics[:, None]
+    lens = cameras.intrinsics[:, None]
+    pose = cameras.extrinsics[:, None]
     pixels, z = project(points.expand(len(depth), -1, -1), lens, pose)
     view = torch.arange(len(depth), device=z.device)[:, None].expand(z.shape)
     return ((z - sample(depth, view, pixels)[..., 0]).abs() < _SHOWN).mT
@@ -200,7 +210,8 @@ def _shown(
 def _as_drawn(
     prediction: Prediction, gaussians: Gaussians, batch: Batch, depth: Float[Tensor, "1 V H W"]
 ) -> Prediction:
-    valid, drawn = batch.masks, depth > 0
+    valid = batch.masks
+    drawn = depth > 0
     # Pixels that no Gaussian covers have the mean depth of their view.
     sums, counts = (each.sum((-2, -1), keepdim=True) for each in (depth, drawn))
     mean = torch.where(counts > 0, sums / counts.clamp(min=1), 1)

@@ -13,7 +13,8 @@ from ghgs_lit.types import Batch, Gaussians
 
 #: Log gamma of all channels, beside the median camera's, above which a camera has a tone curve of its own,
 #: and how many times as large in one as in another: what light and wrong depths do differs between them.
-_OWN, _UNLIKE = 0.1, 2.0
+_OWN = 0.1
+_UNLIKE = 2.0
 
 
 def own_tones(batch: Batch, gaussians: Gaussians) -> dict[str, float]:

@@ -25,7 +25,8 @@ _TIME = re.compile(rb"pts_time:(\S+)")
 # Exact colours: without it green is a level too dark.
 _EXACT = "bicubic+accurate_rnd+full_chroma_int"
 # How framecrc lists a packet that says no time, and one that is not shown.
-_UNTIMED, _HIDDEN = -(2**63), re.compile("F=0x[4-7]")
+_UNTIMED = -(2**63)
+_HIDDEN = re.compile("F=0x[4-7]")
 _PATIENCE = 10.0  #: Seconds of a video that are decoded to reach a frame; beyond, it is sought
 
 
@@ -102,8 +103,11 @@ class Reader:
     ``step``: distance of the frames that will be asked for; ffmpeg drops the others."""
 
     def __init__(self, video: Video, pixels: str, step: int = 1) -> None:
-        self.video, self.pixels, self.step = video, pixels, step
-        self._lock, self._process = threading.Lock(), None
+        self.video = video
+        self.pixels = pixels
+        self.step = step
+        self._lock = threading.Lock()
+        self._process = None
         # The numbers of the frame at hand and of the one before: no frame between them could be decoded.
         self._at = self._before = -1
         self._frame = np.zeros(0, np.uint8)
@@ -121,9 +125,11 @@ class Reader:
             return self._frame
 
     def _open(self, number: int) -> None:
-        video, select = self.video, "1"
+        video = self.video
+        select = "1"
         place = min(np.searchsorted(video.numbers, number), len(video.numbers) - 1)
-        time, length = float(video.seconds[place]), 1 / video.rate
+        time = float(video.seconds[place])
+        length = 1 / video.rate
         uneven = np.abs(video.seconds - video.seconds[0] - video.numbers * length).max()
         if self.step > 1 and uneven < length / 4:
             select = f"lt(mod(t-{time - length / 2:.6f},{self.step * length:.9f}),{length:.6f})"
@@ -143,7 +149,8 @@ class Reader:
             return False
         number = self.video.number_at(float(time[1]))
         if number is not None and number > self._at:
-            self._before, self._at = self._at, number
+            self._before = self._at
+            self._at = number
             self._frame = np.frombuffer(content, np.uint8).reshape(shape)
         return True
 

@@ -36,7 +36,8 @@ def glb_bytes(gaussians: Gaussians, up: torch.Tensor) -> bytes:
         f"{EXTENSION}:OPACITY": stored["opacities"].clamp(0, 1),
         f"{EXTENSION}:SH_DEGREE_0_COEF_0": (stored["colors"] - 0.5) / SH_CONSTANT,
     }
-    model, blob = gltf.GLTF2(scene=0, scenes=[gltf.Scene(nodes=[0])]), b""
+    model = gltf.GLTF2(scene=0, scenes=[gltf.Scene(nodes=[0])])
+    blob = b""
     for name, values in columns.items():
         data = np.ascontiguousarray(values.numpy()).tobytes()
         span = {"byteOffset": len(blob), "byteLength": len(data)}
@@ -50,7 +51,8 @@ def glb_bytes(gaussians: Gaussians, up: torch.Tensor) -> bytes:
             type="SCALAR" if values.dim() == 1 else f"VEC{values.shape[1]}",
         )
         if name == "POSITION":
-            accessor.min, accessor.max = values.amin(0).tolist(), values.amax(0).tolist()
+            accessor.min = values.amin(0).tolist()
+            accessor.max = values.amax(0).tolist()
         model.accessors.append(accessor)
         blob += data
     attributes = gltf.Attributes(**{name: index for index, name in enumerate(columns)})
@@ -58,6 +60,7 @@ def glb_bytes(gaussians: Gaussians, up: torch.Tensor) -> bytes:
     w, x, y, z = turn(up.cpu(), torch.tensor(AXES["y"])).tolist()
     model.nodes = [gltf.Node(mesh=0, rotation=[x, y, z, w])]
     model.meshes = [gltf.Mesh(primitives=[primitive])]
-    model.extensionsUsed, model.buffers = [EXTENSION], [gltf.Buffer(byteLength=len(blob))]
+    model.extensionsUsed = [EXTENSION]
+    model.buffers = [gltf.Buffer(byteLength=len(blob))]
     model.set_binary_blob(blob)
     return b"".join(model.save_to_bytes())

@@ -36,7 +36,9 @@ class Instants:
     """
 
     def __init__(self, count: int, options: OutputOptions, others: Iterable[str] = ()):
-        self.count, self.options, self._seconds = count, options, 0.0
+        self.count = count
+        self.options = options
+        self._seconds = 0.0
         self.others: dict[str, bytes] = dict.fromkeys(others, b"")
         self.folders: list[Path] = []
         self._first: ExportedSubject | None = None
@@ -79,7 +81,8 @@ class Instants:
                 (directory / name).unlink()
         contents = {name: partial(self.others.get, name) for name in self.others}
         contents |= {"viewer.html": self._page, "instants.mp4": self._video}
-        seconds, sources = {"code": self._seconds}, iter(self.folders)
+        seconds = {"code": self._seconds}
+        sources = iter(self.folders)
         for name in names:
             if name in contents:
                 seconds[f"write {name}"] = write_file(directory / name, contents[name])
@@ -98,11 +101,14 @@ class Instants:
         return means - means[0]
 
     def _page(self) -> bytes:
-        name, path = self.folders[0].parent.name, self._path().tolist()
+        name = self.folders[0].parent.name
+        path = self._path().tolist()
         return page(self._first, name, self._packed, path, self.options.fps).encode()
 
     def _video(self) -> bytes:
-        first, cameras, path = self._first, self._first.cameras, self._path()
+        first = self._first
+        cameras = self._first.cameras
+        path = self._path()
         low, high = (np.stack(self._boxes) - path[:, None]).swapaxes(0, 1)
         sides = torch.from_numpy(np.stack((low.min(0), high.max(0)), 1)).to(cameras.extrinsics.device)
         turns = torch.arange(len(path), dtype=torch.float64) * (2 * math.pi / len(path))

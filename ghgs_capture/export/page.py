@@ -22,7 +22,8 @@ from ghgs_lit.types import Gaussians
 FINE = {"center": 64, "scale": 24, "opacity": 255, "rotation": 127}
 COARSE = {"center": 12, "scale": 12, "opacity": 127, "rotation": 31}
 #: A Gaussian's numbers of four bytes (its centre) and of one (the others).
-_WIDE, _NARROW = 3, 10
+_WIDE = 3
+_NARROW = 10
 _LARGEST = 1 << 29
 
 
@@ -91,7 +92,10 @@ def page(
         packed: :func:`pack` of each of several instants, with ``COARSE``.
         path: shift of the page's camera at each instant [instants, 3].
         fps: instants a second."""
-    gaussians, cameras, center, pixel = subject.gaussians, subject.cameras, subject.center, subject.pixel
+    gaussians = subject.gaussians
+    cameras = subject.cameras
+    center = subject.center
+    pixel = subject.pixel
     steps = COARSE if packed else FINE
     packed = packed or [pack(gaussians, pixel, center, steps)]
     scene = {

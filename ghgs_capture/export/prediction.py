@@ -135,7 +135,8 @@ def write_prediction(
         renderer: draws the turntable, and the input views for the report.
         facts: further plain data for the report, such as the seconds of each stage."""
     subject = exported_subject(batch, prediction, renderer, options)
-    names, seconds = output_files(options, subject.views), {}
+    names = output_files(options, subject.views)
+    seconds = {}
     begin_files(directory, names)
     with ThreadPoolExecutor(allowed_cores()) as pool:
         pool.submit(palette, "turbo")  # imports matplotlib, which the sheet needs, meanwhile
@@ -159,7 +160,8 @@ def write_prediction(
 
 
 def _report(subject: ExportedSubject) -> dict[str, Any]:
-    gaussians, valid = subject.gaussians, subject.depth_valid
+    gaussians = subject.gaussians
+    valid = subject.depth_valid
     lost = subject.masks & ~valid
     drawn = subject.renderer(gaussians, subject.cameras[None])
     image = drawn.image[0].clamp(0, 1)

@@ -24,7 +24,8 @@ AXES = {"y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 def turn(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Float[Tensor, "4"]:
     """The unit quaternion of the shortest rotation from unit vector ``start`` to ``end``, float64."""
-    start, end = start.double(), end.double()
+    start = start.double()
+    end = end.double()
     axis = torch.linalg.cross(start, end)
     quaternion = torch.cat([(1 + start @ end)[None], axis])
     if quaternion.norm() < 1e-7:  # opposite: half a turn about any axis at right angles
@@ -54,7 +55,9 @@ _SMALLEST = 1e-3  #: Least standard deviation in pixels
 #: The fit of Gaussians for other viewers: changes, steps, cameras around the subject (beside the inputs), and
 #: views in each step.
 _FIT = {"scales": Change(3.0, 0.15), "opacities": Change(5.0, 0.3), "colors": Change(0.1, 0.006)}
-_FIT_STEPS, _AROUND, _AT_ONCE = 32, 8, 2
+_FIT_STEPS = 32
+_AROUND = 8
+_AT_ONCE = 2
 _WEIGHTS = (1.0, 0.0, 0.1)  #: Of L1, 1 - SSIM (it would take half of the time) and silhouette
 
 
@@ -105,7 +108,8 @@ def fitted(theirs: Gaussians, ours: Gaussians, cameras: Sequence[Cameras], rende
     search = Descent(theirs, None, _FIT)
     for step in range(_FIT_STEPS):
         lap, among = divmod(step, len(cameras))
-        seen, wanted = cameras[among], drawn[among]
+        seen = cameras[among]
+        wanted = drawn[among]
         count = seen.extrinsics.shape[0]
         # Far apart, to see different sides.
         views = [(lap + part * max(count // _AT_ONCE, 1)) % count for part in range(_AT_ONCE)]
@@ -189,7 +193,8 @@ def exported_subject(
     """The subject of a batch of one, in the frame that ``options`` choose. InputError: several subjects."""
     count = len(batch.images)
     require(count == 1, "write_prediction", "a batch of one subject", count)
-    cameras, gaussians = batch.cameras[0], prediction.gaussians.detach()
+    cameras = batch.cameras[0]
+    gaussians = prediction.gaussians.detach()
     finite = gaussians.is_finite
     kept = int(finite.sum())
     dropped = len(gaussians) - kept
@@ -199,7 +204,8 @@ def exported_subject(
         end = up.new_tensor(AXES[options.up])
         gaussians, cameras = rotate_world(turn(up, end), gaussians, cameras)
         up = end
-    depth, valid = prediction.depth[0].detach(), prediction.depth_valid[0] & batch.masks[0]
+    depth = prediction.depth[0].detach()
+    valid = prediction.depth_valid[0] & batch.masks[0]
     valid = valid & depth.isfinite() & (depth > 0)
     return ExportedSubject(
         name=batch.subjects[0] if batch.subjects else "subject",

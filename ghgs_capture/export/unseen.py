@@ -13,7 +13,8 @@ from ghgs_lit.rounds.observation import looked_up
 #: Metres behind the rendered surface up to which a photograph shows a Gaussian.
 _BEHIND = 0.03
 #: Parts of the subject's height, and share of Gaussians beyond either end of it (floaters).
-_PARTS, _OUTSIDE = 4, 1e-3
+_PARTS = 4
+_OUTSIDE = 1e-3
 #: Share of ``seen_once`` above which a part is reported: three even views of whole people have a half, two
 #: opposite ones all.
 GUESSED = 0.75
@@ -38,7 +39,8 @@ def unseen(subject: ExportedSubject, depth: Float[Tensor, "1 V 1 H W"]) -> dict[
 
 
 def _seen_once(subject: ExportedSubject, depth: Float[Tensor, "1 V 1 H W"]) -> dict[str, float]:
-    gaussians, cameras = subject.gaussians, subject.cameras[None]
+    gaussians = subject.gaussians
+    cameras = subject.cameras[None]
     if not len(gaussians):
         return {}
     metre = 1.0 if gaussians.metre is None else float(gaussians.metre[0])
@@ -48,8 +50,10 @@ def _seen_once(subject: ExportedSubject, depth: Float[Tensor, "1 V 1 H W"]) -> d
     matte, depth = values.split((1, 1), -1)
     count = (is_inside & (matte > 0.5) & (z - depth < _BEHIND * metre)).squeeze(-1).sum(1)
     height = exact.means @ subject.up
-    ordered, last = height.sort().values, len(height) - 1
-    low, high = ordered[round(_OUTSIDE * last)], ordered[round((1 - _OUTSIDE) * last)]
+    ordered = height.sort().values
+    last = len(height) - 1
+    low = ordered[round(_OUTSIDE * last)]
+    high = ordered[round((1 - _OUTSIDE) * last)]
     part = torch.bucketize(height, low + (high - low) * torch.arange(1, _PARTS).to(low) / _PARTS)
     ends = [100 * i // _PARTS for i in range(_PARTS + 1)]
     return {

@@ -39,7 +39,8 @@ def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
 
 
 def _format_of(path: Path) -> str:
-    suffix, folder = path.suffix.lower(), path if path.is_dir() else path.parent
+    suffix = path.suffix.lower()
+    folder = path if path.is_dir() else path.parent
     if path.name.lower() in EASYMOCAP or (path.is_dir() and find_path(path, EASYMOCAP[0]) is not None):
         return "easymocap"
     if path.is_dir():

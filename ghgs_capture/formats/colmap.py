@@ -67,7 +67,8 @@ def _names(folder: Path) -> dict[int, str]:
 
 
 def _camera(folder: Path, name: str, image, camera) -> StoredCamera:
-    origin, model = f"{folder}: {name}", camera.model.name
+    origin = f"{folder}: {name}"
+    model = camera.model.name
     require(model in _MODELS, origin, f"a camera model among {', '.join(_MODELS)}", model)
     values = dict(zip(_MODELS[model].split(), camera.params, strict=True))
     fx, fy = (values.get(name, values.get("f")) for name in ("fx", "fy"))

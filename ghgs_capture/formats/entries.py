@@ -25,7 +25,8 @@ NAMES = {
     "gains": ("gains",),
 }
 #: Coefficients with an entry each: of OpenCV's model, and of a fisheye's.
-PERSPECTIVE, FISHEYE = "k1 k2 p1 p2 k3 k4 k5 k6", "k1 k2 k3 k4"
+PERSPECTIVE = "k1 k2 p1 p2 k3 k4 k5 k6"
+FISHEYE = "k1 k2 k3 k4"
 # Camera models that are read: those of a pinhole, with OpenCV's distortion, and of OpenCV's fisheye.
 _PINHOLES = ("pinhole", "perspective", "simplepinhole", "none")
 _BROWN = ("opencv", "radial", "simpleradial", "fullopencv", "brown", "brownconrady", "radtan", "standard")
@@ -122,7 +123,8 @@ class Entries:
 
     def needed(self, what: str, *shapes: tuple[int | None, ...]) -> np.ndarray:
         """As :meth:`array`. InputError: there is none, too."""
-        value, names = self.array(what, *shapes), NAMES.get(what, (what,))
+        value = self.array(what, *shapes)
+        names = NAMES.get(what, (what,))
         require(value is not None, self.origin, f"{what} ({' or '.join(names)})", sorted(self.fields))
         return value
 
@@ -137,7 +139,8 @@ class Entries:
     @property
     def size(self) -> tuple[int, int] | None:
         """(height, width) in pixels, given as two numbers or as a list (width, height)."""
-        width, height = self.whole("width"), self.whole("height")
+        width = self.whole("width")
+        height = self.whole("height")
         both = self.array("size", (2,), (2, 1), (1, 2))
         if both is not None:
             listed = tuple(int(side) for side in both.ravel())
@@ -151,13 +154,15 @@ class Entries:
     @property
     def is_fisheye(self) -> bool:
         """Whether flag or model say so. InputError: they differ, or a model is not read."""
-        flag, models = self.flag("fisheye"), {key: str(self.fields[key]) for key in self.keys("model")}
+        flag = self.flag("fisheye")
+        models = {key: str(self.fields[key]) for key in self.keys("model")}
         self._read |= models.keys()
         expected = f"a camera model among {', '.join((*_PINHOLES, *_BROWN, *_FISHEYES))}"
         for key, model in models.items():
             is_known = plain(model) in (*_PINHOLES, *_BROWN, *_FISHEYES)
             require(is_known, f"{self.origin}: {key}", expected, model)
-        said, named = [plain(model) in _FISHEYES for model in models.values()], " and ".join(models.values())
+        said = [plain(model) in _FISHEYES for model in models.values()]
+        named = " and ".join(models.values())
         mixed = any(said) and any(plain(model) in _BROWN for model in models.values())
         require(not mixed, self.origin, "one model of the lens", named)
         differ = flag is not None and models and flag != any(said)

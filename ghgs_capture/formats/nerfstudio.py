@@ -35,9 +35,12 @@ def read_nerfstudio(path: Path) -> CameraFile:
 def _camera(path: Path, origin: str, shared: Mapping[str, Any], frame: Any) -> StoredCamera:
     require(isinstance(frame, Mapping), origin, "a mapping", frame)
     entries = Entries(origin, {**shared, **frame})
-    photograph, mask = entries.text("file_path"), entries.text("mask_path")
+    photograph = entries.text("file_path")
+    mask = entries.text("mask_path")
     require(photograph is not None, origin, "file_path", sorted(frame))
-    pose, size, fisheye = entries.needed("transform_matrix", (4, 4), (3, 4)), entries.size, entries.is_fisheye
+    pose = entries.needed("transform_matrix", (4, 4), (3, 4))
+    size = entries.size
+    fisheye = entries.is_fisheye
     lens = _lens(entries)
     is_known = size is not None or lens.is_known
     return StoredCamera(

@@ -147,7 +147,8 @@ def camera_from_fields(name: str, origin: str, fields: Mapping[str, Any]) -> Sto
 
 def camera_of(name: str, entries: Entries, pose: np.ndarray) -> StoredCamera:
     """The camera with a ``pose`` [4, 4], all else from ``entries``. InputError: one is missing or wrong."""
-    intrinsics, fisheye = entries.needed("intrinsics", (3, 3)), entries.is_fisheye
+    intrinsics = entries.needed("intrinsics", (3, 3))
+    fisheye = entries.is_fisheye
     return StoredCamera(
         name,
         entries.origin,

@@ -49,7 +49,8 @@ def with_rig(config: dict[str, Any]) -> dict[str, Any]:
         people = resolve(compose("adapt"))["data"]
         entries, fill = _cameras_of_data(config)
     elif config["images"] is None:
-        entries, fill = _cameras_of_file(config), people["fill"]
+        entries = _cameras_of_file(config)
+        fill = people["fill"]
     else:
         folder = capture_folder(config)
         photographs = folder.photographs(folder.instants[0])
@@ -82,7 +83,8 @@ def _cameras_of_data(config: dict[str, Any]) -> tuple[dict[str, dict[str, Any]],
     subjects = list(data.subjects("val"))
     require(subjects != [], "data", "a subject in the split val", subjects)
     batch = data.evaluation_batch(subjects[0])
-    cameras, masks = batch.cameras[0], batch.masks[0].numpy()
+    cameras = batch.cameras[0]
+    masks = batch.masks[0].numpy()
     pairs = zip(cameras.intrinsics.numpy(), cameras.extrinsics.numpy(), strict=True)
     entries = {f"camera_{i}": camera_entry(*pair, masks.shape[1:]) for i, pair in enumerate(pairs)}
     return entries, _fill_of(masks)
@@ -91,7 +93,8 @@ def _cameras_of_data(config: dict[str, Any]) -> tuple[dict[str, dict[str, Any]],
 def _cameras_of_file(config: dict[str, Any]) -> dict[str, dict[str, Any]]:
     require(config["cameras"] is not None, "cameras", "cameras=<calibration>", None)
     file = read_cameras(config["cameras"], config["calibration"]["format"])
-    convention, entries = file.convention.told(config["calibration"]), {}
+    convention = file.convention.told(config["calibration"])
+    entries = {}
     for name, camera in file.cameras.items():
         require(camera.size is not None, camera.origin, "the photographs' size, or images=<folder>", None)
         calibration = calibrate(camera, convention, camera.size)

@@ -46,7 +46,8 @@ def cameras(options: "Doctor", cfg: DictConfig) -> None:
     directory = output_dir()
     folder = capture_folder(save_config(cfg, directory))
     inputs = {os.path.realpath(path) for path in folder.input_files}
-    picture, calibration = directory / "cameras.png", directory / "cameras.json"
+    picture = directory / "cameras.png"
+    calibration = directory / "cameras.json"
     for path in (picture, calibration):
         expected = "a folder (hydra.run.dir) without inputs"
         require(os.path.realpath(path) not in inputs, str(path), expected, "an input")

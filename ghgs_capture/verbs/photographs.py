@@ -37,7 +37,8 @@ def check_cameras(folder: CaptureFolder) -> None:
     of these, or the only instant cannot be read."""
     from ghgs_capture.camera_report import diagnose, in_parts
 
-    names, found = folder.instants, {}
+    names = folder.instants
+    found = {}
     last = len(names) - 1
     for place in sorted({round(last * i / (_CHECKED - 1)) for i in range(_CHECKED)}):
         try:

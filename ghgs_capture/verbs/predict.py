@@ -79,7 +79,8 @@ def predict_subject(options: "Predict", config: dict[str, Any], directory: Path)
     require(options.refine_masks in (0, "auto"), "refine_masks", expected, options.refine_masks)
     output = export.output_options(options)
     device = inputs.pick_device(options.device)
-    renderer, model = inputs.build_renderer(config, device), inputs.load_model(config, device)
+    renderer = inputs.build_renderer(config, device)
+    model = inputs.load_model(config, device)
     data = inputs.build_data(config)
     inputs.check_size(data, model)
     write_config(config, directory)
@@ -95,7 +96,8 @@ def predict_photographs(options: "Predict", config: dict[str, Any], directory: P
     InputError: no instant can be read."""
     folder = capture_folder(config)
     output = export.output_options(options)
-    several, read = len(folder.instants) > 1, folder.input_files
+    several = len(folder.instants) > 1
+    read = folder.input_files
     directories = {name: directory / name if several else directory for name in folder.instants}
     others = ["rig.json"] if options.refine_cameras else []
     together = export.Instants(len(directories), output, others) if several else None
@@ -108,7 +110,8 @@ def predict_photographs(options: "Predict", config: dict[str, Any], directory: P
     if options.check_cameras:
         check_cameras(folder)
     device = inputs.pick_device(options.device)
-    renderer, model = inputs.build_renderer(config, device), inputs.load_model(config, device)
+    renderer = inputs.build_renderer(config, device)
+    model = inputs.load_model(config, device)
     trained = read_config(options.checkpoint)
     size = crop_size(options.size, trained, model)
     write_config(config, directory)
@@ -120,8 +123,10 @@ def predict_photographs(options: "Predict", config: dict[str, Any], directory: P
     }
     temporal = Temporal(partial(in_frame, model), model.skip.every, renderer)
     totals: Counter[str] = Counter()
-    count, begin = 0, time.perf_counter()
-    rig, backgrounds = None, Backgrounds({})
+    count = 0
+    begin = time.perf_counter()
+    rig = None
+    backgrounds = Backgrounds({})
     if together:
         shared = shared_by(folder, model, size, refining, renderer)
         refining["tones"], backgrounds, rig, together.others["rig.json"] = shared
@@ -159,7 +164,9 @@ def shared_by(
     """What the instants of a sequence share, estimated from a few of them: tone curves (those of the first),
     static backgrounds, corrected cameras, and the content of the cameras' file. None and no content: the
     cameras stay as they are."""
-    begin, names, captures = time.perf_counter(), folder.instants, []
+    begin = time.perf_counter()
+    names = folder.instants
+    captures = []
     rounds, masks, tones = (refining[key] for key in ("refine_cameras", "refine_masks", "tones"))
     spread = [round((len(names) - 1) * i / (INSTANTS - 1)) for i in range(INSTANTS)]
     for name in [names[place] for place in dict.fromkeys(spread)] if rounds or masks or tones else ():
@@ -207,7 +214,8 @@ def advice_of(directory: Path) -> Iterator[str]:
     guessed = [part for part, share in report["seen_once"].items() if share > GUESSED]
     if guessed:
         yield f"at {', '.join(guessed)} of its height at most one photograph shows most of it: a guess"
-    low, high = min(quality), max(quality)
+    low = min(quality)
+    high = max(quality)
     if low < LOW_PSNR:
         left = [key for key in ("refine_cameras", "refine_masks") if key not in report]
         hint = f" ({' and '.join(f'{key}=4' for key in left)} may mend them)" if left else ""
@@ -220,7 +228,8 @@ def advice_of(directory: Path) -> Iterator[str]:
 def rig_advice(trained: Mapping[str, Any], batch: Batch) -> Iterator[str]:
     """Lines that say where photographs are not of the rig that ``ghgs adapt`` trained weights for, by their
     configuration ``trained``."""
-    data, count = trained.get("data", {}), len(batch.views[0])
+    data = trained.get("data", {})
+    count = len(batch.views[0])
     if data.get("kind") != "people_in_rig":
         return
     hint = "checkpoint=shipped, or ghgs adapt with these cameras, may predict them better"
@@ -247,7 +256,8 @@ def captures_of(folder: CaptureFolder) -> Iterator[tuple[Capture, float]]:
         following = pool.submit(folder.photographs, names[0])
         for name, after in zip(names, [*names[1:], None], strict=True):
             start = time.perf_counter()
-            photographs, missing = (), folder.missing[name]
+            photographs = ()
+            missing = folder.missing[name]
             try:
                 photographs = following.result()
             except InputError as error:
@@ -273,7 +283,8 @@ def write_result(
     options: export.OutputOptions,
 ) -> dict[str, float]:
     """Write the files of a result and print what was done; return the seconds of each stage."""
-    prediction, seconds = result.prediction, dict(result.seconds)
+    prediction = result.prediction
+    seconds = dict(result.seconds)
     facts: dict[str, Any] = {"checkpoint": checkpoint, "seconds": seconds, "why": result.why}
     why = {name: f"; {doubt} ({name}=0 leaves it)" for name, doubt in result.why.items()}
     if result.changed:

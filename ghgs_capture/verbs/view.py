@@ -71,7 +71,8 @@ def _run_live(options: "View", cfg: DictConfig) -> None:
     config |= model_of(options.checkpoint, cfg)
     output = output_options(options)
     device = pick_device(options.device)
-    renderer, model = build_renderer(config, device), load_model(config, device)
+    renderer = build_renderer(config, device)
+    model = load_model(config, device)
     size = crop_size(options.size, read_config(options.checkpoint), model)
     write_config(config, output_dir())
     # To decide at each instant what ``auto`` should refine would take as long as a prediction.
@@ -89,7 +90,8 @@ def _run_live(options: "View", cfg: DictConfig) -> None:
     recording = None if options.out is None else Recording(resolved(options.out))
     print(f"waiting for an instant in {options.images}", flush=True)
     page = partial(_opened, options, layers=False)
-    until, delay = options.seconds or math.inf, options.delay or math.inf
+    until = options.seconds or math.inf
+    delay = options.delay or math.inf
     show_live(frames, pause, crop, predicted, page, recording, until, delay)
 
 

@@ -68,9 +68,11 @@ class Content:
     def comparison(self, view: int) -> dict[str, np.ndarray | float]:
         """One view and its photograph: pictures [H, W, 3] uint8 ``render``, ``photograph`` and ``FLIP``, and
         in the subject's box ``psnr`` (dB) and ``flip``, nan where the mask is empty."""
-        camera, target = self.batch.cameras[:, view : view + 1], self.batch.images[:, view]
+        camera = self.batch.cameras[:, view : view + 1]
+        target = self.batch.images[:, view]
         image = render(self.gaussians, camera).image[:, 0].clamp(0, 1)
-        difference, box = flip_map(image, target), box_of(self.batch.masks[:, view])
+        difference = flip_map(image, target)
+        box = box_of(self.batch.masks[:, view])
         return {
             "render": to_uint8(image[0]),
             "photograph": to_uint8(target[0]),
@@ -99,7 +101,8 @@ def read_content(path: str | Path, up: str | None) -> Content:
 
 def _read_inputs(directory: Path) -> Batch:
     stored = read_json(directory / "cameras.json")
-    pictures, cameras = [], []
+    pictures = []
+    cameras = []
     for name, camera in stored.cameras.items():
         file = directory / "inputs" / f"{name}.png"
         inside = file.resolve().parent == (directory / "inputs").resolve()
@@ -112,7 +115,8 @@ def _read_inputs(directory: Path) -> Batch:
     values = torch.from_numpy(np.stack(pictures)).movedim(-1, 1).float()[None] / 255
     matrices = ([getattr(c, name) for c in cameras] for name in ("intrinsics", "extrinsics"))
     stacked = [torch.from_numpy(np.stack(each)).float()[None] for each in matrices]
-    colors, alpha = values[:, :, :3], values[:, :, 3:]
+    colors = values[:, :, :3]
+    alpha = values[:, :, 3:]
     return Batch(
         images=torch.where(alpha > 0, colors * alpha, colors),
         masks=alpha[:, :, 0] > 0.5,

@@ -26,7 +26,8 @@ class Recording:
     InputError: a file of another origin is in the way."""
 
     def __init__(self, directory: Path):
-        self.directory, self.instants = directory, {}
+        self.directory = directory
+        self.instants = {}
         before = [f"sequence/{path.name}" for path in (directory / "sequence").glob("*")]
         begin_files(directory, before)
         for name in before:
@@ -46,7 +47,8 @@ class Pause:
     """``pause(seconds)`` waits; CancelledError once ``stopped`` is set. ``seconds``: length of all pauses."""
 
     def __init__(self):
-        self.stopped, self.seconds = threading.Event(), 0.0
+        self.stopped = threading.Event()
+        self.seconds = 0.0
 
     def __call__(self, seconds: float) -> None:
         begin = time.perf_counter()
@@ -74,14 +76,22 @@ def show_live(
         predict: gives what is shown.
         open_page: called with the first content.
         delay: seconds after which a capture is dropped rather than shown."""
-    page, shown, dropped, late, line, times = None, 0, 0, 0, "0 shown", {}
+    page = None
+    shown = 0
+    dropped = 0
+    late = 0
+    line = "0 shown"
+    times = {}
     try:
         with contextlib.closing(_read_ahead(frames, pause, crop, seconds)) as batches:
             for batch, missed, taken, reading in batches:
-                begin, due, dropped = time.perf_counter(), taken + delay, dropped + missed
+                begin = time.perf_counter()
+                due = taken + delay
+                dropped += missed
                 subject = predict(batch) if time.monotonic() <= due else None
                 if time.monotonic() > due:
-                    late, dropped = late + 1, dropped + 1
+                    late += 1
+                    dropped += 1
                     line = f"{shown} shown, {dropped} dropped, {late} of them later than {delay:g} s"
                     continue
                 seen = replace(batch, cameras=subject.cameras[None].to("cpu"))
@@ -89,7 +99,8 @@ def show_live(
                 predicted = time.perf_counter()
                 if page is None:
                     page = open_page(content)
-                    text, last = page.server.gui.add_markdown(""), begin
+                    text = page.server.gui.add_markdown("")
+                    last = begin
                 opened = time.perf_counter()
                 page.show(content)
                 if recording is not None:

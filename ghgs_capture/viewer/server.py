@@ -44,7 +44,8 @@ def _own_pages_only(host: str) -> Iterator[None]:
     """Make servers that start in this context refuse pages of other sites; viser accepts any origin."""
     from websockets.asyncio import server
 
-    serve, names = server.serve, "|".join(map(re.escape, (host, "localhost", "127.0.0.1", "[::1]")))
+    serve = server.serve
+    names = "|".join(map(re.escape, (host, "localhost", "127.0.0.1", "[::1]")))
     # A server open to the network has many names; the Host header has the one in use.
     names = ".+" if host in ("0.0.0.0", "::") else names
     origins = [None, re.compile(rf"https?://({names})(:\d+)?")]
@@ -100,7 +101,8 @@ class Viewer:
         self.show_splats()
 
     def _prepare(self) -> None:
-        g, order = self.content.gaussians, self.content.order
+        g = self.content.gaussians
+        order = self.content.order
         if self.content.batch is not None:
             # Else a screen larger than the photographs shows gaps.
             g = smoothed(g, pixel_size(self.content.cameras, self.content.center))
@@ -110,7 +112,8 @@ class Viewer:
         self._opacities = g.opacities[order][:, None].numpy()
 
     def _add_splat_controls(self) -> None:
-        gui, count = self.server.gui, len(self.content.gaussians)
+        gui = self.server.gui
+        count = len(self.content.gaussians)
         self.visible = gui.add_checkbox("show", True)
         self.opacity = gui.add_slider("opacity", 0.0, 2.0, 0.05, 1.0, hint="factor of all opacities")
         self.count = gui.add_slider("count", min(1, count), max(1, count), 1, max(1, count))
@@ -160,12 +163,15 @@ class Viewer:
     def _add_cameras(self) -> None:
         from viser.transforms import SO3
 
-        cameras, batch = self.content.cameras, self.content.batch
-        self._poses, self._frustums = [], []
+        cameras = self.content.cameras
+        batch = self.content.batch
+        self._poses = []
+        self._frustums = []
         target = self.content.center.numpy()
         size = np.linalg.norm(cameras.centers.numpy() - target, axis=-1).mean()
         for view, name in enumerate(batch.views[0]):
-            k, e = cameras.intrinsics[view].numpy(), cameras.extrinsics[view].numpy().astype(np.float64)
+            k = cameras.intrinsics[view].numpy()
+            e = cameras.extrinsics[view].numpy().astype(np.float64)
             pose = {"wxyz": SO3.from_matrix(e[:3, :3].T).wxyz, "position": -e[:3, :3].T @ e[:3, 3]}
             fov = 2 * math.atan(cameras.height / 2 / k[1, 1])
             alpha = batch.masks[0, view].numpy() * np.uint8(255)
@@ -187,12 +193,14 @@ class Viewer:
 
     def _place_visitors(self) -> None:
         """Start visitors behind and beside the first camera: its photograph would hide the subject."""
-        cameras, target = self.content.cameras, self.content.center.numpy()
+        cameras = self.content.cameras
+        target = self.content.center.numpy()
         up = self.content.up.numpy().astype(np.float64)
         away = cameras.centers[0].numpy() - target
         start = self.server.initial_camera
         start.position = target + 1.5 * away + 0.6 * np.cross(up, away)
-        start.look_at, start.up = target, up
+        start.look_at = target
+        start.up = up
         start.fov = 2 * math.atan(cameras.height / 2 / float(cameras.intrinsics[0, 1, 1]))
 
     def go_to(self, view: int) -> None:
@@ -200,14 +208,16 @@ class Viewer:
         pose, fov = self._poses[view]
         for client in self.server.get_clients().values():
             with client.atomic():
-                client.camera.wxyz, client.camera.position = pose["wxyz"], pose["position"]
+                client.camera.wxyz = pose["wxyz"]
+                client.camera.position = pose["position"]
                 client.camera.fov = fov
         self.view.value = self.content.batch.views[0][view]
         self._at = view
         self._show_frustums()
 
     def _add_comparison(self) -> None:
-        gui, views = self.server.gui, self.content.batch.views[0]
+        gui = self.server.gui
+        views = self.content.batch.views[0]
         self.view = gui.add_dropdown("view", views)
         self.picture = gui.add_button_group("picture", PICTURES, hint="one after the other at one place")
         self.text = gui.add_markdown("")
