@@ -1,0 +1,103 @@
+"""What the model skips: the same Gaussians of the same pixels, by less work."""
+
+import dataclasses
+import operator
+
+import pytest
+import torch
+
+from ghgs_lit.geometry.projection import pixel_centers, project, world_to_camera
+from ghgs_lit.types import Batch
+from tests.helpers.models import close, make_model
+from tests.helpers.scenes import make_batch
+
+
+def element(batch, b):
+    """One element of a batch."""
+    one = slice(b, b + 1)
+    return Batch(batch.images[one], batch.masks[one], batch.cameras[one], depths=batch.depths[one])
+
+
+def test_skip_fast_gives_the_gaussians_of_skip_exact_where_nothing_is_background():
+    """The preset changes what the encoder sees, and nothing else."""
+    batch = make_batch(2, 3)
+    batch = dataclasses.replace(batch, masks=torch.ones_like(batch.masks))
+    with torch.no_grad():
+        fast, exact = (make_model(f"skip={skip}")(batch).gaussians for skip in ("fast", "exact"))
+    close(fast, exact)
+
+
+@pytest.mark.parametrize("margin", [0, 1])
+@torch.no_grad()
+def test_skip_fast_with_few_pixels_and_with_mates(margin):
+    """An empty view, a single pixel, two people and a batch mate: the same pixels, each element as alone."""
+    batch = make_batch(2, 4, zoom=0.4)
+    batch.masks[0, 0] = False
+    batch.masks[0, 1] = False
+    batch.masks[0, 1, 20, 33] = True
+    batch.masks[1, 2, :4, :4] = batch.masks[1, 2, -3:, -3:] = True
+    model = make_model("skip=fast", f"skip.margin={margin}").eval()
+    together = model(batch)
+    assert torch.equal(together.depth_valid, batch.masks)
+    assert len(together.gaussians) == batch.masks.sum()
+    for name in ("means", "quaternions", "scales", "opacities", "colors"):
+        assert getattr(together.gaussians, name).isfinite().all()
+    assert len(together.points.tokens) < 2 * 4 * 4 * 4
+    for b in range(2):
+        close(together.gaussians[b], model(element(batch, b)).gaussians)
+
+
+def test_only_windows_around_the_subject_are_decoded():
+    """skip=exact must skip the work, except where all tokens need a depth."""
+    batch = make_batch(2, 3, zoom=0.4)
+    batch.masks[1, 0] = False
+    model = make_model("skip=exact")
+    decoded = []
+    for head in (model.depth_head.dpt, model.gaussian_head.decoder):
+        head.register_forward_hook(lambda _, args, maps: decoded.append((len(maps), *maps.shape[2:])))
+    model(batch)
+    assert [count for count, *_ in decoded] == [3, 2, 3, 2]
+    assert all(max(size) < 56 for _, *size in decoded)
+    decoded.clear()
+    model.recalibration.tokens = "all"
+    model(batch)
+    assert decoded == [(6, 56, 56), *decoded[1:]]
+    assert [count for count, *_ in decoded[1:]] == [3, 2]
+
+
+@pytest.mark.parametrize("overrides", [["model=hull"], ["unprojection=release"]], ids=operator.itemgetter(0))
+@pytest.mark.parametrize("size", [(70, 70), (154, 98)])
+def test_skip_exact_gives_the_gaussians_of_skip_none(size, overrides):
+    """skip=exact promises the same Gaussians, also where windows are smaller than the photographs."""
+    batch = make_batch(2, 3, *size, zoom=0.3)
+    batch.masks[0, 1] = False
+    batch.masks[1, 2, :5, -9:] = True
+    with torch.no_grad():
+        exact, none = (make_model(f"skip={skip}", *overrides)(batch).gaussians for skip in ("exact", "none"))
+    close(exact, none)
+
+
+@pytest.mark.parametrize("size", [(56, 56), (42, 70)])
+def test_tokens_of_windows_give_gaussians_of_the_same_pixels(size):
+    """The encoder sees less background, the geometry is that of the whole photographs."""
+    batch = make_batch(2, 3, *size, zoom=0.5)
+    whole, part = (make_model(f"skip={name}")(batch) for name in ("exact", "balanced"))
+    assert len(part.points.tokens) < len(whole.points.tokens)
+    assert part.depth.shape == whole.depth.shape
+    assert torch.equal(part.depth_valid, batch.masks)
+    for name in ("image", "pixel", "colors"):
+        assert torch.equal(getattr(part.gaussians, name), getattr(whole.gaussians, name)), name
+    assert part.gaussians.splits == whole.gaussians.splits
+    for name in ("near", "far"):
+        near = (getattr(prediction.depth_maps.bounds, name)[batch.masks] for prediction in (part, whole))
+        assert torch.equal(*near)
+    # Points lie on the rays of their pixels in the whole photograph.
+    camera = world_to_camera(part.points.pixels, batch.cameras.extrinsics[:, :, None, None])
+    uv, _ = project(
+        part.points.pixels,
+        batch.cameras.intrinsics[:, :, None, None],
+        batch.cameras.extrinsics[:, :, None, None],
+    )
+    centers = pixel_centers(*size, camera).expand_as(uv)
+    assert torch.allclose(uv[batch.masks], centers[batch.masks], atol=1e-3)
+    assert torch.allclose(camera[..., 2][batch.masks], part.depth[batch.masks], atol=1e-4)
