@@ -23,8 +23,8 @@ def there():
     """Without a gradient, on the pretend device, on one thread."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    with torch.no_grad(), pretend_device(), drawing_nothing():
-        yield
+    with torch.no_grad(), pretend_device() as log, drawing_nothing():
+        yield log
     torch.set_num_threads(threads)
 
 
@@ -124,3 +124,24 @@ def test_weights_that_move_are_recorded_again():
     around = nn.ModuleDict({"model": model})
     around.load_state_dict(around.state_dict(), assign=True)
     assert not model.playback.recorder._recordings
+
+
+class Silent(OperatorTape):
+    """Plays back nothing, as far as the host is concerned."""
+
+    def record(self, call):
+        return call(), lambda: None
+
+
+def test_what_is_played_back_is_not_asked_for(there):
+    """The encoder, the plan and what surrounds the stages remain, and as many waits as before."""
+    model, batch, asked = recording("model=recurrent"), scene(), []
+    model.playback.recorder.tape = Silent()
+    for _ in range(3):
+        there.clear()
+        model(batch)
+        asked.append((there.launches, there.waits.total()))
+    (eager, waits), _, (played, as_many) = asked
+    print(eager, played, waits, as_many)
+    assert 3 * played < eager
+    assert as_many <= waits
