@@ -56,12 +56,16 @@ class Compiler:
         names = [name for name in kernel.arg_names if name not in flags]
         signature = {name: _type(value) for name, value in zip(names, arguments, strict=True)}
         signature |= dict.fromkeys(flags, "constexpr")
-        unused = {name: value for name, value in zip(names, arguments, strict=True) if value is None}
+        known = {
+            name: value
+            for name, value in zip(names, arguments, strict=True)
+            if signature[name] == "constexpr"
+        }
         for capability in self.capabilities:
             key = (kernel.__name__, capability, *signature.values(), *flags.values())
             if key not in self.done:
                 self.done.add(key)
-                source = ASTSource(fn=kernel, signature=signature, constexprs={**flags, **unused})
+                source = ASTSource(fn=kernel, signature=signature, constexprs={**flags, **known})
                 compiled = triton.compile(source, target=GPUTarget("cuda", capability, 32))
                 said = [name.lower() for name, value in flags.items() if value is True]
                 title = " ".join((kernel.__name__.removesuffix("_rows"), *said))
@@ -69,10 +73,12 @@ class Compiler:
 
 
 def _type(value: Any) -> str:
-    """Triton's name of the type of an argument."""
+    """Triton's name of the type of an argument; None and 1 are compiled in."""
     if isinstance(value, torch.Tensor):
         return TYPES[value.dtype]
-    return {float: "fp32", int: "i32", type(None): "constexpr"}[type(value)]
+    if value is None or (type(value) is int and value == 1):
+        return "constexpr"
+    return {float: "fp32", int: "i32"}[type(value)]
 
 
 def _needs(compiled: Any) -> str:

@@ -1,16 +1,22 @@
 """Operators of the package: kernels of a GPU, which compile without one."""
 
+import dataclasses
 import os
 import subprocess
 import sys
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import torch
+from torch import Tensor
 
 import ghgs_lit.model  # noqa: F401  (it has all operators)
 from ghgs_lit.kernels import gpu
-from tests.helpers.kernels import kernels
+from ghgs_lit.types import Gaussians
+from tests.helpers.kernels import DEVICE, kernels
+from tests.helpers.models import ATTRIBUTES, close, make_model
+from tests.helpers.scenes import make_batch
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "gpu_compile.py"
 
@@ -46,3 +52,27 @@ def test_a_switch_of_tests_and_nothing_else_chooses_kernels():
         assert gpu.is_supported(values, None)
         assert not gpu.is_supported(values, values.double())
         assert not gpu.is_supported(values, values.to("meta"))
+
+
+def test_a_prediction_and_its_gradients_with_kernels_are_plain_pytorchs():
+    """All kernels together, in a model with rounds, on two subjects."""
+    model = make_model("model=recurrent").to(DEVICE)
+    batch = make_batch(2, 3, 28, 28)
+
+    def predicted() -> tuple[Gaussians, Tensor]:
+        torch.manual_seed(0)
+        model.zero_grad()
+        fresh = dataclasses.replace(batch).to(DEVICE)
+        with torch.no_grad():
+            found = model.eval()(fresh).gaussians
+        learned = model.train()(fresh).gaussians
+        sum(getattr(learned, name).square().sum() for name in ATTRIBUTES).backward()
+        return found, torch.cat([p.grad.flatten() for p in model.parameters() if p.grad is not None])
+
+    with mock.patch.object(gpu, "DEVICES", set()):
+        expected, slopes = predicted()
+    with kernels() as called:
+        found, found_slopes = predicted()
+    assert set(called) == set(gpu.KERNELS)
+    close(found, expected, 1e-4)
+    assert (found_slopes - slopes).norm() < 1e-3 * slopes.norm()
