@@ -19,8 +19,9 @@ _MOST = 8
 def automatic_workers(batches: float, processes: int, on_gpu: bool, cores: int | None = None) -> int:
     """The number of loading processes of ``data.workers=auto``.
 
-    None for a few batches. Beside a GPU as many as there are cores for each process, less its own, at most 8.
-    On a CPU the model needs the cores itself: one that reads ahead where there is a core to spare.
+    None for a few batches, and none on a CPU: the model needs the cores itself, and a batch takes longer to
+    come from another process than to be read from packed files. Beside a GPU as many as there are cores for
+    each process, less its own, at least 1 and at most 8.
 
     Args:
         batches: number of batches that are loaded; infinite where it is not known.
@@ -33,10 +34,10 @@ def automatic_workers(batches: float, processes: int, on_gpu: bool, cores: int |
     """
     use_known_start_method()
     few = _FEW_FORKED if multiprocessing.get_start_method() == "fork" else _FEW_STARTED
-    if batches < few:
+    if not on_gpu or batches < few:
         return 0
     spare = (cores or allowed_cores()) // processes - 1
-    return min(max(spare, 1), _MOST) if on_gpu else min(max(spare, 0), 1)
+    return min(max(spare, 1), _MOST)
 
 
 def loader_of(batches: Dataset, workers: int, **options: Any) -> DataLoader:
