@@ -243,7 +243,7 @@ def test_the_host_waits_once(overrides):
 def test_the_hull_of_larger_photographs_is_found_without_asking_for_the_number_of_rays(monkeypatch):
     """As on a CPU, though more rays are marched than there are: the first is repeated."""
     monkeypatch.setattr(box, "RESOLUTION", 28)
-    monkeypatch.setattr(hull, "_DEPTHS", 20_000)
+    monkeypatch.setattr(hull, "_DEPTHS", (20_000, 20_000))
     stage, batch = make_model("model=hull").bounds, make_batch(2, 3, 56, 42)
     expected = stage(batch)
     with pretend_device() as log:

@@ -32,14 +32,14 @@ class Asked(NamedTuple):
 _VERSION = "2.13."
 
 LIMITS = {
-    ("model=paper", 1): Asked(1491, 1, 2984, 2),
-    ("model=paper", 8): Asked(1513, 1, 3079, 2),
-    ("model=hull", 1): Asked(1613, 1, 3142, 2),
-    ("model=hull", 8): Asked(1635, 1, 3239, 2),
-    ("model=recurrent", 1): Asked(2244, 2, 4043, 3),
-    ("model=recurrent", 8): Asked(2313, 2, 4187, 3),
-    ("shipped", 1): Asked(2395, 2, 4043, 3),
-    ("shipped", 8): Asked(2475, 2, 4187, 3),
+    ("model=paper", 1): Asked(1213, 1, 2661, 2),
+    ("model=paper", 8): Asked(1235, 1, 2756, 2),
+    ("model=hull", 1): Asked(1325, 1, 2809, 2),
+    ("model=hull", 8): Asked(1347, 1, 2906, 2),
+    ("model=recurrent", 1): Asked(1901, 2, 3621, 3),
+    ("model=recurrent", 8): Asked(1973, 2, 3768, 3),
+    ("shipped", 1): Asked(2047, 2, 3621, 3),
+    ("shipped", 8): Asked(2130, 2, 3768, 3),
 }
 
 

@@ -15,7 +15,8 @@ from ghgs_lit.bounds.silhouettes import (
     ray_directions,
     votes_outside,
 )
-from ghgs_lit.geometry.projection import world_to_camera
+from ghgs_lit.geometry.constants import constant, middles
+from ghgs_lit.geometry.frame import in_cameras
 
 #: Cells along the longer side of the masks, and depths along each ray: enough to find gross errors.
 RESOLUTION, _SAMPLES = 32, 24
@@ -43,7 +44,7 @@ def trusted_views(
     hit = (counts <= tolerance).any(-1) & masks[:, :, None]
     explained = hit.flatten(3).sum(-1) / masks.flatten(2).sum(-1).clamp(min=1)[..., None]
     # A view that has no vote need not be explained.
-    silent = torch.eye(masks.shape[1] + 1, dtype=torch.bool, device=masks.device)[1:] | ~voting[..., None]
+    silent = constant(torch.eye, masks.shape[1] + 1, like=masks)[1:] | ~voting[..., None]
     agreement = torch.where(silent, 1.0, explained).amin(1)
     best, suspect = agreement[:, 1:].max(1, keepdim=True)
     by_all = agreement[:, :1]
@@ -58,8 +59,8 @@ def _votes(coarse: Silhouettes, voting: Tensor, center: Tensor, reach: Tensor) -
     # At least one cell: the rays of a cell's pixels run beside the ray of its centre.
     outside = votes_outside(dilate(masks, max(coarse.dilation, 1)), voting)
     matrices = projection_matrices(cameras)
-    middle = world_to_camera(center[:, None].expand(b, v, 3), cameras.extrinsics)[..., 2]
-    steps = (torch.arange(_SAMPLES, device=center.device, dtype=center.dtype) + 0.5) / _SAMPLES * 2 - 1
+    middle = in_cameras(center, cameras.extrinsics)[..., 2]
+    steps = 2 * constant(middles, _SAMPLES, like=center) - 1
     depth = (middle[..., None] + reach[:, None, None] * steps).clamp(min=NEAREST)
     turn = matrices[..., :3]
     along = torch.einsum("boij,bvhwj->ibvohw", turn, ray_directions(cameras))
@@ -67,5 +68,5 @@ def _votes(coarse: Silhouettes, voting: Tensor, center: Tensor, reach: Tensor) -
         torch.einsum("boij,bvj->ibvo", turn, cameras.centers) + matrices[..., 3].movedim(2, 0)[:, :, None]
     )
     pixels = origin[..., None, None, None] + along[..., None] * depth[:, :, None, None, None]
-    image = torch.arange(b * v, device=center.device).view(b, 1, v, 1, 1, 1)
-    return look_up(outside.flatten(0, 1), image, *pixels)
+    image = constant(torch.arange, b * v, like=center, dtype=torch.long).view(b, 1, v, 1, 1, 1)
+    return look_up(outside.flatten(0, 1), image, pixels)

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, UInt8
 from pydantic import Field
 from torch import Tensor
 
-from ghgs_lit.bounds import agreement, cpu
+from ghgs_lit.bounds import agreement
 from ghgs_lit.bounds.silhouettes import (
     NEAREST,
     Silhouettes,
@@ -21,11 +21,11 @@ from ghgs_lit.bounds.silhouettes import (
     votes_outside,
 )
 from ghgs_lit.config.options import Index, Options
-from ghgs_lit.geometry.frame import subject_center
+from ghgs_lit.geometry.constants import constant
+from ghgs_lit.geometry.frame import in_cameras, subject_center
 from ghgs_lit.geometry.masks import first_and_last
 from ghgs_lit.geometry.projection import focal_lengths, project
 from ghgs_lit.kernels import gpu
-from ghgs_lit.kernels.pool import is_supported
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 
@@ -95,35 +95,32 @@ def subject_box(
     many views may say "outside" of a point that is kept."""
     center = subject_center(masks, cameras)
     reach = _reach(masks, cameras, center).nan_to_num().amax(1, keepdim=True).clamp(min=0.05)
-    lower, upper = center - reach, center + reach
+    corners = torch.stack((center - reach, center + reach))
     focal, voting = focal_lengths(cameras).amax(-1), masks.flatten(2).any(-1)
     for _ in range(2):
+        lower, upper = corners
         cell = (upper - lower) / CELLS
-        depth = _project_one((lower + upper) / 2, cameras)[1]
+        depth = in_cameras((lower + upper) / 2, cameras.extrinsics)[..., 2]
         # Half a cell's diagonal in pixels, for points as near as 0.6 times the depth of the box's middle.
         pixels = focal * cell.norm(dim=-1, keepdim=True) / 2 / (0.6 * depth).clamp(min=NEAREST)
         grow = pixels.nan_to_num(nan=0.0).amax(1).clamp(max=max(masks.shape[-2:])).ceil().int()
         grown = dilate(masks, radius, grow)
         kept = _carve(votes_outside(grown, voting), cameras, lower, cell, tolerance)
-        is_left = kept.flatten(1).any(-1)[:, None]
         # For each axis, the slices with a kept cell.
         slices = torch.stack([kept.any(axes) for axes in ((2, 3), (1, 3), (1, 2))], 1)
         first, last = first_and_last(slices)
-        corner = lower
-        lower = torch.where(is_left, corner + first * cell, lower)
-        upper = torch.where(is_left, corner + (last + 1) * cell, upper)
-    return lower, upper
+        ends = torch.stack((first, last + 1))
+        corners = torch.where(slices[:, 0].any(-1)[:, None], lower + ends * cell, corners)
+    return corners[0], corners[1]
 
 
 def _carve(
     outside: Tensor, cameras: Cameras, lower: Tensor, cell: Tensor, tolerance: int
 ) -> Bool[Tensor, "B n n n"]:
-    steps = torch.arange(CELLS, device=lower.device, dtype=lower.dtype) + 0.5
+    steps = constant(torch.arange, CELLS, like=lower) + 0.5
     position = lower[..., None] + cell[..., None] * steps
     matrices = projection_matrices(cameras)
-    if gpu.is_supported(matrices, position):
-        return _carving(outside, matrices, position, tolerance)
-    carve = cpu.carve if is_supported(matrices, position) else _carved
+    carve = _carving if gpu.is_supported(matrices, position) else _carved
     return carve(outside, matrices, position, tolerance)
 
 
@@ -133,13 +130,20 @@ def _carved(
     position: Float[Tensor, "B 3 n"],
     tolerance: int,
 ) -> Bool[Tensor, "B n n n"]:
-    """:func:`ghgs_lit.bounds.cpu.carve` in PyTorch."""
-    x, y, z = (matrices[..., axis, None] * position[:, None, None, axis] for axis in range(3))
-    z = z + matrices[..., 3, None]
-    pixel = (x[..., :, None] + y[..., None, :])[..., None] + z[..., None, None, :]
-    image = torch.arange(outside[..., 0, 0].numel(), device=position.device)
-    votes = look_up(outside.flatten(0, 1), image.view(*outside.shape[:2], 1, 1, 1), *pixel.unbind(2))
-    return votes.sum(1) <= tolerance
+    """Cells of a grid that at most ``tolerance`` views place outside; see :func:`subject_box`.
+
+    Args:
+        outside: 1 where a view says "outside".
+        matrices: of projection.
+        position: centres of the cells along each axis.
+        tolerance: votes that a cell may have."""
+    columns = matrices.movedim(2, 0)[..., None]
+    x, y, z = (columns[..., :3, :] * position[:, None]).unbind(3)
+    z = z + columns[..., 3, :]
+    pixels = (x[..., :, None] + y[..., None, :])[..., None] + z[..., None, None, :]
+    count = outside.shape[0] * outside.shape[1]
+    image = constant(torch.arange, count, like=outside, dtype=torch.long).view(*outside.shape[:2], 1, 1, 1)
+    return look_up(outside.flatten(0, 1), image, pixels).sum(1) <= tolerance
 
 
 _carving = gpu.operator(
@@ -149,15 +153,9 @@ _carving = gpu.operator(
 )
 
 
-def _project_one(points: Float[Tensor, "B 3"], cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Pixel [B, V, 2] and depth [B, V] of one point of each element in all its cameras."""
-    points = points[:, None].expand(*cameras.shape, 3)
-    return project(points, cameras.intrinsics, cameras.extrinsics)
-
-
 def _reach(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Float[Tensor, "B 3"]) -> Tensor:
     """A generous radius [B, V] of the subject about ``center`` from each view; NaN for an empty mask."""
-    pixel, depth = _project_one(center, cameras)
+    pixel, depth = project(center[:, None].expand(*cameras.shape, 3), cameras.intrinsics, cameras.extrinsics)
     extents = [
         torch.where(masks.any(-2 + dim), (line - pixel[..., dim, None]).abs() + 0.5, 0).amax(-1)
         for dim, line in enumerate(pixel_axes(cameras))

@@ -7,7 +7,6 @@ from jaxtyping import Bool, Float, Int, UInt8
 from pydantic import Field
 from torch import Tensor
 
-from ghgs_lit.bounds import cpu
 from ghgs_lit.bounds.box import SubjectBox
 from ghgs_lit.bounds.silhouettes import (
     Silhouettes,
@@ -18,13 +17,14 @@ from ghgs_lit.bounds.silhouettes import (
     ray_directions,
     votes_outside,
 )
+from ghgs_lit.geometry.constants import constant, middles, other_images
 from ghgs_lit.kernels import gpu
-from ghgs_lit.kernels.pool import even_parts, is_supported
+from ghgs_lit.kernels.pool import at_once, even_parts
 from ghgs_lit.plan.rows import size_class
 from ghgs_lit.types import Batch, Cameras, DepthBounds, true_places
 
-#: Depths in memory at once.
-_DEPTHS = 1 << 23
+#: Depths in memory at once, on a CPU and elsewhere.
+_DEPTHS = 1 << 18, 1 << 23
 
 
 class VisualHull(SubjectBox):
@@ -78,14 +78,12 @@ def hull_bounds(
         tables = (outside, masks, matrices, directions, cameras.centers)
         return DepthBounds(*_marching(*tables, start.near, start.far, samples, tolerance))
     near, far = (bound.clone(memory_format=torch.contiguous_format) for bound in (start.near, start.far))
-    steps = (torch.arange(samples, device=near.device, dtype=near.dtype) + 0.5) / samples
-    if is_supported(near, directions, matrices):
-        cpu.march(outside, masks, matrices, directions, cameras.centers, near, far, steps, tolerance)
-        return DepthBounds(near, far)
+    steps = constant(middles, samples, like=near)
     if rays is None:
         known = count is not None
         rays = true_places(masks, count, repeats=True) if known else masks.flatten().nonzero()[:, 0]
-    for part in even_parts(len(rays), _DEPTHS // (samples * (masks.shape[1] - 1))):
+    most = at_once(near.device, *_DEPTHS) // (samples * (masks.shape[1] - 1))
+    for part in even_parts(len(rays), most):
         _march(rays[part], outside, matrices, directions, cameras.centers, start, near, far, steps, tolerance)
     return DepthBounds(near, far)
 
@@ -102,21 +100,32 @@ def _march(
     steps: Float[Tensor, " s"],
     tolerance: int,
 ) -> None:
-    """:func:`ghgs_lit.bounds.cpu.march` in PyTorch, for the pixels ``rays`` of all images. ``start`` is read,
-    since a ray may be listed more than once."""
+    """Replace ``near`` and ``far`` of the pixels ``rays`` of all images by the first and the last depth that
+    the other views allow; unchanged where there is none.
+
+    Args:
+        rays: indices of pixels; one may be listed more than once, so that ``start`` is read.
+        outside: 1 where a view says "outside".
+        matrices: of projection.
+        directions: of the rays.
+        centers: of the cameras.
+        start: the depths between which others are tried.
+        near: contiguous, as is ``far``.
+        far: written, like ``near``.
+        steps: fractions of the way from near to far that are tried.
+        tolerance: votes that an allowed depth may have."""
     views, samples = outside.shape[1], len(steps)
     image = rays // outside[0, 0].numel()
     begin, end = (bound.reshape(-1)[rays] for bound in (start.near, start.far))
     length = end - begin
     depth = begin[:, None] + steps * length[:, None]
     direction, center = directions.reshape(-1, 1, 3)[rays], centers.reshape(-1, 1, 3)[image]
-    turn = torch.arange(1, views, device=depth.device)
-    other = (image // views * views)[:, None] + (image[:, None] + turn) % views
-    matrix = matrices.flatten(0, 1)[other]
-    along = (matrix[..., :3] * direction[:, None]).sum(-1)
-    origin = (matrix[..., :3] * center[:, None]).sum(-1) + matrix[..., 3]
-    pixel = torch.addcmul(origin[..., None], depth[:, None, None], along[..., None])
-    votes = look_up(outside.flatten(0, 1), other[..., None], *pixel.unbind(2))
+    other = constant(other_images, len(outside), views, like=image)[image]
+    matrix = matrices.flatten(0, 1).movedim(1, 0)[:, other]
+    along = (matrix[..., :3] * direction).sum(-1)
+    origin = (matrix[..., :3] * center).sum(-1) + matrix[..., 3]
+    pixels = torch.addcmul(origin[..., None], depth[:, None], along[..., None])
+    votes = look_up(outside.flatten(0, 1), other[..., None], pixels)
     inside = (votes.sum(1) <= tolerance).to(torch.uint8)
     hit = inside.amax(1).bool()
     half = length / (2 * samples)

@@ -2,6 +2,7 @@
 of z-depth: ``point(z) = center + z * direction``."""
 
 from dataclasses import dataclass
+from itertools import product
 from math import ceil
 
 import torch
@@ -9,7 +10,14 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 
-from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, pixel_centers, world_to_camera
+from ghgs_lit.geometry.constants import constant
+from ghgs_lit.geometry.projection import (
+    at_least_float32,
+    homogeneous_centers,
+    inverse_intrinsics,
+    pixel_centers,
+    world_to_camera,
+)
 from ghgs_lit.kernels import gpu
 from ghgs_lit.types import Cameras, DepthBounds
 
@@ -17,8 +25,7 @@ from ghgs_lit.types import Cameras, DepthBounds
 def ray_directions(cameras: Cameras) -> Float[Tensor, "*batch h w 3"]:
     """Direction of each pixel's ray: displacement in the world per metre of z-depth."""
     intrinsics, extrinsics = at_least_float32(cameras.intrinsics), at_least_float32(cameras.extrinsics)
-    centers = pixel_centers(cameras.height, cameras.width, intrinsics)
-    centers = torch.cat((centers, torch.ones_like(centers[..., :1])), dim=-1)
+    centers = homogeneous_centers(cameras.height, cameras.width, intrinsics)
     to_world = extrinsics[..., :3, :3].mT @ inverse_intrinsics(intrinsics)
     return torch.einsum("...ij,hwj->...hwi", to_world, centers)
 
@@ -44,8 +51,8 @@ def depths_in_box(cameras: Cameras, lower: Float[Tensor, "B 3"], upper: Float[Te
     faces = [(face[:, None, None, None] - centers) / directions for face in (lower, upper)]
     near = torch.minimum(*faces).amax(-1)
     far = torch.maximum(*faces).amin(-1)
-    corners = torch.stack(torch.meshgrid(*[torch.arange(2, device=lower.device)] * 3, indexing="ij"), -1)
-    corners = torch.where(corners.reshape(1, 8, 3) == 0, lower[:, None], upper[:, None])
+    is_upper = constant(torch.tensor, _CORNERS, like=lower, dtype=torch.bool)
+    corners = torch.where(is_upper, upper[:, None], lower[:, None])
     corners = corners[:, None].expand(-1, cameras.shape[1], -1, -1)
     depth = world_to_camera(corners, cameras.extrinsics[:, :, None])[..., 2]
     misses = near >= far
@@ -54,6 +61,9 @@ def depths_in_box(cameras: Cameras, lower: Float[Tensor, "B 3"], upper: Float[Te
         torch.where(misses, depth.amax(-1)[..., None, None], far),
     )
 
+
+#: Which faces meet in each corner of a box.
+_CORNERS = tuple(product((False, True), repeat=3))
 
 #: The smallest depth in metres at which masks are looked up; points behind the camera are moved there.
 NEAREST = 1e-4
@@ -97,7 +107,7 @@ def _grown(masks: Tensor, radius: int, more: Tensor | None, axis: int) -> Tensor
     if more is not None:
         radius = radius + more.view(-1, *[1] * (masks.dim() - 1))
     size = masks.shape[axis]
-    index = torch.arange(size, device=masks.device)
+    index = constant(torch.arange, size, like=masks, dtype=torch.long)
     index = index[:, None] if axis == -2 else index
     counts = F.pad(masks.cumsum(axis, dtype=torch.int32), (0, 0, 1, 0) if axis == -2 else (1, 0))
     high, low = (index + radius + 1).clamp(max=size), (index - radius).clamp(min=0)
@@ -112,19 +122,21 @@ _grow = gpu.operator(
 
 def votes_outside(dilated: Bool[Tensor, "B V h w"], voting: Bool[Tensor, "B V"]) -> UInt8[Tensor, "B V h w"]:
     """1 where a voting view says "outside the subject"."""
-    return (~dilated & voting[..., None, None]).to(torch.uint8)
+    return (dilated < voting[..., None, None]).view(torch.uint8)
 
 
 def look_up(
-    tables: Shaped[Tensor, "n h w"], image: Int[Tensor, "..."], x: Tensor, y: Tensor, w: Tensor
+    tables: Shaped[Tensor, "n h w"], image: Int[Tensor, "..."], pixels: Float[Tensor, "3 ..."]
 ) -> Tensor:
-    """Entries of ``tables`` at homogeneous pixels (``x``, ``y``, ``w``), which are overwritten. Points
-    outside the frame take the entry of the nearest border pixel: a mask that does not touch the border has
-    the whole subject in its frame. Points behind the camera land far outside the frame. ``image``: which
-    table; broadcasts with the pixels."""
+    """Entries of ``tables`` at homogeneous pixels, which are overwritten. Points outside the frame take the
+    entry of the nearest border pixel: a mask that does not touch the border has the whole subject in its
+    frame. Points behind the camera land far outside the frame. ``image``: which table; broadcasts with the
+    pixels. ``pixels``: the three coordinates of each."""
     height, width = tables.shape[1:]
-    inverse = w.clamp_(min=NEAREST).reciprocal_()
+    inverse = pixels[2].clamp_(min=NEAREST).reciprocal_()
     # Cameras of absurd sizes overflow to NaN, which has no index.
-    column = x.mul_(inverse).nan_to_num_().clamp_(0, width - 1).int()
-    row = y.mul_(inverse).nan_to_num_().clamp_(0, height - 1).int()
-    return tables.flatten().take(row.mul_(width).add_(column) + image * (height * width))
+    places = pixels[:2].mul_(inverse).nan_to_num_().clamp_(min=0)
+    last = constant(torch.tensor, (width - 1, height - 1), like=pixels)
+    column, row = torch.minimum(places, last.view(2, *[1] * (pixels.dim() - 1))).int()
+    place = torch.add(column, row, alpha=width)
+    return tables.flatten().take(torch.add(place, image, alpha=height * width))

@@ -9,11 +9,18 @@ import dataclasses
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ghgs_lit.geometry.constants import constant
 from ghgs_lit.geometry.masks import first_and_last
-from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, world_to_camera
+from ghgs_lit.geometry.projection import (
+    at_least_float32,
+    homogeneous_centers,
+    inverse_intrinsics,
+    world_to_camera,
+)
 from ghgs_lit.geometry.rotations import matrix_to_quaternion, multiply_quaternions, unit
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds, DepthMaps, Gaussians, Prediction
@@ -56,7 +63,7 @@ class Frame:
         moved = extrinsics.clone()
         with exact(batch.masks.device.type):
             moved[..., :3, :3] = extrinsics[..., :3, :3] @ self.axes[:, None].mT
-            moved[..., :3, 3] = _in_cameras(self.origin, extrinsics) / self.metre[:, None, None]
+            moved[..., :3, 3] = in_cameras(self.origin, extrinsics) / self.metre[:, None, None]
         inside = Cameras(cameras.intrinsics.to(dtype), moved.to(dtype), cameras.height, cameras.width)
         return dataclasses.replace(batch, cameras=inside)
 
@@ -76,81 +83,88 @@ class Frame:
         need more digits than in the frame."""
         dtype = torch.promote_types(dtype, torch.float32)
         views, points = prediction.depth.shape[1], prediction.points
-        everyone = torch.arange(len(self.metre), device=points.pixels.device)[:, None, None, None]
+        everyone = constant(torch.arange, len(self.metre), like=points.pixels, dtype=torch.long)
         known: dict[Tensor, Tensor] = {}
-        maps = self._maps(prediction.depth_maps, known)
+        metre = self.metre.to(prediction.depth)[:, None, None, None]
+        maps = _in_unit(prediction.depth_maps, metre, known)
+        world = torch.cat((self.metre[:, None, None] * self.axes, self.origin[:, None]), 1).to(dtype)
         return dataclasses.replace(
             prediction,
-            gaussians=self._gaussians(prediction.gaussians, views, dtype),
+            gaussians=self._gaussians(prediction.gaussians, views, world),
             depth=maps.depth,
             points=dataclasses.replace(
                 points,
-                pixels=self._to_world(points.pixels, everyone, dtype),
-                tokens=self._to_world(points.tokens, points.token_image // views, dtype),
+                pixels=_to_world(points.pixels, everyone[:, None, None, None], world),
+                tokens=_to_world(points.tokens, points.token_image // views, world),
             ),
             depth_maps=maps,
-            rounds=tuple(self._maps(found, known) for found in prediction.rounds),
-            drafts=tuple(self._gaussians(draft, views, dtype) for draft in prediction.drafts),
+            rounds=tuple(_in_unit(found, metre, known) for found in prediction.rounds),
+            drafts=tuple(self._gaussians(draft, views, world) for draft in prediction.drafts),
         )
 
-    def _maps(self, maps: DepthMaps, known: dict[Tensor, Tensor]) -> DepthMaps:
-        """Maps in the world; ``known`` caches results, since rounds share their bounds."""
-
-        def scaled(depth: Tensor) -> Tensor:
-            if depth not in known:
-                known[depth] = depth * self.metre.to(depth)[:, None, None, None]
-            return known[depth]
-
-        bounds = maps.bounds and DepthBounds(scaled(maps.bounds.near), scaled(maps.bounds.far))
-        return dataclasses.replace(maps, depth=scaled(maps.depth), bounds=bounds)
-
-    def _gaussians(self, gaussians: Gaussians, views: int, dtype: torch.dtype) -> Gaussians:
+    def _gaussians(self, gaussians: Gaussians, views: int, world: Tensor) -> Gaussians:
         element, lengths = gaussians.image // views, self.metre.to(gaussians.scales)
         turn = matrix_to_quaternion(self.axes.mT).to(gaussians.quaternions)
         return dataclasses.replace(
             gaussians,
-            means=self._to_world(gaussians.means, element, dtype),
+            means=_to_world(gaussians.means, element, world),
             quaternions=multiply_quaternions(turn[element], gaussians.quaternions),
             scales=gaussians.scales * lengths[element, None],
             metre=lengths if gaussians.metre is None else lengths * gaussians.metre,
         )
 
-    def _to_world(
-        self, points: Float[Tensor, "*n 3"], element: Tensor, dtype: torch.dtype
-    ) -> Float[Tensor, "*n 3"]:
-        """Points in the world, computed in ``dtype``; the error is that of rounding the result."""
-        axes = (self.metre[:, None, None] * self.axes).to(dtype)[element].unbind(-2)
-        found = self.origin.to(dtype)[element]
-        for coordinate, axis in zip(points.to(dtype)[..., None].unbind(-2), axes, strict=True):
-            found = torch.addcmul(found, coordinate, axis)
-        return found
+
+def _in_unit(maps: DepthMaps, metre: Float[Tensor, "B 1 1 1"], known: dict[Tensor, Tensor]) -> DepthMaps:
+    """Maps in the world's unit; ``known`` caches results, since rounds share their bounds."""
+
+    def scaled(depth: Tensor) -> Tensor:
+        if depth not in known:
+            known[depth] = depth * metre
+        return known[depth]
+
+    bounds = maps.bounds and DepthBounds(scaled(maps.bounds.near), scaled(maps.bounds.far))
+    return dataclasses.replace(maps, depth=scaled(maps.depth), bounds=bounds)
+
+
+def _to_world(
+    points: Float[Tensor, "*n 3"], element: Int[Tensor, "*#n"], world: Float[Tensor, "B 4 3"]
+) -> Float[Tensor, "*n 3"]:
+    """Points in the world, computed in its precision; the error is that of rounding the result. ``world``:
+    axes of each element, as long as a metre, and its origin."""
+    *axes, found = world[element].unbind(-2)
+    for coordinate, axis in zip(points.to(world.dtype)[..., None].unbind(-2), axes, strict=True):
+        found = torch.addcmul(found, coordinate, axis)
+    return found
 
 
 def subject_center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Tensor, "B 3"]:
     """The point nearest to the rays through the masks' centroids, by least squares. Optical axes have a small
-    weight, so that one mask or none is enough, and the cameras a smaller one, for parallel rays."""
+    weight, so that one mask or none is enough, and the cameras a smaller one, for parallel rays. To be called
+    where products are exact (:func:`ghgs_lit.kernels.precision.exact`)."""
     intrinsics, extrinsics = at_least_float32(cameras.intrinsics), at_least_float32(cameras.extrinsics)
-    v, u = (torch.arange(side, device=masks.device, dtype=intrinsics.dtype) + 0.5 for side in masks.shape[2:])
-    counts = masks.sum((-2, -1))
-    sums = torch.stack(((masks.sum(-2) * u).sum(-1), (masks.sum(-1) * v).sum(-1)), -1)
+    # Sums of u and v, and the number of pixels: half-integers, whose sums are exact in any order.
+    centers = homogeneous_centers(*masks.shape[2:], intrinsics).flatten(0, 1)
+    sums, counts = (masks.flatten(-2).to(centers.dtype) @ centers).split((2, 1), -1)
     axis = intrinsics[..., :2, 2]
-    centroid = torch.where(counts[..., None] > 0, sums / counts.clamp(min=1)[..., None], axis)
-    rays = torch.stack((centroid, axis), dim=-2)
-    rays = torch.cat((rays, torch.ones_like(rays[..., :1])), -1)
+    is_seen = counts > 0
+    centroid = torch.where(is_seen, sums / counts.clamp(min=1), axis)
+    rays = F.pad(torch.stack((centroid, axis), dim=-2), (0, 1), value=1.0)
     to_world = extrinsics[..., :3, :3].mT @ inverse_intrinsics(intrinsics)
     directions = unit(torch.einsum("bvij,bvrj->bvri", to_world, rays))
-    weights = torch.stack((counts > 0, torch.full_like(counts, 1e-3, dtype=rays.dtype)), -1)
-    identity = torch.eye(3, device=rays.device, dtype=rays.dtype)
+    weights = F.pad(is_seen.to(rays.dtype), (0, 1), value=1e-3)
+    identity = constant(torch.eye, 3, like=rays)
     across = identity - directions[..., :, None] * directions[..., None, :]
     across = (weights[..., None, None] * across).sum(2)
-    origin = cameras.centers.mean(1)
-    offsets = (cameras.centers - origin[:, None])[..., None]
-    matrix = across.sum(1) + 1e-4 * identity
+    centers = cameras.centers
+    origin = centers.mean(1)
+    offsets = (centers - origin[:, None])[..., None]
+    matrix = torch.add(across.sum(1), identity, alpha=1e-4)
     # Never singular; linalg.solve would check that and wait for a GPU.
     return torch.linalg.solve_ex(matrix, (across @ offsets).sum(1)).result[..., 0] + origin
 
 
-def _in_cameras(points: Float[Tensor, "B 3"], extrinsics: Float[Tensor, "B V 4 4"]) -> Float[Tensor, "B V 3"]:
+def in_cameras(points: Float[Tensor, "B 3"], extrinsics: Float[Tensor, "B V 4 4"]) -> Float[Tensor, "B V 3"]:
+    """One point of each element in the axes of all its cameras."""
     return world_to_camera(points[:, None].expand(*extrinsics.shape[:2], 3), extrinsics)
 
 
@@ -158,7 +172,7 @@ def _size(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Tensor) -> F
     """Height or width of the subject, whichever is larger, in the world's unit. The median of the views, so
     that one wrong mask does not matter; of two the larger, since masks are more often too small.
     :data:`HEIGHT` if no view shows the subject in front of it."""
-    depth = _in_cameras(center, cameras.extrinsics)[..., 2]
+    depth = in_cameras(center, cameras.extrinsics)[..., 2]
     sides = []
     for axis in (0, 1):
         first, last = first_and_last(masks.any(axis - 2))
@@ -176,14 +190,12 @@ def _axes(cameras: Cameras) -> Float[Tensor, "B 3 3"]:
     # Without a common up direction: that of the first camera.
     up = unit(torch.where(mean.norm(dim=-1, keepdim=True) > 0.1, mean, -down[:, 0]))
 
-    def level(direction: Tensor) -> Tensor:
-        return direction - (direction * up).sum(-1, keepdim=True) * up
-
-    # If the first camera looks straight up or down, its own up axis is horizontal.
-    back, other = level(-forward), level(-down[:, 0])
+    # Made level. If the first camera looks straight up or down, its own up axis is horizontal.
+    both = -torch.stack((forward, down[:, 0]))
+    back, other = both - (both * up).sum(-1, keepdim=True) * up
     back = unit(torch.where(back.norm(dim=-1, keepdim=True) > 0.1, back, other))
     right = unit(torch.linalg.cross(up, back))
     axes = torch.stack((right, up, back), dim=1)
     # Extrinsics of rank 1 or less define no axes.
     known = (right.norm(dim=-1) > 0)[:, None, None]
-    return torch.where(known, axes, torch.eye(3, device=axes.device, dtype=axes.dtype))
+    return torch.where(known, axes, constant(torch.eye, 3, like=axes))

@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ghgs_lit.geometry.constants import constant
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.types import Batch, DepthBounds
 
@@ -17,8 +18,15 @@ from ghgs_lit.types import Batch, DepthBounds
 def first_and_last(hits: Bool[Tensor, "*batch n"]) -> tuple[Int[Tensor, "*batch"], Int[Tensor, "*batch"]]:
     """Index of the first and of the last True along the last axis; ``n`` and -1 where there is none."""
     count = hits.shape[-1]
-    index = torch.arange(count, device=hits.device)
-    return torch.where(hits, index, count).amin(-1), torch.where(hits, index, -1).amax(-1)
+    places = constant(_from_both_ends, count, like=hits, dtype=torch.long)
+    first, last = (hits[..., None, :] * places).amax(-1).unbind(-1)
+    return count - first, last - 1
+
+
+def _from_both_ends(count: int, **kind: object) -> Int[Tensor, "2 n"]:
+    """Numbers of places from 1, counted from the last and from the first."""
+    index = torch.arange(1, count + 1, **kind)
+    return torch.stack((index.flip(0), index))
 
 
 def patches_around_subject(
@@ -41,7 +49,7 @@ def patches_in_window(
 def between(hits: Bool[Tensor, "*batch n"]) -> Bool[Tensor, "*batch n"]:
     """True from the first to the last True along the last axis."""
     first, last = first_and_last(hits)
-    index = torch.arange(hits.shape[-1], device=hits.device)
+    index = constant(torch.arange, hits.shape[-1], like=hits, dtype=torch.long)
     return (index >= first[..., None]) & (index <= last[..., None])
 
 

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghgs_lit.geometry import cpu
+from ghgs_lit.geometry.constants import constant, middles
 from ghgs_lit.geometry.masks import surface_colors
 from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, pixel_centers, sample
 from ghgs_lit.kernels import gpu
@@ -48,15 +49,10 @@ def consistency_of(
         views = [x.to(near) if x.is_floating_point() else x for x in batch.once(_pairs)]
         on_gpu = gpu.is_supported(near, far)
         if not on_gpu and is_supported(near, far):
-            size, shares = tuple(batch.masks.shape[2:]), _shares(steps, near)
+            size, shares = tuple(batch.masks.shape[2:]), constant(middles, steps, like=near)
             return cpu.sweep(batch.once(_padded), pixels, near, far, size, *views, shares, TOLERANCE)
         sweep = _sweep if on_gpu else _swept
         return sweep(pixels, near, far, batch.once(_smooth).to(near), *views, steps, TOLERANCE)
-
-
-def _shares(steps: int, like: Tensor) -> Tensor:
-    """Middles of ``steps`` equal parts of the way from near to far."""
-    return (torch.arange(steps, device=like.device, dtype=like.dtype) + 0.5) / steps
 
 
 def _swept(
@@ -82,7 +78,7 @@ def _swept(
         compared: whether two views are compared.
         steps: S, the number of depths.
         tolerance: mean difference of colours at which the agreement is 1 / e."""
-    shares, result = _shares(steps, near), near.new_zeros(len(pixels), steps)
+    shares, result = constant(middles, steps, like=near), near.new_zeros(len(pixels), steps)
     for part in even_parts(len(pixels), _SAMPLES // (steps * (colors.shape[1] - 1))):
         depth = near[part, None] + (far - near)[part, None] * shares
         result[part] = _best_match(pixels[part], depth, colors, turn, shift, compared, tolerance)

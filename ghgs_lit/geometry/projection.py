@@ -1,11 +1,14 @@
 """Projection, unprojection and bilinear sampling. Conventions: see :mod:`ghgs_lit.types`. Every function
 takes any leading dimensions and computes in float32 or wider under any autocast."""
 
+from functools import reduce
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ghgs_lit.geometry.constants import constant
 from ghgs_lit.types import Cameras
 
 
@@ -16,17 +19,23 @@ def at_least_float32(tensor: Tensor) -> Tensor:
 
 def pixel_centers(height: int, width: int, like: Tensor) -> Float[Tensor, "h w 2"]:
     """Centres ``(u, v)`` of the pixels of an image, with the device and dtype of ``like``."""
-    rows, columns = (
-        torch.arange(side, device=like.device, dtype=like.dtype) + 0.5 for side in (height, width)
-    )
-    v, u = torch.meshgrid(rows, columns, indexing="ij")
-    return torch.stack((u, v), dim=-1)
+    return homogeneous_centers(height, width, like)[..., :2]
+
+
+def homogeneous_centers(height: int, width: int, like: Tensor) -> Float[Tensor, "h w 3"]:
+    """Centres ``(u, v, 1)`` of the pixels of an image, with the device and dtype of ``like``."""
+    return constant(_centers, height, width, like=like)
+
+
+def _centers(height: int, width: int, **kind: object) -> Tensor:
+    v, u = torch.meshgrid(*(torch.arange(side, **kind) + 0.5 for side in (height, width)), indexing="ij")
+    return torch.stack((u, v, torch.ones_like(u)), dim=-1)
 
 
 def inverse_intrinsics(intrinsics: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """``K^-1`` by substitution, for an upper triangular K (a skew is allowed)."""
     intrinsics = at_least_float32(intrinsics)
-    identity = torch.eye(3, dtype=intrinsics.dtype, device=intrinsics.device)
+    identity = constant(torch.eye, 3, like=intrinsics)
     return torch.linalg.solve_triangular(intrinsics, identity.expand_as(intrinsics), upper=True)
 
 
@@ -38,6 +47,8 @@ def unproject(
 ) -> Float[Tensor, "*batch 3"]:
     """World points of pixels ``(u, v)`` at z-depth ``depth``: ``R^T (z K^-1 [u v 1]^T - t)``."""
     pixels, depth, intrinsics, extrinsics = map(at_least_float32, (pixels, depth, intrinsics, extrinsics))
+    if depth.device.type != "cpu":
+        return _unproject_in_few_steps(pixels, depth, intrinsics, extrinsics)
     fx, fy = intrinsics[..., 0, 0], intrinsics[..., 1, 1]
     y = (pixels[..., 1] - intrinsics[..., 1, 2]) / fy
     x = (pixels[..., 0] - intrinsics[..., 0, 2] - intrinsics[..., 0, 1] * y) / fx
@@ -49,6 +60,16 @@ def unproject(
     return torch.stack(
         [x * rows[0][..., k] + y * rows[1][..., k] + z * rows[2][..., k] for k in range(3)], -1
     )
+
+
+def _unproject_in_few_steps(pixels: Tensor, depth: Tensor, intrinsics: Tensor, extrinsics: Tensor) -> Tensor:
+    """:func:`unproject` in fewer launches of a GPU, with more temporaries."""
+    offset = pixels - intrinsics[..., :2, 2]
+    y = offset[..., 1] / intrinsics[..., 1, 1]
+    x = (offset[..., 0] - intrinsics[..., 0, 1] * y) / intrinsics[..., 0, 0]
+    rays = F.pad(torch.stack((x, y), -1), (0, 1), value=1.0)
+    inside = rays * depth[..., None] - extrinsics[..., :3, 3]
+    return (inside[..., None] * extrinsics[..., :3, :3]).sum(-2)
 
 
 def unproject_maps(
@@ -75,13 +96,23 @@ def world_to_camera(
 
 
 def _camera_axes(points: Tensor, extrinsics: Tensor) -> Tensor:
-    """Coordinates [3, ...] of :func:`world_to_camera`; written out as in :func:`unproject`."""
-    x, y, z = at_least_float32(points).unbind(-1)
-    matrices = at_least_float32(extrinsics)[..., :3, :]
-    # The results come first; before them are the dimensions that broadcasting would add.
-    matrices = matrices[(None,) * (x.dim() + 2 - matrices.dim())].movedim(-2, 0)
-    a, b, c, shift = matrices.unbind(-1)
-    return a * x + b * y + c * z + shift
+    """Coordinates [3, ...] of :func:`world_to_camera`; no product of matrices, as in :func:`unproject`."""
+    points, matrices = at_least_float32(points), at_least_float32(extrinsics)[..., :3, :]
+    columns = _columns(matrices, points.dim() + 1)
+    return _combined(columns[:3], points.movedim(-1, 0)) + columns[3]
+
+
+def _columns(matrices: Tensor, dimensions: int) -> Tensor:
+    """Matrices [..., r, c] as [c, r, ...]; then come the dimensions that broadcasting would add."""
+    return matrices[(None,) * (dimensions - matrices.dim())].movedim((-1, -2), (0, 1))
+
+
+def _combined(columns: Tensor, factors: Tensor) -> Tensor:
+    """The sum of columns [c, r, ...] times factors [c, ...]. On a CPU without a temporary of all
+    products; elsewhere at once."""
+    if factors.device.type == "cpu":
+        return reduce(torch.add, (column * factor for column, factor in zip(columns, factors, strict=True)))
+    return (columns * factors[:, None]).sum(0)
 
 
 def project(
@@ -90,13 +121,11 @@ def project(
     extrinsics: Float[Tensor, "*#batch 4 4"],
 ) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
     """Pixels ``(u, v)`` and z-depth of world points; pixels of points with z <= 0 are meaningless."""
-    x, y, z = _camera_axes(points, extrinsics)
-    intrinsics = at_least_float32(intrinsics)
-    safe = torch.where(z > 0, z, torch.ones_like(z))
-    x, y = x / safe, y / safe
-    u = intrinsics[..., 0, 0] * x + intrinsics[..., 0, 1] * y + intrinsics[..., 0, 2]
-    v = intrinsics[..., 1, 1] * y + intrinsics[..., 1, 2]
-    return torch.stack((u, v), dim=-1), z
+    inside = _camera_axes(points, extrinsics)
+    z = inside[2]
+    seen = inside[:2] / torch.where(z > 0, z, torch.ones_like(z))
+    columns = _columns(at_least_float32(intrinsics)[..., :2, :], seen.dim() + 1)
+    return (_combined(columns[:2], seen) + columns[2]).movedim(0, -1).contiguous(), z
 
 
 def look_at_point(cameras: Cameras) -> Tensor:

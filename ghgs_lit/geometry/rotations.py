@@ -3,9 +3,11 @@ neither where a rig as a whole is nor how far its cameras are from a subject of 
 determine motions of the cameras relative to one another."""
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from ghgs_lit.geometry.constants import constant
 from ghgs_lit.geometry.projection import at_least_float32
 
 
@@ -28,21 +30,33 @@ def quaternion_to_matrix(quaternions: Float[Tensor, "*batch 4"]) -> Float[Tensor
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
+#: The 16 values of Shepperd's table as sums of at most four numbers with signs. 0 is the number 1; entries of
+#: the matrix are numbered from 1, by row.
+_OWN, _X, _Y, _Z = (0, 1, 5, 9), (8, 6, 0, 0), (3, 7, 0, 0), (4, 2, 0, 0)
+_TABLE = (*(_OWN, _X, _Y, _Z), *(_X, _OWN, _Z, _Y), *(_Y, _Z, _OWN, _X), *(_Z, _Y, _X, _OWN))
+_MINUS, _PLUS = (1, -1, 0, 0), (1, 1, 0, 0)
+_TABLE_SIGNS = (
+    *((1, 1, 1, 1), _MINUS, _MINUS, _MINUS),
+    *(_MINUS, (1, 1, -1, -1), _PLUS, _PLUS),
+    *(_MINUS, _PLUS, (1, -1, 1, -1), _PLUS),
+    *(_MINUS, _PLUS, _PLUS, (1, -1, -1, 1)),
+)
+
+
 def matrix_to_quaternion(matrices: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
     """Unit quaternions of proper rotation matrices (Shepperd 1978)."""
-    (a, ab, ac), (ba, b, bc), (ca, cb, c) = (row.unbind(-1) for row in matrices.unbind(-2))
-    x, y, z = cb - bc, ac - ca, ba - ab
-    xy, xz, yz = ba + ab, ac + ca, cb + bc
-    values = (
-        *(1 + a + b + c, x, y, z),
-        *(x, 1 + a - b - c, xy, xz),
-        *(y, xy, 1 - a + b - c, yz),
-        *(z, xz, yz, 1 - a - b + c),
-    )
-    table = torch.stack(values, dim=-1).unflatten(-1, (4, 4))
+    numbers = F.pad(matrices.flatten(-2), (1, 0), value=1.0)
+    table = _signed(numbers, _TABLE, _TABLE_SIGNS).sum(-1).unflatten(-1, (4, 4))
     best = table.diagonal(dim1=-2, dim2=-1).argmax(-1)
     chosen = table.gather(-2, best[..., None, None].expand(*best.shape, 1, 4))[..., 0, :]
     return chosen / chosen.norm(dim=-1, keepdim=True)
+
+
+def _signed(numbers: Float[Tensor, "*batch n"], places: tuple, signs: tuple) -> Float[Tensor, "*batch r 4"]:
+    """The numbers at ``places`` (rows of four) times ``signs``."""
+    index = constant(torch.tensor, sum(places, ()), like=numbers, dtype=torch.long)
+    chosen = numbers.index_select(-1, index).unflatten(-1, (-1, 4))
+    return chosen * constant(torch.tensor, signs, like=numbers)
 
 
 def rotate(
@@ -54,20 +68,17 @@ def rotate(
     return vectors + quaternions[..., :1] * twice + torch.linalg.cross(axis, twice)
 
 
+#: Components of the second quaternion by which those of the first are multiplied, and signs of the products:
+#: for z, y, x and w of the result, in whose order gradients are summed.
+_FACTORS = ((3, 2, 1, 0), (2, 3, 0, 1), (1, 0, 3, 2), (0, 1, 2, 3))
+_FACTOR_SIGNS = ((1, 1, -1, 1), (1, -1, 1, 1), (1, 1, 1, -1), (1, -1, -1, -1))
+
+
 def multiply_quaternions(
     first: Float[Tensor, "*#batch 4"], second: Float[Tensor, "*#batch 4"]
 ) -> Float[Tensor, "*batch 4"]:
     """The products ``first second``: rotate by ``second``, then by ``first``; norms are multiplied."""
-    (a, b, c, d), (w, x, y, z) = first.unbind(-1), second.unbind(-1)
-    return torch.stack(
-        (
-            a * w - b * x - c * y - d * z,
-            a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x,
-            a * z + b * y - c * x + d * w,
-        ),
-        dim=-1,
-    )
+    return (first[..., None, :] * _signed(second, _FACTORS, _FACTOR_SIGNS)).sum(-1).flip(-1)
 
 
 def unit(x: Float[Tensor, "*n c"], least: float = 0.0) -> Float[Tensor, "*n c"]:
@@ -75,13 +86,16 @@ def unit(x: Float[Tensor, "*n c"], least: float = 0.0) -> Float[Tensor, "*n c"]:
     scaled by their largest component: squares of 1e-20 vanish in float32, those of 1e20 overflow. ``least``:
     the gradient, which grows as 1 / length, stays constant for shorter vectors."""
     x = at_least_float32(x)
-    largest = x.detach().abs().amax(-1, keepdim=True)
+    largest = torch.linalg.vector_norm(x.detach(), torch.inf, -1, keepdim=True)
     is_zero = largest == 0
     scaled = x / largest.masked_fill(is_zero, 1.0)
     # The argument is replaced, not the result: a root at 0 would have an infinite gradient.
     squared = scaled.square().sum(-1, keepdim=True).masked_fill(is_zero, 1.0)
-    direction = (scaled * squared.rsqrt()).masked_fill(is_zero, 0.0)
-    if least == 0 or not direction.requires_grad:
+    direction = scaled * squared.rsqrt()
+    if not direction.requires_grad:
+        return direction
+    direction = direction.masked_fill(is_zero, 0.0)
+    if least == 0:
         return direction
     share = (largest * squared.detach().sqrt() / least).clamp(max=1)
     return direction.detach() + share * (direction - direction.detach())

@@ -30,7 +30,6 @@ from ghgs_lit.heads.dense import Part, decode
 from ghgs_lit.heads.dpt import DPTHead
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, Guide, photo_guide
 from ghgs_lit.kernels.linear import Linear
-from ghgs_lit.kernels.pool import multiplies
 from ghgs_lit.kernels.precision import exact, without_float16
 from ghgs_lit.plan import Plan
 from ghgs_lit.plan.rows import Rows
@@ -348,11 +347,7 @@ class GaussianHead(nn.Module):
         headers = [self.offset_header, self.scale_header, self.rot_header, self.opacity_header]
         if self.options.color_limit > 0:
             headers.append(self.color_header)
-        if not torch.is_grad_enabled() and multiplies(descriptors, self.offset_header[0].weight):
-            found = cpu.attributes(headers, descriptors)
-        else:
-            found = (float32_last(header, descriptors) for header in headers)
-        offset, scale, rotation, opacity, *color = found
+        offset, scale, rotation, opacity, *color = (float32_last(header, descriptors) for header in headers)
         return offset, scale, rotation, opacity[..., 0], *color
 
 

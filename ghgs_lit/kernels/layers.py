@@ -171,15 +171,6 @@ def linear(layers, at, outputs, inputs, values, result):
 
 
 @helper
-def bend(layers, at, outputs, inputs, values):
-    """``values = tanh(values + b)`` of the packed layer at ``layers[at]``."""
-    biases = at + lines(outputs) * inputs
-    for channel in range(outputs):
-        for i in range(channel * PANEL, (channel + 1) * PANEL, LANES):
-            memory.store(values, i, simd.tanh(memory.load(values, i) + layers[biases + channel]))
-
-
-@helper
 def rectify(layers, at, outputs, inputs, values):
     """``values = max(values + b, 0)`` of the packed layer at ``layers[at]``; NaN stays."""
     biases = at + lines(outputs) * inputs

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ghgs_lit.geometry.constants import constant
 from ghgs_lit.geometry.masks import coverage, surface_colors
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.kernels.precision import exact
@@ -59,9 +60,9 @@ def log_gains(gaussians: Gaussians, batch: Batch, real: Real = None) -> Float[Te
         own, logs, theirs, weights = _compared(gaussians, batch, real)
         ratios = logs - theirs
         b, views = batch.masks.shape[:2]
-        gains, element = ratios.new_zeros(b, views, 3), own // views
+        gains = ratios.new_zeros(b, views, 3)
         for _ in range(_STEPS):
-            between = gains[element] - gains.flatten(0, 1)[own, None]
+            between = (gains[:, None] - gains[:, :, None]).flatten(0, 1)[own]
             counted = weights / (1 + ((ratios - between) / _OUTLIER).square())
             sums = _summed(own, b * views, counted, counted * ratios)
             gains = _solved(*sums.view(2, b, views, views, 3))
@@ -85,7 +86,7 @@ def log_gammas(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
             away = levels - level[own]
             moments = _summed(own, b * views, counted * away.square(), counted * away * ratios)
             gammas = _solved(*moments.view(2, b, views, views, 3), _PRIOR_OF_SLOPES)
-            between = gammas[own // views] - gammas.flatten(0, 1)[own, None]
+            between = (gammas[:, None] - gammas[:, :, None]).flatten(0, 1)[own]
             fitted = ratio[own] + between * away
         return gammas - gammas.quantile(0.5, 1, keepdim=True)
 
@@ -133,7 +134,8 @@ def _solved(
     """Logs that best fit the sums of differences of views (last V) from own views (first V)."""
     counts, differences = counts.movedim(-1, 1), differences.movedim(-1, 1)
     both = counts + counts.mT
-    identity = torch.eye(both.shape[-1], dtype=both.dtype, device=both.device)
-    laplacian = torch.diag_embed(both.sum(-1)) - both + prior * identity
+    identity = constant(torch.eye, both.shape[-1], like=both)
+    laplacian = torch.add(identity * both.sum(-1, keepdim=True) - both, identity, alpha=prior)
     right = differences.sum(-2) - differences.sum(-1)
-    return torch.linalg.solve(laplacian, right).mT
+    # Never singular; linalg.solve would check that and wait for a GPU.
+    return torch.linalg.solve_ex(laplacian, right).result.mT

@@ -2,13 +2,14 @@
 
 import dataclasses
 from collections.abc import Sequence
+from itertools import accumulate
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.utils.rnn import pad_sequence
 
+from ghgs_lit.geometry.constants import constant
 from ghgs_lit.geometry.masks import coverage, on_black
 from ghgs_lit.geometry.projection import at_least_float32, project
 from ghgs_lit.geometry.rotations import rotate, unit
@@ -118,15 +119,14 @@ def _compared(
         splits: number of Gaussians of each element."""
     views, cameras = photo.shape[1], Cameras(intrinsics, extrinsics, *photo.shape[-2:])
     maps = torch.cat((photo, photo - drawn, mask[:, :, None], alpha, depth), 2)
-    found, z, can_see = _values_at(means, splits, cameras, maps)
+    found, z, can_see = _values_at(means, image, splits, cameras, maps)
     color, error, mask, alpha, depth = found.split((3, 3, 1, 1, 1), -1)
     behind = torch.tanh((z - depth) / scale)
     values = torch.cat((color - colors[:, None], error, mask, alpha, behind), -1)
     values = torch.cat((torch.where(can_see, values, 0), can_see.to(values)), -1)
-    place = torch.arange(views, device=values.device)
-    own_first = (image[:, None] + place) % views
+    own_first = constant(_cyclic, views, like=values, dtype=torch.long)[image % views]
     values = values.gather(1, own_first[..., None].expand_as(values))
-    is_own = (place == 0).to(values).expand(len(values), -1)
+    is_own = constant(torch.eye, views, like=values)[0].expand(len(values), -1)
     return torch.cat((values, is_own[..., None]), -1)
 
 
@@ -138,32 +138,42 @@ _observe = gpu.operator(
 )
 
 
+def _cyclic(views: int, **kind: object) -> Tensor:
+    """The views from each on, in cyclic order: [V, V]."""
+    view = torch.arange(views, **kind)
+    return (view[:, None] + view) % views
+
+
 def looked_up(
     gaussians: Gaussians, cameras: Cameras, maps: Float[Tensor, "B V c H W"]
 ) -> tuple[Float[Tensor, "N V c"], Float[Tensor, "N V 1"], Bool[Tensor, "N V 1"]]:
     """Values of maps at projected means in each view, z-depths, and whether the view can see the means."""
-    return _values_at(gaussians.means, gaussians.splits, cameras, maps)
+    return _values_at(gaussians.means, gaussians.image, gaussians.splits, cameras, maps)
 
 
 def _values_at(
-    means: Tensor, splits: Sequence[int], cameras: Cameras, maps: Tensor
+    means: Tensor, image: Tensor, splits: Sequence[int], cameras: Cameras, maps: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    b, views, channels = maps.shape[:3]
-    # One row of points for each element; those with fewer have points at 0 at the end.
-    means = pad_sequence(means.split(splits), batch_first=True)
+    """:func:`looked_up` at ``means`` that belong to images ``image``."""
+    b, views, channels, height, width = maps.shape
+    rows, means = None, means[None]
+    if b > 1:
+        # One row of points for each element; those with fewer have points at 0 at the end.
+        rows = _rows(image // views, splits)
+        means = means.new_zeros(b, max(splits), 3).index_put(rows, means[0])
     means = means[:, None].expand(-1, views, -1, -1)
     pixels, z = project(means, cameras.intrinsics[:, :, None], cameras.extrinsics[:, :, None])
-    size = pixels.new_full((2,), cameras.width)
-    size[1] = cameras.height
+    size = constant(torch.tensor, (width, height), like=pixels)
     # Pixels far outside are clamped: large numbers are not exact.
     grid = (2 / size * pixels - 1).clamp(-3, 3).flatten(0, 1)[:, None]
     found = F.grid_sample(maps.flatten(0, 1), grid, align_corners=False)[:, :, 0]
     can_see = (z > 0) & ((pixels >= 0) & (pixels <= size)).all(-1)
     of_image = found.view(b, views, channels, -1).permute(0, 3, 1, 2)
     each = (of_image, z.mT[..., None], can_see.mT[..., None])
-    return tuple(_packed(values, splits) for values in each)
+    return tuple(values[0] if rows is None else values[rows] for values in each)
 
 
-def _packed(values: Tensor, splits: Sequence[int]) -> Tensor:
-    """Rows of all elements one after another, without those that pad."""
-    return torch.cat([own[:count] for own, count in zip(values, splits, strict=True)])
+def _rows(element: Int[Tensor, " N"], splits: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """The element of each Gaussian, and its number among those of the element."""
+    first = torch.tensor((0, *accumulate(splits))).to(element.device, non_blocking=True)
+    return element, torch.arange(len(element), device=element.device) - first[element]

@@ -10,7 +10,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, reduce
+from functools import lru_cache
 from typing import Annotated, NamedTuple
 
 import torch
@@ -90,15 +90,12 @@ class Exchange(nn.Module):
 
     def forward(self, known: Float[Tensor, "N w"], windows: Windows) -> Float[Tensor, "N w"]:
         """``known`` with features of the neighbours added."""
-        return known + self.hear(F.relu(self.heard(known, windows)))
-
-    def heard(self, known: Float[Tensor, "N w"], windows: Windows) -> Float[Tensor, "N c"]:
-        """Features of the neighbours; 0 for pixels without a Gaussian."""
         told, size = self.tell(known), math.prod(windows.shape)
         maps = told.new_zeros(size + windows.spare, told.shape[1]).index_copy(0, windows.place, told)
         maps = self.across(maps[:size].view(*windows.shape, told.shape[1]).permute(0, 3, 1, 2))
         place = windows.place.clamp(max=size - 1) if windows.spare else windows.place
-        return maps.permute(0, 2, 3, 1).flatten(0, 2).index_select(0, place)
+        heard = maps.permute(0, 2, 3, 1).flatten(0, 2).index_select(0, place)
+        return known + self.hear(F.relu(heard))
 
 
 #: Gaussians that go through the network at once on a CPU.
@@ -284,14 +281,10 @@ class Rounds(nn.Module):
         windows: Windows | None,
     ) -> tuple[Float[Tensor, "N h"], Float[Tensor, "N c"]]:
         """The memory after observation and exchange, and the change computed from it."""
-        fused = multiplies(each, known, memory, self.memory.weight)
-        if fused:
+        if multiplies(each, known, memory, self.memory.weight):
             memory = cpu.remembered(self.view, self.update, self.memory, each, known, memory)
         else:
             memory = self._remembered_in_parts(each, known, memory)
-        if fused and windows is not None and not torch.is_grad_enabled():
-            heard = self.exchange.heard(memory, windows)
-            return cpu.answered(self.exchange.hear, self.change[-1], heard, memory)
         memory = memory if windows is None else self.exchange(memory, windows)
         return memory, float32_last(self.change, memory)
 
@@ -305,8 +298,8 @@ class Rounds(nn.Module):
         self, each: Float[Tensor, "n V c"], known: Float[Tensor, "n k"], memory: Float[Tensor, "n h"]
     ) -> Float[Tensor, "n h"]:
         """The new memory from the observations of each view (``each``, the own one first) and ``known``."""
-        own, *others = self.view(each).unbind(1)
-        seen = (own, sum(others) / len(others), reduce(torch.maximum, others))
+        own, others = self.view(each).split((1, each.shape[1] - 1), 1)
+        seen = (own[:, 0], others.mean(1), others.amax(1))
         return torch.tanh(memory + self.memory(self.update(torch.cat((*seen, known, memory), -1))))
 
     @torch.no_grad()

@@ -217,8 +217,9 @@ def test_units_of_nested_frames_are_multiplied():
     gaussians = original("hull")[2].gaussians
     inner = dataclasses.replace(gaussians, metre=torch.tensor([4.0]))
     frame = Frame(torch.zeros(1, 3).double(), torch.eye(3).double()[None], torch.tensor([2.5]).double())
-    assert frame._gaussians(inner, 3, torch.float32).metre.tolist() == [10.0]
-    assert frame._gaussians(dataclasses.replace(inner, metre=None), 3, torch.float32).metre.tolist() == [2.5]
+    world = torch.zeros(1, 4, 3)
+    assert frame._gaussians(inner, 3, world).metre.tolist() == [10.0]
+    assert frame._gaussians(dataclasses.replace(inner, metre=None), 3, world).metre.tolist() == [2.5]
 
 
 def test_points_far_from_the_worlds_origin_keep_their_digits():

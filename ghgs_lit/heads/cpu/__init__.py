@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from ghgs_lit.geometry.rotations import matrix_to_quaternion
 from ghgs_lit.heads.activations import Constants
@@ -55,26 +55,3 @@ def activate(
         compiled(), given, [(view, *pair) for view, pair in enumerate(pairwise(ends))], _TASK, count
     )
     return tuple(out)
-
-
-#: Rows in one task, and the work of a row as the pool counts it.
-_ROWS, _WORK = 1024, 2
-
-
-def attributes(
-    networks: list[nn.Sequential], descriptors: Float[Tensor, "*n c"]
-) -> tuple[Float[Tensor, "*n _"], ...]:
-    """Results of the networks for descriptors of pixels; see :func:`ghgs_lit.kernels.pool.multiplies`.
-    ``networks``: three linear layers, of equal widths except the last, and ``nn.Tanh`` or ``nn.ReLU``."""
-    from ghgs_lit.heads.cpu.kernel import attributes as compiled  # here: it loads a compiler
-    from ghgs_lit.kernels.layers import packed, parameters
-
-    layers = packed(parameters([layer for network in networks for layer in network]))
-    outputs = [len(network[4].bias) for network in networks]
-    rows = descriptors.reshape(-1, descriptors.shape[-1]).contiguous()
-    found = rows.new_empty(len(rows), sum(outputs))
-    widths = np.array([len(networks[0][k].bias) for k in (0, 2)] + outputs)
-    bends = np.array([isinstance(network[1], nn.Tanh) for network in networks])
-    given = (rows.numpy(), layers, widths, bends, found.numpy())
-    pool.run_rows(compiled(), given, [(0, len(rows))], _ROWS, _WORK * len(rows))
-    return torch.split(found.view(*descriptors.shape[:-1], sum(outputs)), outputs, -1)

@@ -1,7 +1,5 @@
-"""Kernels of the Gaussian head, without a gradient. :func:`activate` is
-:meth:`ghgs_lit.heads.gaussian.GaussianHead.activate` for 16 Gaussians of one image at once; a line of
-``values`` holds one number of each. :func:`attributes` computes networks of three layers for ``PANEL`` rows
-at once (see :mod:`ghgs_lit.kernels.layers`)."""
+"""The kernel of the Gaussian head, without a gradient: :meth:`ghgs_lit.heads.gaussian.GaussianHead.activate`
+for 16 Gaussians of one image at once. A line of ``values`` holds one number of each."""
 
 import math
 
@@ -12,7 +10,6 @@ from ghgs_lit.heads.activations import SIGMOID_LIMIT, TANH_LIMIT
 from ghgs_lit.heads.surface import OTHER, SAME
 from ghgs_lit.kernels import memory, simd
 from ghgs_lit.kernels.compile import FLOATS, NUMBER, helper, kernel_for
-from ghgs_lit.kernels.layers import PANEL, bend, linear, lines, put_rows, rectify, size
 from ghgs_lit.kernels.simd import EXP2_LIMIT, LANES
 
 ZERO, HALF, ONE, TWO = (np.float32(x) for x in (0, 0.5, 1, 2))
@@ -25,7 +22,7 @@ OFFSET, SCALE, ROTATION, OPACITY, COLOR = 0, 3, 6, 10, 11
 DEPTH, POINT, PHOTO, SHARE, AROUND, LINES = 14, 15, 18, 21, 22, 26
 
 PLACES, MASKS = types.Array(types.int64, 1, "C"), types.Array(types.boolean, 3, "C")
-FLAGS, _EACH = types.Array(types.boolean, 1, "C"), [FLOATS[2], FLOATS[2], FLOATS[2], FLOATS[1], FLOATS[2]]
+_EACH = [FLOATS[2], FLOATS[2], FLOATS[2], FLOATS[1], FLOATS[2]]
 _MAPS = [FLOATS[3], MASKS, FLOATS[4], FLOATS[4], FLOATS[3], FLOATS[3], FLOATS[2]]
 _CONSTANTS = (types.UniTuple(types.float32, 10), types.boolean)
 
@@ -191,38 +188,3 @@ def activate(
             for k in range(4):
                 quaternions[start + lane, k] = values[(ROTATION + k) * LANES + lane]
             opacities[start + lane] = values[OPACITY * LANES + lane]
-
-
-@helper
-def _bend_or_rectify(bends, layers, at, outputs, inputs, values):
-    if bends:
-        bend(layers, at, outputs, inputs, values)
-    else:
-        rectify(layers, at, outputs, inputs, values)
-
-
-@kernel_for(FLOATS[2], FLOATS[1], PLACES, FLAGS, FLOATS[2], NUMBER, NUMBER)
-def attributes(descriptors, layers, widths, bends, out, first, last):
-    """Write rows ``first`` to ``last``; see :func:`ghgs_lit.heads.cpu.attributes`."""
-    channels, wide, narrow = descriptors.shape[1], widths[0], widths[1]
-    widest = max(channels, lines(wide), lines(narrow), lines(widths[2:].max())) * PANEL
-    given, one, two = simd.aligned(channels * PANEL), simd.aligned(widest), simd.aligned(widest)
-    for start in range(first, last, PANEL):
-        count = min(PANEL, last - start)
-        put_rows(descriptors, start, count, 0, given)
-        at, column = 0, 0
-        for network in range(len(bends)):
-            outputs = widths[2 + network]
-            linear(layers, at, wide, channels, given, one)
-            _bend_or_rectify(bends[network], layers, at, wide, channels, one)
-            at += size(wide, channels)
-            linear(layers, at, narrow, wide, one, two)
-            _bend_or_rectify(bends[network], layers, at, narrow, wide, two)
-            at += size(narrow, wide)
-            linear(layers, at, outputs, narrow, two, one)
-            biases = at + lines(outputs) * narrow
-            for lane in range(count):
-                for k in range(outputs):
-                    out[start + lane, column + k] = one[k * PANEL + lane] + layers[biases + k]
-            at += size(outputs, narrow)
-            column += outputs

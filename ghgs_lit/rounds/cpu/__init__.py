@@ -34,21 +34,6 @@ def remembered(
     return _Remember.apply(each, known, before, *parameters((*view, *update, memory)))
 
 
-def answered(
-    hear: nn.Linear, change: nn.Linear, heard: Float[Tensor, "N e"], before: Float[Tensor, "N h"]
-) -> tuple[Float[Tensor, "N h"], Float[Tensor, "N c"]]:
-    """``after = before + hear(relu(heard))`` and ``change(after)``, without a gradient."""
-    from ghgs_lit.kernels.layers import packed, parameters
-    from ghgs_lit.rounds.cpu.kernel import answer
-
-    layers = packed(parameters((hear, change)))
-    after, changed = torch.empty_like(before), before.new_empty(len(before), len(change.bias))
-    rows = [x.contiguous().numpy() for x in (heard, before)]
-    given = (*rows, layers, after.numpy(), changed.numpy())
-    pool.run_rows(answer(), given, [(0, len(before))], _TASK, len(before))
-    return after, changed
-
-
 class _Remember(torch.autograd.Function):
     @staticmethod
     def forward(ctx, each, known, before, *numbers):

@@ -70,34 +70,6 @@ def remember(each, known, before, layers, after, first, last):
                 after[start + lane, channel] = one[channel * PANEL + lane]
 
 
-@kernel_for(FLOATS[2], FLOATS[2], FLOATS[1], FLOATS[2], FLOATS[2], NUMBER, NUMBER)
-def answer(heard, before, layers, after, change, first, last):
-    """Write rows ``first`` to ``last``; see :func:`ghgs_lit.rounds.cpu.answered`."""
-    channels, hidden, outputs = heard.shape[1], before.shape[1], change.shape[1]
-    to_change = size(hidden, channels)
-    to_biases, last_biases = lines(hidden) * channels, to_change + lines(outputs) * hidden
-    widest = max(channels, lines(hidden), lines(outputs)) * PANEL
-    one, two, old = simd.aligned(widest), simd.aligned(widest), simd.aligned(hidden * PANEL)
-    for start in range(first, last, PANEL):
-        count = min(PANEL, last - start)
-        put_rows(heard, start, count, 0, one)
-        put_rows(before, start, count, 0, old)
-        for i in range(0, channels * PANEL, LANES):
-            memory.store(one, i, simd.maximum(ZERO, memory.load(one, i)))
-        linear(layers, 0, hidden, channels, one, two)
-        for channel in range(hidden):
-            for i in range(channel * PANEL, (channel + 1) * PANEL, LANES):
-                value = memory.load(two, i) + layers[to_biases + channel] + memory.load(old, i)
-                memory.store(two, i, value)
-        linear(layers, to_change, outputs, hidden, two, one)
-        for lane in range(count):
-            for channel in range(hidden):
-                after[start + lane, channel] = two[channel * PANEL + lane]
-            for channel in range(outputs):
-                value = one[channel * PANEL + lane] + layers[last_biases + channel]
-                change[start + lane, channel] = value
-
-
 @helper
 def _axis(row, x, y, z):
     return row[0] * x + (row[1] * y + (row[2] * z + row[3]))
