@@ -5,6 +5,7 @@ similar ones needed, and some more; the number that it really needed is read lat
 rendering, while the GPU draws, or of several together (:func:`settled`). Where the room was too small the
 rendering is repeated with enough: an image never lacks splats."""
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -15,14 +16,14 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from ghgs_lit.plan.rows import size_class
+
 T = TypeVar("T")
 Drawn = TypeVar("Drawn")
 #: Tiles that a splat is expected to touch at first, and what is added to the most that was seen.
 _FIRST, _SPARE = 4.0, 1.25
 #: Share of a difference by which an expectation falls if less was needed; it rises at once.
 _FALL = 0.1
-#: Leading binary digits of a capacity: at most an eighth is added, and few sizes occur.
-_DIGITS = 4
 
 #: Tiles of an image (rows, columns): what is expected for them depends on nothing else that is known.
 Grid = tuple[int, int]
@@ -101,7 +102,7 @@ def with_room(
         draw: draws intersections."""
     rooms = _rooms.get()
     while True:
-        capacity = size_class(int(_SPARE * splats * _expected.get(grid, _FIRST)))
+        capacity = size_class(math.ceil(_SPARE * splats * _expected.get(grid, _FIRST)) or 1)
         found, needed = find(capacity)
         room = Room(grid, splats, capacity, needed)
         number = Coming(needed) if rooms is None else None
@@ -111,12 +112,6 @@ def with_room(
             return drawn
         if room.expect(number.read()):
             return drawn
-
-
-def size_class(count: int) -> int:
-    """The least number of at least ``count`` (and 1) with few binary digits, so that few sizes occur."""
-    step = 1 << max(count.bit_length() - _DIGITS, 0)
-    return max(-(-count // step) * step, 1)
 
 
 class Coming:

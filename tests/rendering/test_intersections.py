@@ -3,8 +3,9 @@
 import pytest
 import torch
 
+from ghgs_lit.plan.rows import size_class
 from ghgs_lit.rendering import RasterSettings, capacity, gsplat_backend, reference
-from ghgs_lit.rendering.capacity import deferred, settled, size_class
+from ghgs_lit.rendering.capacity import deferred, settled
 from ghgs_lit.rendering.intersections import TILE, intersections
 from tests.helpers.gsplat import InParts, functions
 from tests.helpers.pretend_device import DEVICE, pretend_device
@@ -122,11 +123,3 @@ def test_too_little_room_is_seen_also_when_played_back(capacities):
     with deferred() as rooms:
         pass
     assert rooms.suffice()
-
-
-def test_size_classes_are_few_and_close():
-    """At most an eighth above the number; they never fall."""
-    classes = [size_class(count) for count in range(5000)]
-    assert classes == sorted(classes)
-    assert all(count <= found <= max(1, count * 9 / 8) for count, found in enumerate(classes))
-    assert len(set(classes)) < 90
