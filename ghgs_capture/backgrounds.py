@@ -37,7 +37,17 @@ class _Background:
 
     @classmethod
     def of(cls, photographs: Sequence[Photograph]) -> "_Background":
-        """The mean of those photographs (of one size) that agree best at each pixel."""
+        """The background that photographs of one camera share.
+
+        At each pixel it is the mean of a quarter of them (at least three), those that agree best.
+
+        Args:
+            photographs: three or more of one camera, of one size.
+
+        Returns:
+            The background; known where enough photographs show it without the subject and differ by
+            less than ``_STEADY`` levels.
+        """
         images = np.stack([photograph.image for photograph in photographs]).astype(np.float32)
         count = max(3, len(images) // 4)
         reach = _reach(images.shape[1:3])
@@ -55,7 +65,15 @@ class _Background:
         return cls(images.mean(0), steady & np.isfinite(width.min(0)))
 
     def mended(self, photograph: Photograph) -> Photograph:
-        """The photograph with a corrected mask; itself where the background does not contradict it."""
+        """Correct the mask of a photograph by this background.
+
+        Args:
+            photograph: of this camera, of the background's size.
+
+        Returns:
+            The photograph with a corrected mask; itself where the background does not contradict
+            it.
+        """
         reach = _reach(self.known.shape)
         box = tuple(slice(max(a - 24 * reach, 0), b + 24 * reach) for a, b in photograph.extents)
         seen = (photograph.image, photograph.matte, self.image, self.known)
@@ -70,7 +88,18 @@ class _Background:
 def _mended(
     image: np.ndarray, matte: np.ndarray, behind: np.ndarray, known: np.ndarray, reach: int
 ) -> np.ndarray | None:
-    """The corrected matte [h, w] of a photograph in front of a background; None: it stays."""
+    """Correct the matte of a photograph in front of a background.
+
+    Args:
+        image: the photograph [h, w, 3] uint8.
+        matte: its matte [h, w] uint8; above 127 is the subject.
+        behind: the background [h, w, 3] float32, levels from 0 to 255.
+        known: where the background is known [h, w] bool.
+        reach: pixels by which outlines of masks may be wrong.
+
+    Returns:
+        The corrected matte [h, w] uint8; None: it stays as it is.
+    """
     mask = matte > 127
     off = ndimage.uniform_filter(np.abs(image - behind).max(-1) * known, 3)
     beside = off[known & ~mask]
@@ -106,6 +135,7 @@ def _is_alike(image: np.ndarray, behind: np.ndarray) -> bool:
 
 
 def _parts(parts: np.ndarray, keep: Callable[[np.ndarray], bool]) -> np.ndarray:
+    """The connected parts for which ``keep``, called with the mask of one part, says true."""
     labels, count = ndimage.label(parts)
     return np.isin(labels, [number for number in range(1, count + 1) if keep(labels == number)])
 
@@ -131,7 +161,14 @@ class Backgrounds:
 
     @classmethod
     def of(cls, captures: Sequence[Capture]) -> "Backgrounds":
-        """From instants spread over a sequence, of cameras with enough photographs of one size."""
+        """Estimate backgrounds from instants that are spread over a sequence.
+
+        Args:
+            captures: the instants, of cameras that stand still.
+
+        Returns:
+            The backgrounds of cameras with ``_ENOUGH`` photographs or more, all of one size.
+        """
         photographs: dict[str, list[Photograph]] = {}
         for photograph in (photograph for capture in captures for photograph in capture.photographs):
             photographs.setdefault(photograph.name, []).append(photograph)
@@ -142,7 +179,15 @@ class Backgrounds:
         return cls(cameras)
 
     def applied(self, capture: Capture) -> Capture:
-        """The capture with masks corrected where large parts contradict the background."""
+        """Correct masks where large parts of them contradict the background.
+
+        Args:
+            capture: an instant; cameras without a background of their photograph's size keep their
+                masks.
+
+        Returns:
+            The capture with corrected masks.
+        """
         with ThreadPoolExecutor(allowed_cores()) as pool:
             return replace(capture, photographs=tuple(pool.map(self._mended, capture.photographs)))
 

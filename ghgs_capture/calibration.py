@@ -58,7 +58,17 @@ class Convention:
             require(1e-9 <= value <= 1e9, f"calibration.{name}", expected, value)
 
     def told(self, said: Mapping[str, Any]) -> "Convention":
-        """The convention with what the user says; None and other keys are ignored."""
+        """Replace what the user says of the convention.
+
+        Args:
+            said: values by the names of :class:`Convention`; None and other keys are ignored.
+
+        Returns:
+            The convention with these values.
+
+        Raises:
+            InputError: ``resized`` or ``unit`` is out of range.
+        """
         named = {f.name: said.get(f.name) for f in fields(self)}
         return replace(self, **{name: value for name, value in named.items() if value is not None})
 
@@ -77,8 +87,14 @@ class PartialIntrinsics:
         return self.focal != (None, None) and None not in self.middle
 
     def intrinsics(self, size: tuple[int, int]) -> np.ndarray:
-        """The matrix [3, 3] for a photograph of ``size`` (height, width); pixels are square where the file
-        has one focal length or angle."""
+        """Complete the intrinsics for one photograph; pixels are square where the file has one focal length.
+
+        Args:
+            size: (height, width) of the photograph in pixels.
+
+        Returns:
+            The matrix [3, 3] float64 in pixels.
+        """
         sides = size[::-1]
         focal = [
             side / 2 / math.tan(angle / 2) if pixels is None and angle is not None else pixels
@@ -118,12 +134,23 @@ class StoredCamera:
     unread: tuple[str, ...] = ()
 
     def has_numbers_of(self, other: "StoredCamera") -> bool:
-        """Whether both mean the same camera."""
+        """Whether both cameras have the same intrinsics, pose, distortion and size.
+
+        Args:
+            other: camera of the same file.
+        """
         both = ((c.intrinsics, c.pose, c.distortion, c.size or (), c.fisheye) for c in (self, other))
         return self.lens == other.lens and all(map(np.array_equal, *both))
 
     def sized(self, photograph: tuple[int, int]) -> "StoredCamera":
-        """The camera with a size: that of its ``photograph`` (height, width) where the file has none."""
+        """Give the camera a size, and the intrinsics that depend on it.
+
+        Args:
+            photograph: (height, width) in pixels, for a camera whose file has no size.
+
+        Returns:
+            The camera with a size; itself where the file has one.
+        """
         if self.size is not None:
             return self
         intrinsics = self.intrinsics if self.lens is None else self.lens.intrinsics(photograph)
@@ -159,8 +186,21 @@ class Calibration:
 
 
 def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[int, int]) -> Calibration:
-    """The camera of a photograph in this package's conventions. ``photograph``: (height, width) in pixels;
-    intrinsics for another size of the same aspect ratio are scaled. InputError: the aspect ratio differs."""
+    """Convert a camera to this package's conventions, for photographs of one size.
+
+    Intrinsics for another size of the same aspect ratio are scaled.
+
+    Args:
+        camera: as its file stores it.
+        convention: meaning of its numbers.
+        photograph: (height, width) of the photograph in pixels.
+
+    Returns:
+        The camera, with its distortion, for photographs of this size.
+
+    Raises:
+        InputError: the photograph's aspect ratio is not that of the calibration.
+    """
     camera = camera.sized(photograph)
     size = camera.size
     if not same_ratio(size, photograph):
@@ -186,7 +226,18 @@ def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[in
 
 
 def extrinsics_of(pose: np.ndarray, convention: Convention) -> np.ndarray:
-    """A stored pose as world to camera [4, 4] with OpenCV axes."""
+    """Convert a stored pose.
+
+    Far from the origin (``_FAR``) the rotation becomes the nearest orthogonal one; the camera's
+    centre stays.
+
+    Args:
+        pose: [4, 4], as the file has it.
+        convention: what the pose maps, the camera's axes, and the unit of length.
+
+    Returns:
+        World to camera [4, 4] with OpenCV axes, in the convention's unit.
+    """
     if convention.extrinsics == "camera_to_world":
         pose = np.linalg.inv(pose)
     extrinsics = _FLIP @ pose if convention.axes == "opengl" else pose.copy()
@@ -205,13 +256,27 @@ def _rigid(pose: np.ndarray) -> np.ndarray:
 
 
 def same_ratio(one: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether one size (height, width) is the other one scaled, up to rounding to whole pixels."""
+    """Whether one size is the other one scaled, up to rounding to whole pixels (``_ROUNDING``).
+
+    Args:
+        one: (height, width) in pixels.
+        other: (height, width) in pixels.
+    """
     return abs(one[0] * other[1] / one[1] - other[0]) <= _ROUNDING
 
 
 def quarter_turned(calibration: Calibration, turns: int, size: tuple[int, int]) -> Calibration:
-    """The camera of an image after quarter ``turns`` counterclockwise, as of ``numpy.rot90``. ``calibration``
-    (without distortion) and ``size`` (height, width) are those before."""
+    """Turn a camera with its photograph.
+
+    Args:
+        calibration: the camera before, without distortion.
+        turns: quarter turns of the photograph counterclockwise, as of ``numpy.rot90``; any whole
+            number.
+        size: (height, width) of the photograph before, in pixels.
+
+    Returns:
+        The camera of the turned photograph.
+    """
     for _ in range(turns % 4):
         k = calibration.intrinsics
         height, width = size  # new x is the old y, new y is the width less the old x

@@ -63,19 +63,45 @@ class Hypothesis:
         return min(self.shares.values())
 
     def photographs(self, folder: CaptureFolder) -> list[Photograph]:
-        """The small photographs without lens distortion, upright, with their masks as mattes and their
-        cameras in this meaning. InputError: a photograph has another aspect ratio."""
+        """The small photographs without lens distortion, upright, with their cameras in this meaning.
+
+        Args:
+            folder: where the views come from; it knows how photographs are turned.
+
+        Returns:
+            A photograph for each view, with its mask as matte.
+
+        Raises:
+            InputError: a photograph has another aspect ratio than its calibration.
+        """
         white = np.uint8(255)
         return [
             folder.photograph(v.name, v.camera, v.pixels, v.mask * white, v.convention) for v in self.views
         ]
 
     def silhouettes(self, folder: CaptureFolder) -> list[Silhouette]:
-        """Masks with their cameras in this meaning. InputError: a photograph has another aspect ratio."""
+        """Masks with their cameras in this meaning.
+
+        Args:
+            folder: as for :meth:`photographs`.
+
+        Returns:
+            A silhouette for each view.
+
+        Raises:
+            InputError: a photograph has another aspect ratio than its calibration.
+        """
         return [Silhouette(p.mask, p.intrinsics, p.extrinsics) for p in self.photographs(folder)]
 
     def ranked(self, folder: CaptureFolder) -> "Hypothesis":
-        """The same meaning with its :attr:`shares`, all 0 where no camera can have it."""
+        """Measure how well masks and cameras agree in this meaning.
+
+        Args:
+            folder: as for :meth:`photographs`.
+
+        Returns:
+            The same meaning with its :attr:`shares` from 0 to 1; all 0 where no camera can have it.
+        """
         try:
             shares = HullSearch().shares(self.silhouettes(folder))
         except (InputError, np.linalg.LinAlgError):
@@ -83,7 +109,14 @@ class Hypothesis:
         return replace(self, shares={v.name: share for v, share in zip(self.views, shares, strict=True)})
 
     def size(self, folder: CaptureFolder) -> float:
-        """The subject's largest extent in the user's unit; 0 where it is not known."""
+        """Estimate the subject's largest extent.
+
+        Args:
+            folder: as for :meth:`photographs`.
+
+        Returns:
+            The median over views, in the user's unit; 0 where it is not known.
+        """
         try:
             silhouettes = self.silhouettes(folder)
         except InputError:
@@ -105,7 +138,21 @@ class Diagnosis:
 
 
 def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
-    """Examine the cameras of one instant (None: the first). InputError: a file cannot be read."""
+    """Examine the cameras of one instant.
+
+    Copies are looked for first, then other meanings of all cameras, then mistakes of one or two of
+    them.
+
+    Args:
+        folder: photographs, masks and calibration.
+        instant: one of ``folder.instants``; None: the first.
+
+    Returns:
+        Whether cameras and masks agree, with what was found and the meanings that were tried.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
     views = small_views(folder, folder.instants[0] if instant is None else instant)
     given = Hypothesis("the calibration is right as it is", "", views).ranked(folder)
     same = twins({view.name: view.camera.pose for view in views})
@@ -141,7 +188,18 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
 
 
 def small_views(folder: CaptureFolder, instant: str) -> tuple[StoredView, ...]:
-    """The photographs of an instant, so small that many meanings can be tried."""
+    """Decode the photographs of an instant, so small that many meanings can be tried.
+
+    Args:
+        folder: photographs, masks and calibration.
+        instant: one of ``folder.instants``.
+
+    Returns:
+        A view for each photograph, of at most ``_SIDE`` pixels a side.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
     views = []
     for name, (camera, pixels, matte) in folder.decode(instant).items():
         height, width = pixels.size
@@ -156,7 +214,14 @@ def small_views(folder: CaptureFolder, instant: str) -> tuple[StoredView, ...]:
 
 
 def in_parts(views: Sequence[StoredView]) -> list[str]:
-    """The photographs whose masks have a second large part, as two people have."""
+    """Find masks that have a second large part, as two people have.
+
+    Args:
+        views: the photographs with their masks.
+
+    Returns:
+        The names of these photographs.
+    """
     from scipy import ndimage  # here: it takes time to import
 
     found = []
@@ -169,6 +234,7 @@ def in_parts(views: Sequence[StoredView]) -> list[str]:
 
 
 def _for_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
+    """Other meanings of all cameras: what poses map, axes, unit of the intrinsics, and a resize."""
     given = views[0].convention
     points = [view.camera.intrinsics[:2, 2] / np.array(view.camera.size)[::-1] for view in views]
     scale = 0.5 / max(float(np.median(points)), 0.01)  # brings principal points to the middle
@@ -194,6 +260,7 @@ def _for_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
 
 
 def _plausible(view: StoredView) -> bool:
+    """Whether the principal point of a view lies in the middle part of its photograph (``_MIDDLE``)."""
     share = view.camera.intrinsics[:2, 2] * view.convention.resized
     if view.convention.intrinsics == "pixels":
         share = share / np.array(view.camera.size)[::-1]

@@ -23,22 +23,39 @@ class Capture:
 
     @classmethod
     def read(cls, images: str | Path, cameras: str | Path, **options: Any) -> "Capture":
-        """The photographs of a folder with their cameras. ``cameras``: the calibration, in one of
-        :data:`ghgs_capture.formats.FORMATS`. ``options``: as for
-        :class:`ghgs_capture.folder.CaptureFolder`, such as ``masks``. InputError: a file is
-        missing or wrong, or the folder holds several instants."""
+        """Read a folder with photographs of one instant, and their cameras.
+
+        Args:
+            images: the folder; photographs are named after their cameras.
+            cameras: the calibration, in one of :data:`ghgs_capture.formats.FORMATS`.
+            options: as for :class:`ghgs_capture.folder.CaptureFolder`, such as ``masks``.
+
+        Returns:
+            The capture.
+
+        Raises:
+            InputError: a file is missing or wrong, or the folder holds several instants.
+        """
         folder = CaptureFolder(images, cameras, **options)
         instants = folder.instants
         require(len(instants) == 1, str(images), "one instant (CaptureFolder reads several)", len(instants))
         return cls(instants[0], folder.photographs(instants[0]))
 
     def batch(self, size: tuple[int, int], refine_masks: int = 0) -> Batch:
-        """Crops around the subject on a black background, as a model sees them: a batch of one element.
+        """Crops around the subject on a black background, as a model sees them.
 
-        Cameras are in the user's world, in float64, which a world far from its origin needs. Photographs are
-        divided by the gains of their cameras where those of all are known. ``size``: (height, width) of the
-        crops in pixels. ``refine_masks``: pixels of a crop by which outlines of masks may be wrong; mattes
-        are then searched in the photographs (:func:`refined_matte`). 0: masks are right."""
+        Cameras are in the user's world, in float64, which a world far from its origin needs.
+        Photographs are divided by the gains of their cameras where those of all are known.
+
+        Args:
+            size: (height, width) of the crops in pixels.
+            refine_masks: pixels of a crop by which outlines of masks may be wrong; mattes are then
+                searched in the photographs (:func:`ghgs_lit.data.matting.refined_matte`). 0: masks
+                are right.
+
+        Returns:
+            A batch of one element; images from 0 to 1.
+        """
         crops = [crop_to_subject(photograph, size, refine_masks) for photograph in self.photographs]
         images, mattes, intrinsics, extrinsics = (
             torch.from_numpy(np.stack([getattr(crop, name) for crop in crops]))[None]

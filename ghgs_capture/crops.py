@@ -36,11 +36,20 @@ class Photograph:
 
 
 def crop_to_subject(photograph: Photograph, size: tuple[int, int], refine_masks: int = 0) -> Photograph:
-    """A crop of ``size`` (height, width) with the subject in its middle, and its camera.
+    """Cut the subject out, in the middle of the crop, and move its camera along.
 
-    Beyond the photograph and beside the subject it is black. A large photograph's sharp mask becomes a soft
-    matte. Where the photograph's border cuts the subject the crop ends, too: black beside it would look like
-    the subject's end. ``refine_masks``: as for ``Capture.batch``."""
+    Beyond the photograph and beside the subject the crop is black. A large photograph's sharp mask
+    becomes a soft matte. Where the photograph's border cuts the subject the crop ends, too: black
+    beside it would look like the subject's end.
+
+    Args:
+        photograph: with a subject of one pixel or more.
+        size: (height, width) of the crop in pixels.
+        refine_masks: as for :meth:`ghgs_capture.capture.Capture.batch`.
+
+    Returns:
+        The crop as a photograph of ``size``, with its intrinsics.
+    """
     extents = photograph.extents
     scale = max((end - first) / (SHARE * side) for (first, end), side in zip(extents, size, strict=True))
     spans = [
@@ -67,7 +76,19 @@ def crop_to_subject(photograph: Photograph, size: tuple[int, int], refine_masks:
 def _refined(
     name: str, image: np.ndarray, matte: np.ndarray, size: tuple[int, int], pixels: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """:func:`refined_matte` of a cut, which is resized first where it is much larger than the crop."""
+    """Refine the matte of a cut, which is resized first where it is much larger than the crop.
+
+    Args:
+        name: of the photograph, for a warning.
+        image: the cut [h, w, 3] uint8.
+        matte: its matte [h, w] uint8.
+        size: (height, width) of the crop in pixels.
+        pixels: of the crop, by which the mask's outline may be wrong.
+
+    Returns:
+        The subject on black [h, w, 3] and its matte [h, w], uint8. Where the refined mask has less
+        than half or more than twice the area, a warning says so and the matte stays as it is.
+    """
     from ghgs_lit.data.matting import refined_matte  # here: photographs are read while PyTorch is imported
 
     sides = [min(_FINER * side, whole) for side, whole in zip(size, matte.shape, strict=True)]
@@ -90,7 +111,17 @@ def _on_black(image: np.ndarray, matte: np.ndarray) -> np.ndarray:
 
 
 def _span(first: int, end: int, length: int, whole: int) -> tuple[int, int]:
-    """``length`` pixels around those from ``first`` to ``end`` of ``whole``; see :func:`crop_to_subject`."""
+    """Place a crop along one axis; it ends where the photograph's border cuts the subject.
+
+    Args:
+        first: first pixel of the subject.
+        end: the pixel after its last one.
+        length: of the crop, in pixels of the photograph.
+        whole: length of the photograph.
+
+    Returns:
+        First pixel of the crop and the one after its last; they may lie beyond the photograph.
+    """
     if first == 0 and end == whole:
         return 0, whole
     start = (first + end - length) // 2
@@ -102,6 +133,7 @@ def _span(first: int, end: int, length: int, whole: int) -> tuple[int, int]:
 
 
 def _cut(image: np.ndarray, spans: list[tuple[int, int]]) -> np.ndarray:
+    """Pixels of ``spans`` (rows, then columns); 0 beyond the photograph."""
     inside = tuple(slice(max(a, 0), min(b, side)) for (a, b), side in zip(spans, image.shape, strict=False))
     pads = [(max(-a, 0), max(b - side, 0)) for (a, b), side in zip(spans, image.shape, strict=False)]
     return np.pad(image[inside], pads + [(0, 0)] * (image.ndim - 2))

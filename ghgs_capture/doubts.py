@@ -20,7 +20,16 @@ _REST = 0.25  #: Share of the distance that the others have where one camera may
 
 
 def doubt_of_masks(capture: Capture, size: tuple[int, int]) -> str:
-    """Where photographs show outlines, in pixels of crops of ``size``, if masks are off; else ""."""
+    """Say where photographs show outlines, if they contradict the masks.
+
+    Args:
+        capture: photographs with their masks.
+        size: (height, width) of the crops in pixels.
+
+    Returns:
+        Pixels of a crop from each mask's outline inward to the photograph's; "" where masks are
+        right.
+    """
     off = [_outline(photograph, size) for photograph in capture.photographs]
     if np.abs(off).mean() <= _OFF:
         return ""
@@ -28,8 +37,18 @@ def doubt_of_masks(capture: Capture, size: tuple[int, int]) -> str:
 
 
 def doubt_of_cameras(capture: Capture, batch: Batch) -> str:
-    """By how much silhouettes of its crops miss one another, if cameras are off, and without which of them
-    they do not: one, or two that are nearly exchangeable, as opposite ones are; else ""."""
+    """Say by how much silhouettes miss one another, if cameras are off.
+
+    It is also said without which cameras they do not: one, or two that are nearly exchangeable, as
+    opposite ones are.
+
+    Args:
+        capture: photographs with their cameras.
+        batch: its crops, of one element.
+
+    Returns:
+        The message; "" where cameras are right.
+    """
     missed, without = (distances[0].tolist() for distances in contradiction(Frame.of(batch).enter(batch)))
     focal = [photograph.intrinsics[0, 0] for photograph in capture.photographs]
     # An enlarged photograph has larger pixels, and larger steps of outlines.

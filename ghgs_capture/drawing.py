@@ -20,11 +20,20 @@ _COLORS = ((255, 220, 0), (0, 200, 255), (255, 120, 255), (255, 160, 60), (160, 
 def camera_sheet(
     names: Sequence[str], images: Sequence[np.ndarray], views: Sequence[Silhouette]
 ) -> np.ndarray:
-    """Picture [H, W, 3] uint8: a row with masks (green) and hulls of the others (red), then epipolar lines.
+    """Draw masks, hulls and epipolar lines, by which cameras can be checked by eye.
 
-    Each row of lines begins with points of one mask; the other pictures show the line on which each point
-    must be, near the subject's depth: it passes the same part of the body in every photograph. ``images``:
-    [h, w, 3] uint8. ``views``: masks of the photographs' sizes with their cameras."""
+    The first row has masks (green) and the hull of the other masks (red). Each further row begins
+    with points of one mask; the other pictures show the line on which each point must be, near the
+    subject's depth: it passes the same part of the body in every photograph.
+
+    Args:
+        names: of the photographs.
+        images: the photographs [h, w, 3] uint8, without distortion.
+        views: their masks, of the photographs' sizes, with their cameras.
+
+    Returns:
+        The picture [H, W, 3] uint8.
+    """
     focus, radius = subject_sphere(views)
     small = [_smaller(view) for view in views]
     tiles = []
@@ -46,6 +55,7 @@ def camera_sheet(
 
 
 def _smaller(view: Silhouette) -> Silhouette:
+    """The view with every n-th pixel of its mask, at most ``_CELLS`` a side."""
     step = max(-(-max(view.mask.shape) // _CELLS), 1)
     intrinsics = view.intrinsics.copy()
     intrinsics[:2] /= step
@@ -71,6 +81,18 @@ def _dots(image: np.ndarray, points: np.ndarray) -> np.ndarray:
 def _lines(
     image: np.ndarray, view: Silhouette, other: Silhouette, points: np.ndarray, depths: np.ndarray
 ) -> np.ndarray:
+    """Draw the rays of points of one view on the photograph of another.
+
+    Args:
+        image: the other photograph [h, w, 3] uint8.
+        view: the mask and camera of the points.
+        other: the camera of the photograph.
+        points: [5, 2] (column, row) in pixels of ``view``.
+        depths: [n] z-depths in ``view``, in the unit of the cameras, between which rays are drawn.
+
+    Returns:
+        The picture [h, w, 3] uint8.
+    """
     picture = Image.fromarray(image)
     draw = ImageDraw.Draw(picture)
     for ray, color in zip(view.rays(points), _COLORS, strict=True):
