@@ -286,7 +286,8 @@ def _for_some(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
             _contrast(one, other.mask) * _contrast(other, one.mask)
             > _contrast(one, one.mask) * _contrast(other, other.mask)
         ):
-            swapped[i], swapped[j] = replace(one, mask=other.mask), replace(other, mask=one.mask)
+            swapped[i] = replace(one, mask=other.mask)
+            swapped[j] = replace(other, mask=one.mask)
             yield Hypothesis(f"the masks of {names} are exchanged", "", tuple(swapped), blames)
             continue
         option = f"'calibration.names={{{one.name}: {other.name}, {other.name}: {one.name}}}'"

@@ -19,7 +19,18 @@ the rotation (w, x, y, z), of which 128 is zero."""
 
 
 def converted(name: str, gaussians: Gaussians) -> bytes:
-    """The content of a file in format ``name`` of ``CONVERTED``. InputError: it cannot be, as of none."""
+    """Convert Gaussians to another program's format, by the package gaussforge.
+
+    Args:
+        name: of the format, in ``CONVERTED``.
+        gaussians: of one subject, with RGB colours.
+
+    Returns:
+        The content of a file.
+
+    Raises:
+        InputError: gaussforge cannot convert them, such as none.
+    """
     from gaussforge import GaussForge
 
     answer = GaussForge().convert(ply_bytes(gaussians), "ply", CONVERTED[name])
@@ -30,23 +41,46 @@ def converted(name: str, gaussians: Gaussians) -> bytes:
 
 
 def to_records(gaussians: Gaussians) -> np.ndarray:
-    """The Gaussians of one subject (RGB colours) as records [N] of dtype ``RECORD``, large and opaque ones
-    first, so that a part of a ``.splat`` file is a picture, too."""
+    """Store Gaussians as records of ``.splat``.
+
+    Large and opaque ones come first, so that a part of a file is a picture, too.
+
+    Args:
+        gaussians: of one subject, with RGB colours.
+
+    Returns:
+        Records [N] of dtype ``RECORD``.
+    """
     values = {name: value[visible_first(gaussians).cpu()] for name, value in stored_values(gaussians).items()}
     records = np.empty(len(gaussians), RECORD)
-    records["mean"], records["scale"] = values["means"].numpy(), values["scales"].numpy()
+    records["mean"] = values["means"].numpy()
+    records["scale"] = values["scales"].numpy()
     records["color"] = rgba(values).numpy()
     records["rotation"] = (values["quaternions"] * 128 + 128).round().clamp(0, 255).byte().numpy()
     return records
 
 
 def visible_first(gaussians: Gaussians) -> Tensor:
-    """Indices [N] of the Gaussians, large and opaque ones first."""
+    """Sort Gaussians by volume times opacity.
+
+    Args:
+        gaussians: of one subject.
+
+    Returns:
+        Indices [N] of the Gaussians, large and opaque ones first.
+    """
     size = gaussians.scales.double().prod(-1) * gaussians.opacities
     return size.argsort(descending=True, stable=True)
 
 
 def rgba(values: Mapping[str, Tensor]) -> Tensor:
-    """Colours and opacities [N, 4] uint8 of :func:`ghgs_lit.ply.stored_values`."""
+    """Round colours and opacities to bytes.
+
+    Args:
+        values: those of :func:`ghgs_lit.ply.stored_values`.
+
+    Returns:
+        [N, 4] uint8.
+    """
     colors = torch.cat([values["colors"], values["opacities"][:, None]], dim=-1)
     return (colors.clamp(0, 1) * 255).round().byte()

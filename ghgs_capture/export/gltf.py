@@ -22,8 +22,18 @@ _KERNEL = {
 
 
 def glb_bytes(gaussians: Gaussians, up: torch.Tensor) -> bytes:
-    """The content of a file with the Gaussians of one subject (RGB colours). ``up``: the world's upward unit
-    vector [3]. InputError: there are no Gaussians (glTF has no empty lists)."""
+    """Store Gaussians as binary glTF (Khronos extension ``KHR_gaussian_splatting``).
+
+    Args:
+        gaussians: of one subject, with RGB colours.
+        up: the world's upward unit vector [3].
+
+    Returns:
+        The content of a file.
+
+    Raises:
+        InputError: there are no Gaussians (glTF has no empty lists).
+    """
     import pygltflib as gltf
 
     require(len(gaussians) > 0, "formats=glb", "at least one Gaussian", 0)

@@ -28,11 +28,17 @@ _VIDEO_SIDE = 720  #: Least length of its pictures' longer side in pixels
 
 
 class Instants:
-    """Files of all instants together, beside their folders: for ``html`` ``viewer.html``; for ``ply``
-    ``sequence/0000.ply`` and so on, which other programs import as a sequence; for ``mp4`` ``instants.mp4``.
+    """Files of all instants together, beside their folders.
 
-    The cameras of page and video follow the subject's mean, smoothed over a second. ``count``: largest number
-    of instants. ``others``: names of further files, whose contents are set in the attribute before writing.
+    For ``html`` ``viewer.html``; for ``ply`` ``sequence/0000.ply`` and so on, which other programs
+    import as a sequence; for ``mp4`` ``instants.mp4``. The cameras of page and video follow the
+    subject's mean, smoothed over a second.
+
+    Args:
+        count: largest number of instants.
+        options: formats, upward axis and pictures a second.
+        others: names of further files, whose contents are set in the attribute ``others`` before
+            writing.
     """
 
     def __init__(self, count: int, options: OutputOptions, others: Iterable[str] = ()):
@@ -55,7 +61,14 @@ class Instants:
         return [*made, *self.others]
 
     def add(self, folder: Path, batch: Batch, prediction: Prediction, renderer: Renderer) -> None:
-        """Keep what the files need of the next instant. ``folder``: that of the instant's own files."""
+        """Keep what the files need of the next instant.
+
+        Args:
+            folder: that of the instant's own files.
+            batch: photographs, masks and cameras of one subject.
+            prediction: the subject's, of this batch.
+            renderer: draws the pictures of the video.
+        """
         self.folders.append(folder)
         if not {"html", "mp4"} & {*self.options.formats}:
             return
@@ -69,10 +82,19 @@ class Instants:
         self._seconds += time.perf_counter() - begin
 
     def write(self, directory: Path) -> list[Path]:
-        """Write the files, after all instants are added and their own files written. Returns: the paths, the
-        report last; none if ``formats`` has no such file. InputError: a file of other origin is in the way.
+        """Write the files, after all instants are added and their own files written.
+
+        Args:
+            directory: that of all instants.
+
+        Returns:
+            The paths, that of the report last; none if ``formats`` has no such file.
+
+        Raises:
+            InputError: a file of another origin is in the way.
         """
-        self.count, self.others = len(self.folders), {n: made for n, made in self.others.items() if made}
+        self.count = len(self.folders)
+        self.others = {name: made for name, made in self.others.items() if made}
         names = self.files
         if not names:
             return []
@@ -92,6 +114,7 @@ class Instants:
         return end_files(directory, names, report)
 
     def _path(self) -> np.ndarray:
+        """Shift of page and video at each instant [instants, 3]: the smoothed path of the subject's mean."""
         reach = self.options.fps // 2
         # Odd reflection at the ends: a steady walk stays steady.
         padded = np.pad(np.stack(self._means), ((reach, reach), (0, 0)), "reflect", reflect_type="odd")
@@ -141,8 +164,16 @@ _COLORS = (
 
 
 def mp4_bytes(pictures: Iterable[np.ndarray], fps: int) -> bytes:
-    """The content of a video of pictures [h, w, 3] uint8 of one size; odd sides get one more row or column.
-    ``pictures``: at least one; taken one by one, so that a long video fits in memory."""
+    """Encode pictures as a video; odd sides get one more row or column.
+
+    Args:
+        pictures: [h, w, 3] uint8 of one size, at least one; taken one by one, so that a long video
+            fits in memory.
+        fps: pictures a second.
+
+    Returns:
+        The content of an MP4 file.
+    """
     import imageio_ffmpeg
 
     pictures = iter(pictures)

@@ -19,15 +19,30 @@ _LEVELS = 65535  # of a picture of 16 bits
 
 
 def png(picture: np.ndarray, text: PngInfo | None = None) -> bytes:
-    """A picture as PNG: [h, w] uint16, [h, w, 3] or with alpha [h, w, 4] uint8."""
+    """Encode a picture as PNG.
+
+    Args:
+        picture: [h, w] uint16, [h, w, 3] or with alpha [h, w, 4] uint8.
+        text: entries of text in the file; None: none.
+
+    Returns:
+        The content of a file.
+    """
     content = BytesIO()
     Image.fromarray(picture).save(content, format="PNG", pnginfo=text)
     return content.getvalue()
 
 
 def depth_unit(largest: float) -> float:
-    """The length of one grey level of a depth picture: 0.001, or another power of ten if ``largest`` needs it
-    to fit into 16 bits and have at least 1000 levels."""
+    """Choose the length of one grey level of a depth picture.
+
+    Args:
+        largest: the largest depth, 0 or more.
+
+    Returns:
+        0.001, or another power of ten if ``largest`` needs it to fit into 16 bits and have at least
+        1000 levels.
+    """
     exponent = -3
     while largest > _LEVELS * 10.0**exponent:
         exponent += 1
@@ -37,8 +52,16 @@ def depth_unit(largest: float) -> float:
 
 
 def depth_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
-    """Functions that make a 16-bit PNG of each view (0: no depth; the unit stands in the file), then an exact
-    NPZ with ``depth`` [V, H, W] (nan: none), ``intrinsics``, ``extrinsics`` and ``views``."""
+    """Depth maps as pictures and as exact numbers.
+
+    Args:
+        subject: with depths of each view.
+
+    Yields:
+        Functions that make a 16-bit PNG of each view (0: no depth; the unit stands in the file),
+        then an NPZ with ``depth`` [V, H, W] float32 (nan: none), ``intrinsics``, ``extrinsics`` and
+        ``views``.
+    """
     valid = subject.depth_valid.cpu().numpy()
     depth = np.where(valid, subject.depth.float().cpu().numpy(), np.float32(np.nan))
     unit = depth_unit(float(np.max(depth, where=valid, initial=0)))
@@ -57,7 +80,14 @@ def depth_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
 
 
 def points_ply(subject: ExportedSubject) -> bytes:
-    """A PLY of the unprojected pixels of the subject with their colours."""
+    """Store the unprojected pixels of the subject with their colours.
+
+    Args:
+        subject: with its ``points``.
+
+    Returns:
+        The content of a PLY file.
+    """
     positions = subject.points.float().cpu().numpy()
     colors = (subject.colors.float().clamp(0, 1) * 255).round().byte().cpu().numpy()
     columns = dict(zip("xyz", positions.T, strict=True))
@@ -65,8 +95,15 @@ def points_ply(subject: ExportedSubject) -> bytes:
 
 
 def input_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
-    """Functions that make a PNG of each view as the model saw it, with matte or mask as alpha, then the
-    cameras: what ``ghgs predict images=inputs cameras=cameras.json`` reads."""
+    """Photographs and cameras, as ``ghgs predict images=inputs cameras=cameras.json`` reads them.
+
+    Args:
+        subject: with its photographs.
+
+    Yields:
+        Functions that make a PNG of each view as the model saw it, with matte or mask as alpha,
+        then the JSON of the cameras.
+    """
     for image, matte in zip(subject.images, subject.mattes, strict=True):
         colors = to_uint8(unmultiplied(image, matte))  # PNG's colours are not premultiplied
         alpha = (matte * 255).round().byte().cpu().numpy()[..., None]
@@ -79,11 +116,24 @@ def input_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
 
 
 def camera_entry(intrinsics: Any, extrinsics: Any, size: tuple[int, int]) -> dict[str, Any]:
-    """A camera of this package's JSON. ``size``: (height, width) of its photograph in pixels."""
+    """A camera of this package's JSON.
+
+    Args:
+        intrinsics: array or tensor [3, 3] in pixels.
+        extrinsics: array or tensor [4, 4], world to camera.
+        size: (height, width) of its photograph in pixels.
+
+    Returns:
+        Plain data.
+    """
     matrices = {"intrinsics": intrinsics.tolist(), "extrinsics": extrinsics.tolist()}
     return {**matrices, "width": size[1], "height": size[0]}
 
 
 def cameras_json(entries: Mapping[str, dict[str, Any]]) -> str:
-    """The text of this package's JSON of cameras, from :func:`camera_entry` by name."""
+    """The text of this package's JSON of cameras.
+
+    Args:
+        entries: those of :func:`camera_entry`, by name.
+    """
     return json.dumps({"cameras": entries}, indent=1)

@@ -28,12 +28,22 @@ _LARGEST = 1 << 29
 
 
 def pack(gaussians: Gaussians, pixel: float, center: Tensor, steps: Mapping[str, int]) -> bytes:
-    """Gaussians of one subject (RGB colours) in few bytes, which ``page.html`` unpacks: planes [22, N].
+    """Store Gaussians in few bytes, which ``page.html`` unpacks: planes [22, N].
 
-    A Gaussian becomes whole numbers: its centre relative to ``center`` [3] in parts of ``pixel``, the side of
-    a photograph's pixel at the subject; the logarithms of its standard deviations; colour and opacity; and
-    its rotation as ``v / (1 + w)`` of the unit quaternion ``(w, v)`` with ``w >= 0``. Each is stored as the
-    difference from the Gaussian before, mostly its neighbour's. ``steps``: ``FINE`` or ``COARSE``."""
+    A Gaussian becomes whole numbers: its centre relative to ``center`` in parts of ``pixel``; the
+    logarithms of its standard deviations; colour and opacity; and its rotation as ``v / (1 + w)``
+    of the unit quaternion ``(w, v)`` with ``w >= 0``. Each is stored as the difference from the
+    Gaussian before, mostly its neighbour's.
+
+    Args:
+        gaussians: of one subject, with RGB colours.
+        pixel: side of a photograph's pixel at the subject, in the unit of the cameras.
+        center: point [3] in the middle of the subject.
+        steps: ``FINE`` or ``COARSE``.
+
+    Returns:
+        The planes, compressed by zlib.
+    """
     values = stored_values(gaussians, torch.float64)
     w, v = values["quaternions"].split((1, 3), dim=1)
     parts = (
@@ -53,7 +63,18 @@ def pack(gaussians: Gaussians, pixel: float, center: Tensor, steps: Mapping[str,
 
 
 def unpack(data: bytes, pixel: float, center: Tensor, steps: Mapping[str, int], like: Gaussians) -> Gaussians:
-    """The Gaussians of :func:`pack`, on the CPU, with the image constants of ``like``."""
+    """The Gaussians of :func:`pack`, on the CPU.
+
+    Args:
+        data: the packed bytes.
+        pixel: as given to :func:`pack`.
+        center: as given to :func:`pack`.
+        steps: as given to :func:`pack`.
+        like: Gaussians whose image constants (``low_pass``, ``antialiased``) they get.
+
+    Returns:
+        The Gaussians of one subject, rounded to ``steps``, in float32.
+    """
     planes = np.frombuffer(zlib.decompress(data), np.uint8).reshape(4 * _WIDE + _NARROW, -1)
     wide = np.ascontiguousarray(planes[: 4 * _WIDE].T).view("<u4").astype(np.int64)
     centers = torch.from_numpy((wide >> 1 ^ -(wide & 1)).cumsum(0))
@@ -85,13 +106,18 @@ def page(
     path: Sequence[Sequence[float]] = ((0.0, 0.0, 0.0),),
     fps: float = 1.0,
 ) -> str:
-    """The text of a page that shows one instant or plays several, with a button for each camera.
+    """A page that shows one instant or plays several, with a button for each camera.
 
     Args:
         subject: the first instant; the page begins at its first camera.
-        packed: :func:`pack` of each of several instants, with ``COARSE``.
+        name: title of the page, as plain text.
+        packed: :func:`pack` of each of several instants, with ``COARSE``; none: the subject alone.
         path: shift of the page's camera at each instant [instants, 3].
-        fps: instants a second."""
+        fps: instants a second.
+
+    Returns:
+        The text of an HTML file.
+    """
     gaussians = subject.gaussians
     cameras = subject.cameras
     center = subject.center

@@ -45,7 +45,12 @@ class Format:
     extra: str = "formats"  #: extra of this package that installs it
 
     def names(self, views: Sequence[str], frames: int) -> list[str]:
-        """The names of all files."""
+        """The names of all files.
+
+        Args:
+            views: names of the photographs.
+            frames: number of pictures of the turntable.
+        """
         names = []
         for pattern in self.files:
             if "{view}" in pattern:
@@ -93,6 +98,12 @@ FORMATS: dict[str, Format] = {
 def output_options(verb: "Predict") -> OutputOptions:
     """What a verb writes, checked before any work.
 
+    Args:
+        verb: its options.
+
+    Returns:
+        The choices for files.
+
     Raises:
         InputError: an unknown format, no frames for a video, or a package that is not installed.
     """
@@ -109,7 +120,15 @@ def output_options(verb: "Predict") -> OutputOptions:
 
 
 def output_files(options: OutputOptions, views: Sequence[str]) -> list[str]:
-    """Names of the files, except the report, that :func:`write_prediction` writes into its directory."""
+    """List what :func:`write_prediction` writes into its directory.
+
+    Args:
+        options: formats and number of pictures of the turntable.
+        views: names of the photographs.
+
+    Returns:
+        Names of the files, except the report.
+    """
     names = [name for format in options.formats for name in FORMATS[format].names(views, options.frames)]
     return [*names, SHEET]
 
@@ -125,15 +144,23 @@ def write_prediction(
 ) -> list[Path]:
     """Write the prediction of one subject, ``sheet.png`` to look at and ``report.json`` about it.
 
-    Lengths in the files are in the unit of the batch's cameras. Returns: the paths, that of ``report.json``
-    last. InputError: several subjects, or a file of another origin is in the way.
+    Lengths in the files are in the unit of the batch's cameras.
 
     Args:
         directory: files of an earlier prediction are replaced, others stay.
-        batch: photographs, masks and cameras of the subject; the sheet compares renders with its targets, or
-            with the photographs where it has none.
+        batch: photographs, masks and cameras of the subject; the sheet compares renders with its
+            targets, or with the photographs where it has none.
+        prediction: of this batch, in the world of its cameras.
         renderer: draws the turntable, and the input views for the report.
-        facts: further plain data for the report, such as the seconds of each stage."""
+        options: formats and choices for them.
+        facts: further plain data for the report, such as the seconds of each stage.
+
+    Returns:
+        The paths, that of ``report.json`` last.
+
+    Raises:
+        InputError: several subjects, or a file of another origin is in the way.
+    """
     subject = exported_subject(batch, prediction, renderer, options)
     names = output_files(options, subject.views)
     seconds = {}

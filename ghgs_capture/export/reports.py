@@ -16,7 +16,16 @@ REPORT = "report.json"  #: The file that lists the others
 
 
 def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] = ()) -> None:
-    """Refuse to replace inputs, or ``names`` and a report of other origin. InputError: names the first."""
+    """Refuse to replace inputs, or files of other origin.
+
+    Args:
+        directory: where files will be written.
+        names: of the files, below the directory; the report is checked, too.
+        inputs: files that are read.
+
+    Raises:
+        InputError: names the first file that is in the way.
+    """
     read = {os.path.realpath(path) for path in inputs}
     written = _written_before(directory)
     for name in (*names, REPORT):
@@ -28,8 +37,18 @@ def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] =
 
 
 def begin_files(directory: Path, names: Sequence[str]) -> list[str]:
-    """List files in the report before they are written, so that those of an interrupted run are known, too.
-    Returns: other files of earlier predictions. InputError: a file of another origin is in the way."""
+    """List files in the report before they are written, so that an interrupted run's are known, too.
+
+    Args:
+        directory: where files will be written.
+        names: of the files, below the directory.
+
+    Returns:
+        Names of other files of earlier predictions.
+
+    Raises:
+        InputError: a file of another origin is in the way.
+    """
     require_free(directory, names)
     earlier = _beside(directory, names)
     known = {"files": dict.fromkeys(names), "earlier_files": earlier}
@@ -38,7 +57,16 @@ def begin_files(directory: Path, names: Sequence[str]) -> list[str]:
 
 
 def end_files(directory: Path, names: Sequence[str], report: Mapping[str, Any]) -> list[Path]:
-    """Write the report, with the sizes of the files. Returns: their paths, that of the report last."""
+    """Write the report, with the sizes of the files.
+
+    Args:
+        directory: where the files are.
+        names: of the files, below the directory.
+        report: plain data, without NaN or infinity.
+
+    Returns:
+        The paths of the files, that of the report last.
+    """
     paths = [directory / name for name in names]
     sizes = {name: path.stat().st_size for name, path in zip(names, paths, strict=True)}
     earlier = _beside(directory, names)
@@ -49,7 +77,15 @@ def end_files(directory: Path, names: Sequence[str], report: Mapping[str, Any]) 
 
 
 def write_file(path: Path, content: Callable[[], bytes]) -> float:
-    """Make and write a file. Returns: the seconds that it took."""
+    """Make and write a file.
+
+    Args:
+        path: of the file, which is written whole or not at all.
+        content: makes what is written.
+
+    Returns:
+        The seconds that both took.
+    """
     begin = time.perf_counter()
     made = content()
     write_atomically(path, lambda temporary: temporary.write_bytes(made))

@@ -23,7 +23,16 @@ AXES = {"y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 def turn(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Float[Tensor, "4"]:
-    """The unit quaternion of the shortest rotation from unit vector ``start`` to ``end``, float64."""
+    """The shortest rotation from one direction to another.
+
+    Args:
+        start: unit vector.
+        end: unit vector; if opposite to ``start``, the rotation is half a turn about any axis at
+            right angles.
+
+    Returns:
+        The unit quaternion (w, x, y, z), float64.
+    """
     start = start.double()
     end = end.double()
     axis = torch.linalg.cross(start, end)
@@ -37,7 +46,16 @@ def turn(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Float[Tensor, "4
 def rotate_world(
     quaternion: Float[Tensor, "4"], gaussians: Gaussians, cameras: Cameras
 ) -> tuple[Gaussians, Cameras]:
-    """The same scene in a world rotated by the unit ``quaternion``. Colours must not depend on direction."""
+    """Rotate a whole scene.
+
+    Args:
+        quaternion: unit quaternion (w, x, y, z) of the rotation.
+        gaussians: their colours must not depend on direction.
+        cameras: of any number.
+
+    Returns:
+        The same Gaussians and cameras in the rotated world, of the dtypes as given.
+    """
     quaternion = quaternion.double()
     rotation = quaternion_to_matrix(quaternion)
     means = gaussians.means.double() @ rotation.to(gaussians.means.device).mT
@@ -77,9 +95,18 @@ class OutputOptions:
 
 
 def smoothed(gaussians: Gaussians, pixel: float) -> Gaussians:
-    """Gaussians widened by what a renderer adds in photographs with pixels of side ``pixel``: ``low_pass``
-    square pixels and, with ``antialiased``, the loss of opacity (exact for round Gaussians; for others the
-    geometric mean of their axes)."""
+    """Widen Gaussians by what a renderer adds in photographs.
+
+    That is ``low_pass`` square pixels and, with ``antialiased``, the loss of opacity (exact for
+    round Gaussians; for others the geometric mean of their axes).
+
+    Args:
+        gaussians: with the renderer's image constants.
+        pixel: side of a photograph's pixel at the subject, in the unit of the cameras.
+
+    Returns:
+        Gaussians that need no constants: ``low_pass`` 0, not ``antialiased``.
+    """
     variances = gaussians.scales.square()
     wider = variances + gaussians.low_pass * pixel**2
     opacities = gaussians.opacities
@@ -92,8 +119,16 @@ def smoothed(gaussians: Gaussians, pixel: float) -> Gaussians:
 def for_other_renderers(gaussians: Gaussians, pixel: float) -> Gaussians:
     """Gaussians that 3D Gaussian Splatting's own renderer draws as ours draws the given ones.
 
-    It always adds 0.3 px^2 and does not reduce opacity. Variances are reduced by what it adds too much at the
-    photographs' size, with pixels of side ``pixel``; those that ours draws below 0.3 px^2 become points."""
+    It always adds 0.3 px^2 and does not reduce opacity. Variances are reduced by what it adds too
+    much at the photographs' size; those that ours draws below 0.3 px^2 become points.
+
+    Args:
+        gaussians: with our renderer's image constants.
+        pixel: side of a photograph's pixel at the subject, in the unit of the cameras.
+
+    Returns:
+        Gaussians with that renderer's constants; the given ones where they have them already.
+    """
     if gaussians.low_pass == VIEWER_LOW_PASS and not gaussians.antialiased:
         return gaussians
     drawn = smoothed(gaussians, pixel)
@@ -103,7 +138,17 @@ def for_other_renderers(gaussians: Gaussians, pixel: float) -> Gaussians:
 
 
 def fitted(theirs: Gaussians, ours: Gaussians, cameras: Sequence[Cameras], renderer: Renderer) -> Gaussians:
-    """``theirs`` optimised to render more like ``ours``. ``cameras``: sets of cameras [n], used in turn."""
+    """Optimise Gaussians to render more like others, in ``_FIT_STEPS`` steps.
+
+    Args:
+        theirs: Gaussians with the image constants of another renderer.
+        ours: what renders are compared with.
+        cameras: sets of cameras [n], used in turn.
+        renderer: draws both, with gradients.
+
+    Returns:
+        ``theirs`` with changed scales, opacities and colours.
+    """
     drawn = [renderer(ours, some[None], background=0.0) for some in cameras]
     search = Descent(theirs, None, _FIT)
     for step in range(_FIT_STEPS):
@@ -190,7 +235,22 @@ class ExportedSubject:
 def exported_subject(
     batch: Batch, prediction: Prediction, renderer: Renderer, options: OutputOptions
 ) -> ExportedSubject:
-    """The subject of a batch of one, in the frame that ``options`` choose. InputError: several subjects."""
+    """The subject of a batch of one, in the frame that ``options`` choose.
+
+    Gaussians that are not finite are dropped.
+
+    Args:
+        batch: photographs, masks and cameras of one subject.
+        prediction: of this batch, in the world of its cameras.
+        renderer: draws pictures of the files.
+        options: the upward axis, and choices that go along.
+
+    Returns:
+        The subject, on the device of the prediction.
+
+    Raises:
+        InputError: there are several subjects.
+    """
     count = len(batch.images)
     require(count == 1, "write_prediction", "a batch of one subject", count)
     cameras = batch.cameras[0]
@@ -227,7 +287,11 @@ def exported_subject(
 
 
 def file_names(views: Sequence[str]) -> list[str]:
-    """Names of photographs made fit for file names, all different even without case."""
+    """Names of photographs made fit for file names, all different even without case.
+
+    Args:
+        views: names of the photographs.
+    """
     names: dict[str, str] = {}
     for view in views:
         name = "".join(c if c.isalnum() or c in "-_." else "_" for c in view)

@@ -21,12 +21,17 @@ GUESSED = 0.75
 
 
 def unseen(subject: ExportedSubject, depth: Float[Tensor, "1 V 1 H W"]) -> dict[str, Any]:
-    """Plain data for the report. ``depth``: of the rendered inputs.
+    """What photographs do not show of a subject, as plain data for the report.
+
+    Args:
+        subject: with masks and Gaussians.
+        depth: of the rendered inputs, in the unit of the cameras.
 
     Returns:
-        ``cut``: by edge of the frame, the photographs whose mask reaches it. ``seen_once``: by part of the
-        subject's height, the share of its Gaussians that at most one photograph shows, so that no second one
-        confirms their depth; empty without Gaussians."""
+        ``cut``: by edge of the frame, the photographs whose mask reaches it. ``seen_once``: by part
+        of the subject's height, the share of its Gaussians that at most one photograph shows, so
+        that no second one confirms their depth; empty without Gaussians.
+    """
     masks = subject.masks
     lines = {"top": masks[:, 0], "bottom": masks[:, -1], "left": masks[..., 0], "right": masks[..., -1]}
     touched = {edge: line.any(-1).tolist() for edge, line in lines.items()}
