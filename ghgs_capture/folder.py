@@ -143,7 +143,18 @@ class CaptureFolder:
         return files + [file for path in given for file in (path.rglob("*") if path.is_dir() else [path])]
 
     def photographs(self, instant: str) -> tuple[Photograph, ...]:
-        """The photographs of one instant, two or more. InputError: as for :meth:`decode`."""
+        """Decode one instant, and apply the calibration.
+
+        Args:
+            instant: one of :attr:`instants`.
+
+        Returns:
+            Its photographs, two or more, undistorted and upright.
+
+        Raises:
+            InputError: as for :meth:`decode`; or a photograph has another aspect ratio than its
+                calibration.
+        """
         views = self.decode(instant)
         self._begun.clear()  # they take much memory
         upright = {n: partial(self.photograph, n, *view, self.convention) for n, view in views.items()}
@@ -152,9 +163,18 @@ class CaptureFolder:
     def decode(self, instant: str) -> dict[str, tuple[StoredCamera, Pixels, np.ndarray]]:
         """Camera, photograph and matte as shown of each view, before the calibration is applied.
 
-        They are kept until :meth:`photographs` has them, or another instant is decoded. InputError: a
-        photograph or mask is missing or wrong; of several instants one may lack photographs (:attr:`missing`)
-        where three or more remain."""
+        They are kept until :meth:`photographs` has them, or another instant is decoded.
+
+        Args:
+            instant: one of :attr:`instants`.
+
+        Returns:
+            ``{camera: (camera, photograph, matte [h, w] uint8)}``.
+
+        Raises:
+            InputError: a photograph or mask is missing or wrong; of several instants one may lack
+                photographs (:attr:`missing`) where three or more remain.
+        """
         self.begin(instant)
         return self._complete(instant, {name: view.result for name, view in self._begun[instant].items()})
 
@@ -175,7 +195,11 @@ class CaptureFolder:
         return found
 
     def begin(self, instant: str) -> None:
-        """Decode the views of an instant in threads; :meth:`decode` waits for them."""
+        """Decode the views of an instant in threads; :meth:`decode` waits for them.
+
+        Args:
+            instant: one of :attr:`instants`; what is kept of another is forgotten.
+        """
         if instant in self._begun:
             return
         self._begun.clear()
@@ -196,13 +220,33 @@ class CaptureFolder:
         return camera, pixels, matte
 
     def keeps_stored(self, camera: StoredCamera, pixels: Pixels) -> bool:
-        """Whether a camera was calibrated with the photograph as stored, not as shown."""
+        """Whether a camera was calibrated with the photograph as stored, not as shown.
+
+        Args:
+            camera: of the photograph, as its file stores it.
+            pixels: the decoded photograph.
+        """
         return fits_stored(pixels, camera, self._said.exif)
 
     def photograph(
         self, name: str, camera: StoredCamera, pixels: Pixels, matte: np.ndarray, convention: Convention
     ) -> Photograph:
-        """One view, undistorted and upright, with the camera that a convention gives it."""
+        """One view, undistorted and upright, with the camera that a convention gives it.
+
+        Args:
+            name: of the camera.
+            camera: as its file stores it.
+            pixels: the photograph as shown.
+            matte: of the photograph as shown, [h, w] uint8.
+            convention: meaning of the camera's numbers.
+
+        Returns:
+            The photograph.
+
+        Raises:
+            InputError: its aspect ratio is not that of the calibration, or undistortion leaves
+                nothing of the subject.
+        """
         image = pixels.image
         turns = 0
         if self.keeps_stored(camera, pixels):
@@ -226,7 +270,21 @@ class CaptureFolder:
         return Photograph(name, image, matte, found.intrinsics, found.extrinsics, found.gains)
 
     def _matte(self, name: str, camera: StoredCamera, path: Source, pixels: Pixels) -> np.ndarray:
-        """The matte [h, w] uint8 of the photograph as shown, from the first source that there is."""
+        """The matte of a photograph, from the first source that there is.
+
+        Args:
+            name: of the camera.
+            camera: its file may name a mask.
+            path: where the photograph comes from.
+            pixels: the photograph as shown.
+
+        Returns:
+            [h, w] uint8 of the photograph as shown.
+
+        Raises:
+            InputError: there is no source, or the one that the user named has no file for this
+                photograph, or a wrong one.
+        """
         masks = self.images if self.masks is None else self.masks
         mask = mask_path(path, self.images, masks) if isinstance(path, Path) else path.mask
         if self.masks is not None:
@@ -256,6 +314,18 @@ _segmenter = functools.cache(segmenter)
 
 @functools.lru_cache(maxsize=16)
 def _grid(intrinsics: tuple, distortion: tuple, fisheye: bool, height: int, width: int) -> "torch.Tensor":
+    """The grid of :func:`ghgs_lit.geometry.undistortion.undistorting_grid`, kept for further instants.
+
+    Args:
+        intrinsics: the nine numbers of the matrix, in pixels.
+        distortion: OpenCV's coefficients.
+        fisheye: whether they are of Kannala and Brandt's model.
+        height: of the photograph in pixels.
+        width: of the photograph in pixels.
+
+    Returns:
+        Where each pixel of the undistorted photograph lies in the given one.
+    """
     from ghgs_lit.geometry.undistortion import undistorting_grid
 
     return undistorting_grid(np.reshape(intrinsics, (3, 3)), np.array(distortion), height, width, fisheye)

@@ -27,9 +27,18 @@ FORMATS: dict[str, Callable[[Path], CameraFile]] = {
 
 
 def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
-    """Read a file or a folder of cameras; a warning names entries that are not read. ``path``: a folder for
-    COLMAP's models, OpenCV's files for each camera and EasyMocap's. ``format``: one of :data:`FORMATS`;
-    ``auto`` tells it by file names and keys of JSON. InputError: no such path or format, or a wrong camera.
+    """Read a file or a folder of cameras; a warning names entries that are not read.
+
+    Args:
+        path: a file; or a folder for COLMAP's models, OpenCV's files for each camera and
+            EasyMocap's.
+        format: one of :data:`FORMATS`; ``auto`` tells it by file names and keys of JSON.
+
+    Returns:
+        The cameras, and the meaning of their numbers by the format.
+
+    Raises:
+        InputError: no such path or format, or a wrong camera.
     """
     path = Path(path).expanduser()
     choice("calibration.format", format, ("auto", *FORMATS))

@@ -26,12 +26,24 @@ class CameraFile:
     def of(
         cls, cameras: Sequence[StoredCamera], convention: Convention, format: str, unread: Sequence[str] = ()
     ) -> "CameraFile":
-        """Cameras in their order, named by their photographs without folder and suffix. One warning names
-        entries that are not read: those of the cameras, and ``unread`` ones beside them.
+        """Name cameras by their photographs, without folder and suffix, in their order.
 
-        Where different cameras share such a name (that of an instant), all are named by their folders, or as
-        the file has it. A camera that is listed for several photographs is one, without their masks.
-        InputError: two cameras have one name."""
+        Where different cameras share such a name (that of an instant), all are named by their
+        folders, or as the file has it. A camera that is listed for several photographs is one,
+        without their masks. One warning names all entries that are not read.
+
+        Args:
+            cameras: with names as the file has them.
+            convention: meaning of their numbers by the format.
+            format: name of the format.
+            unread: keys beside the cameras that are not read.
+
+        Returns:
+            The cameras by name.
+
+        Raises:
+            InputError: two different cameras have one name.
+        """
         if unread := sorted({*unread, *(key for camera in cameras for key in camera.unread)}):
             warnings.warn(f"cameras: entries that are not read: {', '.join(unread)}", stacklevel=3)
         for part in (-1, -2, 0):
@@ -58,12 +70,35 @@ def _parts(name: str) -> list[str]:
 
 
 def read_mapping(path: Path, parse: Callable[[str], Any], kind: str, content: str) -> dict[str, Any]:
-    """The mapping in a text file. ``kind``, ``content``: for messages. InputError: there is none."""
+    """The mapping in a text file.
+
+    Args:
+        path: of the file.
+        parse: gives the content of a text; its errors are named with the path.
+        kind: what the file should be, for messages.
+        content: what it should hold, for messages.
+
+    Returns:
+        The mapping.
+
+    Raises:
+        InputError: the file cannot be read or parsed, or holds no mapping.
+    """
     value = read_parsed(path, kind, parse)
     require(isinstance(value, dict), str(path), content, type(value).__name__)
     return value
 
 
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
-    """Intrinsics [3, 3] of focal lengths and a principal point in pixels."""
+    """Intrinsics of a pinhole camera.
+
+    Args:
+        fx: horizontal focal length in pixels.
+        fy: vertical focal length in pixels.
+        cx: column of the principal point, in pixels.
+        cy: row of the principal point, in pixels.
+
+    Returns:
+        The matrix [3, 3] float64.
+    """
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)

@@ -26,14 +26,34 @@ _FILES = ("cameras", "images", "points3D", "rigs", "frames")
 
 
 def model_folder(path: Path) -> Path | None:
-    """The folder of a sparse model at or below ``path``, None where there is none."""
+    """Find a sparse model.
+
+    Args:
+        path: the model's folder, or one above it as COLMAP lays them out.
+
+    Returns:
+        The folder of the model; None where there is none.
+    """
     folders = [path, path / "sparse" / "0", path / "sparse", path / "0"]
     return next((p for p in folders if (p / "cameras.bin").exists() or (p / "cameras.txt").exists()), None)
 
 
 def read_colmap(path: Path) -> CameraFile:
-    """Registered photographs of a sparse model. InputError: it cannot be read, pycolmap is not installed, or
-    a camera model is not known."""
+    """Registered photographs of a sparse model, text or binary.
+
+    Formats: https://colmap.github.io/format.html and, of camera models,
+    https://colmap.github.io/cameras.html.
+
+    Args:
+        path: folder of the model or above it, or one of its files.
+
+    Returns:
+        Cameras named by their photographs.
+
+    Raises:
+        InputError: the model cannot be read, pycolmap is not installed, or a camera model is not
+            known.
+    """
     folder = model_folder(path if path.is_dir() else path.parent)
     require(folder is not None, str(path), "a COLMAP model (cameras.bin or cameras.txt)", "none")
     pycolmap = installed("pycolmap", "colmap", str(path))
@@ -67,6 +87,20 @@ def _names(folder: Path) -> dict[int, str]:
 
 
 def _camera(folder: Path, name: str, image, camera) -> StoredCamera:
+    """One registered photograph's camera.
+
+    Args:
+        folder: of the model, for messages.
+        name: of the photograph.
+        image: pycolmap's image, with a pose.
+        camera: pycolmap's camera of this image.
+
+    Returns:
+        The camera, world to camera with OpenCV axes.
+
+    Raises:
+        InputError: its model is not among ``_MODELS``.
+    """
     origin = f"{folder}: {name}"
     model = camera.model.name
     require(model in _MODELS, origin, f"a camera model among {', '.join(_MODELS)}", model)

@@ -40,12 +40,30 @@ _MODELS = re.compile(f"equidist|kannala|division|prism|fov|ucm|doublesphere|vr18
 
 
 def plain(key: str) -> str:
-    """A key without case, signs and a final "coefficients" or "parameters", by which files differ."""
+    """A key without case, signs and a final "coefficients" or "parameters", by which files differ.
+
+    Args:
+        key: as the file has it.
+
+    Returns:
+        Lower-case letters and digits alone.
+    """
     return re.sub(r"(coef|param)\w*$", "", "".join(filter(str.isalnum, str(key).lower())))
 
 
 def finite(place: str, value: Any) -> float:
-    """An entry as a number. InputError: it is not finite, or no number."""
+    """An entry as a number.
+
+    Args:
+        place: file and key, for the message.
+        value: as the file has it; text that spells a number is one.
+
+    Returns:
+        The number.
+
+    Raises:
+        InputError: it is not finite, or no number.
+    """
     try:
         number = math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):
@@ -68,19 +86,46 @@ class Entries:
         self._read: set[str] = set()
 
     def keys(self, what: str) -> list[str]:
-        """Keys that spell one of :data:`NAMES`, or ``what`` itself, the preferred first."""
+        """Find the keys that spell one thing.
+
+        Args:
+            what: one of :data:`NAMES`, or another key.
+
+        Returns:
+            Keys as the file has them, the preferred first.
+        """
         names = NAMES.get(what, (plain(what),))
         spelled = [key for key in self.fields if plain(key) in names]
         return sorted(spelled, key=lambda key: names.index(plain(key)))
 
     def number(self, what: str) -> float | None:
-        """A finite number."""
+        """A finite number.
+
+        Args:
+            what: as for :meth:`keys`.
+
+        Returns:
+            The number; None: there is no such entry.
+
+        Raises:
+            InputError: an entry is no finite number, or two differ.
+        """
         return self._one(
             what, {key: finite(f"{self.origin}: {key}", self.fields[key]) for key in self.keys(what)}
         )
 
     def whole(self, what: str) -> int | None:
-        """A whole number above 0."""
+        """A whole number above 0.
+
+        Args:
+            what: as for :meth:`keys`.
+
+        Returns:
+            The number; None: there is no such entry.
+
+        Raises:
+            InputError: an entry is no such number, or two differ.
+        """
         number = self.number(what)
         if number is None:
             return None
@@ -89,7 +134,17 @@ class Entries:
         return int(number)
 
     def flag(self, what: str) -> bool | None:
-        """True or false, also as 1 or 0; text, such as "no", is refused."""
+        """True or false, also as 1 or 0.
+
+        Args:
+            what: as for :meth:`keys`.
+
+        Returns:
+            The value; None: there is no such entry.
+
+        Raises:
+            InputError: an entry is anything else, such as the text "no", or two differ.
+        """
         values = {}
         for key in self.keys(what):
             value = self.fields[key]
@@ -99,19 +154,47 @@ class Entries:
         return self._one(what, values)
 
     def text(self, what: str) -> str | None:
-        """Text that is not empty."""
+        """Text that is not empty.
+
+        Args:
+            what: as for :meth:`keys`.
+
+        Returns:
+            The text; None: there is no such entry, or it is empty.
+
+        Raises:
+            InputError: an entry is no text, or two differ.
+        """
         values = {key: self.fields[key] for key in self.keys(what)}
         for key, value in values.items():
             require(isinstance(value, str), f"{self.origin}: {key}", "text", value)
         return self._one(what, values) or None
 
     def has(self, what: str, *shapes: tuple[int | None, ...]) -> bool:
-        """Whether there is an array of one of ``shapes``."""
+        """Whether there is an array of one of several shapes.
+
+        Args:
+            what: as for :meth:`keys`.
+            shapes: lengths of the axes; None is any length.
+        """
         return any(_fits(self.fields[key], shape) for key in self.keys(what) for shape in shapes)
 
     def array(self, what: str, *shapes: tuple[int | None, ...]) -> np.ndarray | None:
-        """An array of one of ``shapes``, in which None is any length. Of several entries those count that
-        have such a shape: ``K`` is a matrix beside ``k``, coefficients of a lens."""
+        """An array of one of several shapes.
+
+        Of several entries those count that have such a shape: ``K`` is a matrix beside ``k``,
+        coefficients of a lens.
+
+        Args:
+            what: as for :meth:`keys`.
+            shapes: lengths of the axes; None is any length.
+
+        Returns:
+            The array; None: there is no such entry.
+
+        Raises:
+            InputError: an entry has another shape or no finite numbers, or two differ.
+        """
         keys = self.keys(what)
         fitting = [key for key in keys if any(_fits(self.fields[key], shape) for shape in shapes)]
         values = {}
@@ -122,7 +205,18 @@ class Entries:
         return self._one(what, values)
 
     def needed(self, what: str, *shapes: tuple[int | None, ...]) -> np.ndarray:
-        """As :meth:`array`. InputError: there is none, too."""
+        """As :meth:`array`, of an entry that must be there.
+
+        Args:
+            what: as for :meth:`keys`.
+            shapes: as for :meth:`array`.
+
+        Returns:
+            The array.
+
+        Raises:
+            InputError: there is none; or as for :meth:`array`.
+        """
         value = self.array(what, *shapes)
         names = NAMES.get(what, (what,))
         require(value is not None, self.origin, f"{what} ({' or '.join(names)})", sorted(self.fields))
@@ -175,8 +269,18 @@ class Entries:
         return any(said) if flag is None else flag
 
     def distortion(self, order: str) -> np.ndarray:
-        """Distortion coefficients, as a list or with an entry each; none if all are 0. ``order``: names of
-        those that are allowed, in their order."""
+        """Distortion coefficients, as a list or with an entry each.
+
+        Args:
+            order: names of the entries that are allowed, in their order, with spaces between them.
+
+        Returns:
+            The coefficients, of a list as it is; those with an entry each in this order, none if
+            all are 0.
+
+        Raises:
+            InputError: there is another coefficient that is not 0, or list and entries differ.
+        """
         listed = self.array("distortion", (None,), (None, 1), (1, None))
         numbers = {name: self.number(name) for name in PERSPECTIVE.split()}
         single = {name: number for name, number in numbers.items() if number is not None}
@@ -192,8 +296,18 @@ class Entries:
         return listed
 
     def unread(self, irrelevant: Collection[str]) -> tuple[str, ...]:
-        """Keys of entries that nothing has read so far. ``irrelevant``: spelled as :func:`plain` does.
-        InputError: one about the lens is neither empty nor 0: without it the picture would be bent."""
+        """Keys of entries that nothing has read so far.
+
+        Args:
+            irrelevant: keys that do not matter, spelled as :func:`plain` does.
+
+        Returns:
+            The keys as the file has them.
+
+        Raises:
+            InputError: one about the lens is neither empty nor 0: without it the picture would be
+                bent.
+        """
         left = {
             key: value
             for key, value in self.fields.items()
@@ -209,7 +323,15 @@ class Entries:
 
 
 def coefficients(numbers: Mapping[str, float], names: str) -> np.ndarray:
-    """Distortion coefficients in the order of ``names``, 0 where they are missing; none if all are 0."""
+    """Distortion coefficients in an order.
+
+    Args:
+        numbers: coefficients by name; those that are missing are 0.
+        names: their order, with spaces between them.
+
+    Returns:
+        [n] float64; none if all are 0.
+    """
     values = np.array([numbers.get(name, 0.0) for name in names.split()])
     return values if values.any() else np.zeros(0)
 

@@ -16,7 +16,17 @@ from ghgs_lit.errors import require
 
 
 def read_json_file(path: Path) -> dict[str, Any]:
-    """The object of a JSON file. InputError: it is none, or has a key twice, of which JSON keeps the last."""
+    """The object of a JSON file.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        The object.
+
+    Raises:
+        InputError: there is none, or it has a key twice, of which JSON keeps the last.
+    """
     return read_mapping(path, lambda text: json.loads(text, object_pairs_hook=_once), "JSON", "a JSON object")
 
 
@@ -31,9 +41,19 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def read_json(path: Path) -> CameraFile:
     """``{"cameras": {<name>: {...}}}``, or that mapping alone, with the keys of one of two kinds.
 
-    ``intrinsics`` [3, 3], ``extrinsics`` [4, 4] or [3, 4], ``width``, ``height``, ``distortion``, ``fisheye``
-    and ``gains``: this package's conventions (:mod:`ghgs_lit.types`); only the first two must be there.
-    ``K``, ``R``, ``T``, ``D``: OpenCV's. InputError: a camera is missing or wrong."""
+    ``intrinsics`` [3, 3], ``extrinsics`` [4, 4] or [3, 4], ``width``, ``height``, ``distortion``,
+    ``fisheye`` and ``gains``: this package's conventions (:mod:`ghgs_lit.types`); only the first
+    two must be there. ``K``, ``R``, ``T``, ``D``: OpenCV's.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        The cameras by name.
+
+    Raises:
+        InputError: a camera is missing or wrong.
+    """
     content = read_json_file(path)
     named = _cameras_of(path, content)
     with_extrinsics = {n: c for n, c in named.items() if isinstance(c, Mapping) and "extrinsics" in c}
@@ -56,8 +76,20 @@ def _cameras_of(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
 def _others(
     path: Path, content: Mapping[str, Any], named: Mapping[str, Any], read: Mapping[str, Any]
 ) -> list[str]:
-    """Entries beside the cameras that are ``read``, of those ``named`` and of the file. InputError: one says
-    something of the lens."""
+    """Entries of a file that are no cameras.
+
+    Args:
+        path: of the file, for messages.
+        content: all of the file.
+        named: what may be cameras, by name.
+        read: the cameras among them that are read.
+
+    Returns:
+        Keys of the others, of ``named`` and beside the entry ``cameras``.
+
+    Raises:
+        InputError: one says something of the lens.
+    """
     below = {name: value for name, value in named.items() if name not in read}
     beside = {key: value for key, value in content.items() if "cameras" in content}
     return [key for fields in (below, beside) for key in Entries(str(path), fields).unread(opencv.IRRELEVANT)]
@@ -65,7 +97,16 @@ def _others(
 
 def read_toml(path: Path) -> CameraFile:
     """Pose2Sim's, Anipose's and Caliscope's TOML: a table for each camera, named by its key ``name``.
-    InputError: a camera is missing or wrong."""
+
+    Args:
+        path: of the file.
+
+    Returns:
+        The cameras by name.
+
+    Raises:
+        InputError: a camera is missing or wrong.
+    """
     content = read_mapping(path, tomllib.loads, "TOML", "TOML")
     tables = _cameras_of(path, content)
     named = {str(t.get("name", key)) if isinstance(t, dict) else key: t for key, t in tables.items()}
@@ -75,6 +116,20 @@ def read_toml(path: Path) -> CameraFile:
 def _read_matrices(
     path: Path, content: Mapping[str, Any], named: Mapping[str, Any], name_of_format: str
 ) -> CameraFile:
+    """Cameras with OpenCV's matrices, and a warning about other entries.
+
+    Args:
+        path: of the file.
+        content: all of the file.
+        named: what may be cameras, by name; those without a camera matrix are none.
+        name_of_format: one of :data:`ghgs_capture.formats.FORMATS`.
+
+    Returns:
+        The cameras by name.
+
+    Raises:
+        InputError: a camera is missing or wrong.
+    """
     expected = "cameras with intrinsics and extrinsics (or K, R and T)"
     with_intrinsics = {name: camera for name, camera in named.items() if opencv.has_intrinsics(camera)}
     cameras = opencv.cameras_from_fields(path, with_intrinsics, expected, sorted(named))
@@ -91,7 +146,14 @@ def _camera(name: str, origin: str, camera: Mapping[str, Any]) -> StoredCamera:
 
 
 def json_text(cameras: Mapping[str, tuple[Calibration, tuple[int, int]]]) -> str:
-    """Cameras and the (height, width) of their photographs as :func:`read_json` reads them."""
+    """Cameras as text that :func:`read_json` reads.
+
+    Args:
+        cameras: each with the (height, width) of its photographs in pixels.
+
+    Returns:
+        The content of a file.
+    """
     from ghgs_capture.export.maps import camera_entry, cameras_json  # here: it imports PyTorch
 
     entries = {

@@ -23,7 +23,19 @@ _IRRELEVANT = (
 
 
 def read_nerfstudio(path: Path) -> CameraFile:
-    """Cameras of ``frames``, whose intrinsics win over those of the file. InputError: a frame is wrong."""
+    """Cameras of ``frames``, whose intrinsics win over those of the file.
+
+    Format: https://docs.nerf.studio/quickstart/data_conventions.html.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        Cameras named by their photographs.
+
+    Raises:
+        InputError: a frame is missing or wrong.
+    """
     content = read_json_file(path)
     frames = content.get("frames")
     require(isinstance(frames, list) and len(frames) > 0, f"{path}: frames", "a list of frames", frames)
@@ -33,6 +45,20 @@ def read_nerfstudio(path: Path) -> CameraFile:
 
 
 def _camera(path: Path, origin: str, shared: Mapping[str, Any], frame: Any) -> StoredCamera:
+    """The camera of one frame.
+
+    Args:
+        path: of the file; masks are sought beside it.
+        origin: file and frame, for messages.
+        shared: entries of the file, which hold for all frames.
+        frame: entries of the frame.
+
+    Returns:
+        The camera, named by its photograph, with a pose as the file has it.
+
+    Raises:
+        InputError: an entry is missing or wrong.
+    """
     require(isinstance(frame, Mapping), origin, "a mapping", frame)
     entries = Entries(origin, {**shared, **frame})
     photograph = entries.text("file_path")

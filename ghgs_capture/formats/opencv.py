@@ -50,12 +50,26 @@ for _name in ("opencv-matrix", "opencv-nd-matrix"):
 
 
 def yaml_files(folder: Path) -> list[Path]:
-    """The YAML files of a folder."""
+    """The YAML files of a folder, sorted by name.
+
+    Args:
+        folder: where they lie.
+    """
     return [path for path in sorted(folder.iterdir()) if path.suffix.lower() in (".yml", ".yaml")]
 
 
 def read_opencv(path: Path) -> CameraFile:
-    """Cameras of a YAML file, or of all YAML files of a folder. InputError: a camera is missing or wrong."""
+    """Cameras of a YAML file, or of all YAML files of a folder.
+
+    Args:
+        path: of the file, or of the folder.
+
+    Returns:
+        The cameras, named by their files or entries.
+
+    Raises:
+        InputError: a camera is missing or wrong.
+    """
     files = yaml_files(path) if path.is_dir() else [path]
     cameras: list[StoredCamera] = []
     unread: list[str] = []
@@ -75,8 +89,17 @@ def read_opencv(path: Path) -> CameraFile:
 
 
 def read_easymocap(path: Path) -> CameraFile:
-    """EasyMocap's ``intri.yml`` and ``extri.yml``, by the path of one of them or of their folder. InputError:
-    one of the files is missing, or a camera is wrong."""
+    """EasyMocap's ``intri.yml`` and ``extri.yml``.
+
+    Args:
+        path: of one of them, or of their folder.
+
+    Returns:
+        The cameras by name.
+
+    Raises:
+        InputError: one of the files is missing, or a camera is wrong.
+    """
     folder = path if path.is_dir() else path.parent
     fields: dict[str, Any] = {}
     for name in EASYMOCAP:
@@ -117,18 +140,47 @@ def _by_name(fields: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], dict
 def cameras_from_fields(
     path: Path, named: Mapping[str, Any], expected: str, keys: list[str]
 ) -> list[StoredCamera]:
-    """The cameras of a file. InputError: none (names ``expected`` and ``keys``), or one is wrong."""
+    """The cameras of a file with OpenCV's matrices.
+
+    Args:
+        path: of the file, for messages.
+        named: entries of each camera, by name.
+        expected: what a file without cameras should have, for the message.
+        keys: what that file has instead.
+
+    Returns:
+        The cameras, in their order.
+
+    Raises:
+        InputError: there is none, or one is wrong.
+    """
     require(bool(named), str(path), expected, keys)
     return [camera_from_fields(name, f"{path}: {name}", camera) for name, camera in named.items()]
 
 
 def has_intrinsics(fields: Any) -> bool:
-    """Whether this is a mapping with a camera matrix."""
+    """Whether this is a mapping with a camera matrix.
+
+    Args:
+        fields: anything that a file holds.
+    """
     return isinstance(fields, Mapping) and bool(Entries("", fields).keys("intrinsics"))
 
 
 def camera_from_fields(name: str, origin: str, fields: Mapping[str, Any]) -> StoredCamera:
-    """The camera in ``fields``, under any usual names. InputError: a matrix is missing or wrong."""
+    """One camera with OpenCV's matrices, under any usual names.
+
+    Args:
+        name: of the camera.
+        origin: file and camera, for messages.
+        fields: its entries; a rotation is a matrix or a vector.
+
+    Returns:
+        The camera.
+
+    Raises:
+        InputError: a matrix is missing or wrong.
+    """
     entries = Entries(origin, fields)
     # All are looked at, so that a vector beside a matrix counts as read.
     rotations = [
@@ -146,7 +198,19 @@ def camera_from_fields(name: str, origin: str, fields: Mapping[str, Any]) -> Sto
 
 
 def camera_of(name: str, entries: Entries, pose: np.ndarray) -> StoredCamera:
-    """The camera with a ``pose`` [4, 4], all else from ``entries``. InputError: one is missing or wrong."""
+    """A camera with a known pose, all else from its entries.
+
+    Args:
+        name: of the camera.
+        entries: those of the camera in its file.
+        pose: [4, 4], as the file has it.
+
+    Returns:
+        The camera.
+
+    Raises:
+        InputError: an entry is missing or wrong.
+    """
     intrinsics = entries.needed("intrinsics", (3, 3))
     fisheye = entries.is_fisheye
     return StoredCamera(

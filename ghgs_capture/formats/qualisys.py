@@ -17,7 +17,17 @@ _DISTORTION = {"k": "radialDistortion", "p": "tangentalDistortion"}
 
 
 def read_qualisys(path: Path) -> CameraFile:
-    """The cameras by serial number. InputError: no such file, or an entry is missing or no number."""
+    """The cameras of Qualisys' ``.qca.txt`` by serial number.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        The cameras; their lengths are millimetres.
+
+    Raises:
+        InputError: no such file, or an entry is missing or no number.
+    """
     require_file(path, "cameras of Qualisys")
     try:
         cameras = [_camera(path, camera) for camera in ElementTree.parse(path).getroot().iter("camera")]
