@@ -25,10 +25,10 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from ghgs_lit.config import build, compose, resolve
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.diagnostics.benchmark.stages import OTHER, TOTAL, top_level, watched
-from ghgs_lit.kernels.watching import Watcher
 from ghgs_lit.losses import Losses, LossWeights
 from ghgs_lit.model import GHGS
 from ghgs_lit.rendering import api, gsplat_backend
+from ghgs_lit.runtime.watching import Watcher
 from ghgs_lit.training import Optimization
 from ghgs_lit.types import Batch
 from tests.helpers.pretend_device import DEVICE, Log, pretend_device

@@ -20,7 +20,7 @@ from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.device import drawing_nothing
 from ghgs_lit import model as models
-from ghgs_lit.kernels import precision
+from ghgs_lit.runtime import precision
 from tests.helpers.pretend_device import DEVICE, Log, pretend_device
 
 #: Kinds of a trace's events that are work of a GPU; in a rehearsal, operators.

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from ghgs_capture.backgrounds import Backgrounds
 from ghgs_capture.capture import Capture
-from ghgs_capture.doubts import ENOUGH, doubt_of_cameras, doubt_of_masks
+from ghgs_capture.doubts import CORRECTION, doubt_of_cameras, doubt_of_masks
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.prediction import crop_size, in_frame
 from ghgs_capture.rig import INSTANTS, Rig, corrected_rig
@@ -95,9 +95,9 @@ class Measured:
             capture = backgrounds.applied(capture) if masks == "mended" else capture
             if cameras == "once" and rig:
                 capture = dataclasses.replace(rig, gains={}).applied(capture)
-            given = found = capture.batch(self.size, ENOUGH if doubt_of_masks(capture, self.size) else 0)
+            given = found = capture.batch(self.size, CORRECTION if doubt_of_masks(capture, self.size) else 0)
             if cameras == "each" and doubt_of_cameras(capture, given):
-                found = CameraRefinement(ENOUGH, self.model, self.renderer)(given)
+                found = CameraRefinement(CORRECTION, self.model, self.renderer)(given)
             zoom = (found.cameras.intrinsics / given.cameras.intrinsics)[0, :, 0, 0].numpy()
             lenses = np.stack([photograph.intrinsics for photograph in capture.photographs])
             lenses[:, [0, 1], [0, 1]] *= zoom[:, None]

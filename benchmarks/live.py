@@ -31,7 +31,7 @@ from ghgs_lit.diagnostics.benchmark.presets import Case
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL, SecondsProbe, forward, top_level
 from ghgs_lit.diagnostics.machine import in_words, machine_facts
-from ghgs_lit.kernels.allocation import keep_freed_memory
+from ghgs_lit.runtime.allocation import keep_freed_memory
 from ghgs_lit.types import Batch
 from ghgs_lit.visualization.pictures import to_uint8
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from ghgs_lit.kernels.allocation import forget_peak, resident_bytes, return_free_memory
+from ghgs_lit.runtime.allocation import forget_peak, resident_bytes, return_free_memory
 
 
 @dataclass

@@ -26,7 +26,7 @@ from ghgs_lit.cli.inputs import build_data, build_renderer, pick_device
 from ghgs_lit.config import build, compose, resolve
 from ghgs_lit.data.batches import BatchBuilder
 from ghgs_lit.data.datamodule import PhotographsDataModule
-from ghgs_lit.data.reader import Photographs
+from ghgs_lit.data.reader import PhotographCache
 from ghgs_lit.data.sampling import SampleSpec, evaluation_samples
 from ghgs_lit.evaluation.measure import Estimate, Method, ModelMethod, measure
 from ghgs_lit.metrics import ImageMetrics
@@ -81,7 +81,7 @@ def measured(
     device: torch.device,
 ) -> dict[str, float | None]:
     """Means over the instants of a person."""
-    stored = Photographs(reader, None)
+    stored = PhotographCache(reader, None)
     builder, targets, images = BatchBuilder(stored, stored), [], []
 
     def recorded(batch: Batch) -> Estimate:

@@ -35,7 +35,7 @@ except ImportError:
 steps, threads, *overrides = sys.argv[1:]
 torch.set_num_threads(int(threads))
 try:  # as the command line of the version does
-    from ghgs_lit.kernels.allocation import keep_freed_memory
+    from ghgs_lit.runtime.allocation import keep_freed_memory
     keep_freed_memory()
 except ImportError:
     pass

@@ -13,9 +13,9 @@ from scipy import ndimage
 
 from ghgs_capture.capture import Capture
 from ghgs_capture.crops import Photograph
-from ghgs_lit.kernels.cores import allowed_cores
+from ghgs_lit.runtime.cores import allowed_cores
 
-_ENOUGH = 6  #: Least number of photographs for a background
+_MIN_BACKGROUND = 6  #: Least number of photographs for a background
 #: Levels of 255 by which photographs of a background differ at most, and the subject at least.
 _STEADY = 20.0
 _DIFFERENT = 12.0
@@ -174,7 +174,7 @@ class Backgrounds:
             photographs.setdefault(photograph.name, []).append(photograph)
         cameras = {}
         for name, found in photographs.items():
-            if len(found) >= _ENOUGH and len({photograph.mask.shape for photograph in found}) == 1:
+            if len(found) >= _MIN_BACKGROUND and len({photograph.mask.shape for photograph in found}) == 1:
                 cameras[name] = _Background.of(found)
         return cls(cameras)
 

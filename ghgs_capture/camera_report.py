@@ -13,7 +13,7 @@ from ghgs_capture.crops import Photograph
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.photographs import Pixels
 from ghgs_capture.placement import copies, placement_lines
-from ghgs_lit.data.silhouettes import twins
+from ghgs_lit.data.mask_checks import twins
 from ghgs_lit.data.view import area_image, area_mask
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, subject_sphere

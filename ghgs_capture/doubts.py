@@ -9,7 +9,7 @@ from ghgs_lit.geometry.masks import signed_distance
 from ghgs_lit.refinement.coherence import contradiction
 from ghgs_lit.types import Batch
 
-ENOUGH = 4  #: Pixels of masks, and rounds of cameras, for correcting what is found
+CORRECTION = 4  #: Pixels of masks, and rounds of cameras, for correcting what is found
 _REACH = 6  #: Pixels beside an outline in which contrast is measured
 #: Mean pixels of crops from masks' outlines to the photographs', above which masks are off.
 _OFF = 0.35

@@ -24,14 +24,14 @@ from ghgs_capture.photographs import (
     read_pixels,
 )
 from ghgs_lit.config import nodes
-from ghgs_lit.data.silhouettes import implausible
+from ghgs_lit.data.mask_checks import implausible
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.kernels.cores import allowed_cores
+from ghgs_lit.runtime.cores import allowed_cores
 
 if TYPE_CHECKING:  # photographs are read while PyTorch is imported
     import torch
 
-ENOUGH = 3  #: Photographs that an instant needs where others of its are missing
+MIN_PHOTOGRAPHS = 3  #: Photographs that an instant needs where others of its are missing
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,8 @@ class CaptureFolder:
         backgrounds: folder of photographs without the subject, named after the cameras.
         segment: a segmenter of :data:`ghgs_capture.masks.SEGMENTERS`.
         calibration: what the file does not say, or says wrongly (:class:`ghgs_lit.config.nodes.Calibration`).
-        sequence: which instants count, and how videos fit together (:class:`ghgs_lit.config.nodes.Sequence`).
+        sequence: which instants count, and how videos fit together
+            (:class:`ghgs_lit.config.nodes.SequenceOptions`).
     """
 
     images: str | Path | Mapping[str, Frame]
@@ -77,8 +78,8 @@ class CaptureFolder:
         return nodes.Calibration.read(self.calibration, "calibration")
 
     @functools.cached_property
-    def _part(self) -> nodes.Sequence:
-        return nodes.Sequence.read(self.sequence, "sequence")
+    def _part(self) -> nodes.SequenceOptions:
+        return nodes.SequenceOptions.read(self.sequence, "sequence")
 
     @functools.cached_property
     def file(self) -> CameraFile:
@@ -190,7 +191,7 @@ class CaptureFolder:
                 self.missing[instant][name] = str(error)
         missing = self.missing[instant] if len(self.instants) > 1 else {}
         why = "; ".join(f"{name}: {text}" for name, text in missing.items())
-        least, why = (ENOUGH, f"{len(found)} ({why})") if missing else (2, len(found))
+        least, why = (MIN_PHOTOGRAPHS, f"{len(found)} ({why})") if missing else (2, len(found))
         require(len(found) >= least, f"{self.images}: {instant}", f"{least} photographs or more", why)
         return found
 

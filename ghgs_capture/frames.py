@@ -21,8 +21,8 @@ from ghgs_capture.photographs import (
 )
 from ghgs_capture.videos import SUFFIXES, Reader, Video, read_video
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.kernels.cores import allowed_cores
-from ghgs_lit.readers import composed, read_rows
+from ghgs_lit.parsing import composed, read_rows
+from ghgs_lit.runtime.cores import allowed_cores
 
 # Coding changes black and white by less than this.
 _CODED = 16

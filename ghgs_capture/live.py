@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ghgs_capture.capture import Capture
-from ghgs_capture.folder import ENOUGH, CaptureFolder
+from ghgs_capture.folder import MIN_PHOTOGRAPHS, CaptureFolder
 from ghgs_capture.formats import CameraFile, read_cameras
 from ghgs_capture.frames import Frame
 from ghgs_capture.photographs import (
@@ -21,7 +21,7 @@ from ghgs_capture.photographs import (
     images_in,
 )
 from ghgs_capture.videos import SUFFIXES
-from ghgs_lit.config.nodes import Sequence
+from ghgs_lit.config.nodes import SequenceOptions
 from ghgs_lit.errors import InputError, require
 
 #: Seconds between looks for a frame and for a folder, and of waiting for a camera at the end.
@@ -123,7 +123,7 @@ def live_frames(
         images: a folder of videos, played at their own rate; or of instants, each a folder that counts once
             it has a photograph of every camera and none of its files grows any more. Or what OpenCV opens, by
             camera: numbers of devices, addresses of streams; ``options`` then says where masks come from, and
-            at least ``ENOUGH`` cameras must go on.
+            at least ``MIN_PHOTOGRAPHS`` cameras must go on.
         masks: a folder laid out as ``images``.
         idle: seconds without a new instant after which a folder of instants ends; None: never.
         clock, sleep: tells seconds, and waits.
@@ -136,7 +136,7 @@ def live_frames(
         if images_in(folder, SUFFIXES):
             return _played(CaptureFolder(folder, cameras, masks, **options), clock, sleep)
     expected = f"all instants of {'a folder that is being written' if is_folder else 'cameras'}"
-    require(Sequence.read(part, "sequence") == Sequence(), "sequence", expected, part)
+    require(SequenceOptions.read(part, "sequence") == SequenceOptions(), "sequence", expected, part)
     stored = read_cameras(cameras, said.get("format") or "auto")
     if not is_folder:
         devices = by_camera(
@@ -145,7 +145,7 @@ def live_frames(
         expected = "backgrounds=<folder> or segment=rembg for masks of cameras"
         is_told = masks is None and (options.get("backgrounds") or options.get("segment"))
         require(bool(is_told), "masks", expected, masks)
-        least = min(ENOUGH, len(devices))
+        least = min(MIN_PHOTOGRAPHS, len(devices))
         return _watched(newest_frames(opened(devices), least, clock, sleep), stored, options)
     names = composed_names(said.get("names"))
     places = [folder] if masks is None else [folder, Path(masks).expanduser()]

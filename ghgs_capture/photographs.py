@@ -11,7 +11,7 @@ import numpy as np
 from ghgs_capture.calibration import StoredCamera, same_ratio
 from ghgs_lit.data.images import orientation_of, read_image, rgb_of
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.readers import composed, find_path
+from ghgs_lit.parsing import composed, find_path
 
 SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif", ".tif", ".tiff", ".bmp")
 #: Suffixes of pictures that are not read, and of files that are no photographs whatever their name.

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import torch
 
 from ghgs_capture.capture import Capture
-from ghgs_capture.doubts import ENOUGH, doubt_of_cameras, doubt_of_masks
+from ghgs_capture.doubts import CORRECTION, doubt_of_cameras, doubt_of_masks
 from ghgs_capture.temporal import Temporal
 from ghgs_capture.tones import own_tones, without_tones
 from ghgs_lit.config.keys import lookup
@@ -110,11 +110,11 @@ def _predicted(
     why = {}
     if refine_masks == "auto":
         why["refine_masks"] = doubt_of_masks(capture, size)
-        refine_masks = ENOUGH if why["refine_masks"] else 0
+        refine_masks = CORRECTION if why["refine_masks"] else 0
     batch, changed = _crops(capture, size, refine_masks, seconds)
     if refine_cameras == "auto":
         why["refine_cameras"] = doubt_of_cameras(capture, batch)
-        refine_cameras = ENOUGH if why["refine_cameras"] else 0
+        refine_cameras = CORRECTION if why["refine_cameras"] else 0
     batch = batch.to(next(model.parameters()).device)
     forward = functools.partial(in_frame, model)
     result = predict_batch(batch, model, renderer, refine_cameras, refine, forward, temporal)

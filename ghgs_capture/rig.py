@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from ghgs_capture.calibration import MOST_GAIN, Calibration, calibrate
 from ghgs_capture.capture import Capture
 from ghgs_capture.crops import Photograph
-from ghgs_capture.doubts import ENOUGH, doubt_of_cameras, doubt_of_masks
+from ghgs_capture.doubts import CORRECTION, doubt_of_cameras, doubt_of_masks
 from ghgs_capture.folder import CaptureFolder
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.model import GHGS
@@ -97,14 +97,14 @@ def corrected_rig(
     for capture in captures:
         masks = refine_masks
         if masks == "auto":
-            masks = ENOUGH if doubt_of_masks(capture, size) else 0
+            masks = CORRECTION if doubt_of_masks(capture, size) else 0
         batches.append(capture.batch(size, masks))
         doubts.append(doubt_of_cameras(capture, batches[-1]) if rounds == "auto" else "")
     contradicted = [doubt for doubt in doubts if doubt]
     if rounds == "auto":
         if 2 * len(contradicted) < len(captures):
             return None
-        rounds = ENOUGH
+        rounds = CORRECTION
     batch = _together(batches).to(next(model.parameters()).device)
     corrected = CameraRefinement(rounds, model, renderer, shared=True)(batch)
     before = batch.cameras

@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from ghgs_lit.errors import InputError, installed, require
-from ghgs_lit.readers import require_file
+from ghgs_lit.parsing import require_file
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 # ffmpeg says on stderr when each frame is shown, before it writes the frame.

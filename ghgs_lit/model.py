@@ -15,11 +15,11 @@ from ghgs_lit.config.registry import build, read_node
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.padding import bounds_of
 from ghgs_lit.heads.dpt import LEVELS, DPTHead
-from ghgs_lit.kernels.precision import PRECISIONS, precision_of
 from ghgs_lit.plan import Plan, SkipOptions, planned
 from ghgs_lit.playback import Playback
 from ghgs_lit.rendering.capacity import settled
 from ghgs_lit.rounds import CoarseDepths, Rounds, State, coarse_depths, prediction_of, replaced
+from ghgs_lit.runtime.precision import PRECISIONS, precision_of
 from ghgs_lit.stages import HEADS, OPTIONS, STAGES
 from ghgs_lit.surroundings import Finding, ModelOptions, any_bad, refuse, surroundings
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Prediction, Tokens
@@ -62,7 +62,7 @@ class GHGS(nn.Module):
         self.precision = "inherit"
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Refuse a ``precision`` other than :data:`ghgs_lit.kernels.precision.PRECISIONS`."""
+        """Refuse a ``precision`` other than :data:`ghgs_lit.runtime.precision.PRECISIONS`."""
         if name == "precision":
             choice("precision", value, PRECISIONS)
         super().__setattr__(name, value)

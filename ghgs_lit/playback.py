@@ -2,7 +2,7 @@
 
 What follows a plan (:mod:`ghgs_lit.plan`) depends on sizes alone, and on a GPU these are size classes. So two
 pieces of a prediction, the bounds and all that comes after the encoder, are the same work for every batch of
-a class. Recorded once as CUDA graphs (:mod:`ghgs_lit.kernels.recording`), each starts at once instead of by
+a class. Recorded once as CUDA graphs (:mod:`ghgs_lit.runtime.recording`), each starts at once instead of by
 thousands of calls. The encoder stays eager: it has few and large kernels, and its semantic branch works on as
 many patches as a scene shows."""
 
@@ -15,12 +15,12 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from ghgs_lit.kernels.recording import Recorder
-from ghgs_lit.kernels.watching import is_watched
 from ghgs_lit.plan import Plan
 from ghgs_lit.plan.patches import KeptPatches
 from ghgs_lit.rendering.capacity import Rooms, deferred, settled
 from ghgs_lit.rounds import CoarseDepths
+from ghgs_lit.runtime.recording import Recorder
+from ghgs_lit.runtime.watching import is_watched
 from ghgs_lit.types import Batch, DecodedPixels, DepthBounds, Extent, Prediction, Tokens
 
 

@@ -141,7 +141,7 @@ class Surrounding:
         return prediction
 
 
-class Photographs(Surrounding):
+class CheckedPhotographs(Surrounding):
     """To be checked; masks are thresholds of soft mattes, if any."""
 
     def __init__(self, side_multiple: int, checks_values: bool, least_matte: float | None) -> None:
@@ -186,7 +186,7 @@ def side_multiple(options: ModelOptions, patch_size: int) -> int:
 def surroundings(options: ModelOptions, patch_size: int, checks_values: bool) -> Sequence[Surrounding]:
     """The layers around the stages for one batch, the outermost first."""
     return [
-        Photographs(side_multiple(options, patch_size), checks_values, options.matte),
+        CheckedPhotographs(side_multiple(options, patch_size), checks_values, options.matte),
         *([SubjectFrame()] if options.frame == "subject" else []),
         *([Border(patch_size)] if options.pad == "multiple" else []),
     ]

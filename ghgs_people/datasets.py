@@ -106,7 +106,7 @@ class _Generated(_Renderable):
     """Number of people."""
     active: ActivePeople = ActivePeople()
     """Number of further people, in poses of sport and dance."""
-    cache_dir: options.Path | None = None
+    cache_dir: options.PathText | None = None
     """Folder of the caches; null: $GHGS_CACHE or ~/.cache/ghgs_lit."""
 
     @property
@@ -218,9 +218,9 @@ class Scans(DataSet, _OnRing):
     name: Text = "scans"
     size: Size = (140, 140)
     render: RenderOptions = RenderOptions(lights="none")
-    source: options.Path | None = None
+    source: options.PathText | None = None
     """Folder of textured meshes, <id>/<id>.obj or .glb; only for rendering."""
-    split: options.Path | dict[str, tuple[Text | Index, ...] | None] | None = None
+    split: options.PathText | dict[str, tuple[Text | Index, ...] | None] | None = None
     """Which subjects are train and val: a folder with split_train.txt and split_val.txt, or
     {train: [0000-0425], val: [0426-0525]}. Null: the folders train and val of root; when rendering, the split
     files in source, else a fraction."""

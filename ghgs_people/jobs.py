@@ -30,7 +30,7 @@ from ghgs_lit.data.sampling import RING_VIEW, ViewNumber, subject_rng
 from ghgs_lit.data.view import View, encode_depth
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import naming
-from ghgs_lit.kernels.cores import allowed_cores, use_known_start_method
+from ghgs_lit.runtime.cores import allowed_cores, use_known_start_method
 from ghgs_people import figures
 from ghgs_people.figures.mesh import Person
 from ghgs_people.photograph import Lights, Studio

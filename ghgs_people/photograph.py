@@ -84,7 +84,7 @@ class LightRig:
 
 
 @dataclass(frozen=True)
-class Photographs:
+class RenderedViews:
     """Photographs from n cameras. ``images``: [n, h, w, 3] float32 in [0, 1], premultiplied by ``alphas``.
     ``alphas``: [n, h, w] float32 in [0, 1]. ``depths``: [n, h, w] float32, metres, 0 where ``alphas`` are."""
 
@@ -123,7 +123,7 @@ class Studio:
         self._scene = scenes.EmbreeScene(robust=True)
         meshes.TriangleMesh(self._scene, self._vertices, self._faces)
 
-    def shoot(self, cameras: Cameras) -> Photographs:
+    def shoot(self, cameras: Cameras) -> RenderedViews:
         """Photographs from ``cameras`` [n]. InputError: a camera is not finite or has a focal length <= 0."""
         intrinsics = cameras.intrinsics.double().numpy()
         extrinsics = cameras.extrinsics.double().numpy()
@@ -140,7 +140,7 @@ class Studio:
             for row in range(top, bottom, step):
                 window = (n, slice(row, min(row + step, bottom)), slice(left, right))
                 images[window], alphas[window], depths[window] = self._expose(matrix, pose, *window[1:])
-        return Photographs(images, alphas, depths)
+        return RenderedViews(images, alphas, depths)
 
     def _window(
         self, matrix: np.ndarray, pose: np.ndarray, height: int, width: int

@@ -14,7 +14,7 @@ from ghgs_lit.config.keys import flatten
 from ghgs_lit.data.layout import Completeness, lights_of
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import is_locked, lock, lock_owner, write_text_atomically
-from ghgs_lit.readers import read_json
+from ghgs_lit.parsing import read_json
 
 log = logging.getLogger(__name__)
 

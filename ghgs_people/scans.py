@@ -14,7 +14,7 @@ from PIL import Image
 from ghgs_lit.data.decoding import check_extent, read_vertices
 from ghgs_lit.data.images import listed_formats, read_image
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.readers import find_path, parts_of, require_folder
+from ghgs_lit.parsing import find_path, parts_of, require_folder
 from ghgs_people.figures.mesh import Person, TexturedMesh
 from ghgs_people.gltf import posed
 

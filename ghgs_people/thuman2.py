@@ -21,7 +21,7 @@ from ghgs_lit.config.options import Share, Size, Text
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.data.pickles import load_pickle
 from ghgs_lit.errors import InputError
-from ghgs_lit.readers import find_path, read_text, require_folder
+from ghgs_lit.parsing import find_path, read_text, require_folder
 from ghgs_people.datasets import Scans
 from ghgs_people.figures.mesh import Person
 from ghgs_people.jobs import RenderOptions
@@ -106,7 +106,7 @@ class THuman2(Scans):
     )
     val_fraction: Share = 0.19
     pixel_centers: Literal["half", "integer", "auto"] = "auto"
-    fits: options.Path | None = None
+    fits: options.PathText | None = None
     """Folder with <id>/smplx_param.pkl, mesh_smplx.obj; null: by its usual names in or beside source."""
 
     def scans(self) -> THuman2Source:

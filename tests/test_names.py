@@ -2,7 +2,7 @@
 
 import pytest
 
-from ghgs_lit.readers import find_path, parts_of
+from ghgs_lit.parsing import find_path, parts_of
 
 #: The file that lies there, what a file or a user says, the endings that count.
 SPELLINGS = [

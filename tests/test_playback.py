@@ -9,10 +9,10 @@ from torch import nn
 
 from benchmarks.device import drawing_nothing
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
-from ghgs_lit.kernels.recording import Recorder
-from ghgs_lit.kernels.watching import Watcher, watched
 from ghgs_lit.playback import Playback
 from ghgs_lit.rendering.capacity import Rooms
+from ghgs_lit.runtime.recording import Recorder
+from ghgs_lit.runtime.watching import Watcher, watched
 from tests.helpers.models import close, make_model
 from tests.helpers.pretend_device import DEVICE, pretend_device
 from tests.helpers.tape import OperatorTape

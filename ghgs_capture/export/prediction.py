@@ -20,12 +20,12 @@ from ghgs_capture.export.subject import ExportedSubject, OutputOptions, exported
 from ghgs_capture.export.unseen import unseen
 from ghgs_lit.errors import choice, installed, require
 from ghgs_lit.geometry.frame import HEIGHT
-from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.metrics import psnr
 from ghgs_lit.metrics.functional import box_of
 from ghgs_lit.ply import ply_bytes
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import versions
+from ghgs_lit.runtime.cores import allowed_cores
 from ghgs_lit.types import Batch, Gaussians, Prediction
 from ghgs_lit.visualization.pictures import palette, sheet
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically, write_text_atomically
-from ghgs_lit.readers import read_json
+from ghgs_lit.parsing import read_json
 from ghgs_lit.runs.results import plain
 
 REPORT = "report.json"  #: The file that lists the others

@@ -10,7 +10,7 @@ from ghgs_capture.formats.nerfstudio import read_nerfstudio
 from ghgs_capture.formats.opencv import EASYMOCAP, read_easymocap, read_opencv, yaml_files
 from ghgs_capture.formats.qualisys import read_qualisys
 from ghgs_lit.errors import InputError, choice
-from ghgs_lit.readers import find_path
+from ghgs_lit.parsing import find_path
 
 __all__ = ["FORMATS", "CameraFile", "read_cameras"]
 

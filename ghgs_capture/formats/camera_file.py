@@ -11,7 +11,7 @@ import numpy as np
 from ghgs_capture.calibration import Convention, StoredCamera
 from ghgs_capture.photographs import PICTURES, SUFFIXES
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.readers import composed, parts_of, read_parsed
+from ghgs_lit.parsing import composed, parts_of, read_parsed
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from ghgs_capture.calibration import Convention, StoredCamera
 from ghgs_capture.formats.camera_file import CameraFile, pinhole
 from ghgs_capture.formats.entries import FISHEYE, PERSPECTIVE, coefficients
 from ghgs_lit.errors import InputError, installed, require
-from ghgs_lit.readers import require_file
+from ghgs_lit.parsing import require_file
 
 #: COLMAP's camera models: order of its parameters; ``f`` is both focal lengths.
 _MODELS = {

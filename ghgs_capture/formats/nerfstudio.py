@@ -12,7 +12,7 @@ from ghgs_capture.formats.camera_file import CameraFile
 from ghgs_capture.formats.entries import FISHEYE, Entries
 from ghgs_capture.formats.json_and_toml import read_json_file
 from ghgs_lit.errors import require
-from ghgs_lit.readers import find_path
+from ghgs_lit.parsing import find_path
 
 # Entries that are irrelevant for a camera, as :func:`plain` spells them.
 _IRRELEVANT = (

@@ -16,7 +16,7 @@ from ghgs_capture.calibration import Convention, StoredCamera
 from ghgs_capture.formats.camera_file import CameraFile, read_mapping
 from ghgs_capture.formats.entries import FISHEYE, PERSPECTIVE, Entries
 from ghgs_lit.errors import require
-from ghgs_lit.readers import check_yaml, find_path
+from ghgs_lit.parsing import check_yaml, find_path
 
 EASYMOCAP = ("intri.yml", "extri.yml")  #: The files of EasyMocap: intrinsics and poses
 #: Entries of a camera, or beside cameras, that do not matter, as :func:`plain` spells them.

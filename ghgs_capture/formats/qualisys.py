@@ -9,7 +9,7 @@ from ghgs_capture.calibration import Convention, StoredCamera
 from ghgs_capture.formats.camera_file import CameraFile, pinhole
 from ghgs_capture.formats.entries import Entries, coefficients
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.readers import require_file
+from ghgs_lit.parsing import require_file
 
 _SUBPIXELS = 64
 _ORDER = "k1 k2 p1 p2 k3"

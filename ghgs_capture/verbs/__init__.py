@@ -10,22 +10,22 @@ from omegaconf import DictConfig
 from pydantic import Field
 
 from ghgs_lit.cli.verb import Budgets, Device, Measured, Training, Verb
-from ghgs_lit.config.nodes import Sequence, Texts, Turntable
-from ghgs_lit.config.options import CropSize, Index, Path, Positive, Seed, Text, Words
+from ghgs_lit.config.nodes import SequenceOptions, Texts, Turntable
+from ghgs_lit.config.options import CropSize, Index, PathText, Positive, Seed, Text, Words
 
 Axis = Literal["y", "-y", "z"]
 
 
-class Photographs(Verb):
+class OfPhotographs(Verb):
     """The user's photographs and their cameras."""
 
-    images: Path | None = None
+    images: PathText | None = None
     """Folder of photographs or videos named after their cameras; of such folders: one for each instant."""
-    cameras: Path | None = None
+    cameras: PathText | None = None
     """Their calibration: JSON, transforms.json, COLMAP, YAML of OpenCV or EasyMocap, TOML of Pose2Sim."""
-    masks: Path | None = None
+    masks: PathText | None = None
     """Folder of masks; null: backgrounds, segment, <name>_mask.png, those of the calibration, or alpha."""
-    backgrounds: Path | None = None
+    backgrounds: PathText | None = None
     """Folder of photographs without the subject."""
     segment: Text | None = None
     """rembg: masks by that package."""
@@ -42,7 +42,7 @@ class Photographs(Verb):
             begin_to_read(config)
 
 
-class Predict(Photographs, Measured):
+class Predict(OfPhotographs, Measured):
     """Turn photographs into a splat, pictures and a page."""
 
     example = "ghgs predict images=photographs cameras=cameras.json masks=masks out=splat"
@@ -50,7 +50,7 @@ class Predict(Photographs, Measured):
     reads_data = True
     has_trained_data = True
 
-    checkpoint: Path | None = "shipped"
+    checkpoint: PathText | None = "shipped"
     """The one that comes with the package, or a file of ``ghgs train`` or ``ghgs import``."""
     check_cameras: bool = True
     """Refuse cameras that the masks contradict (``ghgs doctor task=cameras`` says more)."""
@@ -67,7 +67,7 @@ class Predict(Photographs, Measured):
     """auto: undo the tone curve that a single camera has beside the others (of images alone); 0: leave it."""
     refine: int = Field(0, ge=0, le=10000)
     """Steps of optimisation towards the photographs after the prediction, such as 15; 0: none."""
-    out: Path | None = None
+    out: PathText | None = None
     """Folder for the results; null: that of this run."""
     subject: Text | Index = 0
     """Without images: name of the subject, or its number in the split."""
@@ -82,7 +82,7 @@ class Predict(Photographs, Measured):
     """Gaussians in files are as large as the photographs' pixels: no gaps on larger screens."""
     turntable: Turntable = Turntable()
     """Pictures around the subject."""
-    sequence: Sequence = Sequence()
+    sequence: SequenceOptions = SequenceOptions()
     """Which instants count, and how the videos of cameras fit together."""
 
     def reads_at_once(self) -> bool:
@@ -101,12 +101,12 @@ class View(Predict):
     opens = ()
     reads_data = False
 
-    images: Path | Annotated[dict, Words("a folder or a mapping of cameras to devices")] | None = None
+    images: PathText | Annotated[dict, Words("a folder or a mapping of cameras to devices")] | None = None
     """As for ``ghgs predict``; with live also {camera: number of a device, or address of a stream}, which
     OpenCV opens."""
-    path: Path | None = None
+    path: PathText | None = None
     """A directory of ``ghgs predict`` (its formats ply and inputs), or a PLY; null: predict first."""
-    checkpoint: Path | None = None
+    checkpoint: PathText | None = None
     """Without path: a checkpoint, as for ``ghgs predict``; null: the one that comes with the package."""
     formats: Texts = ("ply", "inputs")
     """What is written, as for ``ghgs predict``."""
@@ -132,17 +132,17 @@ class View(Predict):
         return view.run(self, cfg)
 
 
-class Adapt(Photographs, Training):
+class Adapt(OfPhotographs, Training):
     """Train the weights of the package further for your own cameras, in minutes."""
 
     example = "ghgs adapt cameras=cameras.json images=photographs masks=masks out=mine.ckpt"
     opens = ("checkpoint",)
 
-    checkpoint: Path = "shipped"
+    checkpoint: PathText = "shipped"
     """The weights to start from."""
     minutes: float = Field(3, gt=0, le=1440)
     """Minutes of training."""
-    out: Path | None = None
+    out: PathText | None = None
     """File for the weights; null: adapted.ckpt in the run's directory."""
 
     def run(self, cfg: DictConfig) -> object:
@@ -151,7 +151,7 @@ class Adapt(Photographs, Training):
         return adapt.run(self, cfg)
 
 
-class Doctor(Photographs):
+class Doctor(OfPhotographs):
     """Whether cameras and masks fit together, what this machine lacks, whether a GPU computes well."""
 
     example = "ghgs doctor task=cameras images=photographs cameras=cameras.json masks=masks"

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.bounds.silhouettes import (
+from ghgs_lit.bounds.rays import (
     NEAREST,
     Silhouettes,
     dilate,

@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor
 
 from ghgs_lit.bounds import agreement
-from ghgs_lit.bounds.silhouettes import (
+from ghgs_lit.bounds.rays import (
     NEAREST,
     Silhouettes,
     depths_in_box,
@@ -26,7 +26,7 @@ from ghgs_lit.geometry.frame import in_cameras, subject_center
 from ghgs_lit.geometry.masks import first_and_last
 from ghgs_lit.geometry.projection import focal_lengths, project
 from ghgs_lit.kernels import gpu
-from ghgs_lit.kernels.precision import exact
+from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 
 #: Cells along the longer side of the masks that are searched, and along each side of the grid that is carved.

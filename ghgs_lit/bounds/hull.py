@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from ghgs_lit.bounds.box import SubjectBox
-from ghgs_lit.bounds.silhouettes import (
+from ghgs_lit.bounds.rays import (
     Silhouettes,
     depths_in_box,
     dilate,

@@ -19,11 +19,11 @@ from ghgs_lit.config.compose import check_ablation, plain, read_verb, store_defa
 from ghgs_lit.config.outside import check_outside_files
 from ghgs_lit.config.registry import check, verb_class
 from ghgs_lit.files import require_no_links, write_text_atomically
-from ghgs_lit.kernels.allocation import collect_garbage_again
-from ghgs_lit.kernels.cores import children_sleep
 from ghgs_lit.runs.job import register_resolvers
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.runs.signals import Interrupted, interruptible
+from ghgs_lit.runtime.allocation import collect_garbage_again
+from ghgs_lit.runtime.cores import children_sleep
 
 register_resolvers()  # on import, so that the processes of a launcher have them too
 check_outside_files()

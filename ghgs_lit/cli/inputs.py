@@ -13,10 +13,10 @@ from ghgs_lit.config import build
 from ghgs_lit.config.keys import ablation_of, flatten, is_below, lookup
 from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.kernels.precision import half_precision, keep_rounded
 from ghgs_lit.model import GHGS
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.rendering.api import resolve_backend
+from ghgs_lit.runtime.precision import half_precision, keep_rounded
 from ghgs_lit.stages import OPTIONS, STAGES
 from ghgs_lit.surroundings import side_multiple
 from ghgs_lit.weights.checkpoint import load_weights, read_config

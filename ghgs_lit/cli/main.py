@@ -4,8 +4,8 @@ import gc
 import os
 import sys
 
-from ghgs_lit.kernels.allocation import collect_garbage_again, keep_freed_memory
-from ghgs_lit.kernels.cores import spin_if_alone
+from ghgs_lit.runtime.allocation import collect_garbage_again, keep_freed_memory
+from ghgs_lit.runtime.cores import spin_if_alone
 
 
 def _command(argv: list[str]) -> int:

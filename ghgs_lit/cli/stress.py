@@ -11,8 +11,8 @@ from ghgs_lit.diagnostics.output import print_tables
 from ghgs_lit.diagnostics.stress import report
 from ghgs_lit.diagnostics.stress.run import run_tasks, tasks_of
 from ghgs_lit.errors import require
-from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.runs.provenance import provenance
+from ghgs_lit.runtime.cores import allowed_cores
 from ghgs_lit.training.replay import replay
 
 if TYPE_CHECKING:

@@ -5,13 +5,13 @@ The fields of a verb are the keys that ``conf/<verb>.yaml`` sets beside its grou
 """
 
 from collections.abc import Mapping
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from omegaconf import DictConfig
 from pydantic import Field
 
-from ghgs_lit.config.options import Options, Patches, Path, Seed
+from ghgs_lit.config.options import Options, Patches, PathText, Seed
 
 Device = Literal["auto", "cpu", "cuda"]
 Precision = Literal["inherit", "float32", "tf32", "bfloat16", "float16", "auto"]
@@ -48,7 +48,7 @@ class Verb(Options):
         Raises:
             FileNotFoundError, InputError: a file or folder is missing or wrong; the message is its reader's.
         """
-        from ghgs_lit.readers import require_folder  # here: --help needs no NumPy
+        from ghgs_lit.parsing import require_folder  # here: --help needs no NumPy
         from ghgs_lit.weights.reading import require_weights
 
         for key in self.opens:
@@ -57,7 +57,7 @@ class Verb(Options):
         data = config.get("data")
         is_read = self.reads_data and isinstance(data, Mapping) and not data.get("source")
         if is_read and isinstance(data.get("root"), str):
-            require_folder(FilePath(data["root"]).expanduser())
+            require_folder(Path(data["root"]).expanduser())
 
     def run(self, cfg: DictConfig) -> object:
         """Do the work of the verb; a sweeper optimises the number that it returns, if any."""
@@ -80,7 +80,7 @@ class Training(Verb):
 
     seed: Seed = 1
     """Of weights, of samples and of their order."""
-    resume: Literal["auto"] | Path | None = "auto"
+    resume: Literal["auto"] | PathText | None = "auto"
     """A checkpoint to go on from; auto: where the run in the directory stands; null: begins anew."""
     overwrite: bool = False
     """Delete the run that is in the directory already."""

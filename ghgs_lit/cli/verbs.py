@@ -10,7 +10,7 @@ from pydantic import Field
 
 from ghgs_lit.cli.verb import Budgets, Measured, Training, Verb
 from ghgs_lit.config.nodes import Check, PairedTest, PerScene, Texts, Timing
-from ghgs_lit.config.options import Count, Path, Seed, Text, Words, Workers
+from ghgs_lit.config.options import Count, PathText, Seed, Text, Words, Workers
 
 
 class Train(Training):
@@ -24,7 +24,7 @@ class Train(Training):
     token_budgets: Budgets | None = None
     """What the encoder sees in a training step, drawn from this list: all, window (around the subject), or a
     number (patches around the subject that stay). One checkpoint then serves all presets of skip."""
-    init_from: Path | None = None
+    init_from: PathText | None = None
     """A checkpoint whose weights to start from."""
     init_strict: bool = False
     """Whether all weights of init_from must fit, and be all that the model has (or all of its encoder)."""
@@ -60,7 +60,7 @@ class Evaluate(Measured):
     reads_data = True
     has_trained_data = True
 
-    checkpoint: Path | None = None
+    checkpoint: PathText | None = None
     """A checkpoint; null: baselines alone."""
     refine_cameras: int = Field(0, ge=0, le=100)
     """Rounds, at most, that correct the inputs' cameras before each prediction; 0: none."""
@@ -82,7 +82,7 @@ class Benchmark(Measured):
 
     example = "ghgs benchmark checkpoint=runs/train/.../checkpoints/last.ckpt presets=[none,exact,balanced]"
 
-    checkpoint: Path | None = None
+    checkpoint: PathText | None = None
     """null: random weights, of which only run times and differences mean something."""
     presets: Annotated[tuple[Text, ...], Field(min_length=1)] = ("none", "exact", "balanced", "fast")
     """Names of files of conf/skip; none, which the others are compared with, is always measured, too."""
@@ -115,7 +115,7 @@ class Stress(Verb):
     """Names of stages, as a run prints them; null: all."""
     families: tuple[Text, ...] | None = None
     """Names of families of inputs, as stress.md lists them; null: all."""
-    dump: Path | None = None
+    dump: PathText | None = None
     """A training step that was not finite, <run>/faults/step_<n>.pt: run it again, and nothing else."""
     workers: Workers | None = None
     """Processes; null: one for each processor, 0: this one."""
@@ -179,11 +179,11 @@ class Import(Verb):
 
     example = "ghgs import vggt=facebook/VGGT-1B release=release.pth out=release.ckpt"
 
-    vggt: Path | None = None
+    vggt: PathText | None = None
     """facebook/VGGT-1B, or its file (.safetensors or .pt)."""
-    release: Path | None = None
+    release: PathText | None = None
     """The authors' checkpoint; null: the file holds the encoder alone, for init_from of a training."""
-    out: Path
+    out: PathText
     """File of the checkpoint."""
     dtype: Literal["float32", "bfloat16", "float16"] = "float32"
     """Of the encoder in the checkpoint; the heads are float32."""
@@ -202,13 +202,13 @@ class Export(Verb):
     example = "ghgs export checkpoint=checkpoints/last.ckpt inference=small.ckpt"
     opens = ("checkpoint",)
 
-    checkpoint: Path
+    checkpoint: PathText
     """A checkpoint of ``ghgs train`` or ``ghgs import``."""
-    vggt: Path | None = None
+    vggt: PathText | None = None
     """File for the encoder, .safetensors or .pt; null: not written."""
-    release: Path | None = None
+    release: PathText | None = None
     """File for all other stages, .pth; null: not written."""
-    inference: Path | None = None
+    inference: PathText | None = None
     """File with weights and configuration alone, a checkpoint for ``ghgs predict``; null: not written."""
     dtype: Literal["float16", "bfloat16", "float32"] = "float16"
     """Of the weights in it."""

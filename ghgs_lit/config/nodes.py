@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ghgs_lit.config.options import Count, Index, Options, Path, Positive, Share, Text, Words
+from ghgs_lit.config.options import Count, Index, Options, PathText, Positive, Share, Text, Words
 
 #: One value or several.
 Texts = Text | tuple[Text, ...]
@@ -38,7 +38,7 @@ class Calibration(Options):
     """Camera of a photograph with another name: {photograph: camera}."""
 
 
-class Sequence(Options):
+class SequenceOptions(Options):
     """Instants to use, and how the videos of cameras are synchronised."""
 
     group = "sequence"
@@ -48,7 +48,7 @@ class Sequence(Options):
     """Number of the first one that no longer counts; negative: from the end."""
     step: Count = 1
     """Every so many of them."""
-    sync: Path | Annotated[dict, Words("a mapping of cameras to frames")] | None = None
+    sync: PathText | Annotated[dict, Words("a mapping of cameras to frames")] | None = None
     """Of videos. null: their frames are numbered alike. {camera: frames} by which it began before the others.
     A CSV (camera,frame,seconds): the frames nearest to those of the first camera."""
 

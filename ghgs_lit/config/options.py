@@ -111,7 +111,7 @@ def _pair(size: int | tuple[int, int]) -> tuple[int, int]:
 
 
 Text = Annotated[str, Field(min_length=1)]
-Path = Annotated[str, Field(min_length=1), BeforeValidator(_text), Words("a path")]
+PathText = Annotated[str, Field(min_length=1), BeforeValidator(_text), Words("a path")]
 Count = Annotated[int, Field(ge=1)]
 Index = Annotated[int, Field(ge=0)]
 Amount = Annotated[float, Field(ge=0)]

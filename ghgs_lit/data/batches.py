@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.utils.data import Dataset, DistributedSampler
 
 from ghgs_lit.data.augmentation import Augmentation, Size
-from ghgs_lit.data.reader import Photographs
+from ghgs_lit.data.reader import PhotographCache
 from ghgs_lit.data.sampling import Photo, SampleSpec, TrainingSampler, photo_name
 from ghgs_lit.data.view import View
 from ghgs_lit.types import Batch, Cameras, Targets
@@ -21,8 +21,8 @@ class BatchBuilder:
     """Reads samples into a :class:`Batch`. ``inputs``, ``targets``: photographs at the sizes of either.
     ``depths``: whether depth maps of the inputs are read, if there are any."""
 
-    inputs: Photographs
-    targets: Photographs
+    inputs: PhotographCache
+    targets: PhotographCache
     depths: bool = True
 
     def batch(
@@ -57,7 +57,7 @@ class BatchBuilder:
 
 
 def _views(
-    photographs: Photographs, subject: str, photos: Sequence[Photo], depth: bool, size: Size | None
+    photographs: PhotographCache, subject: str, photos: Sequence[Photo], depth: bool, size: Size | None
 ) -> list[View]:
     return [photographs.view(subject, *photo, depth=depth, size=size) for photo in photos]
 

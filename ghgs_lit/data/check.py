@@ -16,10 +16,10 @@ from torch.utils.data import Dataset
 
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.layout import Completeness
+from ghgs_lit.data.mask_checks import SEARCH, height, implausible, silhouette, twins
 from ghgs_lit.data.overlap import Tile, draw_tile, overlap, save_sheet
-from ghgs_lit.data.reader import PHASES, Photographs, Reader
+from ghgs_lit.data.reader import PHASES, PhotographCache, Reader
 from ghgs_lit.data.sampling import CAMERAS, RING_VIEW, TargetProtocol
-from ghgs_lit.data.silhouettes import SEARCH, height, implausible, silhouette, twins
 from ghgs_lit.data.view import View
 from ghgs_lit.data.workers import loader_of
 from ghgs_lit.errors import InputError
@@ -98,7 +98,7 @@ class Report:
 class _Readings(Dataset):
     """Item ``i`` is the result of reading photograph ``i``."""
 
-    photographs: Photographs
+    photographs: PhotographCache
     listed: Sequence[Photograph]
     pictured: set[Photograph]
     min_iou: float
@@ -157,7 +157,7 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
         except InputError as error:
             report.problems.append(str(error))
             continue
-        photographs = Photographs(reader, None, min(dataset.cache_images_mb, _CACHE_MB))
+        photographs = PhotographCache(reader, None, min(dataset.cache_images_mb, _CACHE_MB))
         found = Phase(reader, _read(photographs, targets, min_iou, data, f"checking {phase}"))
         _compare_masks(found.seen, reader, min_agreement)
         report.phases[phase] = found
@@ -174,7 +174,7 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
 
 
 def _read(
-    photographs: Photographs,
+    photographs: PhotographCache,
     targets: TargetProtocol,
     min_iou: float,
     data: PhotographsDataModule,

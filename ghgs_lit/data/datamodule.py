@@ -14,7 +14,7 @@ from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.batches import BatchBuilder, EvaluationBatches, StepSampler, TrainingBatches
 from ghgs_lit.data.options import LoadingOptions
 from ghgs_lit.data.packed import Packing, folder_of, packed_reader
-from ghgs_lit.data.reader import PHASES, Photographs
+from ghgs_lit.data.reader import PHASES, PhotographCache
 from ghgs_lit.data.resident import Drawn, DrawnBatches, resident_batches
 from ghgs_lit.data.sampling import (
     RING_VIEW,
@@ -103,9 +103,9 @@ class PhotographsDataModule(LightningDataModule):
         choice("split", phase, self.dataset.split_names)
         if phase not in self._builders:
             data, reader = self.dataset, self.dataset.reader(phase)
-            inputs = targets = Photographs(reader, data.size, data.cache_images_mb, data.resampling)
+            inputs = targets = PhotographCache(reader, data.size, data.cache_images_mb, data.resampling)
             if data.target_size not in (None, data.size):
-                targets = Photographs(reader, data.target_size, data.cache_images_mb, data.resampling)
+                targets = PhotographCache(reader, data.target_size, data.cache_images_mb, data.resampling)
             self._builders[phase] = BatchBuilder(inputs, targets)
         return self._builders[phase]
 
@@ -145,7 +145,7 @@ class PhotographsDataModule(LightningDataModule):
             return BatchBuilder(inputs, inputs)
         return BatchBuilder(inputs, self._packed(plain.targets, False, reads, rank))
 
-    def _packed(self, photographs: Photographs, depths: bool, reads: float, rank: int) -> Photographs:
+    def _packed(self, photographs: PhotographCache, depths: bool, reads: float, rank: int) -> PhotographCache:
         """Photographs of training from packed files.
 
         Args:
@@ -171,7 +171,7 @@ class PhotographsDataModule(LightningDataModule):
         reader = packed_reader(reader, packing, data.packed_gb, said)
         if reader is photographs.reader:
             return photographs
-        return Photographs(reader, photographs.size, 0, data.resampling)  # the system keeps the files' pages
+        return PhotographCache(reader, photographs.size, 0, data.resampling)  # the system keeps pages
 
     def train_dataloader(self) -> DataLoader:
         """Batches of one epoch, which continues where the last one ended."""

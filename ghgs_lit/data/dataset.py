@@ -52,7 +52,7 @@ class DataOptions(LoadingOptions):
 class DataSet(DataOptions):
     """Options of a data set in the user's folder."""
 
-    root: options.Path | None = None
+    root: options.PathText | None = None
     """Folder of the data."""
     limit: Limit = Limit()
     """Subjects used of each phase."""

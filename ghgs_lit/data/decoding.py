@@ -10,7 +10,7 @@ import numpy as np
 from ghgs_lit.data.images import UPRIGHT, orientation_of, read_image, rgb_of
 from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.readers import read_npy
+from ghgs_lit.parsing import read_npy
 
 # Largest distance of a principal point from the image's centre, as a fraction of the side.
 _OFF_CENTRE = 0.25

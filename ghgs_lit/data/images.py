@@ -12,7 +12,7 @@ import numpy as np
 from PIL import ExifTags, Image
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.readers import require_file
+from ghgs_lit.parsing import require_file
 
 if TYPE_CHECKING:  # most photographs have no profile
     from PIL import ImageCms

@@ -38,7 +38,7 @@ from ghgs_lit.data.decoding import (
 from ghgs_lit.data.reader import PHASES, Reader
 from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.readers import composed, find_path, read_json, require_folder
+from ghgs_lit.parsing import composed, find_path, read_json, require_folder
 
 #: Folder of the renderer's notes.
 FOLDER = "rendering"

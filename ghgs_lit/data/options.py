@@ -11,7 +11,7 @@ from ghgs_lit.config.options import Amount, Count, Index, Options, Size, Text, W
 from ghgs_lit.data.reader import PHASES, Reader
 from ghgs_lit.data.sampling import TargetProtocol
 from ghgs_lit.errors import InputError
-from ghgs_lit.readers import require_folder
+from ghgs_lit.parsing import require_folder
 
 
 class LoadingOptions(Options):

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.readers import read_npy
+from ghgs_lit.parsing import read_npy
 
 
 def _bytes(text: str, encoding: str = "latin1") -> bytes:

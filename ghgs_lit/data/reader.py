@@ -1,7 +1,7 @@
 """Readers of photographs by subject, position and view.
 
 A data set provides a :class:`Reader`, which finds and decodes its files. Resizing and caching
-(:class:`Photographs`), sampling and batching are the same for all data sets.
+(:class:`PhotographCache`), sampling and batching are the same for all data sets.
 """
 
 import contextlib
@@ -133,7 +133,7 @@ class FrameReader(Reader):
         return there
 
 
-class Photographs:
+class PhotographCache:
     """Photographs of a reader, resized and cached.
 
     Args:

@@ -18,11 +18,11 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from ghgs_lit.data.batches import TrainingBatches
-from ghgs_lit.data.reader import Photographs
+from ghgs_lit.data.reader import PhotographCache
 from ghgs_lit.data.sampling import RING_VIEW, Photo, SampleSpec, photo_name
 from ghgs_lit.data.view import DEPTH_SCALE, SAME_SURFACE, View, area_weights, neighbors, resize_view
 from ghgs_lit.errors import require
-from ghgs_lit.kernels.precision import exact
+from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Cameras, Targets, map_tensors
 
 log = logging.getLogger(__name__)
@@ -80,7 +80,7 @@ class ResidentPhotographs:
 
     def __init__(
         self,
-        photographs: Photographs,
+        photographs: PhotographCache,
         views: Sequence[int],
         depths: bool,
         stored: bool,

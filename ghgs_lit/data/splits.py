@@ -7,7 +7,7 @@ import numpy as np
 
 from ghgs_lit.data.reader import PHASES
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.readers import read_text, require_folder
+from ghgs_lit.parsing import read_text, require_folder
 
 Split = str | Path | Mapping[str, Sequence[str] | None]
 

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from ghgs_lit.kernels.cores import allowed_cores, use_known_start_method
+from ghgs_lit.runtime.cores import allowed_cores, use_known_start_method
 
 #: Batches below which processes take longer to start than they save: forked ones, and those that import.
 _FEW_FORKED, _FEW_STARTED = 32, 256

@@ -11,9 +11,9 @@ from typing import Any
 import torch
 from rich.filesize import decimal
 
-from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.rendering import gsplat_backend
 from ghgs_lit.runs.provenance import version_of
+from ghgs_lit.runtime.cores import allowed_cores
 
 DISTRIBUTION = "ghgs-lit"
 

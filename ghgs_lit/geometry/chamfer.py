@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.kernels.precision import exact
+from ghgs_lit.runtime.precision import exact
 
 #: Distances in the memory of an accelerator at once, and candidates of each query that are compared exactly.
 _DISTANCES, _CANDIDATES = 1 << 26, 4

@@ -22,7 +22,7 @@ from ghgs_lit.geometry.projection import (
     world_to_camera,
 )
 from ghgs_lit.geometry.rotations import matrix_to_quaternion, multiply_quaternions, unit
-from ghgs_lit.kernels.precision import exact
+from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds, DepthMaps, Gaussians, Prediction
 
 #: Height of the subject in its frame, or its width if larger, in metres.
@@ -140,7 +140,7 @@ def _to_world(
 def subject_center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Tensor, "B 3"]:
     """The point nearest to the rays through the masks' centroids, by least squares. Optical axes have a small
     weight, so that one mask or none is enough, and the cameras a smaller one, for parallel rays. To be called
-    where products are exact (:func:`ghgs_lit.kernels.precision.exact`)."""
+    where products are exact (:func:`ghgs_lit.runtime.precision.exact`)."""
     intrinsics, extrinsics = at_least_float32(cameras.intrinsics), at_least_float32(cameras.extrinsics)
     # Sums of u and v, and the number of pixels: half-integers, whose sums are exact in any order.
     centers = homogeneous_centers(*masks.shape[2:], intrinsics).flatten(0, 1)

@@ -12,7 +12,7 @@ from ghgs_lit.geometry.masks import surface_colors
 from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, pixel_centers, sample
 from ghgs_lit.kernels import gpu
 from ghgs_lit.kernels.pool import even_parts, is_supported
-from ghgs_lit.kernels.precision import exact
+from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, DepthBounds
 
 #: Samples in memory at once.

@@ -17,8 +17,8 @@ from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.heads.guide import Guide, GuidePyramid
 from ghgs_lit.kernels.linear import linear
 from ghgs_lit.kernels.pool import at_once, even_parts
-from ghgs_lit.kernels.precision import exact, without_float16
 from ghgs_lit.plan.window import Span, Window, reach
+from ghgs_lit.runtime.precision import exact, without_float16
 from ghgs_lit.types import Tokens
 
 SCALE = 0.1

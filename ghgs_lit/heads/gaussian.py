@@ -30,9 +30,9 @@ from ghgs_lit.heads.dense import Part, decode
 from ghgs_lit.heads.dpt import DPTHead
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, Guide, photo_guide
 from ghgs_lit.kernels.linear import Linear
-from ghgs_lit.kernels.precision import exact, without_float16
 from ghgs_lit.plan import Plan
 from ghgs_lit.plan.rows import Rows
+from ghgs_lit.runtime.precision import exact, without_float16
 from ghgs_lit.types import (
     Batch,
     DepthBounds,

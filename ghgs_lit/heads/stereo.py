@@ -19,8 +19,8 @@ from ghgs_lit.geometry.projection import at_least_float32, pixel_centers, projec
 from ghgs_lit.heads.activations import bounded_sigmoid
 from ghgs_lit.heads.depth import BOUNDED, finite_maps
 from ghgs_lit.heads.dpt import ResidualUnit
-from ghgs_lit.kernels.precision import exact, without_float16
 from ghgs_lit.plan import Plan
+from ghgs_lit.runtime.precision import exact, without_float16
 from ghgs_lit.types import Batch, Cameras, DepthBounds, DepthMaps, Tokens, true_places
 
 #: Side of a cell in pixels, and channels of its features and of the GRU's memory.

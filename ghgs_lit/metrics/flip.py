@@ -12,8 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.kernels.precision import exact
 from ghgs_lit.metrics.functional import correlate
+from ghgs_lit.runtime.precision import exact
 
 PIXELS_PER_DEGREE = 67.0206
 """Resolution in the eye of the paper's viewer: 0.7 m away from a screen 0.7 m wide with 3840 pixels."""

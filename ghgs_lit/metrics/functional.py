@@ -17,7 +17,7 @@ from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.chamfer import nearest
 from ghgs_lit.geometry.masks import between, first_and_last
 from ghgs_lit.geometry.projection import at_least_float32, project, sample
-from ghgs_lit.kernels.precision import exact
+from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Cameras
 
 REGIONS = ("image", "box", "subject", "crop", "edge")

@@ -15,20 +15,20 @@ from ghgs_lit.config.options import Amount, Count, Options, Patches, Text
 from ghgs_lit.types import Decision, DecodedPixels
 
 
-class View(NamedTuple):
+class KeptTokens(NamedTuple):
     """The ``tokens`` and ``margin`` of an encoder; the margin is 0 with all tokens."""
 
     tokens: str
     margin: int = 0
 
     @classmethod
-    def of_budget(cls, budget: str | int) -> "View":
+    def of_budget(cls, budget: str | int) -> "KeptTokens":
         """The view for one choice of ``token_budgets``."""
         return cls("subject", budget) if isinstance(budget, int) else cls(budget)
 
 
 @contextmanager
-def seeing(encoder: Any, view: View) -> Iterator[None]:
+def seeing(encoder: Any, view: KeptTokens) -> Iterator[None]:
     """Set ``tokens`` and ``margin`` of a :class:`ghgs_lit.encoder.VGGTEncoder` while the context lasts."""
     before = (encoder.tokens, encoder.margin)
     encoder.tokens, encoder.margin = view
@@ -66,9 +66,9 @@ class Preset(Options):
     it. null: nothing is promised."""
 
     @property
-    def view(self) -> View:
+    def view(self) -> KeptTokens:
         """Which patches the encoder works on."""
-        return View(self.tokens, 0 if self.tokens == "all" else self.margin)
+        return KeptTokens(self.tokens, 0 if self.tokens == "all" else self.margin)
 
     @property
     def is_exact(self) -> bool:
@@ -139,7 +139,7 @@ class AutoSkip:
     def trained_by(self, config: Mapping[str, Any]) -> "AutoSkip":
         """Only the presets that occurred in the training of ``config``: the loss of others is unknown."""
         shown = {SkipOptions.read(config.get("skip") or {}, "skip").view}
-        shown |= {View.of_budget(budget) for budget in config.get("token_budgets") or []}
+        shown |= {KeptTokens.of_budget(budget) for budget in config.get("token_budgets") or []}
         known = {n: p for n, p in self.presets.items() if p.is_exact or p.view in shown}
         unknown = {name: "not shown in training" for name in self.presets if name not in known}
         return replace(self, presets=known, left_out={**unknown, **self.left_out})

@@ -13,11 +13,11 @@ from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.rotations import unit
 from ghgs_lit.kernels.linear import linear
 from ghgs_lit.kernels.pool import at_once, even_parts
-from ghgs_lit.kernels.precision import exact
 from ghgs_lit.plan import Plan
 from ghgs_lit.plan.rows import Rows
 from ghgs_lit.recalibration.attention import SemanticAttention, Similarity
 from ghgs_lit.recalibration.neighbors import nearest_neighbors
+from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import DecodedPixels, Points, Tokens
 
 #: Cosines in memory at once, on a CPU and on a GPU.

@@ -21,8 +21,8 @@ from ghgs_lit.geometry.frame import HEIGHT, subject_center
 from ghgs_lit.geometry.masks import coverage
 from ghgs_lit.geometry.projection import project, unproject, world_to_camera
 from ghgs_lit.geometry.rotations import after_motions, without_common
-from ghgs_lit.kernels.precision import exact
 from ghgs_lit.refinement.outlines import QUICK, TO, Outlines
+from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Cameras
 
 Lens, Pose = Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"]

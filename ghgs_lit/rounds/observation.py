@@ -15,9 +15,9 @@ from ghgs_lit.geometry.projection import at_least_float32, project
 from ghgs_lit.geometry.rotations import rotate, unit
 from ghgs_lit.kernels import gpu
 from ghgs_lit.kernels.pool import is_supported
-from ghgs_lit.kernels.precision import exact
 from ghgs_lit.rendering import render
 from ghgs_lit.rounds import cpu
+from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering, map_tensors
 
 #: Scale in metres of a Gaussian's distance behind the rendered surface (tanh of the ratio).

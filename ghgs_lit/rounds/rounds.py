@@ -19,18 +19,18 @@ from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor, nn
 
-from ghgs_lit.bounds.silhouettes import ray_directions
+from ghgs_lit.bounds.rays import ray_directions
 from ghgs_lit.config.options import Options, Width
 from ghgs_lit.geometry.photo_consistency import consistency_of
 from ghgs_lit.geometry.projection import at_least_float32, focal_lengths
 from ghgs_lit.heads.activations import bounded_tanh
 from ghgs_lit.heads.gaussian import RAW_VALUES, RawGaussians, float32_last
 from ghgs_lit.kernels.pool import at_once, even_parts, multiplies
-from ghgs_lit.kernels.precision import exact
 from ghgs_lit.plan.rows import size_class
 from ghgs_lit.rounds import cpu
 from ghgs_lit.rounds.gains import equalized
 from ghgs_lit.rounds.observation import CHANNELS, SLOPES, observe, slopes
+from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Prediction
 
 #: Side in pixels of the square around a Gaussian's pixel whose Gaussians it exchanges features with.

@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from ghgs_lit.config.keys import lookup
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import resolved
-from ghgs_lit.readers import read_yaml
+from ghgs_lit.parsing import read_yaml
 from ghgs_lit.runs.processes import is_queued_again, process_count
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import AUTO, MARKER, PLAN, RunDirectory, begun_by_job

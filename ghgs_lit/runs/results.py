@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
-from ghgs_lit.readers import read_json
+from ghgs_lit.parsing import read_json
 from ghgs_lit.runs.provenance import config_hash
 
 FORMAT_VERSION = 3  #: The version that is written, and the only one that is read

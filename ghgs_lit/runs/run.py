@@ -23,7 +23,7 @@ from pydantic import BaseModel, ConfigDict
 from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, lookup
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import append_line, is_locked, lock, lock_owner, resolved, write_text_atomically
-from ghgs_lit.readers import read_json, read_lines_of_json, read_yaml
+from ghgs_lit.parsing import read_json, read_lines_of_json, read_yaml
 from ghgs_lit.runs.processes import is_queued_again, launch, slurm_job
 from ghgs_lit.runs.provenance import config_hash, differences
 from ghgs_lit.runs.results import read_results, validated

@@ -11,7 +11,7 @@ from torch import nn
 from torchmetrics import MeanMetric
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.kernels.watching import time_mark
+from ghgs_lit.runtime.watching import time_mark
 from ghgs_lit.training.optimization import Optimization, hold_rates, plain_rates
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION

@@ -9,9 +9,9 @@ import torch
 from lightning.pytorch.callbacks import Callback
 
 from ghgs_lit.config.options import Options
-from ghgs_lit.kernels.allocation import forget_peak, resident_bytes
-from ghgs_lit.kernels.watching import Inputs, Stopwatch, Watcher, watched
 from ghgs_lit.model import STAGES
+from ghgs_lit.runtime.allocation import forget_peak, resident_bytes
+from ghgs_lit.runtime.watching import Inputs, Stopwatch, Watcher, watched
 
 #: Parts of a step in their order.
 PARTS = ("data", *STAGES, "rounds", "render", "loss", "backward", "optimizer")

@@ -15,7 +15,7 @@ from ghgs_lit.config.keys import is_hyperparameter, key_of, lookup
 from ghgs_lit.config.options import Options
 from ghgs_lit.errors import installed
 from ghgs_lit.files import write_atomically
-from ghgs_lit.readers import read_rows
+from ghgs_lit.parsing import read_rows
 from ghgs_lit.runs.run import RunDirectory
 
 #: Final values by which runs are compared; ``metrics.json`` has all.

@@ -17,7 +17,7 @@ from ghgs_lit.heads.inspection import offsets_at_limit, seen_attributes
 from ghgs_lit.losses import Losses
 from ghgs_lit.metrics import MetricsOptions, depth_error_mm, surface_error_mm
 from ghgs_lit.model import GHGS
-from ghgs_lit.plan.presets import View, seeing
+from ghgs_lit.plan.presets import KeptTokens, seeing
 from ghgs_lit.training.base import BudgetedModule, image_mean
 from ghgs_lit.training.faults import Step
 from ghgs_lit.training.guard import Guard
@@ -54,7 +54,7 @@ def token_budget(model: GHGS, budget: str | int | None) -> AbstractContextManage
 
     Returns:
         The context."""
-    return nullcontext() if budget is None else seeing(model.encoder, View.of_budget(budget))
+    return nullcontext() if budget is None else seeing(model.encoder, KeptTokens.of_budget(budget))
 
 
 def _depth_error(batch: Batch, maps: DepthMaps) -> Tensor:

@@ -7,7 +7,7 @@ import torch
 
 from ghgs_lit.bounds import SubjectBox, VisualHull
 from ghgs_lit.bounds.box import RESOLUTION
-from ghgs_lit.bounds.silhouettes import silhouettes
+from ghgs_lit.bounds.rays import silhouettes
 from tests.helpers.scenes import make_batch
 
 

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 
 from ghgs_lit.bounds import NoBounds, SubjectBox, VisualHull
 from ghgs_lit.bounds.box import subject_box
-from ghgs_lit.bounds.silhouettes import depths_in_box, dilate, silhouettes
+from ghgs_lit.bounds.rays import depths_in_box, dilate, silhouettes
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.types import Batch, DepthBounds

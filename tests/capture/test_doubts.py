@@ -9,7 +9,7 @@ import torch
 
 from ghgs_capture import predict as predicting
 from ghgs_capture.capture import Capture
-from ghgs_capture.doubts import ENOUGH, doubt_of_cameras, doubt_of_masks
+from ghgs_capture.doubts import CORRECTION, doubt_of_cameras, doubt_of_masks
 from ghgs_capture.prediction import predict
 from ghgs_lit.geometry.masks import signed_distance
 from tests.helpers.figures import Figure
@@ -102,7 +102,7 @@ def test_what_is_doubted_is_refined(taken, monkeypatch):
     seen = []
     monkeypatch.setattr(predicting, "doubt_of_cameras", lambda capture, batch: seen.append(batch) or "")
     found = predict(wrong, model, 56)
-    asked = predict(wrong, model, 56, refine_cameras=0, refine_masks=ENOUGH)
+    asked = predict(wrong, model, 56, refine_cameras=0, refine_masks=CORRECTION)
     assert list(found.why) == ["refine_masks"]
     assert torch.equal(found.batch.images, asked.batch.images)
     assert torch.equal(seen[0].alpha, asked.batch.alpha)

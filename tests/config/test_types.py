@@ -6,7 +6,7 @@ from typing import Literal
 import pytest
 from pydantic import Field, model_validator
 
-from ghgs_lit.config.options import Count, Options, Path, Share, Size, Text, Width, meanings
+from ghgs_lit.config.options import Count, Options, PathText, Share, Size, Text, Width, meanings
 from ghgs_lit.errors import InputError
 
 
@@ -24,7 +24,7 @@ class Outer(Options):
     mode: Literal["a", "b"] = "a"
     inner: Inner = Inner()
     size: Size = 3
-    path: Path | None = None
+    path: PathText | None = None
     per: Count | Literal["all"] = 1
     name: Text = "x"
     shares: dict[str, Share] = Field({})

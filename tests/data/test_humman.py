@@ -15,7 +15,7 @@ from scipy import sparse
 
 from ghgs_lit.data.humman.dataset import HuMMan
 from ghgs_lit.data.humman.smpl import read_model, read_parameters
-from ghgs_lit.data.reader import Photographs
+from ghgs_lit.data.reader import PhotographCache
 from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.errors import InputError
 from scripts.miniatures import humman
@@ -41,9 +41,9 @@ def root(tmp_path_factory) -> Path:
     return folder
 
 
-def photographs(root: Path, size=None, **options) -> Photographs:
+def photographs(root: Path, size=None, **options) -> PhotographCache:
     data = HuMMan(root=root, split={"val": [TEST]}, frames=(0, 97, 6), **options)
-    return Photographs(data.reader("val"), size)
+    return PhotographCache(data.reader("val"), size)
 
 
 def test_frames_are_multiples_of_6_and_some_lack(root):

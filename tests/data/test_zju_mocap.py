@@ -12,7 +12,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from ghgs_lit.data.pickles import load_npy
-from ghgs_lit.data.reader import Photographs
+from ghgs_lit.data.reader import PhotographCache
 from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.data.view import half_centers, resize_view
 from ghgs_lit.data.zju_mocap.annotations import frame_number, read_annotations
@@ -43,9 +43,9 @@ def root(tmp_path_factory) -> Path:
     return folder
 
 
-def photographs(root: Path, sequence: str = "386", frames=(0, 2, 1), size=None, **options) -> Photographs:
+def photographs(root: Path, sequence: str = "386", frames=(0, 2, 1), size=None, **options) -> PhotographCache:
     split = {key: [{"sequences": [sequence], "frames": list(frames)}] for key in ("train", "val")}
-    return Photographs(ZJUMoCap(root=root, split=split, **options).reader("val"), size)
+    return PhotographCache(ZJUMoCap(root=root, split=split, **options).reader("val"), size)
 
 
 def test_bodies_project_into_every_mask(root):

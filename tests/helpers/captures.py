@@ -14,7 +14,7 @@ from scipy.ndimage import binary_dilation
 
 from ghgs_lit.config import build, compose
 from ghgs_lit.data.packed import Packing, packed_reader
-from ghgs_lit.data.reader import Photographs, Reader
+from ghgs_lit.data.reader import PhotographCache, Reader
 from ghgs_lit.data.view import View, resize_view
 from ghgs_lit.errors import InputError
 from ghgs_people import figures
@@ -42,9 +42,9 @@ def build_data(name: str, root: Path, *overrides: str):
     return build(node, "data", views=cfg.views, targets=cfg.targets, seed=0)
 
 
-def stored(data, phase: str, size: tuple[int, int] | None = None) -> Photographs:
+def stored(data, phase: str, size: tuple[int, int] | None = None) -> PhotographCache:
     """The photographs of a data module, at their stored size unless ``size`` is given."""
-    return Photographs(data.dataset.reader(phase), size)
+    return PhotographCache(data.dataset.reader(phase), size)
 
 
 def require_same_packed(reader: Reader, folder: Path, size: tuple[int, int]) -> None:

@@ -76,7 +76,7 @@ def test_the_key_covers_all_that_kernels_read(room, monkeypatch):
                     assert node.module in names, file
     compile._digest.cache_clear()
     before, read = compile._digest(room), Path.read_bytes
-    for file in files:  # such as bounds/silhouettes.py, whose NEAREST is a constant of machine code
+    for file in files:  # such as bounds/rays.py, whose NEAREST is a constant of machine code
         changed = lambda path, file=file: read(path) + b"#" * (path == file)  # noqa: E731
         monkeypatch.setattr(Path, "read_bytes", changed)
         compile._digest.cache_clear()

@@ -17,8 +17,8 @@ from tensorboard.plugins.hparams import plugin_data_pb2
 
 from ghgs_lit.config import build
 from ghgs_lit.errors import InputError
-from ghgs_lit.kernels.allocation import resident_bytes
 from ghgs_lit.runs.run import RunDirectory
+from ghgs_lit.runtime.allocation import resident_bytes
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.cost import Costs
 from ghgs_lit.training.loggers import (

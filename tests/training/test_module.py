@@ -16,8 +16,8 @@ from torch.utils.data import DataLoader
 
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.errors import InputError
-from ghgs_lit.kernels.precision import exact
 from ghgs_lit.model import GHGS
+from ghgs_lit.runtime.precision import exact
 from ghgs_lit.training import DivergedError, GHGSModule, Optimization
 from ghgs_lit.training.callbacks import RunProgress
 from ghgs_lit.training.checkpoints import CheckpointOptions

@@ -1,4 +1,4 @@
-"""Searches of the bounds for a GPU, in Triton: formulas of :mod:`ghgs_lit.bounds.silhouettes`, ``box`` and
+"""Searches of the bounds for a GPU, in Triton: formulas of :mod:`ghgs_lit.bounds.rays`, ``box`` and
 ``hull``. ``outside``: 1 where a view says "outside"."""
 
 import torch
@@ -6,7 +6,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from ghgs_lit.bounds.silhouettes import NEAREST
+from ghgs_lit.bounds.rays import NEAREST
 from ghgs_lit.kernels.tiles import load3, load4, rows_of, start
 
 LEAST = tl.constexpr(NEAREST)
@@ -108,7 +108,7 @@ def marched_rows(
 
 
 def dilated(masks: Tensor, radius: int, more: Tensor | None, axis: int) -> Tensor:
-    """The operator of :mod:`ghgs_lit.bounds.silhouettes`."""
+    """The operator of :mod:`ghgs_lit.bounds.rays`."""
     height, width = masks.shape[-2:]
     out = masks.new_empty(masks.shape)
     size, stride = (height, width) if axis == -2 else (width, 1)

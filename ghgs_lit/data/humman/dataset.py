@@ -33,7 +33,7 @@ from ghgs_lit.data.humman.smpl import Body, read_parameters
 from ghgs_lit.data.reader import FrameReader
 from ghgs_lit.data.view import View, opencv_view
 from ghgs_lit.errors import InputError
-from ghgs_lit.readers import find_path, read_json
+from ghgs_lit.parsing import find_path, read_json
 
 log = logging.getLogger(__name__)
 
@@ -185,7 +185,7 @@ class HuMMan(DataSet):
     """[start, stop, step] of frame numbers; those that a sequence lacks are left out."""
     masks: Literal["kinect_mask", "kinect_mask_manual"] = "kinect_mask"
     """Folder of masks; kinect_mask_manual is there for the test sequences only."""
-    smpl_model: options.Path | None = None
+    smpl_model: options.PathText | None = None
     """The licensed SMPL_NEUTRAL.pkl, or a folder with smpl/SMPL_NEUTRAL.pkl: its vertices are the bodies. It
     needs the package smplx. Null: no bodies; train with loss.weights.chamfer=0."""
 

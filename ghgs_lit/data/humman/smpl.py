@@ -19,7 +19,7 @@ from scipy import sparse
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.data.pickles import load_pickle
 from ghgs_lit.errors import InputError, installed, require
-from ghgs_lit.readers import require_file
+from ghgs_lit.parsing import require_file
 
 VERTICES = 6890
 #: Length of each vector in ``smpl_params/<frame>.npz``.

@@ -23,7 +23,7 @@ from ghgs_lit.data.view import View, half_centers, opencv_view
 from ghgs_lit.data.zju_mocap.annotations import Annotations, frame_field, frame_number, read_annotations
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.undistortion import undistort, undistorting_grid
-from ghgs_lit.readers import find_path
+from ghgs_lit.parsing import find_path
 
 log = logging.getLogger(__name__)
 

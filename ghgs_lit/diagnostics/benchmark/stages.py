@@ -12,10 +12,10 @@ from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, 
 
 from ghgs_lit.encoder import cpu
 from ghgs_lit.evaluation.measure import Renderer
-from ghgs_lit.kernels.allocation import can_forget_peak, forget_peak, resident_bytes, return_free_memory
-from ghgs_lit.kernels.watching import Inputs, Stopwatch, Watcher, inside
-from ghgs_lit.kernels.watching import watched as stages_watched
 from ghgs_lit.model import GHGS, STAGES
+from ghgs_lit.runtime.allocation import can_forget_peak, forget_peak, resident_bytes, return_free_memory
+from ghgs_lit.runtime.watching import Inputs, Stopwatch, Watcher, inside
+from ghgs_lit.runtime.watching import watched as stages_watched
 from ghgs_lit.types import Batch, Prediction, Rendering
 
 ROUNDS, RENDER, TOTAL = "rounds", "render", "total"

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.tables.records import SETTING, Variant
-from ghgs_lit.readers import read_json
+from ghgs_lit.parsing import read_json
 from ghgs_lit.runs.results import validated
 
 _Text = Annotated[str, Field(min_length=1)]

@@ -27,7 +27,7 @@ from ghgs_lit.config.keys import (
     switches_of,
 )
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.readers import read_yaml
+from ghgs_lit.parsing import read_yaml
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.results import KEYS, METHOD, read_results, validated
 

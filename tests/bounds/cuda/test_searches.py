@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ghgs_lit.bounds import VisualHull
-from ghgs_lit.bounds.silhouettes import _grown, dilate
+from ghgs_lit.bounds.rays import _grown, dilate
 from ghgs_lit.types import Batch
 from tests.helpers.kernels import DEVICE, kernels
 from tests.helpers.scenes import make_batch

@@ -15,7 +15,7 @@ from ghgs_lit.config import compose, resolve
 from ghgs_lit.data.view import half_centers
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
-from ghgs_lit.readers import read_yaml
+from ghgs_lit.parsing import read_yaml
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.weights.checkpoint import read_checkpoint
 from ghgs_people import jobs

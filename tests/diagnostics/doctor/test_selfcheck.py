@@ -20,10 +20,10 @@ from ghgs_lit.diagnostics.doctor.selfcheck import (
     table,
 )
 from ghgs_lit.geometry.unprojection import Unprojection
-from ghgs_lit.kernels.precision import rounds_products
 from ghgs_lit.model import GHGS
 from ghgs_lit.recalibration import Recalibration
 from ghgs_lit.rendering.cpu import backend as cpu
+from ghgs_lit.runtime.precision import rounds_products
 from tests.helpers.models import TINY
 from tests.helpers.pretend_device import DEVICE, pretend_device
 from tests.helpers.verbs import ghgs

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from ghgs_lit.kernels.precision import rounding_state
+from ghgs_lit.runtime.precision import rounding_state
 
 Result = TypeVar("Result")
 _PACKAGE = Path(__file__).parents[1]

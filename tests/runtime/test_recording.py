@@ -10,9 +10,9 @@ import pytest
 import torch
 from torch import nn
 
-from ghgs_lit.kernels import recording
-from ghgs_lit.kernels.precision import precision_of
-from ghgs_lit.kernels.recording import CudaTape, Recorder
+from ghgs_lit.runtime import recording
+from ghgs_lit.runtime.precision import precision_of
+from ghgs_lit.runtime.recording import CudaTape, Recorder
 from ghgs_lit.types import Cameras
 from tests.helpers.pretend_device import DEVICE, pretend_device
 from tests.helpers.tape import OperatorTape

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from ghgs_lit.kernels import cores
+from ghgs_lit.runtime import cores
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from tests.helpers.processes import run_python
 CODE = """
 import resource
 import torch
-from ghgs_lit.kernels.allocation import keep_freed_memory
+from ghgs_lit.runtime.allocation import keep_freed_memory
 print(keep_freed_memory())
 for _ in range(12):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
