@@ -41,6 +41,7 @@ class Frame:
         return self.origin
 
     def pixels(self) -> Pixels:
+        """The photograph."""
         return Pixels(self.image, None, 0)
 
 
@@ -60,7 +61,17 @@ class VideoFrame:
         return Pixels(self.video.frame(self.number), None, 0)
 
     def matte(self, pixels: Pixels) -> np.ndarray:
-        """The mask [h, w] uint8 of a photograph. InputError: it cannot be decoded or has another size."""
+        """The mask of a photograph.
+
+        Args:
+            pixels: the photograph that the mask is of.
+
+        Returns:
+            [h, w] uint8; black and white are exact, though coding changes them.
+
+        Raises:
+            InputError: it cannot be decoded, or has another size.
+        """
         grey = self.video.frame(self.number)
         expected = f"the size of its video, {pixels.size} (height, width)"
         require(grey.shape == pixels.size, str(self.video.video.path), expected, grey.shape)
@@ -71,7 +82,13 @@ Source = Path | Frame | VideoFrame  #: Where a photograph comes from
 
 
 def has_videos(folder: Path, cameras: Mapping[str, StoredCamera], names: Mapping[str, str]) -> bool:
-    """Whether a folder without photographs has a camera's video, or videos and no folders."""
+    """Whether a folder without photographs has a camera's video, or videos and no folders.
+
+    Args:
+        folder: where they may lie.
+        cameras: by name.
+        names: cameras of photographs of other names.
+    """
     if not folder.is_dir() or images_in(folder):
         return False
     videos = images_in(folder, SUFFIXES)
@@ -88,16 +105,27 @@ def find_frames(
     sync: Mapping[str, int] | str | None,
     step: int,
 ) -> tuple[dict[str, dict[str, VideoFrame]], str]:
-    """The frames of each instant that all videos show. Returns: ``{instant: {camera: frame}}``, instants
-    named by the first camera's frame; and a line about frames that are left over. InputError: videos do not
-    fit the cameras or one another.
+    """The frames of each instant that all videos show.
 
     Args:
-        masks: folder of masks: for each video one of the same name, or a folder of numbered images; None:
-            videos beside the others that end with ``_mask``, if any.
-        sync: frames by which a camera began before the others; or a CSV of ``camera,frame,seconds``, by which
-            each frame of the first camera gets the nearest one of every other; None: all began together.
-        step: of the instants that will be read."""
+        folder: of videos, each named after its camera.
+        masks: folder of masks: for each video one of the same name, or a folder of numbered images;
+            None: videos beside the others that end with ``_mask``, if any.
+        cameras: by name.
+        names: cameras of videos of other names.
+        convention: meaning of the cameras' numbers, to check the videos' sizes.
+        sync: frames by which a camera began before the others; or a CSV of
+            ``camera,frame,seconds``, by which each frame of the first camera gets the nearest one
+            of every other; None: all began together.
+        step: of the instants that will be read, 1 or more; with a CSV it is not used.
+
+    Returns:
+        ``{instant: {camera: frame}}``, instants named by the first camera's frame; and a line about
+        frames that are left over, or "".
+
+    Raises:
+        InputError: videos do not fit the cameras or one another.
+    """
     found = images_in(folder, SUFFIXES)
     require_all_read(folder, found, {*cameras, *names}, SUFFIXES)
     paths = by_camera(folder, found, cameras, names)
@@ -175,7 +203,21 @@ def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) 
 
 
 def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict[int, VideoFrame | Path]:
-    """The masks of a video by frame number; empty if there are none beside it."""
+    """The masks of a video by frame number.
+
+    Args:
+        video: of the photographs.
+        folder: of the videos.
+        masks: as for :func:`find_frames`.
+        step: as for :func:`find_frames`.
+
+    Returns:
+        Frames of a video of masks, or paths of images; empty if ``masks`` is None and there are
+        none beside it.
+
+    Raises:
+        InputError: ``masks`` has none of this video, or they are not numbered as its frames.
+    """
     name = composed(video.path.stem)
     place = folder if masks is None else masks
     marked = f"{name}{MASK_ENDING}"

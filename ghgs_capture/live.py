@@ -31,8 +31,17 @@ _PATIENCE = 2.0
 
 
 def opened(devices: Mapping[str, int | str]) -> dict[str, Any]:
-    """OpenCV's captures by camera. ``devices``: number, address of a stream or path of a video. InputError:
-    one cannot be opened, or OpenCV is not installed."""
+    """Open cameras and streams with OpenCV.
+
+    Args:
+        devices: number of a device, address of a stream or path of a video, by camera.
+
+    Returns:
+        OpenCV's captures by camera.
+
+    Raises:
+        InputError: one cannot be opened, or OpenCV is not installed.
+    """
     try:
         import cv2
     except ImportError:
@@ -47,10 +56,22 @@ def opened(devices: Mapping[str, int | str]) -> dict[str, Any]:
 def newest_frames(
     captures: Mapping[str, Any], least: int, clock: Callable[[], float], sleep: Callable[[float], None]
 ) -> Iterator[tuple[dict[str, Frame], int, float]]:
-    """The newest frames by camera whenever they are asked for, how many were taken before and not asked for,
-    and when the newest were taken. A thread takes frames as they come, so that none waits in a camera's
-    buffer, and decodes only those that are asked for. Ends, and releases the cameras, where fewer than
-    ``least`` give frames."""
+    """The newest frames whenever they are asked for.
+
+    A thread takes frames as they come, so that none waits in a camera's buffer, and decodes only
+    those that are asked for. Ends, and releases the cameras, where fewer than ``least`` give
+    frames.
+
+    Args:
+        captures: OpenCV's captures by camera.
+        least: number of cameras that must go on.
+        clock: tells seconds.
+        sleep: waits so many seconds.
+
+    Yields:
+        Frames by camera, how many were taken before and not asked for, and when they were taken, by
+        the clock.
+    """
     wanted = threading.Event()
     stopped = threading.Event()
     ready = SimpleQueue()
@@ -116,18 +137,26 @@ def live_frames(
     sleep: Callable[[float], None] = time.sleep,
     **options: Any,
 ) -> Iterator[Arrived]:
-    """The newest capture whenever one is asked for; those that come meanwhile or cannot be read are dropped.
-    InputError: the calibration, a video, a camera or the folder is missing or wrong.
+    """The newest capture whenever one is asked for; others, and those that cannot be read, are dropped.
 
     Args:
-        images: a folder of videos, played at their own rate; or of instants, each a folder that counts once
-            it has a photograph of every camera and none of its files grows any more. Or what OpenCV opens, by
-            camera: numbers of devices, addresses of streams; ``options`` then says where masks come from, and
-            at least ``MIN_PHOTOGRAPHS`` cameras must go on.
-        masks: a folder laid out as ``images``.
+        images: a folder of videos, played at their own rate; or of instants, each a folder that
+            counts once it has a photograph of every camera and none of its files grows any more. Or
+            what OpenCV opens, by camera: numbers of devices, addresses of streams; ``options`` then
+            says where masks come from, and at least ``MIN_PHOTOGRAPHS`` cameras must go on.
+        cameras: the calibration, in one of :data:`ghgs_capture.formats.FORMATS`.
+        masks: a folder laid out as ``images``; None: as for :class:`CaptureFolder`.
         idle: seconds without a new instant after which a folder of instants ends; None: never.
-        clock, sleep: tells seconds, and waits.
-        options: as for :class:`CaptureFolder`."""
+        clock: tells seconds.
+        sleep: waits so many seconds.
+        options: as for :class:`CaptureFolder`.
+
+    Returns:
+        An iterator of captures, which waits for the next one.
+
+    Raises:
+        InputError: the calibration, a video, a camera or the folder is missing or wrong.
+    """
     said = options.get("calibration", {})
     part = options.get("sequence", {})
     if is_folder := not isinstance(images, Mapping):
@@ -164,6 +193,7 @@ def live_frames(
 def _watched(
     frames: Iterator[tuple[dict[str, Frame], int, float]], stored: CameraFile, options: Mapping[str, Any]
 ) -> Iterator[Arrived]:
+    """Captures of cameras; a line says once why instants cannot be read."""
     number = -1
     dropped = 0
     said = ""
@@ -185,6 +215,7 @@ def _watched(
 def _played(
     folder: CaptureFolder, clock: Callable[[], float], sleep: Callable[[float], None]
 ) -> Iterator[Arrived]:
+    """Captures of videos at the time at which each frame is due."""
     names = folder.instants
     first = next(iter(folder.paths[names[0]].values())).video.video
     # Instants are named by the frame of the first camera.
@@ -214,6 +245,19 @@ def _arriving(
     clock: Callable[[], float],
     sleep: Callable[[float], None],
 ) -> Iterator[Arrived]:
+    """Captures of folders that are written meanwhile.
+
+    Args:
+        places: the folder of instants, and that of their masks if it is another.
+        is_whole: whether an instant, by name, has a photograph of every camera.
+        read: gives the capture of an instant, by name.
+        idle: seconds without a new instant after which this ends; None: never.
+        clock: tells seconds.
+        sleep: waits so many seconds.
+
+    Yields:
+        The newest whole instant that does not grow any more and is later than those before.
+    """
     done = []
     before = {}
     unread = {}

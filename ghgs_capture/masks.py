@@ -23,10 +23,20 @@ _SPECK = 0.05  # Regions below this share of the largest one's area are not of t
 
 
 def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
-    """The matte of the photograph as shown, from alpha, labels, or grey of 8 or 16 bits.
+    """The matte of a photograph from alpha, labels, or grey of 8 or 16 bits.
 
-    An alpha channel counts unless it is constant. All labels but 0 are the subject; a single larger number
-    beside them is void. InputError: it cannot be decoded, or fits the photograph neither as shown nor stored.
+    An alpha channel counts unless it is constant. All labels but 0 are the subject; a single larger
+    number beside them is void.
+
+    Args:
+        path: of the mask.
+        pixels: the photograph as shown; the mask fits it as shown or as stored.
+
+    Returns:
+        [h, w] uint8 of the photograph as shown.
+
+    Raises:
+        InputError: the mask cannot be decoded, or fits the photograph neither as shown nor stored.
     """
     image = read_image(path)
     values = np.asarray(image)
@@ -49,7 +59,18 @@ def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
 
 
 def matte_of_background(pixels: Pixels, path: Path) -> np.ndarray:
-    """A mask of what differs from a background. InputError: it has another size, or nothing differs."""
+    """A mask of what differs from a background.
+
+    Args:
+        pixels: the photograph with the subject.
+        path: of a photograph of the same camera without the subject.
+
+    Returns:
+        [h, w] uint8, 0 or 255; without specks and holes.
+
+    Raises:
+        InputError: the background has another size, or nothing differs.
+    """
     from scipy import ndimage  # here: masks of files do not need it
 
     background = read_pixels(path)
@@ -70,7 +91,17 @@ def matte_of_background(pixels: Pixels, path: Path) -> np.ndarray:
 
 
 def segmenter(name: str) -> Callable[[Pixels], np.ndarray]:
-    """A function from photographs to mattes. ``name``: of :data:`SEGMENTERS`. InputError: not installed."""
+    """A function from photographs to mattes, which keeps its network loaded.
+
+    Args:
+        name: one of :data:`SEGMENTERS`.
+
+    Returns:
+        The function; its mattes are [h, w] uint8.
+
+    Raises:
+        InputError: the name is unknown, or the package is not installed.
+    """
     choice("segment", name, SEGMENTERS)
     rembg = installed("rembg", "segment", "segment")
     session = rembg.new_session()
@@ -83,7 +114,16 @@ def segmenter(name: str) -> Callable[[Pixels], np.ndarray]:
 
 
 def mask_path(photograph: Path, images: Path, masks: Path) -> Path | None:
-    """The mask's file: in the same place below ``masks`` as the photograph below ``images``; None: none."""
+    """Find the mask of a photograph: in the same place below ``masks``, or marked beside it.
+
+    Args:
+        photograph: a path below ``images``.
+        images: folder of the photographs.
+        masks: folder of the masks; may be ``images``.
+
+    Returns:
+        The path; None: there is no mask.
+    """
     # Not resolved: photographs may be links to files elsewhere.
     folder = masks / photograph.parent.relative_to(images)
     marked = f"{photograph.stem}{MASK_ENDING}"

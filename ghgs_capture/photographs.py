@@ -42,8 +42,17 @@ class Pixels:
 
 
 def read_pixels(path: Path) -> Pixels:
-    """Decode a photograph of 8 bits a channel and turn it as its EXIF entry says. InputError: it is missing,
-    cannot be decoded, has other values, or is mirrored."""
+    """Decode a photograph of 8 bits a channel and turn it as its EXIF entry says.
+
+    Args:
+        path: of the photograph.
+
+    Returns:
+        The photograph as shown.
+
+    Raises:
+        InputError: it is missing, cannot be decoded, has other values, or is mirrored.
+    """
     image = read_image(path)
     orientation = orientation_of(image, path)
     found = f"EXIF orientation {orientation}"
@@ -57,9 +66,16 @@ def read_pixels(path: Path) -> Pixels:
 
 
 def fits_stored(pixels: Pixels, camera: StoredCamera, exif: str) -> bool:
-    """Whether a camera was calibrated with the photograph as stored, not as shown. With ``exif`` ``auto`` the
-    size of the calibration tells for quarter turns; otherwise it is as shown, since OpenCV turns photographs
-    on reading. ``exif``: ``auto`` | ``stored`` | ``shown``, by the user."""
+    """Whether a camera was calibrated with the photograph as stored, not as shown.
+
+    With ``auto`` the size of the calibration tells for quarter turns; otherwise it is as shown,
+    since OpenCV turns photographs on reading.
+
+    Args:
+        pixels: the decoded photograph.
+        camera: as its file stores it.
+        exif: ``auto`` | ``stored`` | ``shown``, by the user.
+    """
     if exif != "auto" or not pixels.turns:
         return exif == "stored"
     size = camera.size
@@ -67,12 +83,30 @@ def fits_stored(pixels: Pixels, camera: StoredCamera, exif: str) -> bool:
 
 
 def composed_names(names: Mapping[Any, Any] | None) -> dict[str, str]:
-    """``calibration.names`` as text in its composed spelling: numbers, too, are names of cameras."""
+    """``calibration.names`` as text in its composed spelling: numbers, too, are names of cameras.
+
+    Args:
+        names: the camera of each photograph of another name, text or numbers; None: none.
+
+    Returns:
+        The same as text, in Unicode's composed form.
+    """
     return {composed(str(key)): composed(str(name)) for key, name in (names or {}).items()}
 
 
 def images_in(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[str, Path]:
-    """Photographs of a folder by name without suffix, sorted, no masks. InputError: two have one name."""
+    """Photographs of a folder, no masks.
+
+    Args:
+        folder: where they lie.
+        suffixes: of photographs, in lower case with their point.
+
+    Returns:
+        Paths by name without suffix, sorted.
+
+    Raises:
+        InputError: two have one name.
+    """
     paths: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         is_image = path.suffix.lower() in suffixes and not path.name.startswith(".") and not path.is_dir()
@@ -85,21 +119,34 @@ def images_in(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[str, P
 
 
 def image_named(folder: Path, *names: str, suffixes: tuple[str, ...] = SUFFIXES) -> Path | None:
-    """The image of a folder with one of these names (without suffix), None where there is none."""
+    """Find an image of a folder by name.
+
+    Args:
+        folder: where it may lie.
+        names: without suffix, the preferred first.
+        suffixes: of images, in lower case with their point.
+
+    Returns:
+        The path; None where there is none.
+    """
     return next((path for name in names if (path := find_path(folder, name, suffixes))), None)
 
 
 def require_all_read(
     folder: Path, read: Collection[str], known: Collection[str], suffixes: tuple[str, ...] = SUFFIXES
 ) -> None:
-    """Refuse to leave out a photograph or video without a word. InputError: there is a picture of a kind that
-    is not read, or another file of a known name, such as ``right.heic`` or ``right.jpg.part``.
+    """Refuse to leave out a photograph or video without a word.
 
     Args:
         folder: of photographs or of videos.
         read: names of those that are read; what lies beside them under their names is no matter.
         known: further names: of cameras or instants.
-        suffixes: of what is read, for the message."""
+        suffixes: of what is read, for the message.
+
+    Raises:
+        InputError: there is a picture of a kind that is not read, or another file of a known name,
+            such as ``right.heic`` or ``right.jpg.part``.
+    """
     for path in sorted(folder.iterdir()):
         name = composed(path.name)
         kind = path.suffix.lower().removeprefix(".")
@@ -117,11 +164,22 @@ def require_all_read(
 def find_instants(
     folder: Path, cameras: Mapping[str, StoredCamera], names: Mapping[str, str]
 ) -> dict[str, dict[str, Path]]:
-    """``{instant: {camera: path}}``, of photographs in the folder itself or in its folders.
+    """Find photographs in a folder itself or in its folders.
 
-    A folder is an instant with a photograph of every camera, or, if named after a camera, has one photograph
-    for each instant. Of several instants one may lack photographs. ``names``: the camera of a photograph (or
-    camera's folder) of another name. InputError: there are none, or photographs do not fit the cameras."""
+    A folder is an instant with a photograph of every camera, or, if named after a camera, has one
+    photograph for each instant. Of several instants one may lack photographs.
+
+    Args:
+        folder: of photographs, or of such folders.
+        cameras: by name.
+        names: the camera of a photograph (or camera's folder) of another name.
+
+    Returns:
+        ``{instant: {camera: path}}``.
+
+    Raises:
+        InputError: there are none, or photographs do not fit the cameras.
+    """
     problem = "a file" if folder.exists() else "no such folder"
     require(folder.is_dir(), str(folder), "a folder of photographs", problem)
     known = {*cameras, *names}
@@ -148,7 +206,14 @@ def find_instants(
 
 
 def counted(name: str) -> list[str | int]:
-    """Sort key of names by which numbers follow one another: 2 before 10."""
+    """Sort key of names by which numbers follow one another: 2 before 10.
+
+    Args:
+        name: of an instant.
+
+    Returns:
+        Its parts, text and numbers in turn.
+    """
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
@@ -168,8 +233,17 @@ def _by_instant(folder: Path, by_camera: Mapping[str, dict[str, Path]]) -> dict[
 
 
 def camera_named(name: str, cameras: Collection[str], names: Mapping[str, str]) -> str:
-    """The camera of a photograph: what ``names`` says, or the one of its name, or the only one whose name
-    differs by upper and lower case alone; the name itself where there is none."""
+    """The camera of a photograph, by its name.
+
+    Args:
+        name: of the photograph, without suffix.
+        cameras: names of all cameras.
+        names: cameras of photographs of other names.
+
+    Returns:
+        What ``names`` says, or the camera of this name, or the only one whose name differs by upper
+        and lower case alone; the name itself where there is none.
+    """
     said = names.get(name, name)
     alike = [camera for camera in cameras if camera.casefold() == said.casefold()]
     return alike[0] if said not in cameras and len(alike) == 1 else said
@@ -182,8 +256,21 @@ def by_camera(
     names: Mapping[str, str],
     least: int = 2,
 ) -> dict[str, Any]:
-    """Values by camera instead of by name of a photograph, of a video or of a camera's folder. InputError: a
-    name is that of no camera, two are of one, or there are fewer than ``least``."""
+    """Values by camera instead of by name of a photograph, of a video or of a camera's folder.
+
+    Args:
+        folder: where they lie, for messages.
+        values: by name.
+        cameras: by name.
+        names: cameras of photographs of other names.
+        least: number of values that there must be.
+
+    Returns:
+        The values by camera.
+
+    Raises:
+        InputError: a name is that of no camera, two are of one, or there are fewer than ``least``.
+    """
     named = {name: camera_named(name, cameras, names) for name in values}
     unknown = [name for name, camera in named.items() if camera not in cameras]
     if unknown:

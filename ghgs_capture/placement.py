@@ -24,7 +24,14 @@ _ALIKE = 2.0
 
 
 def copies(photographs: Sequence[Photograph]) -> tuple[str, str] | None:
-    """Names of two photographs that are the same picture; None: there are none."""
+    """Find two photographs that are the same picture, also if stored with losses.
+
+    Args:
+        photographs: of one instant, with their mattes.
+
+    Returns:
+        Their names; None: there are none.
+    """
     for one, other in itertools.combinations(photographs, 2):
         if one.image.shape != other.image.shape:
             continue
@@ -37,8 +44,15 @@ def copies(photographs: Sequence[Photograph]) -> tuple[str, str] | None:
 
 
 def placement_lines(photographs: Sequence[Photograph], stored: Sequence[np.ndarray]) -> list[str]:
-    """Lines about cameras that may lead to a poor prediction; none for an ordinary ring of four or more.
-    ``stored``: the poses [4, 4] as their file has them."""
+    """Say where cameras may lead to a poor prediction.
+
+    Args:
+        photographs: of one instant, with their cameras.
+        stored: the poses [4, 4] as their file has them.
+
+    Returns:
+        Lines of text; none for an ordinary ring of four cameras or more.
+    """
     silhouettes = [Silhouette(p.mask, p.intrinsics, p.extrinsics) for p in photographs]
     focus, _ = subject_sphere(silhouettes)
     toward = np.stack([silhouette.center for silhouette in silhouettes]) - focus

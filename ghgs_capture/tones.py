@@ -18,8 +18,17 @@ _UNLIKE = 2.0
 
 
 def own_tones(batch: Batch, gaussians: Gaussians) -> dict[str, float]:
-    """Gammas, about, of cameras with a tone curve of their own, by name; two photographs do not tell which
-    has it. ``gaussians``: predicted from the batch, of one subject."""
+    """Find cameras with a tone curve of their own.
+
+    Two photographs do not tell which of them has it.
+
+    Args:
+        batch: photographs of one subject.
+        gaussians: predicted from the batch.
+
+    Returns:
+        Their gammas, about, by name.
+    """
     if len(batch.views[0]) < 3:
         return {}
     tones = {}
@@ -31,7 +40,15 @@ def own_tones(batch: Batch, gaussians: Gaussians) -> dict[str, float]:
 
 
 def without_tones(capture: Capture, tones: Mapping[str, float]) -> Capture:
-    """The capture with the gammas of ``tones`` undone, others of its photographs as they are."""
+    """Undo tone curves.
+
+    Args:
+        capture: photographs as they are.
+        tones: gammas above 0 by camera.
+
+    Returns:
+        The capture with these gammas undone; photographs of other cameras stay.
+    """
     if not tones:
         return capture
     photographs = (_without(one, tones.get(one.name, 1.0)) for one in capture.photographs)
@@ -39,7 +56,15 @@ def without_tones(capture: Capture, tones: Mapping[str, float]) -> Capture:
 
 
 def tone_lines(tones: Mapping[str, float], what_is_done: str) -> Iterator[str]:
-    """A line for each camera with a tone curve of its own."""
+    """A line for each camera with a tone curve of its own.
+
+    Args:
+        tones: gammas by camera.
+        what_is_done: end of the line, such as "undone".
+
+    Yields:
+        The lines.
+    """
     for name, gamma in tones.items():
         yield (
             f"photograph {name} has a gamma of about {gamma:.2f} beside the others: a tone curve, profile or"

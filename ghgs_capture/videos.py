@@ -51,15 +51,32 @@ class Video:
         return (self.count - 1) / length if self.count > 1 else 1.0
 
     def number_at(self, seconds: float) -> int | None:
-        """The frame that is shown at a time; None: there is none within half a frame."""
+        """The frame that is shown at a time.
+
+        Args:
+            seconds: on the clock of :attr:`seconds`.
+
+        Returns:
+            Its number; None: there is none within half a frame.
+        """
         away = np.abs(self.seconds - seconds)
         place = int(away.argmin())
         return int(self.numbers[place]) if away[place] < 0.5 / self.rate else None
 
 
 def read_video(path: Path) -> Video:
-    """List the frames of a video; only the first is decoded. InputError: the file is missing, ffmpeg cannot
-    read it or is not installed, or there is no frame."""
+    """List the frames of a video; only the first is decoded.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        When each frame is shown, and its number.
+
+    Raises:
+        InputError: the file is missing, ffmpeg cannot read it or is not installed, or there is no
+            frame.
+    """
     require_file(path, "a video")
     return _read_video(path, path.stat().st_mtime_ns)
 
@@ -99,8 +116,13 @@ def _command(path: Path, pixels: str, *output: str, select: str = "1", **source:
 
 
 class Reader:
-    """Frames of one video, decoded in order; elsewhere it is sought. ``pixels``: ``rgb24`` | ``gray``.
-    ``step``: distance of the frames that will be asked for; ffmpeg drops the others."""
+    """Frames of one video, decoded in order; elsewhere it is sought.
+
+    Args:
+        video: as :func:`read_video` lists it.
+        pixels: ``rgb24`` | ``gray``.
+        step: distance of the frames that will be asked for; ffmpeg drops the others.
+    """
 
     def __init__(self, video: Video, pixels: str, step: int = 1) -> None:
         self.video = video
@@ -113,7 +135,17 @@ class Reader:
         self._frame = np.zeros(0, np.uint8)
 
     def frame(self, number: int) -> np.ndarray:
-        """A frame, [h, w, 3] or [h, w] uint8. InputError: none of this number can be decoded."""
+        """Decode a frame.
+
+        Args:
+            number: of the frame, counted with dropped ones.
+
+        Returns:
+            [h, w, 3] or, with ``gray``, [h, w] uint8; read-only.
+
+        Raises:
+            InputError: no frame of this number can be decoded.
+        """
         far = _PATIENCE * self.video.rate + self.step
         with self._lock:
             if self._process is None or number <= self._before or number > self._at + far:
@@ -125,6 +157,7 @@ class Reader:
             return self._frame
 
     def _open(self, number: int) -> None:
+        """Start ffmpeg a second before a frame."""
         video = self.video
         select = "1"
         place = min(np.searchsorted(video.numbers, number), len(video.numbers) - 1)
@@ -142,6 +175,7 @@ class Reader:
         self._at = self._before = number - 1
 
     def _advance(self) -> bool:
+        """Take the next frame of ffmpeg; false: there is none."""
         shape = (*self.video.size, 3) if self.pixels == "rgb24" else self.video.size
         time = next(filter(None, map(_TIME.search, self._process.stderr)), None)
         content = self._process.stdout.read(math.prod(shape))
