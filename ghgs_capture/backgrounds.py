@@ -167,7 +167,7 @@ class Backgrounds:
             captures: the instants, of cameras that stand still.
 
         Returns:
-            The backgrounds of cameras with ``_ENOUGH`` photographs or more, all of one size.
+            The backgrounds of cameras with ``_MIN_BACKGROUND`` photographs or more, all of one size.
         """
         photographs: dict[str, list[Photograph]] = {}
         for photograph in (photograph for capture in captures for photograph in capture.photographs):

@@ -57,24 +57,32 @@ def predict(
     temporal: Temporal | None = None,
     tones: Mapping[str, float] | Literal["auto"] = "auto",
 ) -> TimedPrediction:
-    """The Gaussians of a capture. InputError: the checkpoint cannot be used, or the size does not fit the
-    model.
+    """The Gaussians of a capture, in the user's world.
 
     Args:
-        model: a model in evaluation mode, or a checkpoint (kept in memory for further calls): a path, or the
-            one that comes with the package.
-        size: side or (height, width) of the crops that the model sees, in pixels; None: as it was trained
-            (checkpoints only).
+        capture: photographs of one instant with masks and cameras, in any unit of length.
+        model: a model in evaluation mode, or a checkpoint (kept in memory for further calls): a
+            path, or the one that comes with the package.
+        size: side or (height, width) of the crops that the model sees, in pixels; None: as it was
+            trained (checkpoints only).
         refine_cameras: most rounds that correct the cameras until the photographs agree
-            (:class:`CameraRefinement`); 0: none; ``auto``: 4 where silhouettes contradict one another.
+            (:class:`ghgs_lit.refinement.CameraRefinement`); 0: none; ``auto``: 4 where silhouettes
+            contradict one another.
         refine_masks: pixels of a crop by which masks may be wrong; mattes are then searched in the
-            photographs (:func:`ghgs_lit.data.matting.refined_matte`). 0: masks are right; ``auto``: 4 where
-            photographs show other outlines.
+            photographs (:func:`ghgs_lit.data.matting.refined_matte`). 0: masks are right; ``auto``:
+            4 where photographs show other outlines.
         refine: steps that bring the Gaussians nearer to the photographs, such as 15; 0: none.
         renderer: what refining draws with; None: that of the device.
         temporal: the predictor of the instants before, in their order; None: no sequence.
-        tones: gammas of cameras, by name, that are undone first; ``auto``: of those that have one of their
-            own beside the others, by a first prediction."""
+        tones: gammas of cameras, by name, that are undone first; ``auto``: of those that have one
+            of their own beside the others, by a first prediction.
+
+    Returns:
+        The prediction with the crops, on the model's device, and what was corrected and why.
+
+    Raises:
+        InputError: the checkpoint cannot be used, or the size does not fit the model.
+    """
     if not isinstance(model, GHGS):
         path = file_of(model)
         model = _model(path, path.stat().st_mtime_ns)
@@ -105,7 +113,21 @@ def _predicted(
     renderer: Renderer,
     temporal: Temporal | None,
 ) -> TimedPrediction:
-    """:func:`predict` of photographs with their colours as they are."""
+    """:func:`predict` of photographs with their colours as they are.
+
+    Args:
+        capture: photographs of one instant.
+        model: in evaluation mode.
+        size: (height, width) of the crops in pixels.
+        refine_cameras: as for :func:`predict`.
+        refine_masks: as for :func:`predict`.
+        refine: as for :func:`predict`.
+        renderer: what refining draws with.
+        temporal: as for :func:`predict`.
+
+    Returns:
+        As of :func:`predict`, without ``tones``.
+    """
     seconds = {}
     why = {}
     if refine_masks == "auto":
@@ -123,7 +145,15 @@ def _predicted(
 
 
 def in_frame(model: GHGS, batch: Batch) -> Prediction:
-    """A prediction in the subject's frame, whatever the weights, so that a capture may have any unit."""
+    """Predict in the subject's frame, whatever the weights, so that a capture may have any unit.
+
+    Args:
+        model: in evaluation mode.
+        batch: photographs, masks and cameras.
+
+    Returns:
+        The prediction in the world of the batch's cameras.
+    """
     # Weights with compat=release do not enter a frame of their own.
     frame = Frame.of(batch)
     return frame.leave(model(frame.enter(batch)), batch.cameras.extrinsics.dtype)
@@ -141,11 +171,18 @@ def predict_batch(
     """The Gaussians of a batch of one subject, which keeps its targets.
 
     Args:
-        renderer: draws what :class:`CameraRefinement` and :class:`Refinement` compare.
-        refine_cameras: most rounds of :class:`CameraRefinement`; 0: none.
-        refine: steps of :class:`Refinement`; 0: none.
+        batch: photographs, masks and cameras, on the model's device.
+        model: in evaluation mode.
+        renderer: draws what :class:`ghgs_lit.refinement.CameraRefinement` and
+            :class:`ghgs_lit.refinement.Refinement` compare.
+        refine_cameras: most rounds of ``CameraRefinement``; 0: none.
+        refine: steps of ``Refinement``; 0: none.
         forward: predicts a batch without targets; None: the model.
-        temporal: takes the place of ``forward`` where instants before are known."""
+        temporal: takes the place of ``forward`` where instants before are known.
+
+    Returns:
+        The prediction, with the batch as corrected and the seconds of each stage.
+    """
     forward = forward or model
     moved = ()
     seconds = {}
@@ -175,7 +212,18 @@ def predict_batch(
 def _crops(
     capture: Capture, size: tuple[int, int], refine_masks: int, seconds: dict[str, float]
 ) -> tuple[Batch, tuple[float, ...]]:
-    """The batch that the model sees, and the share by which refining changed each matte; adds run times."""
+    """Crops of a capture, with refined mattes where asked for.
+
+    Args:
+        capture: photographs of one instant.
+        size: (height, width) of the crops in pixels.
+        refine_masks: pixels of a crop by which masks may be wrong; 0: they are right.
+        seconds: run times by stage, to which those of ``crop`` and ``refine_masks`` are added.
+
+    Returns:
+        The batch that the model sees, and the share of the subject that refining changed in each
+        crop; () without refining.
+    """
     start = time.perf_counter()
     given = capture.batch(size)
     seconds["crop"] = time.perf_counter() - start
@@ -189,15 +237,35 @@ def _crops(
 
 
 def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:
-    """Side or (height, width) of the photographs that a checkpoint's model was trained with; of imported
-    weights the size of the encoder's position embedding."""
+    """Size of the photographs that a checkpoint's model was trained with.
+
+    Args:
+        config: of the checkpoint; of imported weights the size of the encoder's position embedding
+            counts.
+
+    Returns:
+        Side or (height, width) in pixels.
+    """
     return lookup(config, "data.size") or lookup(config, "encoder.image_size") or 518
 
 
 def crop_size(size: int | tuple[int, int] | None, config: Mapping[str, Any], model: GHGS) -> tuple[int, int]:
-    """(height, width) of the crops that a checkpoint's model sees; None: as it was trained. Warns of larger
-    ones, which make results worse, not sharper, where the model does not work from coarse to fine
-    (``rounds.height``). InputError: the model cannot take this size."""
+    """Size of the crops that a checkpoint's model sees.
+
+    Warns of sizes larger than in training, which make results worse, not sharper, where the model
+    does not work from coarse to fine (``rounds.height``).
+
+    Args:
+        size: side or (height, width) in pixels; None: as the model was trained.
+        config: of the checkpoint.
+        model: that of the checkpoint.
+
+    Returns:
+        (height, width) in pixels.
+
+    Raises:
+        InputError: the model cannot take this size.
+    """
     trained = image_size("size", trained_size(config))
     patch = model.encoder.patch_size
     height, width = trained if size is None else image_size("size", size)

@@ -41,7 +41,14 @@ class Rig:
     gains: Mapping[str, np.ndarray] = field(default_factory=dict)  #: [3], with a geometric mean of 1
 
     def applied(self, capture: Capture) -> Capture:
-        """The capture with the corrected cameras."""
+        """Give a capture the corrected cameras.
+
+        Args:
+            capture: of this rig, with cameras as given.
+
+        Returns:
+            The capture; cameras that the rig lacks stay.
+        """
         return replace(capture, photographs=tuple(map(self._corrected, capture.photographs)))
 
     def _corrected(self, photograph: Photograph) -> Photograph:
@@ -57,8 +64,15 @@ class Rig:
     def calibrations(
         self, folder: CaptureFolder, captures: Sequence[Capture]
     ) -> dict[str, tuple[Calibration, tuple[int, int]]]:
-        """The corrected cameras of a folder's photographs as they are stored, and their (height, width).
-        ``captures``: of the folder, with the cameras as given."""
+        """The corrected cameras of a folder's photographs as they are stored.
+
+        Args:
+            folder: where the captures come from.
+            captures: of the folder, with the cameras as given.
+
+        Returns:
+            By camera, its calibration and the (height, width) of its photographs in pixels.
+        """
         found = {}
         for name, photograph in {p.name: p for c in captures for p in c.photographs}.items():
             stored = folder.file.cameras[name]
@@ -82,14 +96,20 @@ def corrected_rig(
     refine_masks: int | Literal["auto"],
     renderer: Renderer,
 ) -> Rig | None:
-    """The cameras of several instants, corrected together; None: they stay as they are.
+    """Correct the cameras of several instants together.
 
     Args:
         captures: of one rig; those that lack a camera take no part.
+        model: in evaluation mode, whose predictions the photographs are compared with.
         size: (height, width) of the crops in pixels.
-        rounds: most rounds of :class:`CameraRefinement`; ``auto``: 4 where the silhouettes of half of the
-            instants contradict the cameras.
-        refine_masks: as for :func:`ghgs_capture.prediction.predict`."""
+        rounds: most rounds of :class:`ghgs_lit.refinement.CameraRefinement`; ``auto``: 4 where the
+            silhouettes of half of the instants contradict the cameras.
+        refine_masks: as for :func:`ghgs_capture.prediction.predict`.
+        renderer: draws what is compared.
+
+    Returns:
+        The cameras with their gains; None: they stay as they are.
+    """
     names = Counter(_names(capture) for capture in captures).most_common(1)[0][0]
     captures = [capture for capture in captures if _names(capture) == names]
     batches = []
@@ -122,9 +142,16 @@ def corrected_rig(
 
 @torch.no_grad()
 def shared_gains(batch: Batch, model: GHGS) -> np.ndarray | None:
-    """Colour gains [V, 3] of the cameras: the median over instants, with a geometric mean of 1 over cameras.
-    None: exposures change between instants, photographs are divided by gains already, or the model uses none.
-    ``batch``: an element for each instant, in the world."""
+    """Colour gains of cameras: the median over instants, with a geometric mean of 1 over cameras.
+
+    Args:
+        batch: an element for each instant, in the world.
+        model: in evaluation mode.
+
+    Returns:
+        [V, 3] from ``1 / MOST_GAIN`` to ``MOST_GAIN``; None: exposures change between instants,
+        photographs are divided by gains already, or the model uses none.
+    """
     if model.rounds is None or not model.rounds.options.gains or batch.log_gains is not None:
         return None
     batch = Frame.of(batch).enter(batch)
@@ -138,9 +165,18 @@ def shared_gains(batch: Batch, model: GHGS) -> np.ndarray | None:
 
 
 def turned_from(rig: np.ndarray, cameras: np.ndarray) -> float:
-    """Greatest angle in degrees between cameras [n, 4, 4] and the nearest of a rig's [R, 4, 4], after the
-    rotation of the world that makes it least; 0 for cameras of the rig, whichever and in any order. Quarter
-    turns about the optical axis do not count: photographs may be turned upright."""
+    """How far cameras are turned from those of a rig, whatever the world's axes.
+
+    Quarter turns about the optical axis do not count: photographs may be turned upright.
+
+    Args:
+        rig: world to camera [R, 4, 4] of all cameras of the rig.
+        cameras: world to camera [n, 4, 4], in any order.
+
+    Returns:
+        Greatest angle in degrees between a camera and the nearest of the rig, after the rotation of
+        the world that makes it least; 0 for cameras of the rig.
+    """
     quarters = Rotation.from_euler("z", [[0], [90], [180], [270]], degrees=True).as_matrix()
     known = (quarters[:, None] @ rig[:, :3, :3]).reshape(-1, 1, 3, 3)
     taken = cameras[:, :3, :3]
@@ -156,6 +192,7 @@ def _names(capture: Capture) -> tuple[str, ...]:
 
 
 def _together(batches: Sequence[Batch]) -> Batch:
+    """One batch of batches of one element, with the same views."""
     names = ("images", "masks", "alpha", "log_gains")
     known = [name for name in names if getattr(batches[0], name) is not None]
     parts = {name: torch.cat([getattr(batch, name) for batch in batches]) for name in known}

@@ -51,7 +51,15 @@ class _Crossing:
     instants: int
 
     def shared(self, gaussians: Gaussians, age: int) -> Gaussians:
-        """The Gaussians of the instant ``age`` after the prediction."""
+        """Share opacities between the new prediction and the Gaussians before it.
+
+        Args:
+            gaussians: both, the new ones first.
+            age: instants since the prediction.
+
+        Returns:
+            The Gaussians with opacities of this instant.
+        """
         done = (age + 1) / (self.instants + 1)
         come = done * done * (3 - 2 * done)
         shares = torch.full_like(self.opacities, 1 - come)
@@ -59,7 +67,14 @@ class _Crossing:
         return replace(gaussians, opacities=1 - (1 - self.opacities) ** shares)
 
     def arrived(self, gaussians: Gaussians) -> Gaussians:
-        """Those of the new prediction alone."""
+        """End with the new prediction alone.
+
+        Args:
+            gaussians: both, the new ones first.
+
+        Returns:
+            The new ones with their whole opacities.
+        """
         whole = replace(gaussians, opacities=self.opacities)
         return whole.select(slice(self.coming), (self.coming,))
 
@@ -157,7 +172,17 @@ class Temporal:
     def _kept(
         self, prediction: Prediction, batch: Batch, levels: list[Tensor], drawn: Rendering
     ) -> Prediction:
-        """The prediction with the Gaussians as they are, which becomes the last one."""
+        """Keep the instant, which becomes the last one.
+
+        Args:
+            prediction: of this instant; or of the last one, whose Gaussians were moved.
+            batch: photographs, masks and cameras of the instant.
+            levels: its photographs for the flow, a pyramid.
+            drawn: renders of the inputs.
+
+        Returns:
+            The prediction with the Gaussians as they are.
+        """
         depth = drawn.depth.detach()
         found = _as_drawn(prediction, self._descent.gaussians, batch, depth[:, :, 0])
         self._last = _Last(batch, found, levels, depth)
@@ -170,6 +195,17 @@ def _are_equal(first: Batch, second: Batch) -> bool:
 
 
 def _moved(gaussians: Gaussians, last: _Last, batch: Batch, levels: list[Tensor]) -> Gaussians:
+    """Move Gaussians by the scene flow between two instants.
+
+    Args:
+        gaussians: those of the last instant, where a descent starts.
+        last: the last instant; its prediction has as many Gaussians.
+        batch: photographs, masks and cameras of the new instant.
+        levels: its photographs for the flow, a pyramid.
+
+    Returns:
+        The Gaussians with new means and rotations.
+    """
     seen = last.prediction.gaussians
     metre = 1.0 if seen.metre is None else float(seen.metre[0])
     # Near the origin and in metres: the world may have any place and unit.
@@ -210,6 +246,17 @@ def _shown(
 def _as_drawn(
     prediction: Prediction, gaussians: Gaussians, batch: Batch, depth: Float[Tensor, "1 V H W"]
 ) -> Prediction:
+    """A prediction with other Gaussians, and depths as they are rendered.
+
+    Args:
+        prediction: whose other fields stay.
+        gaussians: of the same subject.
+        batch: masks and cameras of the instant.
+        depth: of the rendered inputs; 0: no Gaussian covers the pixel.
+
+    Returns:
+        The prediction; subject's pixels that no Gaussian covers have the mean depth of their view.
+    """
     valid = batch.masks
     drawn = depth > 0
     # Pixels that no Gaussian covers have the mean depth of their view.

@@ -35,15 +35,35 @@ _MINUTES = 3
 
 
 def run(options: "Adapt", cfg: DictConfig) -> float | str | None:
-    """Run the verb; return the mean PSNR of validation people in the rig. Interrupted: Ctrl-C or SIGTERM."""
+    """Run the verb; Ctrl-C or SIGTERM interrupts it.
+
+    Args:
+        options: of the verb.
+        cfg: the whole configuration.
+
+    Returns:
+        Mean PSNR in dB of validation people in the rig, also of a run that is done; ``BUSY``
+        (:mod:`ghgs_lit.runs.job`): in a sweep, another process works on it.
+    """
     config = resolve(cfg) | model_of(options.checkpoint, cfg)
     files_to_write(options, ["out"])
     return run_job(with_rig(config), RunDirectory(output_dir()), adapt)
 
 
 def with_rig(config: dict[str, Any]) -> dict[str, Any]:
-    """Place the people of ``config`` in the rig of ``cameras`` or of the data set ``data``. All its cameras
-    are inputs unless ``views.training_counts`` is given. InputError: a file or the data is bad or missing."""
+    """Place the people of a configuration in the rig of ``cameras`` or of the data set ``data``.
+
+    All its cameras are inputs unless ``views.training_counts`` is given.
+
+    Args:
+        config: of the verb, resolved.
+
+    Returns:
+        The configuration with cameras, people and views of the rig.
+
+    Raises:
+        InputError: a file or the data is bad or missing, or there are not 2 to 8 cameras.
+    """
     people = config["data"]
     if people["kind"] != "people_in_rig":
         people = resolve(compose("adapt"))["data"]
@@ -91,6 +111,7 @@ def _cameras_of_data(config: dict[str, Any]) -> tuple[dict[str, dict[str, Any]],
 
 
 def _cameras_of_file(config: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Entries of the calibration that ``cameras`` names. InputError: it has no sizes, or is wrong."""
     require(config["cameras"] is not None, "cameras", "cameras=<calibration>", None)
     file = read_cameras(config["cameras"], config["calibration"]["format"])
     convention = file.convention.told(config["calibration"])
@@ -109,7 +130,16 @@ def _fill_of(masks: Sequence[np.ndarray]) -> list[float]:
 
 
 def adapt(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float | None:
-    """Render people, train and write the weights; arguments as for :func:`ghgs_lit.cli.train.train`."""
+    """Render people, train and write the weights.
+
+    Args:
+        config: of :func:`with_rig`.
+        directory: of the run; the weights go there unless ``out`` is given.
+        stats: gets the facts of the training, as for :func:`ghgs_lit.cli.train.train`.
+
+    Returns:
+        Mean PSNR in dB of validation people after training; None: it was interrupted.
+    """
     begin = time.perf_counter()
     data = build_data(config)
     data.prepare_data()
@@ -142,6 +172,16 @@ def adapt(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
 
 
 def _measure(config: dict[str, Any], data: "PhotographsDataModule", directory: Path) -> float:
+    """Measure a checkpoint on validation people.
+
+    Args:
+        config: with ``checkpoint`` and the data.
+        data: prepared.
+        directory: where results are written.
+
+    Returns:
+        Mean PSNR in dB.
+    """
     device = pick_device("cpu" if config["trainer"]["accelerator"] == "cpu" else "auto")
     inference = {**config, "precision": "inherit"}
     method = ModelMethod(load_model(inference, device), build_renderer(config, device))

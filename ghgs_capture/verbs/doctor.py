@@ -33,14 +33,32 @@ _LISTED = 6  #: Number of interpretations of a calibration that are listed
 
 
 def run(options: "Doctor", cfg: DictConfig) -> None:
-    """Run the task of the verb."""
+    """Run the task of the verb.
+
+    Args:
+        options: of the verb.
+        cfg: the whole configuration.
+
+    Raises:
+        InputError: as for the task.
+    """
     tasks = {"cameras": cameras, "machine": machine, "selfcheck": selfcheck_device}
     tasks[options.task](options, cfg)
 
 
 def cameras(options: "Doctor", cfg: DictConfig) -> None:
-    """Check whether photographs, masks and calibration fit together. Writes ``cameras.png``, and
-    ``cameras.json`` where another interpretation of the calibration fits. InputError: the cameras do not."""
+    """Check whether photographs, masks and calibration fit together.
+
+    Writes ``cameras.png``, and ``cameras.json`` where another interpretation of the calibration
+    fits.
+
+    Args:
+        options: of the verb.
+        cfg: the whole configuration.
+
+    Raises:
+        InputError: the cameras do not fit the masks, or a file is missing or wrong.
+    """
     tasks = "images=<folder of photographs> cameras=<calibration>, task=machine or task=selfcheck"
     require(options.images is not None, "images", tasks, None)
     directory = output_dir()
@@ -79,7 +97,11 @@ def cameras(options: "Doctor", cfg: DictConfig) -> None:
 
 
 def machine(options: "Doctor", _: DictConfig) -> None:
-    """Print what this machine has and which features lack a package or device."""
+    """Print what this machine has and which features lack a package or device.
+
+    Args:
+        options: of the verb.
+    """
     console = Console(soft_wrap=True)
     for title, lines in (
         ("This machine", machine_lines(pick_device(options.device))),
@@ -92,8 +114,17 @@ def machine(options: "Doctor", _: DictConfig) -> None:
 
 
 def selfcheck_device(options: "Doctor", cfg: DictConfig) -> None:
-    """Check whether a device computes as the CPU does: print each outcome, and write all of them with facts
-    of the machine to ``selfcheck.md``. InputError: a check failed."""
+    """Check whether a device computes as the CPU does.
+
+    Prints each outcome, and writes all of them with facts of the machine to ``selfcheck.md``.
+
+    Args:
+        options: of the verb.
+        cfg: the whole configuration.
+
+    Raises:
+        InputError: a check failed.
+    """
     config = resolve(cfg)
     device = pick_device(options.device)
     outcomes = []

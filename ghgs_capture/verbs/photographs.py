@@ -13,28 +13,61 @@ _CHECKED = 5  #: Number of instants of a sequence whose cameras are checked
 
 
 def sources_of(config: Mapping[str, Any]) -> dict[str, Any]:
-    """``images``, ``cameras`` and the keys beside them. InputError: one of the two is missing."""
+    """Keys of a configuration that name photographs.
+
+    Args:
+        config: of a verb.
+
+    Returns:
+        ``images``, ``cameras`` and the keys beside them.
+
+    Raises:
+        InputError: one of the two is missing.
+    """
     for name, example in (("images", "images=<folder of photographs>"), ("cameras", "cameras=<calibration>")):
         require(config[name] is not None, name, example, None)
     return {name: config[name] for name in _SOURCES if name in config}
 
 
 def capture_folder(config: Mapping[str, Any]) -> CaptureFolder:
-    """The folder that :func:`sources_of` describes. InputError: a key or file is missing or wrong."""
+    """The folder that :func:`sources_of` describes, with what :func:`begin_to_read` decodes.
+
+    Args:
+        config: of a verb.
+
+    Returns:
+        The folder.
+
+    Raises:
+        InputError: a key or file is missing or wrong.
+    """
     folder = CaptureFolder(**sources_of(config))
     return _BEGUN.pop() if [folder] == _BEGUN else folder
 
 
 def begin_to_read(config: Mapping[str, Any]) -> None:
-    """Start decoding the first instant for the next :func:`capture_folder`; raises what that raises."""
+    """Start decoding the first instant for the next :func:`capture_folder`.
+
+    Args:
+        config: of a verb.
+
+    Raises:
+        InputError: as for :func:`capture_folder`.
+    """
     _BEGUN[:] = [capture_folder(config)]
     if config["segment"] is None:
         _BEGUN[0].begin(_BEGUN[0].instants[0])
 
 
 def check_cameras(folder: CaptureFolder) -> None:
-    """Print how well cameras and masks agree in a few instants. InputError: they contradict each other in all
-    of these, or the only instant cannot be read."""
+    """Print how well cameras and masks agree in a few instants.
+
+    Args:
+        folder: of one instant or several.
+
+    Raises:
+        InputError: they contradict each other in all of these, or the only instant cannot be read.
+    """
     from ghgs_capture.camera_report import diagnose, in_parts
 
     names = folder.instants

@@ -51,7 +51,12 @@ OTHER_RIG = 5.0
 
 @torch.no_grad()
 def run(options: "Predict", cfg: DictConfig) -> None:
-    """Run the verb."""
+    """Run the verb.
+
+    Args:
+        options: of the verb.
+        cfg: the whole configuration.
+    """
     directory = output_dir() if options.out is None else resolved(options.out)
     is_capture = options.images is not None or options.cameras is not None
     config = resolve(cfg if is_capture else inputs.with_trained_data(cfg))
@@ -63,8 +68,20 @@ def run(options: "Predict", cfg: DictConfig) -> None:
 def subject_batch(
     data: "PhotographsDataModule", subject: str | int, split: str, targets: dict[str, Any] | None
 ) -> Batch:
-    """Photographs of one subject, given by its name or number in the split. ``targets``: a protocol whose
-    targets are read too. InputError: there is no such subject."""
+    """Photographs of one subject of a data set.
+
+    Args:
+        data: prepared.
+        subject: its name, or its number in the split from 0.
+        split: such as ``val``.
+        targets: a protocol whose targets are read too; None: none.
+
+    Returns:
+        A batch of one element.
+
+    Raises:
+        InputError: there is no such subject.
+    """
     names = list(data.subjects(split))
     if isinstance(subject, int) and 0 <= subject < len(names):
         subject = names[subject]
@@ -74,7 +91,16 @@ def subject_batch(
 
 
 def predict_subject(options: "Predict", config: dict[str, Any], directory: Path) -> None:
-    """Predict a subject of a data set."""
+    """Predict a subject of a data set and write its files.
+
+    Args:
+        options: of the verb.
+        config: its whole configuration, resolved.
+        directory: where files are written.
+
+    Raises:
+        InputError: there is no such subject, or an option does not fit.
+    """
     expected = "0 without images=...: photographs of data sets are on black"
     require(options.refine_masks in (0, "auto"), "refine_masks", expected, options.refine_masks)
     output = export.output_options(options)
@@ -92,8 +118,18 @@ def predict_subject(options: "Predict", config: dict[str, Any], directory: Path)
 
 
 def predict_photographs(options: "Predict", config: dict[str, Any], directory: Path) -> None:
-    """Predict each instant of a folder of photographs; several instants get a folder each and shared files.
-    InputError: no instant can be read."""
+    """Predict each instant of a folder of photographs and write its files.
+
+    Several instants get a folder each and shared files.
+
+    Args:
+        options: of the verb.
+        config: its whole configuration, resolved.
+        directory: where files are written.
+
+    Raises:
+        InputError: no instant can be read, or a file or option is wrong.
+    """
     folder = capture_folder(config)
     output = export.output_options(options)
     several = len(folder.instants) > 1
@@ -161,9 +197,20 @@ def predict_photographs(options: "Predict", config: dict[str, Any], directory: P
 def shared_by(
     folder: CaptureFolder, model: GHGS, size: tuple[int, int], refining: Mapping[str, Any], renderer: Renderer
 ) -> tuple[Mapping[str, float], Backgrounds, Rig | None, bytes]:
-    """What the instants of a sequence share, estimated from a few of them: tone curves (those of the first),
-    static backgrounds, corrected cameras, and the content of the cameras' file. None and no content: the
-    cameras stay as they are."""
+    """Estimate what the instants of a sequence share, from a few of them.
+
+    Args:
+        folder: of several instants.
+        model: in evaluation mode.
+        size: (height, width) of the crops in pixels.
+        refining: ``refine_cameras``, ``refine_masks`` and ``tones`` as for
+            :func:`ghgs_capture.prediction.predict`.
+        renderer: what refining draws with.
+
+    Returns:
+        Gammas of tone curves (those of the first instant), static backgrounds, corrected cameras,
+        and the content of the cameras' file. None and no content: the cameras stay as they are.
+    """
     begin = time.perf_counter()
     names = folder.instants
     captures = []
@@ -187,7 +234,15 @@ def shared_by(
 
 
 def mended_by(backgrounds: Backgrounds, given: Capture) -> Capture:
-    """The capture with masks corrected by static backgrounds; prints which ones changed."""
+    """Correct masks by static backgrounds; prints which ones changed.
+
+    Args:
+        backgrounds: by camera; of none nothing changes.
+        given: an instant.
+
+    Returns:
+        The instant with corrected masks.
+    """
     capture = backgrounds.applied(given)
     both = zip(given.photographs, capture.photographs, strict=True)
     if mended := [after.name for before, after in both if after is not before]:
@@ -197,7 +252,14 @@ def mended_by(backgrounds: Backgrounds, given: Capture) -> Capture:
 
 
 def advice_of(directory: Path) -> Iterator[str]:
-    """Advice from a prediction's report: gains that were undone, why it may be poor and what may help."""
+    """Advice from a prediction's report.
+
+    Args:
+        directory: where the report lies.
+
+    Yields:
+        Lines about gains that were undone, why the prediction may be poor and what may help.
+    """
     report = json.loads((directory / REPORT).read_text())
     shares = {name: geometric_mean(each) - 1 for name, each in report.get("gains", {}).items()}
     said = [
@@ -226,8 +288,15 @@ def advice_of(directory: Path) -> Iterator[str]:
 
 
 def rig_advice(trained: Mapping[str, Any], batch: Batch) -> Iterator[str]:
-    """Lines that say where photographs are not of the rig that ``ghgs adapt`` trained weights for, by their
-    configuration ``trained``."""
+    """Say where photographs are not of the rig that ``ghgs adapt`` trained weights for.
+
+    Args:
+        trained: configuration of the weights.
+        batch: the photographs, of one element.
+
+    Yields:
+        Lines; none for weights that are for any rig.
+    """
     data = trained.get("data", {})
     count = len(batch.views[0])
     if data.get("kind") != "people_in_rig":
@@ -242,15 +311,33 @@ def rig_advice(trained: Mapping[str, Any], batch: Batch) -> Iterator[str]:
 
 
 def moved_line(moved: dict[str, float]) -> str:
-    """Message: pixels by which the subject moved in each photograph, and the cameras if only some moved."""
+    """The message about corrected cameras, which names them if only some moved.
+
+    Args:
+        moved: pixels by which the subject moved in each photograph, by camera.
+
+    Returns:
+        A line of text.
+    """
     off = [name for name, pixels in moved.items() if pixels]
     beside = f": {', '.join(off)} beside the others" if 0 < len(off) < len(moved) else ""
     return f"refine_cameras: moved by {', '.join(f'{p:.2f}' for p in moved.values())} pixels{beside}"
 
 
 def captures_of(folder: CaptureFolder) -> Iterator[tuple[Capture, float]]:
-    """Yield the capture of each instant and the seconds of waiting for it; the next one is decoded meanwhile.
-    Of several instants, those that cannot be read are left out with a message."""
+    """Read the instants of a folder one by one; the next one is decoded meanwhile.
+
+    Of several instants, those that cannot be read are left out with a message.
+
+    Args:
+        folder: of one instant or several.
+
+    Yields:
+        The capture of each instant and the seconds of waiting for it.
+
+    Raises:
+        InputError: the only instant cannot be read.
+    """
     names = folder.instants
     with ThreadPoolExecutor(1) as pool:
         following = pool.submit(folder.photographs, names[0])
@@ -282,7 +369,19 @@ def write_result(
     checkpoint: str,
     options: export.OutputOptions,
 ) -> dict[str, float]:
-    """Write the files of a result and print what was done; return the seconds of each stage."""
+    """Write the files of a result and print what was done.
+
+    Args:
+        directory: where files are written.
+        result: the prediction of one subject.
+        model: its report on skipping is written, too.
+        renderer: draws pictures of the files.
+        checkpoint: name of the weights, for the report.
+        options: formats and choices for them.
+
+    Returns:
+        The seconds of each stage, with those of writing.
+    """
     prediction = result.prediction
     seconds = dict(result.seconds)
     facts: dict[str, Any] = {"checkpoint": checkpoint, "seconds": seconds, "why": result.why}

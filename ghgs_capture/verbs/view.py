@@ -35,7 +35,15 @@ if TYPE_CHECKING:
 
 
 def run(options: "View", cfg: DictConfig) -> None:
-    """Show ``path``; without it predict first, or with ``live`` again and again. Ctrl-C ends it."""
+    """Show ``path``; without it predict first, or with ``live`` again and again. Ctrl-C ends it.
+
+    Args:
+        options: of the verb.
+        cfg: the whole configuration; gets the weights that are used where none are named.
+
+    Raises:
+        InputError: there is nothing to show, or a file or option is wrong.
+    """
     sources = (options.path, options.checkpoint, options.images)
     has_source = options.live or any(source is not None for source in sources)
     require(has_source, "path", "a directory of ghgs predict or a PLY, or checkpoint=<file>", None)

@@ -66,8 +66,15 @@ class Content:
 
     @torch.no_grad()
     def comparison(self, view: int) -> dict[str, np.ndarray | float]:
-        """One view and its photograph: pictures [H, W, 3] uint8 ``render``, ``photograph`` and ``FLIP``, and
-        in the subject's box ``psnr`` (dB) and ``flip``, nan where the mask is empty."""
+        """Compare one view with its photograph.
+
+        Args:
+            view: index of the photograph.
+
+        Returns:
+            Pictures [H, W, 3] uint8 ``render``, ``photograph`` and ``FLIP``, and in the subject's
+            box ``psnr`` (dB) and ``flip``, nan where the mask is empty.
+        """
         camera = self.batch.cameras[:, view : view + 1]
         target = self.batch.images[:, view]
         image = render(self.gaussians, camera).image[:, 0].clamp(0, 1)
@@ -84,8 +91,18 @@ class Content:
 
 def read_content(path: str | Path, up: str | None) -> Content:
     """Read what ``ghgs predict`` wrote into a directory (its formats ``ply`` and ``inputs``), or a PLY.
-    ``up``: the axis ``y``, ``-y`` or ``z`` that points up; None: the up of the cameras, and ``y`` for a PLY.
-    InputError: ``path`` is neither, or a file of it is missing or wrong."""
+
+    Args:
+        path: the directory or the PLY.
+        up: the axis ``y``, ``-y`` or ``z`` that points up; None: the up of the cameras, and ``y``
+            for a PLY.
+
+    Returns:
+        The Gaussians, and of a directory the photographs with their cameras.
+
+    Raises:
+        InputError: ``path`` is neither, or a file of it is missing or wrong.
+    """
     path = Path(path)
     choice("up", up, (None, *AXES))
     if path.is_file():

@@ -22,8 +22,16 @@ _RECENT = 30  #: Instants over which run times are averaged, later ones with mor
 
 
 class Recording:
-    """Numbered PLYs of what is shown, ``sequence/0000.ply`` and so on, which replace those of earlier runs.
-    InputError: a file of another origin is in the way."""
+    """Numbered PLYs of what is shown, ``sequence/0000.ply`` and so on.
+
+    They replace those of earlier runs.
+
+    Args:
+        directory: where ``sequence`` is written.
+
+    Raises:
+        InputError: a file of another origin is in the way.
+    """
 
     def __init__(self, directory: Path):
         self.directory = directory
@@ -34,6 +42,11 @@ class Recording:
             (directory / name).unlink()
 
     def add(self, subject: ExportedSubject) -> None:
+        """Write the next PLY.
+
+        Args:
+            subject: what is shown.
+        """
         name = f"sequence/{len(self.instants):04d}.ply"
         write_ply(subject.stored, self.directory / name)
         self.instants[name] = subject.name
@@ -67,15 +80,20 @@ def show_live(
     seconds: float = math.inf,
     delay: float = math.inf,
 ) -> None:
-    """Show the newest capture until no more come or ``seconds`` are over; then, also after an error, close
-    the page and print a summary.
+    """Show the newest capture until no more come or the time is over.
+
+    Then, also after an error, close the page and print a summary.
 
     Args:
         frames: captures as they come; waits with ``pause``, which is stopped here.
+        pause: waits between looks for a capture.
         crop: gives what the model sees; called in a thread, while the capture before is predicted.
         predict: gives what is shown.
         open_page: called with the first content.
-        delay: seconds after which a capture is dropped rather than shown."""
+        recording: gets what is shown; None: nothing is written.
+        seconds: time after which this ends.
+        delay: seconds after which a capture is dropped rather than shown.
+    """
     page = None
     shown = 0
     dropped = 0
@@ -127,7 +145,18 @@ def show_live(
 def _read_ahead(
     frames: Iterator[Arrived], pause: Pause, crop: Callable[[Capture], Batch], seconds: float
 ) -> Iterator[tuple[Batch, int, float, float]]:
-    """Batches, captures dropped before each, its time of arrival, and seconds of reading without pauses."""
+    """Read and crop captures in a thread, one ahead.
+
+    Args:
+        frames: captures as they come; waits with ``pause``.
+        pause: stopped at the end.
+        crop: gives what the model sees.
+        seconds: time after which this ends.
+
+    Yields:
+        A batch, captures dropped before it, its time of arrival, and seconds of reading without
+        pauses.
+    """
 
     def following() -> tuple[Batch, int, float, float] | None:
         begin = time.perf_counter() - pause.seconds

@@ -57,12 +57,17 @@ def _own_pages_only(host: str) -> Iterator[None]:
 
 
 class Viewer:
-    """A running page. InputError: viser is not installed, or this machine has no such address.
+    """A running page.
 
     Args:
+        content: what it shows first.
         host: the address to listen at; ``127.0.0.1`` is seen by this machine alone.
         port: the first one to try.
-        layers: also show cameras, photographs, point cloud and hull, of the first content alone."""
+        layers: also show cameras, photographs, point cloud and hull, of the first content alone.
+
+    Raises:
+        InputError: viser is not installed, or this machine has no such address.
+    """
 
     def __init__(self, content: Content, host: str = "127.0.0.1", port: int = 8080, layers: bool = True):
         viser = installed("viser", "viewer", "ghgs view")
@@ -88,13 +93,19 @@ class Viewer:
 
     @property
     def address(self) -> str:
+        """Where browsers find the page."""
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
     def stop(self) -> None:
+        """Close the page."""
         self.server.stop()
 
     def show(self, content: Content) -> None:
-        """Show other Gaussians; visitors stay where they are."""
+        """Show other Gaussians; visitors stay where they are.
+
+        Args:
+            content: the new ones.
+        """
         with self._lock:
             self.content = content
             self._prepare()
@@ -204,7 +215,11 @@ class Viewer:
         start.fov = 2 * math.atan(cameras.height / 2 / float(cameras.intrinsics[0, 1, 1]))
 
     def go_to(self, view: int) -> None:
-        """Put every visitor at the camera of a photograph."""
+        """Put every visitor at the camera of a photograph.
+
+        Args:
+            view: index of the photograph.
+        """
         pose, fov = self._poses[view]
         for client in self.server.get_clients().values():
             with client.atomic():
