@@ -19,7 +19,8 @@ if TYPE_CHECKING:  # runs and --help read no arrays
     import numpy as np
 
 #: Largest size of a text file in bytes, and the most levels of nested mappings and lists.
-LARGEST, DEEPEST = 1 << 28, 64
+LARGEST = 1 << 28
+DEEPEST = 64
 _NO_TEXT = (yaml.YAMLError, csv.Error)
 
 
@@ -172,11 +173,13 @@ def check_yaml(text: str, aliases: bool = True) -> None:
             case yaml.CollectionEndEvent():
                 anchor, size = unfinished.pop()
             case yaml.ScalarEvent():
-                anchor, size = event.anchor, 1
+                anchor = event.anchor
+                size = 1
             case yaml.AliasEvent():
                 if not aliases or event.anchor not in sizes:
                     raise ValueError("an alias (*name)")
-                anchor, size = event.anchor, sizes[event.anchor]
+                anchor = event.anchor
+                size = sizes[event.anchor]
             case _:
                 continue
         sizes[anchor] = size

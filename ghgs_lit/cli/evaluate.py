@@ -28,7 +28,8 @@ def trained_method(
     options: "Evaluate", config: Mapping[str, Any], device: torch.device
 ) -> tuple[ModelMethod, dict[str, Any]]:
     """The model of a checkpoint with the chosen refinement, and facts about it."""
-    renderer, model = inputs.build_renderer(config, device), inputs.load_model(config, device)
+    renderer = inputs.build_renderer(config, device)
+    model = inputs.load_model(config, device)
     checkpoint = read_checkpoint(options.checkpoint)
     facts: dict[str, Any] = {
         "checkpoint_config": checkpoint["config"],
@@ -48,7 +49,11 @@ def baselines_of(
 ) -> dict[str, Method]:
     """Baselines by name; ``names`` may be one name or ``all``."""
     names = BASELINES if names == "all" else [names] if isinstance(names, str) else names
-    renderer, untrained = inputs.build_renderer(config, device), lambda: GHGS.from_config(config).to(device)
+    renderer = inputs.build_renderer(config, device)
+
+    def untrained() -> GHGS:
+        return GHGS.from_config(config).to(device)
+
     return {name: baseline(name, renderer, untrained, config["per_scene"]) for name in names}
 
 

@@ -25,7 +25,8 @@ _PATCHES = 8  # along each side of the photographs on which two models are compa
 @torch.no_grad()
 def parity(checkpoint: str, exported: str) -> dict[str, float]:
     """Differences between the predictions of two checkpoints for photographs of a noisy ellipsoid."""
-    results, batch = [], None
+    results = []
+    batch = None
     for path in (exported, checkpoint):  # one model in memory at a time
         model = GHGS.from_checkpoint(path).eval()
         if batch is None:

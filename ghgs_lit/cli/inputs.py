@@ -67,7 +67,8 @@ def load_model(config: Mapping[str, Any], device: torch.device) -> GHGS:
 
 def check_size(data: "PhotographsDataModule", model: GHGS) -> None:
     """Check the size of photographs before any is read. InputError: a side is no multiple of the patch."""
-    size, multiple = data.dataset.size, side_multiple(model.options, model.encoder.patch_size)
+    size = data.dataset.size
+    multiple = side_multiple(model.options, model.encoder.patch_size)
     expected = f"sides divisible by the patch size {multiple} (or model.pad=multiple)"
     require(not any(side % multiple for side in size), "data.size", expected, list(size))
 
@@ -104,7 +105,8 @@ def model_of(checkpoint: str, cfg: DictConfig) -> dict[str, Any]:
         hint = f"`ghgs train init_from={checkpoint}` starts from it"
         raise InputError(f"{checkpoint}: expected a whole model; found the encoder alone ({hint})")
     for stage in STAGES:
-        place, found = f"{checkpoint}: config.{stage}", trained.get(stage)
+        place = f"{checkpoint}: config.{stage}"
+        found = trained.get(stage)
         require(isinstance(found, Mapping), place, "a stage of the model", found)
     before = {node: trained[node] for node in (*MODEL_NODES, "chosen") if node in trained}
     after = OmegaConf.create(before)
@@ -131,7 +133,8 @@ def _require_same(trained: Mapping[str, Any], key: str, value: Any) -> None:
 
 def _require_ablation(trained: Mapping[str, Any]) -> None:
     """Refuse another ``ablation`` than the trained one; its switches can be set one by one instead."""
-    own, wanted = ablation_of(trained), HydraConfig.get().runtime.choices["ablation"]
+    own = ablation_of(trained)
+    wanted = HydraConfig.get().runtime.choices["ablation"]
     switches = "recalibration.neighborhood=... and .similarity=... act"
     require(wanted == own, "ablation", f"{own}, as the checkpoint was trained ({switches})", wanted)
 

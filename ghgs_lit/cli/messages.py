@@ -70,7 +70,8 @@ def _unread_override(error: OverrideParseException) -> str:
 
 
 def _yaml(error: YAMLError) -> str:
-    mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
+    mark = getattr(error, "problem_mark", None)
+    problem = getattr(error, "problem", None)
     place = f"{mark.name}, line {mark.line + 1}" if mark else "--config-dir"
     return f"{place}: expected YAML of plain data; found {problem or error}"
 
@@ -103,7 +104,8 @@ def _hint(verb: str, key: str) -> str:
     overrides = sys.argv[1:]
     folders = {str(path.relative_to(conf_dir())) for path in conf_dir().rglob("*") if path.is_dir()}
     chosen = [text for text in overrides if text.partition("=")[0] in folders and "," not in text]
-    keys, group = _keys(verb, chosen) or _keys(verb), key.partition(".")[0]
+    keys = _keys(verb, chosen) or _keys(verb)
+    group = key.partition(".")[0]
     if any(key in verb_class(name).model_fields for name in verbs()):
         return ""  # a key of another verb
     for of in (group, "model") if "." in key else ():  # a model chooses groups of its own

@@ -45,5 +45,6 @@ def check(data: PhotographsDataModule, folder: Path, expected: Check) -> None:
     show(report)
     announce(write(report, folder))
     if report.problems:
-        name, count = data.dataset.name, len(report.problems)
+        name = data.dataset.name
+        count = len(report.problems)
         raise InputError(f"{name}: expected nothing missing or broken; found {count} (see check.json)")

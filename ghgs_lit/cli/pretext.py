@@ -29,7 +29,8 @@ def pretrain(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> 
     """Train the branch and save it; arguments as for :func:`ghgs_lit.cli.train.train`."""
     # Tables of models that start from this checkpoint show this origin.
     config = {**config, "encoder": {**config["encoder"], "weights": "pretext"}}
-    options, patch_size = config["encoder"]["semantic"], config["encoder"]["patch_size"]
+    options = config["encoder"]["semantic"]
+    patch_size = config["encoder"]["patch_size"]
     require(options is not None, "encoder.semantic", "the options of a branch to train", None)
     if rank_zero_only.rank == 0:
         write_config(config, directory)

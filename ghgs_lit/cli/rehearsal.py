@@ -32,11 +32,13 @@ class _Clock(Callback):
     """Seconds of the last step, waiting for its batch included."""
 
     def __init__(self) -> None:
-        self.seconds, self._since = 0.0, 0.0
+        self.seconds = 0.0
+        self._since = 0.0
 
     def on_train_batch_end(self, *_: Any) -> None:
         now = time.perf_counter()
-        self.seconds, self._since = now - self._since, now
+        self.seconds = now - self._since
+        self._since = now
 
 
 class _Rehearsed:
@@ -137,7 +139,8 @@ class _Rehearsed:
 
     def step_seconds(self, data: "PhotographsDataModule", folder: Path) -> float | None:
         """Seconds of a training step of one process, which reads its own photographs."""
-        config, clock = self.config, _Clock()
+        config = self.config
+        clock = _Clock()
         few = {"max_steps": _STEPS, "max_time": None, "limit_val_batches": 0, "devices": 1, "num_nodes": 1}
         trainer = {**config["trainer"], **few, "strategy": "auto", "profiler": None}
         quick = {**config, "trainer": trainer, "logger": {}, "callbacks": {}}
@@ -161,7 +164,8 @@ def rehearse(configs: Sequence[Mapping[str, Any]]) -> Rehearsal:
     reasons: dict[str, None] = {}
     notes: dict[str, None] = {}
     listed: set[str] = set()
-    tried, seconds = set(), None
+    tried = set()
+    seconds = None
     quiet()
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")

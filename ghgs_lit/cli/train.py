@@ -112,7 +112,8 @@ def environments() -> list[ClusterEnvironment]:
 
 def run(options: "Train", cfg: DictConfig) -> float | str | None:
     """Train and measure (in a sweep: unless done); return the mean PSNR. Interrupted: Ctrl-C or SIGTERM."""
-    config, run_directory = resolve(cfg), RunDirectory(output_dir())
+    config = resolve(cfg)
+    run_directory = RunDirectory(output_dir())
     config["chosen"] = chosen_options(config, HydraConfig.get())
     require(not options.dry_run, "dry_run", "false without a grid (-m, or sweep=<file>)", True)
     job.check_config(config)
@@ -147,7 +148,8 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
     data = build_data(config)
     model = GHGS.from_config(config)
     check_size(data, model)
-    renderer, losses = build(config["renderer"], "renderer"), build(config["loss"], "loss")
+    renderer = build(config["renderer"], "renderer")
+    losses = build(config["loss"], "loss")
     data.trains_on_depths &= getattr(losses, "reads_depths", True)  # a plug-in's may not say
     module = GHGSModule(
         model, renderer, losses, build(config["optimizer"], "optimizer"), config, config.get("token_budgets")
@@ -211,7 +213,8 @@ def measure_last(
     training: dict[str, Any],
 ) -> float:
     """Measure the last weights and write the results; return the mean PSNR of the first protocol."""
-    model, device = module.model, trainer.strategy.root_device
+    model = module.model
+    device = trainer.strategy.root_device
     identity = RunDirectory(directory).marker
     path = measure_and_write(
         {"model": ModelMethod(model.to(device).eval(), module.renderer)},

@@ -48,13 +48,15 @@ def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
 
 
 #: More than any configuration has; a file of a few kilobytes can refer to one list a billion times.
-_MOST_VALUES, _MOST_LEVELS = 100_000, 32
+_MOST_VALUES = 100_000
+_MOST_LEVELS = 32
 
 
 def require_plain(config: Any, where: str) -> None:
     """Refuse a configuration that YAML could not have said: other types than mappings with keys of text,
     lists, texts and numbers, or containers that hold themselves. ``where``: for messages."""
-    left, count = [(where, config, 0)], 0
+    left = [(where, config, 0)]
+    count = 0
     while left:
         key, value, level = left.pop()
         count += 1

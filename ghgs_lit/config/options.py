@@ -80,7 +80,8 @@ def _words(annotation: Any, metadata: Iterable[Any] = ()) -> str:
     for item in metadata:
         if isinstance(item, Words):
             return item.text
-    origin, args = get_origin(annotation), get_args(annotation)
+    origin = get_origin(annotation)
+    args = get_args(annotation)
     if origin in (Union, types.UnionType):
         return " or ".join(_words(arg, () if arg is type(None) else metadata) for arg in args)
     if origin is Literal:
@@ -213,7 +214,9 @@ def _input_error(cls: type[Options], key: str, values: Mapping, error: Validatio
     errors = error.errors(include_url=False)
     first = next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])
     own = first.get("ctx", {}).get("error")
-    path, field, nested = [key] if key else [], None, cls
+    path = [key] if key else []
+    field = None
+    nested = cls
     for name in first["loc"]:
         if nested is None or not isinstance(values, Mapping | list | tuple):
             break
@@ -231,7 +234,8 @@ def _input_error(cls: type[Options], key: str, values: Mapping, error: Validatio
     if isinstance(own, InputError):  # raised by a validator of several fields
         return InputError(f"{dotted}.{own}" if dotted else str(own))
     if first["type"] == "extra_forbidden":
-        name, known = first["loc"][-1], list(cls.model_fields)
+        name = first["loc"][-1]
+        known = list(cls.model_fields)
         text = f"expected one of {', '.join(sorted(known))}; found {name!r}{did_you_mean(name, known)}"
         return InputError(f"{dotted} key: {text}" if dotted else f"{name}: {text}")
     if first["type"] == "missing" and first["loc"][-1] in cls.model_fields:

@@ -67,7 +67,8 @@ def differences(
     (of the preset or the yardstick, whichever has more) over the number of the yardstick's.
     """
     (prediction, rendering), (yardstick, reference) = found, expected
-    ours, theirs = prediction.gaussians, yardstick.gaussians
+    ours = prediction.gaussians
+    theirs = yardstick.gaussians
     a, b = partners(ours, theirs)
     result = {n: relative_difference(getattr(ours, n)[a], getattr(theirs, n)[b], share) for n in ATTRIBUTES}
     result["render"] = relative_difference(rendering.image, reference.image, min(share, MOST))
@@ -164,7 +165,8 @@ def time_cases(
     seconds: list[dict[str, list[float]]] = [{} for _ in cases]
     for turn in track(range(-warmup, repeats), "rounds"):
         for number in order(turn, len(cases)):
-            case, probe = cases[number], SecondsProbe(device)
+            case = cases[number]
+            probe = SecondsProbe(device)
             for batch in batches:
                 forward(case.model, case.renderer, batch, probe)
             for stage, value in probe.seconds().items() if turn >= 0 else ():
@@ -222,11 +224,13 @@ def record_cases(
                 record.differences[name] = worst(record.differences.get(name, value), value)
             # The error against the truth, as `ghgs evaluate` measures it; its time does not count.
             prediction, rendering = result
-            depth, decisions = (prediction.depth, prediction.depth_valid), prediction.decisions
+            depth = (prediction.depth, prediction.depth_valid)
+            decisions = prediction.decisions
             estimate = Estimate(rendering.image, *depth, decisions=decisions)
             measured = measure(lambda _, known=estimate: known, record.case.label, [batch], metrics, device)
             record.metrics += [{n: value for n, value in row.items() if n != "seconds"} for row in measured]
     times = time_cases(cases, batches, WARMUP, repeats, device)
     for record, mine, seconds in zip(records, works, times, strict=True):
-        record.work, record.times = Work.of(mine), seconds
+        record.work = Work.of(mine)
+        record.times = seconds
     return records

@@ -102,13 +102,15 @@ def broken_budgets(rows: Sequence[Row]) -> list[str]:
 
 def _broken(row: Row) -> list[str]:
     said = []
-    limit, difference = row["max_rel_diff_budget"], row["rel_diff"]
+    limit = row["max_rel_diff_budget"]
+    difference = row["rel_diff"]
     if limit is not None and not difference <= limit:
         said.append(f"expected rel_diff up to max_rel_diff={limit:g}; found {difference:g}")
     missing = row["differences"]["unmatched"]
     if limit is not None and missing > 0:
         said.append(f"expected the Gaussians of none; found {missing:.2%} others")
-    promises_equality, limit = limit is not None, row["budget_db"]
+    promises_equality = limit is not None
+    limit = row["budget_db"]
     loss = max(row["psnr_loss_db"], row["difference_db"] if promises_equality else -math.inf)
     if row["trained"] and limit is not None and not loss <= limit:
         said.append(f"expected a loss up to {limit:g} dB of PSNR; found {loss:.3g}")

@@ -12,7 +12,8 @@ from ghgs_lit.model import GHGS
 from ghgs_lit.types import Batch, Cameras, Targets
 
 #: Width over height of the silhouette, as of a standing person, and its largest height over the frame's.
-_ASPECT, _TALLEST = 0.4, 0.9
+_ASPECT = 0.4
+_TALLEST = 0.9
 
 
 def ellipse(share: float, size: tuple[int, int]) -> torch.Tensor:

@@ -18,7 +18,9 @@ from ghgs_lit.runtime.watching import Inputs, Stopwatch, Watcher, inside
 from ghgs_lit.runtime.watching import watched as stages_watched
 from ghgs_lit.types import Batch, Prediction, Rendering
 
-ROUNDS, RENDER, TOTAL = "rounds", "render", "total"
+ROUNDS = "rounds"
+RENDER = "render"
+TOTAL = "total"
 OTHER = "other"  #: Work outside of stages: checks, padding
 #: Modules of parts of stages, by ``<stage>.<part>``.
 PARTS = {"encoder.patch_tokens": "encoder.aggregator.patch_embed"}

@@ -17,10 +17,13 @@ from ghgs_lit.runtime.precision import exact, has_bfloat16, rounds_products
 from ghgs_lit.runtime.watching import Results, watched
 from ghgs_lit.types import Batch, Cameras, Gaussians
 
-PASSED, FAILED, SKIPPED = "pass", "fail", "skip"
+PASSED = "pass"
+FAILED = "fail"
+SKIPPED = "skip"
 #: Largest errors of images and their gradients. Rounding to float32 gives 1e-6 and 1e-5 on a CPU; a splat
 #: that is cut off at 1/255 or at a tile's border, or drawn in another order, gives more than 1e-3.
-IMAGE_LIMIT, IMAGE_GRADIENT_LIMIT = 1e-4, 1e-3
+IMAGE_LIMIT = 1e-4
+IMAGE_GRADIENT_LIMIT = 1e-3
 #: Largest error of a stage, by precision. In float32 it is 1e-6 on a CPU; with another order of summation
 #: another of two equally distant neighbours may be chosen, which moves one token. The other precisions round
 #: every product: 8 times one rounding (2^-8 in bfloat16, 2^-11 in float16 and TF32); 1.6 times in bfloat16 on
@@ -31,8 +34,10 @@ PRECISIONS = ("inherit", *LIMITS)
 #: Largest error of the gradient of all weights in float32, and number of models that are tried. It jumps if
 #: rounding moves a unit across 0 or a token to another neighbour: 2e-6 to 4e-2 on a CPU. At least one of
 #: three models has no such jump; a wrong kernel affects all.
-GRADIENT_LIMIT, _MODELS = 1e-2, 3
-_SIZE, _LONGEST = 48, 300  #: Side of the images of splats; number of characters of an error that are shown
+GRADIENT_LIMIT = 1e-2
+_MODELS = 3
+_SIZE = 48  #: Side of the images of splats, in pixels
+_LONGEST = 300  #: Number of characters of an error that are shown
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,8 @@ def compared(check: str, found: Tensor, expected: Tensor, limit: float) -> Outco
     """Outcome that passes if shapes agree and ``|found - expected| <= limit * |expected|`` (2-norms)."""
     error = float("nan")
     if found.shape == expected.shape:
-        found, expected = found.detach().cpu().double(), expected.detach().cpu().double()
+        found = found.detach().cpu().double()
+        expected = expected.detach().cpu().double()
         norm = expected.norm()
         error = float((found - expected).norm() / torch.where(norm > 0, norm, 1.0))
     # This comparison fails for NaN.
@@ -95,7 +101,8 @@ def renderer(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcom
 
 
 def _random_splats() -> Gaussians:
-    n, g = 240, torch.Generator().manual_seed(0)
+    n = 240
+    g = torch.Generator().manual_seed(0)
     return Gaussians(
         means=torch.randn(n, 3, generator=g) * torch.tensor([0.2, 0.5, 0.2]),
         quaternions=torch.randn(n, 4, generator=g),
@@ -165,7 +172,8 @@ def stages(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]
 def gradient(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]:
     """Check the gradient of all weights in float32, as ``trainer.precision=32-true`` has it; one of
     :data:`_MODELS` random models must pass."""
-    batch, outcomes = _small_batch(config), []
+    batch = _small_batch(config)
+    outcomes = []
     for seed in range(_MODELS):
         expected = _gradients(random_model(config, seed).double(), _in_float64(batch))
         with exact(device.type):
@@ -202,7 +210,9 @@ def _results(model: GHGS, batch: Batch) -> dict[str, Tensor]:
     with watched(model, {name: name for name in ("encoder", "recalibration")}, seen):
         prediction = model(batch).to("cpu")
     encoder, recalibration = (torch.stack(tokens.latent).cpu() for tokens in seen.results.values())
-    bounds, points, masks = prediction.depth_maps.bounds, prediction.points, batch.masks.cpu()
+    bounds = prediction.depth_maps.bounds
+    points = prediction.points
+    masks = batch.masks.cpu()
     edges = {} if bounds is None else {"bounds": torch.stack((bounds.near[masks], bounds.far[masks]))}
     return {
         **edges,

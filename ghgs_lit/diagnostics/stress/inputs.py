@@ -75,7 +75,8 @@ def _towards_middle(angle: float) -> Tensor:
 def intrinsics(lenses: Tensor) -> Tensor:
     """Intrinsics [..., 3, 3] from lenses."""
     fx, fy, cx, cy = lenses.unbind(-1)
-    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    zero = torch.zeros_like(fx)
+    one = torch.ones_like(fx)
     return torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
 
 
@@ -96,7 +97,8 @@ def points(family: str, g: Generator, count: int, middle: Tensor, poses: Tensor 
         return around + 1e6 * directions(g, 1, 3)
     if poses is None or family not in ("behind", "beside", "on_camera"):
         return around
-    rotation, translation = poses[0, :, :3], poses[0, :, 3]
+    rotation = poses[0, :, :3]
+    translation = poses[0, :, 3]
     center = -rotation.mT @ translation
     if family == "behind":
         return center - rotation[2] * uniform(g, 0.1, 3, count, 1) + 0.1 * normal(g, count, 3)
@@ -145,7 +147,8 @@ def features(family: str, g: Generator, count: int, width: int) -> Tensor:
 
 def raw(family: str, g: Generator, *shape: int) -> Tensor:
     """Raw values of a head."""
-    values, factor = normal(g, *shape), {"saturated": 100.0, "extreme": 1e4}.get(family)
+    values = normal(g, *shape)
+    factor = {"saturated": 100.0, "extreme": 1e4}.get(family)
     return values if factor is None else values.sign() * factor * uniform(g, 0.5, 1.5, *shape)
 
 

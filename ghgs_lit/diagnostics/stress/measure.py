@@ -63,7 +63,8 @@ def measure(
 def _row(
     stage: Stage, family: str, dtype: str, seeds: Sequence[int], outcome: Outcome, seconds: float
 ) -> Row:
-    errors, case = outcome.errors, int(outcome.errors.argmax())
+    errors = outcome.errors
+    case = int(outcome.errors.argmax())
     return plain(
         {
             "stage": stage.name,
@@ -128,7 +129,9 @@ def _spread(run: Callable[[Values], Values], exact: Values, truth: Values, stage
     any decision within it (a ray that grazes a box)."""
     spread = {name: torch.zeros(len(value), dtype=torch.float64) for name, value in truth.items()}
     for seed, size in ((0, 1), (1, 1), (2, stage.factor), (2, -stage.factor)):
-        g, step, moved = torch.Generator().manual_seed(seed), size * _STEP, dict(exact)
+        g = torch.Generator().manual_seed(seed)
+        step = size * _STEP
+        moved = dict(exact)
         for name, value in exact.items():
             if value.is_floating_point() and name not in stage.steady:
                 signs = 1 - 2 * torch.randint(2, value.shape, generator=g)
@@ -177,7 +180,8 @@ def _compared(stage: Stage, family: str, exact: Values, truth: Values, spread: V
 
 
 def _refused(stage: Stage, cases: Values, dtype: str) -> Outcome:
-    inputs, errors = _inputs(cases, dtype), []
+    inputs = _inputs(cases, dtype)
+    errors = []
     for i in range(len(next(iter(cases.values())))):
         try:
             evaluate(stage.run, {name: value[i : i + 1] for name, value in inputs.items()}, (), dtype)
@@ -193,11 +197,14 @@ def _planted(stage: Stage, value: float, cases: Values, seeds: Sequence[int], dt
     outputs and reaches no other case; else infinite."""
     inputs = _inputs(cases, dtype)
     names = [name for name, x in inputs.items() if x.is_floating_point() and name not in stage.steady]
-    errors, lost, said = torch.zeros(len(seeds)), torch.zeros(len(seeds)), []
+    errors = torch.zeros(len(seeds))
+    lost = torch.zeros(len(seeds))
+    said = []
     for i, seed in enumerate(seeds):
         pair = {name: x[[i, (i + 1) % len(seeds)]].clone() for name, x in inputs.items()}
         name = names[i % len(names)]
-        g, entries = torch.Generator().manual_seed(seed), pair[name][0].view(-1)
+        g = torch.Generator().manual_seed(seed)
+        entries = pair[name][0].view(-1)
         entries[int(torch.randint(len(entries), (), generator=g))] = value
         said.append(f"in {name}")
         try:

@@ -64,7 +64,8 @@ def _rays_inputs(family: str, g: Generator) -> Values:
 
 
 def _hits(cameras: Cameras, middle: Tensor, half: Tensor) -> Tensor:
-    directions, centers = ray_directions(cameras), cameras.centers[:, None, None]
+    directions = ray_directions(cameras)
+    centers = cameras.centers[:, None, None]
     faces = [(middle + sign * half - centers) / directions for sign in (-1, 1)]
     return torch.minimum(*faces).amax(-1) < torch.maximum(*faces).amin(-1)
 
@@ -87,7 +88,8 @@ def scene(family: str, g: Generator, views: int, size: int, target: bool = False
     pixels = torch.stack((columns, rows, torch.ones_like(rows)), -1)
     rays = torch.einsum("vij,hwj->vhwi", torch.linalg.inv(intrinsics), pixels)
     center = extrinsics[:, :3, :3] @ rig["middle"] + extrinsics[:, :3, 3]
-    a, b = rays.square().sum(-1), (rays * center[:, None, None]).sum(-1)
+    a = rays.square().sum(-1)
+    b = (rays * center[:, None, None]).sum(-1)
     radius = 0.5 * unit
     root = b * b - a * (center.square().sum(-1) - radius**2)[:, None, None]
     depth = (b - root.clamp(min=0).sqrt()) / a
@@ -118,9 +120,11 @@ _HULL = VisualHull(dilation=0.02)
 def _bounds(v: Values) -> Values:
     """Bounds of the subject's pixels, computed in the subject's frame as the model does, and the distance of
     the true surface outside them."""
-    batch, masks = batch_of(v), v["masks"]
+    batch = batch_of(v)
+    masks = v["masks"]
     frame = Frame.of(batch)
-    found, metre = _HULL(frame.enter(batch)), frame.metre.to(v["truth"])[:, None, None, None]
+    found = _HULL(frame.enter(batch))
+    metre = frame.metre.to(v["truth"])[:, None, None, None]
     found = DepthBounds(found.near * metre, found.far * metre)
     outside = torch.relu(found.near - v["truth"]) + torch.relu(v["truth"] - found.far)
     seen = masks & (v["truth"] > 0)
@@ -192,7 +196,8 @@ def _tokens(v: Values) -> Values:
 def _padding(v: Values) -> Values:
     padding = pad_to_patches(v["masks"], 4)
     padded = padding.pad_batch(batch_of(v))
-    cameras, images = padded.cameras, padding.cut(padded.images.movedim(2, -1)).movedim(-1, 2)
+    cameras = padded.cameras
+    images = padding.cut(padded.images.movedim(2, -1)).movedim(-1, 2)
     moved, _ = project(v["middle"][:, None].expand(-1, 2, -1), cameras.intrinsics, cameras.extrinsics)
     corner = torch.tensor([padding.left, padding.top])
     return {"images": images, "masks": padding.cut(padded.masks).to(images), "pixel": moved + corner}

@@ -56,7 +56,8 @@ def _covariance_slowly(v: Values) -> Values:
     length = q.norm(dim=-1, keepdim=True)
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=q.dtype)
     q = torch.where(length > 0, q / torch.where(length > 0, length, 1.0), identity)
-    real, imaginary = q[..., None, :1], q[..., None, 1:].expand(*q.shape[:-1], 3, 3)
+    real = q[..., None, :1]
+    imaginary = q[..., None, 1:].expand(*q.shape[:-1], 3, 3)
     axes = torch.eye(3, dtype=q.dtype).expand_as(imaginary)
     twice = 2 * torch.linalg.cross(imaginary, axes)
     rotation = (axes + real * twice + torch.linalg.cross(imaginary, twice)).mT

@@ -17,7 +17,8 @@ from ghgs_lit.rendering import Renderer, render
 from ghgs_lit.rounds.gains import log_gains
 from ghgs_lit.types import Batch, Gaussians
 
-_LENS, _STEP = 17, 8  #: Side of a photograph with a lens; pixels between evaluations of its model
+_LENS = 17  #: Side of a photograph with a lens, in pixels
+_STEP = 8  #: Pixels between evaluations of the lens's model
 
 
 def _lens_inputs(family: str, g: Generator) -> Values:
@@ -31,7 +32,8 @@ def _lens_inputs(family: str, g: Generator) -> Values:
 
 def _lens(v: Values) -> Values:
     """Where the pixels of the undistorted image lie in the photograph, for OpenCV's and a fisheye's model."""
-    matrices, (k1, k2, k3, _) = inputs.intrinsics(v["lens"]).numpy(), v["radial"].mT
+    matrices = inputs.intrinsics(v["lens"]).numpy()
+    k1, k2, k3, _ = v["radial"].mT
     opencv = torch.stack((k1, k2, *v["p"].mT, k3), -1).numpy()
     models = {"opencv": (opencv, False), "fisheye": (v["radial"].numpy(), True)}
     return {
@@ -91,7 +93,8 @@ def _seen(v: Values) -> tuple[Gaussians, Batch]:
     means = unproject_maps(one["truth"], batch.cameras)[subject]
     size = (one["truth"] / batch.cameras.intrinsics[..., 0, 0, None, None])[subject]
     quaternions = means.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(len(means), 4)
-    opacities, colors = one["opacities"][subject], batch.images.movedim(2, -1)[subject]
+    opacities = one["opacities"][subject]
+    colors = batch.images.movedim(2, -1)[subject]
     scales = 0.5 * size[:, None].expand(-1, 3)
     return Gaussians(means, quaternions, scales, opacities, colors, (len(means),), image, pixel), batch
 
@@ -121,7 +124,8 @@ def _refined_slowly(v: Values) -> Values:
     own = start.image
     photographs = batch.images * batch.masks[:, :, None]
     focal = batch.cameras.intrinsics[0, :, [0, 1], [0, 1]].prod(-1).sqrt()[own]
-    axes, shifts = batch.cameras.extrinsics[0, :, 2, :3], batch.cameras.extrinsics[0, :, 2, 3]
+    axes = batch.cameras.extrinsics[0, :, 2, :3]
+    shifts = batch.cameras.extrinsics[0, :, 2, 3]
     side = (((axes[own] * start.means).sum(-1) + shifts[own]) / focal)[:, None]
     odds = (start.opacities.clamp(1e-4, 1 - 1e-4) / (1 - start.opacities.clamp(1e-4, 1 - 1e-4))).log()
     fields = (start.means, start.scales, odds, start.colors)

@@ -70,13 +70,15 @@ _BLOCKS = {s: SemanticAttention(128, 2, s) for s in ("product", "product_clamped
 
 def _attention(v: Values) -> Values:
     """Eq. 3 with every use of the similarity."""
-    inputs, cosines = [v[name] for name in ("q", "k", "v", "index")], v["cosines"]
+    inputs = [v[name] for name in ("q", "k", "v", "index")]
+    cosines = v["cosines"]
     return {name: block._attend(*inputs, block.factor_and_bias(cosines)) for name, block in _BLOCKS.items()}
 
 
 def _attention_slowly(v: Values) -> Values:
     q, k, value = (v[name].unflatten(-1, (2, 16)) for name in ("q", "k", "v"))
-    s, logits = v["cosines"], torch.einsum("mad,mkad->amk", q, k[v["index"]]) / 4.0
+    s = v["cosines"]
+    logits = torch.einsum("mad,mkad->amk", q, k[v["index"]]) / 4.0
     changed = {
         "product": logits * s,
         "product_clamped": logits * s.clamp(min=0),

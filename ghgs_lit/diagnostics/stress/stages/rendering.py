@@ -85,9 +85,11 @@ def _ssim_slowly(v: Values) -> Values:
     weights = (line[:, None] * line / line.sum() ** 2).flatten()
     a, b = (image.unfold(2, 11, 1).unfold(3, 11, 1).flatten(4) for image in (v["image"], v["target"]))
     mean_a, mean_b = ((p * weights).sum(-1) for p in (a, b))
-    da, db = a - mean_a[..., None], b - mean_b[..., None]
+    da = a - mean_a[..., None]
+    db = b - mean_b[..., None]
     aa, bb, ab = ((p * q * weights).sum(-1) for p, q in ((da, da), (db, db), (da, db)))
-    c1, c2 = 0.01**2, 0.03**2
+    c1 = 0.01**2
+    c2 = 0.03**2
     first = (2 * mean_a * mean_b + c1) / (mean_a.square() + mean_b.square() + c1)
     values = first * (2 * ab + c2) / (aa + bb + c2)
     return {"l1": _l1(v), "ssim": values.flatten(1).mean(1)}

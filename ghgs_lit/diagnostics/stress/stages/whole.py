@@ -59,7 +59,8 @@ def _inputs(family: str, g: Generator) -> Values:
 
 def _dense(prediction: Prediction, batch: Batch) -> Values:
     """Depths and Gaussians as maps; 0 where there are none, NaN for lost depths of the subject."""
-    gaussians, size = prediction.gaussians, batch.masks.shape
+    gaussians = prediction.gaussians
+    size = batch.masks.shape
     parts = (gaussians.means, gaussians.scales, gaussians.opacities[:, None], gaussians.colors)
     rows = torch.cat(parts, dim=-1)
     row = gaussians.image * (size[-2] * size[-1]) + gaussians.pixel
@@ -83,7 +84,8 @@ _LOSSES = Losses(weights={"chamfer": 0.0, "depth": 1.0})  # Chamfer has a stage 
 @torch.enable_grad()
 def _step(name: str, v: Values) -> Values:
     one = {name: value[None] for name, value in v.items()}
-    model, exact = _model(name, one, training=True), v["images"].dtype == torch.float64
+    model = _model(name, one, training=True)
+    exact = v["images"].dtype == torch.float64
     cameras = Cameras(*inputs.matrices(one["target_lenses"], one["target_poses"]), _SIZE, _SIZE)
     masks = torch.ones(1, 1, _SIZE, _SIZE, dtype=torch.bool)
     surface = one["middle"] + 0.5 * inputs.directions(Generator().manual_seed(1), 40, 3).to(one["middle"])
