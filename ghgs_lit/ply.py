@@ -58,7 +58,8 @@ def ply_bytes(gaussians: Gaussians) -> bytes:
         for group, names in _GROUPS.items()
         for i, name in enumerate(names)
     }
-    low_pass, antialiased = float(gaussians.low_pass), bool(gaussians.antialiased)
+    low_pass = float(gaussians.low_pass)
+    antialiased = bool(gaussians.antialiased)
     return vertices_ply(columns, [_CONSTANTS.format(low_pass=low_pass, antialiased=antialiased)])
 
 

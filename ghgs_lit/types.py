@@ -75,7 +75,8 @@ class Cameras(_TensorStruct):
     @property
     def centers(self) -> Float[Tensor, "*batch 3"]:
         """Camera centres in the world, ``-R^T t``."""
-        rotation, translation = self.extrinsics[..., :3, :3], self.extrinsics[..., :3, 3]
+        rotation = self.extrinsics[..., :3, :3]
+        translation = self.extrinsics[..., :3, 3]
         # Written out: a product of matrices would run in half precision under autocast.
         return -(rotation * translation[..., :, None]).sum(-2)
 
@@ -369,7 +370,8 @@ class Gaussians(_TensorStruct):
         if not -len(self.splits) <= element < len(self.splits):
             raise IndexError(f"batch element {element} of Gaussians with {len(self.splits)} elements")
         element %= len(self.splits)
-        start, count = sum(self.splits[:element]), self.splits[element]
+        start = sum(self.splits[:element])
+        count = self.splits[element]
         found = self.select(slice(start, start + count), (count,))
         metre = None if self.metre is None else self.metre[element : element + 1]
         return dataclasses.replace(found, metre=metre)

@@ -34,7 +34,8 @@ def rotary_tables(positions: Int[Tensor, "t 2"], head_width: int, like: Tensor) 
     exponents = torch.arange(0, head_width, 4, device=positions.device, dtype=torch.float32) / head_width
     angles = positions.float()[..., None] * (1.0 / BASE**exponents)
     angles = angles.to(at_least_float32(like).dtype)
-    cosine, sine = angles.cos(), angles.sin()
+    cosine = angles.cos()
+    sine = angles.sin()
     return Rotary(
         torch.stack((cosine, cosine), dim=-2).flatten(-3), torch.stack((-sine, sine), dim=-2).flatten(-3)
     )
@@ -47,7 +48,8 @@ def rotate(x: Float[Tensor, "*batch t d"], rotary: Rotary) -> Float[Tensor, "*ba
 
 
 #: Values of queries or keys that are rotated at once without a gradient, to save memory: on a CPU, on a GPU.
-_ROTATED, _GPU_ROTATED = 1 << 18, 1 << 25
+_ROTATED = 1 << 18
+_GPU_ROTATED = 1 << 25
 
 
 class Attention(nn.Module):
@@ -66,7 +68,8 @@ class Attention(nn.Module):
         self, x: Float[Tensor, "t c"], lengths: Sequence[int], rotary: Rotary | None = None
     ) -> Float[Tensor, "t c"]:
         q, k, v = rearrange(self.qkv(x), "t (s a d) -> s a t d", s=3, a=self.heads)
-        q, k = self._norm_and_rotate(q, self.q_norm, rotary), self._norm_and_rotate(k, self.k_norm, rotary)
+        q = self._norm_and_rotate(q, self.q_norm, rotary)
+        k = self._norm_and_rotate(k, self.k_norm, rotary)
         if len(set(lengths)) == 1:
             each = (rearrange(values, "a (n t) d -> n a t d", n=len(lengths)) for values in (q, k, v))
             return self.proj(_attend(*each).flatten(0, 1))
@@ -101,7 +104,8 @@ def _attend(
 REGISTERS = 4
 
 #: Hidden values of the MLP in memory at once without a gradient: on a CPU, on a GPU.
-_HIDDEN, _GPU_HIDDEN = 1 << 23, 1 << 28
+_HIDDEN = 1 << 23
+_GPU_HIDDEN = 1 << 28
 
 
 def draw_normal_(values: Tensor, std: float) -> Tensor:

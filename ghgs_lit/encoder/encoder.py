@@ -92,10 +92,12 @@ class VGGTOptions(Options):
         fits = self.width % (4 * self.heads) == 0
         self.require(fits, "width", "a multiple of 4 * heads (rows and columns rotate)")
         if self.vit.kind == "dinov2":
-            heads, patch = self.vit.heads, self.patch_size
+            heads = self.vit.heads
+            patch = self.patch_size
             self.require(self.width % heads == 0, "width", f"a multiple of vit.heads={heads}")
             self.require(self.image_size % patch == 0, "image_size", f"a multiple of {patch}")
-        layers, last = list(self.layers), self.depth - 1
+        layers = list(self.layers)
+        last = self.depth - 1
         fits = bool(layers) and sorted(set(layers)) == layers and layers[0] >= 0 and layers[-1] == last
         expected = f"ascending indices that end at the last of {self.depth} pairs of blocks"
         self.require(fits, "layers", expected)
@@ -125,8 +127,10 @@ class Aggregator(nn.Module):
 
     def __init__(self, patch_embed: nn.Module, options: VGGTOptions):
         super().__init__()
-        width, heads = options.width, options.heads
-        self.patch_size, self.layers = options.patch_size, options.layers
+        width = options.width
+        heads = options.heads
+        self.patch_size = options.patch_size
+        self.layers = options.layers
         self.checkpointing = options.checkpointing
         self.special = 1 + REGISTERS
         self.head_width = width // heads
@@ -140,7 +144,8 @@ class Aggregator(nn.Module):
                 for _ in range(options.depth)
             )
 
-        self.frame_blocks, self.global_blocks = blocks(), blocks()
+        self.frame_blocks = blocks()
+        self.global_blocks = blocks()
 
     def forward(
         self, images: Float[Tensor, "b v i H W"], kept: KeptPatches
@@ -156,9 +161,11 @@ class Aggregator(nn.Module):
         special = special.to(patches.dtype).repeat(b, 1, 1)
         x = kept.join(special, patches)
         rotary = rotary_tables(kept.positions(self.special), self.head_width, x)
-        inside, across = kept.lengths(self.special), kept.element_lengths(self.special)
+        inside = kept.lengths(self.special)
+        across = kept.element_lengths(self.special)
 
-        pairs, blocks = [], zip(self.frame_blocks, self.global_blocks, strict=True)
+        pairs = []
+        blocks = zip(self.frame_blocks, self.global_blocks, strict=True)
         for i, (frame_block, global_block) in enumerate(blocks):
             frame = run_block(frame_block, x, inside, self.checkpointing, rotary)
             x = run_block(global_block, frame, across, self.checkpointing, rotary)
@@ -185,9 +192,13 @@ class VGGTEncoder(nn.Module):
 
     def __init__(self, options: VGGTOptions, tokens: str = "all", margin: int = 1):
         super().__init__()
-        self.options, self.tokens, self.margin = options, tokens, margin
-        self.patch_size, self.dim_latent = options.patch_size, 2 * options.width
-        self.mask_input, self.bounds_input = options.mask_input, options.bounds_input
+        self.options = options
+        self.tokens = tokens
+        self.margin = margin
+        self.patch_size = options.patch_size
+        self.dim_latent = 2 * options.width
+        self.mask_input = options.mask_input
+        self.bounds_input = options.bounds_input
         extra = [0.5] * self.mask_input
         # Not in checkpoints, so they need storage even in a model that is built on the meta device.
         for name, values in (("mean", IMAGENET_MEAN), ("std", IMAGENET_STD)):
@@ -253,7 +264,9 @@ def _joined(pairs: list[Pair], kept: KeptPatches, special: int) -> Iterator[Floa
 
 
 def _patch_embedding(options: VGGTOptions, channels: int) -> nn.Module:
-    vit, width, patch_size = options.vit, options.width, options.patch_size
+    vit = options.vit
+    width = options.width
+    patch_size = options.patch_size
     if vit.kind == "conv":
         return PatchEmbed(channels, width, patch_size)
     if vit.kind == "stem":

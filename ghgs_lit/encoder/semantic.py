@@ -59,8 +59,11 @@ class SemanticBranch(nn.Module):
 
     def __init__(self, options: SemanticOptions, patch_size: int):
         super().__init__()
-        width, heads, self.parts = options.width, options.heads, PARTS
-        self.patch_size, self.head_width = patch_size, width // heads
+        width = options.width
+        heads = options.heads
+        self.parts = PARTS
+        self.patch_size = patch_size
+        self.head_width = width // heads
         self.stem = ConvStem(4, width, patch_size, options.channels)
         self.token = nn.Parameter(draw_normal_(torch.empty(1, 1, width), 0.02))
         self.blocks = nn.ModuleList(

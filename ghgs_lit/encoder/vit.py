@@ -47,11 +47,15 @@ class ConvStem(nn.Module):
     def __init__(self, in_channels: int, width: int, patch_size: int, channels: int):
         super().__init__()
         self.patch_size = patch_size
-        layers, rest, outputs = [], patch_size, min(channels, width)
+        layers = []
+        rest = patch_size
+        outputs = min(channels, width)
         while rest % 2 == 0:
             halving = nn.Conv2d(in_channels, outputs, 3, stride=2, padding=1)
             layers += [halving, ChannelNorm(outputs), nn.GELU()]
-            in_channels, outputs, rest = outputs, min(2 * outputs, width), rest // 2
+            in_channels = outputs
+            outputs = min(2 * outputs, width)
+            rest = rest // 2
         self.reduce = nn.Sequential(*layers, nn.Conv2d(in_channels, width, rest, stride=rest))
         self.mix_norm = ChannelNorm(width)
         self.mix = nn.Conv2d(width, width, 3, padding=1)
@@ -127,7 +131,8 @@ class VisionTransformer(nn.Module):
 
     def tokens(self, images: Float[Tensor, "n i H W"], kept: KeptPatches) -> Float[Tensor, "t c"]:
         """Packed class, register and patch tokens after the final norm."""
-        x, lengths = self.embed(images, kept), kept.lengths(self.special)
+        x = self.embed(images, kept)
+        lengths = kept.lengths(self.special)
         for block in self.blocks:
             x = run_block(block, x, lengths, self.checkpointing)
         return self.norm(x)

@@ -10,13 +10,15 @@ from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.runtime.precision import exact
 
 #: Distances in the memory of an accelerator at once, and candidates of each query that are compared exactly.
-_DISTANCES, _CANDIDATES = 1 << 26, 4
+_DISTANCES = 1 << 26
+_CANDIDATES = 4
 
 
 def nearest(queries: Float[Tensor, "n 3"], references: Float[Tensor, "m 3"]) -> Int[Tensor, " n"]:
     """Index of the nearest reference of each query; of any reference if the query is not finite. On the CPU
     by a k-d tree in float64, elsewhere by :func:`nearest_by_products`. ``references``: not empty, finite."""
-    queries, references = at_least_float32(queries.detach()), at_least_float32(references.detach())
+    queries = at_least_float32(queries.detach())
+    references = at_least_float32(references.detach())
     queries = queries.nan_to_num(0.0, 0.0, 0.0)
     if queries.device.type != "cpu":
         return nearest_by_products(queries, references)
@@ -31,8 +33,10 @@ def nearest_by_products(queries: Float[Tensor, "n 3"], references: Float[Tensor,
     Differences to all references (``torch.cdist`` without products) took 4 s on a GPU for 160 000 Gaussians
     and 10 475 vertices."""
     middle = references.mean(0)
-    queries, references = queries - middle, references - middle
-    squares, count = references.square().sum(1), min(_CANDIDATES, len(references))
+    queries = queries - middle
+    references = references - middle
+    squares = references.square().sum(1)
+    count = min(_CANDIDATES, len(references))
     index = [queries.new_zeros(0, dtype=torch.long)]
     with exact(queries.device.type):
         for block in queries.split(max(1, _DISTANCES // len(references))):
@@ -59,12 +63,14 @@ def chamfer(
     either set is empty (with a gradient of 0), nan if a coordinate is not finite. ``points``: the prediction,
     in metres. ``references``: the surface, in metres. ``limit``: largest number of points of each set that
     are matched (to all of the other set, so that the mean stays unbiased); None: all."""
-    points, references = at_least_float32(points), at_least_float32(references)
+    points = at_least_float32(points)
+    references = at_least_float32(references)
     if not (torch.isfinite(points).all() and torch.isfinite(references).all()):
         return (points.sum() + references.sum()) * torch.nan
     if len(points) == 0 or len(references) == 0:
         return points.sum() * 0 + references.sum() * 0
-    some, few = subsample(points, limit), subsample(references, limit)
+    some = subsample(points, limit)
+    few = subsample(references, limit)
     there = (some - references[nearest(some, references)]).square().sum(-1)
     back = (points[nearest(few, points)] - few).square().sum(-1)
     return there.mean() + back.mean()

@@ -58,7 +58,8 @@ class Frame:
     def enter(self, batch: Batch) -> Batch:
         """The batch with its input cameras in the frame, in the precision of the photographs. Targets, true
         depths and body vertices stay in the world."""
-        cameras, dtype = batch.cameras, at_least_float32(batch.images).dtype
+        cameras = batch.cameras
+        dtype = at_least_float32(batch.images).dtype
         extrinsics = cameras.extrinsics.double()
         moved = extrinsics.clone()
         with exact(batch.masks.device.type):
@@ -82,7 +83,8 @@ class Frame:
         """The prediction in the world. ``dtype``: of points in the world (that of its cameras), which may
         need more digits than in the frame."""
         dtype = torch.promote_types(dtype, torch.float32)
-        views, points = prediction.depth.shape[1], prediction.points
+        views = prediction.depth.shape[1]
+        points = prediction.points
         everyone = constant(torch.arange, len(self.metre), like=points.pixels, dtype=torch.long)
         known: dict[Tensor, Tensor] = {}
         metre = self.metre.to(prediction.depth)[:, None, None, None]
@@ -103,7 +105,8 @@ class Frame:
         )
 
     def _gaussians(self, gaussians: Gaussians, views: int, world: Tensor) -> Gaussians:
-        element, lengths = gaussians.image // views, self.metre.to(gaussians.scales)
+        element = gaussians.image // views
+        lengths = self.metre.to(gaussians.scales)
         turn = matrix_to_quaternion(self.axes.mT).to(gaussians.quaternions)
         return dataclasses.replace(
             gaussians,
@@ -141,7 +144,8 @@ def subject_center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Te
     """The point nearest to the rays through the masks' centroids, by least squares. Optical axes have a small
     weight, so that one mask or none is enough, and the cameras a smaller one, for parallel rays. To be called
     where products are exact (:func:`ghgs_lit.runtime.precision.exact`)."""
-    intrinsics, extrinsics = at_least_float32(cameras.intrinsics), at_least_float32(cameras.extrinsics)
+    intrinsics = at_least_float32(cameras.intrinsics)
+    extrinsics = at_least_float32(cameras.extrinsics)
     # Sums of u and v, and the number of pixels: half-integers, whose sums are exact in any order.
     centers = homogeneous_centers(*masks.shape[2:], intrinsics).flatten(0, 1)
     sums, counts = (masks.flatten(-2).to(centers.dtype) @ centers).split((2, 1), -1)
@@ -185,7 +189,8 @@ def _size(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Tensor) -> F
 
 def _axes(cameras: Cameras) -> Float[Tensor, "B 3 3"]:
     """Right, up and back as rows: proper rotations for any extrinsics."""
-    down, forward = cameras.extrinsics[..., 1, :3], cameras.extrinsics[:, 0, 2, :3]
+    down = cameras.extrinsics[..., 1, :3]
+    forward = cameras.extrinsics[:, 0, 2, :3]
     mean = -down.mean(1)
     # Without a common up direction: that of the first camera.
     up = unit(torch.where(mean.norm(dim=-1, keepdim=True) > 0.1, mean, -down[:, 0]))

@@ -42,7 +42,8 @@ def patches_in_window(
 ) -> Bool[Tensor, "b v h w"]:
     """Patches of the smallest rectangle around the subject of a view, grown by ``margin``; none if empty."""
     touched = F.max_pool2d(masks.float(), patch_size).bool()
-    rows, columns = between(touched.any(-1)), between(touched.any(-2))
+    rows = between(touched.any(-1))
+    columns = between(touched.any(-2))
     return _grown((rows[..., :, None] & columns[..., None, :]).float(), margin)
 
 
@@ -76,7 +77,8 @@ def soft_signed_distance(matte: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "
     from scipy.ndimage import distance_transform_edt
 
     inside = matte > 0.5
-    coarse, rim = signed_distance(inside), (matte > _RIM[0]) & (matte < _RIM[1])
+    coarse = signed_distance(inside)
+    rim = (matte > _RIM[0]) & (matte < _RIM[1])
     if not rim.any():
         return coarse
     away, nearest = distance_transform_edt(~rim, return_indices=True)

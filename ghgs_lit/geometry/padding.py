@@ -66,12 +66,14 @@ class Padding:
 
     def _cut_pixel(self, pixel: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
         """Indices of pixels of an image in that of its photograph."""
-        row, column = pixel // self.width + self.top, pixel % self.width + self.left
+        row = pixel // self.width + self.top
+        column = pixel % self.width + self.left
         return row * self.full[1] + column
 
     def cut_pixels(self, pixels: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
         """Indices of pixels among those of all images, among those of all photographs."""
-        image, pixel = pixels // (self.height * self.width), pixels % (self.height * self.width)
+        image = pixels // (self.height * self.width)
+        pixel = pixels % (self.height * self.width)
         return image * (self.full[0] * self.full[1]) + self._cut_pixel(pixel)
 
     def cut_extent(self, extent: Extent) -> Extent:
@@ -81,7 +83,8 @@ class Padding:
 
     def _sides(self, maps: Tensor) -> list[int]:
         """Widths of the border in the order of ``F.pad``: last axis first, before and after."""
-        below, right = self.height - self.full[0] + self.top, self.width - self.full[1] + self.left
+        below = self.height - self.full[0] + self.top
+        right = self.width - self.full[1] + self.left
         return [0, 0] * (maps.dim() - 4) + [-self.left, right, -self.top, below]
 
 

@@ -43,13 +43,15 @@ def consistency_of(
 ) -> Float[Tensor, "N S"]:
     """:func:`photo_consistency` of some pixels of the subject. ``pixels``: ascending indices among those of
     all images. ``near``, ``far``: bounds of these pixels in metres."""
-    near, far = at_least_float32(near), at_least_float32(far)
+    near = at_least_float32(near)
+    far = at_least_float32(far)
     # An error of half a pixel, as in bfloat16, would give another colour.
     with exact(batch.masks.device.type):
         views = [x.to(near) if x.is_floating_point() else x for x in batch.once(_pairs)]
         on_gpu = gpu.is_supported(near, far)
         if not on_gpu and is_supported(near, far):
-            size, shares = tuple(batch.masks.shape[2:]), constant(middles, steps, like=near)
+            size = tuple(batch.masks.shape[2:])
+            shares = constant(middles, steps, like=near)
             return cpu.sweep(batch.once(_padded), pixels, near, far, size, *views, shares, TOLERANCE)
         sweep = _sweep if on_gpu else _swept
         return sweep(pixels, near, far, batch.once(_smooth).to(near), *views, steps, TOLERANCE)
@@ -78,7 +80,8 @@ def _swept(
         compared: whether two views are compared.
         steps: S, the number of depths.
         tolerance: mean difference of colours at which the agreement is 1 / e."""
-    shares, result = constant(middles, steps, like=near), near.new_zeros(len(pixels), steps)
+    shares = constant(middles, steps, like=near)
+    result = near.new_zeros(len(pixels), steps)
     for part in even_parts(len(pixels), _SAMPLES // (steps * (colors.shape[1] - 1))):
         depth = near[part, None] + (far - near)[part, None] * shares
         result[part] = _best_match(pixels[part], depth, colors, turn, shift, compared, tolerance)
@@ -107,7 +110,8 @@ def _best_match(
 ) -> Float[Tensor, "n S"]:
     """Agreement of pixels of any images, at their depths, with the best other view; see :func:`_swept`."""
     views, _, height, width = colors.shape[1:]
-    image, place = pixels // (height * width), pixels % (height * width)
+    image = pixels // (height * width)
+    place = pixels % (height * width)
     centers = F.pad(pixel_centers(height, width, depth).flatten(0, 1)[place], (0, 1), value=1.0)
     flat = colors.flatten(0, 1)
     own = flat.flatten(2)[image, :3, place]
@@ -171,7 +175,8 @@ def _relations(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """``turn`` and ``shift`` [B, j, k] in ``z_k p_k = z_j turn p_j + shift`` for pixels ``p`` of views j and
     k, and the cosine between the axes of the views."""
-    rotation, translation = extrinsics[..., :3, :3], extrinsics[..., :3, 3:]
+    rotation = extrinsics[..., :3, :3]
+    translation = extrinsics[..., :3, 3:]
     relative = rotation[:, None] @ rotation[:, :, None].mT
     turn = intrinsics[:, None] @ relative @ inverse_intrinsics(intrinsics)[:, :, None]
     shift = intrinsics[:, None] @ (translation[:, None] - relative @ translation[:, :, None])

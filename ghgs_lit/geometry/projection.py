@@ -49,11 +49,14 @@ def unproject(
     pixels, depth, intrinsics, extrinsics = map(at_least_float32, (pixels, depth, intrinsics, extrinsics))
     if depth.device.type != "cpu":
         return _unproject_in_few_steps(pixels, depth, intrinsics, extrinsics)
-    fx, fy = intrinsics[..., 0, 0], intrinsics[..., 1, 1]
+    fx = intrinsics[..., 0, 0]
+    fy = intrinsics[..., 1, 1]
     y = (pixels[..., 1] - intrinsics[..., 1, 2]) / fy
     x = (pixels[..., 0] - intrinsics[..., 0, 2] - intrinsics[..., 0, 1] * y) / fx
     shift = extrinsics[..., :3, 3]
-    x, y, z = x * depth - shift[..., 0], y * depth - shift[..., 1], depth - shift[..., 2]
+    x = x * depth - shift[..., 0]
+    y = y * depth - shift[..., 1]
+    z = depth - shift[..., 2]
     # The product with R^T is written out: matmul would run in half precision under autocast, and this way
     # there is no temporary of nine numbers for each pixel.
     rows = extrinsics[..., :3, :3].unbind(-2)
@@ -97,7 +100,8 @@ def world_to_camera(
 
 def _camera_axes(points: Tensor, extrinsics: Tensor) -> Tensor:
     """Coordinates [3, ...] of :func:`world_to_camera`; no product of matrices, as in :func:`unproject`."""
-    points, matrices = at_least_float32(points), at_least_float32(extrinsics)[..., :3, :]
+    points = at_least_float32(points)
+    matrices = at_least_float32(extrinsics)[..., :3, :]
     columns = _columns(matrices, points.dim() + 1)
     return _combined(columns[:3], points.movedim(-1, 0)) + columns[3]
 
@@ -131,7 +135,8 @@ def project(
 def look_at_point(cameras: Cameras) -> Tensor:
     """The world point [3] nearest to all optical axes of ``cameras`` [V] (least squares), float64; for
     parallel axes, the solution nearest to the mean position of the cameras."""
-    forward, centers = cameras.extrinsics[:, 2, :3].double(), cameras.centers.double()
+    forward = cameras.extrinsics[:, 2, :3].double()
+    centers = cameras.centers.double()
     middle = centers.mean(0)
     away = torch.eye(3, dtype=torch.float64, device=forward.device) - forward[:, :, None] * forward[:, None]
     right = (away @ (centers - middle)[:, :, None]).sum(0)

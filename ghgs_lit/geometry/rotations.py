@@ -32,9 +32,13 @@ def quaternion_to_matrix(quaternions: Float[Tensor, "*batch 4"]) -> Float[Tensor
 
 #: The 16 values of Shepperd's table as sums of at most four numbers with signs. 0 is the number 1; entries of
 #: the matrix are numbered from 1, by row.
-_OWN, _X, _Y, _Z = (0, 1, 5, 9), (8, 6, 0, 0), (3, 7, 0, 0), (4, 2, 0, 0)
+_OWN = (0, 1, 5, 9)
+_X = (8, 6, 0, 0)
+_Y = (3, 7, 0, 0)
+_Z = (4, 2, 0, 0)
 _TABLE = (*(_OWN, _X, _Y, _Z), *(_X, _OWN, _Z, _Y), *(_Y, _Z, _OWN, _X), *(_Z, _Y, _X, _OWN))
-_MINUS, _PLUS = (1, -1, 0, 0), (1, 1, 0, 0)
+_MINUS = (1, -1, 0, 0)
+_PLUS = (1, 1, 0, 0)
 _TABLE_SIGNS = (
     *((1, 1, 1, 1), _MINUS, _MINUS, _MINUS),
     *(_MINUS, (1, 1, -1, -1), _PLUS, _PLUS),
@@ -150,7 +154,8 @@ def after_motions(
 ) -> Float[Tensor, "*n 4 4"]:
     """Cameras that see points as ``extrinsics`` sees them after :func:`rigid` motions about ``middle``."""
     rotations, shifts = rigid(motions, length)
-    moved, axes = extrinsics.clone(), extrinsics[..., :3, :3]
+    moved = extrinsics.clone()
+    axes = extrinsics[..., :3, :3]
     moved[..., :3, :3] = axes @ rotations
     moved[..., :3, 3] += (axes - moved[..., :3, :3]) @ middle + (axes @ shifts[..., None])[..., 0]
     return moved

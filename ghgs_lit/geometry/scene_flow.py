@@ -26,7 +26,9 @@ _EVERY = 4
 #: Difference of colours at which an equation has half its weight.
 _OUTLIER = 0.06
 #: Longest step in metres; damping of steps: absolute, and relative to the mean of the matrix's diagonal.
-_LONGEST, _STILL, _STIFF = 0.05, 1e-3, 0.01
+_LONGEST = 0.05
+_STILL = 1e-3
+_STIFF = 0.01
 
 
 class _Level(NamedTuple):
@@ -121,7 +123,8 @@ def scene_flow(
     near = ((points - points.nanmedian(0).values).abs() < _REACH).all(-1) if len(points) else shown.any(-1)
     if not near.any():
         return torch.zeros_like(points), torch.zeros_like(points)
-    some, seen = points[::_EVERY], (shown & near[:, None])[::_EVERY]
+    some = points[::_EVERY]
+    seen = (shown & near[:, None])[::_EVERY]
     grid, (index, view) = _Grid.around(points[near]), seen.nonzero().unbind(-1)
     moved = points.new_zeros(3, *grid.shape)
     from_, _ = _seen(some[index], view, before.cameras)
@@ -158,7 +161,8 @@ def _equations(
     """Normal equations of a step of each point in one view: a symmetric matrix and the right side."""
     pixels, depth = _seen(points, view, cameras)
     value, right, down = sample(maps, view, pixels / smaller).split(3, -1)
-    lens, pose = cameras.intrinsics[view], cameras.extrinsics[view]
+    lens = cameras.intrinsics[view]
+    pose = cameras.extrinsics[view]
     inside = world_to_camera(points, pose)
     right = right * (lens[:, 0, :1] / (smaller * depth[:, None]))
     down = down * (lens[:, 1, 1:2] / (smaller * depth[:, None]))
@@ -188,6 +192,8 @@ def _steps(sums: Float[Tensor, "9 z y x"]) -> Float[Tensor, "3 z y x"]:
 def _turns(moved: Float[Tensor, "3 z y x"]) -> Float[Tensor, "3 z y x"]:
     """Rotation vectors: half the curl of the motion."""
     slopes = torch.gradient(moved, spacing=_CELL, dim=(3, 2, 1))
-    x, y, z = 0, 1, 2
+    x = 0
+    y = 1
+    z = 2
     turns = [slopes[b][c] - slopes[c][b] for b, c in ((y, z), (z, x), (x, y))]
     return torch.stack(turns) / 2

@@ -118,7 +118,8 @@ def hull_in_view(silhouettes: Sequence[Silhouette], index: int) -> np.ndarray:
 
 def subject_sphere(silhouettes: Sequence[Silhouette]) -> tuple[np.ndarray, float]:
     """The subject's middle [3], and an upper limit of its radius."""
-    rays, centers = [], np.stack([s.center for s in silhouettes])
+    rays = []
+    centers = np.stack([s.center for s in silhouettes])
     for s in silhouettes:
         rows, columns = np.nonzero(s.mask)
         cells = np.array([[columns.mean(), rows.mean()]]) + 0.5 if len(rows) else np.zeros((1, 2))

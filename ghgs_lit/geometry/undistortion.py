@@ -28,7 +28,8 @@ def undistorting_grid(
     pixels = torch.stack((columns, rows), -1).reshape(-1, 2)
     matrix, coefficients = (torch.from_numpy(np.asarray(a, np.float64)) for a in (intrinsics, distortion))
     if fisheye:
-        scale, middle = matrix[[0, 1], [0, 1]], matrix[:2, 2]
+        scale = matrix[[0, 1], [0, 1]]
+        middle = matrix[:2, 2]
         params = torch.cat((scale, middle, coefficients))
         places = distort_points_kannala_brandt((pixels - middle) / scale, params)
     else:

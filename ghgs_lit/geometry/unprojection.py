@@ -58,7 +58,8 @@ def subject_tokens(
     depth_maps: DepthMaps, patch_size: int
 ) -> tuple[Float[Tensor, "B V h w 2"], Float[Tensor, "B V h w"], Bool[Tensor, "B V h w"]]:
     """Mean pixel ``(u, v)`` and mean depth of the valid pixels of each patch, and whether it has any."""
-    depth, valid = at_least_float32(depth_maps.depth), depth_maps.valid
+    depth = at_least_float32(depth_maps.depth)
+    valid = depth_maps.valid
     centers = pixel_centers(*depth.shape[-2:], depth).permute(2, 0, 1)
     values = torch.cat(
         (depth[..., None, :, :], centers.expand(*depth.shape[:2], 2, *depth.shape[-2:])), dim=2
@@ -79,5 +80,6 @@ def subject_tokens(
 def seen_surfaces(batch: Batch) -> list[Float[Tensor, "_ 3"]]:
     """Points of the true surface of each element in the world, in metres: one for each of the subject's input
     pixels whose depth is known (``batch.depths``, which must be there)."""
-    points, known = unproject_maps(batch.depths, batch.cameras), batch.masks & (batch.depths > 0)
+    points = unproject_maps(batch.depths, batch.cameras)
+    known = batch.masks & (batch.depths > 0)
     return [own[seen] for own, seen in zip(points, known, strict=True)]

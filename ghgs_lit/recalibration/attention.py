@@ -26,9 +26,11 @@ Changes = tuple[Tensor, Tensor]
 S_MIN = 0.01
 
 #: Tokens computed at once without a gradient; in half precision a smaller number is as fast on a CPU.
-_ROWS, _HALF_ROWS = 424, 256
+_ROWS = 424
+_HALF_ROWS = 256
 #: Limits of the scores of all tokens on a CPU, and of gathered values of neighbours.
-_SCORES, _GATHERED = 1 << 26, 1 << 25
+_SCORES = 1 << 26
+_GATHERED = 1 << 25
 
 
 class SemanticAttention(nn.Module):
@@ -49,7 +51,8 @@ class SemanticAttention(nn.Module):
         super().__init__()
         expected = f"heads that divide a quarter of the token width ({dim} / 4)"
         require(dim % (4 * num_heads) == 0, "recalibration.num_heads", expected, num_heads)
-        self.num_heads, self.similarity = num_heads, similarity
+        self.num_heads = num_heads
+        self.similarity = similarity
         inner = dim // 4
         for name, value in (("one", 1.0), ("zero", 0.0)):  # on the CPU: not in checkpoints, need storage
             self.register_buffer(name, torch.tensor(value, device="cpu"), persistent=False)
@@ -86,8 +89,10 @@ class SemanticAttention(nn.Module):
     ) -> Float[Tensor, "m k a"]:
         """Softmax weights of each head from the ``m`` tokens ``rows`` to their neighbours, for inspection.
         ``x``: tokens of one element. ``near``, ``cosines`` [n, k]: of all ``n``."""
-        near, normed = near[rows], self.norm1(x)
-        q, k = at_least_float32(self.q_proj(normed[rows])), at_least_float32(self.k_proj(normed))
+        near = near[rows]
+        normed = self.norm1(x)
+        q = at_least_float32(self.q_proj(normed[rows]))
+        k = at_least_float32(self.k_proj(normed))
         changes = self.factor_and_bias(None if cosines is None else cosines[rows])
         return self._weights(q, k[near], *(y.expand(near.shape) for y in changes))
 

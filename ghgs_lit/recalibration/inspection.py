@@ -49,11 +49,14 @@ def attention_on_other_parts(
     """Share of each token's attention, in each layer, on tokens that show another body part; mean over heads.
     ``tokens``, ``points``: inputs of the stage. ``part``: number of the part that a token shows; -1: unknown:
     such tokens are no queries, and attention to them does not count."""
-    takes_part, element, found = recalibration.takes_part(points), tokens.image // tokens.grid[1], []
+    takes_part = recalibration.takes_part(points)
+    element = tokens.image // tokens.grid[1]
+    found = []
     for number in range(tokens.grid[0]):
         chosen = (takes_part & (element == number)).nonzero()[:, 0]
         near, weights = _weights(recalibration, tokens, points, chosen, slice(None))
-        own, others = part[chosen, None], part[chosen][near]
+        own = part[chosen, None]
+        others = part[chosen][near]
         differs = (own != others) & (others >= 0)
         found.append((weights.mean(-1) * differs).sum(-1).T[own[:, 0] >= 0])
     return torch.cat(found)
@@ -63,7 +66,8 @@ def _near(
     recalibration: Recalibration, tokens: Tokens, points: Points, chosen: Int[Tensor, " n"]
 ) -> Int[Tensor, "n k"]:
     """Neighbours of the ``chosen`` tokens of an element, as indices among them."""
-    places, positions = recalibration.places(tokens), recalibration.positions(tokens, points)
+    places = recalibration.places(tokens)
+    positions = recalibration.positions(tokens, points)
     places = None if places is None else places[chosen]
     k = neighbor_count(recalibration.k, len(chosen))
     return nearest_neighbors(positions[chosen], tokens.image[chosen], k, places, tokens.grid[1])
@@ -86,7 +90,9 @@ def neighborhoods(recalibration: Recalibration, tokens: Tokens, points: Points) 
     """The neighbourhood of each element. ``tokens``, ``points``: inputs of the stage."""
     other = copy.copy(recalibration)
     other.neighborhood = "image_plane" if recalibration.neighborhood == "xyz" else "xyz"
-    takes_part, element, found = recalibration.takes_part(points), tokens.image // tokens.grid[1], []
+    takes_part = recalibration.takes_part(points)
+    element = tokens.image // tokens.grid[1]
+    found = []
     for number in range(tokens.grid[0]):
         chosen = (takes_part & (element == number)).nonzero()[:, 0]
         near, changed = (_near(stage, tokens, points, chosen) for stage in (recalibration, other))

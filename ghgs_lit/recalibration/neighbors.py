@@ -8,7 +8,8 @@ from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.kernels.pool import at_once, even_parts
 
 #: Distances in memory at once: a block fits a CPU's cache; on a GPU it takes 200 MB with its keys.
-_BLOCK, _GPU_BLOCK = 1 << 17, 1 << 23
+_BLOCK = 1 << 17
+_GPU_BLOCK = 1 << 23
 
 
 @torch.no_grad()

@@ -21,7 +21,8 @@ from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import DecodedPixels, Points, Tokens
 
 #: Cosines in memory at once, on a CPU and on a GPU.
-_COSINES, _GPU_COSINES = 1 << 21, 1 << 25
+_COSINES = 1 << 21
+_GPU_COSINES = 1 << 25
 
 
 class RecalibrationOptions(Options):
@@ -52,7 +53,9 @@ class Recalibration(nn.Module):
 
     def __init__(self, options: RecalibrationOptions, dim_latent: int):
         super().__init__()
-        self.k, self.neighborhood, self.tokens = options.k, options.neighborhood, options.tokens
+        self.k = options.k
+        self.neighborhood = options.neighborhood
+        self.tokens = options.tokens
         self.block = SemanticAttention(dim_latent, options.num_heads, options.similarity)
 
     def forward(self, tokens: Tokens, points: Points, plan: Plan) -> Tokens:
@@ -61,7 +64,9 @@ class Recalibration(nn.Module):
         rows = plan.peers.only(self.takes_part(points))
         if rows.real is not None:
             return self._filled(tokens, points, rows)
-        batch_size, counts, chosen = tokens.grid[0], rows.counts, rows.index
+        batch_size = tokens.grid[0]
+        counts = rows.counts
+        chosen = rows.index
 
         def part(values: Tensor) -> Tensor:
             return values if len(chosen) == len(values) else values[chosen]
@@ -88,7 +93,8 @@ class Recalibration(nn.Module):
         """:meth:`forward` for elements with the same number of ``rows``, all at once. Rows that do not count
         are out of reach of the others, and their results are not read."""
         shape = (len(rows.counts), rows.counts[0])
-        places, real = self.places(tokens), rows.real.view(shape)
+        places = self.places(tokens)
+        real = rows.real.view(shape)
         of_tokens = (self.positions(tokens, points), tokens.image)
         where, image = (values[rows.index].unflatten(0, shape) for values in of_tokens)
         where = where.masked_fill(~real[..., None], torch.inf)

@@ -25,20 +25,25 @@ from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
 
 Renderer = Callable[..., Rendering]
 #: Numbers of the elements of a batch, and a choice of their cameras.
-Numbers, Which = Float[Tensor, " B"], Bool[Tensor, "B V"]
+Numbers = Float[Tensor, " B"]
+Which = Bool[Tensor, "B V"]
 
 #: Steps of the optimiser in a round, and their size at first: radians, and half heights of the subject.
-_STEPS, _RATE = 15, 0.006
+_STEPS = 15
+_RATE = 0.006
 _OUTLINE = 0.5  #: Weight of silhouettes; that of colours is 1
 _SAME = 0.05  #: Largest difference in metres of depths of one surface
 _STAY = 4.0  #: Weight of the squared motion
 #: Relative decrease of the loss for which the cameras of the first and of a later round are kept: with exact
 #: cameras it is up to 0.01 (0.02 from above), with cameras off by a pixel 0.02 to 0.2. ``_FIRST`` also holds
 #: for cameras that silhouettes propose.
-_FIRST, _LATER = 0.02, 0.01
+_FIRST = 0.02
+_LATER = 0.01
 #: With ``_TELLING`` cameras or more (fewer silhouettes tell less), a silhouette distance below ``_EXACT``
 #: pixels means that they are off by half a pixel at most: the first round must gain ``_DOUBTED``.
-_TELLING, _EXACT, _DOUBTED = 4, 1.5e-4, 0.05
+_TELLING = 4
+_EXACT = 1.5e-4
+_DOUBTED = 0.05
 
 
 @dataclass(frozen=True)
@@ -68,7 +73,10 @@ class CameraRefinement:
         self, rounds: int, predict: Callable[[Batch], Prediction], renderer: Renderer, shared: bool = False
     ):
         require(rounds >= 1, "refine_cameras", "1 or more rounds", rounds)
-        self.rounds, self.predict, self.renderer, self.shared = rounds, predict, renderer, shared
+        self.rounds = rounds
+        self.predict = predict
+        self.renderer = renderer
+        self.shared = shared
 
     def __call__(self, batch: Batch) -> Batch:
         """The batch with corrected cameras; targets stay as they are. ``batch``: two views or more."""
@@ -81,7 +89,8 @@ class CameraRefinement:
             cameras, is_better = self._corrected(prediction, inside, free, worth)
             if not bool(is_better.any()):
                 break
-            inside, moved = replace(inside, cameras=cameras), moved | is_better
+            inside = replace(inside, cameras=cameras)
+            moved = moved | is_better
         left = frame.leave_cameras(inside.cameras, batch.cameras)  # to the frame and back is not exact
         return replace(batch, cameras=_chosen(moved[:, None] & free, left, batch.cameras))
 
@@ -118,7 +127,8 @@ class CameraRefinement:
 
     def _loss(self, drawn: Rendering, views: _Views, batch: Batch) -> Numbers:
         """L1 of colours and silhouettes per pixel of an element's subject, or with ``shared`` its mean."""
-        image, alpha = drawn.image[:, 0], drawn.alpha[:, 0, 0]
+        image = drawn.image[:, 0]
+        alpha = drawn.alpha[:, 0, 0]
         # Where the other views lack the surface of the photograph, what lies behind it is drawn.
         same = (drawn.depth.detach()[:, 0, 0] - views.depths).abs() < _SAME
         errors = same * (image - views.photographs).abs().mean(1)
@@ -132,7 +142,8 @@ class CameraRefinement:
         self, prediction: Prediction, batch: Batch, free: Which, worth: Numbers
     ) -> tuple[Cameras, Bool[Tensor, " B"]]:
         """Cameras after one round, and which elements gain ``worth``; the cameras of the others stay."""
-        cameras, losses = batch.cameras, []
+        cameras = batch.cameras
+        losses = []
         views = _views(prediction, batch)
         axes = cameras.extrinsics[..., 2, :3]
         rigs = 1 if self.shared else len(axes)

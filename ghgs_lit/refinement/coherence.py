@@ -25,23 +25,31 @@ from ghgs_lit.refinement.outlines import QUICK, TO, Outlines
 from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Cameras
 
-Lens, Pose = Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"]
+Lens = Float[Tensor, "V 3 3"]
+Pose = Float[Tensor, "V 4 4"]
 #: Those of ``K`` instants, whose crops differ in intrinsics.
-Lenses, Middles = Float[Tensor, "K V 3 3"], Float[Tensor, "K 3"]
+Lenses = Float[Tensor, "K V 3 3"]
+Middles = Float[Tensor, "K 3"]
 #: One for each camera, and one for each ray.
-Which, Numbers, Points = Bool[Tensor, " V"], Int[Tensor, " R"], Float[Tensor, "R 3"]
+Which = Bool[Tensor, " V"]
+Numbers = Int[Tensor, " R"]
+Points = Float[Tensor, "R 3"]
 
 _DEPTHS = 48  #: Depths tried along a ray
 #: Mean distance of rays in pixels below which silhouettes are consistent.
 _COHERENT = 5e-4
 #: Weight of the squared steps, in pixels, relative to the mean squared distance; and the factor of it for
 #: zooms: lenses are known better than poses.
-_STAY, _KNOWN = 1e-3, 5.0
+_STAY = 1e-3
+_KNOWN = 5.0
 #: Cameras are wrong by themselves if the others, as given, miss one another by less than ``_CLEARLY`` times
 #: what they do without any other ones (opposite cameras are nearly exchangeable), counted from ``_EXACT``
 #: pixels, which exact cameras reach. They move alone if that leaves less than ``_COHERENT``, ``_AS_WELL``
 #: times the distance that moving all leaves, or ``_REST`` of the given distance, as with rough masks.
-_CLEARLY, _EXACT, _AS_WELL, _REST = 0.25, 5e-5, 1.5, 0.02
+_CLEARLY = 0.25
+_EXACT = 5e-5
+_AS_WELL = 1.5
+_REST = 0.02
 _BUMPED = 1e-3  #: Given distance from which it is tried: that of one camera off by a pixel
 
 
@@ -67,7 +75,8 @@ class _Phase:
         return (r < 0) * self.scale / r.abs().clamp(min=self.scale)
 
 
-_MEET, _LIE = _Phase(12, TO, 1.0, is_exact=False), _Phase(6, 3.0, 0.3, is_exact=True)
+_MEET = _Phase(12, TO, 1.0, is_exact=False)
+_LIE = _Phase(6, 3.0, 0.3, is_exact=True)
 
 
 @dataclass(frozen=True)
@@ -83,7 +92,8 @@ class _Alignment:
         found = self
         for _ in range(phase.steps):
             equations = silhouettes.equations(found.lens, found.pose, phase)
-            steps, are_all = equations.solved(self.free), bool(self.free.all())
+            steps = equations.solved(self.free)
+            are_all = bool(self.free.all())
             moved = _stepped(steps, found.lens, found.pose, are_all)
             found = _Alignment(*moved, self.free, (*found.distances, equations.distance))
         return found
@@ -96,7 +106,8 @@ def contradiction(batch: Batch) -> tuple[Float[Tensor, " B"], Float[Tensor, "B V
 
     With exact cameras that of all is up to 0.0025, with ones off by 1.5 pixels 0.007 to 0.09; where one is
     off, the others' is that of exact cameras. ``batch``: as for :func:`coherent_cameras`."""
-    found, without = [], []
+    found = []
+    without = []
     for mattes, lens, pose in zip(*_on_cpu(batch), strict=True):
         silhouettes = _Silhouettes((Outlines.of(mattes, QUICK),), pose.new_zeros(1, 3))
         found.append(silhouettes.distance(lens[None], pose))
@@ -142,9 +153,11 @@ def coherent_cameras(
     with exact("cpu"):
         rigs = [_coherent(mattes[part], lens[part], pose[part][0], middle[part], alone) for part in each]
     lenses, poses, free, distances = zip(*rigs, strict=True)
-    count, device = len(pose) // len(rigs), batch.masks.device
+    count = len(pose) // len(rigs)
+    device = batch.masks.device
     poses, free = (torch.stack(found).repeat_interleave(count, 0) for found in (poses, free))
-    lenses, poses = torch.cat(lenses).to(cameras.intrinsics), poses.to(cameras.extrinsics)
+    lenses = torch.cat(lenses).to(cameras.intrinsics)
+    poses = poses.to(cameras.extrinsics)
     moved = replace(cameras, intrinsics=lenses, extrinsics=poses)
     return moved, free.to(device), torch.tensor(distances, device=device).repeat_interleave(count)
 
@@ -218,12 +231,14 @@ class _Silhouettes:
     def distance(self, lens: Lenses, pose: Pose, views: Sequence[int] = ()) -> float:
         """Mean distance by which rays miss other silhouettes, without those of ``views``."""
         kept = [view for view in range(len(pose)) if view not in views]
-        missed, rays = 0.0, 0
+        missed = 0.0
+        rays = 0
         for outlines, each, middle in zip(self.outlines, lens, self.middle, strict=True):
             some = outlines.of_views(kept)
             placed = _placed(pose[kept], middle)
             depth = _best_points(some, each[kept], placed, some.view, some.pixels)[2]
-            missed, rays = missed - float(depth.clamp(max=0).sum()), rays + len(depth)
+            missed = missed - float(depth.clamp(max=0).sum())
+            rays = rays + len(depth)
         return missed / max(rays, 1)
 
     def equations(self, lens: Lenses, pose: Pose, phase: _Phase) -> "_Equations":
@@ -239,7 +254,8 @@ def _equations(
     count = len(pose)
     pose = _placed(pose, middle)
     near = outlines.depth <= phase.to
-    view, depth_at_home = outlines.view[near], outlines.depth[near]
+    view = outlines.view[near]
+    depth_at_home = outlines.depth[near]
     points, other, depth = _best_points(outlines, lens, pose, view, outlines.pixels[near])
     distances = phase.distances(depth, depth_at_home)
     rays = max(len(distances), 1)
@@ -269,7 +285,8 @@ def _stepped(steps: Float[Tensor, "V 7"], lens: Lenses, pose: Pose, are_all: boo
     """Intrinsics and extrinsics after a step, without what is common to all cameras if ``are_all`` free."""
     motions, zooms = (steps / _pixel(lens, pose)).split((6, 1), -1)
     if are_all:
-        motions, zooms = without_common(motions, pose[:, 2, :3]), zooms - zooms.mean(0)
+        motions = without_common(motions, pose[:, 2, :3])
+        zooms = zooms - zooms.mean(0)
     zoomed = lens.clone()
     zoomed[..., [0, 1], [0, 1]] *= zooms.exp()
     return zoomed, after_motions(pose, motions, pose.new_zeros(3), HEIGHT / 2)
@@ -282,7 +299,8 @@ def _best_points(
     in, and its signed depth in that in pixels. ``view``: the silhouette of each ray, ascending."""
     centers = -(pose[:, :3, :3].mT @ pose[:, :3, 3:])[..., 0]
     along = torch.linspace(-HEIGHT / 2, HEIGHT / 2, _DEPTHS).to(pixels)
-    views, points = range(len(pose)), []
+    views = range(len(pose))
+    points = []
     for home in views:
         rays = pixels[view == home]
         ahead = unproject(rays, torch.ones_like(rays[:, 0]), lens[home], pose[home]) - centers[home]

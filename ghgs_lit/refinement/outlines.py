@@ -14,9 +14,11 @@ from ghgs_lit.geometry.projection import pixel_centers, sample
 
 _FINER = 4  #: Size of the distance maps relative to photographs
 _FAR = 20.0  #: Distances are clamped to this, in pixels
-_FROM, TO = 0.25, 8.0  #: Range of depth inside the outline, in pixels, whose rays are tried
+_FROM = 0.25
+TO = 8.0  #: Range of depth inside the outline, in pixels, whose rays are tried
 #: Size of the maps, greatest depth of rays in pixels, and every how many rays one is used.
-CAREFUL, QUICK = (_FINER, TO, 1), (1, 1.5, 2)
+CAREFUL = (_FINER, TO, 1)
+QUICK = (1, 1.5, 2)
 _REACH = 0.75  #: Half the step in pixels of slopes of a distance map
 
 
@@ -69,7 +71,8 @@ class Outlines:
         # Places from -1 to 1 over the photograph: ratios of functions that are linear in depth.
         height, width = self.size
         onto = lens.new_tensor([[2 / width, 0, -1], [0, 2 / height, -1], [0, 0, 1]]) @ lens
-        first, slope = onto @ (pose[:3, :3] @ start + pose[:3, 3]), ahead @ (onto @ pose[:3, :3]).mT
+        first = onto @ (pose[:3, :3] @ start + pose[:3, 3])
+        slope = ahead @ (onto @ pose[:3, :3]).mT
         x, y, z = (first[axis] + slope[:, axis, None] * depths for axis in range(3))
         z = torch.where(z > 0, z, 1)
         places = torch.stack((x / z, y / z), -1)[None]

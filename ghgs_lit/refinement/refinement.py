@@ -68,7 +68,8 @@ class Descent:
         changes: what may change, as for :class:`Refinement`."""
 
     def __init__(self, gaussians: Gaussians, batch: Batch | None, changes: Mapping[str, Change]):
-        self.start, self.changes = gaussians.detach(), changes
+        self.start = gaussians.detach()
+        self.changes = changes
         if "means" in changes:
             require(gaussians.image is not None, "refine", "Gaussians of the inputs' pixels", "others")
             self._footprint = _footprints(self.start, batch)
@@ -118,7 +119,9 @@ class Refinement:
 
     def __init__(self, steps: int, renderer: Renderer, changes: Mapping[str, Change] = NEAR):
         require(steps >= 1, "refine", "1 or more steps", steps)
-        self.steps, self.renderer, self.changes = steps, renderer, changes
+        self.steps = steps
+        self.renderer = renderer
+        self.changes = changes
 
     def __call__(self, gaussians: Gaussians, batch: Batch) -> Gaussians:
         """The refined Gaussians. InputError: they do not belong to pixels of ``batch``."""
@@ -126,7 +129,8 @@ class Refinement:
 
     def states(self, gaussians: Gaussians, batch: Batch) -> Iterator[Gaussians]:
         """The Gaussians before the first step and after each; arguments and errors as for a call."""
-        seen, search = seen_by(batch), Descent(gaussians, batch, self.changes)
+        seen = seen_by(batch)
+        search = Descent(gaussians, batch, self.changes)
         yield gaussians.detach()
         for _ in range(self.steps):
             search.step(self.renderer, seen)
@@ -139,7 +143,8 @@ class Refinement:
         too little of a person), which takes as long as prediction and refinement. ``batch``: one element,
         from which both were predicted. ``predict``: gives the Gaussians of a batch, here of the inputs
         without the last."""
-        inputs, held_out = tuple(self._psnr(splats, batch) for splats in (gaussians, refined)), None
+        inputs = tuple(self._psnr(splats, batch) for splats in (gaussians, refined))
+        held_out = None
         *seen, hidden = range(batch.images.shape[1])
         if len(seen) > 2:
             others = batch.of_views(seen)
@@ -163,8 +168,10 @@ def seen_by(batch: Batch) -> Seen:
 
 def _footprints(gaussians: Gaussians, batch: Batch) -> Tensor:
     """Side [N, 1] of a pixel at each Gaussian's depth in its image, in the unit of the world."""
-    extrinsics, intrinsics = batch.cameras.extrinsics.flatten(0, 1), batch.cameras.intrinsics.flatten(0, 1)
-    image, dtype = gaussians.image, gaussians.means.dtype
+    extrinsics = batch.cameras.extrinsics.flatten(0, 1)
+    intrinsics = batch.cameras.intrinsics.flatten(0, 1)
+    image = gaussians.image
+    dtype = gaussians.means.dtype
     depth = world_to_camera(gaussians.means, extrinsics.to(dtype)[image])[:, 2]
     focal = intrinsics.to(dtype).diagonal(dim1=-2, dim2=-1)[:, :2].prod(-1).sqrt()[image]
     return (depth / focal)[:, None]

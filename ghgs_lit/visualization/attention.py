@@ -73,7 +73,8 @@ def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> 
     if torch.equal(attention.weights, attention.plain):
         del kinds[", s = 1"]
     for layer in range(len(attention.weights)):
-        tiles, captions = [], []
+        tiles = []
+        captions = []
         for what, all_weights in kinds.items():
             weights = all_weights[layer].float().mean(0).cpu()
             shares = [float(weights[(near == v).cpu()].sum()) for v in range(views)]
@@ -102,7 +103,8 @@ def _tiles(
     views = tokens.grid[1]
 
     def box(token: int) -> tuple[int, int, int, int]:
-        left, top = int(tokens.column[token]) * side, int(tokens.row[token]) * side
+        left = int(tokens.column[token]) * side
+        top = int(tokens.row[token]) * side
         return left, top, left + side - 1, top + side - 1
 
     viridis = palette("viridis")

@@ -42,6 +42,7 @@ def clouds(batch: Batch, prediction: Prediction, element: int, limit: int = 6000
 def _thinned(cloud: Cloud, limit: int) -> Cloud:
     positions, colors = (part.detach().float().cpu() for part in cloud)
     finite = positions.isfinite().all(-1)
-    positions, colors = positions[finite], colors[finite].nan_to_num(0).clamp(0, 1)
+    positions = positions[finite]
+    colors = colors[finite].nan_to_num(0).clamp(0, 1)
     step = max(1, -(-len(positions) // limit))
     return positions[::step], colors[::step]

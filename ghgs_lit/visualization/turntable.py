@@ -26,8 +26,10 @@ def subject_points(gaussians: Gaussians) -> Tensor:
     points = (gaussians.means[opaque] if bool(opaque.any()) else gaussians.means).detach().double()
     if not len(points):
         return points
-    ordered, last = points.sort(0).values, len(points) - 1
-    low, high = ordered[round(_OUTSIDE * last)], ordered[round((1 - _OUTSIDE) * last)]
+    ordered = points.sort(0).values
+    last = len(points) - 1
+    low = ordered[round(_OUTSIDE * last)]
+    high = ordered[round((1 - _OUTSIDE) * last)]
     return points[((points >= low) & (points <= high)).all(1)]
 
 
@@ -71,7 +73,8 @@ def up_direction(cameras: Cameras) -> Tensor:
     Returns:
         Unit vector [3] of the world, float64.
     """
-    rows, columns = cameras.extrinsics[:, 0, :3].double(), cameras.extrinsics[:, 1, :3].double()
+    rows = cameras.extrinsics[:, 0, :3].double()
+    columns = cameras.extrinsics[:, 1, :3].double()
     mean = -columns.mean(0)
     # Least squares; the small weight of the mean decides where all rows of images are parallel.
     weight = 1e-3 * len(rows)

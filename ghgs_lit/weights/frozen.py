@@ -48,7 +48,8 @@ class Frozen:
             return checkpoint
         known = [(name, tensor.data_ptr(), tensor._version) for name, tensor in tensors.items()]
         if known != self._known:  # hashed again only if something wrote to them
-            self._known, self._digest = known, digest_of(tensors)
+            self._known = known
+            self._digest = digest_of(tensors)
         path = folder / PATTERN.replace("*", self._digest[:16])
         if not path.exists():
             _write(path, tensors)
@@ -73,10 +74,12 @@ def joined(path: str | Path, checkpoint: Mapping[str, Any], whole: bool = False)
     SHA-256. InputError: there is no such file beside the checkpoint, or it holds something else."""
     if "frozen_file" not in checkpoint:
         return dict(checkpoint)
-    place, linked = f"{path}: frozen_file", checkpoint["frozen_file"]
+    place = f"{path}: frozen_file"
+    linked = checkpoint["frozen_file"]
     fits = isinstance(linked, Mapping) and all(isinstance(linked.get(k), str) for k in ("name", "sha256"))
     require(fits, place, "a mapping of name and sha256", linked)
-    name, sha256 = linked["name"], linked["sha256"]
+    name = linked["name"]
+    sha256 = linked["sha256"]
     require(Path(name).name == name, place, "the name of a file beside the checkpoint", name)
     file = file_of(path).resolve().with_name(name)
     if not file.is_file():

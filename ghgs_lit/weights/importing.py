@@ -45,7 +45,8 @@ def fetch(repository: str) -> tuple[str, Path, str]:
             ) from error
     path = Path(cached)
     # The name of a file in the cache is the published checksum.
-    found, published = sha256(path), path.resolve().name
+    found = sha256(path)
+    published = path.resolve().name
     is_whole = found == published or not re.fullmatch(r"[0-9a-f]{64}", published)
     require(is_whole, str(path.resolve()), f"SHA-256 {published}", f"{found}: a broken download: delete it")
     return repository, path, found

@@ -27,8 +27,10 @@ FAILED_DOWNLOADS = (
     (b"<?xml", "an XML document, as servers send it for an error"),
 )
 #: Name and file of the checkpoint that comes with the package (docs/model_card.md).
-SHIPPED, SHIPPED_FILE = "shipped", Path(__file__).with_name("shipped.ckpt")
-ZIP, PICKLE = b"PK", b"\x80"
+SHIPPED = "shipped"
+SHIPPED_FILE = Path(__file__).with_name("shipped.ckpt")
+ZIP = b"PK"
+PICKLE = b"\x80"
 _ENCRYPTED = 1  # flag of a record
 _FLOATS = ("float64", "float32", "float16", "bfloat16")  # precisions of weights
 
@@ -92,7 +94,8 @@ def require_stored(path: Path) -> None:
         is_stored = record.compress_type == zipfile.ZIP_STORED and record.compress_size == record.file_size
         if not is_stored or record.flag_bits & _ENCRYPTED:
             raise _unfit(path, f"a compressed or encrypted record ({record.filename})")
-    claimed, size = sum(record.file_size for record in records), path.stat().st_size
+    claimed = sum(record.file_size for record in records)
+    size = path.stat().st_size
     if claimed > size:
         raise _unfit(path, f"records of {claimed} bytes in a file of {size}")
 
@@ -147,7 +150,8 @@ def require_dense(tensors: "Mapping[str, Any]", path: str | Path) -> None:
             found = f"{value.dtype}, {value.layout} on {value.device}"
             raise InputError(f"{path}: {name}: expected a dense tensor of 16, 32 or 64 bits; found {found}")
         if value.nbytes > value.untyped_storage().nbytes():
-            shape, stored = tuple(value.shape), value.untyped_storage().nbytes()
+            shape = tuple(value.shape)
+            stored = value.untyped_storage().nbytes()
             raise InputError(f"{path}: {name}: expected as many bytes as {shape} takes; found {stored}")
 
 
@@ -165,7 +169,8 @@ def cast(
     used = 0
     for name in changed:
         if used > _CHUNK:
-            tensors, used = {}, 0
+            tensors = {}
+            used = 0
             tensors = open_tensors()
         used += tensors[name].nbytes
         result[name] = tensors[name].to(target[name])

@@ -19,7 +19,8 @@ QUERIES = 96
 
 # Multiplications from which the kernel is faster, on one thread and on several, where PyTorch's operator
 # divides small products better: 360 and 1450 tokens in two heads of 32 channels.
-_SMALL, _LARGE = 1 << 23, 1 << 27
+_SMALL = 1 << 23
+_LARGE = 1 << 27
 # Processor features that the kernel needs.
 _FEATURES = {"avx2", "fma"}
 

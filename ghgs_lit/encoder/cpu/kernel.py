@@ -24,10 +24,13 @@ def attend_head(q, k, v, out, first, last):
     [tokens, d] with any strides, ``d`` a multiple of 32."""
     tokens, width = k.shape
     scale = np.float32(math.log2(math.e) / math.sqrt(width))
-    keys, values = _packed_keys(k), _packed_values(v)
+    keys = _packed_keys(k)
+    values = _packed_values(v)
     queries = simd.aligned(QUERIES * width)
-    scores, weights = simd.aligned(ROWS * KEYS), simd.aligned(ROWS * KEYS)
-    totals, sums = simd.aligned(QUERIES * width), simd.aligned(QUERIES * LANES)
+    scores = simd.aligned(ROWS * KEYS)
+    weights = simd.aligned(ROWS * KEYS)
+    totals = simd.aligned(QUERIES * width)
+    sums = simd.aligned(QUERIES * LANES)
     highest = np.empty(QUERIES, np.float32)
     for start in range(first, last, QUERIES):
         count = min(QUERIES, last - start)
@@ -125,7 +128,9 @@ def _scale_down(exponent, sums, totals, r, width):
 @helper
 def _weigh(scores, r, seen, scale, top, weights, sums, query):
     """Write the weights ``2^(scale s - top)`` of a row of scores, and add them to the sum of each lane."""
-    total, minus, limit = memory.load(sums, query * LANES), simd.full(-scale), simd.full(EXP2_LIMIT)
+    total = memory.load(sums, query * LANES)
+    minus = simd.full(-scale)
+    limit = simd.full(EXP2_LIMIT)
     for i in range(0, _padded(seen), LANES):
         depth = simd.fma(memory.load(scores, r * KEYS + i), minus, top)
         # ``minimum`` gives the second argument where either is NaN, so NaN stays.

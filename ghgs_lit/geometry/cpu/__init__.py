@@ -11,7 +11,8 @@ from torch import Tensor
 from ghgs_lit.kernels import pool
 
 #: Pixels, and rows of an image, in one task.
-_PIXELS, _ROWS = 1024, 64
+_PIXELS = 1024
+_ROWS = 64
 
 
 def padded(photo: Float[Tensor, "B V 3 H W"], masks: Bool[Tensor, "B V H W"]) -> Tensor:

@@ -22,7 +22,8 @@ def _vector(count: int) -> ir.VectorType:
 
 def _between(builder, low, high, share):
     """``low + share (high - low)`` for vectors of any length."""
-    kind, share = low.type, everywhere(builder, share, low.type.count)
+    kind = low.type
+    share = everywhere(builder, share, low.type.count)
     function = ir.FunctionType(kind, [kind] * 3)
     callee = cgutils.get_or_insert_function(builder.module, function, f"llvm.fmuladd.v{kind.count}f32")
     return builder.call(callee, [share, builder.fsub(high, low), low])
@@ -35,8 +36,10 @@ def interpolate(typing_context, pixels, at, line, right, down, out, place):
     pixels of a line are loaded at once."""
 
     def emit(context, builder, sig, args):
-        pair, array = _vector(2 * CHANNELS), sig.args[0]
-        index, below = args[1], builder.add(args[1], args[2])
+        pair = _vector(2 * CHANNELS)
+        array = sig.args[0]
+        index = args[1]
+        below = builder.add(args[1], args[2])
         lines = [
             builder.load(pointer_to(context, builder, array, args[0], i, types.intp, pair), align=4)
             for i in (index, below)
@@ -87,28 +90,39 @@ def store_places(typing_context, places, at, row, column, line):
 
 ZERO, HALF, ONE, THREE = (np.float32(x) for x in (0, 0.5, 1, 3))
 
-PIXELS, MASKS = types.Array(types.int64, 1, "C"), types.Array(types.boolean, 3, "C")
+PIXELS = types.Array(types.int64, 1, "C")
+MASKS = types.Array(types.boolean, 3, "C")
 _SWEPT = (FLOATS[1], PIXELS, FLOATS[1], FLOATS[1], FLOATS[5], FLOATS[4], MASKS, FLOATS[1])
 
 
 @kernel_for(FLOATS[4], MASKS, FLOATS[1], NUMBER, NUMBER, NUMBER)
 def smooth_rows(photo, masks, out, image, first, last):
     """Write rows ``first`` to ``last`` of ``image``; see :func:`ghgs_lit.geometry.cpu.padded`."""
-    height, width = masks.shape[1], masks.shape[2]
+    height = masks.shape[1]
+    width = masks.shape[2]
     for row in range(first, last):
-        top, bottom = max(row - 1, 0), min(row + 2, height)
+        top = max(row - 1, 0)
+        bottom = min(row + 2, height)
         if not masks[image, top:bottom].any():
             continue
         for column in range(width):
-            red, green, blue, count = ZERO, ZERO, ZERO, ZERO
+            red = ZERO
+            green = ZERO
+            blue = ZERO
+            count = ZERO
             at = ((image * (height + 2) + row + 1) * (width + 2) + column + 1) * CHANNELS
             for y in range(top, bottom):
                 for x in range(max(column - 1, 0), min(column + 2, width)):
                     if not masks[image, y, x]:
                         continue
-                    r, g, b = photo[image, 0, y, x], photo[image, 1, y, x], photo[image, 2, y, x]
+                    r = photo[image, 0, y, x]
+                    g = photo[image, 1, y, x]
+                    b = photo[image, 2, y, x]
                     if np.isfinite(r + g + b):
-                        red, green, blue, count = red + r, green + g, blue + b, count + ONE
+                        red = red + r
+                        green = green + g
+                        blue = blue + b
+                        count = count + ONE
                         if y == row and x == column:
                             out[at + 3] = ONE
             if count > ZERO:
@@ -133,8 +147,10 @@ def _project(rays, shift, depth, height, width, places, rights, downs):
     x = simd.fma(rays[0], depth, shift[0]) * inverse - HALF
     y = simd.fma(rays[1], depth, shift[1]) * inverse - HALF
     seen = (z > ZERO) & (x > -ONE) & (x < np.float32(width)) & (y > -ONE) & (y < np.float32(height))
-    x, y = simd.select(seen, x, -ONE), simd.select(seen, y, -ONE)
-    left, top = simd.floor(x), simd.floor(y)
+    x = simd.select(seen, x, -ONE)
+    y = simd.select(seen, y, -ONE)
+    left = simd.floor(x)
+    top = simd.floor(y)
     memory.store(rights, 0, x - left)
     memory.store(downs, 0, y - top)
     store_places(places, 0, top + ONE, left + ONE, (width + 2) * CHANNELS)
@@ -151,7 +167,8 @@ def _load_pixels(colors, pixels, near, far, start, last, height, width, begin, v
     for lane in range(LANES):
         i = min(start + lane, last - 1)
         place = pixels[i] % (height * width)
-        row, column = place // width, place % width
+        row = place // width
+        column = place % width
         values[lane], values[LANES + lane] = np.float32(column) + HALF, np.float32(row) + HALF
         values[2 * LANES + lane], values[3 * LANES + lane] = near[i], far[i] - near[i]
         at = begin + ((row + 1) * (width + 2) + column + 1) * CHANNELS
@@ -166,23 +183,31 @@ def sweep_pixels(
 ):  # fmt: skip
     """Write rows ``first`` to ``last``, pixels of ``image``; see :func:`ghgs_lit.geometry.cpu.sweep`."""
     views = turn.shape[1]
-    element, view = image // views, image % views
+    element = image // views
+    view = image % views
     line = (width + 2) * CHANNELS
     size = (height + 2) * line
     rate = np.float32(math.log2(math.e)) / (THREE * tolerance)
-    values, own, found = simd.aligned(4 * LANES), simd.aligned(4 * LANES), simd.aligned(4 * LANES)
-    rights, downs, places = simd.aligned(LANES), simd.aligned(LANES), np.empty(LANES, np.int32)
+    values = simd.aligned(4 * LANES)
+    own = simd.aligned(4 * LANES)
+    found = simd.aligned(4 * LANES)
+    rights = simd.aligned(LANES)
+    downs = simd.aligned(LANES)
+    places = np.empty(LANES, np.int32)
     best = simd.aligned(len(shares) * LANES)
     for start in range(first, last, LANES):
         _load_pixels(colors, pixels, near, far, start, last, height, width, image * size, values, own)
-        u, v = memory.load(values, 0), memory.load(values, LANES)
-        low, length = memory.load(values, 2 * LANES), memory.load(values, 3 * LANES)
+        u = memory.load(values, 0)
+        v = memory.load(values, LANES)
+        low = memory.load(values, 2 * LANES)
+        length = memory.load(values, 3 * LANES)
         red, green, blue, _ = channels_of(own, 0)
         best[:] = ZERO
         for other in range(views):
             if other == view or not compared[element, view, other]:
                 continue
-            rays, moved = _rays(turn[element, view, other], u, v), shift[element, view, other]
+            rays = _rays(turn[element, view, other], u, v)
+            moved = shift[element, view, other]
             begin = (element * views + other) * size
             for s in range(len(shares)):
                 depth = simd.fma(length, shares[s], low)

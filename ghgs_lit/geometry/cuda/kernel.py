@@ -21,7 +21,8 @@ def _row(x, y, z, first, second, third):
 def relations_rows(count, intrinsics, extrinsics, turn, shift, facing, views, ROWS: tl.constexpr):
     """Write what leads from pixels of view j to those of view k, for rows (element, j, k)."""
     i = rows_of(count, ROWS)
-    k, j = i // (views * views) * views + i % views, i // views
+    k = i // (views * views) * views + i % views
+    j = i // views
     a, b, c, of_a = load4(extrinsics, 4 * j)
     d, e, f, of_b = load4(extrinsics, 4 * j + 1)
     g, h, m, of_c = load4(extrinsics, 4 * j + 2)
@@ -39,8 +40,10 @@ def relations_rows(count, intrinsics, extrinsics, turn, shift, facing, views, RO
     fx, skew, cx = load3(intrinsics, 3 * j)
     _, fy, cy = load3(intrinsics, 3 * j + 1)
     # Rows of K_j^-1, an upper triangular matrix.
-    zero, unit = tl.zeros_like(fx), tl.zeros_like(fx) + 1
-    top, middle = (1 / fx, -skew / (fx * fy), (skew * cy / fy - cx) / fx), (zero, 1 / fy, -cy / fy)
+    zero = tl.zeros_like(fx)
+    unit = tl.zeros_like(fx) + 1
+    top = (1 / fx, -skew / (fx * fy), (skew * cy / fy - cx) / fx)
+    middle = (zero, 1 / fy, -cy / fy)
     one = _row(one[0], one[1], one[2], top, middle, (zero, zero, unit))
     two = _row(two[0], two[1], two[2], top, middle, (zero, zero, unit))
     tl.store(facing + i, three[2])
@@ -60,24 +63,31 @@ def smoothed_rows(count, photo, masks, out, height, width, ROWS: tl.constexpr):
     """Write the four channels of ``ROWS`` pixels."""
     i = rows_of(count, ROWS)
     area = height * width
-    image, row, column = i // area, i % area // width, i % width
-    red, green, blue, number = tl.zeros_like(i), tl.zeros_like(i), tl.zeros_like(i), tl.zeros_like(i)
-    red, green = red.to(tl.float32), green.to(tl.float32)
+    image = i // area
+    row = i % area // width
+    column = i % width
+    red = tl.zeros_like(i)
+    green = tl.zeros_like(i)
+    blue = tl.zeros_like(i)
+    number = tl.zeros_like(i)
+    red = red.to(tl.float32)
+    green = green.to(tl.float32)
     blue, number, own = blue.to(tl.float32), number.to(tl.float32), number.to(tl.float32)
     for k in tl.static_range(9):
-        y, x = row + k // 3 - 1, column + k % 3 - 1
+        y = row + k // 3 - 1
+        x = column + k % 3 - 1
         inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
         place = y * width + x
         inside &= tl.load(masks + image * area + place, inside, 0) != 0
         at = photo + image * 3 * area + place
-        r, g, b = (
-            tl.load(at, inside, 0.0),
-            tl.load(at + area, inside, 0.0),
-            tl.load(at + 2 * area, inside, 0.0),
-        )
+        r = tl.load(at, inside, 0.0)
+        g = tl.load(at + area, inside, 0.0)
+        b = tl.load(at + 2 * area, inside, 0.0)
         inside &= (r + g + b) - (r + g + b) == 0  # finite
-        red, green = red + tl.where(inside, r, 0.0), green + tl.where(inside, g, 0.0)
-        blue, number = blue + tl.where(inside, b, 0.0), number + tl.where(inside, 1.0, 0.0)
+        red = red + tl.where(inside, r, 0.0)
+        green = green + tl.where(inside, g, 0.0)
+        blue = blue + tl.where(inside, b, 0.0)
+        number = number + tl.where(inside, 1.0, 0.0)
         if k == 4:
             own = tl.where(inside, 1.0, 0.0)
     scale = 1 / tl.maximum(number, 1.0)
@@ -95,14 +105,20 @@ def swept_rows(
 ):  # fmt: skip
     """Write the agreement of ``ROWS`` pixels at depths; ``count``: pixels times depths."""
     i = rows_of(count, ROWS)
-    n, step = i // steps, i % steps
+    n = i // steps
+    step = i % steps
     area = height * width
-    pixel, low = tl.load(pixels + n), tl.load(near + n)
-    image, place = pixel // area, pixel % area
-    u, v = (place % width).to(tl.float32) + 0.5, (place // width).to(tl.float32) + 0.5
+    pixel = tl.load(pixels + n)
+    low = tl.load(near + n)
+    image = pixel // area
+    place = pixel % area
+    u = (place % width).to(tl.float32) + 0.5
+    v = (place // width).to(tl.float32) + 0.5
     depth = low + (tl.load(far + n) - low) * ((step.to(tl.float32) + 0.5) / steps)
     at = colors + image * 4 * area + place
-    red, green, blue = tl.load(at), tl.load(at + area), tl.load(at + 2 * area)
+    red = tl.load(at)
+    green = tl.load(at + area)
+    blue = tl.load(at + 2 * area)
     best = tl.zeros_like(depth)
     for other in range(1, views):
         k = (image + other) % views
@@ -114,12 +130,15 @@ def swept_rows(
         a, b, c = load3(turn, 3 * pair + 2)
         z = a * u + b * v + c
         a, b, c = load3(shift, pair)
-        x, y, z = x * depth + a, y * depth + b, z * depth + c
+        x = x * depth + a
+        y = y * depth + b
+        z = z * depth + c
         is_front = z > 0
         z = tl.where(is_front, z, 1.0)
         left, right, before, after = cells(x / z, width)
         top, bottom, above, below = cells(y / z, height)
-        top, bottom = top * width, bottom * width
+        top = top * width
+        bottom = bottom * width
         there = colors + (image // views * views + k) * 4 * area
         r = between(there, top, bottom, left, right, above, below, before, after)
         g = between(there + area, top, bottom, left, right, above, below, before, after)
