@@ -38,6 +38,9 @@ if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"
 
 import tests.helpers.composing  # noqa: E402, F401
+from ghgs_lit.config.registry import load_plugins  # noqa: E402
+
+load_plugins()  # before any test has a register of its own
 
 torch.set_num_threads(_THREADS)
 

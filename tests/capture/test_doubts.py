@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from ghgs_capture import predict as predicting
+from ghgs_capture import prediction as predicting
 from ghgs_capture.capture import Capture
 from ghgs_capture.doubts import CORRECTION, doubt_of_cameras, doubt_of_masks
 from ghgs_capture.prediction import predict
