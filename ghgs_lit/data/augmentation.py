@@ -29,7 +29,9 @@ from ghgs_lit.data.matting import refined_matte
 from ghgs_lit.types import Batch, Cameras
 
 # Streams of random numbers beside those of ghgs_lit.data.sampling.
-_SIZES, _IMPERFECTIONS, _CHANCE = 3, 4, 5
+_SIZES = 3
+_IMPERFECTIONS = 4
+_CHANCE = 5
 
 #: Greatest diameter of a missing piece of a mask over the subject's height, as of a hand or foot.
 HOLE = 0.12
@@ -148,7 +150,10 @@ class Augmentation(Options):
         streams = [rng.spawn(6) for rng in rngs]
         if self.cut:
             batch = cut(batch, self.cut, [s[4] for s in streams])
-        images, masks, cameras, alpha = batch.images, batch.masks, batch.cameras, batch.alpha
+        images = batch.images
+        masks = batch.masks
+        cameras = batch.cameras
+        alpha = batch.alpha
         if self.exposure or self.white_balance:
             views = masks.shape[1]
             gains = [color_gains(views, self.exposure, self.white_balance, s[0]) for s in streams]

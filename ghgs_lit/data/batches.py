@@ -93,7 +93,8 @@ class TrainingBatches(Dataset):
 
     def sizes(self, step: int) -> tuple[Size, Size]:
         """(height, width) of the inputs and of the targets at a step."""
-        inputs, targets = self.builder.inputs.size, self.builder.targets.size
+        inputs = self.builder.inputs.size
+        targets = self.builder.targets.size
         return self.augmentation.draw_sizes(inputs, targets, self.sampler.seed, step)
 
     def __getitem__(self, step: int) -> Batch:

@@ -30,7 +30,8 @@ _LINE = re.compile(r"(?P<place>.*?): expected (?P<expected>.*); found (?P<found>
 _SHOWN = 30
 # MiB of decoded files kept, so that a body is read once for all photographs of its subject.
 _CACHE_MB = 4
-_PICTURED_SUBJECTS, _PICTURED_VIEWS = 6, 8
+_PICTURED_SUBJECTS = 6
+_PICTURED_VIEWS = 8
 # A subject whose channels are all below this, of 255, counts as black.
 _BLACK = 8
 # Metres: taller subjects suggest another unit.
@@ -108,7 +109,8 @@ class _Readings(Dataset):
 
     def __getitem__(self, index: int) -> Seen:
         photograph = self.listed[index]
-        seen, wanted = Seen(*photograph), photograph in self.pictured
+        seen = Seen(*photograph)
+        wanted = photograph in self.pictured
         try:
             view = self.photographs.view(*photograph)
             body = self.photographs.body(seen.name)
@@ -120,7 +122,9 @@ class _Readings(Dataset):
         seen.tile = draw_tile(view, body) if wanted else None
         seen.bright = float(view.image[view.mask].mean() / 255)
         if body is not None:
-            seen.body, seen.tall, seen.iou = True, float(np.ptp(body, axis=0).max()), overlap(body, view)
+            seen.body = True
+            seen.tall = float(np.ptp(body, axis=0).max())
+            seen.iou = overlap(body, view)
         if (problem := self._problem(view, seen.iou)) is not None:
             seen.problem = f"{self.photographs.reader.place(*photograph)}: {problem}"
         elif seen.iou is None:
@@ -143,7 +147,8 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
     ``min_iou``: least IoU of a body's silhouette and a mask; clothed people reach 0.75 to 0.95, wrong cameras
     0 to 0.4. ``min_agreement``, without a body: least share of a mask that the subject's other masks allow;
     right cameras reach 0.98 to 1."""
-    report, dataset = Report(), data.dataset
+    report = Report()
+    dataset = data.dataset
     # Static cameras allow only one protocol.
     targets = CAMERAS if dataset.static_cameras else data.targets
     for phase in PHASES:
@@ -228,7 +233,8 @@ def _compare_subject(seen: Sequence[Seen], reader: Reader, least: float) -> None
     silhouettes = [one.silhouette for one in seen]
     tall = height(silhouettes)
     for one, share in zip(seen, SEARCH.shares(silhouettes), strict=True):
-        one.agreement, one.tall = share, tall if one.tall is None else one.tall
+        one.agreement = share
+        one.tall = tall if one.tall is None else one.tall
     worst = min(seen, key=lambda one: one.agreement)
     if worst.agreement < least:
         worst.problem = (
@@ -239,7 +245,8 @@ def _compare_subject(seen: Sequence[Seen], reader: Reader, least: float) -> None
 
 
 def _notes(published: int | None, phase: str, found: Phase) -> list[str]:
-    reader, notes = found.reader, []
+    reader = found.reader
+    notes = []
     if published is not None and reader.people != published:
         notes.append(f"{phase}: expected {published} people as published; found {reader.people}")
     if found.bodies < len(reader.subjects):
@@ -307,7 +314,8 @@ def split_line(line: str) -> tuple[str, str, str]:
 
 
 def _counts(phase: Phase) -> dict[str, int]:
-    reader, broken = phase.reader, sum(one.problem is not None for one in phase.seen)
+    reader = phase.reader
+    broken = sum(one.problem is not None for one in phase.seen)
     counts = (reader.people, len(reader.subjects), len(phase.seen), broken, phase.bodies)
     return dict(zip(("people", "subjects", "photos", "broken", "bodies"), counts, strict=True))
 
@@ -324,7 +332,8 @@ def show(report: Report) -> None:
     """Print the report as tables."""
     table = Table("phase", "people", "subjects", "photos", "broken", "bodies", "mean IoU", "min IoU", "agree")
     for name, phase in report.phases.items():
-        iou, agreement = phase.known("iou"), phase.known("agreement")
+        iou = phase.known("iou")
+        agreement = phase.known("agreement")
         numbers = [f"{np.mean(iou):.3f}", f"{min(iou):.3f}"] if iou else ["-", "-"]
         numbers.append(f"{min(agreement):.3f}" if agreement else "-")
         table.add_row(name, *map(str, _counts(phase).values()), *numbers)
@@ -343,7 +352,8 @@ def show(report: Report) -> None:
 
 def write(report: Report, folder: Path) -> Path:
     """Write ``check.json`` and, if there are photographs, ``contact.png``; return ``folder``."""
-    keys, rows = ("place", "expected", "found"), dict[str, list[Tile]]()
+    keys = ("place", "expected", "found")
+    rows = dict[str, list[Tile]]()
     content = {
         "problems": [dict(zip(keys, split_line(line), strict=True)) for line in report.problems],
         "notes": report.notes,

@@ -102,7 +102,8 @@ class PhotographsDataModule(LightningDataModule):
         """Batch builder of a split, made at its first use."""
         choice("split", phase, self.dataset.split_names)
         if phase not in self._builders:
-            data, reader = self.dataset, self.dataset.reader(phase)
+            data = self.dataset
+            reader = self.dataset.reader(phase)
             inputs = targets = PhotographCache(reader, data.size, data.cache_images_mb, data.resampling)
             if data.target_size not in (None, data.size):
                 targets = PhotographCache(reader, data.target_size, data.cache_images_mb, data.resampling)
@@ -244,7 +245,8 @@ class PhotographsDataModule(LightningDataModule):
     def _evaluation_samples(
         self, subjects: Mapping[str, tuple[int, ...]], protocols: Sequence[TargetProtocol], views: int | None
     ) -> list[SampleSpec]:
-        data, count = self.dataset, self.views.evaluation_count if views is None else views
+        data = self.dataset
+        count = self.views.evaluation_count if views is None else views
         possible = [self._possible(protocol) for protocol in protocols]
         return evaluation_samples(subjects, count, possible, data.ring, self.seed, data.evaluation_positions)
 

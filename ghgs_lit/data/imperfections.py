@@ -23,7 +23,8 @@ _GAMMA = 2.2
 # Width of the bumps of a ragged outline in pixels.
 _BUMP = 6
 # Patches of backgrounds: number along a side and deviation of colours; noise of single pixels.
-_PATCHES, _NOISE = ((3, 0.35), (12, 0.15), (40, 0.06)), 0.02
+_PATCHES = ((3, 0.35), (12, 0.15), (40, 0.06))
+_NOISE = 0.02
 
 
 def color_gains(
@@ -103,7 +104,8 @@ def imperfect_mask(
         noise = noise[: mask.shape[0], : mask.shape[1]][window]
         result[window] = signed_distance(part) + (2 * grow - 1) * offset + height * ragged * noise > 0
     if missing < hole_chance:
-        middle, radius = int(place * len(rows)), size * hole * (rows.max() - rows.min() + 1) / 2
+        middle = int(place * len(rows))
+        radius = size * hole * (rows.max() - rows.min() + 1) / 2
         v, u = np.ogrid[: mask.shape[0], : mask.shape[1]]
         result &= (v - rows[middle]) ** 2 + (u - columns[middle]) ** 2 >= radius**2
     return result if result.any() else mask
@@ -163,7 +165,8 @@ def miscalibrated(
     count = len(masks)
     directions = torch.from_numpy(rng.standard_normal((count, 6)))
     wanted = pixels * torch.from_numpy(rng.uniform(size=count))
-    lenses, poses = cameras.intrinsics.double(), cameras.extrinsics.double()
+    lenses = cameras.intrinsics.double()
+    poses = cameras.extrinsics.double()
     distances = (poses[:, 2, :3] * look_at_point(cameras)).sum(-1) + poses[:, 2, 3]
     expected = "cameras that look at the subject"
     require(bool((distances > 0).all()), "augmentation.calibration", expected, distances.tolist())
@@ -171,10 +174,12 @@ def miscalibrated(
 
     def moved(errors: Tensor) -> tuple[Tensor, Tensor]:
         """Intrinsics and extrinsics after errors [V, 6], each about in pixels."""
-        focal, half = lenses[:, 1, 1], max(cameras.height, cameras.width) / 2
+        focal = lenses[:, 1, 1]
+        half = max(cameras.height, cameras.width) / 2
         turn = errors[:, :3] / 2 / torch.stack((focal, focal, torch.full_like(focal, half)), -1)
         rotation = quaternion_to_matrix(torch.cat((torch.ones(count, 1, dtype=turn.dtype), turn), -1))
-        pose, lens = poses.clone(), lenses.clone()
+        pose = poses.clone()
+        lens = lenses.clone()
         pose[:, :3] = rotation @ poses[:, :3]
         pose[:, :2, 3] += errors[:, 3:5] * (distances / focal)[:, None]
         lens[:, [0, 1], [0, 1]] *= 1 + errors[:, 5:] / half
@@ -215,7 +220,8 @@ def _apart(
     cameras: Cameras, lens: Float[Tensor, "V 3 3"], pose: Float[Tensor, "V 4 4"]
 ) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"]]:
     """Intrinsics and extrinsics without the common part of their differences from ``cameras``."""
-    true, middle = cameras.extrinsics.double(), look_at_point(cameras).double()
+    true = cameras.extrinsics.double()
+    middle = look_at_point(cameras).double()
     motions = without_common(motions_between(true, pose, middle), true[:, 2, :3])
     both = [0, 1]
     zoom = lens[:, both, both] / cameras.intrinsics.double()[:, both, both]
@@ -234,10 +240,13 @@ def cut(batch: Batch, chance: float, rngs: list[np.random.Generator]) -> Batch:
     photograph shows; the others in some inputs, at different heights. Photographs are moved down in their
     frames, and principal points with them."""
     views = batch.masks.shape[1]
-    shares, ends = np.ones(batch.masks.shape[:2]), np.ones(len(rngs))
+    shares = np.ones(batch.masks.shape[:2])
+    ends = np.ones(len(rngs))
     for b, rng in enumerate(rngs):
         is_cut, everywhere, *drawn = rng.uniform(size=3 + 2 * views)
-        height, chosen, heights = drawn[0], np.array(drawn[1 : 1 + views]), np.array(drawn[1 + views :])
+        height = drawn[0]
+        chosen = np.array(drawn[1 : 1 + views])
+        heights = np.array(drawn[1 + views :])
         low, high = _SHOWN
         if is_cut >= chance:
             continue
@@ -262,7 +271,8 @@ def cut(batch: Batch, chance: float, rngs: list[np.random.Generator]) -> Batch:
 
 def _rows(masks: Bool[Tensor, "B V H W"], shares: Float[np.ndarray, "B V"]) -> list[list[int]]:
     """Rows by which photographs move down so that the given share of the mask's height remains."""
-    height, views = masks.shape[2], masks.shape[1]
+    height = masks.shape[2]
+    views = masks.shape[1]
     found = []
     for seen, share in zip(extents(masks.flatten(0, 1)), shares.flatten(), strict=True):
         end = math.ceil(seen.top + share * (seen.bottom - seen.top))

@@ -122,7 +122,8 @@ class Rendered(DataOptions):
         return len(names) > 0
 
     def reader(self, phase: str, strict: bool = True) -> "Layout":
-        names, limit = self.subject_names(phase), self.limit.of(phase)
+        names = self.subject_names(phase)
+        limit = self.limit.of(phase)
         return Layout(self.folder, phase, names, limit, self.pixel_centers, strict)
 
 
@@ -254,7 +255,8 @@ class Layout(Reader):
             inverse = inverse.astype(np.uint16)
             seen = inverse.any() or not mask.any()
             require(seen, str(path), "inverse depth above 0 at the subject", "0 everywhere")
-        path, matte = self._file(name, "alpha", position, f"{view}.png"), None
+        path = self._file(name, "alpha", position, f"{view}.png")
+        matte = None
         if path.exists():
             matte = read_map(path, size)
             if matte.dtype != np.uint8:

@@ -15,7 +15,8 @@ _CELLS = 64
 #: Comparison of masks, of which a quarter may be wrong.
 SEARCH = HullSearch(rays=200, depths=64, reach=1.0, others=12, wrong=0.25)
 # Least share of a photograph and greatest share of its border that a person covers.
-_LEAST_SHARE, _MOST_BORDER = 1e-3, 0.5
+_LEAST_SHARE = 1e-3
+_MOST_BORDER = 0.5
 
 
 def silhouette(view: View) -> Silhouette:

@@ -17,7 +17,8 @@ _CELLS = 96
 
 def project(vertices: np.ndarray, view: View) -> np.ndarray:
     """Pixels [m, 2] (u, v), float64, of the vertices [n, 3] in front of the camera."""
-    pose, matrix = view.extrinsics.astype(np.float64), view.intrinsics.astype(np.float64)
+    pose = view.extrinsics.astype(np.float64)
+    matrix = view.intrinsics.astype(np.float64)
     points = vertices.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
     points = points[points[:, 2] > 1e-6] @ matrix.T
     return points[:, :2] / points[:, 2:]
@@ -37,13 +38,15 @@ def overlap(vertices: np.ndarray, view: View) -> float | None:
     pixels = pixels[shown]
     cells = min(_CELLS, int(1.2 * np.sqrt(len(vertices))))
     cell = max(np.ptp(pixels[:, 1]) / cells, 1.0)
-    rows, columns = max(round(height / cell), 1), max(round(width / cell), 1)
+    rows = max(round(height / cell), 1)
+    columns = max(round(width / cell), 1)
     share = area_image(np.repeat(view.mask[..., None] * np.uint8(255), 3, -1), rows, columns)[..., 0]
     hit = np.zeros((rows, columns), bool)
     row = (pixels[:, 1] * rows / height).astype(int)
     column = (pixels[:, 0] * columns / width).astype(int)
     hit[row, column] = True
-    body, subject = _joined(hit), share >= 128
+    body = _joined(hit)
+    subject = share >= 128
     return float((body & subject).sum() / max((body | subject).sum(), 1))
 
 
@@ -55,8 +58,11 @@ def _joined(hit: np.ndarray) -> np.ndarray:
 
 
 Tile = np.ndarray
-_HEIGHT, _LINE = 176, 14
-_GREEN, _RED, _GREY = (0, 255, 90), (255, 60, 40), (70, 70, 70)
+_HEIGHT = 176
+_LINE = 14
+_GREEN = (0, 255, 90)
+_RED = (255, 60, 40)
+_GREY = (70, 70, 70)
 _DOTS = 400
 
 

@@ -39,7 +39,8 @@ _OPEN_FILES = 128
 _SHARE_OF_DISK = 0.5
 #: Numbers of each photograph in a file: where it begins, its size, the part of it that is kept, its maps.
 _COLUMNS = ("position", "view", "start", "height", "width", "top", "bottom", "left", "right", "maps")
-_MATTE, _DEPTH = 1, 2
+_MATTE = 1
+_DEPTH = 2
 
 
 @dataclass(frozen=True)
@@ -146,7 +147,9 @@ class PackedReader(Reader):
             log.warning("%s: expected room for packed photographs; found %s", path, error.strerror)
 
     def _content(self, name: str) -> dict[str, np.ndarray]:
-        rows, matrices, parts = [], [], [np.empty(0, np.uint8)]
+        rows = []
+        matrices = []
+        parts = [np.empty(0, np.uint8)]
         start = 0
         for position in self.subjects[name]:
             for view in self.packing.views:
@@ -224,7 +227,10 @@ def _packed(view: View) -> tuple[tuple[int, ...], np.ndarray]:
             shown = shown | (array != 0)
     shown[0, 0] |= not shown.any()  # a part has a pixel
     rows, columns = (np.flatnonzero(shown.any(axis)) for axis in (1, 0))
-    top, bottom, left, right = int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+    top = int(rows[0])
+    bottom = int(rows[-1]) + 1
+    left = int(columns[0])
+    right = int(columns[-1]) + 1
     parts = [np.ascontiguousarray(array[top:bottom, left:right]).view(np.uint8).ravel() for _, array in there]
     maps = sum(flag for flag, _ in there)
     return (*view.mask.shape, top, bottom, left, right, maps), np.concatenate(parts)

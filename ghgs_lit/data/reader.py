@@ -152,8 +152,11 @@ class PhotographCache:
         resampling: str = "area",
     ) -> None:
         require(cache_mb >= 0, "data.cache_images_mb", "at least 0", cache_mb)
-        self.reader, self.size, self.resampling = reader, size, resampling
-        self.cached_bytes, self.cache_bytes = 0, int(cache_mb * 2**20)
+        self.reader = reader
+        self.size = size
+        self.resampling = resampling
+        self.cached_bytes = 0
+        self.cache_bytes = int(cache_mb * 2**20)
         self._cache: OrderedDict[tuple, View | np.ndarray | None] = OrderedDict()
 
     def view(

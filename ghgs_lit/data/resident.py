@@ -124,8 +124,10 @@ class ResidentPhotographs:
                 whole[name][number] = map_.to(device)
         size = sum(map_.nbytes for map_ in whole.values()) / 1e9
         log.info("%d photographs of training stay on %s: %.2g GB", count, device, size)
-        self.images, self.masks = whole["images"], whole["masks"]
-        self.mattes, self.inverse = whole.get("mattes"), whole.get("inverse")
+        self.images = whole["images"]
+        self.masks = whole["masks"]
+        self.mattes = whole.get("mattes")
+        self.inverse = whole.get("inverse")
 
     def without_maps(self) -> "ResidentPhotographs":
         """Numbers and cameras alone."""
@@ -152,7 +154,8 @@ class ResidentPhotographs:
         """Images [B, V, 3, h, w] in [0, 1], masks, depths in metres and mattes in [0, 1] [B, V, h, w]."""
         mattes = None if self.mattes is None else self.mattes[rows]
         inverse = self.inverse[rows] if depth and self.inverse is not None else None
-        images, masks = self.images[rows], self.masks[rows]
+        images = self.images[rows]
+        masks = self.masks[rows]
         images = images.permute(0, 1, 4, 2, 3)
         if size != self.size:
             images = _levels(images, size)
@@ -160,7 +163,8 @@ class ResidentPhotographs:
                 masks = shown = _area_means(masks, size) > 0.5 - 1e-6
             else:
                 mattes = _levels(mattes, size)
-                masks, shown = mattes >= 128, mattes > 0
+                masks = mattes >= 128
+                shown = mattes > 0
             if inverse is not None:
                 inverse = _centered_depth(inverse.to(torch.int32) & 0xFFFF, size) * shown
         elif inverse is not None:
@@ -239,7 +243,8 @@ def resident_batches(batches: TrainingBatches, device: torch.device) -> DrawnBat
     Raises:
         InputError: photographs do not fit there, or are drawn at larger sizes than they are stored.
     """
-    builder, augmentation = batches.builder, batches.augmentation
+    builder = batches.builder
+    augmentation = batches.augmentation
     views = (RING_VIEW, *batches.sampler.targets.training_views)
     varies = augmentation.varies_sizes
     inputs = ResidentPhotographs(builder.inputs, views, builder.depths, varies, device)

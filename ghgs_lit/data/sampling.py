@@ -18,9 +18,12 @@ from pydantic import Field, model_validator
 from ghgs_lit.config.options import Count, Index, Options, Text
 from ghgs_lit.errors import InputError, require
 
-RING_VIEW, MIDDLE_VIEW = 0, 3
+RING_VIEW = 0
+MIDDLE_VIEW = 3
 # Independent streams of random numbers.
-_ORDER, _COUNT, _SAMPLE = 0, 1, 2
+_ORDER = 0
+_COUNT = 1
+_SAMPLE = 2
 
 #: (ring position, view number)
 Photo = tuple[int, int]
@@ -70,7 +73,8 @@ class ViewProtocol(Options):
     def draw(self, available: Sequence[int], count: int, ring: int, rng: np.random.Generator) -> list[int]:
         """Positions of the ``count`` inputs of a training sample."""
         if self.training != "any":
-            start, positions = int(rng.integers(ring)), np.asarray(even_positions(ring, count))
+            start = int(rng.integers(ring))
+            positions = np.asarray(even_positions(ring, count))
             if self.training == "uneven":  # positions are at least 3 apart, so they stay different
                 positions = positions + rng.integers(-1, 1, count, endpoint=True)
             return [int(position) for position in (start + positions) % ring]

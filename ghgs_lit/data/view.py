@@ -50,7 +50,8 @@ def centered_depth(inverse: np.ndarray, height: int, width: int) -> np.ndarray:
     weights = [down[i][:, None] * across[j] for i in (0, 1) for j in (0, 1)]
     front = np.maximum.reduce([np.where(w > 0, c, 0) for c, w in zip(corners, weights, strict=True)])
     least = np.maximum((1 - SAME_SURFACE) * front, 0.5)  # 0 is unknown
-    total, mean = np.zeros_like(front), np.zeros_like(front)
+    total = np.zeros_like(front)
+    mean = np.zeros_like(front)
     for corner, weight in zip(corners, weights, strict=True):
         counted = weight * (corner >= least)
         total += counted
@@ -184,12 +185,14 @@ def resize_view(view: View, height: int, width: int, resampling: str = "area") -
     intrinsics[:2] *= np.array([[width / w], [height / h]])
     resize = {"area": (area_image, area_mask), "release": (release_image, release_mask)}
     image, mask = resize[resampling]
-    inverse, matte = view.inverse_depth, view.matte
+    inverse = view.inverse_depth
+    matte = view.matte
     if matte is None:
         shown = subject = mask(view.mask, height, width)
     else:
         matte = image(matte, height, width)
-        shown, subject = matte > 0, matte >= 128
+        shown = matte > 0
+        subject = matte >= 128
     return replace(
         view,
         image=image(view.image, height, width),

@@ -11,7 +11,8 @@ from torch.utils.data import DataLoader, Dataset
 from ghgs_lit.runtime.cores import allowed_cores, use_known_start_method
 
 #: Batches below which processes take longer to start than they save: forked ones, and those that import.
-_FEW_FORKED, _FEW_STARTED = 32, 256
+_FEW_FORKED = 32
+_FEW_STARTED = 256
 #: More processes than this wait for the disk.
 _MOST = 8
 

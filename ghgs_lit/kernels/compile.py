@@ -15,7 +15,8 @@ from numba.core.caching import FunctionCache
 # Kernels are only called from Python and helpers only from kernels: no other entry points are needed.
 _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 #: Arguments of kernels: contiguous arrays of float32 by their number of dimensions, and whole numbers.
-FLOATS, NUMBER = [types.Array(types.float32, dimensions, "C") for dimensions in range(6)], types.int64
+FLOATS = [types.Array(types.float32, dimensions, "C") for dimensions in range(6)]
+NUMBER = types.int64
 
 
 class _Cache(FunctionCache):

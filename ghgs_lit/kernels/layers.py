@@ -85,7 +85,8 @@ def make_product(strides: tuple[int, int], adds: bool):
 product = make_product((1, ROWS), adds=False)
 
 
-ZERO, ONE = np.float32(0), np.float32(1)
+ZERO = np.float32(0)
+ONE = np.float32(1)
 
 #: ``out += x y^T``, summed over the lanes of the lines ``x`` and of ``y`` as :func:`_turn` stores it.
 _lane_product = make_product((PANEL, 1), adds=True)

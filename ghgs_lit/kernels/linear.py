@@ -11,7 +11,9 @@ from ghgs_lit.kernels.pool import even_parts
 
 #: Multiplications from which oneDNN is faster in spite of its slower calls: without a gradient, and with one,
 #: as a convolution, which also needs more than ``_PIXELS`` inputs (PyTorch's own limit) and two threads.
-_SMALL, _LARGE, _PIXELS = 1 << 21, 1 << 24, 20480
+_SMALL = 1 << 21
+_LARGE = 1 << 24
+_PIXELS = 20480
 #: Weight values that oneDNN copies at once if the input has fewer rows than channels.
 _COPY = 1 << 20
 
@@ -35,7 +37,8 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """``x @ weight.T + bias``, as ``F.linear``."""
     if not prefers_onednn(x, weight):
         return F.linear(x, weight, bias)
-    k, product = x.shape[-1], _convolve if torch.is_grad_enabled() else _multiply
+    k = x.shape[-1]
+    product = _convolve if torch.is_grad_enabled() else _multiply
     if x.numel() >= k * k or weight.numel() <= _COPY:
         return product(x, weight, bias)
     # oneDNN copies the weight to its own layout; with few rows that copy would take most of the memory.

@@ -18,14 +18,17 @@ from ghgs_lit.kernels.compile import helper
 
 LANES = 16
 DOUBLES = 8
-I32, I64 = ir.IntType(32), ir.IntType(64)
+I32 = ir.IntType(32)
+I64 = ir.IntType(64)
 
 
 class _Lanes(types.Type):
     """A Numba type for an LLVM vector, which exists only inside kernels."""
 
     def __init__(self, name: str, element: ir.Type, count: int):
-        self.count, self.element, self.llvm = count, element, ir.VectorType(element, count)
+        self.count = count
+        self.element = element
+        self.llvm = ir.VectorType(element, count)
         super().__init__(name)
 
 
@@ -168,7 +171,8 @@ def _make_extreme(sign: str):
     return extreme
 
 
-minimum, maximum = _make_extreme("<"), _make_extreme(">")
+minimum = _make_extreme("<")
+maximum = _make_extreme(">")
 
 
 @intrinsic
@@ -203,7 +207,8 @@ def lane_sum(typing_context, x):
     """Sum of all lanes of floats, by adding the upper half to the lower half until one lane is left."""
 
     def emit(context, builder, sig, args):
-        total, width = args[0], LANES
+        total = args[0]
+        width = LANES
         while width > 1:
             width //= 2
             low, high = (indices(range(k, k + width)) for k in (0, width))
@@ -259,7 +264,9 @@ def exp2_minus(typing_context, x):
     return floats(floats), emit
 
 
-_ZERO, _ONE, _TWICE = np.float32(0), np.float32(1), np.float32(2 * math.log2(math.e))
+_ZERO = np.float32(0)
+_ONE = np.float32(1)
+_TWICE = np.float32(2 * math.log2(math.e))
 
 
 @helper

@@ -88,10 +88,12 @@ def cells(place, size):
     places far away, are beyond it."""
     place = tl.where(place > -2, tl.where(place < size + 2, place, size + 2), -2) - 0.5
     first = tl.floor(place)
-    share, at = place - first, first.to(tl.int32)
+    share = place - first
+    at = first.to(tl.int32)
     before = tl.where((at >= 0) & (at < size), 1 - share, 0.0)
     after = tl.where((at >= -1) & (at < size - 1), share, 0.0)
-    left, right = tl.maximum(tl.minimum(at, size - 1), 0), tl.maximum(tl.minimum(at + 1, size - 1), 0)
+    left = tl.maximum(tl.minimum(at, size - 1), 0)
+    right = tl.maximum(tl.minimum(at + 1, size - 1), 0)
     return left, right, before, after
 
 

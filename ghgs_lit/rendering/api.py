@@ -124,7 +124,8 @@ def _check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
     require(len(found) == 2 and found[0] == count, "gaussians.colors", f"shape ({count}, channels)", found)
     adds_up = sum(gaussians.splits) == count and min(gaussians.splits, default=0) >= 0
     require(adds_up, "gaussians.splits", f"counts that add up to {count}", gaussians.splits)
-    found, expected = tuple(cameras.shape), f"shape [{len(gaussians.splits)}, T], one row per batch element"
+    found = tuple(cameras.shape)
+    expected = f"shape [{len(gaussians.splits)}, T], one row per batch element"
     require(len(found) == 2 and found[0] == len(gaussians.splits), "cameras", expected, found)
     size = (cameras.height, cameras.width)
     require(min(size) > 0, "cameras", "a positive image size", size)

@@ -21,7 +21,8 @@ from ghgs_lit.plan.rows import size_class
 T = TypeVar("T")
 Drawn = TypeVar("Drawn")
 #: Tiles that a splat is expected to touch at first, and what is added to the most that was seen.
-_FIRST, _SPARE = 4.0, 1.25
+_FIRST = 4.0
+_SPARE = 1.25
 #: Share of a difference by which an expectation falls if less was needed; it rises at once.
 _FALL = 0.1
 
@@ -42,7 +43,8 @@ class Room:
 
     def expect(self, needed: int) -> bool:
         """Whether the room sufficed; later renderings expect what was ``needed``."""
-        found, before = needed / self.splats, _expected.get(self.grid, 0.0)
+        found = needed / self.splats
+        before = _expected.get(self.grid, 0.0)
         _expected[self.grid] = max(found, before + _FALL * (found - before))
         return needed <= self.capacity
 
@@ -118,7 +120,8 @@ class Coming:
     """A number on its way to the host, which can go on until it reads it. ``value``: on any device."""
 
     def __init__(self, value: Int[Tensor, ""]):
-        self.value, self.arrived = value, None
+        self.value = value
+        self.arrived = None
         if value.is_cuda:
             self.value = torch.empty((), dtype=value.dtype, pin_memory=True)
             self.value.copy_(value, non_blocking=True)

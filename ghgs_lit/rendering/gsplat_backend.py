@@ -61,11 +61,13 @@ def rasterize(
     """Render on black in float32; see :func:`ghgs_lit.rendering.render`. A limit of alpha below
     :data:`_ALPHA_MAX` is applied to opacities: for opacities above it, alphas differ by at most
     ``1 - alpha_max`` from those of other backends."""
-    default, expected = RasterSettings(), f"at most {_ALPHA_MAX}, which is compiled into gsplat"
+    default = RasterSettings()
+    expected = f"at most {_ALPHA_MAX}, which is compiled into gsplat"
     allowed = settings.alpha_max <= _ALPHA_MAX
     require(allowed, "renderer.settings.alpha_max", expected, settings.alpha_max)
     for name in _FIXED:
-        value, fixed = getattr(settings, name), getattr(default, name)
+        value = getattr(settings, name)
+        fixed = getattr(default, name)
         require(value == fixed, f"renderer.settings.{name}", f"{fixed}, which is compiled into gsplat", value)
     gsplat = load()
     channels = gaussians.colors.shape[1]
@@ -132,7 +134,8 @@ def _without_wait(
     radii, centers, depths, conics, compensations = gsplat.fully_fused_projection(
         covars=None, calc_compensations=antialiased, **seen
     )
-    height, width = seen["height"], seen["width"]
+    height = seen["height"]
+    width = seen["width"]
     opacities = seen["opacities"][:, None].expand(depths.shape)
     if antialiased:
         opacities = opacities * compensations

@@ -55,8 +55,10 @@ def intersections(
         depths: float32, above 0 where a splat is drawn.
         height, width: of the images, in pixels.
         capacity: number of places, at least 1."""
-    shape, splats = depths.shape[:-1], depths.numel()
-    rows, columns = -(-height // TILE), -(-width // TILE)
+    shape = depths.shape[:-1]
+    splats = depths.numel()
+    rows = -(-height // TILE)
+    columns = -(-width // TILE)
     fixed = _fixed(shape, rows, columns, centers.device)
     boxes = _boxes(centers, radii, fixed).view(splats, 3)
     _, order = depths.contiguous().view(torch.int32).flatten().sort(stable=True)

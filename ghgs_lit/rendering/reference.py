@@ -65,7 +65,8 @@ def visible(
     """Indices of the Gaussians to draw, sorted by float32 depth, ties by index: between near and far, with
     finite centres, a positive, finite determinant and an opacity of at least ``alpha_min``."""
     splats = project(gaussians, camera, settings)
-    depths, determinants = splats.depths, splats.determinants
+    depths = splats.depths
+    determinants = splats.determinants
     keep = (depths >= near) & (depths <= far) & (determinants > 0) & determinants.isfinite()
     keep &= (splats.opacities >= settings.alpha_min) & splats.centers.isfinite().all(-1)
     index = keep.nonzero()[:, 0]
@@ -74,14 +75,17 @@ def visible(
 
 def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> Splats:
     """All Gaussians as splats of one camera, also those that it does not see."""
-    rotation, translation = camera.extrinsics[:3, :3], camera.extrinsics[:3, 3]
+    rotation = camera.extrinsics[:3, :3]
+    translation = camera.extrinsics[:3, 3]
     points = gaussians.means @ rotation.mT + translation
     x, y, z = points.unbind(-1)
-    focal, center = camera.intrinsics.diagonal()[:2], camera.intrinsics[:2, 2]
+    focal = camera.intrinsics.diagonal()[:2]
+    center = camera.intrinsics[:2, 2]
     size = focal.new_tensor([camera.width, camera.height])
     margin = settings.frustum_margin * 0.5 * size / focal
     tangents = torch.stack((x / z, y / z), dim=-1)
-    low, high = -center / focal - margin, (size - center) / focal + margin
+    low = -center / focal - margin
+    high = (size - center) / focal + margin
     tangents = torch.minimum(torch.maximum(tangents, low), high)
     zero = torch.zeros_like(z)
     across = torch.stack((focal[0] / z, zero, -focal[0] / z * tangents[:, 0]), dim=-1)
@@ -89,7 +93,9 @@ def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> 
     jacobian = torch.stack((across, down), dim=-2)
     root = quaternion_to_matrix(gaussians.quaternions) * gaussians.scales[:, None, :]
     row_x, row_y = (jacobian @ rotation @ root).unbind(-2)
-    xx, xy, yy = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)
+    xx = (row_x * row_x).sum(-1)
+    xy = (row_x * row_y).sum(-1)
+    yy = (row_y * row_y).sum(-1)
     # |row_x x row_y|^2 = xx yy - xy^2 without the cancellation.
     bare = torch.linalg.cross(row_x, row_y).square().sum(-1)
     determinant = bare + settings.low_pass * (xx + yy) + settings.low_pass**2

@@ -388,7 +388,8 @@ def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = N
     returns: list[JobReturn] = []
     require(batch is None or batch >= 1, "hydra.sweeper.max_batch_size", "a number of at least 1", batch)
     while todo:
-        busy, size = [], batch or len(todo)
+        busy = []
+        size = batch or len(todo)
         for jobs in (todo[first : first + size] for first in range(0, len(todo), size)):
             results = launch([item.overrides for item in jobs], len(returns))
             for item, result in zip(jobs, results, strict=True):

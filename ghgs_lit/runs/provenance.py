@@ -43,7 +43,8 @@ def differences(
     Returns:
         Lines ``key: old value -> new value``.
     """
-    old, new = flatten(before), flatten(now)
+    old = flatten(before)
+    new = flatten(now)
     keys = (key for key in sorted(old.keys() | new.keys()) if not is_below(key, without))
     return [f"{key}: {old.get(key)} -> {new.get(key)}" for key in keys if old.get(key) != new.get(key)]
 

@@ -10,9 +10,12 @@ import sys
 from pathlib import Path
 
 #: Parameters of glibc's ``mallopt``, and their largest value.
-_TRIM_THRESHOLD, _MMAP_THRESHOLD, _MOST = -1, -3, 2**31 - 1
+_TRIM_THRESHOLD = -1
+_MMAP_THRESHOLD = -3
+_MOST = 2**31 - 1
 #: Linux's counters of this process, and the file that resets the peak.
-_STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+_STATUS = Path("/proc/self/status")
+_CLEAR = Path("/proc/self/clear_refs")
 
 
 def resident_bytes(field: str = "VmRSS") -> int:

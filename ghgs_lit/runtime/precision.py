@@ -174,7 +174,9 @@ class _Rounding:
 @cache
 def _modules(device: str) -> list[Any]:
     """What decides whether products and convolutions round on a type of device, in PyTorch 2.9 and later."""
-    matmul, cudnn, mkldnn = torch.backends.cuda.matmul, torch.backends.cudnn, torch.backends.mkldnn
+    matmul = torch.backends.cuda.matmul
+    cudnn = torch.backends.cudnn
+    mkldnn = torch.backends.mkldnn
     if not hasattr(matmul, "fp32_precision"):
         return []
     if device == "cpu":

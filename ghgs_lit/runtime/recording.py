@@ -82,7 +82,9 @@ class Recorder:
         reason: why the last recording failed; empty if none did."""
 
     def __init__(self, limit: int = 8, eager: int = 1, tape: Tape | None = None):
-        self.limit, self.eager, self.tape = limit, eager, tape or CudaTape()
+        self.limit = limit
+        self.eager = eager
+        self.tape = tape or CudaTape()
         self.counts: Counter[str] = Counter()
         self.reason = ""
         self._lock = threading.RLock()
@@ -153,7 +155,8 @@ class Recorder:
 
     def _refuse(self, kind: Hashable, error: Exception) -> None:
         self.counts["refused"] += 1
-        said, self.reason = self.reason, " ".join(str(error).split())[:300] or type(error).__name__
+        said = self.reason
+        self.reason = " ".join(str(error).split())[:300] or type(error).__name__
         if not said:
             warnings.warn(f"not recorded as a CUDA graph, but called as always: {self.reason}", stacklevel=4)
         self._refused.add(kind)

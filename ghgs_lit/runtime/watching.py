@@ -74,7 +74,9 @@ class _Wrapped:
     """A stage that is no module, with a watcher of its calls."""
 
     def __init__(self, stage: Any, name: str, watcher: Watcher):
-        self._stage, self._name, self._watcher = stage, name, watcher
+        self._stage = stage
+        self._name = name
+        self._watcher = watcher
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
         inputs = (arguments, options)

@@ -39,7 +39,8 @@ log = logging.getLogger(__name__)
 
 KINECTS = range(10)
 # Metres: least and greatest plausible distance between cameras of one studio.
-_NEAREST, _FURTHEST = 0.1, 100.0
+_NEAREST = 0.1
+_FURTHEST = 100.0
 _SEQUENCE = re.compile(r"p\d{6}_a\d{6}")
 
 #: Intrinsics [3, 3] with pixel centres at integers, and extrinsics [4, 4].
@@ -77,7 +78,8 @@ class _Frame:
     number: int
 
     def file(self, kind: str, kinect: int) -> Path:
-        folder, name = self.folder / kind / f"kinect_{kinect:03d}", f"{self.number:06d}.png"
+        folder = self.folder / kind / f"kinect_{kinect:03d}"
+        name = f"{self.number:06d}.png"
         return find_path(folder, name) or folder / name
 
     @property
@@ -93,7 +95,9 @@ class HuMManReader(FrameReader):
 
     def __init__(self, data: "HuMMan", phase: str, strict: bool = True) -> None:
         super().__init__(strict)
-        self.data, folder, names = data, data.folder, data.sequences(phase)
+        self.data = data
+        folder = data.folder
+        names = data.sequences(phase)
         self._body: Body | None = None
         if data.smpl_model is not None:
             with self.collecting():

@@ -26,7 +26,8 @@ _WIDTHS = (16, 32, 48, 64)
 #: Pixels at which the distance from the mask's outline is clipped.
 FARTHEST = 8.0
 #: Colours nearby are averaged in images smaller by this factor, over squares of these sides, twice.
-_COARSER, _SIDES = 4, (3, 7)
+_COARSER = 4
+_SIDES = (3, 7)
 #: Channels: colours, mask, distance from its outline; differences from colours inside and outside nearby.
 _FEATURES = 5 + 3 * 2 * len(_SIDES)
 
@@ -64,7 +65,8 @@ class MattingNetwork(nn.Module):
         # A pixel mixes the colours of subject and background; the network predicts their difference.
         colors = images + (1 - share.detach())[:, None] * out[:, 1:]
         if not self.training:
-            found, colors = share, colors.clamp(0, 1)
+            found = share
+            colors = colors.clamp(0, 1)
         return found, found[:, None] * colors
 
 

@@ -64,7 +64,8 @@ class ZJUMoCapReader(FrameReader):
 
     def __init__(self, data: "ZJUMoCap", phase: str, strict: bool = True) -> None:
         super().__init__(strict)
-        self.data, folder = data, data.folder
+        self.data = data
+        folder = data.folder
         chosen = getattr(data.split, phase)
         wanted = [(f"CoreView_{s}", some.frames) for some in chosen for s in some.sequences]
         there = self.existing(folder, [name for name, _ in wanted], wanted[0][0])

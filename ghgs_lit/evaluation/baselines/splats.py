@@ -49,7 +49,9 @@ def hull_depth(batch: Batch) -> Tensor:
 
 #: Number of compared depths; half the side of the window over which consistency is averaged, over the longer
 #: side of the image; temperature of the softmax over depths. Tuned on four people, with 3 to 5 views.
-DEPTHS, WINDOW, SOFTNESS = 32, 0.02, 0.03
+DEPTHS = 32
+WINDOW = 0.02
+SOFTNESS = 0.03
 
 
 def photo_depth(batch: Batch) -> Tensor:
@@ -90,7 +92,11 @@ def _window_mean(maps: Tensor, radius: int) -> Tensor:
 
 #: Discs, as ``model=recurrent`` starts: standard deviations along and across the surface and distance behind
 #: it in pixel footprints; opacity; low-pass filter in px^2.
-_ALONG, _ACROSS, _INWARD, _OPACITY, _LOW_PASS = 0.5, 0.1, 0.4, 0.8, 0.1
+_ALONG = 0.5
+_ACROSS = 0.1
+_INWARD = 0.4
+_OPACITY = 0.8
+_LOW_PASS = 0.1
 #: Matte above which a pixel gets a disc.
 _MATTE = 0.125
 
@@ -222,7 +228,8 @@ CHANGES = {
     "colors": Change(limit=0.05, rate=0.001),
 }
 #: Standard deviation in pixels and opacity of the initial Gaussians.
-SIGMA, OPACITY = 0.5, 0.5
+SIGMA = 0.5
+OPACITY = 0.5
 
 
 @dataclass(frozen=True)

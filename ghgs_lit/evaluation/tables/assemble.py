@@ -136,7 +136,8 @@ def _groups(rows: pd.DataFrame, planned: list[Planned], options: TableOptions) -
 
 def _reported(layout: Layout, reported: str, groups: list[Group]) -> tuple[list[Line], list[dict]]:
     """The paper's rows, and its figures with their line and group."""
-    lines, cells = [], []
+    lines = []
+    cells = []
     switches = {name: pair for pair, name in ABLATIONS.items()}
     for method, figures in reported_table(reported)[1].items():
         pair = switches[method] if layout.rows == "ablation" else None

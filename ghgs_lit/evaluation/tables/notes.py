@@ -135,11 +135,10 @@ def _about_test(table: Table) -> list[str]:
     if test.against == "full":
         full = [line for line in table.ours if line.variant.ablation == "full"]
         against = "the row of the whole method" if len(full) == 1 else against
-    seeds, subjects = [c.seeds for c in known], [c.subjects for c in known]
-    names, sizes = (
-        " or ".join(map(title, table.tested)),
-        f"{_range(seeds)} seeds and {_range(subjects)} subjects",
-    )
+    seeds = [c.seeds for c in known]
+    subjects = [c.subjects for c in known]
+    names = " or ".join(map(title, table.tested))
+    sizes = f"{_range(seeds)} seeds and {_range(subjects)} subjects"
     comparisons = f"{table.comparisons} comparison{'s' if table.comparisons > 1 else ''}"
     others = "; other metrics are not tested" if len(table.tested) < len(table.metrics) else ""
     return [

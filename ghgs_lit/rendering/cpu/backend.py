@@ -38,11 +38,13 @@ class Plan:
 
     @classmethod
     def of(cls, gaussians, cameras, settings, near, far) -> "Plan":
-        counts, views_each = np.array(gaussians.splits, dtype=np.int64), cameras.shape[1]
+        counts = np.array(gaussians.splits, dtype=np.int64)
+        views_each = cameras.shape[1]
         firsts = np.cumsum(counts) - counts
         # Each view has whole vectors of splats, so two threads never write to the same vector.
         sizes = np.repeat(-(-counts // simd.DOUBLES) * simd.DOUBLES, views_each)
-        views, edges = _view_rows(cameras, settings), _part_edges(firsts, counts)
+        views = _view_rows(cameras, settings)
+        edges = _part_edges(firsts, counts)
         shifts = np.cumsum(sizes) - sizes - np.repeat(firsts, views_each)
         numbers = int(sizes.sum()), tuple(cameras.shape), cameras.height, cameras.width
         return cls(views, edges, shifts, *numbers, settings, near, far)
@@ -71,7 +73,8 @@ class Plan:
 
 def _part_edges(firsts: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Ends [B, P + 1] of the parts of each element; all parts but the last are whole vectors."""
-    threads, total = torch.get_num_threads(), int(counts.sum())
+    threads = torch.get_num_threads()
+    total = int(counts.sum())
     parts = 1 if threads == 1 else max(1, min(-(-2 * threads // max(1, len(counts))), total // pool.GRAIN))
     steps = -(-counts // (parts * simd.DOUBLES)) * simd.DOUBLES
     edges = np.minimum(steps[:, None] * np.arange(parts + 1), counts[:, None])
@@ -84,7 +87,8 @@ def _view_rows(cameras: Cameras, settings: RasterSettings) -> np.ndarray:
     rows = np.zeros((len(intrinsics), layout.VIEW))
     sides = ((0, cameras.width, layout.X_LOW), (1, cameras.height, layout.Y_LOW))
     for axis, size, low in sides:
-        focal, center = intrinsics[:, axis, axis], intrinsics[:, axis, 2]
+        focal = intrinsics[:, axis, axis]
+        center = intrinsics[:, axis, 2]
         margin = settings.frustum_margin * 0.5 * size / focal
         rows[:, layout.FX + axis], rows[:, layout.CX + axis] = focal, center
         rows[:, low], rows[:, low + 1] = -center / focal - margin, (size - center) / focal + margin
@@ -131,7 +135,8 @@ def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differen
     settings, (tiles_x, tiles_y), total = plan.settings, plan.tiles, plan.splats
     (elements, views), parts = plan.shape, plan.parts
     records = simd.aligned_floats(total * layout.RECORD).reshape(total, layout.RECORD)
-    depths, boxes = np.empty((total, 1), np.float32), np.empty((total, 4), np.int32)
+    depths = np.empty((total, 1), np.float32)
+    boxes = np.empty((total, 4), np.int32)
     counts = np.zeros((elements, plan.edges.shape[1] - 1, views, tiles_x * tiles_y), np.int64)
     found = np.zeros(counts.shape[:2], np.int64)
 
@@ -154,7 +159,8 @@ def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differen
         f"{size * each / 2**30:.1f} GiB: {size} entries, {size // max(len(means), 1)} of each Gaussian",
     )
     next_free = tile_starts[:-1].reshape(elements, 1, *counts.shape[2:]) + np.cumsum(counts, 1) - counts
-    entries, entry_starts = np.empty((size, layout.ENTRY), np.int32), np.empty(total, np.int32)
+    entries = np.empty((size, layout.ENTRY), np.int32)
+    entry_starts = np.empty(total, np.int32)
 
     def list_part(b: int, p: int, first: int, last: int, seen_by: slice) -> None:
         scatter(
@@ -163,7 +169,8 @@ def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differen
         )  # fmt: skip
 
     pool.run([partial(list_part, *part) for part in parts], size)
-    drawn, reached = np.zeros(len(tile_starts) - 1, np.int64), np.zeros(size, np.uint8)
+    drawn = np.zeros(len(tile_starts) - 1, np.int64)
+    reached = np.zeros(size, np.uint8)
     return _Splats(records, boxes, entry_starts, tile_starts, entries, drawn, reached)
 
 
@@ -184,7 +191,8 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx, means, quaternions, scales, opacities, colors, plan: Plan):
         arrays = [t.detach().numpy() for t in (means, quaternions, scales, opacities[:, None], colors)]
         found = _prepare(plan, *arrays, differentiable=any(ctx.needs_input_grad))
-        channels, size = colors.shape[1], (plan.height, plan.width)
+        channels = colors.shape[1]
+        size = (plan.height, plan.width)
         image, alpha, depth = (_zeros(*plan.shape, planes, *size) for planes in (channels, 1, 1))
         outputs = [_flat(t) for t in (image, alpha, depth)]
         pool.run([
@@ -197,14 +205,17 @@ class _Rasterize(torch.autograd.Function):
         ], len(found.entries))  # fmt: skip
         ctx.save_for_backward(means, quaternions, scales, opacities, colors, image, alpha, depth)
         ctx.set_materialize_grads(False)
-        ctx.plan, ctx.found = plan, found
+        ctx.plan = plan
+        ctx.found = found
         return image, alpha, depth
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, d_image, d_alpha, d_depth):
         *inputs, image, alpha, depth = ctx.saved_tensors
-        plan, found, settings = ctx.plan, ctx.found, ctx.plan.settings
+        plan = ctx.plan
+        found = ctx.found
+        settings = ctx.plan.settings
         means, quaternions, scales, _, colors = (t.detach().numpy() for t in inputs)
         gradients = _scratch(len(found.entries) * layout.gradient_width(colors.shape[1]))
         d_image = _zeros(*image.shape) if d_image is None else d_image

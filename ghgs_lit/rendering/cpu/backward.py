@@ -19,7 +19,8 @@ _AHEAD = 8
 @helper
 def _read(image, first, width, rows, columns, block):
     """A block of a tile whose first pixel is ``image[first]``; 0 outside ``rows`` x ``columns``."""
-    y, x = block // 4 * 4, block % 4 * 4
+    y = block // 4 * 4
+    x = block % 4 * 4
     if y + 4 <= rows and x + 4 <= columns:
         return tables.load_block(image, first + y * width + x, width)
     edge = np.zeros(LANES, np.float32)
@@ -37,10 +38,13 @@ def _read_gradients(
     """Fill ``upstream`` with the gradients of a tile's planes and ``suffix`` with ``S`` of all splats.
     Gradients of alpha and depth may be missing (size 0). With depth = D / A, ``dL/dD = g / A`` and
     ``dL/dA = -g depth / A``, so the parts of D and A in ``S`` cancel."""
-    channels, start = simd.length(count), view * height * width + first
+    channels = simd.length(count)
+    start = view * height * width + first
     for block in range(BLOCKS):
         at = block * LANES
-        total, d_sum, d_total = simd.full(ZERO), simd.full(ZERO), simd.full(ZERO)
+        total = simd.full(ZERO)
+        d_sum = simd.full(ZERO)
+        d_total = simd.full(ZERO)
         for c in range(channels):
             plane = (view * channels + c) * height * width + first
             slope = _read(d_image, plane, width, rows, columns, block)
@@ -66,9 +70,17 @@ def _read_gradients(
 def _differentiate_splat(
     records, s, colors, n, count, x0, y0, hit, pixels, transmittance, upstream, suffix, sums, alpha_max, stop
 ):
-    channels, zero = simd.length(count), simd.full(ZERO)
-    numbers, depth = tiles.read_splat(records[s], np.float32(x0), np.float32(y0)), records[s, layout.DEPTH]
-    h, h_p, h_q, h_pp, h_pq, h_qq, d_depth = zero, zero, zero, zero, zero, zero, zero
+    channels = simd.length(count)
+    zero = simd.full(ZERO)
+    numbers = tiles.read_splat(records[s], np.float32(x0), np.float32(y0))
+    depth = records[s, layout.DEPTH]
+    h = zero
+    h_p = zero
+    h_q = zero
+    h_pp = zero
+    h_pq = zero
+    h_qq = zero
+    d_depth = zero
     for c in range(channels):
         memory.store(sums, (layout.COLOR + c) * LANES, zero)
     while hit != 0:
@@ -95,9 +107,14 @@ def _differentiate_splat(
         # dL / d ln(alpha), where alpha is not clamped.
         slope = alpha * (before * value - rest / (ONE - alpha))
         slope = simd.select(seen & (raw < alpha_max), slope, ZERO)
-        s_p, s_q = slope * p, slope * q
-        h, h_p, h_q = h + slope, h_p + s_p, h_q + s_q
-        h_pp, h_pq, h_qq = simd.fma(s_p, p, h_pp), simd.fma(s_p, q, h_pq), simd.fma(s_q, q, h_qq)
+        s_p = slope * p
+        s_q = slope * q
+        h = h + slope
+        h_p = h_p + s_p
+        h_q = h_q + s_q
+        h_pp = simd.fma(s_p, p, h_pp)
+        h_pq = simd.fma(s_p, q, h_pq)
+        h_qq = simd.fma(s_q, q, h_qq)
     memory.store(sums, layout.H * LANES, h)
     memory.store(sums, layout.H_P * LANES, h_p)
     memory.store(sums, layout.H_Q * LANES, h_q)
@@ -115,10 +132,12 @@ def backward(
     """Write gradients of the drawn entries of tiles to ``gradients`` [slots x gradient_width], which is flat
     and starts on a cache line; images and their gradients are flat as in ``forward``."""
     channels = simd.length(count)
-    transmittance, suffix = simd.aligned(layout.PIXELS), simd.aligned(layout.PIXELS)
+    transmittance = simd.aligned(layout.PIXELS)
+    suffix = simd.aligned(layout.PIXELS)
     upstream = simd.aligned((channels + 2) * layout.PIXELS)
     stride = layout.kernel_gradient_width(channels)
-    sums, pixels = simd.aligned(stride * LANES), tiles.grid()
+    sums = simd.aligned(stride * LANES)
+    pixels = tiles.grid()
     sums[:] = ZERO
     for tile in some_tiles:
         view, x0, y0, rows, columns, first = tiles.place(tile, tiles_x, tiles_y, height, width)
@@ -127,13 +146,15 @@ def backward(
             d_depth, upstream, suffix,
         )  # fmt: skip
         tiles.open_pixels(views[view], x0, y0, pixels, transmittance)
-        start, end = tile_starts[tile], tile_starts[tile] + drawn[tile]
+        start = tile_starts[tile]
+        end = tile_starts[tile] + drawn[tile]
         for entry in range(start, end):
             later = min(entry + _AHEAD, end - 1)
             s = entries[later, layout.SPLAT]
             tiles.prefetch(records, s, colors, s - shifts[view])
             memory.prefetch(gradients, entries[later, layout.SLOT] * stride)
-            s, hit = entries[entry, layout.SPLAT], np.int64(entries[entry, layout.BLOCKS])
+            s = entries[entry, layout.SPLAT]
+            hit = np.int64(entries[entry, layout.BLOCKS])
             _differentiate_splat(
                 records, s, colors, s - shifts[view], count, x0, y0, hit, pixels, transmittance, upstream,
                 suffix, sums, alpha_max, stop,

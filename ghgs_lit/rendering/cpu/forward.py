@@ -37,7 +37,8 @@ def scatter(first, last, shifts, depths, boxes, tiles_x, slot, entry_starts, nex
 @helper
 def _insertion_sort(keys, count):
     for i in range(1, count):
-        key, k = keys[i], i
+        key = keys[i]
+        k = i
         while k > 0 and keys[k - 1] > key:
             keys[k] = keys[k - 1]
             k -= 1
@@ -65,15 +66,19 @@ def _radix_pass(keys, new_keys, count, shift, places):
 def depth_order(entries, start, end, keys, spare, places):
     """The entries of a tile sorted stably by depth, as keys whose lower halves are rows of ``entries``. Bits
     of positive floats sort like integers; relative to a tile's smallest, only a few low digits differ."""
-    count, least, most = end - start, entries[start, layout.KEY], entries[start, layout.KEY]
+    count = end - start
+    least = entries[start, layout.KEY]
+    most = entries[start, layout.KEY]
     for i in range(start, end):
-        least, most = min(least, entries[i, layout.KEY]), max(most, entries[i, layout.KEY])
+        least = min(least, entries[i, layout.KEY])
+        most = max(most, entries[i, layout.KEY])
     for i in range(count):
         keys[i] = (np.int64(entries[start + i, layout.KEY] - least) << 32) | (start + i)
     if count <= _FEW:
         _insertion_sort(keys, count)
         return keys[:count]
-    span, shift = np.int64(most) - least, 0
+    span = np.int64(most) - least
+    shift = 0
     while span >> shift > 0:
         _radix_pass(keys, spare, count, 32 + shift, places)
         keys, spare = spare, keys
@@ -84,7 +89,8 @@ def depth_order(entries, start, end, keys, spare, places):
 # Entries that are drawn into all blocks before the next ones are read: the bits of an integer.
 _CHUNK = 64
 # Places of depth and colours in a gathered row, after the values of ``tiles.read_splat``.
-_DEPTH, _COLOR = 7, 8
+_DEPTH = 7
+_COLOR = 8
 
 
 @helper
@@ -93,8 +99,10 @@ def _touches(numbers, slope_x, slope_y, block):
     on its column or row nearest to the splat's centre, at the minimum along it. The comparison is slightly
     generous, since it only saves work."""
     side = np.float32(layout.BLOCK - 1)
-    left, top = numbers[0] + np.float32(block % 4 * 4), numbers[1] + np.float32(block // 4 * 4)
-    right, bottom = left + side, top + side
+    left = numbers[0] + np.float32(block % 4 * 4)
+    top = numbers[1] + np.float32(block // 4 * 4)
+    right = left + side
+    bottom = top + side
     near_x = simd.minimum(simd.maximum(left, ZERO), right)
     near_y = simd.minimum(simd.maximum(top, ZERO), bottom)
     along_x = simd.minimum(simd.maximum(left, near_y * slope_x), right)
@@ -154,8 +162,10 @@ def _add(planes, position, value):
 @helper
 def _draw_block(block, todo, rows, count, pixels, planes, transmittance, alpha_max, stop, hits):
     """Blend the splats ``todo`` (bits) into a block, front to back; returns whether light still passes."""
-    at, bit = block * LANES, np.int32(1) << block
-    x, y = memory.load(pixels, at), memory.load(pixels, layout.PIXELS + at)
+    at = block * LANES
+    bit = np.int32(1) << block
+    x = memory.load(pixels, at)
+    y = memory.load(pixels, layout.PIXELS + at)
     before = memory.load(transmittance, at)
     while todo != 0:
         i = simd.trailing_zeros(todo)
@@ -185,7 +195,8 @@ def _draw_block(block, todo, rows, count, pixels, planes, transmittance, alpha_m
 @helper
 def _write(image, first, width, rows, columns, block, value):
     """Write the part of a block inside ``rows`` x ``columns`` of a tile that starts at ``image[first]``."""
-    y, x = block // 4 * 4, block % 4 * 4
+    y = block // 4 * 4
+    x = block % 4 * 4
     if y + 4 <= rows and x + 4 <= columns:
         tables.store_block(image, first + y * width + x, width, value)
         return
@@ -218,20 +229,28 @@ def forward(
     """Draw tiles to flat ``image`` [V C h w], ``alpha`` and expected ``depth`` [V h w]. For the backward pass
     (see ``layout``) the drawn entries are written to ``entries``, their number in each tile to ``drawn``, and
     their slots are marked in ``reached``. ``count``: number of channels, or a tuple of that length."""
-    channels, longest = simd.length(count), 1
+    channels = simd.length(count)
+    longest = 1
     for tile in some_tiles:
         longest = max(longest, tile_starts[tile + 1] - tile_starts[tile])
-    keys, spare, places = np.empty(longest, np.int64), np.empty(longest, np.int64), np.empty(256, np.int64)
-    kept, rows = np.empty((longest, 3), np.int32), simd.aligned((_COLOR + channels) * _CHUNK)
+    keys = np.empty(longest, np.int64)
+    spare = np.empty(longest, np.int64)
+    places = np.empty(256, np.int64)
+    kept = np.empty((longest, 3), np.int32)
+    rows = simd.aligned((_COLOR + channels) * _CHUNK)
     splats = np.empty(_CHUNK, np.int64)
-    todo, hits = np.empty(BLOCKS, np.int64), np.empty(_CHUNK, np.int32)
-    transmittance, planes = simd.aligned(layout.PIXELS), simd.aligned((channels + 2) * layout.PIXELS)
+    todo = np.empty(BLOCKS, np.int64)
+    hits = np.empty(_CHUNK, np.int32)
+    transmittance = simd.aligned(layout.PIXELS)
+    planes = simd.aligned((channels + 2) * layout.PIXELS)
     pixels = tiles.grid()
     for tile in some_tiles:
         view, x0, y0, height_here, width_here, first = tiles.place(tile, tiles_x, tiles_y, height, width)
         planes[:] = ZERO
         live = tiles.open_pixels(views[view], x0, y0, pixels, transmittance)
-        start, found, shift = tile_starts[tile], 0, shifts[view]
+        start = tile_starts[tile]
+        found = 0
+        shift = shifts[view]
         order = depth_order(entries, start, tile_starts[tile + 1], keys, spare, places)
         for i in range(0, len(order), _CHUNK):
             chunk = min(_CHUNK, len(order) - i)

@@ -27,9 +27,18 @@ def unit(quaternions):
 @helper
 def rotation(w, x, y, z):
     """Rotation matrices of unit quaternions."""
-    x2, y2, z2 = x + x, y + y, z + z
-    xx, yy, zz, xy, xz, yz = x * x2, y * y2, z * z2, x * y2, x * z2, y * z2
-    wx, wy, wz = w * x2, w * y2, w * z2
+    x2 = x + x
+    y2 = y + y
+    z2 = z + z
+    xx = x * x2
+    yy = y * y2
+    zz = z * z2
+    xy = x * y2
+    xz = x * z2
+    yz = y * z2
+    wx = w * x2
+    wy = w * y2
+    wz = w * z2
     return (
         1.0 - (yy + zz), xy - wz, xz + wy,
         xy + wz, 1.0 - (xx + zz), yz - wx,
@@ -55,7 +64,8 @@ def dot(a, b, c, x, y, z):
 @helper
 def camera_points(view, mean):
     """x / z, y / z, z and 1 / z of world points in camera axes."""
-    r, t = layout.ROTATION, layout.TRANSLATION
+    r = layout.ROTATION
+    t = layout.TRANSLATION
     z = dot(view[r + 6], view[r + 7], view[r + 8], mean[0], mean[1], mean[2]) + view[t + 2]
     inverse = 1.0 / z
     x = dot(view[r], view[r + 1], view[r + 2], mean[0], mean[1], mean[2]) + view[t]
@@ -74,8 +84,12 @@ def clamped(view, x, y):
 @helper
 def affine(view, x, y, inverse):
     """``J W``, 2 x 3, the local affine map of the projection, at clamped ``x`` and ``y``."""
-    fx, fy, r = view[layout.FX] * inverse, view[layout.FY] * inverse, layout.ROTATION
-    a, b, c = view[r + 6], view[r + 7], view[r + 8]
+    fx = view[layout.FX] * inverse
+    fy = view[layout.FY] * inverse
+    r = layout.ROTATION
+    a = view[r + 6]
+    b = view[r + 7]
+    c = view[r + 8]
     return (
         fx * (view[r] - x * a), fx * (view[r + 1] - x * b), fx * (view[r + 2] - x * c),
         fy * (view[r + 3] - y * a), fy * (view[r + 4] - y * b), fy * (view[r + 5] - y * c),
@@ -105,5 +119,6 @@ def normal(m):
 def determinants(m, n, low_pass):
     """``det(M M^T)`` before and after the low-pass filter, and the diagonal of ``M M^T``."""
     bare = dot(n[0], n[1], n[2], n[0], n[1], n[2])
-    xx, yy = dot(m[0], m[1], m[2], m[0], m[1], m[2]), dot(m[3], m[4], m[5], m[3], m[4], m[5])
+    xx = dot(m[0], m[1], m[2], m[0], m[1], m[2])
+    yy = dot(m[3], m[4], m[5], m[3], m[4], m[5])
     return bare, bare + low_pass * (xx + yy) + low_pass * low_pass, xx, yy

@@ -9,11 +9,14 @@ from ghgs_lit.rendering.cpu import geometry, layout, tables
 
 _WIDE = simd.DOUBLES
 # Rows of 8 doubles: gradients of the mean, of R S, and of the opacity.
-_MEAN, _ROOT, _OPACITY = 0, 3, 12
+_MEAN = 0
+_ROOT = 3
+_OPACITY = 12
 _SUMS = 13
 
 # Each K, and so each whitened coordinate, contains a factor K_SCALE.
-_FIRST_MOMENT, _SECOND_MOMENT = geometry.K_SCALE**-2, geometry.K_SCALE**-4
+_FIRST_MOMENT = geometry.K_SCALE**-2
+_SECOND_MOMENT = geometry.K_SCALE**-4
 
 
 @helper
@@ -42,11 +45,15 @@ def _footprint_gradient(moments, record, m, low_pass, antialiased):
     """``dL/dM`` (2 x 3) and ``dL/d opacity``. The covariance's gradient is ``G = L^-T H L^-1 / 2`` with the
     whitened second moments H, and ``dL/dM = 2 G M``. With anti-aliasing, opacity also contains
     ``(det before / det after)^(1/2)``."""
-    k_xx, k_yx, k_yy = record[layout.K_XX], record[layout.K_YX], record[layout.K_YY]
-    pp, pq = _SECOND_MOMENT * moments[layout.H_PP], _SECOND_MOMENT * moments[layout.H_PQ]
+    k_xx = record[layout.K_XX]
+    k_yx = record[layout.K_YX]
+    k_yy = record[layout.K_YY]
+    pp = _SECOND_MOMENT * moments[layout.H_PP]
+    pq = _SECOND_MOMENT * moments[layout.H_PQ]
     qq = _SECOND_MOMENT * moments[layout.H_QQ]
     xx = k_xx * (k_xx * pp + k_yx * pq) + k_yx * (k_xx * pq + k_yx * qq)
-    xy, yy = k_yy * (k_xx * pq + k_yx * qq), k_yy * k_yy * qq
+    xy = k_yy * (k_xx * pq + k_yx * qq)
+    yy = k_yy * k_yy * qq
     h = moments[layout.H]
     d_opacity = h / record[layout.OPACITY]
     out = (
@@ -58,7 +65,8 @@ def _footprint_gradient(moments, record, m, low_pass, antialiased):
         bare, determinant, _, _ = geometry.determinants(m, n, low_pass)
         d_opacity = d_opacity * simd.sqrt(bare / determinant)
         # d ln(compensation) = (d ln bare - d ln determinant) / 2, both sums of squares of n and m.
-        d_n, d_m = h * (1.0 / bare - 1.0 / determinant), 0.0 - h * low_pass / determinant
+        d_n = h * (1.0 / bare - 1.0 / determinant)
+        d_m = 0.0 - h * low_pass / determinant
         out = (
             out[0] + d_n * (m[4] * n[2] - m[5] * n[1]) + d_m * m[0],
             out[1] + d_n * (m[5] * n[0] - m[3] * n[2]) + d_m * m[1],
@@ -74,7 +82,9 @@ def _footprint_gradient(moments, record, m, low_pass, antialiased):
 def _point_gradient(view, x, y, clamped_x, clamped_y, inverse, d_u, d_v, d_z, d_t):
     """``dL/d point`` in camera axes, from the gradients of the centre, the depth and ``J W`` (2 x 3); ``x``
     and ``y`` are x / z and y / z of the point."""
-    r, fx, fy = layout.ROTATION, view[layout.FX] * inverse, view[layout.FY] * inverse
+    r = layout.ROTATION
+    fx = view[layout.FX] * inverse
+    fy = view[layout.FY] * inverse
     # J_xx = fx and J_xz = -fx clamped_x; dL/dJ = dL/d(J W) W^T.
     d_xz = geometry.dot(view[r + 6], view[r + 7], view[r + 8], d_t[0], d_t[1], d_t[2])
     d_yz = geometry.dot(view[r + 6], view[r + 7], view[r + 8], d_t[3], d_t[4], d_t[5])
@@ -113,7 +123,8 @@ def _splat_gradients(view, mean, root, moments, record, drawn, low_pass, antiali
         geometry.dot(d_m[3], d_m[4], d_m[5], root[6], root[7], root[8]),
     )
     # dL / d centre = L^-T (H_P, H_Q).
-    h_p, h_q = _FIRST_MOMENT * moments[layout.H_P], _FIRST_MOMENT * moments[layout.H_Q]
+    h_p = _FIRST_MOMENT * moments[layout.H_P]
+    h_q = _FIRST_MOMENT * moments[layout.H_Q]
     d_u = record[layout.K_XX] * h_p + record[layout.K_YX] * h_q
     d_v = record[layout.K_YY] * h_q
     d_z = moments[layout.D_DEPTH]
@@ -158,10 +169,12 @@ def collect(
     """Write the gradients of Gaussians ``first`` to ``last``, summed over ``views``."""
     channels = d_colors.shape[1]
     width = layout.kernel_gradient_width(channels)
-    lines, sums = simd.aligned(_WIDE * width), np.empty(_SUMS * _WIDE)
+    lines = simd.aligned(_WIDE * width)
+    sums = np.empty(_SUMS * _WIDE)
     lines[:] = np.float32(0)
     for n in range(first, last, _WIDE):
-        mean, scale = tables.columns3(means, n, last), tables.columns3(scales, n, last)
+        mean = tables.columns3(means, n, last)
+        scale = tables.columns3(scales, n, last)
         w, x, y, z, inverse = geometry.unit(tables.columns4(quaternions, n, last))
         rotation = geometry.rotation(w, x, y, z)
         root = geometry.scaled(rotation, scale)
@@ -174,7 +187,8 @@ def collect(
             drawn = _gather_splats(m, boxes, entry_starts, reached, gradients, width, lines)
             if drawn == 0:
                 continue
-            moments, record = tables.load_lines(lines, 0, width), tables.load_lines(records, m, layout.RECORD)
+            moments = tables.load_lines(lines, 0, width)
+            record = tables.load_lines(records, m, layout.RECORD)
             _splat_gradients(
                 views[t], mean, root, moments, record, simd.mask(drawn), low_pass, antialiased, sums
             )
@@ -183,7 +197,8 @@ def collect(
                 drawn &= drawn - 1
                 for c in range(channels):
                     d_colors[n + lane, c] += lines[lane * width + layout.COLOR + c]
-        d, r = _root_rows(sums), rotation
+        d = _root_rows(sums)
+        r = rotation
         tables.store_columns3(d_scales, n, last, (
             geometry.dot(r[0], r[3], r[6], d[0], d[3], d[6]),
             geometry.dot(r[1], r[4], r[7], d[1], d[4], d[7]),

@@ -34,9 +34,11 @@ def _project_vector(
     clamped_x, clamped_y = geometry.clamped(view, x, y)
     footprint = geometry.footprint(geometry.affine(view, clamped_x, clamped_y, inverse), root)
     bare, determinant, xx, yy = geometry.determinants(footprint, geometry.normal(footprint), low_pass)
-    a, c = xx + low_pass, yy + low_pass
+    a = xx + low_pass
+    c = yy + low_pass
     b = geometry.dot(footprint[0], footprint[1], footprint[2], footprint[3], footprint[4], footprint[5])
-    u, v = simd.fma(x, view[layout.FX], view[layout.CX]), simd.fma(y, view[layout.FY], view[layout.CY])
+    u = simd.fma(x, view[layout.FX], view[layout.CX])
+    v = simd.fma(y, view[layout.FY], view[layout.CY])
     if antialiased:
         opacity = opacity * simd.sqrt(simd.minimum(simd.maximum(bare / determinant, 0.0), 1.0))
     visible = (z >= near) & (z <= far) & (opacity >= alpha_min)
@@ -48,7 +50,8 @@ def _project_vector(
     left, right, top, bottom = _extents(view, u, v, a, c, cutoff)
     visible = visible & (left <= right) & (top <= bottom)
     seen = simd.bits(visible)
-    tile, zero = 1.0 / layout.TILE, simd.full(0.0)
+    tile = 1.0 / layout.TILE
+    zero = simd.full(0.0)
     tables.store_boxes(boxes, m, (
         simd.select(visible, simd.floor(left * tile), zero),
         simd.select(visible, simd.floor(right * tile) + 1.0, zero),
@@ -57,7 +60,9 @@ def _project_vector(
     ))  # fmt: skip
     if seen == 0:
         return seen
-    column, row, inverse_a = simd.floor(u), simd.floor(v), 1.0 / a
+    column = simd.floor(u)
+    row = simd.floor(v)
+    inverse_a = 1.0 / a
     k_yy = geometry.K_SCALE * simd.sqrt(a / determinant)
     tables.store_columns1(depths, m, m + _WIDE, (z,))
     tables.store_lines(records, m, (
@@ -77,8 +82,10 @@ def project(
     Fills ``records``, ``depths`` and ``boxes``; adds to ``tile_counts`` [T, tiles]."""
     entries = 0
     for n in range(first, last, _WIDE):
-        mean, quaternion = tables.columns3(means, n, last), tables.columns4(quaternions, n, last)
-        scale, opacity = tables.columns3(scales, n, last), tables.columns1(opacities, n, last)
+        mean = tables.columns3(means, n, last)
+        quaternion = tables.columns4(quaternions, n, last)
+        scale = tables.columns3(scales, n, last)
+        opacity = tables.columns1(opacities, n, last)
         w, x, y, z, _ = geometry.unit(quaternion)
         root = geometry.scaled(geometry.rotation(w, x, y, z), scale)
         for t in range(len(views)):

@@ -8,7 +8,8 @@ from ghgs_lit.kernels.memory import pointer_to
 from ghgs_lit.kernels.simd import DOUBLES, I32, I64, LANES, constant, doubles, everywhere, floats, indices
 from ghgs_lit.rendering.cpu import layout
 
-_FLOAT8, _INT8 = ir.VectorType(ir.FloatType(), DOUBLES), ir.VectorType(I32, DOUBLES)
+_FLOAT8 = ir.VectorType(ir.FloatType(), DOUBLES)
+_INT8 = ir.VectorType(I32, DOUBLES)
 
 
 def _block_rows(context, builder, array_type, array, index, stride, index_type):
@@ -91,10 +92,12 @@ def _flat_rows(context, builder, array_type, args, index_type, count, kind):
 
 def _masked(builder, name: str, kind, rows, count: int, *args):
     """Load or store the first ``rows`` of a vector of eight rows of ``count`` floats."""
-    wide, lanes = ir.VectorType(I64, kind.count), range(kind.count)
+    wide = ir.VectorType(I64, kind.count)
+    lanes = range(kind.count)
     limit = everywhere(builder, rows, kind.count)
     mask = builder.icmp_signed("<", ir.Constant(wide, [lane // count for lane in lanes]), limit)
-    values, align = [v for v in args if v.type == kind], ir.Constant(I32, 4)
+    values = [v for v in args if v.type == kind]
+    align = ir.Constant(I32, 4)
     (address,) = (v for v in args if v.type != kind)
     operands = [*values, address, align, mask] + ([] if values else [ir.Constant(kind, [0.0] * kind.count)])
     result = ir.VoidType() if values else kind
@@ -183,7 +186,8 @@ def _transpose(builder, vectors: list):
         high = [i + distance if not i & distance else LANES + i for i in range(LANES)]
         for j in range(len(vectors)):
             if not j & distance:
-                a, b = vectors[j], vectors[j + distance]
+                a = vectors[j]
+                b = vectors[j + distance]
                 vectors[j] = builder.shuffle_vector(a, b, indices(low))
                 vectors[j + distance] = builder.shuffle_vector(a, b, indices(high))
         distance //= 2

@@ -10,7 +10,8 @@ from ghgs_lit.rendering.cpu import layout
 
 LANES = simd.LANES
 BLOCKS = layout.PIXELS // LANES
-ZERO, ONE = np.float32(0), np.float32(1)
+ZERO = np.float32(0)
+ONE = np.float32(1)
 # Smallest denominator of the expected depth; for smaller alphas depth has no gradient in alpha.
 LEAST_ALPHA = np.float32(1e-10)
 
@@ -20,7 +21,8 @@ def grid():
     """Columns, then rows of a tile's pixels, block by block."""
     pixels = simd.aligned(2 * layout.PIXELS)
     for pixel in range(layout.PIXELS):
-        block, lane = pixel // LANES, pixel % LANES
+        block = pixel // LANES
+        lane = pixel % LANES
         pixels[pixel] = block % 4 * 4 + lane % 4
         pixels[layout.PIXELS + pixel] = block // 4 * 4 + lane // 4
     return pixels
@@ -29,9 +31,12 @@ def grid():
 @helper
 def place(tile, tiles_x, tiles_y, height, width):
     """View, first column and row, rows and columns in the image, and index of the first pixel of a tile."""
-    view, inner = tile // (tiles_x * tiles_y), tile % (tiles_x * tiles_y)
-    y0, x0 = inner // tiles_x * layout.TILE, inner % tiles_x * layout.TILE
-    rows, columns = min(layout.TILE, height - y0), min(layout.TILE, width - x0)
+    view = tile // (tiles_x * tiles_y)
+    inner = tile % (tiles_x * tiles_y)
+    y0 = inner // tiles_x * layout.TILE
+    x0 = inner % tiles_x * layout.TILE
+    rows = min(layout.TILE, height - y0)
+    columns = min(layout.TILE, width - x0)
     return view, x0, y0, rows, columns, y0 * width + x0
 
 
@@ -43,7 +48,8 @@ def open_pixels(view, x0, y0, pixels, transmittance):
     bottom = simd.full(np.float32(view[layout.BOTTOM] - y0))
     for block in range(BLOCKS):
         at = block * LANES
-        x, y = memory.load(pixels, at), memory.load(pixels, layout.PIXELS + at)
+        x = memory.load(pixels, at)
+        y = memory.load(pixels, layout.PIXELS + at)
         within = (x <= right) & (y <= bottom)
         memory.store(transmittance, at, simd.select(within, simd.full(ONE), ZERO))
         if simd.bits(within) != 0:
@@ -54,7 +60,8 @@ def open_pixels(view, x0, y0, pixels, transmittance):
 @helper
 def read_splat(record, x0, y0):
     """Vector from a splat's centre to the tile's first pixel (2), ``K`` (3), opacity and cutoff."""
-    x, y = x0 - record[layout.COLUMN], y0 - record[layout.ROW]
+    x = x0 - record[layout.COLUMN]
+    y = y0 - record[layout.ROW]
     return (
         x + record[layout.REST_X], y + record[layout.REST_Y], record[layout.K_XX], record[layout.K_YX],
         record[layout.K_YY], record[layout.OPACITY], record[layout.CUTOFF],
