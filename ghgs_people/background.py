@@ -20,7 +20,9 @@ class Joining(dict[str, tuple[int, ...]]):
 
     def __init__(self, layout: Layout, names: Sequence[str]) -> None:
         super().__init__(layout.subjects)
-        self._layout, self._names, self._made = layout, names, Completeness(layout.root)
+        self._layout = layout
+        self._names = names
+        self._made = Completeness(layout.root)
         layout.subjects = self
 
     def __iter__(self) -> Iterator[str]:

@@ -87,7 +87,8 @@ class CaptureRig:
     @cached_property
     def _middle(self) -> np.ndarray:
         """The point [3] of the world nearest to all optical axes."""
-        rotations, axes = self._poses[:, :3, :3], self._poses[:, 2, :3]
+        rotations = self._poses[:, :3, :3]
+        axes = self._poses[:, 2, :3]
         centers = -(rotations.mT @ self._poses[:, :3, 3:])[..., 0]
         across = np.eye(3) - axes[:, :, None] * axes[:, None]
         return np.linalg.lstsq(across.sum(0), (across @ centers[..., None]).sum(0)[:, 0], rcond=None)[0]
@@ -101,7 +102,8 @@ class CaptureRig:
     def _upright(self) -> np.ndarray:
         """Rotation [3, 3] from the world to one whose y points up. Cameras are assumed level: up is
         orthogonal to all image rows. If all rows are parallel, it is the mean up direction of the images."""
-        rows, mean = self._poses[:, 0, :3], -self._poses[:, 1, :3].mean(0)
+        rows = self._poses[:, 0, :3]
+        mean = -self._poses[:, 1, :3].mean(0)
         _, strengths, axes = np.linalg.svd(rows)
         up = axes[2] * np.sign(axes[2] @ mean) if strengths[1] > 0.1 * strengths[0] else mean
         up = up / np.linalg.norm(up)
@@ -138,7 +140,8 @@ class CaptureRig:
     ) -> tuple["PlacedRig", Poses]:
         """The cameras around one subject; the deviations (second value) are 0."""
         vertices = np.concatenate([part.vertices for part in person.parts])
-        low, high = vertices.min(0), vertices.max(0)
+        low = vertices.min(0)
+        high = vertices.max(0)
         tall = high[1] - low[1]
         share = rng.uniform(*self.fill)
         focal = np.array([matrix[1][1] for matrix in self.intrinsics]) / np.asarray(self.heights)
@@ -195,7 +198,8 @@ class PlacedRig:
         near = "cameras farther from the subject than it is wide (data.fill is less)"
         require(points[:, 2].min() > 1e-3, "data.cameras", near, f"a depth of {points[:, 2].min():.3g} m")
         pixels = (points @ matrix.T)[:, :2] / points[:, 2:]
-        low, high = pixels.min(0), pixels.max(0)
+        low = pixels.min(0)
+        high = pixels.max(0)
         factor = (SHARE * np.asarray(size) / (high - low)).min()
         crop = matrix.copy()
         crop[:2, 2] -= (low + high) / 2

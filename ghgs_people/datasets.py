@@ -149,7 +149,8 @@ class _Generated(_Renderable):
 
     def render_first(self, names: Mapping[str, Sequence[str]]) -> None:
         """Render these people, by phase."""
-        source, rig = SyntheticSource(_PEOPLE_SEED), self.camera_rig()
+        source = SyntheticSource(_PEOPLE_SEED)
+        rig = self.camera_rig()
         render_people(Path(self.root), names, source, rig, self.render, _PEOPLE_SEED, self.render_workers)
 
     def check_targets(self, targets: TargetProtocol) -> None:
@@ -191,7 +192,8 @@ class PeopleInRig(_Generated):
         """Render these people, but of training only the first; start to render the others."""
         if self.render_workers == 0:
             return super().render_first(names)
-        trained, root = list(names.get("train", [])), Path(self.root)
+        trained = list(names.get("train", []))
+        root = Path(self.root)
         super().render_first({**names, "train": trained[:_FIRST_TRAIN]})
         render_beside(
             root, trained, SyntheticSource(_PEOPLE_SEED), self.camera_rig(), self.render, _PEOPLE_SEED
@@ -251,10 +253,12 @@ class Scans(DataSet, _OnRing):
 
     def render_missing(self) -> int:
         """Render the scans of the split (up to ``limit``) that ``root`` lacks; returns their number."""
-        source, root = self.scans(), required_folder("data.root", "a folder", self.root)
+        source = self.scans()
+        root = required_folder("data.root", "a folder", self.root)
         names = split_names(self.source_folder, source.names(), self.split, self.val_fraction, _SEED)
         names = {phase: listed[: self.limit.of(phase)] for phase, listed in names.items()}
-        rig, workers = self.camera_rig(), self.render_workers
+        rig = self.camera_rig()
+        workers = self.render_workers
         return render_people(root, names, source, rig, self.render, _SEED, workers)
 
 

@@ -15,7 +15,9 @@ from ghgs_lit.parsing import find_path
 
 _NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-_JSON, _BIN = 0x4E4F534A, 0x004E4942  # Kinds of a GLB's chunks
+# Kinds of a GLB's chunks.
+_JSON = 0x4E4F534A
+_BIN = 0x004E4942
 # Extensions without which a reader would see another mesh or texture, though a file may require them.
 _READ = ("EXT_texture_webp", "KHR_lights_punctual", "KHR_materials_")
 
@@ -34,7 +36,8 @@ def posed(path: Path) -> dict[str, Any] | None:
         moved = [(i, node) for i, node in nodes if "skin" in node or any(_morphs(tree, node))]
         if not moved:
             return None
-        worlds, shown = _worlds(tree), _shown(tree)
+        worlds = _worlds(tree)
+        shown = _shown(tree)
         for i, node in moved:
             if i in shown:
                 _pose(tree, buffers, node, worlds)
@@ -49,14 +52,17 @@ def posed(path: Path) -> dict[str, Any] | None:
 
 def _read(path: Path) -> tuple[dict[str, Any], list[bytes]]:
     """The tree of a file and the content of its buffers."""
-    content, binary = path.read_bytes(), b""
+    content = path.read_bytes()
+    binary = b""
     if content[:4] == b"glTF":
-        chunks, start = {}, 12
+        chunks = {}
+        start = 12
         while start + 8 <= len(content):
             length, kind = np.frombuffer(content, "<u4", 2, start).tolist()
             chunks.setdefault(kind, content[start + 8 : start + 8 + length])
             start += 8 + length
-        content, binary = chunks[_JSON], chunks.get(_BIN, b"")
+        content = chunks[_JSON]
+        binary = chunks.get(_BIN, b"")
     tree = json.loads(content)
     buffers = []
     for entry in tree.get("buffers", []):
@@ -130,7 +136,8 @@ def _pose(
 ) -> None:
     """Give a node a mesh of its own, whose vertices are moved; a skinned one leaves its place in the scene,
     since joints alone say where it is."""
-    mesh, morphs = copy.deepcopy(tree["meshes"][node["mesh"]]), _morphs(tree, node)
+    mesh = copy.deepcopy(tree["meshes"][node["mesh"]])
+    morphs = _morphs(tree, node)
     skin = tree["skins"][node["skin"]] if "skin" in node else None
     for primitive in mesh["primitives"]:
         attributes = primitive["attributes"]
@@ -188,7 +195,8 @@ def _values(tree: dict[str, Any], buffers: list[bytes], index: int) -> np.ndarra
     entry = tree["accessors"][index]
     if "sparse" in entry:
         raise ValueError("a sparse accessor of a rigged mesh")
-    view, number = tree["bufferViews"][entry["bufferView"]], np.dtype(_NUMBERS[entry["componentType"]])
+    view = tree["bufferViews"][entry["bufferView"]]
+    number = np.dtype(_NUMBERS[entry["componentType"]])
     columns = _COLUMNS[entry["type"]]
     start = view.get("byteOffset", 0) + entry.get("byteOffset", 0)
     strides = view.get("byteStride") or columns * number.itemsize, number.itemsize

@@ -135,7 +135,8 @@ def render_subject(job: _Job) -> tuple[_Job, str]:
 def _render(job: _Job) -> None:
     rng = subject_rng(job.seed, job.name)
     person = job.rig.place(job.source.load(job.name), rng)
-    yaws, lights = job.rig.yaws(rng) + job.source.facing(job.name), LIGHTS.draw(rng)
+    yaws = job.rig.yaws(rng) + job.source.facing(job.name)
+    lights = LIGHTS.draw(rng)
     if job.settings.lights == "none":
         lights = None
     height, width = job.settings.size
@@ -189,7 +190,8 @@ def render_people(
     positions = settings.positions
     fits = positions is None or set(positions) <= set(range(rig.positions))
     require(fits, "data.render.positions", f"some of 0 to {rig.positions - 1}", positions)
-    progress, made_with = Progress(Path(root)), identity(rig, settings, seed)
+    progress = Progress(Path(root))
+    made_with = identity(rig, settings, seed)
     progress.check_settings(made_with)
     if not any(progress.missing(phase, listed) for phase, listed in names.items()):
         return 0
@@ -202,7 +204,9 @@ def render_people(
             for phase, listed in names.items()
             for name in progress.missing(phase, listed)
         ]
-        console, label, bad = Console(stderr=True), f"rendering into {root}", []
+        console = Console(stderr=True)
+        label = f"rendering into {root}"
+        bad = []
         try:
             with contextlib.closing(_run(todo, workers)) as finished:
                 for job, why in track(finished, label, total=len(todo), console=console, disable=not shown):

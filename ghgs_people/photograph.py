@@ -107,7 +107,8 @@ class Studio:
         parts = [part for part in person.parts if len(part.faces)]
         if not parts:
             raise InputError(f"{person.name}: expected a mesh with faces; found none")
-        self.lights, self.samples = lights, samples
+        self.lights = lights
+        self.samples = samples
         counts = np.cumsum([0] + [len(part.vertices) for part in parts])
         self._vertices = np.concatenate([part.vertices for part in parts]).astype(np.float32)
         self._faces = np.concatenate([p.faces + n for p, n in zip(parts, counts, strict=False)]).astype(
@@ -128,7 +129,8 @@ class Studio:
         intrinsics = cameras.intrinsics.double().numpy()
         extrinsics = cameras.extrinsics.double().numpy()
         size = (len(intrinsics), cameras.height, cameras.width)
-        images, depths = np.zeros((*size, 3), np.float32), np.zeros(size, np.float32)
+        images = np.zeros((*size, 3), np.float32)
+        depths = np.zeros(size, np.float32)
         alphas = np.zeros(size, np.float32)
         for n, (matrix, pose) in enumerate(zip(intrinsics, extrinsics, strict=True)):
             is_finite = np.isfinite(matrix).all() and np.isfinite(pose).all()
@@ -160,7 +162,9 @@ class Studio:
         self, matrix: np.ndarray, pose: np.ndarray, rows: slice, columns: slice
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Image [h, w, 3], matte [h, w] and depth [h, w] of a window."""
-        n, h, w = self.samples, rows.stop - rows.start, columns.stop - columns.start
+        n = self.samples
+        h = rows.stop - rows.start
+        w = columns.stop - columns.start
         y = (rows.start + (np.arange(h * n) + 0.5) / n - matrix[1, 2]) / matrix[1, 1]
         u = columns.start + (np.arange(w * n) + 0.5) / n - matrix[0, 2]
         x = (u - matrix[0, 1] * y[:, None]) / matrix[0, 0]
@@ -171,12 +175,16 @@ class Studio:
         origin = (-pose[:3, :3].T @ pose[:3, 3]).astype(np.float32)
 
         hits = self._scene.run(np.tile(origin, (len(directions), 1)), directions, output=True)
-        hit, u, v = hits["primID"] >= 0, hits["u"], hits["v"]
-        depth, weights = np.where(hit, hits["tfar"], 0), np.stack((1 - u - v, u, v), -1)
+        hit = hits["primID"] >= 0
+        u = hits["u"]
+        v = hits["v"]
+        depth = np.where(hit, hits["tfar"], 0)
+        weights = np.stack((1 - u - v, u, v), -1)
         colors = np.zeros((len(rays), 3), np.float32)
         colors[hit] = self._shade(directions[hit], hits["primID"][hit], weights[hit])
 
-        hit, depth = hit.reshape(h, w, n * n), depth.reshape(h, w, n * n)
+        hit = hit.reshape(h, w, n * n)
+        depth = depth.reshape(h, w, n * n)
         offset = np.abs(np.arange(n) - (n - 1) / 2)
         order = np.argsort(offset[:, None] ** 2 + offset**2, axis=None, kind="stable")
         nearest = order[hit[..., order].argmax(-1)]

@@ -34,7 +34,8 @@ class Progress(Completeness):
                     f"{self.root}: expected an empty folder or one rendered here before; found other files"
                 )
             _write_json(path, settings)
-        wanted, stored = lights_of(settings["render"]), self.lights
+        wanted = lights_of(settings["render"])
+        stored = self.lights
         if wanted != stored:
             raise InputError(
                 f"{path}: expected data.render.lights={wanted}; found {stored} (render into another folder,"

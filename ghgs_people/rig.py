@@ -133,7 +133,8 @@ class Rig:
         focal = self.focal * height
         intrinsics = np.zeros((*np.shape(yaws), 3, 3))
         intrinsics[...] = [[focal, 0, width / 2], [0, focal, height / 2 + self.shift_y * height], [0, 0, 1]]
-        intrinsics, extrinsics = intrinsics.astype(np.float32), extrinsics.astype(np.float32)
+        intrinsics = intrinsics.astype(np.float32)
+        extrinsics = extrinsics.astype(np.float32)
         return Cameras(torch.from_numpy(intrinsics), torch.from_numpy(extrinsics), height, width)
 
     def drawn(
@@ -142,20 +143,25 @@ class Rig:
         """The rig of one subject by ``variation``, and the deviations of its cameras. ``yaws``: of all its
         views (:meth:`yaws`). ``aspect``: width / height of the images. ``rng``: for the rig alone; the same
         numbers are drawn whatever varies."""
-        v, share = self.variation, rng.uniform(size=3)
+        v = self.variation
+        share = rng.uniform(size=3)
         deviations = rng.uniform(-1, 1, (*yaws.shape, 5))
         deviations[:, 1] = np.roll(deviations[:, 0], -1, 0)  # view 1 is the next ring camera
-        pitch, roll, shift = deviations[..., 0], deviations[..., 1], deviations[..., 2:]
+        pitch = deviations[..., 0]
+        roll = deviations[..., 1]
+        shift = deviations[..., 2:]
         higher = rng.uniform(-1, 1, yaws.shape)  # drawn last, so that the numbers above do not change
         higher[:, :2] = 0
         pitch = v.camera_pitch * pitch + v.between_pitch * higher
         poses = Poses(pitch, v.camera_roll * roll, v.camera_look_at * shift)
-        radius, ring_pitch = _within(v.radius, share[0], self.radius), _within(v.pitch, share[1], self.pitch)
+        radius = _within(v.radius, share[0], self.radius)
+        ring_pitch = _within(v.pitch, share[1], self.pitch)
         rig = replace(self, radius=radius, pitch=ring_pitch, variation=STILL)
         if v.fill is None:
             return rig, poses
         low, high = rig._extents(person, yaws, poses)
-        room, middle = np.array([aspect, 1]) / 2 - _MARGIN, np.array([0, self.shift_y])
+        room = np.array([aspect, 1]) / 2 - _MARGIN
+        middle = np.array([0, self.shift_y])
         reach = np.maximum(-low / (room + middle), high / (room - middle)).max()
         tallest = (high - low)[:, 1].max()
         return replace(rig, focal=float(min(_within(v.fill, share[2], 0.0) / tallest, 1 / reach))), poses
@@ -163,7 +169,8 @@ class Rig:
     def _extents(self, person: Person, yaws: np.ndarray, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
         """Smallest and largest (x/z, y/z) [n, 2] of a subject in each camera."""
         vertices = np.concatenate([part.vertices for part in person.parts])
-        low, high = [], []
+        low = []
+        high = []
         for pose in self.cameras(yaws, 1, 1, poses).extrinsics.flatten(0, 1).numpy():
             points = vertices @ pose[:3, :3].T + pose[:3, 3]
             near = f"a ring farther from {person.name}: its points in front of all cameras"

@@ -79,7 +79,8 @@ class _Beside(trimesh.resolvers.FilePathResolver):
     def get(self, key: str) -> bytes:
         """The content of a file; one that is named with folders of another machine lies beside the mesh.
         FileNotFoundError: there is none."""
-        name, folder = str(key).strip().strip('"'), Path(self.parent)
+        name = str(key).strip().strip('"')
+        folder = Path(self.parent)
         # Escapes of a URI, folders of another machine, and options of map_Kd, which stand before the name.
         for spelling in (name, unquote(name), parts_of(name)[-1], *name.split()[-1:]):
             path = find_path(folder, spelling) if spelling else None
@@ -95,7 +96,8 @@ def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
     content = path.read_bytes() if tree is None else json.dumps(tree).encode()
     try:
         with listed_formats():
-            file, kind = io.BytesIO(content), kind if tree is None else "gltf"
+            file = io.BytesIO(content)
+            kind = kind if tree is None else "gltf"
             scene = trimesh.load_scene(file, kind, _Beside(str(path)), process=False)
     except Exception as error:  # trimesh raises whatever its parsers raise
         raise InputError(f"{path}: expected a readable mesh; found {error!r}") from error

@@ -83,7 +83,8 @@ class THuman2Source(ScanSource):
 def _check_body(folder: Path, scan: Person, body: np.ndarray) -> None:
     """Refuse a body outside its scan, as when scale or translation were not applied."""
     points = np.concatenate([part.vertices for part in scan.parts])
-    low, high = points.min(0), points.max(0)
+    low = points.min(0)
+    high = points.max(0)
     tall = high[1] - low[1]
     outside = np.maximum(np.maximum(low - body.min(0), body.max(0) - high), 0).max()
     ratio = np.ptp(body[:, 1]) / tall

@@ -30,9 +30,11 @@ FOLDER = Path(__file__).parent
 #: Ring positions of the photographs that are compared: front and back.
 POSITIONS = (0, 8)
 SIDE = 16
-#: Largest root mean square difference of two thumbnails, of 255 levels: at the size of the stored ones (0 on
-#: the machine that made them), and at others (5.7 at 56 pixels).
-SAME_SIZE, OTHER_SIZE = 0.3, 8.0
+#: Largest root mean square difference of two thumbnails, of 255 levels, at the size of the stored ones (it is
+#: 0 on the machine that made them).
+SAME_SIZE = 0.3
+#: The same at other sizes (it is 5.7 at 56 pixels).
+OTHER_SIZE = 8.0
 #: Smallest longer side in pixels at which people can be told apart.
 LEAST = 56
 
@@ -87,7 +89,8 @@ def thumbnail(view: View) -> np.ndarray:
 def check_photographs(split: str, reader: Reader) -> None:
     """Refuse photographs that do not show the people of the definition. ``reader``: of some or all of
     :func:`names`. InputError: names the first person whose photographs differ."""
-    made, known = definition(split), dict(zip(names(split), thumbnails(split), strict=True))
+    made = definition(split)
+    known = dict(zip(names(split), thumbnails(split), strict=True))
     for name in reader.subjects:
         for position, expected in zip(POSITIONS, known[name], strict=True):
             view = reader.read_view(name, position, RING_VIEW, depth=False)

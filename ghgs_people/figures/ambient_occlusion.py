@@ -28,10 +28,12 @@ def occluding_spheres(figure: Figure) -> Spheres:
     """Centres [s, 3] in the pose and radii [s] of spheres that touch the skin from inside."""
     body = load_body()
     naked = figure.rest[:BODY_VERTICES]
-    centres, bones = [], []
+    centres = []
+    bones = []
     for end in (".L", ".R"):
         for start, stop, count in CHAINS:
-            a, b = body.bone(start + end), body.bone(stop + end)
+            a = body.bone(start + end)
+            b = body.bone(stop + end)
             for share in (np.arange(count) + 0.3) / count:
                 centres.append((1 - share) * figure.joints[a] + share * figure.joints[b])
                 bones.append(a)

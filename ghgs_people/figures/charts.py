@@ -86,12 +86,15 @@ RECIPES = {
 @cache
 def chart(name: str) -> Chart:
     """One of the charts in `RECIPES`, built once per process."""
-    body, recipe = load_body(), RECIPES[name]
+    body = load_body()
+    recipe = RECIPES[name]
     surface, box = _select(body, name)
-    quads, uv_quads = surface.quads, surface.uv_quads
+    quads = surface.quads
+    uv_quads = surface.uv_quads
     used, quads = np.unique(quads, return_inverse=True)
     quads = quads.reshape(-1, 4)
-    ones, rows = np.ones(len(used)), np.arange(len(used))
+    ones = np.ones(len(used))
+    rows = np.arange(len(used))
     interpolation = sparse.csr_matrix((ones, (rows, used)), (len(used), body.vertex_count))
     uv = _cropped(body.uv, box).astype(np.float64)
     for _ in range(recipe.levels):
@@ -105,7 +108,8 @@ def chart(name: str) -> Chart:
     point_faces = triangles(quads)
     pairs = np.stack([point_faces.ravel(), triangles(uv_quads).ravel()], 1)
     pairs, faces = np.unique(pairs, axis=0, return_inverse=True)
-    faces, uv = faces.reshape(-1, 3), uv[pairs[:, 1]]
+    faces = faces.reshape(-1, 3)
+    uv = uv[pairs[:, 1]]
     weights = interpolation @ body.weights
     arm_bones = ("upperarm", "lowerarm", "wrist", "finger")
     arm_weight = weights[:, [name.startswith(arm_bones) for name in body.bone_names]].sum(1)
@@ -137,7 +141,8 @@ def chart(name: str) -> Chart:
 
 def _select(body: BodyModel, name: str) -> tuple[Surface, Sequence[float]]:
     """The quads of a chart, and the box (left, bottom, right, top) in the UV layout that it fills."""
-    surface, margin = body.surfaces["body"], 0.0
+    surface = body.surfaces["body"]
+    margin = 0.0
     if name in ("head", "skin"):
         uv = _cropped(body.uv, body.head_uv)
         inside = ((uv > 0) & (uv < 1)).all(1)[surface.uv_quads].all(1)
@@ -150,7 +155,8 @@ def _select(body: BodyModel, name: str) -> tuple[Surface, Sequence[float]]:
     elif name in ("eyes", "skirt"):
         surface = body.surfaces[name]
     else:
-        surface, margin = body.surfaces["tights"], 0.0004
+        surface = body.surfaces["tights"]
+        margin = 0.0004
         x, y, _ = np.moveaxis(body.mean[surface.quads], -1, 0)
         foot = body.uv[surface.uv_quads][..., 1].max(1) < FEET_UV
         surface = surface[

@@ -62,9 +62,11 @@ def sample_complexion(rng: np.random.Generator, female: bool, age: float) -> Com
     makeup = float(female and rng.random() < 0.6) * rng.uniform(0.3, 1.0)
     rose = skin * np.array([0.88, 0.62, 0.60])
     lipstick = np.array([rng.uniform(0.5, 0.8), rng.uniform(0.08, 0.25), rng.uniform(0.12, 0.32)])
-    beard, style = 0.0, "none"
+    beard = 0.0
+    style = "none"
     if not female and rng.random() < 0.55:
-        beard, style = rng.uniform(0.25, 0.95), str(rng.choice(("stubble", "full", "goatee", "moustache")))
+        beard = rng.uniform(0.25, 0.95)
+        style = str(rng.choice(("stubble", "full", "goatee", "moustache")))
     return Complexion(
         skin=skin,
         lips=rose + (lipstick - rose) * 0.75 * makeup,
@@ -89,7 +91,8 @@ def _blob(
 
 
 def _grain(look: Complexion, point: np.ndarray) -> np.ndarray:
-    u, v = point[:, 0] + 0.5 * point[:, 2], point[:, 1] + 0.3 * point[:, 2]
+    u = point[:, 0] + 0.5 * point[:, 2]
+    v = point[:, 1] + 0.3 * point[:, 2]
     return 1 + 0.030 * look.noise(u / 0.45, v / 0.45) + 0.018 * look.fine(u / 0.12, v / 0.12)
 
 
@@ -108,7 +111,8 @@ def head_texture(look: Complexion, scalp: float) -> np.ndarray:
     colour = colour * (1 - flush[:, None] * np.array([0.02, 0.16, 0.14]))
     hollow = _blob(point, (0.030, 1.568, 0.205), (0.022, 0.014, 0.03))
     colour = darken(colour, hollow, 0.16)
-    u, v = point[:, 0], point[:, 1]
+    u = point[:, 0]
+    v = point[:, 1]
     if look.freckles:
         spots = smoothstep(1.4, 2.2, look.fine(u / 0.09, v / 0.09)) * _blob(
             point, (0.03, 1.53, 0.21), (0.035, 0.03, 0.04)
@@ -133,7 +137,9 @@ def _masks(piece: Chart) -> np.ndarray:
 
 
 def _eyes_and_brows(colour: np.ndarray, look: Complexion, point: np.ndarray, lids: np.ndarray) -> np.ndarray:
-    x, y, z = np.abs(point[:, 0]), point[:, 1], point[:, 2]
+    x = np.abs(point[:, 0])
+    y = point[:, 1]
+    z = point[:, 2]
     dark = look.hair * 0.45
     distance = np.linalg.norm(np.stack([x, y, z], 1) - EYE, axis=1)
     lash = (1 - smoothstep(0.0150, 0.0168, distance)) * (z > 0.19) * np.where(y > EYE[1] - 0.002, 1.0, 0.45)
@@ -155,7 +161,9 @@ def _eyes_and_brows(colour: np.ndarray, look: Complexion, point: np.ndarray, lid
 def _beard(colour: np.ndarray, look: Complexion, point: np.ndarray, lips: np.ndarray) -> np.ndarray:
     if look.beard_style == "none":
         return colour
-    x, y, z = np.abs(point[:, 0]), point[:, 1], point[:, 2]
+    x = np.abs(point[:, 0])
+    y = point[:, 1]
+    z = point[:, 2]
     jaw = (
         smoothstep(1.520, 1.500, y + 0.5 * np.clip(0.19 - z, -0.05, 0.06))
         * smoothstep(1.425, 1.445, y)

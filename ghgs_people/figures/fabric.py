@@ -23,7 +23,8 @@ def random_colour(rng: np.random.Generator, neutral: float = 0.4) -> np.ndarray:
     """A colour of clothes, [3] in [0, 1]; `neutral` is the probability of greys, navy and browns."""
     if rng.random() < neutral:
         return np.clip(np.array(NEUTRALS[rng.integers(len(NEUTRALS))]) + rng.normal(0, 0.025, 3), 0.04, 0.96)
-    saturation, value = rng.uniform(0.35, 0.88), rng.uniform(0.35, 0.92)
+    saturation = rng.uniform(0.35, 0.88)
+    value = rng.uniform(0.35, 0.92)
     return np.array(colorsys.hsv_to_rgb(rng.random(), saturation, value))
 
 
@@ -110,10 +111,12 @@ def _pattern(
         radius = np.hypot(u + 0.5 * row - np.rint(u + 0.5 * row), v - row - 0.5)
         return 1 - _edge(radius, 0.27, 1.5 * soft), none
     if name == "blobs":
-        field, other = fabric.noise(u / 9, v / 9), fabric.noise(u / 9 + 0.37, v / 9 + 0.61)
+        field = fabric.noise(u / 9, v / 9)
+        other = fabric.noise(u / 9 + 0.37, v / 9 + 0.61)
         return _edge(field, 0.7, 0.12), _edge(other, 0.95, 0.12)
     if name == "camouflage":
-        field, other = fabric.noise(u / 14, v / 18), fabric.noise(u / 14 + 0.43, v / 18 + 0.29)
+        field = fabric.noise(u / 14, v / 18)
+        other = fabric.noise(u / 14 + 0.43, v / 18 + 0.29)
         return _edge(field, 0.25, 0.05), _edge(other, 0.6, 0.05)
     if name == "block":
         return _edge(along, 1.19, 0.002), _edge(np.abs(along - 1.19), -1, 1) * (np.abs(along - 1.19) < 0.012)
@@ -133,11 +136,14 @@ def print_emblem(
 ) -> np.ndarray:
     """Print a random emblem on colours [k, 3] at places (x, y), metres, of front or back."""
     kind = str(rng.choice(("disc", "letters", "bars", "star", "rings", "number")))
-    ink, size = random_colour(rng, 0.3), rng.uniform(0.05, 0.10)
+    ink = random_colour(rng, 0.3)
+    size = rng.uniform(0.05, 0.10)
     if np.abs(ink - colour.mean(0)).sum() < 0.6:
         ink = np.where(colour.mean() > 0.5, 0.2 * ink, 0.7 + 0.3 * ink)
-    u, v = (x - centre[0]) / size, (y - centre[1]) / size
-    radius, angle = np.hypot(u, v), np.arctan2(v, u)
+    u = (x - centre[0]) / size
+    v = (y - centre[1]) / size
+    radius = np.hypot(u, v)
+    angle = np.arctan2(v, u)
     soft = 0.0012 / size
     if kind == "disc":
         cut = int(rng.integers(2, 6))
@@ -157,14 +163,19 @@ def print_emblem(
 def _glyphs(u: np.ndarray, v: np.ndarray, count: int, soft: float, rng: np.random.Generator) -> np.ndarray:
     """Mask [k] of `count` letter-like signs in a row: strokes between the nodes of a small grid."""
     mask = np.zeros_like(u)
-    pitch, height = 2.6 / count, min(0.75, 2.2 / count)
+    pitch = 2.6 / count
+    height = min(0.75, 2.2 / count)
     nodes = np.array([(i, j) for j in (-1.0, 0.0, 1.0) for i in (-0.36, 0.36)])
     for index in range(count):
         centre = (index - (count - 1) / 2) * pitch
         order = rng.permutation(6)[: rng.integers(4, 6)]
         for a, b in zip(nodes[order[:-1]], nodes[order[1:]], strict=True):
-            ax, ay, bx, by = centre + a[0] * pitch, a[1] * height, centre + b[0] * pitch, b[1] * height
-            dx, dy = bx - ax, by - ay
+            ax = centre + a[0] * pitch
+            ay = a[1] * height
+            bx = centre + b[0] * pitch
+            by = b[1] * height
+            dx = bx - ax
+            dy = by - ay
             t = np.clip(((u - ax) * dx + (v - ay) * dy) / (dx * dx + dy * dy), 0, 1)
             distance = np.hypot(u - ax - t * dx, v - ay - t * dy)
             mask = np.maximum(mask, 1 - _edge(distance, 0.13, soft))

@@ -139,8 +139,10 @@ def _pockets(colour: np.ndarray, place: Place, bottom: Bottom) -> np.ndarray:
         colour = darken(colour, mask, 0.35)
         return colour if thread is None else mix(colour, 0.5 * mask, thread)
 
-    x, low = np.abs(place.x), place.y - (bottom.waist - 0.03)
-    front, back = place.z > 0.09, place.z < 0.06
+    x = np.abs(place.x)
+    low = place.y - (bottom.waist - 0.03)
+    front = place.z > 0.09
+    back = place.z < 0.06
     arc = np.hypot(x - 0.175, low - 0.01) - 0.085
     colour = stitch(colour, _line(arc, 0.003) * front * (low < 0) * (low > -0.11))
     fly = np.where(low > -0.09, place.x + 0.022, np.hypot(place.x, low + 0.09) - 0.022)

@@ -101,7 +101,8 @@ def drape_top(figure: Figure, top: Top, noise: Noise) -> np.ndarray:
     folds = _wrinkles(place, noise, top)
     if top.tucked:  # flat below the waistband, loose above it
         out = smoothstep(0.985, 1.03, place.y)
-        ease, folds = out * (ease + 0.008 * bump(place.y, 1.05, 0.03)) + 0.001 * (1 - out), out * folds
+        ease = out * (ease + 0.008 * bump(place.y, 1.05, 0.03)) + 0.001 * (1 - out)
+        folds = out * folds
     else:  # over the waistband of trousers or skirt
         low = max(1.02, top.hem + 0.03)
         ease = np.maximum(ease, 0.0145 * (1 - smoothstep(low, low + 0.06, place.y)))
@@ -139,9 +140,12 @@ def _hang(points: np.ndarray, place: Place, share: np.ndarray | float) -> np.nda
     trunk = place.arm < 0.3
     axis = np.array([0.0, np.median(points[trunk, 2])])
     offset = points[:, [0, 2]] - axis
-    radius, angle = np.hypot(*offset.T), np.arctan2(offset[:, 0], offset[:, 1])
-    rows, columns = 28, 36
-    top, bottom = points[trunk & (place.y < 1.30), 1].max(), points[trunk, 1].min()
+    radius = np.hypot(*offset.T)
+    angle = np.arctan2(offset[:, 0], offset[:, 1])
+    rows = 28
+    columns = 36
+    top = points[trunk & (place.y < 1.30), 1].max()
+    bottom = points[trunk, 1].min()
     row = np.clip((top - points[:, 1]) / (top - bottom) * (rows - 1), 0, rows - 1)
     column = (angle / (2 * np.pi) % 1.0) * columns
     cell = np.rint(row).astype(int) * columns + np.rint(column).astype(int) % columns

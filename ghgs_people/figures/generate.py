@@ -106,7 +106,8 @@ def arm_depth(posed: np.ndarray, faces: np.ndarray) -> float:
     normals = vertex_normals(posed, faces)
     distance, nearest = cKDTree(posed[solid]).query(posed[limb], distance_upper_bound=0.08)
     near = np.isfinite(distance)
-    nearest, limb = solid[nearest[near]], limb[near]
+    nearest = solid[nearest[near]]
+    limb = limb[near]
     height = np.einsum("ki,ki->k", posed[limb] - posed[nearest], normals[nearest])
     return float(np.clip(-height, 0, None).max(initial=0.0))
 
@@ -124,8 +125,13 @@ def _limbs_and_trunk() -> tuple[np.ndarray, np.ndarray]:
 def dress(figure: Figure, outfit: Outfit, spheres: Spheres, rng: np.random.Generator) -> list[TexturedMesh]:
     """Top and jacket, trousers or skirt, shoes; each without what the next one hides."""
     noise = Noise(rng, 2.3, 3.0, 128)
-    top, jacket, bottom, shoes = outfit.top, outfit.jacket, outfit.bottom, outfit.shoes
-    upper, lower, feet = chart("upper"), chart("skirt" if bottom.kind == "skirt" else "lower"), chart("shoes")
+    top = outfit.top
+    jacket = outfit.jacket
+    bottom = outfit.bottom
+    shoes = outfit.shoes
+    upper = chart("upper")
+    lower = chart("skirt" if bottom.kind == "skirt" else "lower")
+    feet = chart("shoes")
 
     def sew(piece: Chart, points: np.ndarray, field: np.ndarray, texture: np.ndarray) -> TexturedMesh:
         return piece.mesh(points, field, piece.shaded(texture, ambient_occlusion(piece, points, spheres)))
@@ -135,13 +141,15 @@ def dress(figure: Figure, outfit: Outfit, spheres: Spheres, rng: np.random.Gener
         field = np.minimum(field, OVERLAP - garments.bottom_field(upper.place, bottom))
     if jacket:
         field = np.minimum(field, OVERLAP - garments.top_field(upper.place, jacket))
-    points, texture = garments.drape_top(figure, top, noise), top_texture(top, noise, rng)
+    points = garments.drape_top(figure, top, noise)
+    texture = top_texture(top, noise, rng)
     parts = [sew(upper, points, field, texture)]
     if top.neck == "collar":
         points, collar = garments.fold_collar(points, top)
         parts.append(sew(upper, points, np.minimum(collar, field), texture))
     if jacket:
-        points, texture = garments.drape_top(figure, jacket, noise), top_texture(jacket, noise, rng)
+        points = garments.drape_top(figure, jacket, noise)
+        texture = top_texture(jacket, noise, rng)
         parts.append(sew(upper, points, garments.top_field(upper.place, jacket), texture))
     field = garments.bottom_field(lower.place, bottom)
     for outer in (jacket, None if top.tucked else top):
@@ -187,13 +195,18 @@ def join(parts: list[TexturedMesh]) -> TexturedMesh:
     """One mesh of several opaque ones, their textures side by side."""
     height = max(part.texture.shape[0] for part in parts)
     width = sum(part.texture.shape[1] for part in parts)
-    textures, uv, faces, left, count = [], [], [], 0, 0
+    textures = []
+    uv = []
+    faces = []
+    left = 0
+    count = 0
     for part in parts:
         h, w, _ = part.texture.shape
         textures.append(np.pad(part.texture, ((height - h, 0), (0, 0), (0, 0)), mode="edge"))
         uv.append((part.uv * [w, h] + [left, 0]) / [width, height])
         faces.append(part.faces + count)
-        left, count = left + w, count + len(part.vertices)
+        left = left + w
+        count = count + len(part.vertices)
     vertices = np.concatenate([part.vertices for part in parts])
     uv = np.concatenate(uv).astype(np.float32)
     return TexturedMesh(vertices, np.concatenate(faces), uv, np.concatenate(textures, 1))

@@ -21,7 +21,8 @@ SHARES = {  # by sex (True: female), in the order of the styles
     True: (0.0, 0.03, 0.09, 0.03, 0.08, 0.22, 0.28, 0.16, 0.11),
     False: (0.07, 0.30, 0.28, 0.18, 0.08, 0.02, 0.04, 0.02, 0.01),
 }
-ROWS, COLUMNS = 56, 80
+ROWS = 56
+COLUMNS = 80
 
 
 @dataclass(frozen=True)
@@ -179,7 +180,8 @@ def _skull(figure: Figure) -> tuple[np.ndarray, float, Callable[[np.ndarray], np
     """Centre [3] of the cranium, its size against the average one, its radius along directions [..., 3]."""
     piece = chart("head")
     upper = piece.place.y > 1.50
-    head, mean = (piece.interpolation @ figure.rest)[upper], piece.place.point[upper]
+    head = (piece.interpolation @ figure.rest)[upper]
+    mean = piece.place.point[upper]
     scale = np.ptp(head[:, 1]) / np.ptp(mean[:, 1])
     centre = head.mean(0) + (np.array([0.0, 1.575, 0.100]) - mean.mean(0)) * scale
     radii = np.linalg.norm(head - centre, axis=1)

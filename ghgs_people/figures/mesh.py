@@ -25,11 +25,13 @@ class TexturedMesh:
     def __post_init__(self) -> None:
         for name, shape in (("vertices", (None, 3)), ("faces", (None, 3)), ("uv", (len(self.vertices), 2))):
             check_array(name, getattr(self, name), [shape])
-        texture, count = self.texture, len(self.vertices)
+        texture = self.texture
+        count = len(self.vertices)
         fits = texture.ndim == 3 and texture.shape[2] == 3 and texture.dtype == np.uint8
         require(fits, "texture", "uint8 [h, w, 3]", f"{texture.dtype} {list(texture.shape)}")
         if len(self.faces):
-            low, high = int(self.faces.min()), int(self.faces.max())
+            low = int(self.faces.min())
+            high = int(self.faces.max())
             require(low >= 0 and high < count, "faces", f"indices in [0, {count})", f"{low} to {high}")
 
 
@@ -57,9 +59,12 @@ def sample_texture(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     """Colours [n, 3] in [0, 1] of a repeating texture [h, w, 3] uint8, bilinear. ``uv``: [n, 2], origin at
     the bottom left."""
     height, width, _ = texture.shape
-    x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
-    left, top = np.floor(x), np.floor(y)
-    fx, fy = (x - left).astype(np.float32), (y - top).astype(np.float32)
+    x = uv[:, 0] * width - 0.5
+    y = (1 - uv[:, 1]) * height - 0.5
+    left = np.floor(x)
+    top = np.floor(y)
+    fx = (x - left).astype(np.float32)
+    fy = (y - top).astype(np.float32)
     columns = np.stack((left, left + 1)).astype(np.int64) % width
     rows = np.stack((top, top + 1)).astype(np.int64) % height
     texels = texture.reshape(-1, 3)

@@ -81,7 +81,8 @@ def clip(faces: np.ndarray, field: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
         np.stack([on_left, right, on_right], 1)[~tip],
     ]
     faces = np.concatenate(parts)
-    one, two = field[unique[:, 0]], field[unique[:, 1]]
+    one = field[unique[:, 0]]
+    two = field[unique[:, 1]]
     a = np.concatenate([np.arange(count), unique[:, 0]])
     b = np.concatenate([np.arange(count), unique[:, 1]])
     t = np.concatenate([np.zeros(count), one / (one - two)])
@@ -106,7 +107,8 @@ def rasterise(uv: np.ndarray, faces: np.ndarray, height: int, width: int) -> tup
     area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     valid = np.abs(area) > 1e-12
     scale = np.where(valid, 1.0 / np.where(valid, area, 1.0), 0.0)[face]
-    dx, dy = x - a[face, 0], y - a[face, 1]
+    dx = x - a[face, 0]
+    dy = y - a[face, 1]
     second = (dx * (c - a)[face, 1] - dy * (c - a)[face, 0]) * scale
     third = (dy * (b - a)[face, 0] - dx * (b - a)[face, 1]) * scale
     bary = np.stack([1 - second - third, second, third], 1)

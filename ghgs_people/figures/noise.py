@@ -19,12 +19,18 @@ class Noise:
         """Bilinear values at `u`, `v` in periods, any shape; by hand in float32, faster than SciPy."""
         x = np.asarray(u, np.float32) * np.float32(self.size)
         y = np.asarray(v, np.float32) * np.float32(self.size)
-        left, top = np.floor(x), np.floor(y)
-        fx, fy = x - left, y - top
-        i, j = left.astype(np.int32) % self.size, top.astype(np.int32) % self.size
-        k, row, below = (i + 1) % self.size, j * self.size, (j + 1) % self.size * self.size
+        left = np.floor(x)
+        top = np.floor(y)
+        fx = x - left
+        fy = y - top
+        i = left.astype(np.int32) % self.size
+        j = top.astype(np.int32) % self.size
+        k = (i + 1) % self.size
+        row = j * self.size
+        below = (j + 1) % self.size * self.size
         field = self.field.ravel()
-        a, b = field[row + i], field[below + i]
+        a = field[row + i]
+        b = field[below + i]
         upper = a + (field[row + k] - a) * fx
         lower = b + (field[below + k] - b) * fx
         return upper + (lower - upper) * fy

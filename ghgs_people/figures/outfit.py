@@ -83,7 +83,8 @@ def sample_outfit(rng: np.random.Generator, female: bool) -> Outfit:
     jacket = None
     if not dress and top.kind in ("tee", "tank", "shirt") and rng.random() < 0.3:
         fabric = sample_fabric(rng, ("plain", "melange", "knit", "checks", "pinstripes"))
-        hem, opening = rng.uniform(0.82, 0.95), rng.uniform(0.035, 0.09)
+        hem = rng.uniform(0.82, 0.95)
+        opening = rng.uniform(0.035, 0.09)
         jacket = Top("jacket", 0.478, hem, "vee", 0.024, 0.5, False, fabric, None, opening)
     shoes = _sample_shoes(rng, bottom)
     beanie = sample_fabric(rng, ("knit", "stripes", "melange")) if rng.random() < 0.09 else None
@@ -95,20 +96,28 @@ def _sample_top(rng: np.random.Generator, female: bool, tucked: bool) -> Top:
     hem = rng.uniform(0.84, 0.93)
     if kind == "tee":
         neck = str(rng.choice(("crew", "vee", "scoop"), p=(0.6, 0.2, 0.2)))
-        fabric, sleeve = sample_fabric(rng, SMOOTH_KNITS), rng.uniform(0.10, 0.20)
-        ease, hang = rng.uniform(0.007, 0.016), rng.uniform(0.2, 0.9)
+        fabric = sample_fabric(rng, SMOOTH_KNITS)
+        sleeve = rng.uniform(0.10, 0.20)
+        ease = rng.uniform(0.007, 0.016)
+        hang = rng.uniform(0.2, 0.9)
     elif kind == "sweater":
         neck = str(rng.choice(("crew", "vee"), p=(0.8, 0.2)))
-        fabric, sleeve = sample_fabric(rng, WOOLS), rng.uniform(0.45, 0.475)
-        ease, hang = rng.uniform(0.012, 0.022), rng.uniform(0.4, 1.0)
+        fabric = sample_fabric(rng, WOOLS)
+        sleeve = rng.uniform(0.45, 0.475)
+        ease = rng.uniform(0.012, 0.022)
+        hang = rng.uniform(0.4, 1.0)
     elif kind == "shirt":
-        neck, fabric = "collar", sample_fabric(rng, WOVEN)
+        neck = "collar"
+        fabric = sample_fabric(rng, WOVEN)
         sleeve = 0.472 if rng.random() < 0.6 else rng.uniform(0.17, 0.30)
-        ease, hang = rng.uniform(0.009, 0.017), rng.uniform(0.4, 0.9)
+        ease = rng.uniform(0.009, 0.017)
+        hang = rng.uniform(0.4, 0.9)
     else:
-        neck, fabric = "straps", sample_fabric(rng, SMOOTH_KNITS)
+        neck = "straps"
+        fabric = sample_fabric(rng, SMOOTH_KNITS)
         sleeve = rng.uniform(0.122, 0.135) if female else rng.uniform(0.140, 0.155)
-        ease, hang = rng.uniform(0.005, 0.010), rng.uniform(0.0, 0.6)
+        ease = rng.uniform(0.005, 0.010)
+        hang = rng.uniform(0.0, 0.6)
     emblem = None
     if (
         kind in ("tee", "sweater")

@@ -65,10 +65,12 @@ def locate(point: np.ndarray, arm_weight: np.ndarray) -> Place:
 
 def _along(points: np.ndarray, line: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Length [n] along a polyline of joints and offset [n, 3] from it; its ends are extended straight."""
-    starts, steps = np.array(line[:-1]), np.diff(line, axis=0)  # [s, 3]
+    starts = np.array(line[:-1])  # [s, 3]
+    steps = np.diff(line, axis=0)  # [s, 3]
     lengths = np.linalg.norm(steps, axis=1)
     directions = steps / lengths[:, None]
-    low, high = np.zeros(len(steps)), lengths.copy()
+    low = np.zeros(len(steps))
+    high = lengths.copy()
     low[0], high[-1] = -np.inf, np.inf
     from_start = points[:, None] - starts
     along = np.clip(np.einsum("nsi,si->ns", from_start, directions), low, high)

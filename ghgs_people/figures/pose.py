@@ -92,7 +92,9 @@ def _gestures(stance: str, rng: np.random.Generator) -> tuple[str, str]:
 
 def _bend_trunk(body: BodyModel, local: np.ndarray, stance: str, rng: np.random.Generator) -> np.ndarray:
     """Twist, lean and bend spine and neck in place; return the rotation of the pelvis [3, 3]."""
-    twist, side, lean = rng.uniform(-22, 22), rng.uniform(-5, 5), rng.uniform(-4, 7)
+    twist = rng.uniform(-22, 22)
+    side = rng.uniform(-5, 5)
+    lean = rng.uniform(-4, 7)
     tilt = 0.0
     if stance == "contrapposto":
         tilt = rng.uniform(3.5, 7.0) * rng.choice((-1, 1))
@@ -102,10 +104,13 @@ def _bend_trunk(body: BodyModel, local: np.ndarray, stance: str, rng: np.random.
     elif stance == "walk":
         twist *= 0.5
     elif stance in ("lunge", "squat"):
-        lean, side = lean + rng.uniform(0, 18), 2 * side
+        lean = lean + rng.uniform(0, 18)
+        side = 2 * side
     pelvis = Rotation.from_euler("zxy", [tilt, 0.35 * lean, 0.25 * twist], degrees=True).as_matrix()
     local[body.bone("root")] = pelvis
-    nod, turn, roll = rng.uniform(-9, 9) - 0.6 * lean, rng.uniform(-30, 30) - 0.5 * twist, rng.uniform(-6, 6)
+    nod = rng.uniform(-9, 9) - 0.6 * lean
+    turn = rng.uniform(-30, 30) - 0.5 * twist
+    roll = rng.uniform(-6, 6)
     for names, angles in ((SPINE, (side, 0.65 * lean, 0.75 * twist)), (NECK, (roll, nod, turn))):
         share = Rotation.from_euler("zxy", np.array(angles) / len(names), degrees=True).as_matrix()
         local[[body.bone(name) for name in names]] = share
@@ -153,7 +158,8 @@ def _pose_arm(
     bend = np.array(bend) + rng.normal(0, 0.08, 3)
     bend = bend - (bend @ upper) * upper
     lower = np.cos(flex) * upper + np.sin(flex) * bend / np.linalg.norm(bend)
-    upper, lower = chest @ (mirror * upper), chest @ (mirror * lower)
+    upper = chest @ (mirror * upper)
+    lower = chest @ (mirror * lower)
 
     # The shoulder girdle follows a raised arm.
     lift = np.radians(np.interp(upper @ chest[:, 1], [-0.6, 0.0, 0.9], [0.0, 6.0, 24.0])) * side
@@ -211,7 +217,9 @@ def _pose_legs(
     """Place the soles on the ground, solve hips and knees; return where the root joint goes [3]."""
     (root,) = skeleton.rest("root")
     feet = _feet(skeleton, stance, stride, rng)
-    ankles, hips, lengths = [], [], []
+    ankles = []
+    hips = []
+    lengths = []
     for end, (across, forward, yaw, heel) in zip((".L", ".R"), feet, strict=True):
         hip, knee, ankle, toes = skeleton.rest("upperleg01", "lowerleg01", "foot", "toe2-1", end=end)
         turn = Rotation.from_euler("y", yaw, degrees=True).as_matrix()
@@ -248,22 +256,33 @@ def _feet(
     half = half * rng.uniform(0.85, 1.25)
     feet = []
     for side in (1, -1):
-        x, z, yaw, heel = side * half, rng.normal(0, 0.015), side * rng.uniform(2, 16), 0.0
+        x = side * half
+        z = rng.normal(0, 0.015)
+        yaw = side * rng.uniform(2, 16)
+        heel = 0.0
         if stance in ("walk", "step"):
             scale = 0.62 if stance == "walk" else 0.35
-            x, z = side * half * 0.7, scale * leg * stride * side
+            x = side * half * 0.7
+            z = scale * leg * stride * side
             heel = rng.uniform(14, 32) if z < 0 and stance == "walk" else 0.0
         elif stance in ("wide", "crouch"):
-            x, yaw = side * half * rng.uniform(1.5, 2.1), side * rng.uniform(10, 26)
+            x = side * half * rng.uniform(1.5, 2.1)
+            yaw = side * rng.uniform(10, 26)
         elif stance == "lunge":
-            x, z, yaw = side * half * 0.8, 0.9 * leg * stride * side, 0.6 * yaw
+            x = side * half * 0.8
+            z = 0.9 * leg * stride * side
+            yaw = 0.6 * yaw
             heel = rng.uniform(18, 42) if z < 0 else 0.0
         elif stance == "squat":
-            x, yaw = side * half * rng.uniform(2.0, 3.2), side * rng.uniform(20, 45)
+            x = side * half * rng.uniform(2.0, 3.2)
+            yaw = side * rng.uniform(20, 45)
         elif stance == "cross":
-            x, z = -side * half * rng.uniform(0.0, 0.5), side * np.sign(stride) * rng.uniform(0.08, 0.14)
+            x = -side * half * rng.uniform(0.0, 0.5)
+            z = side * np.sign(stride) * rng.uniform(0.08, 0.14)
         elif stance == "contrapposto" and side * stride > 0:
-            x, z, yaw = side * half * 1.35, rng.uniform(0.03, 0.14), side * rng.uniform(14, 32)
+            x = side * half * 1.35
+            z = rng.uniform(0.03, 0.14)
+            yaw = side * rng.uniform(14, 32)
         feet.append((x, z, yaw, heel))
     return feet
 
