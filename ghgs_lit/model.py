@@ -46,10 +46,15 @@ class GHGS(nn.Module):
     ):
         super().__init__()
         stages.require_bounds(bounds, encoder, depth_head, rounds)
-        self.bounds, self.encoder, self.depth_head = bounds, encoder, depth_head
-        self.unprojection, self.recalibration = unprojection, recalibration
-        self.rounds, self.gaussian_head = rounds, gaussian_head
-        self.skip, self.options = skip or SkipOptions(), options or ModelOptions()
+        self.bounds = bounds
+        self.encoder = encoder
+        self.depth_head = depth_head
+        self.unprojection = unprojection
+        self.recalibration = recalibration
+        self.rounds = rounds
+        self.gaussian_head = gaussian_head
+        self.skip = skip or SkipOptions()
+        self.options = options or ModelOptions()
         self.auto = self.skip.build()
         #: The nodes that :meth:`from_config` built the model from; empty if the stages were given.
         self.config: dict[str, Any] = {}
@@ -82,7 +87,9 @@ class GHGS(nn.Module):
     def plan(self, batch: Batch, findings: Sequence[Finding] = ()) -> Plan:
         """What the stages work on, read from a batch as they see it; a GPU is waited for once. ``findings``:
         of its checks, which are read, too. InputError: the batch violates one."""
-        auto, encoder, masks = self.auto, self.encoder, batch.masks
+        auto = self.auto
+        encoder = self.encoder
+        masks = batch.masks
         cameras = [batch.cameras] if batch.targets is None else [batch.cameras, batch.targets.cameras]
         plan = planned(
             masks,

@@ -157,7 +157,8 @@ class SubjectFrame(Surrounding):
     """Metres around the subject inside, the cameras' world outside (:mod:`ghgs_lit.geometry.frame`)."""
 
     def enter(self, batch: Batch) -> Batch:
-        self.frame, self.dtype = Frame.of(batch), batch.cameras.extrinsics.dtype
+        self.frame = Frame.of(batch)
+        self.dtype = batch.cameras.extrinsics.dtype
         return self.frame.enter(batch)
 
     def leave(self, prediction: Prediction) -> Prediction:

@@ -19,7 +19,8 @@ from ghgs_lit.geometry.constants import constant, middles
 from ghgs_lit.geometry.frame import in_cameras
 
 #: Cells along the longer side of the masks, and depths along each ray: enough to find gross errors.
-RESOLUTION, _SAMPLES = 32, 24
+RESOLUTION = 32
+_SAMPLES = 24
 
 #: Masks agree if the others explain at least this share of the rays of each.
 _SHARE = 0.95
@@ -54,7 +55,8 @@ def trusted_views(
 
 def _votes(coarse: Silhouettes, voting: Tensor, center: Tensor, reach: Tensor) -> Tensor:
     """Votes [B, v, o, h, w, S]: 1 where view ``o`` sees a point on a ray of view ``v`` outside its mask."""
-    masks, cameras = coarse.masks, coarse.cameras
+    masks = coarse.masks
+    cameras = coarse.cameras
     b, v = voting.shape
     # At least one cell: the rays of a cell's pixels run beside the ray of its centre.
     outside = votes_outside(dilate(masks, max(coarse.dilation, 1)), voting)

@@ -30,10 +30,13 @@ from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 
 #: Cells along the longer side of the masks that are searched, and along each side of the grid that is carved.
-RESOLUTION, CELLS = 160, 32
+RESOLUTION = 160
+CELLS = 32
 
 #: In metres: margin around the box, smallest near and smallest far - near.
-MARGIN, MIN_DEPTH, MIN_THICKNESS = 0.03, 0.1, 0.02
+MARGIN = 0.03
+MIN_DEPTH = 0.1
+MIN_THICKNESS = 0.02
 
 #: The largest bound in metres, against overflow with cameras of absurd sizes.
 _FARTHEST = 1e6
@@ -96,7 +99,8 @@ def subject_box(
     center = subject_center(masks, cameras)
     reach = _reach(masks, cameras, center).nan_to_num().amax(1, keepdim=True).clamp(min=0.05)
     corners = torch.stack((center - reach, center + reach))
-    focal, voting = focal_lengths(cameras).amax(-1), masks.flatten(2).any(-1)
+    focal = focal_lengths(cameras).amax(-1)
+    voting = masks.flatten(2).any(-1)
     for _ in range(2):
         lower, upper = corners
         cell = (upper - lower) / CELLS

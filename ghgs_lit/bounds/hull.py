@@ -40,7 +40,8 @@ class VisualHull(SubjectBox):
         box = self._valid(depths_in_box(batch.cameras, lower, upper))
         start = box if coarse.stride == 1 else self._valid(depths_in_box(coarse.cameras, lower, upper))
         # At least one cell: the rays of a cell's pixels run beside the ray of its centre.
-        radius, rays = max(coarse.dilation, 1), batch.pixels if coarse.stride == 1 else None
+        radius = max(coarse.dilation, 1)
+        rays = batch.pixels if coarse.stride == 1 else None
         count = size_class(sum(extent.cells(coarse.stride) for extent in batch.extents))
         hull = hull_bounds(
             coarse.masks, coarse.cameras, start, radius, self.tolerance, self.samples, rays, voting, count
@@ -73,7 +74,8 @@ def hull_bounds(
         count: the masks have no more pixels than this, so that a GPU need not be asked; None: unknown."""
     voting = masks.flatten(2).any(-1) if voting is None else voting
     outside = votes_outside(dilate(masks, radius), voting)
-    directions, matrices = ray_directions(cameras), projection_matrices(cameras)
+    directions = ray_directions(cameras)
+    matrices = projection_matrices(cameras)
     if gpu.is_supported(start.near, directions, matrices):
         tables = (outside, masks, matrices, directions, cameras.centers)
         return DepthBounds(*_marching(*tables, start.near, start.far, samples, tolerance))
@@ -114,12 +116,14 @@ def _march(
         far: written, like ``near``.
         steps: fractions of the way from near to far that are tried.
         tolerance: votes that an allowed depth may have."""
-    views, samples = outside.shape[1], len(steps)
+    views = outside.shape[1]
+    samples = len(steps)
     image = rays // outside[0, 0].numel()
     begin, end = (bound.reshape(-1)[rays] for bound in (start.near, start.far))
     length = end - begin
     depth = begin[:, None] + steps * length[:, None]
-    direction, center = directions.reshape(-1, 1, 3)[rays], centers.reshape(-1, 1, 3)[image]
+    direction = directions.reshape(-1, 1, 3)[rays]
+    center = centers.reshape(-1, 1, 3)[image]
     other = constant(other_images, len(outside), views, like=image)[image]
     matrix = matrices.flatten(0, 1).movedim(1, 0)[:, other]
     along = (matrix[..., :3] * direction).sum(-1)

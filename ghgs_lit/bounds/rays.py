@@ -24,7 +24,8 @@ from ghgs_lit.types import Cameras, DepthBounds
 
 def ray_directions(cameras: Cameras) -> Float[Tensor, "*batch h w 3"]:
     """Direction of each pixel's ray: displacement in the world per metre of z-depth."""
-    intrinsics, extrinsics = at_least_float32(cameras.intrinsics), at_least_float32(cameras.extrinsics)
+    intrinsics = at_least_float32(cameras.intrinsics)
+    extrinsics = at_least_float32(cameras.extrinsics)
     centers = homogeneous_centers(cameras.height, cameras.width, intrinsics)
     to_world = extrinsics[..., :3, :3].mT @ inverse_intrinsics(intrinsics)
     return torch.einsum("...ij,hwj->...hwi", to_world, centers)
@@ -110,7 +111,8 @@ def _grown(masks: Tensor, radius: int, more: Tensor | None, axis: int) -> Tensor
     index = constant(torch.arange, size, like=masks, dtype=torch.long)
     index = index[:, None] if axis == -2 else index
     counts = F.pad(masks.cumsum(axis, dtype=torch.int32), (0, 0, 1, 0) if axis == -2 else (1, 0))
-    high, low = (index + radius + 1).clamp(max=size), (index - radius).clamp(min=0)
+    high = (index + radius + 1).clamp(max=size)
+    low = (index - radius).clamp(min=0)
     high, low = (counts.gather(axis, ends.long().expand(masks.shape)) for ends in (high, low))
     return high > low
 

@@ -21,7 +21,8 @@ class _Saturate(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x: Tensor, limit: float, symmetric: bool) -> Tensor:
         ctx.save_for_backward(x)
-        ctx.limit, ctx.symmetric = limit, symmetric
+        ctx.limit = limit
+        ctx.symmetric = symmetric
         stopped = x.clamp(-limit, limit)
         return stopped.tanh() if symmetric else stopped.sigmoid()
 
@@ -41,7 +42,9 @@ class _Saturate(torch.autograd.Function):
 
 
 #: Largest arguments of the activations; sigmoid and tanh have slopes of 4.5e-5 and 1.8e-4 there.
-SIGMOID_LIMIT, TANH_LIMIT, EXP_LIMIT = 10.0, 5.0, 80.0
+SIGMOID_LIMIT = 10.0
+TANH_LIMIT = 5.0
+EXP_LIMIT = 80.0
 
 
 def bounded_sigmoid(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
@@ -154,7 +157,8 @@ def activated(
     offset, scales, quaternions, opacities = attributes(*numbers, footprint)
     if on_surface:
         axes = surface_axes(maps, cameras, image, pixel)
-        offset, quaternions = rotate(axes, offset), multiply_quaternions(axes, quaternions)
+        offset = rotate(axes, offset)
+        quaternions = multiply_quaternions(axes, quaternions)
     if share is not None:
         opacities = opacities * share.to(opacities).flatten(0, 1).flatten(1)[image, pixel]
     colors = photo.flatten(0, 1).flatten(2).transpose(1, 2)[image, pixel]

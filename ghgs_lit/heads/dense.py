@@ -17,7 +17,8 @@ from ghgs_lit.plan.window import Span, Window
 from ghgs_lit.types import Tokens
 
 #: Values of the largest map in memory at once without a gradient (32 MB in float32); on a GPU 4 GB.
-_LARGEST, _GPU_LARGEST = 1 << 23, 1 << 30
+_LARGEST = 1 << 23
+_GPU_LARGEST = 1 << 30
 
 
 @dataclass(frozen=True)

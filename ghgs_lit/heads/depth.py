@@ -87,7 +87,8 @@ class DepthHead(nn.Module):
 
     def __init__(self, options: DepthHeadOptions, dim_latent: int):
         super().__init__()
-        self.options, self.start = options, log(options.start / (1 - options.start))
+        self.options = options
+        self.start = log(options.start / (1 - options.start))
         seen = options.guide * (PHOTO_CHANNELS + options.is_bounded * BOUNDS_CHANNELS)
         self.dpt = DPTHead(dim_latent, 2, options.rectified_skip, seen + options.consistency_depths)
         if self.is_bounded:
@@ -110,7 +111,8 @@ class DepthHead(nn.Module):
             if self.options.consistency_depths:
                 maps.append(photo_consistency(batch, bounds, self.options.consistency_depths))
             guide = photo_guide(batch, *maps)
-        windows, p = plan.depth_windows, plan.patch_size
+        windows = plan.depth_windows
+        p = plan.patch_size
         wanted = None if windows is None else plan.shown.repeat_interleave(p, -2).repeat_interleave(p, -1)
         value, confidence = _whole(decode(self.dpt, tokens, guide, windows, plan.together), batch, wanted)
         if self.is_bounded:

@@ -70,7 +70,9 @@ HIDDEN = 32
 
 #: Without a gradient: values of a map at full resolution in memory at once, on a CPU and on a GPU, and the
 #: smallest number of rows.
-_LARGEST, _GPU_LARGEST, _ROWS = 1 << 21, 1 << 28, 8
+_LARGEST = 1 << 21
+_GPU_LARGEST = 1 << 28
+_ROWS = 8
 
 
 Widths = tuple[int, tuple[int, int, int, int]]
@@ -158,7 +160,8 @@ class Scratch(nn.Module):
             setattr(self, f"layer{i}_rn", _conv3(channels, features, bias=False))
             setattr(self, f"refinenet{i}", Fusion(features, i < LEVELS, rectified_skip))
         self.output_conv1 = _conv3(features, features // 2)
-        hidden_layer, last = _conv3(features // 2, hidden), nn.Conv2d(hidden, output_dim, 1)
+        hidden_layer = _conv3(features // 2, hidden)
+        last = nn.Conv2d(hidden, output_dim, 1)
         self.output_conv2 = nn.Sequential(hidden_layer, nn.ReLU(), last)
 
 
@@ -221,7 +224,8 @@ class DPTHead(nn.Module):
         rows, columns = tokens.grid[2:]
         size = (tokens.patch_size * rows, tokens.patch_size * columns)
         windows = self.windows(window or Window.whole(size), (rows, columns))
-        aspect, s = columns / rows, self.scratch
+        aspect = columns / rows
+        s = self.scratch
         full = None
         if guide is not None:
             targets = (windows.full, windows.fused, windows.levels[0].level)
@@ -279,7 +283,8 @@ class DPTHead(nn.Module):
         s = self.scratch
         full = result.grown(reach(s.output_conv2))
         fused = full.sources(_times(2 * CELLS[0], grid)).grown(reach(s.output_conv1))
-        target, levels = fused, []
+        target = fused
+        levels = []
         for i, resize in enumerate(self.resize_layers):
             fusion = getattr(s, f"refinenet{i + 1}")
             size = _times(CELLS[i], grid) if i < len(CELLS) else tuple(-(-n // 2) for n in grid)

@@ -66,7 +66,8 @@ def float32_last(mlp: nn.Sequential, x: Tensor) -> Tensor:
     """``mlp(x)`` with its last projection in float32 under autocast: offsets of millimetres depend on it.
     Under float16 autocast all of it is in float32."""
     with without_float16(x.device.type):
-        hidden, last = mlp[:-1](x), mlp[-1]
+        hidden = mlp[:-1](x)
+        last = mlp[-1]
     with exact(x.device.type):
         return at_least_float32(last(hidden.to(last.weight.dtype)))
 
@@ -124,7 +125,8 @@ class FootprintAttributes(Options):
     @model_validator(mode="after")
     def _check(self) -> "FootprintAttributes":
         for name in ("scale_start", "thickness_start"):
-            start, limits = getattr(self, name), f"between scale_floor={self.scale_floor:g} and {SCALE_CAP:g}"
+            start = getattr(self, name)
+            limits = f"between scale_floor={self.scale_floor:g} and {SCALE_CAP:g}"
             fits = start is None or self.scale_floor < start < SCALE_CAP
             self.require(fits, name, f"a number {limits}")
         self.require(self.opacity_floor < OPACITY_START, "opacity_floor", f"a number below {OPACITY_START:g}")
@@ -237,8 +239,10 @@ class GaussianHead(nn.Module):
 
     def __init__(self, options: GaussianHeadOptions, dim_latent: int):
         super().__init__()
-        self.options, self.channels = options, options.channels
-        channels, hidden = options.channels, options.hidden
+        self.options = options
+        self.channels = options.channels
+        channels = options.channels
+        hidden = options.hidden
         guided = PHOTO_CHANNELS + 1 + options.photo_consistency if options.guide else 0
         self.decoder = DPTHead(dim_latent, channels, options.rectified_skip, guided)
         self.offset_header = _mlp((channels, *hidden, 3), nn.Tanh)
@@ -278,7 +282,8 @@ class GaussianHead(nn.Module):
         same."""
         views, height, width = points.valid.shape[1:]
         rows = plan.subject.only(points.valid)
-        image, pixel = rows.index // (height * width), rows.index % (height * width)
+        image = rows.index // (height * width)
+        pixel = rows.index % (height * width)
         guide = self._guide(batch, points, depth_maps)
         parts = decode(self.decoder, tokens, guide, plan.windows, plan.together)
         of_part = self._of_subject if plan.pixels == "subject" else self._of_all
@@ -290,7 +295,9 @@ class GaussianHead(nn.Module):
     def activate(self, raw: RawGaussians, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
         """Gaussians from raw attributes, at the points of their pixels."""
         numbers = (raw.offset, raw.scale, raw.rotation, raw.opacity, raw.color)
-        photo, share, options = batch.once(surface_colors), batch.alpha, self.options
+        photo = batch.once(surface_colors)
+        share = batch.alpha
+        options = self.options
         inputs = (*numbers, photo, share, depth_maps.depth, points.pixels, batch.cameras.extrinsics)
         given = (numbers, raw.image, raw.pixel, depth_maps, points.pixels, photo, share, batch.cameras)
         on_surface = options.axes == "surface"

@@ -24,11 +24,13 @@ from ghgs_lit.runtime.precision import exact, without_float16
 from ghgs_lit.types import Batch, Cameras, DepthBounds, DepthMaps, Tokens, true_places
 
 #: Side of a cell in pixels, and channels of its features and of the GRU's memory.
-CELL, CHANNELS = 4, 32
+CELL = 4
+CHANNELS = 32
 #: Number of neighbouring views that each view is paired with.
 PAIRS = 2
 #: Resolutions of the correlations along depth, each half of the one before, and steps to either side.
-LEVELS, RADIUS = 3, 4
+LEVELS = 3
+RADIUS = 4
 
 _inverse = BOUNDED["bounded_inverse"]
 
@@ -92,7 +94,8 @@ class StereoHead(nn.Module):
         volume = found.new_zeros(inside.numel(), found.shape[1]).index_copy(0, cells, found)
         volume = volume.view(-1, *inside.shape[2:], found.shape[1]).movedim(-1, 1)
         levels = [volume] + [F.avg_pool3d(volume[:, None], (2**i, 1, 1))[:, 0] for i in range(1, LEVELS)]
-        memory, context = memory.tanh(), context.relu()
+        memory = memory.tanh()
+        context = context.relu()
         raw = volume.new_zeros(len(volume), 1, *inside.shape[2:])
         for _ in range(self.options.updates):
             memory, change = self.update(memory, context, levels, bounded_sigmoid(raw))
@@ -174,7 +177,8 @@ def correlations(
     inverse depth from near to far."""
     height, width = features.shape[-2:]
     flat = features.flatten(0, 1)
-    image, place = cells // (height * width), cells % (height * width)
+    image = cells // (height * width)
+    place = cells % (height * width)
     with torch.no_grad(), exact(features.device.type):
         share = torch.linspace(0, 1, steps, device=features.device, dtype=features.dtype)
         depth = _inverse(share, *(bound.flatten()[image, None].to(features) for bound in (near, far)))

@@ -13,7 +13,8 @@ from ghgs_lit.types import Cameras, DepthMaps
 
 #: A neighbour counts fully if its depth differs by less than the first number of pixel footprints, and not at
 #: all (another surface) from the second on.
-SAME, OTHER = 4.0, 8.0
+SAME = 4.0
+OTHER = 8.0
 
 
 @torch.no_grad()
@@ -31,7 +32,8 @@ def surface_axes(
     own = depth.flatten(0, 1).flatten(1)[image, pixel]
     intrinsics = at_least_float32(cameras.intrinsics).flatten(0, 1)[image]
     fx, skew, cx, fy, cy = (intrinsics[:, i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
-    row, column = pixel // width, pixel % width
+    row = pixel // width
+    column = pixel % width
     # Invalid pixels and those beyond the border are infinitely far away.
     around = F.pad(depth.masked_fill(~maps.valid, inf), (1, 1, 1, 1), value=inf).flatten()
     place = (image * (height + 2) + row + 1) * (width + 2) + column + 1
@@ -43,7 +45,8 @@ def surface_axes(
     right, down = (after - before) / ((1 + near[:2] * near[2:]) * own + after + before)
     # The cross product of the tangents d(z K^-1 [u v 1]) / du and / dv, multiplied by fx fy / z^2.
     toward = 1 + right * (column + 0.5 - cx) + down * (row + 0.5 - cy)
-    x, y = -fx * right, -skew * right - fy * down
+    x = -fx * right
+    y = -skew * right - fy * down
     length = (x.square() + y.square() + toward.square()).sqrt()
     turn = unit(torch.stack((length + toward, -y, x, torch.zeros_like(x)), -1))
     extrinsics = at_least_float32(cameras.extrinsics).flatten(0, 1)

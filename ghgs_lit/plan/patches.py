@@ -31,7 +31,8 @@ class KeptPatches:
         self._extents = extents(kept.flatten(0, 1)) if known is None else known
         counts = [extent.count for extent in self._extents]
         self._counts = [counts[first : first + views] for first in range(0, len(counts), views)]
-        self._kept, self._device = kept, device
+        self._kept = kept
+        self._device = device
         self.is_whole = sum(counts) == kept.numel()
         if self.is_whole:
             self.index = torch.arange(kept.numel(), device=device)

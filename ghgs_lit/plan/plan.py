@@ -110,7 +110,8 @@ class Plan:
         """Extents of the subject, and of the patches that show it, with which a plan has the same sizes and
         windows for every scene of the class: each image has a share of its element's rows, in the window of
         all."""
-        window, grid = self._windows(self.patch_size)[0], Window.whole(tuple(self.shown.shape[2:]))
+        window = self._windows(self.patch_size)[0]
+        grid = Window.whole(tuple(self.shown.shape[2:]))
         return self._shared(self.subject, window), self._shared(self.peers, grid)
 
     def _shared(self, rows: Rows, window: Window) -> tuple[Extent, ...]:
@@ -181,7 +182,9 @@ def planned(
         for values in found[: len(asked)]
     )
     shown_extents = tuple(e.coarser(patch_size, n) for e, n in zip(extents, counts, strict=True))
-    decisions, kept, kept_extents = (), choices[0], of_choices[0]
+    decisions = ()
+    kept = choices[0]
+    kept_extents = of_choices[0]
     if choose is not None:
         sizes = [torch.tensor([e.count for e in each], device="cpu").view(b, v) for each in of_choices]
         decisions, best = choose(sizes)

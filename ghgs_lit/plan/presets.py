@@ -159,7 +159,8 @@ class AutoSkip:
         ``counts``: numbers of patches that each preset keeps, on the CPU."""
         table = torch.stack([encoder_products(encoder, kept) for kept in counts], dim=-1)
         best = [min(range(len(counts)), key=row.__getitem__) for row in table.tolist()]
-        names, shares = list(self.presets), (table / table[:, :1]).tolist()
+        names = list(self.presets)
+        shares = (table / table[:, :1]).tolist()
         return tuple(Decision(names[k], share[k]) for k, share in zip(best, shares, strict=True)), best
 
     def report(self, decisions: Sequence[Decision]) -> str:
@@ -186,5 +187,6 @@ def encoder_products(encoder: Any, kept: Int[Tensor, "B V"]) -> Float[Tensor, " 
     output, 16 for the MLP of four times the width), attention among m tokens 4 m^2 C: within a view in the
     frame block, among all views in the global block. ``encoder``: a :class:`ghgs_lit.encoder.VGGTEncoder`."""
     tokens = (kept + encoder.aggregator.special).double()
-    width, both = encoder.dim_latent // 2, tokens.sum(1)
+    width = encoder.dim_latent // 2
+    both = tokens.sum(1)
     return 48 * width**2 * both + 4 * width * (tokens.square().sum(1) + both.square())

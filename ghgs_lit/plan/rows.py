@@ -58,7 +58,8 @@ class Rows:
         ranks = wanted.cumsum(1)
         # The n-th row that counts goes to place n from 1 on, and 0 for all others to place 0.
         places = number.new_zeros(groups, size + 1).scatter_(1, ranks * wanted, number * wanted)
-        total, order = ranks[:, -1:], torch.arange(1, size + 1, device=wanted.device)
+        total = ranks[:, -1:]
+        order = torch.arange(1, size + 1, device=wanted.device)
         index = places.gather(1, torch.minimum(order, total))
         if groups > 1:
             index = index + torch.arange(0, wanted.numel(), of_group, device=wanted.device)[:, None]
@@ -84,7 +85,8 @@ class Rows:
 
     def within(self, images: slice) -> slice:
         """The rows of consecutive images, which are whole groups."""
-        first, last = images.start // self.images, images.stop // self.images
+        first = images.start // self.images
+        last = images.stop // self.images
         return slice(sum(self.counts[:first]), sum(self.counts[:last]))
 
     def splits(self, images: int) -> tuple[int, ...]:

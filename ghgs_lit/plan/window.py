@@ -124,11 +124,15 @@ def _sources(
     """For each cell of the target, the two cells of the source around it, and the weight of the second."""
     numbers, place, low, high, weight = _of_whole_maps(source.full, target.full, dtype, device)
     wanted = slice(target.start, target.stop)
-    low, high, weight = low[wanted], high[wanted], weight[wanted]
-    first, last = numbers[target.start], min(numbers[target.stop - 1] + 1, source.full - 1)
+    low = low[wanted]
+    high = high[wanted]
+    weight = weight[wanted]
+    first = numbers[target.start]
+    last = min(numbers[target.stop - 1] + 1, source.full - 1)
     if first < source.start or last >= source.stop:  # the window ends before its neighbours do
         low = low.clamp(source.start, source.stop - 1)
-        high, weight = (low + 1).clamp(max=source.stop - 1), place[wanted] - low
+        high = (low + 1).clamp(max=source.stop - 1)
+        weight = place[wanted] - low
     return (low - source.start, high - source.start, weight) if source.start else (low, high, weight)
 
 

@@ -110,7 +110,8 @@ def coarse_sizes(batch: Batch, height: int, patch_size: int) -> list[Size | None
         batch: photographs of one size, without a border.
         height: pixels of the subject that the weights know.
         patch_size: sides are its multiples."""
-    views, full = batch.masks.shape[1], batch.masks.shape[2:]
+    views = batch.masks.shape[1]
+    full = batch.masks.shape[2:]
     sizes: list[Size | None] = []
     for first in range(0, len(batch.extents), views):
         seen = [extent for extent in batch.extents[first : first + views] if extent.count]
@@ -153,7 +154,8 @@ def enlarged(maps: DepthMaps, size: Size) -> Float[Tensor, "B V H W"]:
     # One pixel around what is known: a finger may lie within the photograph's mask and outside the copy's.
     weight, around = (F.avg_pool2d(values, 3, 1, 1) for values in (maps.valid.to(depth.dtype), inverse))
     inverse = torch.where(maps.valid, inverse, around / torch.where(weight > 0, weight, 1))
-    weight, found = _resized((weight > 0).to(depth.dtype), size), _resized(inverse, size)
+    weight = _resized((weight > 0).to(depth.dtype), size)
+    found = _resized(inverse, size)
     return torch.where(found > 0, weight / torch.where(found > 0, found, 1), 0)
 
 

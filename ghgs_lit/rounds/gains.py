@@ -27,11 +27,13 @@ _OUTLIER = 0.15
 _LEAST = 0.02
 #: Weight of the prior, gains of 1, in Gaussians; views that share nothing get these. For gammas it is one
 #: whose brightness is a tenth from the mean.
-_PRIOR, _PRIOR_OF_SLOPES = 1.0, 0.1**2
+_PRIOR = 1.0
+_PRIOR_OF_SLOPES = 0.1**2
 #: One Gaussian in this many is compared: a third is enough and takes a third of the time.
 _EVERY = 3
 #: Steps of reweighting, and of that of slopes, which begins farther away.
-_STEPS, _STEPS_OF_SLOPES = 5, 15
+_STEPS = 5
+_STEPS_OF_SLOPES = 15
 
 #: Which rows are Gaussians; None: all.
 Real = Bool[Tensor, " N"] | None
@@ -76,7 +78,8 @@ def log_gammas(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
     with log brightness, while gains only shift them: lines are fitted to these, with Cauchy weights."""
     with exact(gaussians.means.device.type):
         own, logs, theirs, weights = _compared(gaussians, batch)
-        ratios, levels = logs - theirs, (logs + theirs) / 2
+        ratios = logs - theirs
+        levels = (logs + theirs) / 2
         b, views = batch.masks.shape[:2]
         fitted = torch.zeros_like(ratios)
         for _ in range(_STEPS_OF_SLOPES):
@@ -99,7 +102,8 @@ def _summed(own: Int[Tensor, " N"], images: int, *values: Float[Tensor, "N V 3"]
 
 def _thinned(gaussians: Gaussians) -> tuple[Gaussians, Int[Tensor, " n"]]:
     """One of :data:`_EVERY` Gaussians of each element, and their indices."""
-    device, splits = gaussians.means.device, gaussians.splits
+    device = gaussians.means.device
+    splits = gaussians.splits
     ends = list(itertools.accumulate(splits))
     kept = [torch.arange(end - n, end, _EVERY, device=device) for n, end in zip(splits, ends, strict=True)]
     index = torch.cat(kept)
@@ -110,7 +114,8 @@ def _compared(
     gaussians: Gaussians, batch: Batch, real: Real = None
 ) -> tuple[Int[Tensor, " N"], Float[Tensor, "N V 3"], Float[Tensor, "N V 3"], Float[Tensor, "N V 3"]]:
     """Own photograph of some Gaussians, logs of their colours in each view and in their own, and weights."""
-    depth, views = render(gaussians, batch.cameras).depth, batch.masks.shape[1]
+    depth = render(gaussians, batch.cameras).depth
+    views = batch.masks.shape[1]
     gaussians, index = _thinned(gaussians)
     shares = coverage(batch)[:, :, None]
     maps = torch.cat((batch.once(surface_colors) * shares, shares, depth), 2).to(batch.cameras.extrinsics)
@@ -132,7 +137,8 @@ def _solved(
     counts: Float[Tensor, "B V V 3"], differences: Float[Tensor, "B V V 3"], prior: float = _PRIOR
 ) -> Float[Tensor, "B V 3"]:
     """Logs that best fit the sums of differences of views (last V) from own views (first V)."""
-    counts, differences = counts.movedim(-1, 1), differences.movedim(-1, 1)
+    counts = counts.movedim(-1, 1)
+    differences = differences.movedim(-1, 1)
     both = counts + counts.mT
     identity = constant(torch.eye, both.shape[-1], like=both)
     laplacian = torch.add(identity * both.sum(-1, keepdim=True) - both, identity, alpha=prior)

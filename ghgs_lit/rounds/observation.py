@@ -75,7 +75,9 @@ def observe(gaussians: Gaussians, batch: Batch, rendering: Rendering | None = No
 
 
 def _compare(gaussians: Gaussians, batch: Batch, rendering: Rendering) -> Float[Tensor, "N V c"]:
-    views, photo, mask = batch.images.shape[1], at_least_float32(batch.images), coverage(batch)
+    views = batch.images.shape[1]
+    photo = at_least_float32(batch.images)
+    mask = coverage(batch)
     cameras = batch.cameras
     seen = (gaussians.means, gaussians.colors, gaussians.image, cameras.intrinsics, cameras.extrinsics)
     maps = (photo, mask, rendering.image, rendering.alpha, rendering.depth)
@@ -117,7 +119,8 @@ def _compared(
         depth: rendered depths in metres.
         scale: of the distance behind the rendered surface, in metres.
         splits: number of Gaussians of each element."""
-    views, cameras = photo.shape[1], Cameras(intrinsics, extrinsics, *photo.shape[-2:])
+    views = photo.shape[1]
+    cameras = Cameras(intrinsics, extrinsics, *photo.shape[-2:])
     maps = torch.cat((photo, photo - drawn, mask[:, :, None], alpha, depth), 2)
     found, z, can_see = _values_at(means, image, splits, cameras, maps)
     color, error, mask, alpha, depth = found.split((3, 3, 1, 1, 1), -1)
@@ -156,7 +159,8 @@ def _values_at(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """:func:`looked_up` at ``means`` that belong to images ``image``."""
     b, views, channels, height, width = maps.shape
-    rows, means = None, means[None]
+    rows = None
+    means = means[None]
     if b > 1:
         # One row of points for each element; those with fewer have points at 0 at the end.
         rows = _rows(image // views, splits)

@@ -53,12 +53,15 @@ class Windows(NamedTuple):
         height = max((extent.bottom - extent.top for extent in filled), default=1)
         width = max((extent.right - extent.left for extent in filled), default=1)
         if raw.real is not None:
-            height, width = size_class(height), size_class(width)
+            height = size_class(height)
+            width = size_class(width)
         corners = [(extent.top, extent.left) if extent.count else (0, 0) for extent in batch.extents]
         top, left = _on_device(tuple(corners), raw.pixel.device)[raw.image].unbind(1)
         full = batch.masks.shape[-1]
-        row, column = raw.pixel // full - top, raw.pixel % full - left
-        place, shape = (raw.image * height + row) * width + column, (len(corners), height, width)
+        row = raw.pixel // full - top
+        column = raw.pixel % full - left
+        place = (raw.image * height + row) * width + column
+        shape = (len(corners), height, width)
         if raw.real is None:
             return cls(place, shape)
         return cls(torch.where(raw.real, place, math.prod(shape)), shape, spare=1)
@@ -90,7 +93,8 @@ class Exchange(nn.Module):
 
     def forward(self, known: Float[Tensor, "N w"], windows: Windows) -> Float[Tensor, "N w"]:
         """``known`` with features of the neighbours added."""
-        told, size = self.tell(known), math.prod(windows.shape)
+        told = self.tell(known)
+        size = math.prod(windows.shape)
         maps = told.new_zeros(size + windows.spare, told.shape[1]).index_copy(0, windows.place, told)
         maps = self.across(maps[:size].view(*windows.shape, told.shape[1]).permute(0, 3, 1, 2))
         place = windows.place.clamp(max=size - 1) if windows.spare else windows.place
@@ -144,9 +148,11 @@ class State:
 def prediction_of(states: Sequence[State], keeps_drafts: bool) -> Prediction:
     """The prediction of the last state. ``states``: before the first round and after each. ``keeps_drafts``:
     include the Gaussians before each round."""
-    last, maps = states[-1], tuple(state.depth_maps for state in states)
+    last = states[-1]
+    maps = tuple(state.depth_maps for state in states)
     drafts = tuple(state.gaussians for state in states[:-1]) if keeps_drafts else ()
-    depth, valid = maps[-1].depth, maps[-1].valid
+    depth = maps[-1].depth
+    valid = maps[-1].valid
     return Prediction(last.gaussians, depth, valid, last.points, maps[-1], rounds=maps, drafts=drafts)
 
 
@@ -193,7 +199,8 @@ class RoundsOptions(Options):
 
 
 def _two_layers(inputs: int, wide: int, outputs: int) -> nn.Sequential:
-    first, second = nn.Linear(inputs, wide), nn.Linear(wide, outputs)
+    first = nn.Linear(inputs, wide)
+    second = nn.Linear(wide, outputs)
     return nn.Sequential(first, nn.ReLU(inplace=True), second, nn.ReLU(inplace=True))
 
 
@@ -207,8 +214,10 @@ class Rounds(nn.Module):
 
     def __init__(self, options: RoundsOptions, channels: int):
         super().__init__()
-        self.options, self.count = options, options.count
-        hidden, depths = options.hidden, options.depths
+        self.options = options
+        self.count = options.count
+        hidden = options.hidden
+        depths = options.depths
         self.view = _two_layers(CHANNELS, hidden, hidden)
         self.start = nn.Linear(channels, hidden)
         inputs = 4 * hidden + depths + _PLACE + 3 + (SLOPES if options.slopes else 0)
@@ -233,7 +242,8 @@ class Rounds(nn.Module):
         if self.options.gains and batch.log_gains is None:
             gaussians, batch = equalized(state.gaussians, batch, state.raw.real)
             state = dataclasses.replace(state, gaussians=gaussians)
-        states, memory = [state], torch.tanh(self.start(state.raw.descriptors))
+        states = [state]
+        memory = torch.tanh(self.start(state.raw.descriptors))
         windows = None if self.exchange is None else Windows.of(state.raw, batch)
         rays = Rays.of(state.raw, batch)
         if isinstance(step, Tensor):
@@ -261,7 +271,8 @@ class Rounds(nn.Module):
         """Changes of depths and of raw attributes, and the memory for the next round. ``size``: of the step,
         as a share of the largest one; one for all Gaussians or one for each."""
         gaussians = state.gaussians.detach()
-        drawn, steep = None, []
+        drawn = None
+        steep = []
         if self.options.slopes:
             drawn, *steep = slopes(gaussians, batch, rays.direction, _footprints(state, batch, rays))
         each = observe(gaussians, batch, drawn)
@@ -290,7 +301,8 @@ class Rounds(nn.Module):
 
     def _remembered_in_parts(self, *rows: Tensor) -> Float[Tensor, "N h"]:
         """:meth:`_remembered` in parts that fit a CPU's cache, in half the time; at once with a gradient."""
-        count, device = len(rows[0]), rows[0].device
+        count = len(rows[0])
+        device = rows[0].device
         parts = even_parts(count, count if torch.is_grad_enabled() else at_once(device, _AT_ONCE, count))
         return torch.cat([self._remembered(*(row[part] for row in rows)) for part in parts])
 
@@ -310,9 +322,11 @@ class Rounds(nn.Module):
             for values in (maps.depth, maps.bounds.near, maps.bounds.far)
         )
         thickness = far - near
-        half, share = reach * thickness, (depth - near) / torch.where(thickness > 0, thickness, 1)
+        half = reach * thickness
+        share = (depth - near) / torch.where(thickness > 0, thickness, 1)
         # By rounding a depth may lie slightly outside its bounds.
-        low, high = torch.minimum(torch.maximum(depth - half, near), depth), torch.minimum(depth + half, far)
+        low = torch.minimum(torch.maximum(depth - half, near), depth)
+        high = torch.minimum(depth + half, far)
         high = torch.maximum(high, depth)
         matches = consistency_of(batch, rays.place, low, high, self.options.depths)
         return Search(matches, torch.stack((share, thickness), -1), depth - low, high - depth)
@@ -334,7 +348,9 @@ def _moved(
     moved: Float[Tensor, " N"],
     change: Float[Tensor, "N c"],
 ) -> State:
-    raw, maps, pixels = state.raw.changed(change), state.depth_maps, state.points.pixels
+    raw = state.raw.changed(change)
+    maps = state.depth_maps
+    pixels = state.points.pixels
     if raw.real is not None:
         moved = moved * raw.real
     depth = maps.depth.flatten().index_add(0, rays.place, moved).view_as(maps.depth)

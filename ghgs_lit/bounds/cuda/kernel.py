@@ -24,7 +24,8 @@ def _cell(x, inverse, size):
 def _vote(outside, view, x, y, w, height, width):
     """Entries of a table at homogeneous pixels."""
     inverse = 1 / tl.where(w > LEAST, w, LEAST)
-    row, column = _cell(y, inverse, height), _cell(x, inverse, width)
+    row = _cell(y, inverse, height)
+    column = _cell(x, inverse, width)
     return tl.load(outside + (view * height + row) * width + column).to(tl.int32)
 
 
@@ -43,7 +44,8 @@ def dilated_rows(
     found = tl.load(masks + i).to(tl.int32)
     for step in range(1, tl.max(reach, 0) + 1):
         is_near = step <= reach
-        after, before = is_near & (place + step < size), is_near & (place >= step)
+        after = is_near & (place + step < size)
+        before = is_near & (place >= step)
         found |= tl.load(masks + i + step * stride, after, 0).to(tl.int32)
         found |= tl.load(masks + i - step * stride, before, 0).to(tl.int32)
     tl.store(out + i, found != 0)
@@ -58,14 +60,16 @@ def carved_rows(
     element = i // cells // cells // cells
     at = position + element * 3 * cells
     x = tl.load(at + i // cells // cells % cells)
-    y, z = tl.load(at + cells + i // cells % cells), tl.load(at + 2 * cells + i % cells)
+    y = tl.load(at + cells + i // cells % cells)
+    z = tl.load(at + 2 * cells + i % cells)
     votes = tl.zeros_like(i).to(tl.int32)
     for v in range(views):
         view = element * views + v
         a, b, c, d = load4(matrices, 3 * view)
         e, f, g, h = load4(matrices, 3 * view + 1)
         k, m, n, o = load4(matrices, 3 * view + 2)
-        right, below = a * x + b * y + (c * z + d), e * x + f * y + (g * z + h)
+        right = a * x + b * y + (c * z + d)
+        below = e * x + f * y + (g * z + h)
         votes += _vote(outside, view, right, below, k * x + m * y + (n * z + o), height, width)
     tl.store(kept + i, votes <= tolerance)
 
@@ -78,7 +82,8 @@ def marched_rows(
     """Write the bounds of ``ROWS`` rays, one for each pixel of a mask; those of others are copied."""
     i = rows_of(count, ROWS)
     image = i // (height * width)
-    begin, end = tl.load(near + i), tl.load(far + i)
+    begin = tl.load(near + i)
+    end = tl.load(far + i)
     length = end - begin
     x, y, z = load3(directions, i)
     cx, cy, cz = load3(centers, image)

@@ -14,14 +14,26 @@ from ghgs_lit.kernels.simd import EXP2_LIMIT, LANES
 
 ZERO, HALF, ONE, TWO = (np.float32(x) for x in (0, 0.5, 1, 2))
 LOG2_E = np.float32(math.log2(math.e))
-SIGMOID, TANH = np.float32(SIGMOID_LIMIT), np.float32(TANH_LIMIT)
-FAR, RANGE = np.float32(OTHER), np.float32(OTHER - SAME)
+SIGMOID = np.float32(SIGMOID_LIMIT)
+TANH = np.float32(TANH_LIMIT)
+FAR = np.float32(OTHER)
+RANGE = np.float32(OTHER - SAME)
 
 # Lines: raw values, values at the pixel, and depths to the right, to the left, below and above it.
-OFFSET, SCALE, ROTATION, OPACITY, COLOR = 0, 3, 6, 10, 11
-DEPTH, POINT, PHOTO, SHARE, AROUND, LINES = 14, 15, 18, 21, 22, 26
+OFFSET = 0
+SCALE = 3
+ROTATION = 6
+OPACITY = 10
+COLOR = 11
+DEPTH = 14
+POINT = 15
+PHOTO = 18
+SHARE = 21
+AROUND = 22
+LINES = 26
 
-PLACES, MASKS = types.Array(types.int64, 1, "C"), types.Array(types.boolean, 3, "C")
+PLACES = types.Array(types.int64, 1, "C")
+MASKS = types.Array(types.boolean, 3, "C")
 _EACH = [FLOATS[2], FLOATS[2], FLOATS[2], FLOATS[1], FLOATS[2]]
 _MAPS = [FLOATS[3], MASKS, FLOATS[4], FLOATS[4], FLOATS[3], FLOATS[3], FLOATS[2]]
 _CONSTANTS = (types.UniTuple(types.float32, 10), types.boolean)
@@ -56,7 +68,10 @@ def _unit(w, x, y, z):
     largest = simd.maximum(largest, simd.maximum(simd.maximum(y, ZERO - y), simd.maximum(z, ZERO - z)))
     is_zero = largest == ZERO
     inverse = ONE / simd.select(is_zero, ONE, largest)
-    w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
+    w = w * inverse
+    x = x * inverse
+    y = y * inverse
+    z = z * inverse
     squared = simd.select(is_zero, ONE, w * w + (x * x + (y * y + z * z)))
     inverse = ONE / simd.sqrt(squared)
     return w * inverse, x * inverse, y * inverse, z * inverse
@@ -89,10 +104,12 @@ def _rotate(q, v):
 @helper
 def _slope(values, line, own, footprint):
     """Relative change of depth along an axis, from the pixels before and after; see ``surface_axes``."""
-    after, before = _line(values, line) - own, _line(values, line + 1) - own
+    after = _line(values, line) - own
+    before = _line(values, line + 1) - own
     near_after = simd.minimum(ONE, (FAR - simd.maximum(after, ZERO - after) / footprint) / RANGE)
     near_before = simd.minimum(ONE, (FAR - simd.maximum(before, ZERO - before) / footprint) / RANGE)
-    near_after, near_before = simd.maximum(near_after, ZERO), simd.maximum(near_before, ZERO)
+    near_after = simd.maximum(near_after, ZERO)
+    near_before = simd.maximum(near_before, ZERO)
     after = simd.select(near_after > ZERO, after, ZERO) * near_after
     before = simd.select(near_before > ZERO, before, ZERO) * near_before
     return (after - before) / ((ONE + near_after * near_before) * own + after + before)
@@ -102,9 +119,11 @@ def _slope(values, line, own, footprint):
 def _axes(values, camera, turn, row, column, own):
     """Quaternions from axes of the surface to the world; see ``surface_axes``."""
     footprint = own / camera[0, 0]
-    right, down = _slope(values, AROUND, own, footprint), _slope(values, AROUND + 2, own, footprint)
+    right = _slope(values, AROUND, own, footprint)
+    down = _slope(values, AROUND + 2, own, footprint)
     toward = ONE + right * (column + HALF - camera[0, 2]) + down * (row + HALF - camera[1, 2])
-    x, y = ZERO - right * camera[0, 0], ZERO - right * camera[0, 1] - down * camera[1, 1]
+    x = ZERO - right * camera[0, 0]
+    y = ZERO - right * camera[0, 1] - down * camera[1, 1]
     length = simd.sqrt(x * x + y * y + toward * toward)
     turned = _unit(length + toward, ZERO - y, x, simd.full(ZERO))
     return _multiply((turn[0], turn[1], turn[2], turn[3]), turned)
@@ -116,10 +135,12 @@ def _read(
     values,
 ):  # fmt: skip
     """Fill ``values`` with Gaussians from ``start`` on; the last one is repeated."""
-    height, width = depth.shape[1], depth.shape[2]
+    height = depth.shape[1]
+    width = depth.shape[2]
     for lane in range(LANES):
         i = min(start + lane, last - 1)
-        row, column = pixel[i] // width, pixel[i] % width
+        row = pixel[i] // width
+        column = pixel[i] % width
         for k in range(3):
             values[(OFFSET + k) * LANES + lane] = offset[i, k]
             values[(SCALE + k) * LANES + lane] = scale[i, k]
@@ -128,7 +149,8 @@ def _read(
             values[(PHOTO + k) * LANES + lane] = photo[image, k, row, column]
         for k in range(4):
             values[(ROTATION + k) * LANES + lane] = rotation[i, k]
-            y, x = row + (k == 2) - (k == 3), column + (k == 0) - (k == 1)
+            y = row + (k == 2) - (k == 3)
+            x = column + (k == 0) - (k == 1)
             inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
             around = depth[image, y, x] if inside and valid[image, y, x] else np.float32(np.inf)
             values[(AROUND + k) * LANES + lane] = around
@@ -144,8 +166,11 @@ def activate(
 ):  # fmt: skip
     """Write Gaussians ``first`` to ``last`` of ``image``; see :func:`ghgs_lit.heads.cpu.activate`."""
     limit, unit, inward, floor, span, across, thickness, least, bias, change = constants
-    camera, width, values = intrinsics[image], depth.shape[2], simd.aligned(LINES * LANES)
-    rows, columns = simd.aligned(LANES), simd.aligned(LANES)
+    camera = intrinsics[image]
+    width = depth.shape[2]
+    values = simd.aligned(LINES * LANES)
+    rows = simd.aligned(LANES)
+    columns = simd.aligned(LANES)
     focal = np.sqrt(camera[0, 0] * camera[1, 1])
     for start in range(first, last, LANES):
         _read(
@@ -158,7 +183,9 @@ def activate(
             _line(values, ROTATION) + ONE, _line(values, ROTATION + 1), _line(values, ROTATION + 2),
             _line(values, ROTATION + 3),
         )  # fmt: skip
-        right, up, back = _line(values, OFFSET), _line(values, OFFSET + 1), _line(values, OFFSET + 2)
+        right = _line(values, OFFSET)
+        up = _line(values, OFFSET + 1)
+        back = _line(values, OFFSET + 2)
         if limit > 0:
             moved = (_tanh(right) * limit, _tanh(up) * limit, _tanh(back) * limit + footprint * inward)
         else:
@@ -168,7 +195,8 @@ def activate(
                 place = pixel[min(start + lane, last - 1)]
                 rows[lane], columns[lane] = place // width, place % width
             axes = _axes(values, camera, turns[image], memory.load(rows, 0), memory.load(columns, 0), own)
-            moved, q = _rotate(axes, moved), _multiply(axes, q)
+            moved = _rotate(axes, moved)
+            q = _multiply(axes, q)
         for k in range(3):
             size = _line(values, SCALE + k) + (thickness if k == 2 else across)
             memory.store(values, (SCALE + k) * LANES, footprint * (floor * _exp(_sigmoid(size) * span)))

@@ -15,7 +15,8 @@ _INPUTS = (
     "Tensor intrinsics, Tensor extrinsics, float[] constants, bool on_surface"
 )
 #: Places of the inputs that have a gradient.
-_RAW, _POINTS = (0, 1, 2, 3, 4), 9
+_RAW = (0, 1, 2, 3, 4)
+_POINTS = 9
 
 
 def is_supported(*tensors: Tensor | None, fixed: Sequence[Tensor | None]) -> bool:
@@ -27,7 +28,8 @@ def is_supported(*tensors: Tensor | None, fixed: Sequence[Tensor | None]) -> boo
 def _plain(*inputs) -> tuple[Tensor, ...]:
     *raw, image, pixel, depth, valid, points, photo, share = inputs[:12]
     intrinsics, extrinsics, constants, on_surface = inputs[12:]
-    maps, cameras = DepthMaps(depth, valid, depth), Cameras(intrinsics, extrinsics, *depth.shape[-2:])
+    maps = DepthMaps(depth, valid, depth)
+    cameras = Cameras(intrinsics, extrinsics, *depth.shape[-2:])
     given = (tuple(raw), image, pixel, maps, points, photo, share, cameras)
     return footprint_gaussians(*given, Constants(*constants), on_surface)
 

@@ -10,9 +10,11 @@ from torch import Tensor
 from ghgs_lit.heads import activations, surface
 from ghgs_lit.kernels.tiles import clamp, load3, load4, rows_of, start, store3, store4, tanh
 
-SIGMOID, TANH = tl.constexpr(activations.SIGMOID_LIMIT), tl.constexpr(activations.TANH_LIMIT)
+SIGMOID = tl.constexpr(activations.SIGMOID_LIMIT)
+TANH = tl.constexpr(activations.TANH_LIMIT)
 SHORTEST = tl.constexpr(activations.SHORTEST)
-FAR, RANGE = tl.constexpr(surface.OTHER), tl.constexpr(surface.OTHER - surface.SAME)
+FAR = tl.constexpr(surface.OTHER)
+RANGE = tl.constexpr(surface.OTHER - surface.SAME)
 
 
 @triton.jit
@@ -41,7 +43,10 @@ def _unit(w, x, y, z):
     """Four numbers divided by their length, and the length; 0 stays 0. The largest is divided out first."""
     largest = tl.maximum(tl.maximum(tl.abs(w), tl.abs(x)), tl.maximum(tl.abs(y), tl.abs(z)))
     scale = 1 / tl.where(largest == 0, 1.0, largest)
-    w, x, y, z = w * scale, x * scale, y * scale, z * scale
+    w = w * scale
+    x = x * scale
+    y = y * scale
+    z = z * scale
     squared = w * w + x * x + y * y + z * z
     length = tl.sqrt(tl.where(largest == 0, 1.0, squared))
     scale = 1 / length
@@ -62,7 +67,9 @@ def _multiply(a, b, c, d, w, x, y, z):
 @triton.jit
 def _rotate(w, a, b, c, x, y, z):
     """The vector (x, y, z) rotated by a unit quaternion."""
-    p, q, r = 2 * (b * z - c * y), 2 * (c * x - a * z), 2 * (a * y - b * x)
+    p = 2 * (b * z - c * y)
+    q = 2 * (c * x - a * z)
+    r = 2 * (a * y - b * x)
     return x + w * p + (b * r - c * q), y + w * q + (c * p - a * r), z + w * r + (a * q - b * p)
 
 
@@ -70,8 +77,10 @@ def _rotate(w, a, b, c, x, y, z):
 def _better(one, other, at: tl.constexpr):
     """The row of Shepperd's table with the larger number ``at`` its diagonal."""
     is_better = other[at] > one[4]
-    w, x = tl.where(is_better, other[0], one[0]), tl.where(is_better, other[1], one[1])
-    y, z = tl.where(is_better, other[2], one[2]), tl.where(is_better, other[3], one[3])
+    w = tl.where(is_better, other[0], one[0])
+    x = tl.where(is_better, other[1], one[1])
+    y = tl.where(is_better, other[2], one[2])
+    z = tl.where(is_better, other[3], one[3])
     return w, x, y, z, tl.where(is_better, other[at], one[4])
 
 
@@ -81,8 +90,12 @@ def _to_world(extrinsics, image):
     a, ba, ca, _ = load4(extrinsics, image * 4)
     ab, b, cb, _ = load4(extrinsics, image * 4 + 1)
     ac, bc, c, _ = load4(extrinsics, image * 4 + 2)
-    x, y, z = cb - bc, ac - ca, ba - ab
-    xy, xz, yz = ba + ab, ac + ca, cb + bc
+    x = cb - bc
+    y = ac - ca
+    z = ba - ab
+    xy = ba + ab
+    xz = ac + ca
+    yz = cb + bc
     best = (1 + a + b + c, x, y, z, 1 + a + b + c)
     best = _better(best, (x, 1 + a - b - c, xy, xz), 1)
     best = _better(best, (y, xy, 1 - a + b - c, yz), 2)
@@ -112,13 +125,15 @@ def _slope(depth, valid, image, row, column, down, right, own, footprint, height
 @triton.jit
 def _axes(depth, valid, intrinsics, extrinsics, image, pixel, own, height, width):
     """The quaternion from axes of the surface to the world."""
-    row, column = pixel // width, pixel % width
+    row = pixel // width
+    column = pixel % width
     fx, skew, cx = load3(intrinsics, image * 3)
     _, fy, cy = load3(intrinsics, image * 3 + 1)
     right = _slope(depth, valid, image, row, column, 0, 1, own, own / fx, height, width)
     down = _slope(depth, valid, image, row, column, 1, 0, own, own / fx, height, width)
     toward = 1 + right * (column + 0.5 - cx) + down * (row + 0.5 - cy)
-    x, y = -fx * right, -skew * right - fy * down
+    x = -fx * right
+    y = -skew * right - fy * down
     length = tl.sqrt(x * x + y * y + toward * toward)
     w, a, b, c, _ = _to_world(extrinsics, image)
     p, q, r, s, _ = _unit(length + toward, -y, x, tl.zeros_like(x))
@@ -129,7 +144,8 @@ def _axes(depth, valid, intrinsics, extrinsics, image, pixel, own, height, width
 def _depth_and_footprint(depth, intrinsics, image, place):
     """Depths, and sides of the pixels there, in metres."""
     own = tl.load(depth + place)
-    fx, fy = tl.load(intrinsics + image * 9), tl.load(intrinsics + image * 9 + 4)
+    fx = tl.load(intrinsics + image * 9)
+    fy = tl.load(intrinsics + image * 9 + 4)
     return own, own / tl.sqrt(fx * fy)
 
 
@@ -153,11 +169,13 @@ def activate_rows(
 ):  # fmt: skip
     """Write ``ROWS`` Gaussians; see :func:`activate`."""
     i = rows_of(count, ROWS)
-    view, at = tl.load(image + i), tl.load(pixel + i)
+    view = tl.load(image + i)
+    at = tl.load(pixel + i)
     place = view * height * width + at
     own, footprint = _depth_and_footprint(depth, intrinsics, view, place)
     x, y, z = load3(offset, i)
-    x, y = _offset(x, limit, unit, HAS_LIMIT), _offset(y, limit, unit, HAS_LIMIT)
+    x = _offset(x, limit, unit, HAS_LIMIT)
+    y = _offset(y, limit, unit, HAS_LIMIT)
     z = _offset(z, limit, unit, HAS_LIMIT) + inward * footprint
     w, a, b, c = load4(rotation, i)
     w, a, b, c, _ = _unit(w + 1, a, b, c)
@@ -192,7 +210,8 @@ def activate_back_rows(
 ):  # fmt: skip
     """Write the gradients of ``ROWS`` Gaussians; see :func:`activate_back`."""
     i = rows_of(count, ROWS)
-    view, at = tl.load(image + i), tl.load(pixel + i)
+    view = tl.load(image + i)
+    at = tl.load(pixel + i)
     place = view * height * width + at
     own, footprint = _depth_and_footprint(depth, intrinsics, view, place)
     x, y, z = load3(of_means, i)
@@ -208,13 +227,17 @@ def activate_back_rows(
         x, y, z = _rotate(p, -q, -r, -s, x, y, z)
         w, a, b, c = _multiply(p, -q, -r, -s, w, a, b, c)
     u, v, t = load3(offset, i)
-    x, y = _offset_back(x, u, limit, unit, HAS_LIMIT), _offset_back(y, v, limit, unit, HAS_LIMIT)
+    x = _offset_back(x, u, limit, unit, HAS_LIMIT)
+    y = _offset_back(y, v, limit, unit, HAS_LIMIT)
     store3(d_offset, i, x, y, _offset_back(z, t, limit, unit, HAS_LIMIT))
     p, q, r, s = load4(rotation, i)
     p, q, r, s, length = _unit(p + 1, q, r, s)
     rate = tl.where(length == 0, 0.0, 1 / tl.where(length < SHORTEST, SHORTEST, length))
     along = p * w + q * a + r * b + s * c
-    w, a, b, c = w - p * along, a - q * along, b - r * along, c - s * along
+    w = w - p * along
+    a = a - q * along
+    b = b - r * along
+    c = c - s * along
     store4(d_rotation, i, rate * w, rate * a, rate * b, rate * c)
     for k in tl.static_range(3):
         raw = tl.load(scale + 3 * i + k) + (thickness if k == 2 else across)

@@ -12,7 +12,8 @@ from ghgs_lit.kernels.pool import even_parts
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 #: Gaussians in one task, and the work of one as the pool counts it.
-_TASK, _WORK = 512, 8
+_TASK = 512
+_WORK = 8
 #: Gaussians in one task of the gradients: each task has its own sums.
 _LEARNED = 2048
 
@@ -40,7 +41,8 @@ class _Remember(torch.autograd.Function):
         from ghgs_lit.kernels.layers import packed
         from ghgs_lit.rounds.cpu.kernel import remember
 
-        layers, after = packed(numbers), torch.empty_like(before)
+        layers = packed(numbers)
+        after = torch.empty_like(before)
         rows = [x.detach().contiguous() for x in (each, known, before)]
         given = (*(x.numpy() for x in rows), layers, after.numpy())
         pool.run_rows(remember(), given, [(0, len(before))], _TASK, _WORK * len(before))
@@ -55,7 +57,8 @@ class _Remember(torch.autograd.Function):
 
         *rows, numbers = *ctx.saved_tensors[:4], ctx.saved_tensors[4:]
         parts = even_parts(len(slope), _LEARNED)
-        sums, d_before = Sums(numbers, len(parts)), torch.empty_like(slope)
+        sums = Sums(numbers, len(parts))
+        d_before = torch.empty_like(slope)
         arrays = [x.numpy() for x in (*rows, slope.contiguous())]
         layers = packed(numbers), packed(numbers, transposed=True), sums.places
         tasks = [

@@ -31,7 +31,8 @@ def _unsee(view, hidden, views, shown, seen, slopes, own):
         if view == 0:
             memory.store(own, i, memory.load(slopes, i))
         else:
-            most, slope = memory.load(seen, 2 * size + i), memory.load(slopes, 2 * size + i)
+            most = memory.load(seen, 2 * size + i)
+            slope = memory.load(slopes, 2 * size + i)
             is_most = memory.load(shown, i) == most
             mean = share * memory.load(slopes, size + i)
             memory.store(own, i, mean + simd.select(is_most, slope, ZERO))
@@ -54,10 +55,15 @@ def _layer(layers, place, outputs, inputs, before, after):
 @helper
 def _look(each, known, before, layers, places, start, count, given, one, two, seen, up, narrow):
     """Compute the inputs of all layers: two of each view, two of the update and the last one."""
-    views, channels, hidden = each.shape[1], each.shape[2], before.shape[1]
-    inputs, wide = 4 * hidden + known.shape[1], 2 * hidden
+    views = each.shape[1]
+    channels = each.shape[2]
+    hidden = before.shape[1]
+    inputs = 4 * hidden + known.shape[1]
+    wide = 2 * hidden
     for view in range(views):
-        x, a, b = _of(view, views, given), _of(view, views, one), _of(view, views, two)
+        x = _of(view, views, given)
+        a = _of(view, views, one)
+        b = _of(view, views, two)
         put_rows(each[:, view], start, count, 0, x)
         put_ones(channels, x)
         _layer(layers, places[0, 0], hidden, channels, x, a)
@@ -76,13 +82,22 @@ def remember_back(
 ):  # fmt: skip
     """Write ``d_before`` of rows ``first`` to ``last`` and add to ``sums``; see
     :func:`ghgs_lit.rounds.cpu.remembered`."""
-    views, channels, hidden = each.shape[1], each.shape[2], before.shape[1]
-    inputs, wide = 4 * hidden + known.shape[1], 2 * hidden
-    line, most = lines(hidden + 1) * PANEL, lines(inputs + 1) * PANEL
+    views = each.shape[1]
+    channels = each.shape[2]
+    hidden = before.shape[1]
+    inputs = 4 * hidden + known.shape[1]
+    wide = 2 * hidden
+    line = lines(hidden + 1) * PANEL
+    most = lines(inputs + 1) * PANEL
     given = simd.aligned(views * lines(channels + 1) * PANEL)
-    one, two = simd.aligned(views * line), simd.aligned(views * line)
-    seen, slope, turned = simd.aligned(most), simd.aligned(most), simd.aligned(most + PANEL * PANEL)
-    up, narrow, down = simd.aligned(2 * line), simd.aligned(line), simd.aligned(2 * line)
+    one = simd.aligned(views * line)
+    two = simd.aligned(views * line)
+    seen = simd.aligned(most)
+    slope = simd.aligned(most)
+    turned = simd.aligned(most + PANEL * PANEL)
+    up = simd.aligned(2 * line)
+    narrow = simd.aligned(line)
+    down = simd.aligned(2 * line)
     for buffer in (given, one, two, seen, up, narrow, turned):  # padding must be finite
         buffer[:] = ZERO
     for start in range(first, last, PANEL):
@@ -106,7 +121,9 @@ def remember_back(
             for channel in range(hidden):
                 d_before[start + lane, channel] += slope[(inputs - hidden + channel) * PANEL + lane]
         for view in range(views):
-            x, a, b = _of(view, views, given), _of(view, views, one), _of(view, views, two)
+            x = _of(view, views, given)
+            a = _of(view, views, one)
+            b = _of(view, views, two)
             _unsee(view, hidden, views, b, seen, slope, down)
             unrectify(b, hidden, down)
             learn(a, hidden, down, hidden, turned, places[1, 2], sums)

@@ -8,7 +8,9 @@ from ghgs_lit.kernels.compile import FLOATS, NUMBER, helper, kernel_for
 from ghgs_lit.kernels.layers import PANEL, linear, lines, put_rows, rectify, size
 from ghgs_lit.kernels.simd import LANES
 
-ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
+ZERO = np.float32(0)
+HALF = np.float32(0.5)
+ONE = np.float32(1)
 
 _SEEN = (FLOATS[2], FLOATS[2], types.Array(types.int64, 1, "C"), FLOATS[4], FLOATS[4])
 _MAPS = (FLOATS[5], FLOATS[4], FLOATS[5], FLOATS[5], FLOATS[5])
@@ -35,7 +37,9 @@ def see(view, hidden, views, shown, seen):
 @kernel_for(FLOATS[3], FLOATS[2], FLOATS[2], FLOATS[1], FLOATS[2], NUMBER, NUMBER)
 def remember(each, known, before, layers, after, first, last):
     """Write rows ``first`` to ``last`` of ``after``; see :func:`ghgs_lit.rounds.cpu.remembered`."""
-    views, channels, hidden = each.shape[1], each.shape[2], before.shape[1]
+    views = each.shape[1]
+    channels = each.shape[2]
+    hidden = before.shape[1]
     inputs = 4 * hidden + known.shape[1]
     to_deep = size(hidden, channels)
     to_update = to_deep + size(hidden, hidden)
@@ -44,7 +48,8 @@ def remember(each, known, before, layers, after, first, last):
     biases = to_memory + lines(hidden) * hidden
     seen = simd.aligned(inputs * PANEL)
     widest = max(lines(2 * hidden), channels) * PANEL
-    one, two = simd.aligned(widest), simd.aligned(widest)
+    one = simd.aligned(widest)
+    two = simd.aligned(widest)
     for start in range(first, last, PANEL):
         count = min(PANEL, last - start)
         for view in range(views):
@@ -80,7 +85,8 @@ def _put_cells(place, side, cells):
     """Write the two cells around positions along an axis and their weights, 0 beyond the border."""
     place = place - HALF
     first = simd.floor(place)
-    share, last = place - first, np.float32(side - 1)
+    share = place - first
+    last = np.float32(side - 1)
     memory.store(cells, 0, simd.maximum(first, ZERO))
     memory.store(cells, LANES, simd.minimum(first + ONE, last))
     memory.store(cells, 2 * LANES, simd.select(first >= ZERO, ONE - share, ZERO))
@@ -97,8 +103,10 @@ def _between(plane, rows, columns, weights):
 def _cells(lane, down, across):
     rows = np.uint64(down[lane]), np.uint64(down[LANES + lane])
     columns = np.uint64(across[lane]), np.uint64(across[LANES + lane])
-    top, bottom = down[2 * LANES + lane], down[3 * LANES + lane]
-    left, right = across[2 * LANES + lane], across[3 * LANES + lane]
+    top = down[2 * LANES + lane]
+    bottom = down[3 * LANES + lane]
+    left = across[2 * LANES + lane]
+    right = across[3 * LANES + lane]
     return rows, columns, (top * left, top * right, bottom * left, bottom * right)
 
 
@@ -107,7 +115,8 @@ def _project(camera, pose, x, y, z, height, width, down, across, z_depth):
     """Write the cells around points in a view, and their depths; returns the visible points, as bits."""
     distance = _axis(pose[2], x, y, z)
     inverse = ONE / distance
-    right, below = _axis(pose[0], x, y, z) * inverse, _axis(pose[1], x, y, z) * inverse
+    right = _axis(pose[0], x, y, z) * inverse
+    below = _axis(pose[1], x, y, z) * inverse
     u = camera[0, 0] * right + (camera[0, 1] * below + camera[0, 2])
     v = camera[1, 1] * below + camera[1, 2]
     seen = (distance > ZERO) & (u >= ZERO) & (u <= np.float32(width))
@@ -122,10 +131,15 @@ def observe(
     means, colors, image, intrinsics, extrinsics, photo, mask, drawn, alpha, depth, near, out, first, last
 ):
     """Write rows ``first`` to ``last`` of one element; see :func:`ghgs_lit.rounds.cpu.compare`."""
-    views, height, width = photo.shape[1], photo.shape[3], photo.shape[4]
+    views = photo.shape[1]
+    height = photo.shape[3]
+    width = photo.shape[4]
     element = image[first] // views
-    point, z_depth, behind = simd.aligned(3 * LANES), simd.aligned(LANES), simd.aligned(LANES)
-    down, across = simd.aligned(4 * LANES), simd.aligned(4 * LANES)
+    point = simd.aligned(3 * LANES)
+    z_depth = simd.aligned(LANES)
+    behind = simd.aligned(LANES)
+    down = simd.aligned(4 * LANES)
+    across = simd.aligned(4 * LANES)
     # Index of each view among the values of a Gaussian, for each own view.
     places = np.empty((views, views), np.int64)
     for own in range(views):
@@ -136,7 +150,9 @@ def observe(
         for lane in range(LANES):
             for axis in range(3):
                 point[axis * LANES + lane] = means[start + min(lane, count - 1), axis]
-        x, y, z = memory.load(point, 0), memory.load(point, LANES), memory.load(point, 2 * LANES)
+        x = memory.load(point, 0)
+        y = memory.load(point, LANES)
+        z = memory.load(point, 2 * LANES)
         for view in range(views):
             pose = extrinsics[element, view]
             seen = _project(intrinsics[element, view], pose, x, y, z, height, width, down, across, z_depth)

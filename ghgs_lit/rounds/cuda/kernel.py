@@ -17,7 +17,8 @@ def observe_rows(
 ):  # fmt: skip
     """Write ``ROWS`` rows of ``out`` [N, V, 11]; ``count``: N V. See :func:`observe`."""
     i = rows_of(count, ROWS)
-    gaussian, turn = i // views, i % views
+    gaussian = i // views
+    turn = i % views
     own = tl.load(image + gaussian)
     view = own // views * views + (own + turn) % views
     x, y, z = load3(means, gaussian)
@@ -25,12 +26,15 @@ def observe_rows(
     fx, skew, cx = load3(intrinsics, 3 * view)
     _, fy, cy = load3(intrinsics, 3 * view + 1)
     is_front = z > 0
-    x, y = x / tl.where(is_front, z, 1.0), y / tl.where(is_front, z, 1.0)
-    u, v = fx * x + skew * y + cx, fy * y + cy
+    x = x / tl.where(is_front, z, 1.0)
+    y = y / tl.where(is_front, z, 1.0)
+    u = fx * x + skew * y + cx
+    v = fy * y + cy
     can_see = is_front & (u >= 0) & (u <= width) & (v >= 0) & (v <= height)
     left, right, before, after = cells(u, width)
     top, bottom, above, below = cells(v, height)
-    top, bottom = top * width, bottom * width
+    top = top * width
+    bottom = bottom * width
     area = height * width
     row = out + i * CHANNELS
     for k in tl.static_range(3):
@@ -53,7 +57,8 @@ def observe_rows(
 def observe(*inputs) -> Tensor:
     """The operator of :mod:`ghgs_lit.rounds.observation`."""
     *tensors, scale, _ = inputs
-    means, photo = tensors[0], tensors[5]
+    means = tensors[0]
+    photo = tensors[5]
     views, _, height, width = photo.shape[1:]
     out = means.new_empty(len(means), views, CHANNELS.value)
     start(observe_rows, len(means) * views, *tensors, out, views, height, width, scale)
