@@ -9,13 +9,32 @@ class InputError(ValueError):
 
 
 def choice(key: str, value: object, allowed: tuple) -> None:
-    """Refuse the ``value`` of a configuration's ``key`` unless it is one of ``allowed``."""
+    """Refuse the value of a configuration's key unless it is one of those allowed.
+
+    Args:
+        key: dotted key, for the message.
+        value: what the key holds.
+        allowed: all values that the key may hold.
+
+    Raises:
+        InputError: names the key, all allowed values and ``value``.
+    """
     if value not in allowed:
         raise InputError(f"{key}: expected one of {', '.join(map(str, allowed))}; found {shown(value)}")
 
 
 def require(condition: bool, key: str, expected: str, found: object) -> None:
-    """Refuse the value ``found`` of ``key`` unless ``condition`` holds; ``expected`` describes it."""
+    """Refuse the value of a path or key unless a condition holds.
+
+    Args:
+        condition: whether the value is good.
+        key: path or dotted key that has the value.
+        expected: what would be good, in words.
+        found: the value, shown by :func:`shown`.
+
+    Raises:
+        InputError: "<key>: expected <expected>; found <found>".
+    """
     if not condition:
         raise InputError(f"{key}: expected {expected}; found {shown(found)}")
 
@@ -29,7 +48,16 @@ def shown(value: object) -> str:
 
 
 def installed(package: str, extra: str, key: str) -> ModuleType:
-    """Import a package that an ``extra`` installs and ``key`` needs. InputError: it is missing."""
+    """Import a package that an extra of this one installs.
+
+    Args:
+        package: name of the module.
+        extra: name of the extra, for the command in the message.
+        key: dotted key that needs the package, for the message.
+
+    Raises:
+        InputError: the package cannot be imported; the message says how to install it.
+    """
     try:
         return importlib.import_module(package)
     except ImportError:

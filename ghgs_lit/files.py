@@ -19,12 +19,19 @@ _OWNER = b"process "  #: How the text of a lock file begins
 
 
 def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
-    """Let ``write(temporary)`` write a file beside ``path``, wait for the disk, then rename it to ``path``.
+    """Write a file beside ``path``, wait for the disk, then rename it to ``path``.
 
-    Readers see the old file or the new one, never a part. Folders are made. A link is replaced, and the file
-    that it points to stays. A temporary file of a process that was killed is removed by the next write of the
-    same path on the same machine. InputError: ``path`` is, or links to, a directory, a device or a pipe.
-    OSError: the disk is full, or the folder cannot be written to; its ``filename`` is ``path``.
+    Readers see the old file or the new one, never a part. Folders are made. A link is replaced,
+    and the file that it points to stays. A temporary file of a process that was killed is
+    removed by the next write of the same path on the same machine.
+
+    Args:
+        path: the file.
+        write: called with the temporary path; writes the content there.
+
+    Raises:
+        InputError: ``path`` is, or links to, a directory, a device or a pipe.
+        OSError: the disk is full, or the folder cannot be written to; ``filename`` is ``path``.
     """
     path = Path(path)
     _require_replaceable(path)
@@ -48,7 +55,11 @@ def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
 
 
 def _require_replaceable(path: Path) -> None:
-    """Refuse what a new file must not take the place of."""
+    """Refuse what a new file must not take the place of.
+
+    Raises:
+        InputError: ``path`` is, or links to, a directory, a device or a pipe.
+    """
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:
@@ -58,9 +69,17 @@ def _require_replaceable(path: Path) -> None:
 
 
 def require_free(path: str | Path, key: str, overwrite: bool) -> None:
-    """The rule for a file that a ``key`` of the command line names: one that exists is replaced only with
-    ``overwrite``. InputError: it exists, is none that :func:`write_atomically` would replace, or its folder
-    cannot be written to, which is said before hours of work, not after them."""
+    """The rule for a file that a key names: one that exists is replaced only with ``overwrite``.
+
+    Args:
+        path: the file, perhaps with ``~``.
+        key: dotted key of the command line, for messages.
+        overwrite: whether a file that exists may be replaced.
+
+    Raises:
+        InputError: the file exists, is none that :func:`write_atomically` would replace, or its
+            folder cannot be written to, which is said before hours of work, not after them.
+    """
     path = Path(path).expanduser()
     _require_replaceable(path)
     taken = os.path.lexists(path) and not overwrite
@@ -72,7 +91,14 @@ def require_free(path: str | Path, key: str, overwrite: bool) -> None:
 
 @contextlib.contextmanager
 def naming(folder: Path) -> Iterator[None]:
-    """Add the name of ``folder`` to an OSError inside the context that names no file, such as a full disk."""
+    """Name a folder in each OSError inside the context that names no file, such as a full disk.
+
+    Args:
+        folder: where the files are written inside the context.
+
+    Raises:
+        OSError: as inside the context, with ``folder`` as its ``filename``.
+    """
     try:
         yield
     except OSError as error:
@@ -100,8 +126,11 @@ def _refusal(path: Path) -> OSError | None:
 
 
 def resolved(path: str | Path) -> Path:
-    """The absolute path without links or ``~``. InputError: a loop of links (before Python 3.13; in later
-    versions opening the path fails)."""
+    """The absolute path without links or ``~``.
+
+    Raises:
+        InputError: a loop of links (before Python 3.13; in later versions opening the path fails).
+    """
     try:
         return Path(path).expanduser().resolve()
     except RuntimeError as error:
@@ -109,13 +138,20 @@ def resolved(path: str | Path) -> Path:
 
 
 def write_text_atomically(path: str | Path, text: str) -> None:
-    """Write ``text`` to ``path`` by :func:`write_atomically`."""
+    """Write ``text`` to ``path``, with the errors of :func:`write_atomically`."""
     write_atomically(path, lambda temporary: temporary.write_text(text))
 
 
 def require_no_links(directory: Path, names: Iterable[str]) -> None:
-    """Refuse links of these names in a run's directory, and in folders of these names: libraries that write
-    there would change the files that the links point to."""
+    """Refuse links where libraries write: they would change the files that the links point to.
+
+    Args:
+        directory: a run's directory.
+        names: of its files and folders; the files directly in these folders are checked, too.
+
+    Raises:
+        InputError: names the first link.
+    """
     for name in names:
         path = directory / name
         files = path.iterdir() if path.is_dir() and not path.is_symlink() else ()
@@ -124,7 +160,15 @@ def require_no_links(directory: Path, names: Iterable[str]) -> None:
 
 
 def append_line(path: Path, text: str) -> None:
-    """Append ``text`` as a line of its own, also after an unfinished line of a killed process."""
+    """Append ``text`` as a line of its own, also after an unfinished line of a killed process.
+
+    Args:
+        path: the file; it and its folders are made.
+        text: without the line's end.
+
+    Raises:
+        OSError: the file is a link, or cannot be written.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "a+b", opener=_open_no_link) as file:
         file.seek(max(0, file.tell() - 1))
@@ -173,7 +217,19 @@ def _place_of_lock(path: str | Path) -> Path:
 
 
 def _open_lock(path: Path, flags: int) -> int:
-    """Open a lock file without changing it. InputError: it is a link, no file, or holds something else."""
+    """Open a lock file without changing it.
+
+    Args:
+        path: the file, without links in its folders.
+        flags: of :func:`os.open`.
+
+    Returns:
+        The handle.
+
+    Raises:
+        InputError: it is a link, no file, or holds something else than an owner.
+        OSError: it cannot be opened.
+    """
     try:
         # Opening a pipe would wait for its other end.
         handle = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o664)
@@ -189,11 +245,23 @@ def _open_lock(path: Path, flags: int) -> int:
 
 @contextlib.contextmanager
 def lock(path: str | Path, wait: bool = False) -> Iterator[bool]:
-    """Lock the file ``path`` for this process; gives whether that succeeded (False if it holds it already). A
-    POSIX record lock: the system frees it however the process ends, forked children do not inherit it, and
-    NFS shares it among machines. The file holds the text of :func:`lock_owner`; folders are made. ``wait``:
-    wait until another process frees the lock. InputError: the file system has no locks, or the file is a link
-    or holds anything but an owner: it is not emptied."""
+    """Lock a file for this process while the context lasts.
+
+    A POSIX record lock (``fcntl``): the system frees it however the process ends, forked children
+    do not inherit it, and NFS shares it among machines. The file holds the text of
+    :func:`lock_owner`.
+
+    Args:
+        path: the lock file; it and its folders are made.
+        wait: wait until another process frees the lock.
+
+    Yields:
+        Whether it is locked now: False if another process holds it, or this one does already.
+
+    Raises:
+        InputError: the file system has no locks, or the file is a link or holds anything but an
+            owner: it is not emptied.
+    """
     path = _place_of_lock(path)
     if path in _HELD:
         yield False
@@ -230,7 +298,11 @@ def _locked_file(path: Path, wait: bool) -> tuple[int, bool]:
 
 
 def is_locked(path: str | Path) -> bool:
-    """Whether a process, this one included, holds the lock of the file ``path``."""
+    """Whether a process, this one included, holds the lock of a file.
+
+    Raises:
+        InputError: as for :func:`lock`.
+    """
     path = _place_of_lock(path)
     if path in _HELD:
         return True
@@ -252,6 +324,21 @@ def lock_owner(path: str | Path) -> str:
 
 
 def _try_lock(handle: int, kind: int, wait: bool, path: Path) -> bool:
+    """Lock or share an open file by ``fcntl.lockf``.
+
+    Args:
+        handle: of the file.
+        kind: ``fcntl.LOCK_EX`` or ``fcntl.LOCK_SH``.
+        wait: wait until no other process has a lock that excludes this one.
+        path: of the file, for messages.
+
+    Returns:
+        Whether it is locked; False: another process has it, and ``wait`` is false.
+
+    Raises:
+        InputError: the file system has no locks.
+        OSError: any other error of the system.
+    """
     try:
         fcntl.lockf(handle, kind | (0 if wait else fcntl.LOCK_NB))
     except OSError as error:

@@ -25,7 +25,15 @@ _NO_TEXT = (yaml.YAMLError, csv.Error)
 
 
 def require_file(path: str | os.PathLike, expected: str) -> None:
-    """Refuse a path that is no regular file: missing, a folder, a link to itself, a pipe."""
+    """Refuse a path that is no regular file: missing, a folder, a link to itself, a pipe.
+
+    Args:
+        path: the path; a link to a regular file is good.
+        expected: what the file would hold, in words.
+
+    Raises:
+        InputError: names the path and what is there.
+    """
     try:
         is_file = stat.S_ISREG(os.stat(path).st_mode)
     except OSError as error:
@@ -37,7 +45,15 @@ def require_file(path: str | os.PathLike, expected: str) -> None:
 
 
 def require_folder(folder: Path, expected: str = "the folder of the data set") -> None:
-    """Refuse a folder that is missing."""
+    """Refuse a folder that is missing.
+
+    Args:
+        folder: its path.
+        expected: what the folder would be, in words.
+
+    Raises:
+        InputError: names the path.
+    """
     if not folder.is_dir():
         raise InputError(f"{folder}: expected {expected}; found no such folder")
 
@@ -55,8 +71,8 @@ def parts_of(name: str) -> list[str]:
 def find_path(folder: Path, name: str, suffixes: Sequence[str] = ("",)) -> Path | None:
     """The file or folder that ``name`` means, as a file, a program or a user of any system spells it.
 
-    A path that exists as it is written counts; otherwise its parts may have backslashes, letters composed of
-    two characters, and upper or lower case where that leaves one path.
+    A path that exists as it is written counts; otherwise its parts may have backslashes, letters
+    composed of two characters, and upper or lower case where that leaves one path.
 
     Args:
         folder: where relative names begin.
@@ -64,7 +80,8 @@ def find_path(folder: Path, name: str, suffixes: Sequence[str] = ("",)) -> Path 
         suffixes: endings, the preferred first.
 
     Returns:
-        An existing path; None: there is none."""
+        An existing path; None: there is none.
+    """
     for suffix in suffixes:
         try:
             if (exact := folder / f"{name}{suffix}").exists():
@@ -92,7 +109,12 @@ def _alike(folder: Path, name: str) -> Path | None:
 
 @functools.lru_cache(maxsize=64)
 def _listed(folder: Path, changed: int) -> dict[str, list[Path]]:
-    """Entries of a folder by their composed names in lower case, until the folder changes."""
+    """Entries of a folder by their composed names in lower case.
+
+    Args:
+        folder: an existing one.
+        changed: its time of modification in nanoseconds; a folder that changed is listed anew.
+    """
     paths: dict[str, list[Path]] = {}
     for path in sorted(folder.iterdir()):
         paths.setdefault(composed(path.name).casefold(), []).append(path)
@@ -100,7 +122,15 @@ def _listed(folder: Path, changed: int) -> dict[str, list[Path]]:
 
 
 def read_text(path: Path, expected: str = "text") -> str:
-    """The text of a UTF-8 file without byte order mark. InputError: no file, over 256 MB, or no UTF-8."""
+    """The text of a UTF-8 file without byte order mark.
+
+    Args:
+        path: the file.
+        expected: what it would hold, in words.
+
+    Raises:
+        InputError: no file, over 256 MB, or no UTF-8.
+    """
     require_file(path, expected)
     try:
         size = path.stat().st_size
@@ -111,24 +141,44 @@ def read_text(path: Path, expected: str = "text") -> str:
 
 
 def read_json(path: Path, expected: str = "JSON") -> Any:
-    """The content of a JSON file. InputError: as for :func:`read_text`; no JSON; more than 64 levels."""
+    """The content of a JSON file.
+
+    Args:
+        path: the file.
+        expected: what it would hold, in words.
+
+    Raises:
+        InputError: as for :func:`read_text`; no JSON; more than 64 levels.
+    """
     return read_parsed(path, expected, json.loads)
 
 
 def read_yaml(path: Path) -> Any:
-    """The plain data of a YAML file, as :func:`read_json`. Aliases are refused: they grow without limit."""
+    """The plain data of a YAML file.
+
+    Raises:
+        InputError: as for :func:`read_json`, or an alias, by which a file grows without limit.
+    """
     return read_parsed(path, "YAML", _plain_yaml)
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
-    """The rows of a CSV file, as dicts with the names of its header; errors as for :func:`read_text`."""
+    """The rows of a CSV file, as dicts with the names of its header.
+
+    Raises:
+        InputError: as for :func:`read_text`, or no CSV.
+    """
     return read_parsed(
         path, "CSV with a header", lambda text: list(csv.DictReader(io.StringIO(text, newline="")))
     )
 
 
 def read_lines_of_json(path: Path) -> Iterator[dict[str, Any]]:
-    """The mappings of a JSON Lines file; lines that are no mapping, such as unfinished ones, are skipped."""
+    """The mappings of a JSON Lines file; lines that are no mapping, such as unfinished ones, are skipped.
+
+    Raises:
+        InputError: there is no such file.
+    """
     require_file(path, "a mapping in JSON on each line")
     for line in path.read_bytes().splitlines():
         try:
@@ -140,7 +190,15 @@ def read_lines_of_json(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def read_npy(path: Path, expected: str = "a readable .npy file") -> "np.ndarray":
-    """The array of an ``.npy`` file (no objects). InputError: missing, another format, or cut short."""
+    """The array of an ``.npy`` file, which may hold no objects.
+
+    Args:
+        path: the file.
+        expected: what it would hold, in words.
+
+    Raises:
+        InputError: missing, another format, or cut short.
+    """
     import numpy as np  # here: commands that read no array start sooner
 
     require_file(path, expected)
@@ -159,8 +217,17 @@ def _plain_yaml(text: str) -> Any:
 
 
 def check_yaml(text: str, aliases: bool = True) -> None:
-    """Refuse YAML that is unsafe to load. ValueError: more than 64 levels, a forbidden alias, or aliases that
-    expand to more than a million values; yaml.YAMLError: no YAML."""
+    """Refuse YAML that is unsafe to load.
+
+    Args:
+        text: the YAML.
+        aliases: whether aliases (``*name``) are allowed.
+
+    Raises:
+        ValueError: more than 64 levels, a forbidden alias, or aliases that expand to more than a
+            million values.
+        yaml.YAMLError: no YAML.
+    """
     sizes: dict[str | None, int] = {}
     unfinished: list[list[Any]] = [[None, 0]]
     for event in yaml.parse(text, yaml.SafeLoader):
@@ -189,7 +256,16 @@ def check_yaml(text: str, aliases: bool = True) -> None:
 
 
 def read_parsed(path: Path, expected: str, parse: Callable[[str], Any]) -> Any:
-    """The result of ``parse`` for the text of a file; other arguments and errors as for :func:`read_json`."""
+    """What a parser makes of the text of a file.
+
+    Args:
+        path: the file.
+        expected: what it would hold, in words.
+        parse: turns the text into plain data.
+
+    Raises:
+        InputError: as for :func:`read_text`; ``parse`` fails; more than 64 levels.
+    """
     try:
         value = parse(read_text(path, expected))
         if _levels(value) > DEEPEST:
@@ -202,7 +278,11 @@ def read_parsed(path: Path, expected: str, parse: Callable[[str], Any]) -> Any:
 
 
 def _levels(value: Any) -> int:
-    """Levels of nested mappings and lists. ValueError: a whole number that no float can hold."""
+    """Levels of nested mappings and lists.
+
+    Raises:
+        ValueError: a whole number that no float can hold.
+    """
     if isinstance(value, int) and value.bit_length() > 1023:
         raise ValueError(f"a number of {value.bit_length()} bits")
     children = value.values() if isinstance(value, dict) else value
@@ -210,7 +290,11 @@ def _levels(value: Any) -> int:
 
 
 def _require_plain(value: Any) -> None:
-    """Refuse what JSON does not have, such as the dates, sets and bytes of YAML."""
+    """Refuse what JSON does not have, such as the dates, sets and bytes of YAML.
+
+    Raises:
+        ValueError: names the type.
+    """
     if isinstance(value, dict | list):
         for child in value if isinstance(value, list) else (*value, *value.values()):
             _require_plain(child)

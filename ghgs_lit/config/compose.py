@@ -25,7 +25,11 @@ VERSION_BASE: dict[str, Any] = {"version_base": "1.3"} if hydra.__version__.star
 
 
 def conf_dir() -> Path:
-    """Absolute path of ``conf``: inside the package in a wheel, beside it in a checkout."""
+    """Absolute path of ``conf``: inside the package in a wheel, beside it in a checkout.
+
+    Raises:
+        InputError: neither is there.
+    """
     package = Path(__file__).resolve().parents[1]
     candidates = (package / "conf", package.parent / "conf")
     for candidate in candidates:
@@ -64,6 +68,9 @@ def store_defaults(verb: str) -> None:
     """Give Hydra the configuration of a plug-in's verb: its own keys, at their defaults.
 
     A file ``<verb>.yaml`` in ``--config-dir`` comes before it, and may add groups.
+
+    Args:
+        verb: name of any verb; those of ``conf`` are left as they are.
     """
     if (conf_dir() / f"{verb}.yaml").is_file():
         return
@@ -80,7 +87,16 @@ def store_defaults(verb: str) -> None:
 
 
 def compose(verb: str, overrides: Sequence[str] = (), with_hydra: bool = False) -> DictConfig:
-    """The configuration of ``ghgs <verb> <overrides>``, with or without the node ``hydra``."""
+    """The configuration of ``ghgs <verb> <overrides>``.
+
+    Args:
+        verb: name of a verb, or of another file in ``conf``.
+        overrides: as on the command line, such as ``model=paper``.
+        with_hydra: whether the node ``hydra`` is part of it.
+
+    Raises:
+        HydraException: an override does not fit.
+    """
     if verb in verbs():
         store_defaults(verb)
     with _application():
@@ -93,8 +109,15 @@ def saved_text(config: dict[str, Any]) -> str:
 
 
 def resolve(cfg: DictConfig, verb: str | None = None) -> dict[str, Any]:
-    """A composed configuration as plain data; groups and the keys of ``verb`` are checked. InputError: a
-    value is missing or has a wrong type or range."""
+    """A composed configuration as plain data, whose groups are checked.
+
+    Args:
+        cfg: the configuration; nodes without a kind are checked when they are built.
+        verb: whose own keys are checked, too; None: none are.
+
+    Raises:
+        InputError: a value is missing or has a wrong type or range.
+    """
     data = plain(cfg)
     if verb is not None:
         read_verb(verb, data)
@@ -103,7 +126,11 @@ def resolve(cfg: DictConfig, verb: str | None = None) -> dict[str, Any]:
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:
-    """A composed configuration as plain data that nothing has checked. InputError: a value is missing."""
+    """A composed configuration as plain data that nothing has checked.
+
+    Raises:
+        InputError: a value is missing.
+    """
     missing = sorted(OmegaConf.missing_keys(cfg))
     if missing:
         raise InputError(f"{missing[0]}: expected a value ({missing[0]}=...); found none")
@@ -111,8 +138,15 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
 
 
 def read_verb(name: str, config: Mapping[str, Any]) -> "Verb":
-    """The verb with its own keys of ``config``, which are all but groups. InputError: a key is unknown, or a
-    value has a wrong type or range."""
+    """The verb with its own keys.
+
+    Args:
+        name: of the verb.
+        config: the whole configuration as plain data; all keys but groups are the verb's.
+
+    Raises:
+        InputError: a key is unknown, or a value has a wrong type or range.
+    """
     return verb_class(name).read({key: value for key, value in config.items() if key not in KINDS}, "")
 
 
@@ -121,9 +155,16 @@ _GLOBAL = ("experiment", "sweep", "ablation")
 
 
 def check_ablation(cfg: DictConfig, hydra_node: DictConfig) -> None:
-    """Check that each key that the chosen ablation sets has its value in ``cfg``, unless the command line
-    says another. ``hydra_node``: the node ``hydra`` of ``cfg``. InputError: a key has another value, or a
-    file that sets keys of the whole configuration lacks the line that says so."""
+    """Check that each key that the chosen ablation sets has its value, unless the command line sets it.
+
+    Args:
+        cfg: the composed configuration.
+        hydra_node: the node ``hydra`` of the application that composed it.
+
+    Raises:
+        InputError: a key has another value, or a file that sets keys of the whole configuration
+            lacks the line that says so.
+    """
     for group in _GLOBAL:
         if group in cfg:
             file = f"{group}/{hydra_node.runtime.choices.get(group)}.yaml"
@@ -140,7 +181,11 @@ def check_ablation(cfg: DictConfig, hydra_node: DictConfig) -> None:
 
 
 def _set_by_ablation(name: str | None) -> dict[str, Any]:
-    """Dotted keys that an option of the group ``ablation`` sets, with its values; None: no option."""
+    """Dotted keys that an option of the group ``ablation`` sets, with its values.
+
+    Args:
+        name: of the option; None: no option, which sets nothing.
+    """
     if name is None:
         return {}
     file = GlobalHydra.instance().config_loader().repository.load_config(f"ablation/{name}")
@@ -167,15 +212,35 @@ def chosen_options(config: Mapping[str, Any], hydra_node: DictConfig) -> dict[st
 def read_options(
     group: str, names: Sequence[str], configured: Mapping[str, Any], key: str
 ) -> dict[str, dict[str, Any]]:
-    """Options of a group by name; the one that the configuration has chosen has its ``configured`` values."""
+    """Options of a group by name.
+
+    Args:
+        group: name of the group, such as ``skip``.
+        names: of the options.
+        configured: the group's node of the configuration; the option that its ``name`` says has
+            these values instead of those of its file.
+        key: begins the message of an error.
+
+    Raises:
+        InputError: the group has no such option.
+    """
     chosen = configured["name"]
     return {name: dict(configured) if name == chosen else read_option(group, name, key) for name in names}
 
 
 def read_option(group: str, name: str, key: str | None = None) -> dict[str, Any]:
-    """The values of ``<group>/<name>.yaml``, including its own defaults, as plain data. An application
-    of the package also searches the user's ``--config-dir``. InputError: the group has no such option; the
-    message begins with ``key`` or the group."""
+    """The values of ``<group>/<name>.yaml``, including its own defaults, as plain data.
+
+    An application of the package also searches the user's ``--config-dir``.
+
+    Args:
+        group: name of the group; a subgroup with slashes.
+        name: of the option.
+        key: begins the message of an error; None: the group does.
+
+    Raises:
+        InputError: the group has no such option.
+    """
     with nullcontext() if _is_own() else _application():
         known = sorted(GlobalHydra.instance().config_loader().get_group_options(group))
         if name in known:

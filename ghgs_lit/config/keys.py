@@ -38,7 +38,12 @@ EXPECTED_TO_DIFFER = (*OF_A_RUN, "recalibration.neighborhood", "recalibration.si
 
 
 def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
-    """Values by dotted key; an empty mapping is a value."""
+    """Values by dotted key; an empty mapping is a value.
+
+    Args:
+        config: nested mappings, or a single value.
+        prefix: dotted key of ``config`` itself; empty: the whole configuration.
+    """
     if not (isinstance(config, Mapping) and config):
         return {prefix: config}
     flat: dict[str, Any] = {}
@@ -53,8 +58,15 @@ _MOST_LEVELS = 32
 
 
 def require_plain(config: Any, where: str) -> None:
-    """Refuse a configuration that YAML could not have said: other types than mappings with keys of text,
-    lists, texts and numbers, or containers that hold themselves. ``where``: for messages."""
+    """Refuse a configuration that YAML could not have said.
+
+    Args:
+        config: mappings with keys of text, lists, texts and numbers are plain.
+        where: its file or key, for messages.
+
+    Raises:
+        InputError: it holds another type, or itself, or too much; names the key.
+    """
     left = [(where, config, 0)]
     count = 0
     while left:

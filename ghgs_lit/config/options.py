@@ -133,7 +133,12 @@ CropSize = Annotated[CropSide | tuple[CropSide, CropSide], AfterValidator(_pair)
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """`` (did you mean ...?)`` with the closest of ``known``, or an empty string."""
+    """`` (did you mean ...?)`` with the closest known name, or an empty string.
+
+    Args:
+        name: what was given.
+        known: all names that there are.
+    """
     close = difflib.get_close_matches(name if isinstance(name, str) else shown(name), list(known), 1)
     return f" (did you mean {close[0]}?)" if close else ""
 
@@ -149,9 +154,14 @@ class _Checked(type(BaseModel)):
 
 
 class Options(BaseModel, metaclass=_Checked):
-    """Base of all options: immutable, without unknown fields and silent conversions. ``group``: dotted key of
-    the options in configurations, for messages. InputError: "<key>: expected ...; found ...", for the first
-    wrong value."""
+    """Base of all options: immutable, without unknown fields and silent conversions.
+
+    Attributes:
+        group: dotted key of the options in configurations, for messages.
+
+    Raises:
+        InputError: "<key>: expected ...; found ...", for the first wrong value.
+    """
 
     model_config = ConfigDict(
         frozen=True,
@@ -170,8 +180,15 @@ class Options(BaseModel, metaclass=_Checked):
 
     @classmethod
     def read(cls: type[_T], values: Any, key: str) -> _T:
-        """Options from a mapping ``values`` (or options already); missing keys have their default.
-        InputError: names the first wrong key below ``key``, what was expected and what was found."""
+        """Options from a mapping; missing keys have their default.
+
+        Args:
+            values: a mapping, a node of OmegaConf, or options of this class, which are returned.
+            key: dotted key of the mapping; empty: the whole configuration.
+
+        Raises:
+            InputError: names the first wrong key below ``key``, what was expected and what was found.
+        """
         if isinstance(values, cls):
             return values
         if OmegaConf.is_config(values):
@@ -184,11 +201,27 @@ class Options(BaseModel, metaclass=_Checked):
             raise _input_error(cls, key, values, error) from None
 
     def replace(self: _T, **changes: Any) -> _T:
-        """The options with some fields changed; the result is checked."""
+        """The options with some fields changed; the result is checked.
+
+        Args:
+            **changes: new values by field.
+
+        Raises:
+            InputError: as for :class:`Options`.
+        """
         return type(self)(**{**dict(self), **changes})
 
     def require(self, condition: bool, name: str, expected: str) -> None:
-        """Refuse the value of field ``name`` unless ``condition``; for use in a ``model_validator``."""
+        """Refuse the value of a field unless a condition holds; for use in a ``model_validator``.
+
+        Args:
+            condition: whether the value is good.
+            name: of the field.
+            expected: what would be good, in words.
+
+        Raises:
+            InputError: "<name>: expected <expected>; found ...".
+        """
         if not condition:
             raise InputError(f"{name}: expected {expected}; found {shown(_plain(getattr(self, name)))}")
 
@@ -210,7 +243,17 @@ def _plain(value: Any) -> Any:
 
 
 def _input_error(cls: type[Options], key: str, values: Mapping, error: ValidationError) -> InputError:
-    """The first of pydantic's errors, unknown keys first: a misspelt key may leave another one missing."""
+    """The first of pydantic's errors, unknown keys first: a misspelt key may leave another one missing.
+
+    Args:
+        cls: the class of options that refused its values.
+        key: dotted key of the options; empty: the whole configuration.
+        values: what the options were made from.
+        error: of pydantic.
+
+    Returns:
+        An error of one line that names the key.
+    """
     errors = error.errors(include_url=False)
     first = next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])
     own = first.get("ctx", {}).get("error")
@@ -245,7 +288,15 @@ def _input_error(cls: type[Options], key: str, values: Mapping, error: Validatio
 
 
 def image_size(key: str, size: int | Sequence[int]) -> tuple[int, int]:
-    """(height, width) in pixels from a side or a pair."""
+    """(height, width) in pixels from a side or a pair.
+
+    Args:
+        key: dotted key, for the message.
+        size: a side of a square, or [height, width]; at least 1.
+
+    Raises:
+        InputError: it is neither.
+    """
     pair = (size, size) if isinstance(size, int) else tuple(size)
     valid = len(pair) == 2 and all(isinstance(side, int) and side >= 1 for side in pair)
     require(valid, key, "a side or [height, width] in pixels", size)

@@ -72,12 +72,13 @@ def check_file(file: Path, name: str, package: str, content: Mapping[str, Any]) 
     """Check a configuration file that is not the package's.
 
     Args:
-        file: Its path, for messages.
-        name: The group and its option, such as ``hydra/launcher/mine``.
-        package: What its line ``@package`` says; empty: its group.
-        content: Its keys, unresolved.
+        file: its path, for messages.
+        name: the group and its option, such as ``hydra/launcher/mine``.
+        package: what its line ``@package`` says; empty: its group.
+        content: its keys, unresolved.
 
-    InputError: it says something to Hydra that is not in :data:`SETTABLE`; names file and key.
+    Raises:
+        InputError: it says something to Hydra that is not in :data:`SETTABLE`; names file and key.
     """
     group = ".".join(name.split("/")[:-1])
     parts = (package or group).replace("_group_", group).removeprefix("_global_").strip(".").split(".")

@@ -34,8 +34,13 @@ PARTS = "parts"
 
 
 def load_plugins() -> None:
-    """Import the user's plug-ins, so that they register their kinds. InputError: a file is missing, or
-    another module has its name. Errors inside a module keep their type."""
+    """Import the user's plug-ins, so that they register their kinds.
+
+    Errors inside a module keep their type.
+
+    Raises:
+        InputError: a file is missing, or another module has its name.
+    """
     names = [_module_of(entry) for entry in os.environ.get(VARIABLE, "").split(os.pathsep) if entry.strip()]
     for name in (*names, *_installed()):
         # Files that are opened while the collector is off would be frozen, and not flushed at exit.
@@ -49,7 +54,14 @@ def _installed() -> tuple[str, ...]:
 
 
 def _module_of(entry: str) -> str:
-    """Module name of an entry; a file is made importable by its stem. InputError: as :func:`load_plugins`."""
+    """Module name of an entry of ``GHGS_PLUGINS``; a file is made importable by its stem.
+
+    Args:
+        entry: a Python file or a module name.
+
+    Raises:
+        InputError: as for :func:`load_plugins`.
+    """
     entry = entry.strip()
     if not entry.endswith(".py"):
         return entry
@@ -145,6 +157,10 @@ _REGISTERED: dict[tuple[str, str], type[Options] | str] = {}
 def register(group: str, kind: str) -> Callable[[_C], _C]:
     """Class decorator that registers options as ``<group>: {kind: <kind>, ...}``.
 
+    Args:
+        group: one of :data:`KINDS`, or :data:`PARTS`.
+        kind: a new one of the group.
+
     Raises:
         InputError: there is no such group, or the kind is taken.
     """
@@ -157,8 +173,12 @@ def register(group: str, kind: str) -> Callable[[_C], _C]:
 
 
 def register_verb(name: str) -> Callable[[_C], _C]:
-    """Class decorator that registers a :class:`ghgs_lit.cli.verb.Verb` as ``ghgs <name>``; without a file
-    ``<name>.yaml`` in ``--config-dir`` it has its own keys alone.
+    """Class decorator that registers a :class:`ghgs_lit.cli.verb.Verb` as ``ghgs <name>``.
+
+    Without a file ``<name>.yaml`` in ``--config-dir`` the verb has its own keys alone.
+
+    Args:
+        name: a new one.
 
     Raises:
         InputError: the name is taken.
@@ -167,18 +187,28 @@ def register_verb(name: str) -> Callable[[_C], _C]:
 
 
 def offer(group: str, **paths: str) -> None:
-    """Register options by import path, such as ``offer("data", scans="my_package.scans.Scans")``: they are
-    imported when they are chosen.
+    """Register options by import path: they are imported when they are chosen.
+
+    Args:
+        group: one of :data:`KINDS`, or :data:`PARTS`.
+        **paths: import path by kind, such as ``scans="my_package.scans.Scans"``.
 
     Raises:
-        InputError: as :func:`register`.
+        InputError: as for :func:`register`.
     """
     for kind, path in paths.items():
         _keep(group, kind, path)
 
 
 def offer_verbs(**paths: str) -> None:
-    """Register verbs by import path, as :func:`offer` does options."""
+    """Register verbs by import path, as :func:`offer` does options.
+
+    Args:
+        **paths: import path by name of the verb.
+
+    Raises:
+        InputError: a name is taken.
+    """
     offer(_VERBS, **paths)
 
 
@@ -211,7 +241,11 @@ def verbs() -> list[str]:
 
 
 def verb_class(name: str) -> type[Options]:
-    """The class of a verb, one of :func:`verbs`."""
+    """The class of a verb.
+
+    Args:
+        name: one of :func:`verbs`.
+    """
     if name not in VERBS:
         load_plugins()
     return _imported(VERBS.get(name) or _REGISTERED[_VERBS, name])
@@ -238,8 +272,16 @@ def kinds_of(group: str) -> list[str | None]:
 
 
 def class_of(group: str, kind: Any, key: str) -> type[Options]:
-    """The options class of a kind (None: the group has no kinds); ``key``: that of the node, for messages.
-    InputError: there is no such kind; names the known ones."""
+    """The options class of a kind.
+
+    Args:
+        group: name of a group, such as ``bounds``.
+        kind: what the node says, of any type; None: the group has no kinds.
+        key: dotted key of the node, for messages.
+
+    Raises:
+        InputError: there is no such kind; names the known ones.
+    """
     known = KINDS.get(group, {})
     if isinstance(kind, str) and kind not in known:
         _load(group)
@@ -260,9 +302,15 @@ _READ: dict[tuple[type[Options], str, str], Options] = {}
 
 
 def read_node(node: Any, key: str) -> Options:
-    """The checked options of a node: a mapping of plain data, with ``kind`` where its group has kinds.
-    ``key``: its dotted key, such as ``bounds`` or ``callbacks.best``. InputError: names the first wrong key,
-    what was expected and what was found."""
+    """The checked options of a node.
+
+    Args:
+        node: a mapping of plain data, with ``kind`` where its group has kinds.
+        key: its dotted key, such as ``bounds`` or ``callbacks.best``.
+
+    Raises:
+        InputError: names the first wrong key, what was expected and what was found.
+    """
     group = key.split(".")[0]
     if not isinstance(node, Mapping):
         raise InputError(f"{key}: expected a mapping of its keys; found {shown(node)}")
@@ -277,12 +325,28 @@ def read_node(node: Any, key: str) -> Options:
 
 
 def build(node: Any, key: str, **extra: Any) -> Any:
-    """The object that a node (:func:`read_node`) describes; ``extra``: further arguments of its ``build``."""
+    """The object that a node describes.
+
+    Args:
+        node: as for :func:`read_node`.
+        key: its dotted key.
+        **extra: further arguments of the ``build`` of its options.
+
+    Raises:
+        InputError: as for :func:`read_node`.
+    """
     return read_node(node, key).build(**extra)
 
 
 def check(config: Mapping[str, Any]) -> None:
-    """Check the nodes of all groups, as :func:`read_node`; those without a kind are checked when built."""
+    """Check the nodes of all groups; those without a kind are checked when they are built.
+
+    Args:
+        config: the whole configuration as plain data.
+
+    Raises:
+        InputError: as for :func:`read_node`.
+    """
     for group, node in config.items():
         # A verb that takes its data from a checkpoint may have neither data nor targets.
         if group not in KINDS or (node is None and group in ("data", "targets")):
