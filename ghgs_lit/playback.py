@@ -15,13 +15,14 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from ghgs_lit.extents import Extent
 from ghgs_lit.plan import Plan
 from ghgs_lit.plan.patches import KeptPatches
 from ghgs_lit.rendering.capacity import Rooms, deferred, settled
 from ghgs_lit.rounds import CoarseDepths
 from ghgs_lit.runtime.recording import Recorder
 from ghgs_lit.runtime.watching import is_watched
-from ghgs_lit.types import Batch, DecodedPixels, DepthBounds, Extent, Prediction, Tokens
+from ghgs_lit.types import Batch, DecodedPixels, DepthBounds, Prediction, Tokens
 
 
 class Pieces(Protocol):

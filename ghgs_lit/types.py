@@ -16,11 +16,13 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, NamedTuple, TypeVar
+from typing import Literal, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+from ghgs_lit.extents import Extent, extents, true_places
 
 _T = TypeVar("_T")
 
@@ -169,12 +171,12 @@ class Batch(_TensorStruct):
             known[function] = function(self)
         return known[function]
 
-    def note(self, extents: Sequence["Extent"], pixels: Int[Tensor, " n"]) -> None:
+    def note(self, extents: Sequence[Extent], pixels: Int[Tensor, " n"]) -> None:
         """Keep what a plan read of the masks as :attr:`extents` and :attr:`pixels`."""
         self.__dict__.update(extents=list(extents), pixels=pixels)
 
     @cached_property
-    def extents(self) -> list["Extent"]:
+    def extents(self) -> list[Extent]:
         """Extent of the subject in each image ``b * V + v``; the host waits for a GPU at the first use, if no
         plan read it."""
         return extents(self.masks.flatten(0, 1))
@@ -183,51 +185,6 @@ class Batch(_TensorStruct):
     def pixels(self) -> Int[Tensor, " n"]:
         """Indices of the subject's pixels among those of all images."""
         return true_places(self.masks, sum(extent.count for extent in self.extents))
-
-
-class Extent(NamedTuple):
-    """Number of pixels of a mask, and its bounding box (ends excluded; no meaning for an empty mask)."""
-
-    count: int
-    top: int
-    bottom: int
-    left: int
-    right: int
-
-    def coarser(self, stride: int, count: int) -> "Extent":
-        """The extent in cells of ``stride`` x ``stride`` pixels, of which ``count`` are touched."""
-        bottom, right = ((end - 1) // stride + 1 for end in (self.bottom, self.right))
-        return Extent(count, self.top // stride, bottom, self.left // stride, right)
-
-    def cells(self, stride: int) -> int:
-        """Number of cells of ``stride`` x ``stride`` pixels that the bounding box touches."""
-        _, top, bottom, left, right = self.coarser(stride, 0)
-        return (bottom - top) * (right - left) if self.count else 0
-
-
-def extents(masks: Bool[Tensor, "n H W"]) -> list[Extent]:
-    """Extent of each mask; the host waits for a GPU once."""
-    return [Extent(*numbers) for numbers in extent_numbers(masks).tolist()]
-
-
-def extent_numbers(masks: Bool[Tensor, "n H W"]) -> Int[Tensor, "n 5"]:
-    """The numbers of each mask's :class:`Extent`."""
-    found = [masks.sum((1, 2))]
-    for lines in (masks.any(2).to(torch.uint8), masks.any(1).to(torch.uint8)):
-        found += [lines.argmax(1), lines.shape[1] - lines.flip(1).argmax(1)]
-    return torch.stack(found, dim=1)
-
-
-def true_places(mask: Bool[Tensor, "..."], count: int, repeats: bool = False) -> Int[Tensor, " n"]:
-    """Flat indices of the ``count`` True values, as ``nonzero`` but without waiting for a GPU. ``repeats``:
-    there may be fewer; the first is repeated there."""
-    flat = mask.flatten()
-    if flat.device.type == "cpu":
-        return flat.nonzero()[:, 0]
-    index = torch.arange(len(flat), device=flat.device)
-    target = torch.where(flat, flat.cumsum(0) - 1, count)  # all others go to the last place
-    found = flat.to(torch.uint8).argmax().repeat(count + 1) if repeats else index.new_empty(count + 1)
-    return found.scatter_(0, target, index)[:count]
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ _THREADS = max(1, (os.cpu_count() or 2) // int(os.environ.get("PYTEST_XDIST_WORK
 os.environ |= {"OMP_NUM_THREADS": str(_THREADS), "OMP_WAIT_POLICY": "PASSIVE"}
 
 _PACKAGE = Path(__file__).parents[1] / "ghgs_lit"
-_CHECKED = ["types", "losses", "metrics"]
+_CHECKED = ["extents", "types", "losses", "metrics"]
 # Without their folders of kernels: a wrapped function cannot be compiled.
 for name in ("bounds", "encoder", "geometry", "heads", "pretext", "recalibration"):
     _CHECKED += [f"{name}.{path.stem}" for path in (_PACKAGE / name).glob("*.py")]

@@ -17,11 +17,12 @@ from ghgs_lit.bounds.rays import (
     ray_directions,
     votes_outside,
 )
+from ghgs_lit.extents import true_places
 from ghgs_lit.geometry.constants import constant, middles, other_images
 from ghgs_lit.kernels import gpu
 from ghgs_lit.kernels.pool import at_once, even_parts
 from ghgs_lit.plan.rows import size_class
-from ghgs_lit.types import Batch, Cameras, DepthBounds, true_places
+from ghgs_lit.types import Batch, Cameras, DepthBounds
 
 #: Depths in memory at once, on a CPU and elsewhere.
 _DEPTHS = 1 << 18, 1 << 23

@@ -13,10 +13,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.errors import require
+from ghgs_lit.extents import extents
 from ghgs_lit.geometry.masks import signed_distance, unmultiplied
 from ghgs_lit.geometry.projection import look_at_point, project, unproject
 from ghgs_lit.geometry.rotations import after_motions, motions_between, quaternion_to_matrix, without_common
-from ghgs_lit.types import Batch, Cameras, extents
+from ghgs_lit.types import Batch, Cameras
 
 # Stored colours are light to the power 1/2.2.
 _GAMMA = 2.2

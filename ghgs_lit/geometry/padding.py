@@ -9,7 +9,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Extent, Gaussians, Prediction, map_tensors
+from ghgs_lit.extents import Extent
+from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Prediction, map_tensors
 
 
 @dataclass(frozen=True)

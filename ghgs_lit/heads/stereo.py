@@ -14,6 +14,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from ghgs_lit.config.options import Options
+from ghgs_lit.extents import true_places
 from ghgs_lit.geometry.masks import coverage, surface_colors
 from ghgs_lit.geometry.projection import at_least_float32, pixel_centers, project, sample, unproject
 from ghgs_lit.heads.activations import bounded_sigmoid
@@ -21,7 +22,7 @@ from ghgs_lit.heads.depth import BOUNDED, finite_maps
 from ghgs_lit.heads.dpt import ResidualUnit
 from ghgs_lit.plan import Plan
 from ghgs_lit.runtime.precision import exact, without_float16
-from ghgs_lit.types import Batch, Cameras, DepthBounds, DepthMaps, Tokens, true_places
+from ghgs_lit.types import Batch, Cameras, DepthBounds, DepthMaps, Tokens
 
 #: Side of a cell in pixels, and channels of its features and of the GRU's memory.
 CELL = 4

@@ -8,12 +8,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ghgs_lit.errors import InputError
+from ghgs_lit.extents import extents
 from ghgs_lit.geometry.chamfer import chamfer as chamfer_distance
 from ghgs_lit.geometry.masks import coverage
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.kernels.pool import have_values
 from ghgs_lit.metrics.functional import SSIM_WINDOW, ssim_map
-from ghgs_lit.types import Batch, Prediction, Rendering, extents
+from ghgs_lit.types import Batch, Prediction, Rendering
 
 Scalar = Float[Tensor, ""]
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghgs_lit.types import Extent, extents, true_places
+from ghgs_lit.extents import Extent, extents, true_places
 
 
 class KeptPatches:

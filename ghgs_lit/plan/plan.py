@@ -11,11 +11,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ghgs_lit.extents import Extent, extent_numbers, true_places
 from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.plan.patches import KeptPatches
 from ghgs_lit.plan.rows import Rows, rounds_up
 from ghgs_lit.plan.window import Span, Window, subject_windows
-from ghgs_lit.types import Decision, DecodedPixels, Extent, Prediction, extent_numbers, true_places
+from ghgs_lit.types import Decision, DecodedPixels, Prediction
 
 #: From the numbers of patches [B, V] that each of several presets keeps: each element's decision, and the
 #: number of its preset.

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from ghgs_lit.types import true_places
+from ghgs_lit.extents import true_places
 
 #: Size classes of an octave.
 _STEPS = 8

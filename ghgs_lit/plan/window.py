@@ -9,9 +9,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from ghgs_lit.extents import Extent
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.plan.rows import size_class
-from ghgs_lit.types import Extent
 
 
 class Span(NamedTuple):

@@ -4,10 +4,10 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from ghgs_lit.extents import extents
 from ghgs_lit.heads import dense, dpt
 from ghgs_lit.heads.dense import decode
 from ghgs_lit.plan.window import Span, Window, subject_windows
-from ghgs_lit.types import extents
 from tests.heads.test_dpt import _head, _tokens
 
 

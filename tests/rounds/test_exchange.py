@@ -7,8 +7,8 @@ import pytest
 import torch
 from scipy.signal import correlate
 
+from ghgs_lit.extents import extents
 from ghgs_lit.rounds.rounds import SIDE, Exchange, Windows
-from ghgs_lit.types import extents
 
 HEIGHT, WIDTH, KNOWN, CHANNELS = 13, 17, 6, 3
 

@@ -1,0 +1,52 @@
+"""Extents of masks, and places of their pixels."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+
+class Extent(NamedTuple):
+    """Number of pixels of a mask, and its bounding box (ends excluded; no meaning for an empty mask)."""
+
+    count: int
+    top: int
+    bottom: int
+    left: int
+    right: int
+
+    def coarser(self, stride: int, count: int) -> "Extent":
+        """The extent in cells of ``stride`` x ``stride`` pixels, of which ``count`` are touched."""
+        bottom, right = ((end - 1) // stride + 1 for end in (self.bottom, self.right))
+        return Extent(count, self.top // stride, bottom, self.left // stride, right)
+
+    def cells(self, stride: int) -> int:
+        """Number of cells of ``stride`` x ``stride`` pixels that the bounding box touches."""
+        _, top, bottom, left, right = self.coarser(stride, 0)
+        return (bottom - top) * (right - left) if self.count else 0
+
+
+def extents(masks: Bool[Tensor, "n H W"]) -> list[Extent]:
+    """Extent of each mask; the host waits for a GPU once."""
+    return [Extent(*numbers) for numbers in extent_numbers(masks).tolist()]
+
+
+def extent_numbers(masks: Bool[Tensor, "n H W"]) -> Int[Tensor, "n 5"]:
+    """The numbers of each mask's :class:`Extent`."""
+    found = [masks.sum((1, 2))]
+    for lines in (masks.any(2).to(torch.uint8), masks.any(1).to(torch.uint8)):
+        found += [lines.argmax(1), lines.shape[1] - lines.flip(1).argmax(1)]
+    return torch.stack(found, dim=1)
+
+
+def true_places(mask: Bool[Tensor, "..."], count: int, repeats: bool = False) -> Int[Tensor, " n"]:
+    """Flat indices of the ``count`` True values, as ``nonzero`` but without waiting for a GPU. ``repeats``:
+    there may be fewer; the first is repeated there."""
+    flat = mask.flatten()
+    if flat.device.type == "cpu":
+        return flat.nonzero()[:, 0]
+    index = torch.arange(len(flat), device=flat.device)
+    target = torch.where(flat, flat.cumsum(0) - 1, count)  # all others go to the last place
+    found = flat.to(torch.uint8).argmax().repeat(count + 1) if repeats else index.new_empty(count + 1)
+    return found.scatter_(0, target, index)[:count]
