@@ -52,8 +52,8 @@ class _Background:
         count = max(3, len(images) // 4)
         reach = _reach(images.shape[1:3])
         light = images.sum(-1)
-        for found, photograph in zip(light, photographs, strict=True):
-            found[ndimage.binary_dilation(photograph.mask, iterations=reach)] = np.inf
+        for brightness, photograph in zip(light, photographs, strict=True):
+            brightness[ndimage.binary_dilation(photograph.mask, iterations=reach)] = np.inf
         order = light.argsort(0)
         light = np.take_along_axis(light, order, 0)
         with np.errstate(invalid="ignore"):
@@ -77,11 +77,11 @@ class _Background:
         reach = _reach(self.known.shape)
         box = tuple(slice(max(a - 24 * reach, 0), b + 24 * reach) for a, b in photograph.extents)
         seen = (photograph.image, photograph.matte, self.image, self.known)
-        found = _mended(*(pixels[box] for pixels in seen), reach)
-        if found is None:
+        mended_part = _mended(*(pixels[box] for pixels in seen), reach)
+        if mended_part is None:
             return photograph
         matte = photograph.matte.copy()
-        matte[box] = found
+        matte[box] = mended_part
         return replace(photograph, matte=matte)
 
 
@@ -102,8 +102,8 @@ def _mended(
     """
     mask = matte > 127
     off = ndimage.uniform_filter(np.abs(image - behind).max(-1) * known, 3)
-    beside = off[known & ~mask]
-    least = max(_DEVIATIONS * 1.4826 * float(np.median(beside)), _DIFFERENT) if len(beside) else np.inf
+    outside = off[known & ~mask]
+    least = max(_DEVIATIONS * 1.4826 * float(np.median(outside)), _DIFFERENT) if len(outside) else np.inf
     same = known & (ndimage.uniform_filter(off, 7) < 0.7 * least)
     gone = _parts(_large(mask & same, mask, reach), lambda part: _is_alike(image[part], behind[part]))
     gone = ndimage.binary_dilation(gone, iterations=reach, mask=mask & (off < 2 * least))
@@ -173,9 +173,10 @@ class Backgrounds:
         for photograph in (photograph for capture in captures for photograph in capture.photographs):
             photographs.setdefault(photograph.name, []).append(photograph)
         cameras = {}
-        for name, found in photographs.items():
-            if len(found) >= _MIN_BACKGROUND and len({photograph.mask.shape for photograph in found}) == 1:
-                cameras[name] = _Background.of(found)
+        for name, of_camera in photographs.items():
+            shapes = {photograph.mask.shape for photograph in of_camera}
+            if len(of_camera) >= _MIN_BACKGROUND and len(shapes) == 1:
+                cameras[name] = _Background.of(of_camera)
         return cls(cameras)
 
     def applied(self, capture: Capture) -> Capture:

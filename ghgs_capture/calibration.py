@@ -57,7 +57,7 @@ class Convention:
             expected = "a number above 0, from 1e-9 to 1e9"
             require(1e-9 <= value <= 1e9, f"calibration.{name}", expected, value)
 
-    def told(self, said: Mapping[str, Any]) -> "Convention":
+    def with_options(self, options: Mapping[str, Any]) -> "Convention":
         """Replace what the user says of the convention.
 
         Args:
@@ -69,7 +69,7 @@ class Convention:
         Raises:
             InputError: ``resized`` or ``unit`` is out of range.
         """
-        named = {f.name: said.get(f.name) for f in fields(self)}
+        named = {f.name: options.get(f.name) for f in fields(self)}
         return replace(self, **{name: value for name, value in named.items() if value is not None})
 
 

@@ -168,8 +168,8 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
         size = given.size(folder)
         agree = f"{given.score:.0%} of each mask or more lies in the hull of the others"
         lines = [f"cameras and masks agree ({agree})", _size_line(size)]
-        suspects, *said = _suspected(given, folder) if given.score < _SOUND else ((),)
-        lines += [*said, *placement_lines(photographs, [view.camera.pose for view in views])]
+        suspects, *suspicion = _suspected(given, folder) if given.score < _SOUND else ((),)
+        lines += [*suspicion, *placement_lines(photographs, [view.camera.pose for view in views])]
         return Diagnosis(True, tuple(lines), "", (given,), size, suspects)
     tried = [given, *(hypothesis.ranked(folder) for hypothesis in _for_all(views))]
     best = max(tried, key=lambda hypothesis: hypothesis.score)
@@ -224,13 +224,13 @@ def in_parts(views: Sequence[StoredView]) -> list[str]:
     """
     from scipy import ndimage  # here: it takes time to import
 
-    found = []
+    names = []
     for view in views:
         regions, _ = ndimage.label(view.mask)
         areas = np.sort(np.bincount(regions.ravel())[1:])
         if len(areas) > 1 and areas[-2] >= _PART * areas[-1]:
-            found.append(view.name)
-    return found
+            names.append(view.name)
+    return names
 
 
 def _for_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
@@ -354,19 +354,19 @@ def _unexplained(folder: CaptureFolder, given: Hypothesis, tried: list[Hypothesi
     return Diagnosis(False, tuple(lines), "", tuple(tried), base.size(folder), suspects)
 
 
-def _suspected(found: Hypothesis, folder: CaptureFolder) -> tuple[Any, ...]:
+def _suspected(hypothesis: Hypothesis, folder: CaptureFolder) -> tuple[Any, ...]:
     """The views that explain by themselves most of the disagreement, and a line about them; () if none does.
 
     A mask that lacks a part lies in the hull of the others, and theirs do not lie in that with it: what is
     compared are the others with and without it."""
-    least = max(AGREES, 1 - (1 - found.score) * _REST)
-    without = {
-        left_out.name: replace(found, views=tuple(v for v in found.views if v is not left_out)).ranked(folder)
-        for left_out in (found.views if len(found.views) > 2 else ())
-    }
+    least = max(AGREES, 1 - (1 - hypothesis.score) * _REST)
+    without = {}
+    for left_out in hypothesis.views if len(hypothesis.views) > 2 else ():
+        rest = tuple(view for view in hypothesis.views if view is not left_out)
+        without[left_out.name] = replace(hypothesis, views=rest).ranked(folder)
     fitting = {name: others.score for name, others in without.items() if others.score >= least}
-    readings = {name: _reading(found, name) for name in fitting}
-    if len(found.views) == 3 and any(readings.values()):  # two views alone agree nearly always
+    readings = {name: _reading(hypothesis, name) for name in fitting}
+    if len(hypothesis.views) == 3 and any(readings.values()):  # two views alone agree nearly always
         fitting = {name: share for name, share in fitting.items() if readings[name]}
     if not fitting:
         return ((),)
@@ -374,24 +374,24 @@ def _suspected(found: Hypothesis, folder: CaptureFolder) -> tuple[Any, ...]:
     names = tuple(name for name, share in fitting.items() if share >= best - _SAME)
     line = f"{' or '.join(names)} disagrees with the others, which agree by {best:.0%} without it"
     if len(names) == 1:
-        return names, f"{line} and by {found.score:.0%} with it{readings[names[0]]}"
-    if len(names) == 2 and len(found.views) > 3:
-        names = tuple(sorted(names, key=_edges(found, names, folder).__getitem__))
+        return names, f"{line} and by {hypothesis.score:.0%} with it{readings[names[0]]}"
+    if len(names) == 2 and len(hypothesis.views) > 3:
+        names = tuple(sorted(names, key=_edges(hypothesis, names, folder).__getitem__))
         return names, f"{line}: rather {names[0]}, by the edges of the photographs (silhouettes cannot tell)"
     return names, f"{line} (silhouettes cannot tell for sure)"
 
 
-def _edges(found: Hypothesis, names: tuple[str, str], folder: CaptureFolder) -> dict[str, float]:
+def _edges(hypothesis: Hypothesis, names: tuple[str, str], folder: CaptureFolder) -> dict[str, float]:
     """Contrast of two photographs, of which one's mask has a part that the other's lacks, at that part of the
     mask's outline, compared with the rest of it: the wrong mask's outline follows no edge there."""
     from scipy import ndimage  # here: it takes time to import
 
-    photographs = found.photographs(folder)
+    photographs = hypothesis.photographs(folder)
     silhouettes = [Silhouette(p.mask, p.intrinsics, p.extrinsics) for p in photographs]
-    more = min(names, key=found.shares.__getitem__)
+    more = min(names, key=hypothesis.shares.__getitem__)
     sphere = subject_sphere(silhouettes)
     edges = {}
-    for place, view in enumerate(found.views):
+    for place, view in enumerate(hypothesis.views):
         if view.name not in names:
             continue
         one = silhouettes[place]
@@ -411,10 +411,10 @@ def _edges(found: Hypothesis, names: tuple[str, str], folder: CaptureFolder) -> 
     return edges
 
 
-def _reading(found: Hypothesis, name: str) -> str:
+def _reading(hypothesis: Hypothesis, name: str) -> str:
     """What may be wrong with a view, by whether its own mask or those of the others lie outside a hull."""
-    own = 1 - found.shares[name]
-    others = 1 - min(share for other, share in found.shares.items() if other != name)
+    own = 1 - hypothesis.shares[name]
+    others = 1 - min(share for other, share in hypothesis.shares.items() if other != name)
     if own <= _REST * others:
         return ": its mask lacks a part that theirs have, or its focal length is too long"
     if others <= _REST * own:

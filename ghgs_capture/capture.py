@@ -57,15 +57,14 @@ class Capture:
             A batch of one element; images from 0 to 1.
         """
         crops = [crop_to_subject(photograph, size, refine_masks) for photograph in self.photographs]
-        images, mattes, intrinsics, extrinsics = (
-            torch.from_numpy(np.stack([getattr(crop, name) for crop in crops]))[None]
-            for name in ("image", "matte", "intrinsics", "extrinsics")
-        )
+        stacked = {}
+        for name in ("image", "matte", "intrinsics", "extrinsics"):
+            stacked[name] = torch.from_numpy(np.stack([getattr(crop, name) for crop in crops]))[None]
         batch = Batch(
-            images=images.movedim(-1, 2).float() / 255,
-            masks=mattes > 127,
-            cameras=Cameras(intrinsics, extrinsics, *size),
-            alpha=mattes.float() / 255,
+            images=stacked["image"].movedim(-1, 2).float() / 255,
+            masks=stacked["matte"] > 127,
+            cameras=Cameras(stacked["intrinsics"], stacked["extrinsics"], *size),
+            alpha=stacked["matte"].float() / 255,
             subjects=(self.name,),
             views=(tuple(crop.name for crop in crops),),
         )

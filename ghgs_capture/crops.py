@@ -32,7 +32,7 @@ class Photograph:
     def extents(self) -> list[tuple[int, int]]:
         """The first row and the one after the last of the subject, then its columns."""
         lines = (np.nonzero(self.mask.any(axis))[0] for axis in (1, 0))
-        return [(int(found[0]), int(found[-1]) + 1) for found in lines]
+        return [(int(occupied[0]), int(occupied[-1]) + 1) for occupied in lines]
 
 
 def crop_to_subject(photograph: Photograph, size: tuple[int, int], refine_masks: int = 0) -> Photograph:

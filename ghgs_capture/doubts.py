@@ -53,14 +53,15 @@ def doubt_of_cameras(capture: Capture, batch: Batch) -> str:
     focal = [photograph.intrinsics[0, 0] for photograph in capture.photographs]
     # An enlarged photograph has larger pixels, and larger steps of outlines.
     larger = max(1.0, *(batch.cameras.intrinsics[0, :, 0, 0].numpy() / focal))
-    rest = {
-        name: share for name, share in zip(batch.views[0], without, strict=True) if share < _REST * missed
-    }
+    rest = {}
+    for name, distance in zip(batch.views[0], without, strict=True):
+        if distance < _REST * missed:
+            rest[name] = distance
     is_of_few = 0 < 2 * len(rest) <= len(without)
     if missed <= larger**2 * (_MISSED_BY_FEW if is_of_few else _MISSED):
         return ""
-    beside = f", without {' or '.join(rest)} by {max(rest.values()):.4f}" if is_of_few else ""
-    return f"silhouettes miss one another by {missed:.4f} pixels{beside}"
+    without_few = f", without {' or '.join(rest)} by {max(rest.values()):.4f}" if is_of_few else ""
+    return f"silhouettes miss one another by {missed:.4f} pixels{without_few}"
 
 
 def _outline(photograph: Photograph, size: tuple[int, int]) -> float:

@@ -74,32 +74,32 @@ class CaptureFolder:
         _ = self.paths  # reads the calibration and lists the photographs: missing files are refused here
 
     @functools.cached_property
-    def _said(self) -> nodes.Calibration:
+    def _calibration(self) -> nodes.Calibration:
         return nodes.Calibration.read(self.calibration, "calibration")
 
     @functools.cached_property
-    def _part(self) -> nodes.SequenceOptions:
+    def _sequence(self) -> nodes.SequenceOptions:
         return nodes.SequenceOptions.read(self.sequence, "sequence")
 
     @functools.cached_property
     def file(self) -> CameraFile:
         """The cameras as stored."""
         given = self.cameras
-        return given if isinstance(given, CameraFile) else read_cameras(given, self._said.format)
+        return given if isinstance(given, CameraFile) else read_cameras(given, self._calibration.format)
 
     @functools.cached_property
     def convention(self) -> Convention:
         """Meaning of the stored numbers: the format's, unless the user says otherwise."""
-        return self.file.convention.told(vars(self._said))
+        return self.file.convention.with_options(vars(self._calibration))
 
     @functools.cached_property
-    def _found(self) -> tuple[dict[str, dict[str, Source]], str]:
+    def _listing(self) -> tuple[dict[str, dict[str, Source]], str]:
         folder = self.images
         cameras = self.file.cameras
-        part = self._part
+        part = self._sequence
         if isinstance(folder, Mapping):
             return {"": dict(folder)}, ""
-        names = composed_names(self._said.names)
+        names = composed_names(self._calibration.names)
         if has_videos(folder, cameras, names):
             return find_frames(folder, self.masks, cameras, names, self.convention, part.sync, part.step)
         require(part.sync is None, "sequence.sync", "null for photographs", part.sync)
@@ -108,26 +108,26 @@ class CaptureFolder:
     @property
     def note(self) -> str:
         """A line about frames that are left over; empty where there are none."""
-        return self._found[1]
+        return self._listing[1]
 
     @functools.cached_property
     def paths(self) -> dict[str, dict[str, Source]]:
         """``{instant: {camera: path or frame}}`` of the instants that ``sequence`` selects."""
-        found = self._found[0]
-        part = self._part
-        names = list(found)[part.start : part.stop : part.step]
-        expected = f"a part of {len(found)} instants"
+        all_instants = self._listing[0]
+        part = self._sequence
+        names = list(all_instants)[part.start : part.stop : part.step]
+        expected = f"a part of {len(all_instants)} instants"
         require(bool(names), "sequence.start", expected, f"none from {part.start} to {part.stop}")
-        return {name: found[name] for name in names}
+        return {name: all_instants[name] for name in names}
 
     @functools.cached_property
     def missing(self) -> dict[str, dict[str, str]]:
         """``{instant: {camera: why}}`` of photographs that are missing, or could not be read so far."""
-        cameras = dict.fromkeys(name for paths in self._found[0].values() for name in paths)
-        return {
-            instant: {name: "there is no photograph" for name in cameras if name not in paths}
-            for instant, paths in self.paths.items()
-        }
+        cameras = dict.fromkeys(name for paths in self._listing[0].values() for name in paths)
+        missing = {}
+        for instant, paths in self.paths.items():
+            missing[instant] = {name: "there is no photograph" for name in cameras if name not in paths}
+        return missing
 
     @property
     def instants(self) -> list[str]:
@@ -141,7 +141,9 @@ class CaptureFolder:
         folders = {path.parent if isinstance(path, Path) else self.images for path in sources}
         given = [path for path in (self.cameras, self.masks, self.backgrounds) if isinstance(path, Path)]
         files = [path for folder in folders for path in folder.iterdir()]
-        return files + [file for path in given for file in (path.rglob("*") if path.is_dir() else [path])]
+        for path in given:
+            files += path.rglob("*") if path.is_dir() else [path]
+        return files
 
     def photographs(self, instant: str) -> tuple[Photograph, ...]:
         """Decode one instant, and apply the calibration.
@@ -181,19 +183,19 @@ class CaptureFolder:
 
     def _complete(self, instant: str, views: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
         """The values of all views; in a sequence, without those that fail where the others are enough."""
-        found = {}
+        values = {}
         for name, view in views.items():
             try:
-                found[name] = view()
+                values[name] = view()
             except InputError as error:
                 if len(self.instants) == 1:
                     raise
                 self.missing[instant][name] = str(error)
         missing = self.missing[instant] if len(self.instants) > 1 else {}
         why = "; ".join(f"{name}: {text}" for name, text in missing.items())
-        least, why = (MIN_PHOTOGRAPHS, f"{len(found)} ({why})") if missing else (2, len(found))
-        require(len(found) >= least, f"{self.images}: {instant}", f"{least} photographs or more", why)
-        return found
+        least, why = (MIN_PHOTOGRAPHS, f"{len(values)} ({why})") if missing else (2, len(values))
+        require(len(values) >= least, f"{self.images}: {instant}", f"{least} photographs or more", why)
+        return values
 
     def begin(self, instant: str) -> None:
         """Decode the views of an instant in threads; :meth:`decode` waits for them.
@@ -227,7 +229,7 @@ class CaptureFolder:
             camera: of the photograph, as its file stores it.
             pixels: the decoded photograph.
         """
-        return fits_stored(pixels, camera, self._said.exif)
+        return fits_stored(pixels, camera, self._calibration.exif)
 
     def photograph(
         self, name: str, camera: StoredCamera, pixels: Pixels, matte: np.ndarray, convention: Convention
@@ -265,10 +267,10 @@ class CaptureFolder:
             expected = "a lens distortion that leaves some of the subject"
             lens = calibration.distortion
             require(bool((matte > 127).any()), camera.origin, expected, lens.tolist())
-        found = quarter_turned(calibration, turns, size)
+        upright = quarter_turned(calibration, turns, size)
         image = np.rot90(image, turns)
         matte = np.rot90(matte, turns)
-        return Photograph(name, image, matte, found.intrinsics, found.extrinsics, found.gains)
+        return Photograph(name, image, matte, upright.intrinsics, upright.extrinsics, upright.gains)
 
     def _matte(self, name: str, camera: StoredCamera, path: Source, pixels: Pixels) -> np.ndarray:
         """The matte of a photograph, from the first source that there is.

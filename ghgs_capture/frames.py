@@ -126,9 +126,9 @@ def find_frames(
     Raises:
         InputError: videos do not fit the cameras or one another.
     """
-    found = images_in(folder, SUFFIXES)
-    require_all_read(folder, found, {*cameras, *names}, SUFFIXES)
-    paths = by_camera(folder, found, cameras, names)
+    paths_by_name = images_in(folder, SUFFIXES)
+    require_all_read(folder, paths_by_name, {*cameras, *names}, SUFFIXES)
+    paths = by_camera(folder, paths_by_name, cameras, names)
     with ThreadPoolExecutor(allowed_cores()) as pool:
         videos = dict(zip(paths, pool.map(read_video, paths.values()), strict=True))
     for name, video in videos.items():
@@ -144,10 +144,10 @@ def find_frames(
         reader = Reader(video, "rgb24", step)
         drawn = _masks_of(video, folder, masks, step)
         frames[name] = {n: VideoFrame(reader, n, drawn.get(n)) for n in video.numbers.tolist()}
-    instants = {
-        f"{instant:0{_DIGITS}d}": {name: frames[name][n] for name, n in shown.items() if n in frames[name]}
-        for instant, shown in numbers.items()
-    }
+    instants = {}
+    for instant, shown in numbers.items():
+        decodable = {name: frames[name][n] for name, n in shown.items() if n in frames[name]}
+        instants[f"{instant:0{_DIGITS}d}"] = decodable
     counts = ", ".join(f"{name} {video.count}" for name, video in videos.items())
     note = f"videos differ in length ({counts} frames): the {len(numbers)} instants that all show are used"
     return instants, note if len({video.count for video in videos.values()}) > 1 else ""
@@ -169,7 +169,10 @@ def _by_number(videos: Mapping[str, Video], offsets: Mapping[str, Any]) -> dict[
     begin = max(-n for n in shift.values())
     end = min(video.count - shift[name] for name, video in videos.items())
     require(begin < end, "sequence.sync", "frames that all videos show", dict(offsets))
-    return {number: {name: number + n for name, n in shift.items()} for number in range(begin, end)}
+    numbers = {}
+    for number in range(begin, end):
+        numbers[number] = {name: number + n for name, n in shift.items()}
+    return numbers
 
 
 def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) -> dict[int, dict[str, int]]:
@@ -185,21 +188,24 @@ def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) 
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: expected camera,frame,seconds with numbers; found {error}") from None
     cameras = table.camera.map(lambda name: names.get(composed(name), composed(name)))
-    times = {name: found.sort_values("seconds") for name, found in table.groupby(cameras)}
+    times = {name: timed.sort_values("seconds") for name, timed in table.groupby(cameras)}
     require(times.keys() == videos.keys(), str(path), f"the times of {', '.join(videos)}", ", ".join(times))
     first, *others = videos
     steps = times[first].seconds.diff().dropna()
     half = float(steps.median()) / 2 if len(steps) else np.inf
-    begin = max(found.seconds.iloc[0] for found in times.values()) - half
-    end = min(found.seconds.iloc[-1] for found in times.values()) + half
+    begin = max(timed.seconds.iloc[0] for timed in times.values()) - half
+    end = min(timed.seconds.iloc[-1] for timed in times.values()) + half
     shared = times[first][times[first].seconds.between(begin, end)][["seconds", "frame"]]
     require(len(shared) > 0, str(path), "times that all cameras share", "none")
     shared = shared.rename(columns={"frame": first})
     for other in others:
-        found = times[other][["seconds", "frame"]].rename(columns={"frame": other})
-        shared = pd.merge_asof(shared, found, on="seconds", direction="nearest", tolerance=half)
-    entries = shared.drop(columns="seconds").to_dict("records")
-    return {entry[first]: {name: int(n) for name, n in entry.items() if n == n} for entry in entries}
+        timed = times[other][["seconds", "frame"]].rename(columns={"frame": other})
+        shared = pd.merge_asof(shared, timed, on="seconds", direction="nearest", tolerance=half)
+    numbers = {}
+    for entry in shared.drop(columns="seconds").to_dict("records"):
+        # A camera without a frame at this time has NaN.
+        numbers[entry[first]] = {name: int(n) for name, n in entry.items() if n == n}
+    return numbers
 
 
 def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict[int, VideoFrame | Path]:

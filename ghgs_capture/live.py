@@ -47,10 +47,10 @@ def opened(devices: Mapping[str, int | str]) -> dict[str, Any]:
     except ImportError:
         hint = "pip install opencv-python-headless"
         raise InputError(f"images: expected the package cv2 for cameras ({hint}); found none") from None
-    found = {name: cv2.VideoCapture(device) for name, device in devices.items()}
+    captures = {name: cv2.VideoCapture(device) for name, device in devices.items()}
     for name, device in devices.items():
-        require(found[name].isOpened(), f"images.{name}", "a camera or stream that OpenCV opens", device)
-    return found
+        require(captures[name].isOpened(), f"images.{name}", "a camera or stream that OpenCV opens", device)
+    return captures
 
 
 def newest_frames(
@@ -110,10 +110,10 @@ def newest_frames(
         while True:
             while ready.empty():
                 sleep(_FRAME_POLL)
-            found = ready.get()
-            if found is None:
+            newest = ready.get()
+            if newest is None:
                 return
-            yield found
+            yield newest
             wanted.set()
     finally:
         stopped.set()
@@ -157,7 +157,7 @@ def live_frames(
     Raises:
         InputError: the calibration, a video, a camera or the folder is missing or wrong.
     """
-    said = options.get("calibration", {})
+    calibration = options.get("calibration", {})
     part = options.get("sequence", {})
     if is_folder := not isinstance(images, Mapping):
         folder = Path(images).expanduser()
@@ -166,7 +166,7 @@ def live_frames(
             return _played(CaptureFolder(folder, cameras, masks, **options), clock, sleep)
     expected = f"all instants of {'a folder that is being written' if is_folder else 'cameras'}"
     require(SequenceOptions.read(part, "sequence") == SequenceOptions(), "sequence", expected, part)
-    stored = read_cameras(cameras, said.get("format") or "auto")
+    stored = read_cameras(cameras, calibration.get("format") or "auto")
     if not is_folder:
         devices = by_camera(
             Path("images"), {str(n): device for n, device in images.items()}, stored.cameras, {}
@@ -176,12 +176,12 @@ def live_frames(
         require(bool(is_told), "masks", expected, masks)
         least = min(MIN_PHOTOGRAPHS, len(devices))
         return _watched(newest_frames(opened(devices), least, clock, sleep), stored, options)
-    names = composed_names(said.get("names"))
+    names = composed_names(calibration.get("names"))
     places = [folder] if masks is None else [folder, Path(masks).expanduser()]
 
     def read(name: str) -> Capture:
-        found = CaptureFolder(folder / name, stored, None if masks is None else places[1] / name, **options)
-        return Capture(name, found.photographs(found.instants[0]))
+        one = CaptureFolder(folder / name, stored, None if masks is None else places[1] / name, **options)
+        return Capture(name, one.photographs(one.instants[0]))
 
     def is_whole(name: str) -> bool:
         photographs = images_in(folder / name)
@@ -196,7 +196,7 @@ def _watched(
     """Captures of cameras; a line says once why instants cannot be read."""
     number = -1
     dropped = 0
-    said = ""
+    last_error = ""
     for images, passed, taken in frames:
         number = number + passed + 1
         dropped += passed
@@ -204,9 +204,9 @@ def _watched(
             capture = Capture(f"{number:06d}", CaptureFolder(images, stored, **options).photographs(""))
         except InputError as error:
             dropped += 1
-            if str(error) != said:
-                said = str(error)
-                print(f"instant {number:06d} is left out: {said}", flush=True)
+            if str(error) != last_error:
+                last_error = str(error)
+                print(f"instant {number:06d} is left out: {last_error}", flush=True)
             continue
         yield Arrived(capture, dropped, taken)
         dropped = 0
@@ -264,8 +264,11 @@ def _arriving(
     last = clock()
     while idle is None or clock() - last < idle:
         folders = (path.name for path in places[0].iterdir() if path.is_dir() and path.name[0] != ".")
-        sizes = {name: [_sizes(place / name) for place in places] for name in folders if counted(name) > done}
-        still = [name for name, found in sizes.items() if before.get(name) == found != unread.get(name)]
+        sizes = {}
+        for name in folders:
+            if counted(name) > done:
+                sizes[name] = [_sizes(place / name) for place in places]
+        still = [name for name, size in sizes.items() if before.get(name) == size != unread.get(name)]
         newest = max(filter(is_whole, still), key=counted, default=None)
         before = sizes
         if newest is None:
@@ -285,10 +288,10 @@ def _arriving(
 
 def _sizes(folder: Path) -> dict[str, int]:
     """Bytes of each file; -1 for one that vanishes meanwhile."""
-    found = {}
+    sizes = {}
     for path in folder.iterdir() if folder.is_dir() else ():
         try:
-            found[path.name] = path.stat().st_size
+            sizes[path.name] = path.stat().st_size
         except FileNotFoundError:
-            found[path.name] = -1
-    return found
+            sizes[path.name] = -1
+    return sizes

@@ -128,6 +128,6 @@ def mask_path(photograph: Path, images: Path, masks: Path) -> Path | None:
     folder = masks / photograph.parent.relative_to(images)
     marked = f"{photograph.stem}{MASK_ENDING}"
     # Beside the photograph, the image of its name is the photograph itself.
-    beside = os.path.realpath(folder) == os.path.realpath(photograph.parent)
+    is_same_folder = os.path.realpath(folder) == os.path.realpath(photograph.parent)
     # COLMAP's masks keep the suffix of the photograph: front.jpg.png.
-    return image_named(folder, *([marked] if beside else [photograph.stem, photograph.name, marked]))
+    return image_named(folder, *([marked] if is_same_folder else [photograph.stem, photograph.name, marked]))

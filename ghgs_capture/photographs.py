@@ -55,8 +55,8 @@ def read_pixels(path: Path) -> Pixels:
     """
     image = read_image(path)
     orientation = orientation_of(image, path)
-    found = f"EXIF orientation {orientation}"
-    require(orientation in _TURNS, str(path), "a photograph that is not mirrored", found)
+    orientation_found = f"EXIF orientation {orientation}"
+    require(orientation in _TURNS, str(path), "a photograph that is not mirrored", orientation_found)
     turns = _TURNS[orientation]
     alpha = None
     colors = np.rot90(rgb_of(image, path), turns)
@@ -223,13 +223,14 @@ def _by_instant(folder: Path, by_camera: Mapping[str, dict[str, Path]]) -> dict[
     for other in others:
         shared = by_camera[first].keys() & by_camera[other].keys()
         expected = f"photographs named as those of {first}"
-        found = ", ".join(list(by_camera[other])[:3])
-        require(bool(shared), f"{folder}: {other}", expected, f"others: {found}")
+        examples = ", ".join(list(by_camera[other])[:3])
+        require(bool(shared), f"{folder}: {other}", expected, f"others: {examples}")
     instants = sorted({instant for paths in by_camera.values() for instant in paths}, key=counted)
-    return {
-        instant: {camera: paths[instant] for camera, paths in by_camera.items() if instant in paths}
-        for instant in instants
-    }
+    by_instant = {}
+    for instant in instants:
+        of_cameras = {camera: paths[instant] for camera, paths in by_camera.items() if instant in paths}
+        by_instant[instant] = of_cameras
+    return by_instant
 
 
 def camera_named(name: str, cameras: Collection[str], names: Mapping[str, str]) -> str:
@@ -244,9 +245,9 @@ def camera_named(name: str, cameras: Collection[str], names: Mapping[str, str]) 
         What ``names`` says, or the camera of this name, or the only one whose name differs by upper
         and lower case alone; the name itself where there is none.
     """
-    said = names.get(name, name)
-    alike = [camera for camera in cameras if camera.casefold() == said.casefold()]
-    return alike[0] if said not in cameras and len(alike) == 1 else said
+    wanted = names.get(name, name)
+    alike = [camera for camera in cameras if camera.casefold() == wanted.casefold()]
+    return alike[0] if wanted not in cameras and len(alike) == 1 else wanted
 
 
 def by_camera(
@@ -279,6 +280,6 @@ def by_camera(
             f" calibration.names={{photograph: camera}}; found {', '.join(unknown)}"
         )
     require(len(values) >= least, str(folder), f"{least} photographs or more", len(values))
-    found = {named[name]: value for name, value in values.items()}
-    require(len(found) == len(values), "calibration.names", "one photograph for each camera", dict(names))
-    return found
+    assigned = {named[name]: value for name, value in values.items()}
+    require(len(assigned) == len(values), "calibration.names", "one photograph for each camera", dict(names))
+    return assigned

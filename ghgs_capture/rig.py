@@ -73,7 +73,7 @@ class Rig:
         Returns:
             By camera, its calibration and the (height, width) of its photographs in pixels.
         """
-        found = {}
+        corrected_cameras = {}
         for name, photograph in {p.name: p for c in captures for p in c.photographs}.items():
             stored = folder.file.cameras[name]
             size = stored.size or photograph.mask.shape
@@ -84,8 +84,8 @@ class Rig:
             lens = given.intrinsics * self._zoom_of(name)
             pose = given.extrinsics @ moved
             changed = replace(given, intrinsics=lens, extrinsics=pose, gains=corrected.gains)
-            found[name] = changed, size
-        return found
+            corrected_cameras[name] = changed, size
+        return corrected_cameras
 
 
 def corrected_rig(
@@ -193,10 +193,13 @@ def _names(capture: Capture) -> tuple[str, ...]:
 
 def _together(batches: Sequence[Batch]) -> Batch:
     """One batch of batches of one element, with the same views."""
-    names = ("images", "masks", "alpha", "log_gains")
-    known = [name for name in names if getattr(batches[0], name) is not None]
-    parts = {name: torch.cat([getattr(batch, name) for batch in batches]) for name in known}
-    both = ([getattr(batch.cameras, name) for batch in batches] for name in ("intrinsics", "extrinsics"))
-    cameras = Cameras(*map(torch.cat, both), *parts["masks"].shape[2:])
-    subjects, views = zip(*((b.subjects[0], b.views[0]) for b in batches), strict=True)
+    parts = {}
+    for name in ("images", "masks", "alpha", "log_gains"):
+        if getattr(batches[0], name) is not None:
+            parts[name] = torch.cat([getattr(batch, name) for batch in batches])
+    intrinsics = torch.cat([batch.cameras.intrinsics for batch in batches])
+    extrinsics = torch.cat([batch.cameras.extrinsics for batch in batches])
+    cameras = Cameras(intrinsics, extrinsics, *parts["masks"].shape[2:])
+    subjects = tuple(batch.subjects[0] for batch in batches)
+    views = tuple(batch.views[0] for batch in batches)
     return Batch(**parts, cameras=cameras, subjects=subjects, views=views)

@@ -184,9 +184,9 @@ class Temporal:
             The prediction with the Gaussians as they are.
         """
         depth = drawn.depth.detach()
-        found = _as_drawn(prediction, self._descent.gaussians, batch, depth[:, :, 0])
-        self._last = _Last(batch, found, levels, depth)
-        return found
+        kept = _as_drawn(prediction, self._descent.gaussians, batch, depth[:, :, 0])
+        self._last = _Last(batch, kept, levels, depth)
+        return kept
 
 
 def _are_equal(first: Batch, second: Batch) -> bool:
@@ -266,5 +266,5 @@ def _as_drawn(
     pixels = unproject_maps(depth, batch.cameras).to(prediction.points.pixels)
     points = replace(prediction.points, pixels=pixels, valid=valid)
     maps = replace(prediction.depth_maps, depth=depth, valid=valid, bounds=None)
-    found = {"gaussians": gaussians, "depth": depth, "depth_valid": valid, "points": points}
-    return replace(prediction, **found, depth_maps=maps, rounds=(), drafts=())
+    changed = {"gaussians": gaussians, "depth": depth, "depth_valid": valid, "points": points}
+    return replace(prediction, **changed, depth_maps=maps, rounds=(), drafts=())

@@ -90,8 +90,8 @@ def _read_video(path: Path, changed: int) -> Video:
     listed = subprocess.run(listing, capture_output=True).stdout.decode().splitlines()
     packets = [line.split(",")[1:3] for line in listed if line[:1].isdigit() and not _HIDDEN.search(line)]
     if time is None or not packets:
-        found = first.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no output of ffmpeg"]
-        raise InputError(f"{path}: expected a video with frames that ffmpeg can decode; found {found[0]}")
+        last_line = first.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no output of ffmpeg"]
+        raise InputError(f"{path}: expected a video with frames that ffmpeg can decode; found {last_line[0]}")
     decoded, shown = np.array(packets, np.int64).T
     unit = next(Fraction(line.split(":")[1].strip()) for line in listed if line.startswith("#tb"))
     is_timed = shown.min() > _UNTIMED

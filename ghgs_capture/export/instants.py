@@ -57,7 +57,10 @@ class Instants:
         """Names of the files that may be written, below the directory of all instants."""
         numbered = [f"sequence/{number:04d}.ply" for number in range(self.count)]
         names = {"html": ["viewer.html"], "ply": numbered, "mp4": ["instants.mp4"]}
-        made = [name for format in names if format in self.options.formats for name in names[format]]
+        made = []
+        for format, files in names.items():
+            if format in self.options.formats:
+                made += files
         return [*made, *self.others]
 
     def add(self, folder: Path, batch: Batch, prediction: Prediction, renderer: Renderer) -> None:

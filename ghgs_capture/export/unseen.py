@@ -34,12 +34,12 @@ def unseen(subject: ExportedSubject, depth: Float[Tensor, "1 V 1 H W"]) -> dict[
     """
     masks = subject.masks
     lines = {"top": masks[:, 0], "bottom": masks[:, -1], "left": masks[..., 0], "right": masks[..., -1]}
-    touched = {edge: line.any(-1).tolist() for edge, line in lines.items()}
-    cut = {
-        edge: [name for name, is_cut in zip(subject.views, which, strict=True) if is_cut]
-        for edge, which in touched.items()
-        if any(which)
-    }
+    cut = {}
+    for edge, line in lines.items():
+        touched = line.any(-1).tolist()
+        names = [name for name, is_cut in zip(subject.views, touched, strict=True) if is_cut]
+        if names:
+            cut[edge] = names
     return {"cut": cut, "seen_once": _seen_once(subject, depth)}
 
 
@@ -61,8 +61,9 @@ def _seen_once(subject: ExportedSubject, depth: Float[Tensor, "1 V 1 H W"]) -> d
     high = ordered[round((1 - _OUTSIDE) * last)]
     part = torch.bucketize(height, low + (high - low) * torch.arange(1, _PARTS).to(low) / _PARTS)
     ends = [100 * i // _PARTS for i in range(_PARTS + 1)]
-    return {
-        f"{ends[i]} to {ends[i + 1]} %": float((count[part == i] < 2).double().mean())
-        for i in range(_PARTS)
-        if bool((part == i).any())
-    }
+    shares = {}
+    for i in range(_PARTS):
+        is_inside = part == i
+        if bool(is_inside.any()):
+            shares[f"{ends[i]} to {ends[i + 1]} %"] = float((count[is_inside] < 2).double().mean())
+    return shares

@@ -255,18 +255,18 @@ class Entries:
         for key, model in models.items():
             is_known = plain(model) in (*_PINHOLES, *_BROWN, *_FISHEYES)
             require(is_known, f"{self.origin}: {key}", expected, model)
-        said = [plain(model) in _FISHEYES for model in models.values()]
+        fisheyes = [plain(model) in _FISHEYES for model in models.values()]
         named = " and ".join(models.values())
-        mixed = any(said) and any(plain(model) in _BROWN for model in models.values())
+        mixed = any(fisheyes) and any(plain(model) in _BROWN for model in models.values())
         require(not mixed, self.origin, "one model of the lens", named)
-        differ = flag is not None and models and flag != any(said)
+        differ = flag is not None and models and flag != any(fisheyes)
         require(
             not differ,
             f"{self.origin}: {' and '.join(self.keys('fisheye'))}",
-            f"{any(said)} beside {named}",
+            f"{any(fisheyes)} beside {named}",
             flag,
         )
-        return any(said) if flag is None else flag
+        return any(fisheyes) if flag is None else flag
 
     def distortion(self, order: str) -> np.ndarray:
         """Distortion coefficients, as a list or with an entry each.
@@ -348,10 +348,10 @@ def _bends(key: str, value: Any) -> bool:
 
 def _fits(value: Any, shape: tuple[int | None, ...]) -> bool:
     try:
-        found = np.shape(value)
+        sizes = np.shape(value)
     except ValueError:  # lists of different lengths
         return False
-    return len(found) == len(shape) and all(side in (None, n) for side, n in zip(shape, found, strict=True))
+    return len(sizes) == len(shape) and all(side in (None, n) for side, n in zip(shape, sizes, strict=True))
 
 
 def _has_flags(value: Any) -> bool:

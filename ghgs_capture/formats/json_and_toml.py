@@ -91,8 +91,11 @@ def _others(
         InputError: one says something of the lens.
     """
     below = {name: value for name, value in named.items() if name not in read}
-    beside = {key: value for key, value in content.items() if "cameras" in content}
-    return [key for fields in (below, beside) for key in Entries(str(path), fields).unread(opencv.IRRELEVANT)]
+    outside = {key: value for key, value in content.items() if "cameras" in content}
+    unread = []
+    for fields in (below, outside):
+        unread += Entries(str(path), fields).unread(opencv.IRRELEVANT)
+    return unread
 
 
 def read_toml(path: Path) -> CameraFile:

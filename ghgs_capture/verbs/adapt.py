@@ -114,7 +114,7 @@ def _cameras_of_file(config: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Entries of the calibration that ``cameras`` names. InputError: it has no sizes, or is wrong."""
     require(config["cameras"] is not None, "cameras", "cameras=<calibration>", None)
     file = read_cameras(config["cameras"], config["calibration"]["format"])
-    convention = file.convention.told(config["calibration"])
+    convention = file.convention.with_options(config["calibration"])
     entries = {}
     for name, camera in file.cameras.items():
         require(camera.size is not None, camera.origin, "the photographs' size, or images=<folder>", None)

@@ -71,24 +71,24 @@ def check_cameras(folder: CaptureFolder) -> None:
     from ghgs_capture.camera_report import diagnose, in_parts
 
     names = folder.instants
-    found = {}
+    diagnoses = {}
     last = len(names) - 1
     for place in sorted({round(last * i / (_CHECKED - 1)) for i in range(_CHECKED)}):
         try:
-            found[names[place]] = diagnose(folder, names[place])
+            diagnoses[names[place]] = diagnose(folder, names[place])
         except InputError:
             if not last:
                 raise
-    if not found:
+    if not diagnoses:
         print("cameras are not checked: none of the instants looked at can be read", flush=True)
-    for name, diagnosis in found.items():
+    for name, diagnosis in diagnoses.items():
         parts = in_parts(diagnosis.ranking[0].views)
         if len(parts) > 1:
             print(f"instant {name}: masks of {', '.join(parts)} have two large parts, taken for one subject")
         if not diagnosis.consistent and last:
             print(f"instant {name}: cameras and masks do not fit: {'; '.join(diagnosis.lines)}", flush=True)
-    sound = [diagnosis for diagnosis in found.values() if diagnosis.consistent]
-    for diagnosis in (sound or list(found.values()))[:1]:
+    sound = [diagnosis for diagnosis in diagnoses.values() if diagnosis.consistent]
+    for diagnosis in (sound or list(diagnoses.values()))[:1]:
         if not diagnosis.consistent:
             raise InputError(
                 "cameras: expected cameras that fit photographs and masks (ghgs doctor draws them,"

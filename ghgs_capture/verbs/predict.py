@@ -216,9 +216,10 @@ def shared_by(
     captures = []
     rounds, masks, tones = (refining[key] for key in ("refine_cameras", "refine_masks", "tones"))
     spread = [round((len(names) - 1) * i / (INSTANTS - 1)) for i in range(INSTANTS)]
-    for name in [names[place] for place in dict.fromkeys(spread)] if rounds or masks or tones else ():
+    is_needed = bool(rounds or masks or tones)
+    for place in dict.fromkeys(spread) if is_needed else ():
         with contextlib.suppress(InputError):  # this instant is left out
-            captures.append(Capture(name, folder.photographs(name)))
+            captures.append(Capture(names[place], folder.photographs(names[place])))
     if tones == "auto":
         plain = {"refine_cameras": 0, "refine_masks": 0, "renderer": renderer}
         tones = predict(captures[0], model, size, **plain).tones if captures else {}
@@ -262,11 +263,12 @@ def advice_of(directory: Path) -> Iterator[str]:
     """
     report = json.loads((directory / REPORT).read_text())
     shares = {name: geometric_mean(each) - 1 for name, each in report.get("gains", {}).items()}
-    said = [
-        f"{n} {abs(x):.0%} {'darker' if x < 0 else 'brighter'}" for n, x in shares.items() if round(100 * x)
-    ]
-    if said:
-        yield f"gains: {', '.join(said)} than the mean of the cameras, undone"
+    deviations = []
+    for name, share in shares.items():
+        if round(100 * share):
+            deviations.append(f"{name} {abs(share):.0%} {'darker' if share < 0 else 'brighter'}")
+    if deviations:
+        yield f"gains: {', '.join(deviations)} than the mean of the cameras, undone"
     yield from tone_lines(report.get("tones", {}), "undone (refine_tones=0 leaves it)")
     quality = report["psnr_box_of_inputs"].values()
     if len(quality) < 3:
@@ -320,8 +322,8 @@ def moved_line(moved: dict[str, float]) -> str:
         A line of text.
     """
     off = [name for name, pixels in moved.items() if pixels]
-    beside = f": {', '.join(off)} beside the others" if 0 < len(off) < len(moved) else ""
-    return f"refine_cameras: moved by {', '.join(f'{p:.2f}' for p in moved.values())} pixels{beside}"
+    moved_alone = f": {', '.join(off)} beside the others" if 0 < len(off) < len(moved) else ""
+    return f"refine_cameras: moved by {', '.join(f'{p:.2f}' for p in moved.values())} pixels{moved_alone}"
 
 
 def captures_of(folder: CaptureFolder) -> Iterator[tuple[Capture, float]]:

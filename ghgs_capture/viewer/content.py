@@ -130,14 +130,14 @@ def _read_inputs(directory: Path) -> Batch:
     shapes = {picture.shape for picture in pictures}
     require(len(shapes) == 1, str(directory / "inputs"), "photographs of one size", sorted(shapes))
     values = torch.from_numpy(np.stack(pictures)).movedim(-1, 1).float()[None] / 255
-    matrices = ([getattr(c, name) for c in cameras] for name in ("intrinsics", "extrinsics"))
-    stacked = [torch.from_numpy(np.stack(each)).float()[None] for each in matrices]
+    intrinsics = torch.from_numpy(np.stack([camera.intrinsics for camera in cameras])).float()[None]
+    extrinsics = torch.from_numpy(np.stack([camera.extrinsics for camera in cameras])).float()[None]
     colors = values[:, :, :3]
     alpha = values[:, :, 3:]
     return Batch(
         images=torch.where(alpha > 0, colors * alpha, colors),
         masks=alpha[:, :, 0] > 0.5,
         alpha=alpha[:, :, 0],
-        cameras=Cameras(*stacked, *pictures[0].shape[:2]),
+        cameras=Cameras(intrinsics, extrinsics, *pictures[0].shape[:2]),
         views=(tuple(stored.cameras),),
     )

@@ -169,10 +169,10 @@ def _read_ahead(
         try:
             coming = pool.submit(following)
             while wait([coming], min(end - time.monotonic(), threading.TIMEOUT_MAX)).done:
-                found = coming.result()
-                if found is None or time.monotonic() > end:
+                current = coming.result()
+                if current is None or time.monotonic() > end:
                     break
                 coming = pool.submit(following)
-                yield found
+                yield current
         finally:
             pause.stopped.set()
