@@ -16,7 +16,12 @@ _running: dict[Path, multiprocessing.process.BaseProcess] = {}
 
 
 class Joining(dict[str, tuple[int, ...]]):
-    """``subjects`` of a training layout; iterating adds those of ``names`` that have become complete."""
+    """``subjects`` of a training layout; iterating adds those of ``names`` that have become complete.
+
+    Args:
+        layout: of the training people that are complete so far; its ``subjects`` become this mapping.
+        names: all training people, complete or not.
+    """
 
     def __init__(self, layout: Layout, names: Sequence[str]) -> None:
         super().__init__(layout.subjects)
@@ -36,8 +41,19 @@ class Joining(dict[str, tuple[int, ...]]):
 def render_beside(
     root: Path, names: Sequence[str], source: PersonSource, rig: object, settings: RenderOptions, seed: int
 ) -> None:
-    """Start to render training people below ``root`` in a process that ends with this one; arguments as of
-    :func:`ghgs_people.jobs.render_people`."""
+    """Start to render training people in a process that ends with this one.
+
+    Nothing starts while such a process runs for ``root``, or where nobody is missing.
+
+    Args:
+        root: folder of the data set.
+        names: training people.
+        source: loads a person by name.
+        rig: the cameras around each person, a :class:`ghgs_people.rig.Rig` or
+            :class:`ghgs_people.capture_rig.CaptureRig`.
+        settings: what is rendered of each person.
+        seed: of heights, yaws and lights.
+    """
     running = root in _running and _running[root].is_alive()
     if running or not Completeness(root).missing("train", names):
         return
@@ -47,6 +63,11 @@ def render_beside(
 
 
 def _render(*arguments: object) -> None:
+    """Render in a process of lowest priority; bad people are named on standard error.
+
+    Args:
+        arguments: those of :func:`ghgs_people.jobs.render_people` from ``root`` to ``seed``.
+    """
     start_worker()
     os.nice(_NICE)
     try:

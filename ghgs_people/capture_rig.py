@@ -45,9 +45,15 @@ class RigCamera(Options):
 
 @dataclass(frozen=True)
 class CaptureRig:
-    """Cameras in an unknown unit. ``intrinsics``: [3, 3] of each. ``extrinsics``: [4, 4] of each.
-    ``heights``: of the photographs in pixels. ``fill``: [least, greatest] share of the photograph's height
-    that a subject takes in the camera that sees it tallest; decides how far the cameras stand."""
+    """Cameras in an unknown unit.
+
+    Args:
+        intrinsics: [3, 3] of each camera, in pixels.
+        extrinsics: [4, 4] of each camera, world to camera, in any unit.
+        heights: of each camera's photographs, pixels.
+        fill: [least, greatest] share of the photograph's height that a subject takes in the camera that
+            sees it tallest, 0 to 1; decides how far the cameras stand.
+    """
 
     intrinsics: tuple
     extrinsics: tuple
@@ -58,11 +64,23 @@ class CaptureRig:
 
     @classmethod
     def of(cls, cameras: Sequence[RigCamera], fill: tuple[float, float]) -> "CaptureRig":
-        """The rig of two or more cameras. InputError: there are fewer, they look in one direction, or the
-        point that they look at is behind one of them."""
+        """Order the cameras of a capture by their azimuth about what they look at.
+
+        Args:
+            cameras: two or more.
+            fill: [least, greatest] share of the photograph's height that a subject takes, 0 to 1.
+
+        Raises:
+            InputError: there are fewer cameras, they look in one direction, or the point that they look at is
+                behind one of them.
+        """
         require(len(cameras) > 1, "data.cameras", "two or more cameras", len(cameras))
-        columns = ([getattr(c, n) for c in cameras] for n in ("intrinsics", "extrinsics", "height"))
-        rig = cls(*map(tuple, columns), fill)
+        rig = cls(
+            tuple(camera.intrinsics for camera in cameras),
+            tuple(camera.extrinsics for camera in cameras),
+            tuple(camera.height for camera in cameras),
+            fill,
+        )
         rotations = rig._poses[:, :3, :3]
         turned = (rotations[:, 2] @ rotations[:, 2].T).min() < _PARALLEL
         require(bool(turned), "data.cameras", "cameras that look in several directions", "one direction")
@@ -71,7 +89,9 @@ class CaptureRig:
         require(bool((depths > 0).all()), "data.cameras", expected, f"depths {depths.round(3).tolist()}")
         order = np.argsort(rig._azimuths)
         return cls(
-            *(tuple(column[i] for i in order) for column in (rig.intrinsics, rig.extrinsics, rig.heights)),
+            tuple(rig.intrinsics[i] for i in order),
+            tuple(rig.extrinsics[i] for i in order),
+            tuple(rig.heights[i] for i in order),
             fill,
         )
 
@@ -124,13 +144,25 @@ class CaptureRig:
         return np.arctan2(centers[:, 0], centers[:, 2])
 
     def yaws(self, rng: np.random.Generator) -> np.ndarray:
-        """Places [positions, 5] of all views of a subject: 1.5 is half-way from camera 1 to camera 2."""
+        """Draw the places of all views of a subject.
+
+        Args:
+            rng: draws where the views 2 and 4 stand between two cameras.
+
+        Returns:
+            Places [positions, 5] of views 0 to 4: 1.5 is half-way from camera 1 to camera 2.
+        """
         first, second = rng.uniform(0, 0.5, (2, self.positions))
         offsets = np.stack((0 * first, 0 * first + 1, first, 0 * first + 0.5, 0.5 + second), -1)
         return np.arange(self.positions)[:, None] + offsets
 
     def place(self, person: Person, rng: np.random.Generator) -> Person:
-        """The person at its own height, turned by a random angle about y, the feet on y = 0."""
+        """Turn a person by a random angle about y, at its own height, the feet on y = 0.
+
+        Args:
+            person: in metres, y up.
+            rng: draws the angle.
+        """
         angle = rng.uniform(0, 2 * np.pi)
         turn = Rotation.from_euler("y", angle).as_matrix()
         return Rig(height=None).place(person, rng).mapped(lambda vertices: vertices @ turn.T)
@@ -138,7 +170,18 @@ class CaptureRig:
     def drawn(
         self, person: Person, yaws: np.ndarray, aspect: float, rng: np.random.Generator
     ) -> tuple["PlacedRig", Poses]:
-        """The cameras around one subject; the deviations (second value) are 0."""
+        """Place the cameras around one subject.
+
+        Args:
+            person: the subject, in metres, y up.
+            yaws: places [positions, 5] of all views (:meth:`yaws`).
+            aspect: width / height of the images; not used, as crops fit their subject.
+            rng: draws the subject's share of the image's height, and how far it stands from the point that
+                the cameras look at.
+
+        Returns:
+            The placed cameras, and their deviations, which are 0.
+        """
         vertices = np.concatenate([part.vertices for part in person.parts])
         low = vertices.min(0)
         high = vertices.max(0)
@@ -153,8 +196,14 @@ class CaptureRig:
 
 @dataclass(frozen=True)
 class PlacedRig:
-    """A rig around one subject. ``scale``: metres per unit of the cameras. ``middle``: the point [3] that the
-    cameras look at, in the subject's world. ``vertices``: [n, 3] of the subject."""
+    """A rig around one subject.
+
+    Args:
+        rig: the cameras.
+        scale: metres per unit of the cameras.
+        middle: the point [3] that the cameras look at, in the subject's world, metres.
+        vertices: [n, 3] of the subject, metres.
+    """
 
     rig: CaptureRig
     scale: float
@@ -162,14 +211,29 @@ class PlacedRig:
     vertices: np.ndarray
 
     def cameras(self, yaws: np.ndarray, height: int, width: int, poses: Poses | None = None) -> Cameras:
-        """Cameras [k] of crops around the subject, float32. ``yaws``: of :meth:`CaptureRig.yaws`."""
+        """Cameras of crops around the subject.
+
+        Args:
+            yaws: k places, of :meth:`CaptureRig.yaws`.
+            height: of the crops, pixels.
+            width: of the crops, pixels.
+            poses: deviations; none is applied.
+
+        Returns:
+            Cameras [k], float32.
+
+        Raises:
+            InputError: a point of the subject is behind a camera.
+        """
         rotations, shifts = self._poses(np.asarray(yaws))
         shifts = self.scale * shifts - rotations @ self.middle
         first, then, share = _neighbours(np.asarray(yaws), self.rig.positions)
         matrices = np.asarray(self.rig.intrinsics, np.float64)
         matrices = (1 - share)[:, None, None] * matrices[first] + share[:, None, None] * matrices[then]
         extrinsics = np.zeros((len(rotations), 4, 4))
-        extrinsics[:, :3, :3], extrinsics[:, :3, 3], extrinsics[:, 3, 3] = rotations, shifts, 1
+        extrinsics[:, :3, :3] = rotations
+        extrinsics[:, :3, 3] = shifts
+        extrinsics[:, 3, 3] = 1
         crops = [self._crop(k, e, (width, height)) for k, e in zip(matrices, extrinsics, strict=True)]
         arrays = (torch.from_numpy(np.stack(a).astype(np.float32)) for a in (crops, extrinsics))
         return Cameras(*arrays, height, width)
@@ -193,7 +257,19 @@ class PlacedRig:
         return rotation, -(rotation @ between[..., None])[..., 0]
 
     def _crop(self, matrix: np.ndarray, pose: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """Intrinsics of a crop of ``size`` (width, height) with the subject in its middle."""
+        """Intrinsics of a crop with the subject in its middle.
+
+        Args:
+            matrix: intrinsics [3, 3] of the whole photograph, pixels.
+            pose: extrinsics [4, 4], metres.
+            size: width and height of the crop, pixels.
+
+        Returns:
+            Intrinsics [3, 3], under which the subject takes ``SHARE`` of the width or height.
+
+        Raises:
+            InputError: a point of the subject is behind the camera.
+        """
         points = self.vertices @ pose[:3, :3].T + pose[:3, 3]
         near = "cameras farther from the subject than it is wide (data.fill is less)"
         require(points[:, 2].min() > 1e-3, "data.cameras", near, f"a depth of {points[:, 2].min():.3g} m")

@@ -133,12 +133,20 @@ class _Generated(_Renderable):
         if phase in bench.SPLITS:
             return bench.names(phase)
         first = 0 if phase == "train" else FIRST_VAL
-        numbers = (("p", getattr(self.people, phase)), (ACTIVE, getattr(self.active, phase)))
-        return [f"{kind}{first + i:07d}" for kind, count in numbers for i in range(count)]
+        names = []
+        for letter, people in (("p", self.people), (ACTIVE, self.active)):
+            names += [f"{letter}{first + i:07d}" for i in range(getattr(people, phase))]
+        return names
 
     def prepare(self, splits: Sequence[str] = PHASES) -> None:
-        """Render the people of ``splits`` that are missing in the cache. InputError: frozen people differ
-        from their definition (:mod:`.bench`)."""
+        """Render the people that the cache lacks.
+
+        Args:
+            splits: ``train``, ``val`` or frozen people (:mod:`.bench`).
+
+        Raises:
+            InputError: frozen people differ from their definition, or people cannot be rendered.
+        """
         frozen = [split for split in splits if split in bench.SPLITS]
         for split in frozen:
             made_with = everything(self.camera_rig(), self.render)
@@ -148,7 +156,11 @@ class _Generated(_Renderable):
             bench.check_photographs(split, self.reader(split))
 
     def render_first(self, names: Mapping[str, Sequence[str]]) -> None:
-        """Render these people, by phase."""
+        """Render people that are needed before work begins.
+
+        Args:
+            names: of the people of each phase.
+        """
         source = SyntheticSource(_PEOPLE_SEED)
         rig = self.camera_rig()
         render_people(Path(self.root), names, source, rig, self.render, _PEOPLE_SEED, self.render_workers)
@@ -185,11 +197,19 @@ class PeopleInRig(_Generated):
         return len(self.cameras)
 
     def subject_names(self, phase: str) -> list[str]:
-        """Names sorted by number, so that the first ones are of both kinds."""
+        """Names sorted by number, so that the first ones are of both kinds.
+
+        Args:
+            phase: ``train``, ``val`` or one of the frozen splits.
+        """
         return sorted(super().subject_names(phase), key=lambda name: name[1:])
 
     def render_first(self, names: Mapping[str, Sequence[str]]) -> None:
-        """Render these people, but of training only the first; start to render the others."""
+        """Render people, but of training only the first ones; start to render the others.
+
+        Args:
+            names: of the people of each phase.
+        """
         if self.render_workers == 0:
             return super().render_first(names)
         trained = list(names.get("train", []))
@@ -235,13 +255,20 @@ class Scans(DataSet, _OnRing):
     def subject_names(self, phase: str) -> list[str] | None:
         if self.split is None:
             return None
-        images = [self.folder / p / "img" for p in PHASES]
-        there = {e.name.rpartition("_")[0] for folder in images if folder.is_dir() for e in folder.iterdir()}
-        return read_split(self.split, sorted(there))[phase]
+        rendered = set()
+        for part in PHASES:
+            images = self.folder / part / "img"
+            if images.is_dir():
+                rendered |= {position.name.rpartition("_")[0] for position in images.iterdir()}
+        return read_split(self.split, sorted(rendered))[phase]
 
     @property
     def source_folder(self) -> Path:
-        """The folder of the scans. InputError: ``source`` is null."""
+        """The folder of the scans.
+
+        Raises:
+            InputError: ``source`` is null.
+        """
         return required_folder("data.source", "a folder of scans", self.source)
 
     def scans(self) -> PersonSource:
@@ -252,7 +279,14 @@ class Scans(DataSet, _OnRing):
         self.render_missing()
 
     def render_missing(self) -> int:
-        """Render the scans of the split (up to ``limit``) that ``root`` lacks; returns their number."""
+        """Render the scans of the split (up to ``limit``) that ``root`` lacks.
+
+        Returns:
+            Number of scans rendered now.
+
+        Raises:
+            InputError: ``source`` or ``root`` is null, a scan is bad, or ``root`` holds something else.
+        """
         source = self.scans()
         root = required_folder("data.root", "a folder", self.root)
         names = split_names(self.source_folder, source.names(), self.split, self.val_fraction, _SEED)

@@ -49,10 +49,25 @@ LIGHTS = Lights()
 class PersonSource(Protocol):
     """A source of people; it can be pickled."""
 
-    def load(self, name: str) -> Person: ...
+    def load(self, name: str) -> Person:
+        """Read or make a person.
+
+        Args:
+            name: of the person.
+
+        Raises:
+            InputError: the person is bad.
+        """
 
     def facing(self, name: str) -> float:
-        """Degrees by which the first camera is turned about y to face the person."""
+        """Tell where a person faces.
+
+        Args:
+            name: of the person.
+
+        Returns:
+            Degrees by which the first camera is turned about y to face the person.
+        """
 
 
 #: First letter of the names of generated people in poses of sport and dance.
@@ -61,7 +76,11 @@ ACTIVE = "a"
 
 @dataclass(frozen=True)
 class SyntheticSource:
-    """Generated people, named ``p<index>``, and those in poses of sport and dance, ``a<index>``."""
+    """Generated people, named ``p<index>``, and those in poses of sport and dance, ``a<index>``.
+
+    Args:
+        seed: of the family, at least 0.
+    """
 
     seed: int
 
@@ -105,14 +124,31 @@ class _Job:
 
 
 def everything(rig: Rig, settings: RenderOptions) -> dict:
-    """All settings besides the seed that photographs of a person depend on, as plain data."""
+    """All settings besides the seed that photographs of a person depend on.
+
+    Args:
+        rig: the cameras.
+        settings: what is rendered.
+
+    Returns:
+        Plain data, under ``rig`` and ``render``.
+    """
     cameras = {**asdict(rig), "variation": rig.variation.model_dump()}
     lights = asdict(LIGHTS) if settings.lights == "studio" else settings.lights
     return {"rig": cameras, "render": {**settings.model_dump(), "lights": lights}}
 
 
 def identity(rig: Rig, settings: RenderOptions, seed: int) -> dict:
-    """:func:`everything` with the seed, in the form of cache keys and stored settings."""
+    """:func:`everything` with the seed, in the form of cache keys and stored settings.
+
+    Args:
+        rig: the cameras.
+        settings: what is rendered.
+        seed: of heights, yaws and lights.
+
+    Returns:
+        Plain data, with the version of the renderer.
+    """
     cameras, render = everything(rig, settings).values()
     render["vids"] = render.pop("views")  # the name in stored data sets and in the keys of caches
     still = STILL.model_dump()
@@ -124,7 +160,14 @@ def identity(rig: Rig, settings: RenderOptions, seed: int) -> dict:
 
 
 def render_subject(job: _Job) -> tuple[_Job, str]:
-    """Render one person into its workspace. Returns the job, and why the person is bad (empty: it is not)."""
+    """Render one person into its workspace.
+
+    Args:
+        job: the person, the rig and the settings.
+
+    Returns:
+        The job, and why the person is bad (empty: it is not).
+    """
     try:
         _render(job)
     except InputError as error:
@@ -152,7 +195,18 @@ def _render(job: _Job) -> None:
 def photographs(
     studio: Studio, rig: Rig, settings: RenderOptions, yaws: np.ndarray, poses: Poses
 ) -> Iterator[tuple[int, int, View]]:
-    """Ring position, number and content of each view of ``settings``; ``yaws``, ``poses``: of all views."""
+    """Photograph a person from every position and view of ``settings``.
+
+    Args:
+        studio: the person under its lights.
+        rig: the cameras around this person.
+        settings: positions, views and size.
+        yaws: [positions, 5] of all views, rendered or not (:meth:`ghgs_people.rig.Rig.yaws`).
+        poses: deviations of the cameras of all views.
+
+    Yields:
+        Ring position, number and content of each view.
+    """
     height, width = settings.size
     for position in range(len(yaws)) if settings.positions is None else settings.positions:
         index = (position, list(settings.views))
@@ -180,12 +234,28 @@ def render_people(
     workers: int | None = None,
     shown: bool = True,
 ) -> int:
-    """Render people below ``root``; existing ones are kept. Returns the number of people rendered now.
+    """Render people below ``root``; existing ones are kept.
 
     It is safe to kill, to repeat, and to start twice at once: a second process waits for the first.
-    ``names``: people of each phase. ``workers``: number of processes (None: one for each core; 0: only this
-    one). ``shown``: whether there is a progress bar. InputError: ``root`` holds something else, the script
-    has no main guard, or people are bad: the others are rendered, then these are named."""
+
+    Args:
+        root: folder of the data set.
+        names: people of each phase.
+        source: loads a person by name.
+        rig: the cameras around each person.
+        settings: what is rendered of each person.
+        seed: of heights, yaws and lights.
+        workers: number of processes; None: one for each core; 0: only this one.
+        shown: whether there is a progress bar.
+
+    Returns:
+        Number of people rendered now.
+
+    Raises:
+        InputError: ``root`` holds something else, a position is not on the rig, the script has no main
+            guard, or people are bad: the others are rendered, then these are named.
+        RuntimeError: a rendering process died.
+    """
     _check_main_guard()
     positions = settings.positions
     fits = positions is None or set(positions) <= set(range(rig.positions))
@@ -199,11 +269,11 @@ def render_people(
         progress.check_settings(made_with)  # another process may have written others meanwhile
         progress.clear_workspaces()
         progress.request(names)
-        todo = [
-            _Job(source, rig, settings, seed, phase, name, progress.workspace(phase, name))
-            for phase, listed in names.items()
-            for name in progress.missing(phase, listed)
-        ]
+        todo = []
+        for phase, listed in names.items():
+            for name in progress.missing(phase, listed):
+                workspace = progress.workspace(phase, name)
+                todo.append(_Job(source, rig, settings, seed, phase, name, workspace))
         console = Console(stderr=True)
         label = f"rendering into {root}"
         bad = []
@@ -227,6 +297,18 @@ def render_people(
 
 
 def _run(jobs: list[_Job], workers: int | None) -> Iterator[tuple[_Job, str]]:
+    """Render people in several processes, or one after the other in this one.
+
+    Args:
+        jobs: one for each person.
+        workers: number of processes; None: one for each core; 0 or 1: only this one.
+
+    Yields:
+        Each job as it ends, and why its person is bad (empty: it is not).
+
+    Raises:
+        RuntimeError: a process died.
+    """
     workers = min(len(jobs), allowed_cores() if workers is None else workers)
     if workers < 2:
         yield from map(render_subject, jobs)
@@ -270,9 +352,18 @@ def _end_with_parent() -> None:
 
 
 def write_view(phase: Path, folder: str, number: int, view: View, quality: int = 98) -> None:
-    """Write one view; the JPEG keeps the full resolution of colours. The mask has three equal channels, as
-    the authors' loader reads channel 0. ``folder``: name of the subject's position, ``<id>_<position>``.
-    ``quality``: of the JPEG, 1 to 100."""
+    """Write one view of a subject, in the layout of :mod:`ghgs_lit.data.layout`.
+
+    The JPEG keeps the full resolution of colours. The mask has three equal channels, as the authors'
+    loader reads channel 0.
+
+    Args:
+        phase: folder of the phase, or a workspace.
+        folder: name of the subject's position, ``<id>_<position>``.
+        number: of the view at its position.
+        view: image, mask and cameras; matte and inverse depth where there are any.
+        quality: of the JPEG, 1 to 100.
+    """
     folders = {kind: phase / kind / folder for kind in ("img", "mask", "alpha", "depth", "parm")}
     for path in folders.values():
         path.mkdir(parents=True, exist_ok=True)
@@ -288,7 +379,13 @@ def write_view(phase: Path, folder: str, number: int, view: View, quality: int =
 
 
 def write_body(phase: Path, name: str, vertices: np.ndarray) -> None:
-    """Write the vertices [n, 3] of a subject's body."""
+    """Write the vertices of a subject's body.
+
+    Args:
+        phase: folder of the phase, or a workspace.
+        name: of the subject.
+        vertices: [n, 3], metres.
+    """
     folder = phase / "smpl" / name
     folder.mkdir(parents=True, exist_ok=True)
     np.save(folder / "vertices.npy", vertices.astype(np.float32))

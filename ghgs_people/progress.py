@@ -25,7 +25,14 @@ class Progress(Completeness):
     """The progress of rendering the data set at ``root``."""
 
     def check_settings(self, settings: dict) -> None:
-        """Store ``settings`` in an empty data set; refuse a data set with other settings or foreign files."""
+        """Store the settings in an empty data set; refuse a data set with others.
+
+        Args:
+            settings: nested plain data (:func:`ghgs_people.jobs.identity`).
+
+        Raises:
+            InputError: the data set has other settings, or files that were not rendered here.
+        """
         path = self.folder / "settings.json"
         foreign = self.root.is_dir() and any(p != self.folder for p in self.root.iterdir())
         if not path.exists():
@@ -41,17 +48,21 @@ class Progress(Completeness):
                 f"{path}: expected data.render.lights={wanted}; found {stored} (render into another folder,"
                 f" or data.render.lights={stored} goes on with this one)"
             )
-        found = flatten(read_json(path))
+        kept = flatten(read_json(path))
         settings = flatten(json.loads(json.dumps(settings)))  # tuples to lists, as they were stored
-        for key in sorted(settings.keys() | found.keys()):
-            if settings.get(key) != found.get(key):
+        for key in sorted(settings.keys() | kept.keys()):
+            if settings.get(key) != kept.get(key):
                 raise InputError(
-                    f"{path}: expected {key} = {settings.get(key)}; found {found.get(key)} "
+                    f"{path}: expected {key} = {settings.get(key)}; found {kept.get(key)} "
                     "(render into another folder, or delete this one)"
                 )
 
     def request(self, names: Mapping[str, Sequence[str]]) -> None:
-        """Store that these subjects were requested; call under the lock."""
+        """Store that subjects were requested; call under the lock.
+
+        Args:
+            names: subjects of each phase.
+        """
         known = self.plan
         phases = known.keys() | names.keys()
         plan = {p: sorted({*known.get(p, []), *names.get(p, [])}) for p in phases}
@@ -59,7 +70,11 @@ class Progress(Completeness):
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Hold the lock for writing; the system frees it when a process dies."""
+        """Hold the lock for writing; the system frees it when a process dies.
+
+        Raises:
+            InputError: this process holds it already, or the file system has no locks.
+        """
         path = self.folder / "lock"
         if is_locked(path):
             log.info("waiting for %s, which renders into %s", lock_owner(path), self.root)
@@ -68,14 +83,25 @@ class Progress(Completeness):
             yield
 
     def workspace(self, phase: str, name: str) -> Path:
-        """A new, empty folder for the files of a subject."""
+        """Make an empty folder for the files of a subject.
+
+        Args:
+            phase: ``train``, ``val`` or another name of a part of the data.
+            name: of the subject.
+        """
         path = self.folder / "tmp" / f"{phase}-{name}"
         shutil.rmtree(path, ignore_errors=True)
         path.mkdir(parents=True)
         return path
 
     def publish(self, workspace: Path, phase: str, name: str) -> None:
-        """Move the subject of a workspace to its place, then mark it as complete."""
+        """Move a subject to its place, then mark it as complete.
+
+        Args:
+            workspace: folder that holds all its files.
+            phase: that the subject belongs to.
+            name: of the subject.
+        """
         for kind in _KINDS:
             for source in sorted((workspace / kind).glob("*")):
                 target = self.root / phase / kind / source.name

@@ -32,24 +32,52 @@ FIT_FOLDERS = ("THuman2.0_smplx", "THuman2.0_Smpl_X_Paras", "THuman2.0_SMPLX_Par
 
 
 def find_fits(source: Path, fits: str | None) -> Path | None:
-    """The folder of the fits; None if there is none. ``fits``: the configured folder (None: one of
-    :data:`FIT_FOLDERS` in or beside ``source``). InputError: the configured folder does not exist."""
+    """Find the folder of the SMPL-X fits.
+
+    Args:
+        source: folder of the scans.
+        fits: the configured folder; None: one of :data:`FIT_FOLDERS` in or beside ``source``.
+
+    Returns:
+        The folder; None if there is none.
+
+    Raises:
+        InputError: the configured folder does not exist.
+    """
     if fits is not None:
         folder = Path(fits).expanduser()
         require_folder(folder, "the folder of the SMPL-X fits")
         return folder
-    candidates = [place / name for place in (source, source.parent) for name in FIT_FOLDERS]
-    return next((folder for folder in candidates if folder.is_dir()), None)
+    for place in (source, source.parent):
+        for name in FIT_FOLDERS:
+            if (place / name).is_dir():
+                return place / name
+    return None
 
 
 @dataclass(frozen=True)
 class THuman2Source(ScanSource):
-    """Raw scans with their bodies. ``fits``: folder of the fits (None: scans have no body)."""
+    """Raw scans with their bodies.
+
+    Args:
+        folder: of the scans.
+        fits: folder of the fits; None: scans have no body.
+    """
 
     fits: Path | None = None
 
     def load(self, name: str) -> Person:
-        """A scan with its body, as stored. InputError: the scan or fit is bad, or the body lies outside."""
+        """Read a scan with its body, as stored.
+
+        Args:
+            name: id of the scan.
+
+        Returns:
+            The scan, in its own unit, with the vertices [n, 3] of its fit.
+
+        Raises:
+            InputError: the scan or fit is bad, or the body lies outside its scan.
+        """
         scan = super().load(name)
         if self.fits is None:
             return scan
@@ -60,8 +88,20 @@ class THuman2Source(ScanSource):
         return replace(scan, body_vertices=body.astype(np.float32))
 
     def facing(self, name: str) -> float:
-        """Degrees by which the first camera is turned about y to face the person; 0 without a fit. The fit's
-        pickle is read without executing it. InputError: it is bad."""
+        """Tell where a scan faces, by the root rotation of its fit (``global_orient`` of SMPL-X).
+
+        The fit's pickle is read without executing it.
+
+        Args:
+            name: id of the scan.
+
+        Returns:
+            Degrees by which the first camera is turned about y to face the person, -180 to 180; 0 without a
+            fit.
+
+        Raises:
+            InputError: the fit is missing or bad.
+        """
         if self.fits is None:
             return 0.0
         path = self._fit(name, "smplx_param.pkl")
@@ -74,14 +114,32 @@ class THuman2Source(ScanSource):
         return float(np.degrees(np.arctan2(forward[0], forward[2])))
 
     def _fit(self, name: str, file: str) -> Path:
-        """A file of a scan's fit. InputError: there is no folder of it."""
+        """A file of a scan's fit.
+
+        Args:
+            name: id of the scan.
+            file: its usual name; another spelling of the letters' case is found, too.
+
+        Raises:
+            InputError: there is no folder of the fit.
+        """
         folder = find_path(self.fits, name) or self.fits / name
         require_folder(folder, "the scan's SMPL-X fit")
         return find_path(folder, file) or folder / file
 
 
 def _check_body(folder: Path, scan: Person, body: np.ndarray) -> None:
-    """Refuse a body outside its scan, as when scale or translation were not applied."""
+    """Refuse a body outside its scan, as when scale or translation were not applied.
+
+    Args:
+        folder: of the fit, for the message.
+        scan: in its own unit.
+        body: vertices [n, 3] of the fit.
+
+    Raises:
+        InputError: the body leaves the scan's box by more than 0.1 of its height, or is not 0.7 to 1.2
+            times as tall.
+    """
     points = np.concatenate([part.vertices for part in scan.parts])
     low = points.min(0)
     high = points.max(0)

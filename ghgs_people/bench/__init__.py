@@ -41,45 +41,90 @@ LEAST = 56
 
 @cache
 def definition(split: str) -> dict[str, Any]:
-    """The definition of the people of one of ``SPLITS``, as plain data."""
+    """Read the definition of the people of a split.
+
+    Args:
+        split: one of ``SPLITS``.
+
+    Returns:
+        The content of ``<split>.json``, as plain data.
+    """
     return json.loads((FOLDER / f"{split}.json").read_text())
 
 
 def names(split: str) -> list[str]:
-    """Names of the subjects of a split."""
-    made = definition(split)
-    return [
-        f"{letter}{made['first'] + i:07d}" for kind, letter in KINDS.items() for i in range(made.get(kind, 0))
-    ]
+    """Name the subjects of a split, in the order of its thumbnails.
+
+    Args:
+        split: one of ``SPLITS``.
+
+    Returns:
+        Names as ``p2000000``: the letter of the kind and the number of the person.
+    """
+    defined = definition(split)
+    listed = []
+    for kind, letter in KINDS.items():
+        listed += [f"{letter}{defined['first'] + i:07d}" for i in range(defined.get(kind, 0))]
+    return listed
 
 
 @cache
 def thumbnails(split: str) -> np.ndarray:
-    """Thumbnails [people, positions, SIDE, SIDE, 4] uint8: colours and mask."""
+    """Read the stored thumbnails of a split.
+
+    Args:
+        split: one of ``SPLITS``.
+
+    Returns:
+        [people, positions, SIDE, SIDE, 4] uint8: colours and mask, positions as in ``POSITIONS``.
+    """
     return np.load(FOLDER / f"{split}.npz")["thumbnails"]
 
 
 @cache
 def facts(split: str) -> dict[str, str]:
-    """Version and digest of a split, for results."""
-    made = json.dumps(definition(split), sort_keys=True).encode()
-    digest = hashlib.sha256(made + thumbnails(split).tobytes()).hexdigest()
+    """Say which version of a split was measured, for results.
+
+    Args:
+        split: one of ``SPLITS``.
+
+    Returns:
+        Version and first 12 digits of the SHA-256 of definition and thumbnails, by the name of the split.
+    """
+    defined = json.dumps(definition(split), sort_keys=True).encode()
+    digest = hashlib.sha256(defined + thumbnails(split).tobytes()).hexdigest()
     return {split: f"version {definition(split)['version']}, {digest[:12]}"}
 
 
 def check_settings(split: str, settings: Mapping[str, Any]) -> None:
-    """Refuse settings of ``data`` that differ from the definition; those that it does not name, such as the
-    size, are free. InputError: names the first key that differs."""
-    found = flatten(json.loads(json.dumps(settings)))  # tuples to lists
+    """Refuse settings of ``data`` that differ from the definition.
+
+    Those that it does not name, such as the size, are free.
+
+    Args:
+        split: one of ``SPLITS``.
+        settings: of the data set, as nested plain data; ``render.size`` is [height, width] in pixels.
+
+    Raises:
+        InputError: names the first key that differs; or the longer side is below ``LEAST`` pixels.
+    """
+    given = flatten(json.loads(json.dumps(settings)))  # tuples to lists
     size = max(settings["render"]["size"])
     require(size >= LEAST, "data.size", f"{LEAST} pixels or more with split={split}", size)
     for key, expected in flatten(definition(split)["data"]).items():
         text = f"{expected}, with which split={split} (version {definition(split)['version']}) is defined"
-        require(found.get(key) == expected, f"data.{key}", text, found.get(key))
+        require(given.get(key) == expected, f"data.{key}", text, given.get(key))
 
 
 def thumbnail(view: View) -> np.ndarray:
-    """The thumbnail [SIDE, SIDE, 4] uint8 of a photograph of any size."""
+    """Shrink a photograph of any size.
+
+    Args:
+        view: image and mask.
+
+    Returns:
+        [SIDE, SIDE, 4] uint8: colours and mask, each pixel the mean of its box.
+    """
     picture = Image.fromarray(np.dstack((view.image, view.mask.astype(np.uint8) * 255)), "RGBA")
     # Each band by itself: PIL would weight colours by the mask.
     bands = [band.resize((SIDE, SIDE), Image.Resampling.BOX) for band in picture.split()]
@@ -87,18 +132,25 @@ def thumbnail(view: View) -> np.ndarray:
 
 
 def check_photographs(split: str, reader: Reader) -> None:
-    """Refuse photographs that do not show the people of the definition. ``reader``: of some or all of
-    :func:`names`. InputError: names the first person whose photographs differ."""
-    made = definition(split)
+    """Refuse photographs that do not show the people of the definition.
+
+    Args:
+        split: one of ``SPLITS``.
+        reader: of some or all of :func:`names`.
+
+    Raises:
+        InputError: names the first person whose photographs differ.
+    """
+    defined = definition(split)
     known = dict(zip(names(split), thumbnails(split), strict=True))
     for name in reader.subjects:
         for position, expected in zip(POSITIONS, known[name], strict=True):
             view = reader.read_view(name, position, RING_VIEW, depth=False)
             difference = float(np.sqrt(np.square(thumbnail(view).astype(float) - expected).mean()))
-            tolerance = SAME_SIZE if set(view.mask.shape) == {made["size"]} else OTHER_SIZE
+            tolerance = SAME_SIZE if set(view.mask.shape) == {defined["size"]} else OTHER_SIZE
             if difference > tolerance:
                 raise InputError(
                     f"{reader.place(name, position, RING_VIEW)}: expected {name} of split={split} (version "
-                    f"{made['version']}), up to {tolerance:g} of 255 levels; found {difference:.1f} "
+                    f"{defined['version']}), up to {tolerance:g} of 255 levels; found {difference:.1f} "
                     "(this version of the package makes other people, or the cache was changed: delete it)"
                 )
