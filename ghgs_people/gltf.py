@@ -23,12 +23,20 @@ _READ = ("EXT_texture_webp", "KHR_lights_punctual", "KHR_materials_")
 
 
 def posed(path: Path) -> dict[str, Any] | None:
-    """The content of a .gltf file in which all vertices are where the file's skins, joints and weights of
-    morph targets put them, with its buffers inside; None where nothing moves them.
+    """Read a file with all vertices where its skins, joints and weights of morph targets put them.
 
-    Section 3.7.3 of the specification of glTF 2.0: a vertex of a skinned mesh is the mean, by its weights, of
-    where its joints put it, in the world of the scene. InputError: the file cannot be read, or requires an
-    extension that is not read."""
+    Section 3.7.3 of the specification of glTF 2.0: a vertex of a skinned mesh is the mean, by its weights,
+    of where its joints put it, in the world of the scene.
+
+    Args:
+        path: of a ``.gltf`` or ``.glb`` file.
+
+    Returns:
+        The content of a ``.gltf`` file with its buffers inside; None where nothing moves vertices.
+
+    Raises:
+        InputError: the file cannot be read, or requires an extension that is not read.
+    """
     try:
         tree, buffers = _read(path)
         _check_extensions(path, tree)
@@ -134,8 +142,16 @@ def _shown(tree: dict[str, Any]) -> set[int]:
 def _pose(
     tree: dict[str, Any], buffers: list[bytes], node: dict[str, Any], worlds: dict[int, np.ndarray]
 ) -> None:
-    """Give a node a mesh of its own, whose vertices are moved; a skinned one leaves its place in the scene,
-    since joints alone say where it is."""
+    """Give a node a mesh of its own, whose vertices are moved.
+
+    A skinned one leaves its place in the scene, since joints alone say where it is.
+
+    Args:
+        tree: content of the file; meshes, nodes and accessors are added.
+        buffers: of the file; those of the moved vertices are added.
+        node: of ``tree``, with a mesh; changed in place.
+        worlds: matrices [4, 4] from each node to the world, by its index.
+    """
     mesh = copy.deepcopy(tree["meshes"][node["mesh"]])
     morphs = _morphs(tree, node)
     skin = tree["skins"][node["skin"]] if "skin" in node else None
@@ -169,16 +185,26 @@ def _skinned(
     skin: dict[str, Any],
     worlds: dict[int, np.ndarray],
 ) -> np.ndarray:
-    """Vertices [n, 3] of a mesh as its joints put them in the world."""
+    """Put vertices where joints put them in the world (section 3.7.3 of the specification of glTF 2.0).
+
+    Args:
+        tree: content of the file.
+        buffers: of the file.
+        attributes: index of the accessor of each of the primitive's attributes, by name.
+        vertices: [n, 3] of the primitive, with its morph targets.
+        skin: entry of ``skins`` that names joints and their inverse matrices.
+        worlds: matrices [4, 4] from each node to the world, by its index.
+
+    Returns:
+        [n, 3] in the world.
+    """
     joints = np.stack([worlds[joint] for joint in skin["joints"]])
     if "inverseBindMatrices" in skin:
         inverse = _values(tree, buffers, skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)
         joints = joints @ inverse[: len(joints)]
     sets = range(sum(key.startswith("JOINTS_") for key in attributes))
-    chosen, weights = (
-        np.concatenate([_values(tree, buffers, attributes[f"{name}_{i}"]) for i in sets], 1)
-        for name in ("JOINTS", "WEIGHTS")
-    )
+    chosen = np.concatenate([_values(tree, buffers, attributes[f"JOINTS_{i}"]) for i in sets], 1)
+    weights = np.concatenate([_values(tree, buffers, attributes[f"WEIGHTS_{i}"]) for i in sets], 1)
     weights = weights.astype(np.float64)
     weights[weights.sum(1) <= 0, 0] = 1  # a vertex without weights goes with its first joint, as in viewers
     total = weights.sum(1, keepdims=True)
@@ -191,7 +217,19 @@ def _skinned(
 
 
 def _values(tree: dict[str, Any], buffers: list[bytes], index: int) -> np.ndarray:
-    """The array [n, columns] of an accessor."""
+    """Read an accessor (section 3.6.2 of the specification of glTF 2.0).
+
+    Args:
+        tree: content of the file.
+        buffers: of the file.
+        index: of the accessor.
+
+    Returns:
+        Array [n, columns], a view of its buffer.
+
+    Raises:
+        ValueError: the accessor is sparse.
+    """
     entry = tree["accessors"][index]
     if "sparse" in entry:
         raise ValueError("a sparse accessor of a rigged mesh")
@@ -204,7 +242,16 @@ def _values(tree: dict[str, Any], buffers: list[bytes], index: int) -> np.ndarra
 
 
 def _add(tree: dict[str, Any], buffers: list[bytes], vertices: np.ndarray) -> int:
-    """Store vertices in a buffer of their own; the index of their accessor."""
+    """Store vertices in a buffer of their own.
+
+    Args:
+        tree: content of the file, to which accessor, view and buffer are added.
+        buffers: of the file, to which the bytes are added.
+        vertices: [n, 3].
+
+    Returns:
+        Index of their accessor.
+    """
     buffers.append(vertices.astype("<f4").tobytes())
     tree["buffers"].append({})
     tree["bufferViews"].append({"buffer": len(buffers) - 1, "byteLength": len(buffers[-1])})

@@ -53,7 +53,11 @@ class Lights:
     jitter: float = 0.25  # relative variation of the strengths of the lights, 0 to below 1
 
     def draw(self, rng: np.random.Generator) -> "LightRig":
-        """Draw the lights of one person: evenly spaced in azimuth, with random elevations and strengths."""
+        """Draw the lights of one person: evenly spaced in azimuth, with random elevations and strengths.
+
+        Args:
+            rng: draws azimuth, elevations and strengths.
+        """
         azimuth = 2 * np.pi * (np.arange(self.count) + rng.uniform()) / self.count
         elevation = np.radians(self.elevation) * rng.uniform(-0.3, 1.0, self.count)
         strength = 1 + self.jitter * rng.uniform(-1, 1, self.count)
@@ -68,8 +72,14 @@ class Lights:
 
 @dataclass(frozen=True)
 class LightRig:
-    """The lights of one person. ``directions``: [l, 3] unit vectors towards the lights. ``strengths``: [l].
-    ``ambient``: brightness without them."""
+    """The lights of one person.
+
+    Args:
+        directions: [l, 3] unit vectors towards the lights.
+        strengths: [l], brightness that each adds to a surface that faces it.
+        ambient: brightness without them.
+        softness: s of the formula of :class:`Lights`, 0 to 1.
+    """
 
     directions: np.ndarray
     strengths: np.ndarray
@@ -77,7 +87,14 @@ class LightRig:
     softness: float
 
     def shade(self, normals: np.ndarray) -> np.ndarray:
-        """Brightness [n] of surfaces with unit ``normals`` [n, 3]."""
+        """Shade surfaces by the formula of :class:`Lights`.
+
+        Args:
+            normals: [n, 3] unit vectors.
+
+        Returns:
+            Brightness [n], at least 0; texture values are multiplied by it.
+        """
         cosine = normals @ self.directions.T
         soft = np.maximum((cosine + self.softness) / (1 + self.softness), 0)
         return self.ambient + soft @ self.strengths
@@ -85,8 +102,13 @@ class LightRig:
 
 @dataclass(frozen=True)
 class RenderedViews:
-    """Photographs from n cameras. ``images``: [n, h, w, 3] float32 in [0, 1], premultiplied by ``alphas``.
-    ``alphas``: [n, h, w] float32 in [0, 1]. ``depths``: [n, h, w] float32, metres, 0 where ``alphas`` are."""
+    """Photographs from n cameras.
+
+    Args:
+        images: [n, h, w, 3] float32 in [0, 1], premultiplied by ``alphas``.
+        alphas: [n, h, w] float32 in [0, 1].
+        depths: [n, h, w] float32, metres, 0 where ``alphas`` are.
+    """
 
     images: np.ndarray
     alphas: np.ndarray
@@ -99,9 +121,18 @@ class RenderedViews:
 
 
 class Studio:
-    """A person under fixed lights, photographed from any number of cameras. Surfaces are double-sided:
-    normals are flipped towards the camera. ``lights``: None leaves textures as they are. ``samples``: 1 to
-    16. InputError: the person has no faces."""
+    """A person under fixed lights, photographed from any number of cameras.
+
+    Surfaces are double-sided: normals are flipped towards the camera.
+
+    Args:
+        person: to photograph, metres.
+        lights: around the person; None leaves textures as they are.
+        samples: each pixel is the mean of samples x samples rays; 1 to 16.
+
+    Raises:
+        InputError: the person has no faces, or Embree is not installed.
+    """
 
     def __init__(self, person: Person, lights: LightRig | None, samples: int = 3) -> None:
         parts = [part for part in person.parts if len(part.faces)]
@@ -125,7 +156,17 @@ class Studio:
         meshes.TriangleMesh(self._scene, self._vertices, self._faces)
 
     def shoot(self, cameras: Cameras) -> RenderedViews:
-        """Photographs from ``cameras`` [n]. InputError: a camera is not finite or has a focal length <= 0."""
+        """Photograph the person.
+
+        Args:
+            cameras: n cameras, metres.
+
+        Returns:
+            n photographs, black where there is no person.
+
+        Raises:
+            InputError: a camera is not finite or has a focal length <= 0.
+        """
         intrinsics = cameras.intrinsics.double().numpy()
         extrinsics = cameras.extrinsics.double().numpy()
         size = (len(intrinsics), cameras.height, cameras.width)
@@ -147,7 +188,18 @@ class Studio:
     def _window(
         self, matrix: np.ndarray, pose: np.ndarray, height: int, width: int
     ) -> tuple[int, int, int, int]:
-        """The window (top, bottom, left, right) in pixels that all vertices project into."""
+        """Find the part of an image that all vertices project into.
+
+        Args:
+            matrix: intrinsics [3, 3], pixels.
+            pose: extrinsics [4, 4], world to camera, metres.
+            height: of the image, pixels.
+            width: of the image, pixels.
+
+        Returns:
+            Top, bottom, left and right in pixels; the whole image where the person is partly behind the
+            camera.
+        """
         points = self._vertices @ pose[:3, :3].T + pose[:3, 3]
         if points[:, 2].min() <= 1e-3:  # partly behind the camera: the projection has no bounds
             return 0, height, 0, width
@@ -161,7 +213,17 @@ class Studio:
     def _expose(
         self, matrix: np.ndarray, pose: np.ndarray, rows: slice, columns: slice
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Image [h, w, 3], matte [h, w] and depth [h, w] of a window."""
+        """Photograph a window of an image.
+
+        Args:
+            matrix: intrinsics [3, 3], pixels.
+            pose: extrinsics [4, 4], world to camera, metres.
+            rows: h rows of the image.
+            columns: w columns of the image.
+
+        Returns:
+            Image [h, w, 3], matte [h, w] and depth [h, w] in metres.
+        """
         n = self.samples
         h = rows.stop - rows.start
         w = columns.stop - columns.start
@@ -194,7 +256,16 @@ class Studio:
         return np.clip(image, 0, 1), alpha, np.where(alpha > 0, center, 0)
 
     def _shade(self, directions: np.ndarray, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Colours [n, 3] of hits seen along ``directions`` [n, 3]."""
+        """Colour what rays hit.
+
+        Args:
+            directions: [n, 3] of the rays.
+            face: [n] index of the face that each hits.
+            weights: [n, 3] barycentric coordinates of the hit.
+
+        Returns:
+            [n, 3] in [0, 1] where textures alone are shown; light may exceed 1.
+        """
         colors = np.empty((len(face), 3), np.float32)
         part = self._part[face]
         for k in np.unique(part):

@@ -103,7 +103,14 @@ class Rig:
     variation: Variation = STILL
 
     def yaws(self, rng: np.random.Generator) -> np.ndarray:
-        """Yaws [positions, 5] in degrees of all views of one subject."""
+        """Draw the yaws of all views of one subject.
+
+        Args:
+            rng: draws the turn of the ring, and where the views 2 and 4 stand between two ring cameras.
+
+        Returns:
+            Yaws [positions, 5] in degrees of views 0 to 4.
+        """
         step = 360.0 / self.positions
         start = rng.uniform(-self.yaw_jitter, self.yaw_jitter) + step * np.arange(self.positions)
         first, second = rng.uniform(0, 0.5, (2, self.positions))
@@ -111,7 +118,17 @@ class Rig:
         return start[:, None] + step * offsets
 
     def cameras(self, yaws: np.ndarray, height: int, width: int, poses: Poses | None = None) -> Cameras:
-        """Cameras of the ring, float32. ``yaws``: degrees, any shape."""
+        """Cameras of the ring.
+
+        Args:
+            yaws: degrees about y, any shape; 0 sees the front of a subject that faces +z.
+            height: of the images, pixels.
+            width: of the images, pixels.
+            poses: deviations of the cameras, of the shape of ``yaws``; None: none.
+
+        Returns:
+            Cameras of the shape of ``yaws``, float32, metres.
+        """
         poses = poses or Poses()
         yaw, pitch, roll = (
             np.broadcast_to(np.radians(angle), np.shape(yaws))[..., None]
@@ -140,9 +157,20 @@ class Rig:
     def drawn(
         self, person: Person, yaws: np.ndarray, aspect: float, rng: np.random.Generator
     ) -> tuple["Rig", Poses]:
-        """The rig of one subject by ``variation``, and the deviations of its cameras. ``yaws``: of all its
-        views (:meth:`yaws`). ``aspect``: width / height of the images. ``rng``: for the rig alone; the same
-        numbers are drawn whatever varies."""
+        """Draw the rig of one subject by ``variation``, and the deviations of its cameras.
+
+        Args:
+            person: the placed subject, metres.
+            yaws: degrees [positions, 5] of all its views (:meth:`yaws`).
+            aspect: width / height of the images.
+            rng: for the rig alone; the same numbers are drawn whatever varies.
+
+        Returns:
+            The rig without variation, and the deviations [positions, 5] of its cameras.
+
+        Raises:
+            InputError: ``fill`` varies and a point of the subject is behind a camera.
+        """
         v = self.variation
         share = rng.uniform(size=3)
         deviations = rng.uniform(-1, 1, (*yaws.shape, 5))
@@ -167,7 +195,19 @@ class Rig:
         return replace(rig, focal=float(min(_within(v.fill, share[2], 0.0) / tallest, 1 / reach))), poses
 
     def _extents(self, person: Person, yaws: np.ndarray, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
-        """Smallest and largest (x/z, y/z) [n, 2] of a subject in each camera."""
+        """Find what a subject takes up in the image of each camera, at focal length 1.
+
+        Args:
+            person: the placed subject, metres.
+            yaws: degrees of n views.
+            poses: deviations of their cameras.
+
+        Returns:
+            Smallest and largest (x/z, y/z) [n, 2].
+
+        Raises:
+            InputError: a point of the subject is behind a camera.
+        """
         vertices = np.concatenate([part.vertices for part in person.parts])
         low = []
         high = []
@@ -181,7 +221,18 @@ class Rig:
         return np.stack(low), np.stack(high)
 
     def place(self, person: Person, rng: np.random.Generator) -> Person:
-        """Scale and centre a person, with the feet on y = 0; the body vertices are moved, too."""
+        """Scale and centre a person, with the feet on y = 0; the body vertices are moved, too.
+
+        Args:
+            person: in any unit, y up.
+            rng: draws the height.
+
+        Returns:
+            The person in metres; at its own height and in its own unit where ``height`` is None.
+
+        Raises:
+            InputError: the person has no height.
+        """
         jitter = self.height_jitter * rng.uniform(-1, 1)
         low = np.min([part.vertices.min(0) for part in person.parts if len(part.vertices)], 0)
         high = np.max([part.vertices.max(0) for part in person.parts if len(part.vertices)], 0)

@@ -26,12 +26,23 @@ _IMAGE_SUFFIXES = (".jpeg", ".jpg", ".png")
 
 @dataclass(frozen=True)
 class ScanSource:
-    """A folder ``<folder>/<id>/<id>.obj`` (with its ``material0.jpeg``) or ``<folder>/<id>/<id>.glb``."""
+    """A folder ``<folder>/<id>/<id>.obj`` (with its ``material0.jpeg``) or ``<folder>/<id>/<id>.glb``.
+
+    Args:
+        folder: of the scans.
+    """
 
     folder: Path
 
     def names(self) -> list[str]:
-        """Ids of all scans, sorted. InputError: the folder is missing or holds no scans."""
+        """List the scans; a folder whose meshes have other names is logged.
+
+        Returns:
+            Ids, sorted.
+
+        Raises:
+            InputError: the folder is missing or holds no scans.
+        """
         require_folder(self.folder, "a folder of scans")
         folders = [p for p in self.folder.iterdir() if p.is_dir() and not p.name.startswith(".")]
         names = sorted(p.name for p in folders if _mesh_file(p) is not None)
@@ -49,8 +60,14 @@ class ScanSource:
         return names
 
     def load(self, name: str) -> Person:
-        """A scan as stored, with its ``body_vertices.npy`` if there is one. InputError: the mesh is missing
-        or unreadable, or a part has no texture."""
+        """Read a scan as stored, with its ``body_vertices.npy`` if there is one.
+
+        Args:
+            name: id of the scan.
+
+        Raises:
+            InputError: the mesh is missing or unreadable, or a part has no texture.
+        """
         folder = self.folder / name
         path = _mesh_file(folder) if folder.is_dir() else None
         if path is None:
@@ -77,8 +94,14 @@ class _Beside(trimesh.resolvers.FilePathResolver):
     """Files that a mesh names, as any system spells them: an MTL file, textures, buffers."""
 
     def get(self, key: str) -> bytes:
-        """The content of a file; one that is named with folders of another machine lies beside the mesh.
-        FileNotFoundError: there is none."""
+        """Read a file; one that is named with folders of another machine lies beside the mesh.
+
+        Args:
+            key: its name, as the mesh spells it.
+
+        Raises:
+            FileNotFoundError: there is none.
+        """
         name = str(key).strip().strip('"')
         folder = Path(self.parent)
         # Escapes of a URI, folders of another machine, and options of map_Kd, which stand before the name.
@@ -90,7 +113,14 @@ class _Beside(trimesh.resolvers.FilePathResolver):
 
 
 def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
-    """All textured meshes of a file in its world frame, where joints and morph targets put them."""
+    """Read all textured meshes of a file in its world frame, where joints and morph targets put them.
+
+    Args:
+        path: of an ``.obj``, ``.glb`` or ``.gltf`` file.
+
+    Raises:
+        InputError: the file cannot be read, has no triangles, or a mesh lacks texture or coordinates.
+    """
     kind = path.suffix.lower()[1:]
     tree = None if kind == "obj" else posed(path)
     content = path.read_bytes() if tree is None else json.dumps(tree).encode()
@@ -115,6 +145,18 @@ def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
 def _part(
     path: Path, name: str, mesh: trimesh.Trimesh, transform: np.ndarray, is_alone: bool
 ) -> TexturedMesh:
+    """Make a textured mesh of one that trimesh has read.
+
+    Args:
+        path: of the file, for messages and for images beside it.
+        name: of the mesh, for messages.
+        mesh: as read, in its own frame.
+        transform: [4, 4] from its frame to the world.
+        is_alone: whether it is the file's only mesh.
+
+    Raises:
+        InputError: texture or texture coordinates are missing, or vertices are bad.
+    """
     texture = _texture(path, getattr(mesh.visual, "material", None), is_alone)
     if texture is None:
         raise InputError(f"{path}: expected a texture for the mesh {name!r}; found none")
@@ -130,8 +172,19 @@ def _part(
 
 
 def _texture(path: Path, material: object, is_alone: bool) -> np.ndarray | None:
-    """Texture [h, w, 3] uint8 of a material, None if it has none. ``is_alone``: of the file's only mesh,
-    which may be that of an image beside it. InputError: its alpha cuts parts away."""
+    """Make a texture of a material.
+
+    Args:
+        path: of the mesh, for messages and for images beside it.
+        material: as trimesh has read it.
+        is_alone: of the file's only mesh, which may be that of an image beside it.
+
+    Returns:
+        [h, w, 3] uint8; None if the material has none.
+
+    Raises:
+        InputError: its alpha cuts parts away.
+    """
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is not None and image.format is None:  # not from a file: trimesh replaced a missing material
         image = None
