@@ -16,7 +16,14 @@ from ghgs_lit.types import Batch, DepthBounds
 
 
 def first_and_last(hits: Bool[Tensor, "*batch n"]) -> tuple[Int[Tensor, "*batch"], Int[Tensor, "*batch"]]:
-    """Index of the first and of the last True along the last axis; ``n`` and -1 where there is none."""
+    """Index of the first and of the last True along the last axis.
+
+    Args:
+        hits: any bools [..., n].
+
+    Returns:
+        Both indices [...]; ``n`` and -1 where there is no True.
+    """
     count = hits.shape[-1]
     places = constant(_from_both_ends, count, like=hits, dtype=torch.long)
     first, last = (hits[..., None, :] * places).amax(-1).unbind(-1)
@@ -32,15 +39,32 @@ def _from_both_ends(count: int, **kind: object) -> Int[Tensor, "2 n"]:
 def patches_around_subject(
     masks: Bool[Tensor, "b v H W"], patch_size: int, margin: int
 ) -> Bool[Tensor, "b v h w"]:
-    """Patches with a pixel of the subject, and those at most ``margin`` rows and columns away. The sides of
-    the masks are multiples of the patch size."""
+    """Patches with a pixel of the subject, and those at most ``margin`` rows and columns away.
+
+    Args:
+        masks: [b, v, H, W], whose sides are multiples of the patch size.
+        patch_size: side of a patch in pixels.
+        margin: in patches, 0 or more.
+
+    Returns:
+        Which patches [b, v, h, w].
+    """
     return _grown(F.max_pool2d(masks.float(), patch_size), margin)
 
 
 def patches_in_window(
     masks: Bool[Tensor, "b v H W"], patch_size: int, margin: int
 ) -> Bool[Tensor, "b v h w"]:
-    """Patches of the smallest rectangle around the subject of a view, grown by ``margin``; none if empty."""
+    """Patches of the smallest rectangle around the subject of a view, grown by ``margin``.
+
+    Args:
+        masks: [b, v, H, W], whose sides are multiples of the patch size.
+        patch_size: side of a patch in pixels.
+        margin: in patches, 0 or more.
+
+    Returns:
+        Which patches [b, v, h, w]; none of a view with an empty mask.
+    """
     touched = F.max_pool2d(masks.float(), patch_size).bool()
     rows = between(touched.any(-1))
     columns = between(touched.any(-2))
@@ -63,8 +87,16 @@ _RIM = (0.02, 0.98)
 
 
 def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Signed distance in pixels to the outline, which runs between pixel centres; positive inside. The
-    image's border is no outline; without an outline distances are infinite."""
+    """Signed distance to the outline of a mask, which runs between pixel centres.
+
+    The image's border is no outline.
+
+    Args:
+        mask: of the subject [h, w].
+
+    Returns:
+        Distances [h, w] in pixels, positive inside; infinite where the mask has no outline.
+    """
     from scipy.ndimage import distance_transform_edt  # here: a plain prediction does not need it
 
     if mask.all() or not mask.any():
@@ -73,7 +105,14 @@ def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 
 
 def soft_signed_distance(matte: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """:func:`signed_distance` with subpixel precision, from the shares of pixels that are inside."""
+    """:func:`signed_distance` with subpixel precision.
+
+    Args:
+        matte: shares of pixels that are inside [h, w], in [0, 1].
+
+    Returns:
+        Distances [h, w] in pixels, positive inside.
+    """
     from scipy.ndimage import distance_transform_edt
 
     inside = matte > 0.5
@@ -87,7 +126,15 @@ def soft_signed_distance(matte: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "
 
 
 def with_matte(batch: Batch, least: float | None) -> Batch:
-    """The batch with masks ``matte > least`` if it has a matte; None: the batch without its matte."""
+    """The batch with masks ``matte > least`` if it has a matte.
+
+    Args:
+        batch: with or without mattes.
+        least: share of a pixel above which it is in the mask, in [0, 1); None: the matte is dropped.
+
+    Returns:
+        The batch; unchanged without a matte.
+    """
     if batch.alpha is None:
         return batch
     if least is None:
@@ -108,7 +155,15 @@ def surface_colors(batch: Batch) -> Float[Tensor, "B V 3 H W"]:
 
 
 def unmultiplied(images: Tensor, alpha: Tensor) -> Tensor:
-    """Colours divided by ``alpha``, at most 1; unchanged where it is 0."""
+    """Colours divided by ``alpha``, at most 1; unchanged where it is 0.
+
+    Args:
+        images: colours that are multiplied by ``alpha``.
+        alpha: shares in [0, 1], of a shape that broadcasts with ``images``.
+
+    Returns:
+        Colours of the shape of ``images``.
+    """
     return torch.where(alpha > 0, (images / torch.where(alpha > 0, alpha, 1)).clamp(max=1), images)
 
 
@@ -127,14 +182,30 @@ BOUNDS_CHANNELS = 2
 def subject_mean(
     values: Float[Tensor, "B V H W"], masks: Bool[Tensor, "B V H W"]
 ) -> Float[Tensor, "B V 1 1"]:
-    """Mean over the subject's pixels of each view; 0 for an empty mask."""
+    """Mean over the subject's pixels of each view; 0 for an empty mask.
+
+    Args:
+        values: maps [B, V, H, W] of any unit.
+        masks: of the subject [B, V, H, W].
+
+    Returns:
+        Means [B, V, 1, 1].
+    """
     count = masks.sum((-2, -1), keepdim=True)
     return torch.where(masks, values, 0).sum((-2, -1), keepdim=True) / count.clamp(min=1)
 
 
 def relative_bounds(bounds: DepthBounds, masks: Bool[Tensor, "B V H W"]) -> Float[Tensor, "B V 2 H W"]:
-    """Two maps of the bounds that describe the shape, not the distance: ``near`` minus the mean middle of the
-    view's bounds, and ``far - near``, in units of :data:`UNIT`; 0 outside the subject."""
+    """Two maps of the bounds that describe the shape, not the distance.
+
+    Args:
+        bounds: depths in metres.
+        masks: of the subject [B, V, H, W].
+
+    Returns:
+        ``near`` minus the mean middle of the view's bounds, and ``far - near``, [B, V, 2, H, W] in units of
+        :data:`UNIT`; 0 outside the subject.
+    """
     middle = subject_mean((bounds.near + bounds.far) / 2, masks)
     maps = torch.stack((bounds.near - middle, bounds.far - bounds.near), dim=2) / UNIT
     return torch.where(masks[:, :, None], maps, 0)
@@ -143,7 +214,14 @@ def relative_bounds(bounds: DepthBounds, masks: Bool[Tensor, "B V H W"]) -> Floa
 def relative_depth(
     depth: Float[Tensor, "B V H W"], masks: Bool[Tensor, "B V H W"]
 ) -> Float[Tensor, "B V 1 H W"]:
-    """Depth minus its mean over the view's subject, in units of :data:`UNIT`, without a gradient; 0 outside
-    the masks. ``depth``: in metres."""
+    """Depth minus its mean over the view's subject, without a gradient.
+
+    Args:
+        depth: [B, V, H, W] in metres.
+        masks: of the subject [B, V, H, W].
+
+    Returns:
+        [B, V, 1, H, W] in units of :data:`UNIT`; 0 outside the masks.
+    """
     depth = depth.detach()
     return torch.where(masks, (depth - subject_mean(depth, masks)) / UNIT, 0)[:, :, None]

@@ -25,7 +25,15 @@ class Padding:
     full: tuple[int, int]
 
     def pad(self, maps: Tensor, fill: float | bool = 0) -> Tensor:
-        """Maps of the photographs [B, V, H, W, ...] with a border of ``fill``."""
+        """Maps of photographs with a border.
+
+        Args:
+            maps: [B, V, H, W, ...] of the photographs.
+            fill: value of the border.
+
+        Returns:
+            Maps [B, V, height, width, ...].
+        """
         return F.pad(maps, self._sides(maps), value=fill)
 
     def cut(self, maps: Tensor) -> Tensor:
@@ -103,7 +111,15 @@ class PaddedBatch(Batch):
 
 
 def bounds_of(stage: Callable[[Batch], DepthBounds | None], batch: Batch) -> DepthBounds | None:
-    """Bounds of all pixels, from the photographs without their border, which would look like background."""
+    """Bounds of all pixels, from the photographs without their border, which would look like background.
+
+    Args:
+        stage: gives the bounds of a batch, or None.
+        batch: padded or not.
+
+    Returns:
+        Bounds of the pixels of ``batch``; depths in a border have no meaning.
+    """
     if not isinstance(batch, PaddedBatch):
         return stage(batch)
     bounds = stage(batch.photographs)  # depths in the border have no meaning
@@ -111,8 +127,17 @@ def bounds_of(stage: Callable[[Batch], DepthBounds | None], batch: Batch) -> Dep
 
 
 def pad_to_patches(masks: Bool[Tensor, "B V H W"], multiple: int) -> Padding | None:
-    """The smallest border that makes both sides multiples, None if they are; an odd pixel goes to the bottom
-    and the right. 512 becomes 518 with 3 pixels on each side, as in the authors' release."""
+    """The smallest border that makes both sides multiples; an odd pixel goes to the bottom and the right.
+
+    512 becomes 518 with 3 pixels on each side, as in the authors' release.
+
+    Args:
+        masks: [B, V, H, W], of which the size is read.
+        multiple: side of a patch in pixels.
+
+    Returns:
+        The border; None if both sides are multiples.
+    """
     height, width = masks.shape[2:]
     missing = (-height % multiple, -width % multiple)
     if missing == (0, 0):

@@ -18,12 +18,30 @@ def at_least_float32(tensor: Tensor) -> Tensor:
 
 
 def pixel_centers(height: int, width: int, like: Tensor) -> Float[Tensor, "h w 2"]:
-    """Centres ``(u, v)`` of the pixels of an image, with the device and dtype of ``like``."""
+    """Centres ``(u, v)`` of the pixels of an image.
+
+    Args:
+        height: of the image in pixels, as is the next.
+        width: of the image.
+        like: has the device and the dtype.
+
+    Returns:
+        [h, w, 2], never to be changed (:func:`ghgs_lit.geometry.constants.constant`).
+    """
     return homogeneous_centers(height, width, like)[..., :2]
 
 
 def homogeneous_centers(height: int, width: int, like: Tensor) -> Float[Tensor, "h w 3"]:
-    """Centres ``(u, v, 1)`` of the pixels of an image, with the device and dtype of ``like``."""
+    """Centres ``(u, v, 1)`` of the pixels of an image.
+
+    Args:
+        height: of the image in pixels, as is the next.
+        width: of the image.
+        like: has the device and the dtype.
+
+    Returns:
+        [h, w, 3], never to be changed (:func:`ghgs_lit.geometry.constants.constant`).
+    """
     return constant(_centers, height, width, like=like)
 
 
@@ -33,7 +51,14 @@ def _centers(height: int, width: int, **kind: object) -> Tensor:
 
 
 def inverse_intrinsics(intrinsics: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """``K^-1`` by substitution, for an upper triangular K (a skew is allowed)."""
+    """``K^-1`` by substitution.
+
+    Args:
+        intrinsics: upper triangular matrices K [..., 3, 3] in pixels; a skew is allowed.
+
+    Returns:
+        Matrices [..., 3, 3], float32 or wider.
+    """
     intrinsics = at_least_float32(intrinsics)
     identity = constant(torch.eye, 3, like=intrinsics)
     return torch.linalg.solve_triangular(intrinsics, identity.expand_as(intrinsics), upper=True)
@@ -45,7 +70,17 @@ def unproject(
     intrinsics: Float[Tensor, "*#batch 3 3"],
     extrinsics: Float[Tensor, "*#batch 4 4"],
 ) -> Float[Tensor, "*batch 3"]:
-    """World points of pixels ``(u, v)`` at z-depth ``depth``: ``R^T (z K^-1 [u v 1]^T - t)``."""
+    """World points of pixels at given depths: ``R^T (z K^-1 [u v 1]^T - t)``.
+
+    Args:
+        pixels: ``(u, v)`` [..., 2].
+        depth: z in the camera [...], in the unit of the world.
+        intrinsics: K, upper triangular (a skew is allowed) [..., 3, 3], in pixels.
+        extrinsics: world to camera [..., 4, 4].
+
+    Returns:
+        Points [..., 3], float32 or wider.
+    """
     pixels, depth, intrinsics, extrinsics = map(at_least_float32, (pixels, depth, intrinsics, extrinsics))
     if depth.device.type != "cpu":
         return _unproject_in_few_steps(pixels, depth, intrinsics, extrinsics)
@@ -66,7 +101,17 @@ def unproject(
 
 
 def _unproject_in_few_steps(pixels: Tensor, depth: Tensor, intrinsics: Tensor, extrinsics: Tensor) -> Tensor:
-    """:func:`unproject` in fewer launches of a GPU, with more temporaries."""
+    """:func:`unproject` in fewer launches of a GPU, with more temporaries.
+
+    Args:
+        pixels: as for :func:`unproject`, but float32 or wider, as are the next.
+        depth: z in the camera.
+        intrinsics: K.
+        extrinsics: world to camera.
+
+    Returns:
+        Points [..., 3].
+    """
     offset = pixels - intrinsics[..., :2, 2]
     y = offset[..., 1] / intrinsics[..., 1, 1]
     x = (offset[..., 0] - intrinsics[..., 0, 1] * y) / intrinsics[..., 0, 0]
@@ -78,7 +123,16 @@ def _unproject_in_few_steps(pixels: Tensor, depth: Tensor, intrinsics: Tensor, e
 def unproject_maps(
     depth: Float[Tensor, "*batch h w"], cameras: Cameras, pixels: Float[Tensor, "*batch h w 2"] | None = None
 ) -> Float[Tensor, "*batch h w 3"]:
-    """World points of a depth map in metres at ``pixels``; None: at the centres of all pixels."""
+    """World points of a depth map.
+
+    Args:
+        depth: z in the camera [..., h, w], in the unit of the world.
+        cameras: with the leading dimensions of ``depth``.
+        pixels: where the depths are [..., h, w, 2]; None: at the centres of all pixels.
+
+    Returns:
+        Points [..., h, w, 3], float32 or wider.
+    """
     if pixels is None:
         centers = pixel_centers(cameras.height, cameras.width, at_least_float32(depth))
         pixels = centers.expand(*depth.shape, 2)
@@ -94,7 +148,15 @@ def focal_lengths(cameras: Cameras) -> Float[Tensor, "*batch 2"]:
 def world_to_camera(
     points: Float[Tensor, "*batch 3"], extrinsics: Float[Tensor, "*#batch 4 4"]
 ) -> Float[Tensor, "*batch 3"]:
-    """World points in camera axes, ``R x + t``."""
+    """World points in camera axes, ``R x + t``.
+
+    Args:
+        points: [..., 3] in the world.
+        extrinsics: world to camera [..., 4, 4].
+
+    Returns:
+        Points [..., 3], float32 or wider; their third coordinate is the depth.
+    """
     return _camera_axes(points, extrinsics).movedim(0, -1).contiguous()
 
 
@@ -124,7 +186,16 @@ def project(
     intrinsics: Float[Tensor, "*#batch 3 3"],
     extrinsics: Float[Tensor, "*#batch 4 4"],
 ) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
-    """Pixels ``(u, v)`` and z-depth of world points; pixels of points with z <= 0 are meaningless."""
+    """Pixels and depths of world points.
+
+    Args:
+        points: [..., 3] in the world.
+        intrinsics: K, upper triangular [..., 3, 3], in pixels.
+        extrinsics: world to camera [..., 4, 4].
+
+    Returns:
+        Pixels ``(u, v)`` [..., 2], which are meaningless where z <= 0, and depths z [...].
+    """
     inside = _camera_axes(points, extrinsics)
     z = inside[2]
     seen = inside[:2] / torch.where(z > 0, z, torch.ones_like(z))
@@ -133,8 +204,14 @@ def project(
 
 
 def look_at_point(cameras: Cameras) -> Tensor:
-    """The world point [3] nearest to all optical axes of ``cameras`` [V] (least squares), float64; for
-    parallel axes, the solution nearest to the mean position of the cameras."""
+    """The world point nearest to all optical axes (least squares).
+
+    Args:
+        cameras: V cameras.
+
+    Returns:
+        Point [3], float64; for parallel axes, the solution nearest to the mean position of the cameras.
+    """
     forward = cameras.extrinsics[:, 2, :3].double()
     centers = cameras.centers.double()
     middle = centers.mean(0)
@@ -146,8 +223,17 @@ def look_at_point(cameras: Cameras) -> Tensor:
 def sample(
     maps: Float[Tensor, "m c H W"], image: Int[Tensor, "*n"], pixels: Float[Tensor, "*n 2"]
 ) -> Float[Tensor, "*n c"]:
-    """Bilinear values of the maps ``image`` at ``pixels`` (u, v); 0 outside. All maps must be finite: by
-    rounding, the next map may enter with a tiny weight."""
+    """Bilinear values of maps at pixels of any of them.
+
+    Args:
+        maps: m maps of one size [m, c, H, W]; all must be finite: by rounding, the next map may enter with a
+            tiny weight.
+        image: number of the map of each pixel [...].
+        pixels: ``(u, v)`` [..., 2].
+
+    Returns:
+        Values [..., c]; 0 outside.
+    """
     count, _, height, width = maps.shape
     u, v = pixels.unbind(-1)
     # The maps are the layers of a volume, and pixels lie in the middle of a layer. Pixels far outside are

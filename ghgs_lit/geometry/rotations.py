@@ -12,8 +12,16 @@ from ghgs_lit.geometry.projection import at_least_float32
 
 
 def quaternion_to_matrix(quaternions: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrices of quaternions of any norm; the zero quaternion gives the identity. Quaternions are
-    first scaled by their largest component: norms of 1e-30 or 1e30 are valid."""
+    """Rotation matrices of quaternions of any norm.
+
+    Quaternions are first scaled by their largest component: norms of 1e-30 or 1e30 are valid.
+
+    Args:
+        quaternions: ``(w, x, y, z)`` [..., 4]; the zero quaternion gives the identity.
+
+    Returns:
+        Matrices [..., 3, 3], float32 or wider.
+    """
     q = at_least_float32(quaternions)
     largest = q.abs().amax(-1, keepdim=True).detach()
     is_zero = largest == 0
@@ -48,7 +56,14 @@ _TABLE_SIGNS = (
 
 
 def matrix_to_quaternion(matrices: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
-    """Unit quaternions of proper rotation matrices (Shepperd 1978)."""
+    """Unit quaternions of rotation matrices (Shepperd 1978).
+
+    Args:
+        matrices: proper rotations [..., 3, 3].
+
+    Returns:
+        ``(w, x, y, z)`` [..., 4].
+    """
     numbers = F.pad(matrices.flatten(-2), (1, 0), value=1.0)
     table = _signed(numbers, _TABLE, _TABLE_SIGNS).sum(-1).unflatten(-1, (4, 4))
     best = table.diagonal(dim1=-2, dim2=-1).argmax(-1)
@@ -66,7 +81,15 @@ def _signed(numbers: Float[Tensor, "*batch n"], places: tuple, signs: tuple) -> 
 def rotate(
     quaternions: Float[Tensor, "*batch 4"], vectors: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 3"]:
-    """Vectors rotated by unit quaternions, in a fifth of the time of a product with matrices."""
+    """Vectors rotated by quaternions, in a fifth of the time of a product with matrices.
+
+    Args:
+        quaternions: ``(w, x, y, z)`` of norm 1 [..., 4].
+        vectors: [..., 3].
+
+    Returns:
+        Vectors [..., 3].
+    """
     axis = quaternions[..., 1:]
     twice = 2 * torch.linalg.cross(axis, vectors)
     return vectors + quaternions[..., :1] * twice + torch.linalg.cross(axis, twice)
@@ -81,14 +104,31 @@ _FACTOR_SIGNS = ((1, 1, -1, 1), (1, -1, 1, 1), (1, 1, 1, -1), (1, -1, -1, -1))
 def multiply_quaternions(
     first: Float[Tensor, "*#batch 4"], second: Float[Tensor, "*#batch 4"]
 ) -> Float[Tensor, "*batch 4"]:
-    """The products ``first second``: rotate by ``second``, then by ``first``; norms are multiplied."""
+    """The products ``first second``: rotate by ``second``, then by ``first``.
+
+    Args:
+        first: ``(w, x, y, z)`` [..., 4] of any norm.
+        second: the same.
+
+    Returns:
+        Quaternions [..., 4], whose norms are the products of the norms.
+    """
     return (first[..., None, :] * _signed(second, _FACTORS, _FACTOR_SIGNS)).sum(-1).flip(-1)
 
 
 def unit(x: Float[Tensor, "*n c"], least: float = 0.0) -> Float[Tensor, "*n c"]:
-    """``x`` divided by its length, float32 or wider; 0 stays 0, with a zero gradient. Vectors are first
-    scaled by their largest component: squares of 1e-20 vanish in float32, those of 1e20 overflow. ``least``:
-    the gradient, which grows as 1 / length, stays constant for shorter vectors."""
+    """Vectors divided by their length; 0 stays 0, with a zero gradient.
+
+    Vectors are first scaled by their largest component: squares of 1e-20 vanish in float32, those of 1e20
+    overflow.
+
+    Args:
+        x: vectors [..., c].
+        least: the gradient, which grows as 1 / length, stays constant for vectors shorter than this.
+
+    Returns:
+        Vectors [..., c], float32 or wider.
+    """
     x = at_least_float32(x)
     largest = torch.linalg.vector_norm(x.detach(), torch.inf, -1, keepdim=True)
     is_zero = largest == 0
@@ -112,9 +152,17 @@ _ALONG = 0.01
 def without_common(
     motions: Float[Tensor, "*b V 6"], axes: Float[Tensor, "*b V 3"]
 ) -> Float[Tensor, "*b V 6"]:
-    """Motions without their mean, and without the mean of their shifts along the optical axes. The mean of
-    the shifts leaves the least shifts across the optical axes (least squares). ``motions``: rotation vectors
-    of points, and shifts, in the world's axes. ``axes``: optical axes of the cameras."""
+    """Motions without their mean, and without the mean of their shifts along the optical axes.
+
+    The mean of the shifts leaves the least shifts across the optical axes (least squares).
+
+    Args:
+        motions: rotation vectors of points, in radians, and shifts [..., V, 6], in the world's axes.
+        axes: optical axes of the cameras [..., V, 3], unit vectors of the world.
+
+    Returns:
+        Motions [..., V, 6].
+    """
     turn, shift = motions.split(3, -1)
     turn = turn - turn.mean(-2, keepdim=True)
     across = torch.eye(3).to(axes) - (1 - _ALONG) * axes[..., :, None] * axes[..., None, :]
@@ -128,7 +176,16 @@ def without_common(
 def rigid(
     motions: Float[Tensor, "*n 6"], length: float = 1.0
 ) -> tuple[Float[Tensor, "*n 3 3"], Float[Tensor, "*n 3"]]:
-    """Rotation matrices, exact to second order in the angles of the vectors, and shifts times ``length``."""
+    """Rotations and shifts of small motions.
+
+    Args:
+        motions: rotation vectors in radians, and shifts in units of ``length``, [..., 6].
+        length: in the unit of the world.
+
+    Returns:
+        Rotation matrices [..., 3, 3], exact to second order in the angles, and shifts [..., 3] in the unit of
+        the world.
+    """
     turn, shift = motions.split(3, -1)
     return quaternion_to_matrix(torch.cat((torch.ones_like(turn[..., :1]), turn / 2), -1)), length * shift
 
@@ -136,7 +193,16 @@ def rigid(
 def motions_between(
     before: Float[Tensor, "V 4 4"], after: Float[Tensor, "V 4 4"], middle: Float[Tensor, "3"]
 ) -> Float[Tensor, "V 6"]:
-    """Small motions about ``middle`` after which ``before`` sees points as ``after`` sees them unmoved."""
+    """Small motions about ``middle`` after which ``before`` sees points as ``after`` sees them unmoved.
+
+    Args:
+        before: extrinsics [V, 4, 4].
+        after: extrinsics [V, 4, 4] that differ from them by small angles.
+        middle: point [3] of the world.
+
+    Returns:
+        Rotation vectors in radians, and shifts in the unit of the world, [V, 6].
+    """
     back = before[:, :3, :3].mT
     turn = back @ after[:, :3, :3]
     turn = (turn - turn.mT) / 2
@@ -152,7 +218,17 @@ def after_motions(
     middle: Float[Tensor, "3"],
     length: float = 1.0,
 ) -> Float[Tensor, "*n 4 4"]:
-    """Cameras that see points as ``extrinsics`` sees them after :func:`rigid` motions about ``middle``."""
+    """Cameras that see points as ``extrinsics`` sees them after :func:`rigid` motions.
+
+    Args:
+        extrinsics: world to camera [..., 4, 4].
+        motions: rotation vectors in radians, and shifts in units of ``length``, [..., 6].
+        middle: point [3] of the world that motions turn about.
+        length: in the unit of the world.
+
+    Returns:
+        Extrinsics [..., 4, 4].
+    """
     rotations, shifts = rigid(motions, length)
     moved = extrinsics.clone()
     axes = extrinsics[..., :3, :3]

@@ -37,14 +37,31 @@ class Silhouette:
         return local @ self.extrinsics[:3, :3]
 
     def depths_around(self, point: np.ndarray, reach: float, count: int) -> np.ndarray:
-        """At most ``count`` positive z-depths, up to ``reach`` in front of and behind a point [3]."""
+        """Depths along rays, evenly spaced in front of and behind a point.
+
+        Args:
+            point: [3] in the world.
+            reach: largest distance from the point's depth, in the unit of the world.
+            count: number of depths.
+
+        Returns:
+            The positive ones of ``count`` z-depths, ascending.
+        """
         middle = (self.extrinsics[:3, :3] @ point + self.extrinsics[:3, 3])[2]
         depths = middle + reach * np.linspace(-1, 1, count)
         return depths[depths > 0]
 
     def covers(self, points: np.ndarray) -> np.ndarray:
-        """Whether world points [..., 3] lie in the dilated mask; false behind the camera. Outside the frame
-        the nearest border cell counts: a mask that touches the border goes on."""
+        """Whether world points lie in the dilated mask; false behind the camera.
+
+        Outside the frame the nearest border cell counts: a mask that touches the border goes on.
+
+        Args:
+            points: [..., 3] in the world.
+
+        Returns:
+            Bools [...].
+        """
         local = points @ self.extrinsics[:3, :3].T + self.extrinsics[:3, 3]
         z = local[..., 2]
         pixels = local @ self.intrinsics.T
@@ -73,7 +90,14 @@ class HullSearch:
     wrong: float = 0.0  # share of these that may say "outside"
 
     def shares(self, silhouettes: Sequence[Silhouette]) -> list[float]:
-        """For each silhouette, the share of its cells whose rays meet the hull of the others; 0 if empty."""
+        """The share of each silhouette's cells whose rays meet the visual hull of the others.
+
+        Args:
+            silhouettes: of one subject at one instant.
+
+        Returns:
+            A share in [0, 1] for each silhouette; 0 if it is empty.
+        """
         count = len(silhouettes) if self.others is None else self.others + 1
         spread = np.unique(np.linspace(0, len(silhouettes) - 1, count).round().astype(int))
         focus, radius = subject_sphere(silhouettes)
@@ -94,9 +118,18 @@ class HullSearch:
         focus: np.ndarray,
         radius: float,
     ) -> np.ndarray:
-        """Whether [n] rays through ``cells`` [n, 2] (column, row) of ``one`` meet the hull of ``others``, of
-        which a share of :attr:`wrong` need not cover a point. ``focus``, ``radius``:
-        :func:`subject_sphere`."""
+        """Whether rays of one silhouette meet the hull of others.
+
+        Args:
+            one: the silhouette whose rays these are.
+            cells: its cells that the rays pass [n, 2] (column, row); the centre of the first is (0.5, 0.5).
+            others: the silhouettes of the hull; a share of :attr:`wrong` need not cover a point.
+            focus: the subject's middle [3] (:func:`subject_sphere`).
+            radius: of the subject, in the unit of the world.
+
+        Returns:
+            Bools [n].
+        """
         depths = one.depths_around(focus, self.reach * radius, self.depths)
         points = one.center + one.rays(cells)[:, None] * depths[:, None]
         outside = np.zeros(points.shape[:2], int)
@@ -108,7 +141,15 @@ class HullSearch:
 
 
 def hull_in_view(silhouettes: Sequence[Silhouette], index: int) -> np.ndarray:
-    """Cells [h, w] bool of one silhouette that show the visual hull of the others."""
+    """Cells of one silhouette that show the visual hull of the others.
+
+    Args:
+        silhouettes: of one subject at one instant.
+        index: number of the one.
+
+    Returns:
+        Bools [h, w].
+    """
     one = silhouettes[index]
     rows, columns = np.indices(one.mask.shape)
     cells = np.stack((columns.ravel(), rows.ravel()), -1) + 0.5

@@ -11,10 +11,20 @@ _STEP = 8
 def undistorting_grid(
     intrinsics: np.ndarray, distortion: np.ndarray, height: int, width: int, fisheye: bool = False
 ) -> torch.Tensor:
-    """Positions in the photograph of the pixels of the undistorted image: [1, h, w, 2] float32 for
-    ``grid_sample`` with ``align_corners=False``. ``intrinsics``: [3, 3], also of the undistorted image.
-    ``distortion``: k1 k2 p1 p2 and up to ten more of OpenCV's model; with ``fisheye`` Kannala-Brandt's k1 to
-    k4."""
+    """Where the pixels of the undistorted image are in the photograph.
+
+    The formulas are those of OpenCV's camera model and of its fisheye model (Kannala and Brandt, PAMI 2006).
+
+    Args:
+        intrinsics: K [3, 3] in pixels, also of the undistorted image.
+        distortion: k1 k2 p1 p2 and up to ten more of OpenCV's model; with ``fisheye`` k1 to k4.
+        height: of both images in pixels.
+        width: of both images in pixels.
+        fisheye: whether the coefficients are those of the fisheye model.
+
+    Returns:
+        Positions [1, h, w, 2] float32 for ``grid_sample`` with ``align_corners=False``.
+    """
     # Here: importing kornia takes longer than reading photographs without distortion.
     from kornia.geometry.calibration import distort_points
     from kornia.geometry.camera.distortion_kannala_brandt import distort_points_kannala_brandt
@@ -40,7 +50,16 @@ def undistorting_grid(
 
 
 def undistort(image: np.ndarray, matte: np.ndarray, grid: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Resample an image and its matte ([h, w] uint8) bilinearly; 0 outside the photograph."""
+    """Resample an image and its matte bilinearly.
+
+    Args:
+        image: [h, w, 3] uint8.
+        matte: [h, w] uint8.
+        grid: of :func:`undistorting_grid`.
+
+    Returns:
+        Image and matte, uint8; 0 outside the photograph.
+    """
     layers = np.concatenate((image, matte[..., None]), -1)
     stacked = torch.from_numpy(layers).permute(2, 0, 1)[None].float()
     sampled = F.grid_sample(stacked, grid, mode="bilinear", padding_mode="zeros", align_corners=False)

@@ -57,7 +57,16 @@ def _release_tokens(depth_maps: DepthMaps, patch_size: int) -> tuple[Tensor, Ten
 def subject_tokens(
     depth_maps: DepthMaps, patch_size: int
 ) -> tuple[Float[Tensor, "B V h w 2"], Float[Tensor, "B V h w"], Bool[Tensor, "B V h w"]]:
-    """Mean pixel ``(u, v)`` and mean depth of the valid pixels of each patch, and whether it has any."""
+    """Where the tokens of patches lie, and how far: means over the valid pixels of each patch.
+
+    Args:
+        depth_maps: with sides that are multiples of the patch size.
+        patch_size: side of a patch in pixels.
+
+    Returns:
+        Mean pixels ``(u, v)`` [B, V, h, w, 2], mean depths [B, V, h, w], and whether a patch has valid pixels
+        [B, V, h, w]; without any, means are those of all its pixels.
+    """
     depth = at_least_float32(depth_maps.depth)
     valid = depth_maps.valid
     centers = pixel_centers(*depth.shape[-2:], depth).permute(2, 0, 1)
@@ -78,8 +87,14 @@ def subject_tokens(
 
 
 def seen_surfaces(batch: Batch) -> list[Float[Tensor, "_ 3"]]:
-    """Points of the true surface of each element in the world, in metres: one for each of the subject's input
-    pixels whose depth is known (``batch.depths``, which must be there)."""
+    """Points of the true surface: one for each of the subject's input pixels whose depth is known.
+
+    Args:
+        batch: with ``depths``.
+
+    Returns:
+        For each element, points [_, 3] in the world, in metres.
+    """
     points = unproject_maps(batch.depths, batch.cameras)
     known = batch.masks & (batch.depths > 0)
     return [own[seen] for own, seen in zip(points, known, strict=True)]
