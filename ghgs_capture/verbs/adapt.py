@@ -12,7 +12,15 @@ from ghgs_capture.calibration import calibrate
 from ghgs_capture.export.maps import camera_entry
 from ghgs_capture.formats import read_cameras
 from ghgs_capture.verbs.photographs import capture_folder
-from ghgs_lit.cli.inputs import build_data, build_renderer, choices, load_model, model_of, pick_device, said
+from ghgs_lit.cli.inputs import (
+    build_data,
+    build_renderer,
+    choices,
+    given_keys,
+    load_model,
+    model_of,
+    pick_device,
+)
 from ghgs_lit.cli.runtime import announce, files_to_write, output_dir
 from ghgs_lit.cli.train import run_job, train
 from ghgs_lit.config import compose, resolve
@@ -78,7 +86,7 @@ def with_rig(config: dict[str, Any]) -> dict[str, Any]:
         fill = _fill_of([p.mask for p in photographs])
     count = len(entries)
     require(2 <= count <= 8, "cameras", "2 to 8 cameras, those of the photographs in images=", count)
-    trained = config["views"]["training_counts"] if "views.training_counts" in said() else [count]
+    trained = config["views"]["training_counts"] if "views.training_counts" in given_keys() else [count]
     views = {**config["views"], "training_counts": trained, "evaluation_count": count}
     return {
         **config,
@@ -90,7 +98,7 @@ def with_rig(config: dict[str, Any]) -> dict[str, Any]:
 
 def _more_people(data: dict[str, Any], minutes: float) -> dict[str, dict[str, int]]:
     """Numbers of people of each kind, as many more to train on as ``minutes`` exceed three."""
-    kinds = [k for k in ("people", "active") if {f"data.{k}", f"data.{k}.train"}.isdisjoint(said())]
+    kinds = [k for k in ("people", "active") if {f"data.{k}", f"data.{k}.train"}.isdisjoint(given_keys())]
     return {k: {**data[k], "train": round(data[k]["train"] * max(1, minutes / _MINUTES))} for k in kinds}
 
 

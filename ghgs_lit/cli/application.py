@@ -30,7 +30,13 @@ check_outside_files()
 
 
 def discard_unused(directory: Path, verb: str, since: float) -> None:
-    """Remove a run's directory that holds nothing but start-up files written after ``since``."""
+    """Remove a run's directory that holds nothing but files of a start.
+
+    Args:
+        directory: the run's.
+        verb: name of the verb, which its log has.
+        since: time of the start in seconds since the epoch; older files are not removed.
+    """
     RunDirectory(directory).discard({".hydra", f"{verb}.log"}, since)
 
 
@@ -39,8 +45,15 @@ _WRITTEN_IN_PLACE = (".hydra", "csv", "init_from.txt", "sessions.jsonl", "tensor
 
 
 def write_hydra_files(cfg: DictConfig, directory: Path) -> None:
-    """Write ``.hydra`` as Hydra does, but whole and through no link. InputError: a file that will be written
-    in place is a link."""
+    """Write ``.hydra`` as Hydra does, but whole and through no link.
+
+    Args:
+        cfg: the configuration that Hydra composed.
+        directory: the run's.
+
+    Raises:
+        InputError: a file that will be written in place is a link.
+    """
     require_no_links(directory, (*_WRITTEN_IN_PLACE, f"{HydraConfig.get().job.name}.log"))
     hydra_config = HydraConfig.instance().cfg
     contents = {"config": cfg, "hydra": hydra_config, "overrides": hydra_config.hydra.overrides.task}
@@ -50,7 +63,14 @@ def write_hydra_files(cfg: DictConfig, directory: Path) -> None:
 
 @dataclass(frozen=True)
 class Verb:
-    """Task function of a verb, which Hydra calls here or in a launcher's processes."""
+    """Task function of a verb, which Hydra calls here or in a launcher's processes.
+
+    Attributes:
+        name: of the verb.
+        argv: words of the command, program and verb first.
+        wants_trace: whether errors keep their traceback.
+        started: time of the start in seconds since the epoch.
+    """
 
     name: str
     argv: tuple[str, ...]
@@ -58,6 +78,17 @@ class Verb:
     started: float = field(default_factory=time.time)
 
     def __call__(self, cfg: DictConfig) -> object:
+        """Check the configuration and do the work of the verb.
+
+        Args:
+            cfg: the configuration that Hydra composed.
+
+        Returns:
+            What the verb returns.
+
+        Raises:
+            SystemExit: bad input, outside of a sweep; its message is printed.
+        """
         # Lightning runs sys.argv again for the other processes of a DDP job; it must contain the verb.
         sys.argv = list(self.argv)
         try:
@@ -85,8 +116,15 @@ class Verb:
 
 
 def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
-    """Rewrite arguments for Hydra: ``data.*`` keys are forced where the data comes from a checkpoint, and
-    ``sweep=<file>`` sets the mode, which Hydra 1.4 needs before it composes."""
+    """Rewrite arguments for Hydra.
+
+    ``data.*`` keys are forced where the data comes from a checkpoint, and ``sweep=<file>`` sets
+    the mode, which Hydra 1.4 needs before it composes.
+
+    Args:
+        verb: name of the verb.
+        arguments: overrides of the command line.
+    """
     sweeps = any(re.match("sweep=(?!null)", argument) for argument in arguments)
     if sweeps and not any(argument.startswith("hydra.mode=") for argument in arguments):
         return [*arguments, "hydra.mode=MULTIRUN"]
@@ -97,6 +135,16 @@ def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
 
 
 def _help(verb: str, words: list[str], folder: str | None) -> int:
+    """Print the help of the verb, or of the groups that were named.
+
+    Args:
+        verb: name of the verb.
+        words: overrides of the command line; those without ``=`` are groups.
+        folder: of ``--config-dir``.
+
+    Returns:
+        The exit code.
+    """
     from ghgs_lit.cli.help import print_group, print_verb
 
     folders = [] if folder is None else [Path(folder)]
@@ -109,14 +157,24 @@ def _help(verb: str, words: list[str], folder: str | None) -> int:
 
 
 def run(verb: str, argv: list[str]) -> int:
+    """Run a verb as a Hydra application; errors and interruptions are printed in one line.
+
+    Args:
+        verb: name of a verb.
+        argv: words of the command, program and verb first.
+
+    Returns:
+        The exit code. 0; 1: bad input; 2: bad usage; 128 + number of a signal: interrupted, such as
+        130 by Ctrl-C, or the reader of the output is gone.
+    """
     # With this variable Hydra raises errors, which are handled below, instead of printing them.
     wants_trace = os.environ.get("HYDRA_FULL_ERROR") == "1"
     os.environ["HYDRA_FULL_ERROR"] = "1"
     task = Verb(verb, tuple(argv), wants_trace)
     try:
-        flags, overrides, found = messages.parsed(argv[2:])
-        if found.help:
-            return _help(verb, overrides, found.config_dir)
+        flags, overrides, values = messages.parsed(argv[2:])
+        if values.help:
+            return _help(verb, overrides, values.config_dir)
         sys.argv = [argv[0], *flags, messages.NO_FILES_OF_HYDRA, *_for_hydra(verb, overrides)]
         messages.check_deletions(overrides)
         store_defaults(verb)

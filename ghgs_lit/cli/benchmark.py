@@ -31,7 +31,16 @@ if TYPE_CHECKING:
 
 
 def run(options: "Benchmark", cfg: DictConfig) -> None:
-    """Run the verb. Exit code 1 if a preset exceeds its error budget."""
+    """Measure the presets, print the tables and write them.
+
+    Args:
+        options: keys of the verb.
+        cfg: the whole configuration that Hydra composed.
+
+    Raises:
+        InputError: the configuration, a checkpoint or the data is wrong.
+        SystemExit: code 1: a preset exceeds its error budget.
+    """
     directory = output_dir()
     config = save_config(with_trained_data(cfg), directory)
     check_options(config, overrides())
@@ -46,13 +55,21 @@ def run(options: "Benchmark", cfg: DictConfig) -> None:
     source = provenance(config, seed=options.seed, verb="benchmark", choices=choices())
     announce(report.write_numbers(directory, {**content, "provenance": source}, tables))
     if content["broken"]:
-        for said in content["broken"]:
-            print(f"ghgs benchmark: {said}", file=sys.stderr)
+        for line in content["broken"]:
+            print(f"ghgs benchmark: {line}", file=sys.stderr)
         raise SystemExit(1)
 
 
 def check_options(config: Mapping[str, Any], given: Sequence[str]) -> None:
-    """Refuse ``given`` overrides of the model beside a checkpoint, which brings its own model."""
+    """Refuse options of the model beside a checkpoint, which brings its own model.
+
+    Args:
+        config: the whole configuration as plain data.
+        given: overrides of the command line.
+
+    Raises:
+        InputError: names the first such key.
+    """
     if config["checkpoint"] is None:
         return
     for key in (text.split("=", 1)[0].lstrip("+~") for text in given):
@@ -65,8 +82,16 @@ _APPLIED = ("skip", "renderer", "precision")
 
 
 def configured_cases(config: Mapping[str, Any], device: torch.device) -> list[Case]:
-    """The model in every preset, always including the yardstick. Raises what :func:`read_checkpoint` and
-    :func:`cases_of` raise."""
+    """The model in every preset, always including the yardstick.
+
+    Args:
+        config: the whole configuration as plain data.
+        device: where the models are.
+
+    Raises:
+        FileNotFoundError: there is no such checkpoint.
+        InputError: a preset or knob does not exist, or the weights do not fit it.
+    """
     names = dict.fromkeys([YARDSTICK, *config["presets"]])
     presets = read_options("skip", list(names), config["skip"], "presets")
     path = config["checkpoint"]
@@ -78,6 +103,22 @@ def configured_cases(config: Mapping[str, Any], device: torch.device) -> list[Ca
 def _presets(
     cases: list[Case], options: "Benchmark", config: dict[str, Any], device: torch.device
 ) -> dict[str, Any]:
+    """Measure cases on the first subjects of the split.
+
+    Args:
+        cases: the yardstick first.
+        options: keys of the verb.
+        config: the whole configuration as plain data.
+        device: where the models are.
+
+    Returns:
+        Content of ``benchmark.json`` without machine and provenance: ``about``, ``random_weights``,
+        ``rows`` (:func:`report.rows_of`), ``broken`` budgets, ``decisions`` of ``skip=auto``, and
+        ``subjects``: the metrics of every picture.
+
+    Raises:
+        InputError: the data has no target photographs, or is wrong.
+    """
     data = build_data(config)
     data.prepare_data([options.split])
     loader = data.evaluation_loader(split=options.split)
@@ -94,15 +135,16 @@ def _presets(
     weights = options.checkpoint or f"{choices().get('encoder', 'encoder')}, random weights"
     weights = f"{weights} ({number:.1f} M parameters, precision {options.precision})"
     photographs = f"{subjects} subjects of {data.dataset.name}, {views} views of {height} x {width}"
+    decisions = []
+    for record in records:
+        auto = record.case.model.auto
+        if auto is not None:
+            decisions.append(f"{record.case.label}: {auto.report(decisions_of(record.metrics))}")
     return {
         "about": f"{weights}; {photographs}",
         "random_weights": options.checkpoint is None,
         "rows": rows,
         "broken": report.broken_budgets(rows),
-        "decisions": [
-            f"{record.case.label}: {record.case.model.auto.report(decisions_of(record.metrics))}"
-            for record in records
-            if record.case.model.auto is not None
-        ],
+        "decisions": decisions,
         "subjects": [row for record in records for row in record.metrics],
     }

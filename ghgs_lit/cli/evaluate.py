@@ -27,7 +27,20 @@ if TYPE_CHECKING:
 def trained_method(
     options: "Evaluate", config: Mapping[str, Any], device: torch.device
 ) -> tuple[ModelMethod, dict[str, Any]]:
-    """The model of a checkpoint with the chosen refinement, and facts about it."""
+    """The model of a checkpoint with the chosen refinement, and facts about it.
+
+    Args:
+        options: keys of the verb, with a checkpoint.
+        config: the whole configuration as plain data, with the checkpoint's model.
+        device: where the model runs.
+
+    Returns:
+        The method, and provenance for ``metrics.json``: ``checkpoint_config``, ``model_config``,
+        ``parameters`` and, where it is known, ``training``.
+
+    Raises:
+        InputError: the weights do not fit, or the renderer does not run on ``device``.
+    """
     renderer = inputs.build_renderer(config, device)
     model = inputs.load_model(config, device)
     checkpoint = read_checkpoint(options.checkpoint)
@@ -47,7 +60,16 @@ def trained_method(
 def baselines_of(
     names: str | Sequence[str], config: Mapping[str, Any], device: torch.device
 ) -> dict[str, Method]:
-    """Baselines by name; ``names`` may be one name or ``all``."""
+    """Baselines by name.
+
+    Args:
+        names: one name, several, or ``all``.
+        config: the whole configuration as plain data.
+        device: where they run.
+
+    Raises:
+        InputError: there is no such baseline, or the renderer does not run on ``device``.
+    """
     names = BASELINES if names == "all" else [names] if isinstance(names, str) else names
     renderer = inputs.build_renderer(config, device)
 
@@ -60,23 +82,36 @@ def baselines_of(
 def _methods(
     options: "Evaluate", config: dict[str, Any], device: Any
 ) -> tuple[dict[str, Method], dict[str, Any]]:
+    """The methods to measure by name, and facts about the model.
+
+    Raises:
+        InputError: there is neither checkpoint nor baseline, or ``skip.every`` is not 1.
+    """
     path = options.checkpoint
     if path is None and not options.baselines:
         raise InputError("checkpoint: expected a checkpoint or baselines=[...]; found neither")
     methods: dict[str, Method] = {}
     facts: dict[str, Any] = {"checkpoint": path}
     if path is not None:
-        methods["model"], found = trained_method(options, config, device)
+        methods["model"], model_facts = trained_method(options, config, device)
         model = methods["model"].model
         expected = "1: ghgs evaluate measures each subject by itself (skip=temporal is of ghgs predict)"
         require(model.skip.every == 1, "skip.every", expected, model.skip.every)
-        facts |= found
+        facts |= model_facts
     methods |= baselines_of(options.baselines, config, device)
     return methods, facts
 
 
 def run(options: "Evaluate", cfg: DictConfig) -> None:
-    """Run the verb."""
+    """Measure a checkpoint, baselines or both, and write the results.
+
+    Args:
+        options: keys of the verb.
+        cfg: the whole configuration that Hydra composed.
+
+    Raises:
+        InputError: the configuration, a checkpoint or the data is wrong.
+    """
     directory = output_dir()
     config = inputs.with_chosen_targets(resolve(inputs.with_trained_data(cfg)))
     if options.checkpoint is not None:

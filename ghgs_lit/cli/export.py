@@ -24,7 +24,15 @@ _PATCHES = 8  # along each side of the photographs on which two models are compa
 
 @torch.no_grad()
 def parity(checkpoint: str, exported: str) -> dict[str, float]:
-    """Differences between the predictions of two checkpoints for photographs of a noisy ellipsoid."""
+    """Differences between the predictions of two checkpoints for photographs of a noisy ellipsoid.
+
+    Args:
+        checkpoint: what the other one is compared with.
+        exported: the other one.
+
+    Returns:
+        As :func:`ghgs_lit.diagnostics.benchmark.measure.differences`.
+    """
     results = []
     batch = None
     for path in (exported, checkpoint):  # one model in memory at a time
@@ -38,7 +46,15 @@ def parity(checkpoint: str, exported: str) -> dict[str, float]:
 
 
 def run(options: "Export", cfg: DictConfig) -> None:
-    """Run the verb."""
+    """Write the files that were asked for, and print how they differ from the checkpoint.
+
+    Args:
+        options: keys of the verb.
+        cfg: the whole configuration that Hydra composed.
+
+    Raises:
+        InputError: no file is asked for, one exists, or the checkpoint is wrong.
+    """
     save_config(cfg, output_dir())
     checkpoint = options.checkpoint
     keys = ("vggt", "release", "inference")
@@ -52,12 +68,13 @@ def run(options: "Export", cfg: DictConfig) -> None:
             print(f"differs from the release: {', '.join(differing)}", flush=True)
     if inference is not None:
         write_inference(checkpoint, inference, options.dtype)
-        found = parity(checkpoint, inference)
+        measured = parity(checkpoint, inference)
         sizes = (file_of(path).stat().st_size / 1e6 for path in (checkpoint, inference))
         print("{:.1f} MB to {:.1f} MB".format(*sizes), flush=True)
         print(
-            f"against the checkpoint, on an ellipsoid: {found['psnr_to_none']:.1f} dB between renders;"
-            f" largest relative difference of depth {found['depth']:.1e}, of means {found['means']:.1e}",
+            f"against the checkpoint, on an ellipsoid: {measured['psnr_to_none']:.1f} dB between renders;"
+            f" largest relative difference of depth {measured['depth']:.1e},"
+            f" of means {measured['means']:.1e}",
             flush=True,
         )
     announce(paths.popitem()[1])

@@ -21,7 +21,11 @@ _OF_MODELS = ("bounds", "depth_head", "unprojection", "recalibration", "gaussian
 
 
 def defaults_of(verb: str) -> dict[str, str | None]:
-    """Default option of each config group that a verb composes; None where there is none."""
+    """Default option of each config group that a verb composes; None where there is none.
+
+    Args:
+        verb: name of a verb, or of another file in ``conf``.
+    """
     if not (conf_dir() / f"{verb}.yaml").is_file():  # a plug-in's, with its own keys alone
         return {}
     shipped = OmegaConf.to_container(OmegaConf.load(conf_dir() / f"{verb}.yaml"))
@@ -35,11 +39,17 @@ def defaults_of(verb: str) -> dict[str, str | None]:
 
 
 def _files(group: str, folders: Sequence[Path]) -> list[Path]:
+    """Files of a group's options: those of ``conf``, then those of ``folders``, each sorted by name."""
     return [path for folder in (conf_dir(), *folders) for path in sorted((folder / group).glob("*.yaml"))]
 
 
 def print_verb(verb: str, folders: Sequence[Path] = ()) -> None:
-    """Print what a verb does, its groups and its keys; ``folders`` are those of ``--config-dir``."""
+    """Print what a verb does, its groups and its keys.
+
+    Args:
+        verb: name of a verb.
+        folders: those of ``--config-dir``.
+    """
     print(f"ghgs {verb} [key=value ...] [group=option ...] [-m for a sweep over comma-separated values]\n")
     about = verb_class(verb)
     print(f"{about.summary()}: {about.example}\n")
@@ -54,7 +64,16 @@ def print_verb(verb: str, folders: Sequence[Path] = ()) -> None:
 
 
 def print_group(verb: str, group: str, folders: Sequence[Path] = ()) -> None:
-    """Print the keys of a group with their meaning. InputError: the verb has no such group."""
+    """Print the keys of a group with their meaning.
+
+    Args:
+        verb: name of a verb.
+        group: name of the group.
+        folders: those of ``--config-dir``.
+
+    Raises:
+        InputError: the verb has no such group.
+    """
     known = [*defaults_of(verb), *(name for name in compose(verb) if name in KINDS)]
     known = list(dict.fromkeys([*known, *(["rounds"] if "model" in known else [])]))
     if group not in known:

@@ -17,14 +17,26 @@ if TYPE_CHECKING:
 
 
 def empty_state(config: Mapping[str, Any], release: str | None) -> dict[str, Tensor]:
-    """Tensors that published weights fill, on the meta device: the model's, or without the authors'
-    ``release`` those of the encoder."""
+    """Tensors that published weights fill, on the meta device.
+
+    Args:
+        config: the nodes of the model as plain data.
+        release: the authors' checkpoint; None: the tensors of the encoder alone.
+    """
     state = GHGS.from_config(config, empty=True).state_dict()
     return {name: tensor for name, tensor in state.items() if release or name.startswith("encoder.")}
 
 
 def run(options: "Import", cfg: DictConfig) -> None:
-    """Run the verb."""
+    """Write the checkpoint, and print what it was made of.
+
+    Args:
+        options: keys of the verb.
+        cfg: the whole configuration that Hydra composed.
+
+    Raises:
+        InputError: the weights do not fit the model, or the file exists.
+    """
     config = save_config(cfg, output_dir())
     model = {key: config[key] for key in MODEL_NODES if key in config}
     sources = (options.vggt, options.release)

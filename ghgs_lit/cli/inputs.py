@@ -37,7 +37,14 @@ FREE += ("recalibration.neighborhood", "recalibration.similarity", "recalibratio
 
 
 def build_data(config: Mapping[str, Any]) -> "PhotographsDataModule":
-    """The configured data with its view and target protocols."""
+    """The configured data with its view and target protocols.
+
+    Args:
+        config: the whole configuration as plain data.
+
+    Raises:
+        InputError: a key is wrong, or files of the data are.
+    """
     # Every data set has cameras that can be targets; a verb without a target protocol reads none.
     targets = config.get("targets") or CAMERAS
     extra = {"views": config["views"], "targets": targets, "seed": config["seed"]}
@@ -47,7 +54,15 @@ def build_data(config: Mapping[str, Any]) -> "PhotographsDataModule":
 
 
 def build_renderer(config: Mapping[str, Any], device: torch.device) -> Renderer:
-    """The configured renderer. InputError: it does not run on ``device``."""
+    """The configured renderer.
+
+    Args:
+        config: the whole configuration as plain data.
+        device: where it will run.
+
+    Raises:
+        InputError: it does not run on ``device``.
+    """
     renderer = build(config["renderer"], "renderer")
     if (backend := getattr(renderer, "backend", None)) is not None:  # a plug-in's may have none
         resolve_backend(backend, device)
@@ -55,7 +70,16 @@ def build_renderer(config: Mapping[str, Any], device: torch.device) -> Renderer:
 
 
 def load_model(config: Mapping[str, Any], device: torch.device) -> GHGS:
-    """The model of ``config["checkpoint"]`` in evaluation mode and the configured precision."""
+    """The model of ``config["checkpoint"]`` in evaluation mode and the configured precision.
+
+    Args:
+        config: the whole configuration as plain data, with the checkpoint's model.
+        device: where the model will run.
+
+    Raises:
+        FileNotFoundError: there is no such checkpoint.
+        InputError: it is none of this package, or its weights do not fit the model.
+    """
     model = GHGS.from_config(config, empty=True)
     load_weights(model, config["checkpoint"], device=device)
     model.precision = config["precision"]
@@ -66,7 +90,15 @@ def load_model(config: Mapping[str, Any], device: torch.device) -> GHGS:
 
 
 def check_size(data: "PhotographsDataModule", model: GHGS) -> None:
-    """Check the size of photographs before any is read. InputError: a side is no multiple of the patch."""
+    """Check the size of photographs before any is read.
+
+    Args:
+        data: has the size that its photographs are cropped to.
+        model: has the size of a patch, and how it pads.
+
+    Raises:
+        InputError: a side is no multiple of the patch.
+    """
     size = data.dataset.size
     multiple = side_multiple(model.options, model.encoder.patch_size)
     expected = f"sides divisible by the patch size {multiple} (or model.pad=multiple)"
@@ -74,9 +106,17 @@ def check_size(data: "PhotographsDataModule", model: GHGS) -> None:
 
 
 def with_trained_data(cfg: DictConfig) -> DictConfig:
-    """Fill in the data that the checkpoint was trained on, unless ``data=<option>`` was chosen. Given keys
-    such as ``data.root=...`` change it; keys of the machine that trained (:data:`OF_MACHINE`) have their
-    defaults. InputError: there is no checkpoint, it stores no training data, or its folder is not here."""
+    """Fill in the data that the checkpoint was trained on, unless ``data=<option>`` was chosen.
+
+    Given keys such as ``data.root=...`` change it; keys of the machine that trained
+    (:data:`OF_MACHINE`) have their defaults.
+
+    Args:
+        cfg: the whole configuration that Hydra composed.
+
+    Raises:
+        InputError: there is no checkpoint, it stores no training data, or its folder is not here.
+    """
     if "kind" in (cfg.get("data") or {}):
         return cfg
     if cfg.checkpoint is None:
@@ -98,19 +138,31 @@ def with_trained_data(cfg: DictConfig) -> DictConfig:
 
 
 def model_of(checkpoint: str, cfg: DictConfig) -> dict[str, Any]:
-    """Model nodes of a checkpoint, with the changes of the command line. The options that a verb composes by
-    default do not count: they describe another model. InputError: a change that the weights do not allow."""
+    """Model nodes of a checkpoint, with the changes of the command line.
+
+    The options that a verb composes by default do not count: they describe another model.
+
+    Args:
+        checkpoint: path of the file, or ``shipped``.
+        cfg: the whole configuration that Hydra composed.
+
+    Returns:
+        The nodes :data:`MODEL_NODES` and ``chosen``, as far as the checkpoint has them.
+
+    Raises:
+        InputError: it is no whole model, or the weights do not allow a change.
+    """
     trained = read_config(checkpoint)
     if trained.keys() & set(STAGES) == {"encoder"}:
         hint = f"`ghgs train init_from={checkpoint}` starts from it"
         raise InputError(f"{checkpoint}: expected a whole model; found the encoder alone ({hint})")
     for stage in STAGES:
         place = f"{checkpoint}: config.{stage}"
-        found = trained.get(stage)
-        require(isinstance(found, Mapping), place, "a stage of the model", found)
+        node = trained.get(stage)
+        require(isinstance(node, Mapping), place, "a stage of the model", node)
     before = {node: trained[node] for node in (*MODEL_NODES, "chosen") if node in trained}
     after = OmegaConf.create(before)
-    for key in said():
+    for key in given_keys():
         if key == "ablation":
             _require_ablation(trained)
         if not is_below(key, MODEL_NODES):
@@ -124,6 +176,16 @@ def model_of(checkpoint: str, cfg: DictConfig) -> dict[str, Any]:
 
 
 def _require_same(trained: Mapping[str, Any], key: str, value: Any) -> None:
+    """Refuse values that differ from those the checkpoint was trained with.
+
+    Args:
+        trained: nodes of the model as plain data.
+        key: dotted key or group of an override.
+        value: what the override composes; keys of :data:`FREE` below it may differ.
+
+    Raises:
+        InputError: names the first key that differs.
+    """
     plain = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
     for name, wanted in flatten(plain, key).items():
         own = lookup(trained, name)
@@ -132,7 +194,14 @@ def _require_same(trained: Mapping[str, Any], key: str, value: Any) -> None:
 
 
 def _require_ablation(trained: Mapping[str, Any]) -> None:
-    """Refuse another ``ablation`` than the trained one; its switches can be set one by one instead."""
+    """Refuse another ``ablation`` than the trained one; its switches can be set one by one instead.
+
+    Args:
+        trained: configuration of the checkpoint as plain data.
+
+    Raises:
+        InputError: another one was chosen.
+    """
     own = ablation_of(trained)
     wanted = HydraConfig.get().runtime.choices["ablation"]
     switches = "recalibration.neighborhood=... and .similarity=... act"
@@ -140,15 +209,29 @@ def _require_ablation(trained: Mapping[str, Any]) -> None:
 
 
 def with_chosen_targets(config: dict[str, Any]) -> dict[str, Any]:
-    """Measure only the protocol of ``targets=<option>``, if given without ``evaluation.targets``."""
-    keys = said()
+    """Measure only the protocol of ``targets=<option>``, if given without ``evaluation.targets``.
+
+    Args:
+        config: the whole configuration as plain data.
+
+    Returns:
+        The configuration, with ``evaluation.targets`` where it is so; ``config`` stays as it is.
+    """
+    keys = given_keys()
     if "targets" not in keys or is_below("evaluation.targets", keys):
         return config
     return {**config, "evaluation": {**config["evaluation"], "targets": [config["targets"]["name"]]}}
 
 
 def pick_device(name: str) -> torch.device:
-    """The device called ``name``; ``auto`` is CUDA, else the CPU. InputError: there is no CUDA device."""
+    """The device of a verb.
+
+    Args:
+        name: cpu, cuda, or auto: CUDA, else the CPU.
+
+    Raises:
+        InputError: there is no CUDA device.
+    """
     there = torch.cuda.is_available()
     require(there or name != "cuda", "device", "auto or cpu on a machine without CUDA", name)
     return torch.device("cuda" if name != "cpu" and there else "cpu")
@@ -164,6 +247,6 @@ def overrides() -> list[str]:
     return list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
 
 
-def said() -> list[str]:
+def given_keys() -> list[str]:
     """Keys and groups of :func:`overrides`, in order."""
     return [part.key_or_group for part in OverridesParser.create().parse_overrides(overrides())]

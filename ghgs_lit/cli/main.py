@@ -9,6 +9,14 @@ from ghgs_lit.runtime.cores import spin_if_alone
 
 
 def _command(argv: list[str]) -> int:
+    """Run a command.
+
+    Args:
+        argv: its words, program first.
+
+    Returns:
+        The exit code, as of :func:`main`.
+    """
     if len(argv) < 2 or argv[1] in ("-h", "--help", "help"):
         from ghgs_lit.cli.usage import usage  # here: it loads pydantic
 
@@ -39,7 +47,11 @@ def _command(argv: list[str]) -> int:
 
 
 def main() -> int:
-    """The console script. Exit code 0; 1: bad input; 2: bad usage; 130, 143: interrupted."""
+    """The console script.
+
+    Returns:
+        The exit code. 0; 1: bad input; 2: bad usage; 130, 143: interrupted.
+    """
     argv = list(sys.argv)
     # Schedulers and daemons may have closed them.
     for name in ("stdout", "stderr"):

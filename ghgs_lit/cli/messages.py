@@ -35,7 +35,12 @@ _LIGHTNING = ("trainer", "callbacks", "logger")
 
 
 def one_line(error: Exception, verb: str) -> str:
-    """Message of one of ``BAD_INPUT`` or of an error inside Hydra, on one line."""
+    """Message of an error on one line.
+
+    Args:
+        error: one of :data:`BAD_INPUT`, or an error inside Hydra.
+        verb: name of the verb, whose keys are known.
+    """
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         text = _missing_option(error)
     elif isinstance(error, OverrideParseException):
@@ -89,7 +94,12 @@ def _missing_option(error: MissingConfigException) -> str:
 
 
 def _composition(error: HydraException, verb: str) -> str:
-    """Message for a key that does not exist, with the closest one, or for another error of Hydra."""
+    """Message for a key that does not exist, with the closest one, or for another error of Hydra.
+
+    Args:
+        error: of the composition.
+        verb: name of the verb, whose keys are known.
+    """
     if chosen := re.match(r"In '([^']+)': Could not override 'ablation'", str(error)):
         expected = "no choice of an ablation, which composes last (ablation=... on the command line)"
         return f"{chosen[1]}: expected {expected}; found one"
@@ -100,7 +110,15 @@ def _composition(error: HydraException, verb: str) -> str:
 
 
 def _hint(verb: str, key: str) -> str:
-    """What the user may have meant by a key that does not exist, after trying it; or an empty string."""
+    """What the user may have meant by a key that does not exist, after trying it.
+
+    Args:
+        verb: name of the verb.
+        key: a dotted key or group that it does not have.
+
+    Returns:
+        A text that begins with a space or "; "; empty: no idea, or a key of another verb.
+    """
     overrides = sys.argv[1:]
     folders = {str(path.relative_to(conf_dir())) for path in conf_dir().rglob("*") if path.is_dir()}
     chosen = [text for text in overrides if text.partition("=")[0] in folders and "," not in text]
@@ -121,7 +139,7 @@ def _hint(verb: str, key: str) -> str:
 
 
 def _keys(verb: str, overrides: Sequence[str] = ()) -> list[str]:
-    """All keys of a verb; none where it cannot be composed so."""
+    """All dotted keys of a verb with some overrides; none where it cannot be composed so."""
     try:
         return list(flatten(OmegaConf.to_container(compose(verb, overrides), resolve=False)))
     except (HydraException, OmegaConfBaseException):
@@ -129,7 +147,14 @@ def _keys(verb: str, overrides: Sequence[str] = ()) -> list[str]:
 
 
 def _can_add(verb: str, chosen: Sequence[str], key: str, override: str) -> bool:
-    """Whether the verb accepts a new key: groups know theirs, some of their values are mappings."""
+    """Whether the verb accepts a new key: groups know theirs, some of their values are mappings.
+
+    Args:
+        verb: name of the verb.
+        chosen: overrides that choose options of groups.
+        key: the dotted key.
+        override: adds the key, such as ``+data.rig.x=3``; empty: the key was not on the command line.
+    """
     if not override or (key.count(".") < 2 and not key.startswith("hydra.")):
         return False
     try:
@@ -146,8 +171,8 @@ def _system(error: OSError) -> str:
     path = error.filename2 or error.filename
     if path is None:
         path = HydraConfig.get().runtime.output_dir if HydraConfig.initialized() else Path.cwd()
-    found = error.strerror or error
-    return f"{os.fsdecode(path)}: expected a file that can be read or written; found {found}"
+    reason = error.strerror or error
+    return f"{os.fsdecode(path)}: expected a file that can be read or written; found {reason}"
 
 
 def raised_by_hydra(error: Exception) -> bool:
@@ -168,16 +193,33 @@ class _Parser(argparse.ArgumentParser):
 
 
 def parsed(arguments: Sequence[str]) -> tuple[list[str], list[str], argparse.Namespace]:
-    """Hydra's flags, which must stand before all overrides, the overrides, and the flags' values. BadUsage: a
-    flag is unknown, or lacks its value."""
+    """Split the arguments of a verb.
+
+    Args:
+        arguments: words of the command line after the verb.
+
+    Returns:
+        Hydra's flags, which must stand before all overrides; the overrides; and the flags' values.
+
+    Raises:
+        BadUsage: a flag is unknown, or lacks its value.
+    """
     parser = get_args_parser()
     parser.__class__ = _Parser
-    found = parser.parse_intermixed_args(list(arguments))
-    return [each for each in arguments if each not in found.overrides], found.overrides, found
+    values = parser.parse_intermixed_args(list(arguments))
+    flags = [word for word in arguments if word not in values.overrides]
+    return flags, values.overrides, values
 
 
 def check_deletions(arguments: Sequence[str]) -> None:
-    """Refuse to delete a key or group that the package reads (``~data.size``)."""
+    """Refuse to delete a key or group that the package reads (``~data.size``).
+
+    Args:
+        arguments: overrides of the command line.
+
+    Raises:
+        InputError: names the first such key.
+    """
     for key in (text[1:].split("=", 1)[0] for text in arguments if text.startswith("~")):
         if key in _LIGHTNING or not is_below(key, _LIGHTNING):
             raise InputError(f"{key}: expected a value (or null where it may be empty); found ~{key}")

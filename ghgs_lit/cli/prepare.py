@@ -22,7 +22,15 @@ log = logging.getLogger(__name__)
 
 
 def run(options: "Prepare", cfg: DictConfig) -> None:
-    """Run the task of the verb."""
+    """Render or check a data set.
+
+    Args:
+        options: keys of the verb.
+        cfg: the whole configuration that Hydra composed.
+
+    Raises:
+        InputError: the configuration or the data is wrong.
+    """
     data = build(cfg.data, key="data", views=cfg.views, targets=cfg.targets, seed=options.seed)
     root = resolved(data.dataset.root or ".")
     if options.task == "render":
@@ -33,14 +41,30 @@ def run(options: "Prepare", cfg: DictConfig) -> None:
 
 
 def render(data: PhotographsDataModule) -> None:
-    """Render what is missing, then check that it can be read."""
+    """Render what is missing, then check that it can be read.
+
+    Args:
+        data: its data set makes itself.
+
+    Raises:
+        InputError: what it is made of, or what is there, is wrong.
+    """
     data.dataset.make()
     for phase in PHASES:
         log.info("%s: %d subjects", phase, len(data.subjects(phase)) if data.dataset.has(phase) else 0)
 
 
 def check(data: PhotographsDataModule, folder: Path, expected: Check) -> None:
-    """Read all data once, print tables, write ``check.json`` and a contact sheet. InputError: data is bad."""
+    """Read all data once, print tables, write ``check.json`` and a contact sheet.
+
+    Args:
+        data: what is read.
+        folder: for the files.
+        expected: limits of good data.
+
+    Raises:
+        InputError: something is missing or broken.
+    """
     report = inspect(data, expected.min_iou, expected.min_agreement)
     show(report)
     announce(write(report, folder))

@@ -21,12 +21,35 @@ from ghgs_lit.training.pretext.module import Pretext, PretextModule
 
 
 def run(_: Training, cfg: DictConfig) -> float | str | None:
-    """Train the branch; return its part accuracy on validation people. Interrupted: Ctrl-C or SIGTERM."""
+    """Train the branch.
+
+    Args:
+        cfg: the whole configuration that Hydra composed.
+
+    Returns:
+        Part accuracy on validation people, 0 to 1; in a sweep ``job.BUSY`` where another process
+        works on the run.
+
+    Raises:
+        Interrupted: by Ctrl-C or SIGTERM.
+    """
     return run_job(resolve(cfg), RunDirectory(output_dir()), pretrain)
 
 
 def pretrain(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float | None:
-    """Train the branch and save it; arguments as for :func:`ghgs_lit.cli.train.train`."""
+    """Train the branch and save it.
+
+    Args:
+        config: the whole configuration as plain data.
+        directory: the run's.
+        stats: receives the ``steps`` and ``seconds`` of this training.
+
+    Returns:
+        Part accuracy on validation people, 0 to 1.
+
+    Raises:
+        InputError: the encoder has no branch, or the size of photographs is no multiple of its patch.
+    """
     # Tables of models that start from this checkpoint show this origin.
     config = {**config, "encoder": {**config["encoder"], "weights": "pretext"}}
     options = config["encoder"]["semantic"]
@@ -47,10 +70,10 @@ def pretrain(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> 
         fit(trainer, module, data, config, step, stats)
         checkpoint = directory / "checkpoints" / "last.ckpt"
         trainer.save_checkpoint(checkpoint)
-        found = trainer.validate(module, data, verbose=False)[0]["val/part_accuracy"]
+        accuracy = trainer.validate(module, data, verbose=False)[0]["val/part_accuracy"]
         if trainer.is_global_zero:
-            print(f"the nearest patch of another view shows the same part: {found:.1%}", flush=True)
+            print(f"the nearest patch of another view shows the same part: {accuracy:.1%}", flush=True)
             announce(checkpoint)
-        return found
+        return accuracy
     finally:
         loggers.close(trainer.loggers)

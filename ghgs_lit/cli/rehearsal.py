@@ -45,10 +45,10 @@ class _Rehearsed:
     """What one configuration needs.
 
     Args:
-        config: Of the run.
-        reasons: Why runs would be refused, as keys in order of appearance.
-        notes: What else they should know, likewise.
-        listed: Data and phases whose files were looked for, which several configurations share.
+        config: of the run.
+        reasons: why runs would be refused, as keys in order of appearance.
+        notes: what else they should know, likewise.
+        listed: data and phases whose files were looked for, which several configurations share.
     """
 
     def __init__(
@@ -64,7 +64,13 @@ class _Rehearsed:
         self.listed = listed
 
     def attempt(self, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-        """The result of a call; None where it refuses its input, which is noted."""
+        """The result of a call; None where it refuses its input, which is noted.
+
+        Args:
+            function: raises InputError or OSError where it refuses.
+            *arguments: of the call.
+            **named: of the call.
+        """
         try:
             return function(*arguments, **named)
         except (InputError, OSError) as error:
@@ -72,8 +78,14 @@ class _Rehearsed:
             return None
 
     def check(self, folder: Path) -> "PhotographsDataModule | None":
-        """Check everything but the step; the data, if it can be trained on. ``folder``: for files of
-        loggers."""
+        """Check everything but the step.
+
+        Args:
+            folder: for files of loggers.
+
+        Returns:
+            The data, if it can be trained on.
+        """
         config = self.config
         self.attempt(job.check_config, config)
         model = self.attempt(GHGS.from_config, config, empty=True)
@@ -94,6 +106,15 @@ class _Rehearsed:
         return data if data is not None and self._check_data(data, model) else None
 
     def _check_data(self, data: "PhotographsDataModule", model: GHGS | None) -> bool:
+        """Note what is missing of the data.
+
+        Args:
+            data: as configured.
+            model: whose patches photographs must fit; None: it was refused.
+
+        Returns:
+            Whether a step can be trained on it now: nothing is missing, and nothing must be rendered.
+        """
         if model is not None:
             self.attempt(check_size, data, model)
         split = self.config["evaluation"]["split"]
@@ -138,7 +159,15 @@ class _Rehearsed:
             self._lacks_body(data, bodies[0])
 
     def step_seconds(self, data: "PhotographsDataModule", folder: Path) -> float | None:
-        """Seconds of a training step of one process, which reads its own photographs."""
+        """Time of a training step of one process, which reads its own photographs.
+
+        Args:
+            data: complete.
+            folder: for files of the Trainer.
+
+        Returns:
+            Seconds; None: the training refuses its input, which is noted.
+        """
         config = self.config
         clock = _Clock()
         few = {"max_steps": _STEPS, "max_time": None, "limit_val_batches": 0, "devices": 1, "num_nodes": 1}
@@ -152,6 +181,7 @@ class _Rehearsed:
 
 
 def _is_rendered(data: "PhotographsDataModule", splits: Iterable[str]) -> bool:
+    """Whether all these splits have subjects that can be read."""
     try:
         return all(bool(data.subjects(split)) for split in splits)
     except (InputError, OSError):
@@ -159,8 +189,16 @@ def _is_rendered(data: "PhotographsDataModule", splits: Iterable[str]) -> bool:
 
 
 def rehearse(configs: Sequence[Mapping[str, Any]]) -> Rehearsal:
-    """Try what the runs of ``configs`` need, each different need once, and time a step of the first run if
-    nothing is missing; nothing is rendered or written."""
+    """Try what runs need, each different need once, and time a step of the first run.
+
+    Nothing is rendered or written; no step is taken if something is missing.
+
+    Args:
+        configs: of the runs, as plain data.
+
+    Returns:
+        Reasons, notes and the seconds of a step.
+    """
     reasons: dict[str, None] = {}
     notes: dict[str, None] = {}
     listed: set[str] = set()

@@ -20,7 +20,15 @@ def output_dir() -> Path:
 
 
 def write_config(config: dict[str, Any], directory: Path) -> None:
-    """Write ``directory/config.yaml`` and print its path. InputError: another program's file is there."""
+    """Write ``directory/config.yaml`` and print its path.
+
+    Args:
+        config: the whole configuration as plain data.
+        directory: the run's.
+
+    Raises:
+        InputError: another program's file is there.
+    """
     path = directory / "config.yaml"
     is_free = not path.is_file() or path.read_text(errors="replace").startswith(HEADER)
     require(is_free, str(path), "no file, or the configuration of an earlier run", "another file")
@@ -30,15 +38,35 @@ def write_config(config: dict[str, Any], directory: Path) -> None:
 
 
 def save_config(cfg: DictConfig, directory: Path) -> dict[str, Any]:
-    """Resolve the configuration and write it; return it as plain data."""
+    """Resolve the configuration and write it.
+
+    Args:
+        cfg: the whole configuration that Hydra composed.
+        directory: the run's.
+
+    Returns:
+        The configuration as plain data.
+
+    Raises:
+        InputError: a value is wrong, or another program's file is there.
+    """
     config = resolve(cfg)
     write_config(config, directory)
     return config
 
 
 def files_to_write(options: Verb, keys: Sequence[str], read: Sequence[str | Path] = ()) -> dict[str, Path]:
-    """Paths of the files that ``keys`` of a verb name, by key, without those that are null. InputError: a
-    file exists and ``overwrite`` is false, it is one of ``read``, or two keys name one."""
+    """Paths of the files that keys of a verb name, by key, without those that are null.
+
+    Args:
+        options: keys of the verb, ``overwrite`` among them.
+        keys: those that name files.
+        read: files that the verb reads.
+
+    Raises:
+        InputError: a file exists and ``overwrite`` is false, it is one of ``read``, or two keys name
+            one.
+    """
     named = {key: getattr(options, key) for key in keys}
     paths = {key: Path(path).expanduser() for key, path in named.items() if path is not None}
     taken = {resolved(path) for path in read}

@@ -20,7 +20,16 @@ if TYPE_CHECKING:
 
 
 def run(options: "Stress", cfg: DictConfig) -> None:
-    """Run the verb. Exit code 1 if an error budget is exceeded or the repeated step is not finite."""
+    """Compare stages with float64 and write the report, or repeat a saved training step.
+
+    Args:
+        options: keys of the verb.
+        cfg: the whole configuration that Hydra composed.
+
+    Raises:
+        InputError: there is no such stage or family.
+        SystemExit: code 1: an error exceeds its budget, or the repeated step is not finite.
+    """
     directory = output_dir()
     config = save_config(cfg, directory)
     if options.dump is not None:
@@ -34,7 +43,7 @@ def run(options: "Stress", cfg: DictConfig) -> None:
     require(bool(tasks), "families", "a family that one of the stages has", options.families)
     rows = run_tasks(tasks, allowed_cores() if options.workers is None else options.workers)
     print_tables(report.tables_of(rows))
-    print(report.said_of(rows))
+    print(report.counts_of(rows))
     source = provenance(config, seed=0, verb="stress", choices=choices())
     announce(report.write(directory, rows, source))
     failed = [row for row in rows if row["failures"]]

@@ -19,7 +19,18 @@ if TYPE_CHECKING:
 
 
 def _listed(options: Options, key: str) -> tuple | None:
-    """The values of a key that holds one or a list; None: none. InputError: one is there twice."""
+    """The values of a key that holds one or a list.
+
+    Args:
+        options: have the key.
+        key: dotted key; its last part is the field.
+
+    Returns:
+        The values; None: there are none.
+
+    Raises:
+        InputError: one is there twice.
+    """
     value = getattr(options, key.rpartition(".")[2])
     values = (value,) if isinstance(value, str | int) else tuple(value or ())
     require(len(set(values)) == len(values), key, "different values", list(values))
@@ -27,6 +38,15 @@ def _listed(options: Options, key: str) -> tuple | None:
 
 
 def _options(options: "Table", evaluation: EvaluationOptions) -> t.TableOptions:
+    """What tables are built by.
+
+    Args:
+        options: keys of the verb.
+        evaluation: numbers of views and targets to show.
+
+    Raises:
+        InputError: ``test.unit`` is no regular expression with a group, or a value is there twice.
+    """
     try:
         unit = re.compile(options.test.unit or "(.+)")
     except re.error as error:
@@ -44,7 +64,15 @@ def _options(options: "Table", evaluation: EvaluationOptions) -> t.TableOptions:
 
 
 def run(verb: "Table", cfg: DictConfig) -> None:
-    """Print and write the tables."""
+    """Print the tables and write them as CSV, LaTeX and Markdown.
+
+    Args:
+        verb: its keys.
+        cfg: the whole configuration that Hydra composed.
+
+    Raises:
+        InputError: a key, a run or a file of other methods is wrong.
+    """
     directory = output_dir()
     config = save_config(cfg, directory)
     options = _options(verb, read_node(config["evaluation"], "evaluation"))

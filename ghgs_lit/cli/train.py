@@ -16,7 +16,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 
-from ghgs_lit.cli.inputs import build_data, check_size, choices, overrides, said
+from ghgs_lit.cli.inputs import build_data, check_size, choices, given_keys, overrides
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import build, resolve
 from ghgs_lit.config.compose import chosen_options
@@ -54,13 +54,25 @@ def quiet() -> None:
 @cache
 def say_which_model() -> None:
     """Print once per process that the default model, unless one was chosen, is not the paper's."""
-    chosen = {"model", "experiment", "sweep"} & set(said())
+    chosen = {"model", "experiment", "sweep"} & set(given_keys())
     if choices().get("model") == "hull" and not chosen:
         print("training model=hull, which learns in minutes; model=paper is the paper's method", flush=True)
 
 
 def prepare_start(config: dict[str, Any], module: GHGSModule, directory: Path) -> int | None:
-    """Load ``init_from`` or ``resume``; return the step to resume at, None for a new run."""
+    """Load ``init_from`` or ``resume``.
+
+    Args:
+        config: the whole configuration as plain data.
+        module: gets the weights.
+        directory: the run's; what was loaded is listed in its ``init_from.txt``.
+
+    Returns:
+        The step to resume at; None: a new run.
+
+    Raises:
+        InputError: both are given, or the checkpoint does not fit.
+    """
     start.check_start(config, directory)
     if config["init_from"] is not None and config["resume"] is None:
         lines = start.initialize(
@@ -74,7 +86,18 @@ def prepare_start(config: dict[str, Any], module: GHGSModule, directory: Path) -
 
 
 def resume_step(config: dict[str, Any], module: L.LightningModule) -> int | None:
-    """Load the weights of ``resume``; return the step to resume at, None for a new run."""
+    """Load the weights of ``resume``.
+
+    Args:
+        config: the whole configuration as plain data.
+        module: gets the weights.
+
+    Returns:
+        The step to resume at; None: a new run.
+
+    Raises:
+        InputError: the checkpoint does not fit.
+    """
     if config["resume"] is None:
         return None
     step, changed = start.check_resume(config["resume"], module, config)
@@ -84,7 +107,16 @@ def resume_step(config: dict[str, Any], module: L.LightningModule) -> int | None
 
 
 def build_trainer(config: dict[str, Any], directory: Path, *further: Callback) -> L.Trainer:
-    """The Trainer; loggers and callbacks write below ``directory``. InputError: it refuses its options."""
+    """The Trainer with the configured loggers and callbacks.
+
+    Args:
+        config: the whole configuration as plain data.
+        directory: the run's; loggers and callbacks write below it.
+        *further: callbacks that come before the configured ones.
+
+    Raises:
+        InputError: it refuses its options.
+    """
     logs = [build(node, f"logger.{name}", save_dir=str(directory)) for name, node in config["logger"].items()]
     callbacks = [*further, *(build(node, f"callbacks.{name}") for name, node in config["callbacks"].items())]
     return build(
@@ -100,8 +132,13 @@ def build_trainer(config: dict[str, Any], directory: Path, *further: Callback) -
 
 
 def environments() -> list[ClusterEnvironment]:
-    """Plugins for a job of SLURM: tasks of ``srun`` are the processes of a training, those of a batch script
-    are not. InputError: ``srun`` was asked for other tasks."""
+    """Plugins of the Trainer for a job of SLURM.
+
+    Tasks of ``srun`` are the processes of a training, those of a batch script are not.
+
+    Raises:
+        InputError: ``srun`` was asked for other tasks.
+    """
     if "SLURM_NTASKS" not in os.environ or "TORCHELASTIC_RUN_ID" in os.environ:
         return []
     try:  # this package stops, saves and queues again: Lightning's own checkpoint may lie within a step
@@ -111,7 +148,20 @@ def environments() -> list[ClusterEnvironment]:
 
 
 def run(options: "Train", cfg: DictConfig) -> float | str | None:
-    """Train and measure (in a sweep: unless done); return the mean PSNR. Interrupted: Ctrl-C or SIGTERM."""
+    """Train and measure a run; in a sweep unless it is done.
+
+    Args:
+        options: keys of the verb.
+        cfg: the whole configuration that Hydra composed.
+
+    Returns:
+        Mean PSNR of the first protocol in dB; in a sweep ``job.BUSY`` where another process works on
+        the run.
+
+    Raises:
+        InputError: the configuration, a checkpoint or the data is wrong.
+        Interrupted: by Ctrl-C or SIGTERM.
+    """
     config = resolve(cfg)
     run_directory = RunDirectory(output_dir())
     config["chosen"] = chosen_options(config, HydraConfig.get())
@@ -123,8 +173,19 @@ def run(options: "Train", cfg: DictConfig) -> float | str | None:
 
 
 def run_job(config: dict[str, Any], run_directory: RunDirectory, train: job.Train) -> float | str | None:
-    """Return what ``train`` returns. On Ctrl-C and signals of batch systems print how to go on and raise
-    Interrupted."""
+    """Train a run, alone or as one of several processes.
+
+    Args:
+        config: the whole configuration as plain data.
+        run_directory: of the run.
+        train: trains and measures; returns the metric.
+
+    Returns:
+        As :func:`ghgs_lit.runs.job.train_once`.
+
+    Raises:
+        Interrupted: by Ctrl-C or a signal of a batch system; how to go on is printed.
+    """
     is_first = settle_rank(config["trainer"]) == 0
     with interruptible():
         try:
@@ -139,8 +200,19 @@ def run_job(config: dict[str, Any], run_directory: RunDirectory, train: job.Trai
 
 
 def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float | None:
-    """Train, save the last weights and measure them; return the mean PSNR of the first protocol. ``stats``
-    receives the ``steps`` and ``seconds`` of this training."""
+    """Train, save the last weights and measure them.
+
+    Args:
+        config: the whole configuration as plain data.
+        directory: the run's.
+        stats: receives the ``steps`` and ``seconds`` of this training.
+
+    Returns:
+        Mean PSNR of the first protocol in dB; None in all processes but the first.
+
+    Raises:
+        InputError: the configuration, a checkpoint or the data is wrong.
+    """
     if rank_zero_only.rank == 0:
         write_config(config, directory)
         say_which_model()
@@ -189,7 +261,19 @@ def fit(
     step: int | None,
     stats: dict[str, Any],
 ) -> None:
-    """Train from ``step`` (None: a new run); ``stats`` is filled even if training is interrupted."""
+    """Train a module.
+
+    Args:
+        trainer: trains it.
+        module: its weights are those of ``resume``, if any.
+        data: of the training.
+        config: the whole configuration as plain data; ``resume`` is read.
+        step: where ``resume`` stands; None: a new run.
+        stats: receives ``steps``, those taken here, and ``seconds``, even if training is interrupted.
+
+    Raises:
+        InputError: options of the Trainer do not fit the data.
+    """
     if step is not None:
         loggers.resume(trainer.loggers, step)
     started = time.perf_counter()
@@ -212,7 +296,19 @@ def measure_last(
     directory: Path,
     training: dict[str, Any],
 ) -> float:
-    """Measure the last weights and write the results; return the mean PSNR of the first protocol."""
+    """Measure the last weights and write the results, on disk and to the loggers.
+
+    Args:
+        trainer: has trained the module.
+        module: its model is measured, and put into evaluation mode.
+        data: gives the batches of the evaluation.
+        config: the whole configuration as plain data.
+        directory: the run's.
+        training: facts about the training: ``steps``, ``seconds``, ``peak_bytes``, ``processes``.
+
+    Returns:
+        Mean PSNR of the first protocol in dB.
+    """
     model = module.model
     device = trainer.strategy.root_device
     identity = RunDirectory(directory).marker

@@ -60,7 +60,14 @@ class Verb(Options):
             require_folder(Path(data["root"]).expanduser())
 
     def run(self, cfg: DictConfig) -> object:
-        """Do the work of the verb; a sweeper optimises the number that it returns, if any."""
+        """Do the work of the verb.
+
+        Args:
+            cfg: the whole configuration that Hydra composed, groups included.
+
+        Returns:
+            A number that a sweeper optimises, if any.
+        """
         raise NotImplementedError
 
 

@@ -173,11 +173,11 @@ def check_ablation(cfg: DictConfig, hydra_node: DictConfig) -> None:
     wanted = _set_by_ablation(name)
     composed = OmegaConf.to_container(cfg)
     overrides = OmegaConf.to_container(hydra_node.overrides.task)  # with interpolations as they were typed
-    said = [part.key_or_group for part in OverridesParser.create().parse_overrides(overrides)]
+    given = [part.key_or_group for part in OverridesParser.create().parse_overrides(overrides)]
     for key, value in wanted.items():
-        found = lookup(composed, key)
-        holds = found == value or is_below(key, ["hydra", *said])
-        require(holds, key, f"{value!r}, as ablation/{name}.yaml sets it", found)
+        present = lookup(composed, key)
+        holds = present == value or is_below(key, ["hydra", *given])
+        require(holds, key, f"{value!r}, as ablation/{name}.yaml sets it", present)
 
 
 def _set_by_ablation(name: str | None) -> dict[str, Any]:

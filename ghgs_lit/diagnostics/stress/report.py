@@ -22,7 +22,7 @@ def bounded(error: float | None) -> str:
     return "no bound" if error is None else f"{error:.3g}"
 
 
-def said_of(rows: Sequence[Row]) -> str:
+def counts_of(rows: Sequence[Row]) -> str:
     """Numbers of cases and failures."""
     return "{} cases, {} failures".format(*(sum(row[name] for row in rows) for name in ("cases", "failures")))
 
@@ -44,7 +44,7 @@ def to_markdown(rows: Sequence[Row]) -> str:
     tables = tables_of(rows)
     tables["Budgets"] = pd.DataFrame({"stage": stages, "reason": [STAGES[name].reason for name in stages]})
     tables["Families"] = pd.DataFrame({"family": families, "inputs": [FAMILIES[f].says for f in families]})
-    return document("Stress test", [f"{said_of(rows)}."], tables)
+    return document("Stress test", [f"{counts_of(rows)}."], tables)
 
 
 def draw(rows: Sequence[Row]) -> Figure:
@@ -55,7 +55,7 @@ def draw(rows: Sequence[Row]) -> Figure:
     values = np.log10(ratios.clip(1e-6, 1e3)).to_numpy()
     height, width = values.shape
     figure = Figure(figsize=(3.2 + 0.3 * width, 2.4 + 0.3 * height), layout="constrained")
-    axes = figure.add_subplot(title=f"Worst error over budget: {said_of(rows)}")
+    axes = figure.add_subplot(title=f"Worst error over budget: {counts_of(rows)}")
     norm = TwoSlopeNorm(vmin=-6, vcenter=0, vmax=3)
     picture = axes.imshow(np.ma.masked_invalid(values), cmap="RdYlGn_r", norm=norm, aspect="auto")
     for i, j in zip(*np.nonzero(values > 0), strict=True):

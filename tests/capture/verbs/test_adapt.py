@@ -61,7 +61,7 @@ def test_all_cameras_of_a_file_are_the_rig(calibration):
 def test_longer_trainings_see_more_people(calibration, monkeypatch, numbers):
     """Ten minutes over the people of three learn these by heart; numbers that were said stay."""
     config = resolve(compose("adapt", [f"cameras={calibration}", "minutes=9", numbers]))
-    monkeypatch.setattr(adapt, "said", lambda: [numbers.partition("=")[0]])
+    monkeypatch.setattr(adapt, "given_keys", lambda: [numbers.partition("=")[0]])
     data, few = with_rig(config)["data"], with_rig({**config, "minutes": 1})["data"]
     assert (data["people"], data["active"]) == ({"train": 96, "val": 6}, {"train": 5, "val": 2})
     assert few["people"] == config["data"]["people"]
