@@ -36,7 +36,7 @@ MISSPELT = [
         "train experiment=demo callbacks=none callbacks.pictures.subjects=4",
         1,
         "callbacks.pictures.subjects: expected a key",
-        "found none of that name (callbacks=default has it)\n",
+        "found none of that name (callbacks=default or ema has it)\n",
     ),
     ("train data.root=x", 1, "data.root", "(data=humman or scans or thuman2 or thuman2_ghg"),
     ("train rounds.count=2", 1, "found none of that name (model=recurrent has it)\n"),
