@@ -396,7 +396,8 @@ def _edges(hypothesis: Hypothesis, names: tuple[str, str], folder: CaptureFolder
             continue
         one = silhouettes[place]
         others = silhouettes[:place] + silhouettes[place + 1 :]
-        close, around = (ndimage.binary_dilation(one.mask, iterations=n * _BESIDE) for n in (1, 2))
+        close = ndimage.binary_dilation(one.mask, iterations=_BESIDE)
+        around = ndimage.binary_dilation(one.mask, iterations=2 * _BESIDE)
         cells = np.argwhere(one.mask if view.name == more else around & ~close)
         meets = HullSearch().meets(one, cells[:, ::-1] + 0.5, others, *sphere)
         part = np.zeros_like(one.mask)
@@ -404,7 +405,8 @@ def _edges(hypothesis: Hypothesis, names: tuple[str, str], folder: CaptureFolder
         near = ndimage.binary_dilation(part, iterations=2 * _BESIDE)
         outline = _outline(one.mask)
         gradient = _gradient(photographs[place].image)
-        here, elsewhere = (gradient[outline & which] for which in (near, ~near))
+        here = gradient[outline & near]
+        elsewhere = gradient[outline & ~near]
         edges[view.name] = (
             here.sum() / max(len(here), 1) / max(elsewhere.sum() / max(len(elsewhere), 1), 1e-6)
         )

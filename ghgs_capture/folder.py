@@ -36,22 +36,25 @@ MIN_PHOTOGRAPHS = 3  #: Photographs that an instant needs where others of its ar
 
 @dataclass(frozen=True)
 class CaptureFolder:
-    """``folder.photographs(instant)`` for each of ``folder.instants``. InputError: a folder or file is
-    missing or wrong.
+    """``folder.photographs(instant)`` for each of ``folder.instants``.
 
     Args:
-        images: folder of photographs named after their cameras; of such folders, one for each instant; or of
-            videos named after their cameras. Or the decoded frames of one instant, by camera.
-        cameras: the calibration, in one of :data:`ghgs_capture.formats.FORMATS`, or already
-            read.
+        images: folder of photographs named after their cameras; of such folders, one for each
+            instant; or of videos named after their cameras. Or the decoded frames of one instant,
+            by camera.
+        cameras: the calibration, in one of :data:`ghgs_capture.formats.FORMATS`, or already read.
         masks: folder of masks, laid out and named as the photographs; None: the first there is of
-            ``backgrounds``, ``segment``, masks beside the photographs (``<name>_mask.png``) or named by the
-            calibration, alpha.
+            ``backgrounds``, ``segment``, masks beside the photographs (``<name>_mask.png``) or
+            named by the calibration, alpha.
         backgrounds: folder of photographs without the subject, named after the cameras.
         segment: a segmenter of :data:`ghgs_capture.masks.SEGMENTERS`.
-        calibration: what the file does not say, or says wrongly (:class:`ghgs_lit.config.nodes.Calibration`).
+        calibration: what the file does not say, or says wrongly
+            (:class:`ghgs_lit.config.nodes.Calibration`).
         sequence: which instants count, and how videos fit together
             (:class:`ghgs_lit.config.nodes.SequenceOptions`).
+
+    Raises:
+        InputError: a folder or file is missing or wrong.
     """
 
     images: str | Path | Mapping[str, Frame]
@@ -94,6 +97,7 @@ class CaptureFolder:
 
     @functools.cached_property
     def _listing(self) -> tuple[dict[str, dict[str, Source]], str]:
+        """``{instant: {camera: path or frame}}`` of all instants, and a line about frames left over."""
         folder = self.images
         cameras = self.file.cameras
         part = self._sequence
@@ -193,8 +197,9 @@ class CaptureFolder:
                 self.missing[instant][name] = str(error)
         missing = self.missing[instant] if len(self.instants) > 1 else {}
         why = "; ".join(f"{name}: {text}" for name, text in missing.items())
-        least, why = (MIN_PHOTOGRAPHS, f"{len(values)} ({why})") if missing else (2, len(values))
-        require(len(values) >= least, f"{self.images}: {instant}", f"{least} photographs or more", why)
+        least = MIN_PHOTOGRAPHS if missing else 2
+        count = f"{len(values)} ({why})" if missing else len(values)
+        require(len(values) >= least, f"{self.images}: {instant}", f"{least} photographs or more", count)
         return values
 
     def begin(self, instant: str) -> None:
@@ -214,6 +219,7 @@ class CaptureFolder:
         pool.shutdown(wait=False)
 
     def _view(self, name: str, path: Source) -> tuple[StoredCamera, Pixels, np.ndarray]:
+        """Decode one view. InputError: its photograph or mask is missing or wrong."""
         camera = self.file.cameras[name]
         pixels = read_pixels(path) if isinstance(path, Path) else path.pixels()
         matte = self._matte(name, camera, path, pixels)

@@ -57,7 +57,11 @@ class VideoFrame:
         return f"{self.video.video.path}, frame {self.number}"
 
     def pixels(self) -> Pixels:
-        """The photograph. InputError: it cannot be decoded."""
+        """The photograph.
+
+        Raises:
+            InputError: it cannot be decoded.
+        """
         return Pixels(self.video.frame(self.number), None, 0)
 
     def matte(self, pixels: Pixels) -> np.ndarray:

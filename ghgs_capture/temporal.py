@@ -127,7 +127,7 @@ class Temporal:
             before = self._descent.gaussians if fits else None
         prediction = self.predict(batch)
         # What moves too fast is not followed at every instant.
-        self.anew = self.anew + 1
+        self.anew += 1
         self._age = 0 if fits else self.every
         self._crossing = None
         self._descent = Descent(prediction.gaussians, batch, _CHANGES)
@@ -158,9 +158,17 @@ class Temporal:
             self._descent.start = start if crossing is None else crossing.shared(start, self._age)
 
     def _improved(self, batch: Batch) -> tuple[Rendering, Float[Tensor, " 2"]]:
-        """Take some steps. Returns: the inputs' renders before the last one, and their misfit: the error
-        within masks, and the share of the subject beyond its mask in the worst view."""
-        photographs, silhouettes, _ = seen = seen_by(batch)
+        """Take some steps of the descent.
+
+        Args:
+            batch: photographs, masks and cameras of the instant.
+
+        Returns:
+            The inputs' renders before the last step, and their misfit: the error within masks, and
+            the share of the subject beyond its mask in the worst view.
+        """
+        seen = seen_by(batch)
+        photographs, silhouettes, _ = seen
         for _ in range(_STEPS):
             drawn = self._descent.step(self.renderer, seen, _WEIGHTS)
         masks = batch.masks[:, :, None]
@@ -211,10 +219,8 @@ def _moved(gaussians: Gaussians, last: _Last, batch: Batch, levels: list[Tensor]
     # Near the origin and in metres: the world may have any place and unit.
     origin = seen.means.double().nanmedian(0).values if len(seen) else seen.means.new_zeros(3).double()
     points = ((seen.means.double() - origin) / metre).to(levels[0])
-    before, after = (
-        Instant(maps, _around(each.cameras, origin, metre).to(points.dtype))
-        for maps, each in ((last.levels, last.batch), (levels, batch))
-    )
+    before = Instant(last.levels, _around(last.batch.cameras, origin, metre).to(points.dtype))
+    after = Instant(levels, _around(batch.cameras, origin, metre).to(points.dtype))
     shown = _shown(points, before.cameras, (last.depth[0] / metre).to(points))
     moved, turned = scene_flow(points, shown, before, after)
     half = torch.cat((torch.ones_like(turned[:, :1]), turned / 2), -1)
@@ -260,7 +266,8 @@ def _as_drawn(
     valid = batch.masks
     drawn = depth > 0
     # Pixels that no Gaussian covers have the mean depth of their view.
-    sums, counts = (each.sum((-2, -1), keepdim=True) for each in (depth, drawn))
+    sums = depth.sum((-2, -1), keepdim=True)
+    counts = drawn.sum((-2, -1), keepdim=True)
     mean = torch.where(counts > 0, sums / counts.clamp(min=1), 1)
     depth = torch.where(valid, torch.where(drawn, depth, mean), 1)
     pixels = unproject_maps(depth, batch.cameras).to(prediction.points.pixels)

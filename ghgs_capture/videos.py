@@ -83,6 +83,7 @@ def read_video(path: Path) -> Video:
 
 @functools.lru_cache(maxsize=256)
 def _read_video(path: Path, changed: int) -> Video:
+    """:func:`read_video` of a file that has not ``changed`` since it was read."""
     options = ("-frames:v", "1", "-f", "image2pipe", "-c:v", "pgm")
     first = subprocess.run(_command(path, "gray", *options, log="error"), capture_output=True)
     time = _TIME.search(first.stderr)

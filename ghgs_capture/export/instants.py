@@ -132,6 +132,7 @@ class Instants:
         return page(self._first, name, self._packed, path, self.options.fps).encode()
 
     def _video(self) -> bytes:
+        """The content of the video: the camera swings by ``_SWING`` to each side, once over all instants."""
         first = self._first
         cameras = self._first.cameras
         path = self._path()

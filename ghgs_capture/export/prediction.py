@@ -187,6 +187,7 @@ def write_prediction(
 
 
 def _report(subject: ExportedSubject) -> dict[str, Any]:
+    """Plain data about a prediction: counts, lengths in the unit of the cameras, PSNR of the inputs."""
     gaussians = subject.gaussians
     valid = subject.depth_valid
     lost = subject.masks & ~valid

@@ -98,6 +98,7 @@ def _beside(directory: Path, names: Sequence[str]) -> list[str]:
 
 
 def _written_before(directory: Path) -> list[str]:
+    """Names of the files that the report of a directory lists; none without a report."""
     try:
         report = read_json(directory / REPORT)
     except InputError:

@@ -44,6 +44,7 @@ def unseen(subject: ExportedSubject, depth: Float[Tensor, "1 V 1 H W"]) -> dict[
 
 
 def _seen_once(subject: ExportedSubject, depth: Float[Tensor, "1 V 1 H W"]) -> dict[str, float]:
+    """``seen_once`` of :func:`unseen`."""
     gaussians = subject.gaussians
     cameras = subject.cameras[None]
     if not len(gaussians):

@@ -105,7 +105,8 @@ def _camera(folder: Path, name: str, image, camera) -> StoredCamera:
     model = camera.model.name
     require(model in _MODELS, origin, f"a camera model among {', '.join(_MODELS)}", model)
     values = dict(zip(_MODELS[model].split(), camera.params, strict=True))
-    fx, fy = (values.get(name, values.get("f")) for name in ("fx", "fy"))
+    fx = values.get("fx", values.get("f"))
+    fy = values.get("fy", values.get("f"))
     intrinsics = pinhole(fx, fy, values["cx"], values["cy"])
     fisheye = "FISHEYE" in model
     distortion = coefficients(values, FISHEYE if fisheye else PERSPECTIVE)

@@ -247,7 +247,11 @@ class Entries:
 
     @property
     def is_fisheye(self) -> bool:
-        """Whether flag or model say so. InputError: they differ, or a model is not read."""
+        """Whether flag or model say so.
+
+        Raises:
+            InputError: they differ, or a model is not read.
+        """
         flag = self.flag("fisheye")
         models = {key: str(self.fields[key]) for key in self.keys("model")}
         self._read |= models.keys()

@@ -84,7 +84,12 @@ def _camera(path: Path, origin: str, shared: Mapping[str, Any], frame: Any) -> S
 
 
 def _lens(entries: Entries) -> PartialIntrinsics:
-    """What the entries say of intrinsics. InputError: neither a focal length nor an angle of view."""
+    """What the entries say of intrinsics.
+
+    Raises:
+        InputError: there is neither a focal length nor an angle of view, or an angle is out of
+            range.
+    """
     focal = entries.number("fl_x"), entries.number("fl_y")
     middle = entries.number("cx"), entries.number("cy")
     angles = entries.number("camera_angle_x"), entries.number("camera_angle_y")

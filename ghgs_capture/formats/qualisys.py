@@ -41,15 +41,17 @@ def read_qualisys(path: Path) -> CameraFile:
 
 
 def _camera(path: Path, camera: ElementTree.Element) -> StoredCamera:
+    """One camera; :func:`read_qualisys` names errors in it."""
     name = camera.attrib["serial"]
     numbers = {
         key: float(value)
         for part in ("fov_video", "transform", "intrinsic")
         for key, value in camera.find(part).attrib.items()
     }
-    fx, fy, cx, cy = (
-        numbers[f"{key}{axis}"] / _SUBPIXELS for key in ("focalLength", "centerPoint") for axis in "UV"
-    )
+    fx = numbers["focalLengthU"] / _SUBPIXELS
+    fy = numbers["focalLengthV"] / _SUBPIXELS
+    cx = numbers["centerPointU"] / _SUBPIXELS
+    cy = numbers["centerPointV"] / _SUBPIXELS
     intrinsics = pinhole(fx, fy, cx - numbers["left"], cy - numbers["top"])
     keys = {name: f"{_DISTORTION[name[0]]}{name[1]}" for name in _ORDER.split()}
     lens = {name: numbers.get(key, 0.0) for name, key in keys.items()}

@@ -119,7 +119,17 @@ def _cameras_of_data(config: dict[str, Any]) -> tuple[dict[str, dict[str, Any]],
 
 
 def _cameras_of_file(config: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Entries of the calibration that ``cameras`` names. InputError: it has no sizes, or is wrong."""
+    """Entries of the calibration that ``cameras`` names.
+
+    Args:
+        config: of the verb.
+
+    Returns:
+        Those of :func:`ghgs_capture.export.maps.camera_entry`, by name.
+
+    Raises:
+        InputError: there is no calibration, it has no sizes, or it is wrong.
+    """
     require(config["cameras"] is not None, "cameras", "cameras=<calibration>", None)
     file = read_cameras(config["cameras"], config["calibration"]["format"])
     convention = file.convention.with_options(config["calibration"])

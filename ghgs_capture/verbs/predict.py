@@ -214,7 +214,9 @@ def shared_by(
     begin = time.perf_counter()
     names = folder.instants
     captures = []
-    rounds, masks, tones = (refining[key] for key in ("refine_cameras", "refine_masks", "tones"))
+    rounds = refining["refine_cameras"]
+    masks = refining["refine_masks"]
+    tones = refining["tones"]
     spread = [round((len(names) - 1) * i / (INSTANTS - 1)) for i in range(INSTANTS)]
     is_needed = bool(rounds or masks or tones)
     for place in dict.fromkeys(spread) if is_needed else ():

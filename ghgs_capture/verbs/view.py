@@ -72,6 +72,7 @@ def run(options: "View", cfg: DictConfig) -> None:
 
 @torch.no_grad()
 def _run_live(options: "View", cfg: DictConfig) -> None:
+    """Predict and show the newest instant again and again."""
     require(options.path is None, "path", "null with live=true", options.path)
     config = resolve(cfg)
     pause = Pause()

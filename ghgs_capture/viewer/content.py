@@ -117,6 +117,7 @@ def read_content(path: str | Path, up: str | None) -> Content:
 
 
 def _read_inputs(directory: Path) -> Batch:
+    """Photographs, masks and cameras of the format ``inputs``. InputError: one is missing or wrong."""
     stored = read_json(directory / "cameras.json")
     pictures = []
     cameras = []

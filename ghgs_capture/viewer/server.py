@@ -112,6 +112,7 @@ class Viewer:
         self.show_splats()
 
     def _prepare(self) -> None:
+        """Compute what viser draws of the Gaussians: covariances, colours and opacities."""
         g = self.content.gaussians
         order = self.content.order
         if self.content.batch is not None:
@@ -146,6 +147,7 @@ class Viewer:
             )
 
     def _add_points(self) -> None:
+        """Add the layers of centres and visual hull, which are hidden at first."""
         means, colors = self.content.points
         extent = np.ptp(means, axis=0).max() if len(means) else 1.0
         clouds = {"points": (means, colors)}
@@ -172,6 +174,7 @@ class Viewer:
             frustum.visible = self.cameras.value and is_clear
 
     def _add_cameras(self) -> None:
+        """Add the cameras with their photographs; a click puts the visitors there."""
         from viser.transforms import SO3
 
         cameras = self.content.cameras
@@ -231,6 +234,7 @@ class Viewer:
         self._show_frustums()
 
     def _add_comparison(self) -> None:
+        """Add a render and its photograph, with their PSNR and FLIP."""
         gui = self.server.gui
         views = self.content.batch.views[0]
         self.view = gui.add_dropdown("view", views)
