@@ -28,9 +28,22 @@ from ghgs_lit.weights.reading import SHIPPED
 
 
 class GHGS(nn.Module):
-    """``model(batch) -> Prediction``: the stages of Figure 2 (:mod:`ghgs_lit.stages`), and rounds.
-    ``rounds``, which need bounds, correct the Gaussians of the Gaussian head. ``skip``: work to leave out.
-    ``options``: layers around the stages."""
+    """The whole method, ``model(batch) -> Prediction``: the stages of Figure 2 of the paper, and rounds.
+
+    Args:
+        bounds: near and far of each pixel's ray.
+        encoder: photographs to tokens.
+        depth_head: tokens to depths.
+        unprojection: depths to points in the world.
+        recalibration: tokens to tokens, by attention among neighbouring points.
+        gaussian_head: tokens and points to Gaussians.
+        rounds: correct the Gaussians of the Gaussian head, and need bounds; None: no rounds.
+        skip: work to leave out; None: ``skip=exact``.
+        options: preparation of photographs around the stages; None: as in a configuration that says nothing.
+
+    Raises:
+        InputError: a stage needs bounds that there are none of, or the reverse.
+    """
 
     def __init__(
         self,
@@ -73,7 +86,17 @@ class GHGS(nn.Module):
         super().__setattr__(name, value)
 
     def forward(self, batch: Batch) -> Prediction:
-        """Gaussians, depths and points in the world of the cameras. InputError: the batch does not fit."""
+        """Gaussians, depths and points in the world of the cameras.
+
+        Args:
+            batch: photographs, masks and cameras are read, and mattes and gains if there are any.
+
+        Returns:
+            The prediction in the pixels of the photographs, in the unit and the axes of the cameras' world.
+
+        Raises:
+            InputError: the batch does not fit the stages.
+        """
         around = surroundings(self.options, self.encoder.patch_size, self.checks_values)
         for layer in around:
             batch = layer.enter(batch)
@@ -85,8 +108,15 @@ class GHGS(nn.Module):
         return dataclasses.replace(plan.trimmed(prediction), decisions=plan.decisions)
 
     def plan(self, batch: Batch, findings: Sequence[Finding] = ()) -> Plan:
-        """What the stages work on, read from a batch as they see it; a GPU is waited for once. ``findings``:
-        of its checks, which are read, too. InputError: the batch violates one."""
+        """What the stages work on; a GPU is waited for once.
+
+        Args:
+            batch: as the stages see it, with whole patches.
+            findings: of its checks, which are read, too.
+
+        Raises:
+            InputError: the batch violates one of the checks.
+        """
         auto = self.auto
         encoder = self.encoder
         masks = batch.masks
@@ -115,6 +145,7 @@ class GHGS(nn.Module):
         return settled(lambda: self._predict(batch, plan, coarse))
 
     def _predict(self, batch: Batch, plan: Plan, coarse: CoarseDepths | None = None) -> Prediction:
+        """The stages of Figure 2: bounds, tokens, and what is decoded from them."""
         bounds = self.bounded(batch)
         return self.decoded(batch, bounds, self.encoded(batch, bounds, plan), plan, coarse)
 
@@ -123,7 +154,13 @@ class GHGS(nn.Module):
         return bounds_of(self.bounds, batch)
 
     def encoded(self, batch: Batch, bounds: DepthBounds | None, plan: Plan) -> Tokens:
-        """Tokens in the precision of the heads, which may differ from that of the encoder."""
+        """Tokens in the precision of the heads, which may differ from that of the encoder.
+
+        Args:
+            batch: photographs and masks are read.
+            bounds: of all pixels; None for stages without bounds.
+            plan: which patches become tokens.
+        """
         tokens = self.encoder(batch.images, batch.masks, bounds, plan)
         heads = (parameter for name in HEADS for parameter in getattr(self, name).parameters())
         return tokens.in_precision(next(heads, tokens.semantic).dtype)
@@ -136,7 +173,18 @@ class GHGS(nn.Module):
         plan: Plan,
         coarse: CoarseDepths | None = None,
     ) -> Prediction:
-        """What the stages after the encoder make of its tokens, and the rounds of that."""
+        """What the stages after the encoder make of its tokens, and the rounds of that.
+
+        Args:
+            batch: as the stages see it.
+            bounds: of all pixels; None for stages without bounds.
+            tokens: of the encoder.
+            plan: which tokens are recalibrated and which pixels become Gaussians.
+            coarse: depths from smaller copies of the photographs; None: there are none.
+
+        Returns:
+            The prediction in the world of the stages.
+        """
         depth_maps = self._depths(tokens, batch, bounds, plan, coarse)
         points = self.unprojection(depth_maps, tokens, batch)
         tokens = self.recalibration(tokens, points, plan)
@@ -156,7 +204,15 @@ class GHGS(nn.Module):
         plan: Plan,
         coarse: CoarseDepths | None,
     ) -> DepthMaps:
-        """Depths of the depth head, but the coarse ones of elements that have them."""
+        """Depths of the depth head, but the coarse ones of elements that have them.
+
+        Args:
+            tokens: of the encoder.
+            batch: as the stages see it.
+            bounds: of all pixels; None for stages without bounds.
+            plan: in which windows depths are needed.
+            coarse: depths from smaller copies of the photographs; None: there are none.
+        """
         if coarse is not None and coarse.are_all:
             return coarse.maps(batch, bounds)
         maps = self.depth_head(tokens, batch, bounds, plan)
@@ -191,8 +247,17 @@ class GHGS(nn.Module):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], empty: bool = False) -> "GHGS":
-        """The model of a configuration; with ``empty`` on the meta device, to be given weights: a strange
-        configuration then takes no memory before they are compared with it."""
+        """The model of a configuration.
+
+        Args:
+            config: nodes by their names: all of :data:`ghgs_lit.stages.STAGES`, and of ``OPTIONS`` there any.
+            empty: on the meta device, to be given weights: a strange configuration then takes no memory
+                before they are compared with it.
+
+        Raises:
+            InputError: a stage is missing, an option is unknown or out of range, or stages do not fit
+                each other.
+        """
         for name in STAGES:
             require(name in config, name, "a stage of the model", "nothing")
         skip, options = (read_node(config.get(name) or {}, name) for name in ("skip", "model"))
@@ -217,7 +282,18 @@ class GHGS(nn.Module):
     def from_checkpoint(
         cls, path: str | Path = SHIPPED, map_location: Any = "cpu", dtype: torch.dtype | None = None
     ) -> "GHGS":
-        """The model of a checkpoint in evaluation mode; arguments as of :func:`load_weights`."""
+        """The model of a checkpoint in evaluation mode.
+
+        Args:
+            path: of a checkpoint of this package, or the name of published weights; by default those that come
+                with it.
+            map_location: the device that the model is moved to.
+            dtype: precision of the encoder; None: as in the file, where the device has it. Heads are float32.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            InputError: it is not a checkpoint of this package, or its weights are not finite or do not fit.
+        """
         model = cls.from_config(read_config(path), empty=True)
         load_weights(model, path, dtype, map_location)
         return model.to(map_location).eval()

@@ -32,7 +32,13 @@ class Pieces(Protocol):
         """Bounds of all pixels."""
 
     def encoded(self, batch: Batch, bounds: DepthBounds | None, plan: Plan) -> Tokens:
-        """Tokens of the patches that the plan keeps."""
+        """Tokens of the patches that the plan keeps.
+
+        Args:
+            batch: as the stages see it.
+            bounds: of all pixels; None for stages without bounds.
+            plan: of the batch.
+        """
 
     def decoded(
         self,
@@ -42,7 +48,15 @@ class Pieces(Protocol):
         plan: Plan,
         coarse: CoarseDepths | None,
     ) -> Prediction:
-        """All that comes after the encoder."""
+        """All that comes after the encoder.
+
+        Args:
+            batch: as the stages see it.
+            bounds: of all pixels; None for stages without bounds.
+            tokens: of the encoder.
+            plan: of the batch.
+            coarse: depths from smaller copies of the photographs; None: there are none.
+        """
 
 
 @dataclass(frozen=True)
@@ -60,6 +74,7 @@ class _Scene:
 
     @classmethod
     def of(cls, batch: Batch, plan: Plan) -> "_Scene":
+        """The inputs that the pieces read; what only losses read is left out."""
         bare = dataclasses.replace(batch, targets=None, body_vertices=None, subjects=(), views=())
         facts = (plan.patch_size, plan.pixels, plan.tokens)
         return cls(bare, plan.shown, *plan.extents_of_class(), *facts)
@@ -83,8 +98,15 @@ class Playback:
         self.recorder = recorder or Recorder(limit=16)
 
     def fits(self, batch: Batch, plan: Plan) -> bool:
-        """Whether recordings of this batch are worth a try: its sizes are those of a class, on a device that
-        records, and no gradient is wanted."""
+        """Whether recordings of this batch are worth a try.
+
+        Args:
+            batch: as the stages see it.
+            plan: of the batch.
+
+        Returns:
+            True where its sizes are those of a class, on a device that records, and no gradient is wanted.
+        """
         here = batch.masks.device.type == self.recorder.tape.device
         sized = type(batch) is Batch and plan.is_of_class and plan.kept.is_whole
         return here and sized and not torch.is_grad_enabled() and not is_watched()
@@ -97,14 +119,18 @@ class Playback:
         coarse: CoarseDepths | None,
         key: Hashable,
     ) -> Prediction:
-        """The prediction for a batch that :meth:`fits`; Gaussians fill their size class.
+        """The prediction for a batch that :meth:`fits`.
 
         Args:
             pieces: the model.
             batch: as the stages see it.
             plan: of the batch.
             coarse: depths from smaller copies, if there are any.
-            key: all else that the prediction depends on, but weights that stay where they are."""
+            key: all else that the prediction depends on, but weights that stay where they are.
+
+        Returns:
+            The prediction; its Gaussians fill their size class.
+        """
         scene = _Scene.of(batch, plan)
         bounds = self.recorder(lambda inputs: pieces.bounded(inputs.read()[0]), scene, ("bounds", key))
         tokens = pieces.encoded(batch, bounds, plan)

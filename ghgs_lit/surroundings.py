@@ -1,4 +1,11 @@
-"""Layers around the stages: they check and prepare a batch, and bring the prediction back to its world."""
+"""What surrounds the stages: layers that a batch enters before them and its prediction leaves after them.
+
+:func:`surroundings` gives the layers of a batch, the outermost first: photographs are checked and masks
+follow mattes (:class:`CheckedPhotographs`); the world becomes metres around the subject
+(:class:`SubjectFrame`); photographs get a black border up to whole patches (:class:`Border`). The prediction
+goes through them in reverse: the border is cut off, and Gaussians, depths and points are brought back to the
+cameras' world. :class:`ModelOptions` (``conf/model``) choose the layers. Checks of values are findings,
+which :meth:`ghgs_lit.model.GHGS.plan` reads together with all else that a GPU must be waited for."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -23,17 +30,35 @@ Finding = tuple[str, str, Tensor]
 
 
 def check_batch(batch: Batch, patch_size: int, values: bool = True) -> None:
-    """Refuse a batch that the stages cannot work on, for which the host waits for a GPU once; arguments and
-    InputError as of :func:`findings_of` and :func:`refuse`."""
+    """Refuse a batch that the stages cannot work on; a GPU is waited for once.
+
+    Args:
+        batch: as of :func:`findings_of`.
+        patch_size: as of :func:`findings_of`.
+        values: as of :func:`findings_of`.
+
+    Raises:
+        InputError: a shape, a dtype or a value is wrong.
+    """
     findings = findings_of(batch, patch_size, values)
     if bool(any_bad(findings)):
         refuse(findings)
 
 
 def findings_of(batch: Batch, patch_size: int, values: bool = True) -> list[Finding]:
-    """What is expected of a batch's values, and where they violate it, without waiting for a GPU; its targets
-    are not checked. ``patch_size``: must divide height and width, in pixels. ``values``: check every value,
-    too: one NaN in the background leaves no Gaussian. InputError: a shape or a dtype is wrong."""
+    """What is expected of a batch's values, and where they violate it, without waiting for a GPU.
+
+    Args:
+        batch: its targets are not checked.
+        patch_size: must divide height and width, in pixels.
+        values: check every value, too: one NaN in the background leaves no Gaussian.
+
+    Returns:
+        A finding for each check, violated or not.
+
+    Raises:
+        InputError: a shape or a dtype is wrong.
+    """
     _check_shapes(batch, patch_size)
     return _findings_of_cameras(batch) + (_findings_of_values(batch) if values else [])
 
@@ -44,13 +69,21 @@ def any_bad(findings: Sequence[Finding]) -> Bool[Tensor, ""]:
 
 
 def refuse(findings: Sequence[Finding]) -> None:
-    """InputError: names the first field that violates what is expected of it, and where."""
+    """Refuse a batch for the first field that violates what is expected of it, if any does.
+
+    Args:
+        findings: of the batch; a GPU is waited for.
+
+    Raises:
+        InputError: names the field, what was expected of it, and where it is violated.
+    """
     for name, expected, bad in findings:
         found = f"others at {bad.nonzero().tolist()} (element, view)"
         require(not bool(bad.any()), f"batch.{name}", expected, found)
 
 
 def _check_shapes(batch: Batch, patch_size: int) -> None:
+    """InputError: a shape or a dtype of the batch is not what the stages work on."""
     colored = batch.images.dim() == 5 and batch.images.shape[2] == 3
     require(colored, "batch.images", "[B, V, 3, H, W]", tuple(batch.images.shape))
     for name in ("images", "depths", "alpha", "log_gains"):
@@ -75,6 +108,7 @@ def _check_shapes(batch: Batch, patch_size: int) -> None:
 
 
 def _findings_of_cameras(batch: Batch) -> list[Finding]:
+    """Checks of cameras and masks, which are always made."""
     found = [
         (f"cameras.{name}", "finite values", ~getattr(batch.cameras, name).isfinite().flatten(2).all(-1))
         for name in ("intrinsics", "extrinsics")
@@ -86,6 +120,7 @@ def _findings_of_cameras(batch: Batch) -> list[Finding]:
 
 
 def _findings_of_values(batch: Batch) -> list[Finding]:
+    """Checks of every value of photographs, mattes, depths and bodies."""
     within = "finite values within [0, 1]"
     found = [("images", within, _beyond(batch.images, 1.0))]
     if batch.alpha is not None:
@@ -142,7 +177,13 @@ class Surrounding:
 
 
 class CheckedPhotographs(Surrounding):
-    """To be checked; masks are thresholds of soft mattes, if any."""
+    """Photographs to be checked; masks are thresholds of soft mattes, if any.
+
+    Args:
+        side_multiple: number of pixels that must divide height and width.
+        checks_values: check every value, too.
+        least_matte: pixels that show a larger share of the subject are its mask, 0 to 0.5; None: masks stay.
+    """
 
     def __init__(self, side_multiple: int, checks_values: bool, least_matte: float | None) -> None:
         self.options = side_multiple, checks_values
@@ -166,7 +207,11 @@ class SubjectFrame(Surrounding):
 
 
 class Border(Surrounding):
-    """Photographs padded to whole patches inside (:mod:`ghgs_lit.geometry.padding`)."""
+    """Photographs padded to whole patches inside (:mod:`ghgs_lit.geometry.padding`).
+
+    Args:
+        patch_size: of the encoder, in pixels.
+    """
 
     def __init__(self, patch_size: int) -> None:
         self.patch_size = patch_size
@@ -185,7 +230,13 @@ def side_multiple(options: ModelOptions, patch_size: int) -> int:
 
 
 def surroundings(options: ModelOptions, patch_size: int, checks_values: bool) -> Sequence[Surrounding]:
-    """The layers around the stages for one batch, the outermost first."""
+    """The layers around the stages for one batch, the outermost first.
+
+    Args:
+        options: choose the layers.
+        patch_size: of the encoder, in pixels.
+        checks_values: refuse NaN and values out of range, too.
+    """
     return [
         CheckedPhotographs(side_multiple(options, patch_size), checks_values, options.matte),
         *([SubjectFrame()] if options.frame == "subject" else []),

@@ -33,9 +33,17 @@ def trusted_views(
 
     A mask that is cut leaves rays of the other views unexplained; a mask that is too large has unexplained
     rays itself. If the masks do not agree (:data:`_SHARE`), the view without which less than half of the
-    unexplained share is left does not vote. With two views both vote: either could be wrong. ``coarse``:
-    masks of at most :data:`RESOLUTION` cells. ``reach``: a generous radius of the subject. ``tolerance``: how
-    many views may say "outside" of a point that is kept."""
+    unexplained share is left does not vote. With two views both vote: either could be wrong.
+
+    Args:
+        coarse: masks of at most :data:`RESOLUTION` cells along the longer side, and their cameras.
+        center: of the subject in the world, in metres.
+        reach: a generous radius of the subject about ``center``, in metres.
+        tolerance: how many views may say "outside" of a point that is kept.
+
+    Returns:
+        Which views vote.
+    """
     masks = coarse.masks
     voting = masks.flatten(2).any(-1)
     votes = _votes(coarse, voting, center, reach)
@@ -54,7 +62,17 @@ def trusted_views(
 
 
 def _votes(coarse: Silhouettes, voting: Tensor, center: Tensor, reach: Tensor) -> Tensor:
-    """Votes [B, v, o, h, w, S]: 1 where view ``o`` sees a point on a ray of view ``v`` outside its mask."""
+    """Votes of each view about points on the rays of all views.
+
+    Args:
+        coarse: masks and their cameras.
+        voting: [B, V], views that may say "outside".
+        center: [B, 3], middle of the depths that are looked at, in metres.
+        reach: [B], half of their range, in metres.
+
+    Returns:
+        Votes [B, v, o, h, w, S]: 1 where view ``o`` sees a point on a ray of view ``v`` outside its mask.
+    """
     masks = coarse.masks
     cameras = coarse.cameras
     b, v = voting.shape

@@ -60,7 +60,15 @@ class SubjectBox(Options):
 
     @torch.no_grad()
     def __call__(self, batch: Batch) -> DepthBounds:
-        """Bounds of all pixels; reads masks and cameras."""
+        """Bounds of all pixels, without a gradient.
+
+        Args:
+            batch: masks and cameras are read; photographs may have any size.
+
+        Returns:
+            Near and far [B, V, H, W] in metres: near is :data:`MIN_DEPTH` or more, far at least
+            :data:`MIN_THICKNESS` behind it.
+        """
         with exact(batch.masks.device.type):
             coarse = silhouettes(batch.masks, batch.cameras, RESOLUTION, self.dilation)
             voting = self._voting(coarse)
@@ -70,6 +78,7 @@ class SubjectBox(Options):
             return self._within(batch, coarse, voting, lower - MARGIN, upper + MARGIN)
 
     def _voting(self, coarse: Silhouettes) -> Bool[Tensor, "B V"]:
+        """Which views vote about the box, from copies of the masks that are coarser still."""
         few = silhouettes(coarse.masks, coarse.cameras, agreement.RESOLUTION, self.dilation)
         center = subject_center(few.masks, few.cameras)
         # The median, not the largest: with a mask of noise no sample would lie within the subject.
@@ -79,6 +88,15 @@ class SubjectBox(Options):
     def _within(
         self, batch: Batch, coarse: Silhouettes, voting: Tensor, lower: Tensor, upper: Tensor
     ) -> DepthBounds:
+        """Bounds of all pixels within the subject's box.
+
+        Args:
+            batch: masks and cameras at full resolution.
+            coarse: the same at a lower one.
+            voting: [B, V], views that may say "outside".
+            lower: [B, 3], the corner of the box with the smallest coordinates, in metres.
+            upper: [B, 3], that with the largest.
+        """
         return self._valid(depths_in_box(batch.cameras, lower, upper))
 
     def _valid(self, bounds: DepthBounds) -> DepthBounds:
@@ -92,10 +110,20 @@ class SubjectBox(Options):
 def subject_box(
     masks: Bool[Tensor, "B V h w"], cameras: Cameras, radius: int, tolerance: int = 0
 ) -> tuple[Float[Tensor, "B 3"], Float[Tensor, "B 3"]]:
-    """The axis-aligned box of the visual hull: its corners with the smallest and the largest coordinates, in
-    metres. Carved twice: the second grid fills the box of the first. If nothing is left (contradicting
-    masks), the box before that pass stays. ``radius``: dilation of the masks in pixels. ``tolerance``: how
-    many views may say "outside" of a point that is kept."""
+    """The axis-aligned box of the visual hull.
+
+    Carved twice: the second grid fills the box of the first. If nothing is left (contradicting masks), the
+    box before that pass stays.
+
+    Args:
+        masks: a view with an empty mask does not vote.
+        cameras: [B, V], whose pixels are those of the masks.
+        radius: dilation of the masks in pixels.
+        tolerance: how many views may say "outside" of a point that is kept.
+
+    Returns:
+        The corners with the smallest and with the largest coordinates, in metres.
+    """
     center = subject_center(masks, cameras)
     reach = _reach(masks, cameras, center).nan_to_num().amax(1, keepdim=True).clamp(min=0.05)
     corners = torch.stack((center - reach, center + reach))
@@ -121,6 +149,15 @@ def subject_box(
 def _carve(
     outside: Tensor, cameras: Cameras, lower: Tensor, cell: Tensor, tolerance: int
 ) -> Bool[Tensor, "B n n n"]:
+    """Cells of a grid of :data:`CELLS` along each side that the views keep.
+
+    Args:
+        outside: uint8 [B, V, h, w], 1 where a view says "outside".
+        cameras: [B, V], whose pixels are those of ``outside``.
+        lower: [B, 3], the corner of the grid with the smallest coordinates, in metres.
+        cell: [B, 3], sides of a cell in metres.
+        tolerance: how many views may say "outside" of a cell that is kept.
+    """
     steps = constant(torch.arange, CELLS, like=lower) + 0.5
     position = lower[..., None] + cell[..., None] * steps
     matrices = projection_matrices(cameras)
@@ -139,8 +176,9 @@ def _carved(
     Args:
         outside: 1 where a view says "outside".
         matrices: of projection.
-        position: centres of the cells along each axis.
-        tolerance: votes that a cell may have."""
+        position: centres of the cells along each axis, in metres.
+        tolerance: votes that a cell may have.
+    """
     columns = matrices.movedim(2, 0)[..., None]
     x, y, z = (columns[..., :3, :] * position[:, None]).unbind(3)
     z = z + columns[..., 3, :]
@@ -158,7 +196,16 @@ _carving = gpu.operator(
 
 
 def _reach(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Float[Tensor, "B 3"]) -> Tensor:
-    """A generous radius [B, V] of the subject about ``center`` from each view; NaN for an empty mask."""
+    """A generous radius of the subject from each view.
+
+    Args:
+        masks: the subject's pixels.
+        cameras: [B, V], of the masks.
+        center: of the subject, in metres.
+
+    Returns:
+        Radius [B, V] about ``center`` in metres; NaN for an empty mask.
+    """
     pixel, depth = project(center[:, None].expand(*cameras.shape, 3), cameras.intrinsics, cameras.extrinsics)
     extents = [
         torch.where(masks.any(-2 + dim), (line - pixel[..., dim, None]).abs() + 0.5, 0).amax(-1)

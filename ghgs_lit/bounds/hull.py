@@ -38,6 +38,15 @@ class VisualHull(SubjectBox):
     def _within(
         self, batch: Batch, coarse: Silhouettes, voting: Tensor, lower: Tensor, upper: Tensor
     ) -> DepthBounds:
+        """As of :class:`SubjectBox`, and for the subject's pixels within the hull.
+
+        Args:
+            batch: masks and cameras at full resolution.
+            coarse: the same at a lower one, at which rays are marched.
+            voting: [B, V], views that may say "outside".
+            lower: [B, 3], the corner of the box with the smallest coordinates, in metres.
+            upper: [B, 3], that with the largest.
+        """
         box = self._valid(depths_in_box(batch.cameras, lower, upper))
         start = box if coarse.stride == 1 else self._valid(depths_in_box(coarse.cameras, lower, upper))
         # At least one cell: the rays of a cell's pixels run beside the ray of its centre.
@@ -67,12 +76,19 @@ def hull_bounds(
     Pixels beside the subject, and rays that miss the hull, keep the bounds of ``start``.
 
     Args:
+        masks: the subject's pixels, whose rays are marched.
+        cameras: [B, V], whose pixels are those of the masks.
+        start: bounds [B, V, h, w] in metres, between which depths are tried.
         radius: dilation of the masks in pixels.
         tolerance: how many other views may say "outside" of a depth that is allowed.
         samples: depths that are tried along each ray.
         rays: indices of the masks' pixels, if known.
         voting: views that may say "outside"; None: those whose mask is not empty.
-        count: the masks have no more pixels than this, so that a GPU need not be asked; None: unknown."""
+        count: the masks have no more pixels than this, so that a GPU need not be asked; None: unknown.
+
+    Returns:
+        Bounds [B, V, h, w] in metres, half a step outside the depths that were tried.
+    """
     voting = masks.flatten(2).any(-1) if voting is None else voting
     outside = votes_outside(dilate(masks, radius), voting)
     directions = ray_directions(cameras)
@@ -103,8 +119,8 @@ def _march(
     steps: Float[Tensor, " s"],
     tolerance: int,
 ) -> None:
-    """Replace ``near`` and ``far`` of the pixels ``rays`` of all images by the first and the last depth that
-    the other views allow; unchanged where there is none.
+    """Replace the bounds of some pixels by the first and the last depth that the other views allow; unchanged
+    where there is none.
 
     Args:
         rays: indices of pixels; one may be listed more than once, so that ``start`` is read.
@@ -112,11 +128,12 @@ def _march(
         matrices: of projection.
         directions: of the rays.
         centers: of the cameras.
-        start: the depths between which others are tried.
-        near: contiguous, as is ``far``.
-        far: written, like ``near``.
+        start: the depths in metres between which others are tried.
+        near: written; contiguous, as is ``far``.
+        far: written.
         steps: fractions of the way from near to far that are tried.
-        tolerance: votes that an allowed depth may have."""
+        tolerance: votes that an allowed depth may have.
+    """
     views = outside.shape[1]
     samples = len(steps)
     image = rays // outside[0, 0].numel()
@@ -151,13 +168,28 @@ def _marched(
     samples: int,
     tolerance: int,
 ) -> tuple[Float[Tensor, "B V h w"], Float[Tensor, "B V h w"]]:
-    """:func:`_march` for all pixels of ``masks``: new bounds within ``near`` and ``far``."""
+    """:func:`_march` for all pixels of ``masks``: new bounds within ``near`` and ``far``.
+
+    Args:
+        outside: 1 where a view says "outside".
+        masks: the subject's pixels, whose rays are marched.
+        matrices: of projection.
+        directions: of the rays.
+        centers: of the cameras.
+        near: depth in metres from which others are tried.
+        far: depth to which they are.
+        samples: number of depths that are tried.
+        tolerance: votes that an allowed depth may have.
+
+    Returns:
+        Near and far.
+    """
     start = DepthBounds(near, far)
-    found = [bound.clone(memory_format=torch.contiguous_format) for bound in (near, far)]
+    new_bounds = [bound.clone(memory_format=torch.contiguous_format) for bound in (near, far)]
     steps = (torch.arange(samples, device=near.device, dtype=near.dtype) + 0.5) / samples
     rays = masks.flatten().nonzero()[:, 0]
-    _march(rays, outside, matrices, directions, centers, start, *found, steps, tolerance)
-    return tuple(found)
+    _march(rays, outside, matrices, directions, centers, start, *new_bounds, steps, tolerance)
+    return tuple(new_bounds)
 
 
 _marching = gpu.operator(
@@ -169,5 +201,6 @@ _marching = gpu.operator(
 
 
 def _enlarge(values: Tensor, stride: int, size: tuple[int, int]) -> Tensor:
+    """Values of cells for their ``stride`` x ``stride`` pixels each, cropped to ``size`` (height, width)."""
     values = values.repeat_interleave(stride, -2).repeat_interleave(stride, -1)
     return values[..., : size[0], : size[1]]

@@ -23,7 +23,7 @@ from ghgs_lit.types import Cameras, DepthBounds
 
 
 def ray_directions(cameras: Cameras) -> Float[Tensor, "*batch h w 3"]:
-    """Direction of each pixel's ray: displacement in the world per metre of z-depth."""
+    """Direction of each pixel's ray: displacement in the world, in metres, per metre of z-depth."""
     intrinsics = at_least_float32(cameras.intrinsics)
     extrinsics = at_least_float32(cameras.extrinsics)
     centers = homogeneous_centers(cameras.height, cameras.width, intrinsics)
@@ -37,14 +37,25 @@ def projection_matrices(cameras: Cameras) -> Float[Tensor, "*batch 3 4"]:
 
 
 def pixel_axes(cameras: Cameras) -> tuple[Float[Tensor, " w"], Float[Tensor, " h"]]:
-    """Coordinates of the pixel centres along a row and along a column."""
+    """Coordinates of the pixel centres along a row (columns + 0.5) and along a column (rows + 0.5)."""
     centers = pixel_centers(cameras.height, cameras.width, at_least_float32(cameras.intrinsics))
     return centers[0, :, 0], centers[:, 0, 1]
 
 
 def depths_in_box(cameras: Cameras, lower: Float[Tensor, "B 3"], upper: Float[Tensor, "B 3"]) -> DepthBounds:
-    """Depths at which the ray of each pixel enters and leaves the axis-aligned box from ``lower`` to
-    ``upper``, in metres; for a ray that misses it, the range of depths of the whole box."""
+    """Depths at which the ray of each pixel enters and leaves an axis-aligned box.
+
+    By slabs (Kay and Kajiya, SIGGRAPH 1986).
+
+    Args:
+        cameras: [B, V].
+        lower: the corner with the smallest coordinates, in metres.
+        upper: that with the largest.
+
+    Returns:
+        Bounds [B, V, h, w] in metres, perhaps behind the camera; for a ray that misses the box, the range of
+        depths of the whole box.
+    """
     directions = ray_directions(cameras)
     centers = cameras.centers[:, :, None, None]
     # A ray along a face: 1e-12 instead of 0 gives the right infinities without 0 / 0.
@@ -83,8 +94,14 @@ class Silhouettes:
 def silhouettes(
     masks: Bool[Tensor, "B V H W"], cameras: Cameras, resolution: int, dilation: float
 ) -> Silhouettes:
-    """Masks at a lower resolution, to limit the cost of a search. ``resolution``: largest number of cells
-    along the image's longer side. ``dilation``: fraction of the image's longer side."""
+    """Masks at a lower resolution, to limit the cost of a search.
+
+    Args:
+        masks: a cell is part of the subject if one of its pixels is.
+        cameras: [B, V], of the masks.
+        resolution: largest number of cells along the image's longer side.
+        dilation: fraction of the image's longer side; that of the result is in cells, rounded up.
+    """
     stride = ceil(max(masks.shape[-2:]) / resolution)
     if stride > 1:
         masks = F.max_pool2d(masks.float(), stride, stride, ceil_mode=True).bool()
@@ -98,13 +115,26 @@ def silhouettes(
 def dilate(
     masks: Bool[Tensor, "*batch h w"], radius: int, more: Int[Tensor, " b"] | None = None
 ) -> Bool[Tensor, "*batch h w"]:
-    """Masks grown by ``radius`` pixels along both axes, and those of each element by ``more``."""
+    """Masks grown along both axes, by squares.
+
+    Args:
+        masks: of elements along the first dimension.
+        radius: pixels by which all masks grow.
+        more: pixels by which those of each element grow more; None: 0.
+    """
     along = _grow if gpu.is_supported(masks, more) else _grown
     return along(along(masks, radius, more, -2), radius, more, -1)
 
 
 def _grown(masks: Tensor, radius: int, more: Tensor | None, axis: int) -> Tensor:
-    """:func:`dilate` along one axis, at a cost that does not depend on the radius."""
+    """:func:`dilate` along one axis, at a cost that does not depend on the radius.
+
+    Args:
+        masks: bool [..., h, w].
+        radius: in pixels.
+        more: [b], further pixels of each element; None: 0.
+        axis: -2 or -1.
+    """
     if more is not None:
         radius = radius + more.view(-1, *[1] * (masks.dim() - 1))
     size = masks.shape[axis]
@@ -123,17 +153,31 @@ _grow = gpu.operator(
 
 
 def votes_outside(dilated: Bool[Tensor, "B V h w"], voting: Bool[Tensor, "B V"]) -> UInt8[Tensor, "B V h w"]:
-    """1 where a voting view says "outside the subject"."""
+    """1 where a voting view says "outside the subject".
+
+    Args:
+        dilated: masks, grown because real ones are noisy.
+        voting: the others say "outside" nowhere.
+    """
     return (dilated < voting[..., None, None]).view(torch.uint8)
 
 
 def look_up(
     tables: Shaped[Tensor, "n h w"], image: Int[Tensor, "..."], pixels: Float[Tensor, "3 ..."]
 ) -> Tensor:
-    """Entries of ``tables`` at homogeneous pixels, which are overwritten. Points outside the frame take the
-    entry of the nearest border pixel: a mask that does not touch the border has the whole subject in its
-    frame. Points behind the camera land far outside the frame. ``image``: which table; broadcasts with the
-    pixels. ``pixels``: the three coordinates of each."""
+    """Entries of tables at homogeneous pixels.
+
+    Points outside the frame take the entry of the nearest border pixel: a mask that does not touch the border
+    has the whole subject in its frame. Points behind the camera land far outside the frame.
+
+    Args:
+        tables: of votes or other values.
+        image: which table; broadcasts with the pixels.
+        pixels: the three coordinates of each; overwritten.
+
+    Returns:
+        Entries of the shape that ``image`` and the pixels broadcast to.
+    """
     height, width = tables.shape[1:]
     inverse = pixels[2].clamp_(min=NEAREST).reciprocal_()
     # Cameras of absurd sizes overflow to NaN, which has no index.

@@ -45,7 +45,12 @@ class KeptPatches:
 
     @classmethod
     def whole(cls, grid: Sequence[int], device: torch.device) -> "KeptPatches":
-        """All patches of a grid [b, v, h, w] of views."""
+        """All patches of a grid.
+
+        Args:
+            grid: [b, v, h, w]: elements, views, rows and columns of patches.
+            device: that of the tokens.
+        """
         images, (height, width) = grid[0] * grid[1], grid[2:]
         kept = torch.ones(*grid, dtype=torch.bool, device=device)
         return cls(kept, device, [Extent(height * width, 0, height, 0, width)] * images)
@@ -71,7 +76,11 @@ class KeptPatches:
         return [sum(element) + len(element) * special for element in self._counts]
 
     def box(self, margin: int) -> tuple[slice, slice]:
-        """Rows and columns of the patches that are kept in any image, with a margin; at least one patch."""
+        """Rows and columns of the patches that are kept in any image, with a margin; at least one patch.
+
+        Args:
+            margin: patches on each side, as far as the grid goes.
+        """
         filled = [extent for extent in self._extents if extent.count] or [Extent(1, 0, 1, 0, 1)]
         rows = min(e.top for e in filled), max(e.bottom for e in filled)
         columns = min(e.left for e in filled), max(e.right for e in filled)
@@ -84,7 +93,15 @@ class KeptPatches:
         return flat if self.is_whole else flat[self.index]
 
     def join(self, special: Tensor, patches: Tensor) -> Tensor:
-        """Packed tokens [B * V * s + N, C] of special [B * V, s, C] and patch tokens, in the wider dtype."""
+        """Special tokens and patch tokens packed together.
+
+        Args:
+            special: [B * V, s, C], of each image.
+            patches: [N, C], of the kept patches.
+
+        Returns:
+            Packed tokens [B * V * s + N, C] in the wider dtype.
+        """
         images, count, width = special.shape
         dtype = torch.promote_types(special.dtype, patches.dtype)
         if self.is_whole:
@@ -98,15 +115,23 @@ class KeptPatches:
         return packed.index_copy_(0, self._places(count), patches.to(dtype))
 
     def take(self, packed: Float[Tensor, "t c"], special: int) -> Float[Tensor, "N c"]:
-        """The patch tokens of packed tokens with ``special`` special ones in each image."""
+        """The patch tokens of packed tokens.
+
+        Args:
+            packed: tokens of all images.
+            special: number of special ones in each image.
+        """
         if self.is_whole:
             images = self.grid[0] * self.grid[1]
             return packed.unflatten(0, (images, -1))[:, special:].flatten(0, 1)
         return packed[self._places(special)]
 
     def positions(self, special: int) -> Int[Tensor, "t 2"]:
-        """``(row, column)`` of packed tokens in the image: (0, 0) for special ones, from (1, 1) for
-        patches."""
+        """``(row, column)`` of packed tokens in the image: (0, 0) for special ones, from (1, 1) for patches.
+
+        Args:
+            special: number of special tokens in each image.
+        """
         at_patches = torch.stack((self.row, self.column), dim=-1) + 1
         b, v = self.grid[:2]
         return self.join(at_patches.new_zeros(b * v, special, 2), at_patches)

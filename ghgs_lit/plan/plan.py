@@ -92,8 +92,14 @@ class Plan:
         return tuple(sum(each[first : first + self.views]) for first in range(0, len(each), self.views))
 
     def trimmed(self, prediction: Prediction) -> Prediction:
-        """The prediction with Gaussians for the subject's pixels alone. On a GPU those of pixels whose depth
-        is not finite stay, with opacity 0."""
+        """The prediction with Gaussians for the subject's pixels alone.
+
+        Args:
+            prediction: Gaussians, and drafts of the rounds, may fill a size class.
+
+        Returns:
+            On a GPU those of pixels whose depth is not finite stay, with opacity 0.
+        """
         real = self.subject.real
         if real is None or prediction.gaussians.splits != self.subject.splits(self.views):
             return prediction
@@ -108,9 +114,13 @@ class Plan:
         return self.classes and min(self.subject.counts[0], self.peers.counts[0]) >= self.views
 
     def extents_of_class(self) -> tuple[tuple[Extent, ...], tuple[Extent, ...]]:
-        """Extents of the subject, and of the patches that show it, with which a plan has the same sizes and
-        windows for every scene of the class: each image has a share of its element's rows, in the window of
-        all."""
+        """Extents with which a plan has the same sizes and windows for every scene of the class.
+
+        Each image has a share of its element's rows, in the window of all.
+
+        Returns:
+            Extents of the subject in pixels, and of the patches that show it, of each image.
+        """
         window = self._windows(self.patch_size)[0]
         grid = Window.whole(tuple(self.shown.shape[2:]))
         return self._shared(self.subject, window), self._shared(self.peers, grid)
@@ -172,7 +182,8 @@ def planned(
         tokens: which ones the recalibration works on.
         choose: gives each element one of the ``choices``; None: all get the first.
         flags: tensors whose values are to be read with those of the masks.
-        classes: whether numbers of rows are size classes; None: as the masks' device needs it."""
+        classes: whether numbers of rows are size classes; None: as the masks' device needs it.
+    """
     b, v = masks.shape[:2]
     shown = patches_around_subject(masks, patch_size, 0)
     asked = [masks, *choices]

@@ -23,13 +23,22 @@ class KeptTokens(NamedTuple):
 
     @classmethod
     def of_budget(cls, budget: str | int) -> "KeptTokens":
-        """The view for one choice of ``token_budgets``."""
+        """The view for one choice of ``token_budgets``.
+
+        Args:
+            budget: number of patches around the subject that stay; or a value of ``tokens``, such as ``all``.
+        """
         return cls("subject", budget) if isinstance(budget, int) else cls(budget)
 
 
 @contextmanager
 def seeing(encoder: Any, view: KeptTokens) -> Iterator[None]:
-    """Set ``tokens`` and ``margin`` of a :class:`ghgs_lit.encoder.VGGTEncoder` while the context lasts."""
+    """Let an encoder work on other patches while the context lasts.
+
+    Args:
+        encoder: a :class:`ghgs_lit.encoder.VGGTEncoder`.
+        view: its ``tokens`` and ``margin``.
+    """
     before = (encoder.tokens, encoder.margin)
     encoder.tokens, encoder.margin = view
     try:
@@ -128,16 +137,24 @@ class AutoSkip:
     """Gives each subject the preset of the budget in which the encoder has the fewest FLOPs.
 
     Only the encoder counts: the heads compute windows around the subject in every preset. The choice does not
-    depend on the machine; half precision is chosen separately (``precision=auto``). ``presets``: those within
-    the budget, the most accurate first. ``budget_db``: PSNR that may be lost against ``skip=none``.
-    ``left_out``: the other presets, with the reason."""
+    depend on the machine; half precision is chosen separately (``precision=auto``).
+
+    Attributes:
+        presets: those within the budget, the most accurate first.
+        budget_db: PSNR in dB that may be lost against ``skip=none``.
+        left_out: the other presets, with the reason.
+    """
 
     presets: Mapping[str, Preset]
     budget_db: float
     left_out: Mapping[str, str]
 
     def trained_by(self, config: Mapping[str, Any]) -> "AutoSkip":
-        """Only the presets that occurred in the training of ``config``: the loss of others is unknown."""
+        """Only the presets that occurred in a training: the loss of others is unknown.
+
+        Args:
+            config: of the training; its ``skip`` and ``token_budgets`` are read.
+        """
         shown = {SkipOptions.read(config.get("skip") or {}, "skip").view}
         shown |= {KeptTokens.of_budget(budget) for budget in config.get("token_budgets") or []}
         known = {n: p for n, p in self.presets.items() if p.is_exact or p.view in shown}
@@ -145,7 +162,12 @@ class AutoSkip:
         return replace(self, presets=known, left_out={**unknown, **self.left_out})
 
     def choices(self, encoder: Any, masks: Bool[Tensor, "B V H W"]) -> list[Bool[Tensor, "B V h w"]]:
-        """The patches that each preset keeps. ``masks``: sides are divisible by the patch size."""
+        """The patches that each preset keeps.
+
+        Args:
+            encoder: a :class:`ghgs_lit.encoder.VGGTEncoder`.
+            masks: the subject's pixels; sides are divisible by the patch size.
+        """
         found = []
         for preset in self.presets.values():
             with seeing(encoder, preset.view):
@@ -155,8 +177,15 @@ class AutoSkip:
     def choose(
         self, encoder: Any, counts: Sequence[Int[Tensor, "B V"]]
     ) -> tuple[tuple[Decision, ...], list[int]]:
-        """The preset of each element, by its masks alone (among equals the most accurate), and its number.
-        ``counts``: numbers of patches that each preset keeps, on the CPU."""
+        """The preset of each element, by its masks alone; among equals the most accurate.
+
+        Args:
+            encoder: a :class:`ghgs_lit.encoder.VGGTEncoder`.
+            counts: numbers of patches that each preset keeps, on the CPU.
+
+        Returns:
+            The decision for each element, and the number of its preset.
+        """
         table = torch.stack([encoder_products(encoder, kept) for kept in counts], dim=-1)
         best = [min(range(len(counts)), key=row.__getitem__) for row in table.tolist()]
         names = list(self.presets)
@@ -164,7 +193,11 @@ class AutoSkip:
         return tuple(Decision(names[k], share[k]) for k, share in zip(best, shares, strict=True)), best
 
     def report(self, decisions: Sequence[Decision]) -> str:
-        """One line that says which presets the subjects got, and why."""
+        """One line that says which presets the subjects got, and why.
+
+        Args:
+            decisions: one for each subject.
+        """
         shares: dict[str, list[float]] = {name: [] for name in self.presets}
         for decision in decisions:
             shares[decision.preset].append(decision.products)
@@ -182,10 +215,16 @@ class AutoSkip:
 
 
 def encoder_products(encoder: Any, kept: Int[Tensor, "B V"]) -> Float[Tensor, " B"]:
-    """FLOPs of a frame block and a global block for each element, for numbers of kept patches. The linear
-    layers of a block take 24 n C^2 (6 for queries, keys and values, 2 for the projection of the attention's
-    output, 16 for the MLP of four times the width), attention among m tokens 4 m^2 C: within a view in the
-    frame block, among all views in the global block. ``encoder``: a :class:`ghgs_lit.encoder.VGGTEncoder`."""
+    """FLOPs of a frame block and a global block for each element.
+
+    The linear layers of a block take 24 n C^2 for n tokens of width C (6 for queries, keys and values, 2 for
+    the projection of the attention's output, 16 for the MLP of four times the width), attention among m
+    tokens 4 m^2 C: within a view in the frame block, among all views in the global block.
+
+    Args:
+        encoder: a :class:`ghgs_lit.encoder.VGGTEncoder`.
+        kept: numbers of patches that are kept.
+    """
     tokens = (kept + encoder.aggregator.special).double()
     width = encoder.dim_latent // 2
     both = tokens.sum(1)

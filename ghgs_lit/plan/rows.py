@@ -20,8 +20,10 @@ def rounds_up(device: torch.device) -> bool:
 
 
 def size_class(count: int) -> int:
-    """The smallest size class that holds ``count`` rows: 1 to 16, then eight of equal steps in each octave
-    (18, 20, ..., 32, 36, ...), so that at most an eighth is added."""
+    """The smallest size class that holds ``count`` rows.
+
+    1 to 16, then eight of equal steps in each octave (18, 20, ..., 32, 36, ...): at most an eighth is added.
+    """
     step = max((1 << max(count - 1, 0).bit_length()) // (2 * _STEPS), 1)
     return -(-count // step) * step
 
@@ -46,12 +48,24 @@ class Rows:
 
     @classmethod
     def exact(cls, wanted: Bool[Tensor, "..."], counts: Sequence[int], images: int) -> "Rows":
-        """The rows that are ``wanted``, of which each group of ``images`` images has ``counts``."""
+        """The rows that are wanted.
+
+        Args:
+            wanted: pixels or tokens, group by group.
+            counts: how many of each group are wanted.
+            images: number of images of a group.
+        """
         return cls(true_places(wanted, sum(counts)), tuple(counts), images)
 
     @classmethod
     def filled(cls, wanted: Bool[Tensor, "g m"], counts: Sequence[int], images: int) -> "Rows":
-        """The rows that are ``wanted``, filled up to the size class of the largest of ``counts``."""
+        """The rows that are wanted, filled up to the size class of the largest group.
+
+        Args:
+            wanted: m pixels or tokens of each of g groups.
+            counts: how many of each group are wanted.
+            images: number of images of a group.
+        """
         groups, of_group = wanted.shape
         size = min(size_class(max(max(counts, default=0), 1)), of_group)
         number = torch.arange(of_group, device=wanted.device)
@@ -76,7 +90,14 @@ class Rows:
         return dataclasses.replace(self, index=self.index[found], counts=counts)
 
     def places(self, total: int) -> tuple[Bool[Tensor, " t"], Int[Tensor, " t"]]:
-        """Which of ``total`` pixels or tokens are rows that count, and the number of each one's row."""
+        """Where pixels or tokens are among the rows.
+
+        Args:
+            total: number of pixels or tokens.
+
+        Returns:
+            Which of them are rows that count, and the number of each one's row; 0 for others.
+        """
         numbers = torch.arange(len(self.index), device=self.index.device)
         # Rows that do not count go to one place more, which is cut off.
         target = self.index if self.real is None else torch.where(self.real, self.index, total)

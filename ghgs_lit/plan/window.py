@@ -22,6 +22,7 @@ class Span(NamedTuple):
     full: int
 
     def grown(self, cells: int) -> "Span":
+        """These and ``cells`` more on each side, as far as the map goes."""
         return Span(max(self.start - cells, 0), min(self.stop + cells, self.full), self.full)
 
     def sources(self, full: int) -> "Span":
@@ -44,6 +45,7 @@ class Span(NamedTuple):
         return Span(start, start + length, self.full)
 
     def hull(self, other: "Span") -> "Span":
+        """The smallest span of the same map that contains both."""
         return Span(min(self.start, other.start), max(self.stop, other.stop), self.full)
 
 
@@ -55,6 +57,7 @@ class Window(NamedTuple):
 
     @classmethod
     def whole(cls, size: tuple[int, int]) -> "Window":
+        """All of a map of ``size`` (height, width)."""
         return cls(*(Span(0, full, full) for full in size))
 
     @property
@@ -64,13 +67,16 @@ class Window(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
+        """Whether this is all of the map."""
         return self == Window.whole(self.full)
 
     @property
     def slices(self) -> tuple[slice, slice]:
+        """Rows and columns, to index maps."""
         return slice(*self.rows[:2]), slice(*self.columns[:2])
 
     def grown(self, cells: int) -> "Window":
+        """Along both axes as of :class:`Span`; so are the next four."""
         return Window(*(span.grown(cells) for span in self))
 
     def sources(self, full: tuple[int, int]) -> "Window":
@@ -86,7 +92,12 @@ class Window(NamedTuple):
         return Window(*(mine.hull(its) for mine, its in zip(self, other, strict=True)))
 
     def cut(self, maps: Float[Tensor, "n c h w"], inner: "Window") -> Float[Tensor, "n c h2 w2"]:
-        """Crop maps of this window to ``inner``."""
+        """Maps of this window, cropped.
+
+        Args:
+            maps: of this window.
+            inner: a window within this one, of the same map.
+        """
         if inner == self:
             return maps
         rows, columns = (
@@ -96,8 +107,14 @@ class Window(NamedTuple):
         return maps[..., rows, columns]
 
     def resize(self, maps: Float[Tensor, "n c h w"], target: "Window") -> Float[Tensor, "n c h2 w2"]:
-        """Resize maps of this window to ``target``, a window of maps of another size; bilinear, as
-        ``F.interpolate`` with ``align_corners=True`` on the whole maps."""
+        """Maps of this window, resized bilinearly as ``F.interpolate`` with ``align_corners=True``.
+
+        Weights are those of whole maps.
+
+        Args:
+            maps: of this window.
+            target: a window of maps of another size, or of the same.
+        """
         if self.full == target.full:
             return self.cut(maps, target)
         if self.is_whole and target.is_whole:
@@ -109,7 +126,14 @@ class Window(NamedTuple):
 
 
 def _interpolate(maps: Tensor, axis: int, source: Span, target: Span) -> Tensor:
-    """Linear interpolation along one axis, with the weights of ``F.interpolate``."""
+    """Linear interpolation along one axis, with the weights of ``F.interpolate``.
+
+    Args:
+        maps: [n, h, w, c], float32 or wider.
+        axis: 1 or 2.
+        source: cells of the maps.
+        target: cells of the result.
+    """
     low, high, weight = _sources(source, target, maps.dtype, maps.device)
     weight = weight.view(-1, *[1] * (3 - axis))
     below, above = (maps.index_select(axis, cell) for cell in (low, high))
@@ -121,7 +145,17 @@ def _interpolate(maps: Tensor, axis: int, source: Span, target: Span) -> Tensor:
 def _sources(
     source: Span, target: Span, dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """For each cell of the target, the two cells of the source around it, and the weight of the second."""
+    """For each cell of the target, the two cells of the source that it lies between.
+
+    Args:
+        source: cells that there are.
+        target: cells of another map.
+        dtype: of the weights: that of the maps.
+        device: of the result.
+
+    Returns:
+        Indices of the first and of the second cell within the source, and the weight of the second.
+    """
     numbers, place, low, high, weight = _of_whole_maps(source.full, target.full, dtype, device)
     wanted = slice(target.start, target.stop)
     low = low[wanted]
@@ -141,8 +175,18 @@ def _sources(
 def _of_whole_maps(
     source: int, target: int, dtype: torch.dtype, device: torch.device
 ) -> tuple[list[int], Tensor, Tensor, Tensor, Tensor]:
-    """For each of ``target`` cells: its place among ``source`` cells, the two cells around it, the weight of
-    the second; the first of the two also as numbers, which are known without waiting for a GPU."""
+    """:func:`_sources` of whole maps.
+
+    Args:
+        source: number of cells that there are.
+        target: number of cells of another map.
+        dtype: of the weights: that of the maps.
+        device: of the result.
+
+    Returns:
+        For each of the target's cells the first of the two cells around it, as a number that is known without
+        waiting for a GPU; its place; the first and the second cell; and the weight of the second.
+    """
     # A division and a product, both rounded to the precision of the maps, as in PyTorch.
     step = torch.tensor((source - 1) / max(target - 1, 1), dtype=dtype, device="cpu").item()
     numbers = (torch.arange(target, dtype=dtype, device="cpu") * step).long().tolist()
@@ -152,7 +196,12 @@ def _of_whole_maps(
 
 
 def subject_windows(extents: Sequence[Extent], size: tuple[int, int]) -> list[Window | None]:
-    """The bounding window of the mask of each image, None if empty. ``size``: height, width of images."""
+    """The bounding window of the mask of each image, None if empty.
+
+    Args:
+        extents: of the masks.
+        size: height and width of the images in pixels.
+    """
     height, width = size
     return [
         Window(Span(top, bottom, height), Span(left, right, width)) if count else None

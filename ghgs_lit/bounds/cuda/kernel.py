@@ -22,7 +22,17 @@ def _cell(x, inverse, size):
 
 @triton.jit
 def _vote(outside, view, x, y, w, height, width):
-    """Entries of a table at homogeneous pixels."""
+    """Entries of tables at homogeneous pixels; outside the frame, those of the nearest border pixel.
+
+    Args:
+        outside: tables [images, height, width] of uint8.
+        view: number of the table of each row.
+        x: first homogeneous coordinate; x / w is the column, with pixel centres at +0.5.
+        y: second; y / w is the row.
+        w: third, the depth in metres.
+        height: of a table.
+        width: of a table.
+    """
     inverse = 1 / tl.where(w > LEAST, w, LEAST)
     row = _cell(y, inverse, height)
     column = _cell(x, inverse, width)
@@ -33,29 +43,55 @@ def _vote(outside, view, x, y, w, height, width):
 def dilated_rows(
     count, masks, more, out, radius, area, size, stride, HAS_MORE: tl.constexpr, ROWS: tl.constexpr
 ):
-    """Write ``ROWS`` pixels, grown along the axis of ``size`` pixels that are ``stride`` apart. ``area``:
-    pixels of an element."""
+    """Write ``ROWS`` pixels of masks that are grown along one axis.
+
+    Args:
+        count: number of pixels of all masks.
+        masks: bool.
+        more: [B], pixels by which the masks of each element grow more; read with ``HAS_MORE``.
+        out: bool, written; of the masks' shape.
+        radius: pixels by which all masks grow.
+        area: pixels of an element, of all its views.
+        size: pixels along the axis.
+        stride: distance of its neighbouring pixels in memory.
+        HAS_MORE: whether there is ``more``.
+        ROWS: pixels of a program.
+    """
     i = rows_of(count, ROWS)
     place = i // stride % size
     reach = tl.zeros_like(place).to(tl.int32) + radius
     if HAS_MORE:
         reach += tl.load(more + i // area)
     reach = tl.minimum(reach, size)
-    found = tl.load(masks + i).to(tl.int32)
+    grown = tl.load(masks + i).to(tl.int32)
     for step in range(1, tl.max(reach, 0) + 1):
         is_near = step <= reach
         after = is_near & (place + step < size)
         before = is_near & (place >= step)
-        found |= tl.load(masks + i + step * stride, after, 0).to(tl.int32)
-        found |= tl.load(masks + i - step * stride, before, 0).to(tl.int32)
-    tl.store(out + i, found != 0)
+        grown |= tl.load(masks + i + step * stride, after, 0).to(tl.int32)
+        grown |= tl.load(masks + i - step * stride, before, 0).to(tl.int32)
+    tl.store(out + i, grown != 0)
 
 
 @triton.jit
 def carved_rows(
     count, outside, matrices, position, kept, views, cells, height, width, tolerance, ROWS: tl.constexpr
 ):
-    """Write ``ROWS`` cells of the grids; ``position`` [B, 3, n]: their centres along each axis."""
+    """Write ``ROWS`` cells of the grids of all elements.
+
+    Args:
+        count: number of cells, B n^3.
+        outside: [B, V, height, width].
+        matrices: [B, V, 3, 4], of projection.
+        position: [B, 3, n], centres of the cells along each axis, in metres.
+        kept: bool [B, n, n, n], written.
+        views: V.
+        cells: n.
+        height: of ``outside``.
+        width: of ``outside``.
+        tolerance: votes that a kept cell may have.
+        ROWS: cells of a program.
+    """
     i = rows_of(count, ROWS)
     element = i // cells // cells // cells
     at = position + element * 3 * cells
@@ -79,7 +115,26 @@ def marched_rows(
     count, outside, masks, matrices, directions, centers, near, far, new_near, new_far,
     samples, views, height, width, tolerance, ROWS: tl.constexpr,
 ):  # fmt: skip
-    """Write the bounds of ``ROWS`` rays, one for each pixel of a mask; those of others are copied."""
+    """Write the bounds of ``ROWS`` rays, one for each pixel of a mask; those of others are copied.
+
+    Args:
+        count: number of pixels, B V height width.
+        outside: [B, V, height, width].
+        masks: bool [B, V, height, width], the subject's pixels.
+        matrices: [B, V, 3, 4], of projection.
+        directions: [B, V, height, width, 3], of the rays, per metre of depth.
+        centers: [B, V, 3], of the cameras, in metres.
+        near: [B, V, height, width], the depth in metres from which others are tried.
+        far: the depth to which they are.
+        new_near: written, of the shape of ``near``.
+        new_far: written.
+        samples: number of depths that are tried.
+        views: V.
+        height: of the masks.
+        width: of the masks.
+        tolerance: votes that an allowed depth may have.
+        ROWS: rays of a program.
+    """
     i = rows_of(count, ROWS)
     image = i // (height * width)
     begin = tl.load(near + i)
@@ -106,14 +161,24 @@ def marched_rows(
         last = tl.where(is_allowed, step, last)
     is_hit = (first < samples) & (tl.load(masks + i) != 0)
     half = length / (2 * samples)
-    found = begin + (first + 0.5) / samples * length - half
-    tl.store(new_near + i, tl.where(is_hit, found, begin))
-    found = begin + (last + 0.5) / samples * length + half
-    tl.store(new_far + i, tl.where(is_hit, found, end))
+    bound = begin + (first + 0.5) / samples * length - half
+    tl.store(new_near + i, tl.where(is_hit, bound, begin))
+    bound = begin + (last + 0.5) / samples * length + half
+    tl.store(new_far + i, tl.where(is_hit, bound, end))
 
 
 def dilated(masks: Tensor, radius: int, more: Tensor | None, axis: int) -> Tensor:
-    """The operator of :mod:`ghgs_lit.bounds.rays`."""
+    """The operator of :mod:`ghgs_lit.bounds.rays`.
+
+    Args:
+        masks: bool [..., h, w], of elements along the first dimension.
+        radius: pixels by which they grow.
+        more: [B], further ones of each element; None: none.
+        axis: -2 or -1.
+
+    Returns:
+        Masks of the same shape.
+    """
     height, width = masks.shape[-2:]
     out = masks.new_empty(masks.shape)
     size, stride = (height, width) if axis == -2 else (width, 1)
@@ -123,7 +188,17 @@ def dilated(masks: Tensor, radius: int, more: Tensor | None, axis: int) -> Tenso
 
 
 def carved(outside: Tensor, matrices: Tensor, position: Tensor, tolerance: int) -> Tensor:
-    """The operator of :mod:`ghgs_lit.bounds.box`."""
+    """The operator of :mod:`ghgs_lit.bounds.box`.
+
+    Args:
+        outside: uint8 [B, V, h, w], 1 where a view says "outside".
+        matrices: [B, V, 3, 4], of projection.
+        position: [B, 3, n], centres of the cells along each axis, in metres.
+        tolerance: votes that a kept cell may have.
+
+    Returns:
+        The kept cells, bool [B, n, n, n].
+    """
     _, views, height, width = outside.shape
     cells = position.shape[2]
     kept = outside.new_empty(len(outside), cells, cells, cells, dtype=torch.bool)
