@@ -47,8 +47,8 @@ def rotate(x: Float[Tensor, "*batch t d"], rotary: Rotary) -> Float[Tensor, "*ba
     return torch.addcmul(x * rotary.cosine, quarters.flip(-2).flatten(-3), rotary.sine)
 
 
-#: Values of queries or keys that are rotated at once without a gradient, to save memory: on a CPU, on a GPU.
-_ROTATED = 1 << 18
+#: Values of queries or keys that are rotated at once without a gradient, to save memory.
+_ROTATED = 1 << 18  # on a CPU
 _GPU_ROTATED = 1 << 25
 
 
@@ -103,8 +103,8 @@ def _attend(
 #: Register tokens of each view in the ViT and in the aggregator.
 REGISTERS = 4
 
-#: Hidden values of the MLP in memory at once without a gradient: on a CPU, on a GPU.
-_HIDDEN = 1 << 23
+#: Hidden values of the MLP in memory at once without a gradient.
+_HIDDEN = 1 << 23  # on a CPU
 _GPU_HIDDEN = 1 << 28
 
 

@@ -9,8 +9,9 @@ from torch import Tensor
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.runtime.precision import exact
 
-#: Distances in the memory of an accelerator at once, and candidates of each query that are compared exactly.
+#: Distances in the memory of an accelerator at once.
 _DISTANCES = 1 << 26
+#: Candidates of each query that are compared exactly.
 _CANDIDATES = 4
 
 

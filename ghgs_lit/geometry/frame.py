@@ -56,8 +56,14 @@ class Frame:
 
     @torch.no_grad()
     def enter(self, batch: Batch) -> Batch:
-        """The batch with its input cameras in the frame, in the precision of the photographs. Targets, true
-        depths and body vertices stay in the world."""
+        """The batch with its input cameras in the frame; targets, true depths and bodies stay in the world.
+
+        Args:
+            batch: with cameras in the world, of any unit.
+
+        Returns:
+            The batch; its cameras have the precision of the photographs, float32 or wider.
+        """
         cameras = batch.cameras
         dtype = at_least_float32(batch.images).dtype
         extrinsics = cameras.extrinsics.double()
@@ -69,7 +75,15 @@ class Frame:
         return dataclasses.replace(batch, cameras=inside)
 
     def leave_cameras(self, inside: Cameras, world: Cameras) -> Cameras:
-        """Cameras in the frame as cameras in the world, in the precision of ``world``, the original ones."""
+        """Cameras in the frame as cameras in the world.
+
+        Args:
+            inside: cameras in the frame, with the extrinsics [B, V, 4, 4] to convert.
+            world: the original cameras, which have the precision of the result.
+
+        Returns:
+            Cameras in the world.
+        """
         extrinsics = world.extrinsics.double().clone()
         extrinsics[..., :3, :3] = inside.extrinsics[..., :3, :3].double() @ self.axes[:, None]
         to_origin = (extrinsics[..., :3, :3] @ self.origin[:, None, :, None])[..., 0]
@@ -80,8 +94,15 @@ class Frame:
         return dataclasses.replace(world, intrinsics=intrinsics, extrinsics=extrinsics.to(world.extrinsics))
 
     def leave(self, prediction: Prediction, dtype: torch.dtype) -> Prediction:
-        """The prediction in the world. ``dtype``: of points in the world (that of its cameras), which may
-        need more digits than in the frame."""
+        """The prediction in the world.
+
+        Args:
+            prediction: in the frame.
+            dtype: of points in the world (that of its cameras), which may need more digits than in the frame.
+
+        Returns:
+            The prediction in the unit and the axes of the world.
+        """
         dtype = torch.promote_types(dtype, torch.float32)
         views = prediction.depth.shape[1]
         points = prediction.points
@@ -132,8 +153,16 @@ def _in_unit(maps: DepthMaps, metre: Float[Tensor, "B 1 1 1"], known: dict[Tenso
 def _to_world(
     points: Float[Tensor, "*n 3"], element: Int[Tensor, "*#n"], world: Float[Tensor, "B 4 3"]
 ) -> Float[Tensor, "*n 3"]:
-    """Points in the world, computed in its precision; the error is that of rounding the result. ``world``:
-    axes of each element, as long as a metre, and its origin."""
+    """Points in the world, computed in its precision; the error is that of rounding the result.
+
+    Args:
+        points: [..., 3] in the frame.
+        element: batch element of each point, of a shape that broadcasts with [...].
+        world: axes of each element, as long as a metre, and its origin [B, 4, 3].
+
+    Returns:
+        Points [..., 3].
+    """
     *axes, found = world[element].unbind(-2)
     for coordinate, axis in zip(points.to(world.dtype)[..., None].unbind(-2), axes, strict=True):
         found = torch.addcmul(found, coordinate, axis)
@@ -141,9 +170,18 @@ def _to_world(
 
 
 def subject_center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Tensor, "B 3"]:
-    """The point nearest to the rays through the masks' centroids, by least squares. Optical axes have a small
-    weight, so that one mask or none is enough, and the cameras a smaller one, for parallel rays. To be called
-    where products are exact (:func:`ghgs_lit.runtime.precision.exact`)."""
+    """The point nearest to the rays through the masks' centroids, by least squares.
+
+    Optical axes have a small weight, so that one mask or none is enough, and the cameras a smaller one, for
+    parallel rays. To be called where products are exact (:func:`ghgs_lit.runtime.precision.exact`).
+
+    Args:
+        masks: of the subject [B, V, h, w].
+        cameras: [B, V], of photographs of that size.
+
+    Returns:
+        Points [B, 3] in the world.
+    """
     intrinsics = at_least_float32(cameras.intrinsics)
     extrinsics = at_least_float32(cameras.extrinsics)
     # Sums of u and v, and the number of pixels: half-integers, whose sums are exact in any order.
@@ -173,9 +211,19 @@ def in_cameras(points: Float[Tensor, "B 3"], extrinsics: Float[Tensor, "B V 4 4"
 
 
 def _size(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Tensor) -> Float[Tensor, " B"]:
-    """Height or width of the subject, whichever is larger, in the world's unit. The median of the views, so
-    that one wrong mask does not matter; of two the larger, since masks are more often too small.
-    :data:`HEIGHT` if no view shows the subject in front of it."""
+    """Height or width of the subject, whichever is larger.
+
+    The median of the views, so that one wrong mask does not matter; of two the larger, since masks are more
+    often too small.
+
+    Args:
+        masks: of the subject [B, V, h, w].
+        cameras: [B, V], of photographs of that size.
+        center: the subject's middle [B, 3].
+
+    Returns:
+        Lengths [B] in the world's unit; :data:`HEIGHT` if no view shows the subject in front of it.
+    """
     depth = in_cameras(center, cameras.extrinsics)[..., 2]
     sides = []
     for axis in (0, 1):

@@ -28,9 +28,16 @@ WIDEST = -0.6
 
 @torch.no_grad()
 def photo_consistency(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Tensor, "B V S H W"]:
-    """Agreement of each pixel of the subject with the best other view, in [0, 1], without a gradient; 0
-    outside the subject, and where no other view has the point in its mask. ``batch``: images, masks and
-    cameras are read. ``steps``: S, the number of depths: the middles of S equal parts from near to far."""
+    """Agreement of each pixel of the subject with the best other view, without a gradient.
+
+    Args:
+        batch: images, masks and cameras are read.
+        bounds: depths between which a pixel's point lies, in the unit of the cameras.
+        steps: S, the number of depths: the middles of S equal parts from near to far.
+
+    Returns:
+        [B, V, S, H, W] in [0, 1]; 0 outside the subject, and where no other view has the point in its mask.
+    """
     near, far = (bound.flatten()[batch.pixels] for bound in (bounds.near, bounds.far))
     found = consistency_of(batch, batch.pixels, near, far, steps)
     result = found.new_zeros(batch.masks.numel(), steps).index_copy_(0, batch.pixels, found)
@@ -41,8 +48,18 @@ def photo_consistency(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Te
 def consistency_of(
     batch: Batch, pixels: Int[Tensor, " N"], near: Float[Tensor, " N"], far: Float[Tensor, " N"], steps: int
 ) -> Float[Tensor, "N S"]:
-    """:func:`photo_consistency` of some pixels of the subject. ``pixels``: ascending indices among those of
-    all images. ``near``, ``far``: bounds of these pixels in metres."""
+    """:func:`photo_consistency` of some pixels of the subject.
+
+    Args:
+        batch: images, masks and cameras are read.
+        pixels: ascending indices [N] among those of all images.
+        near: least depth of each of these pixels [N], in the unit of the cameras.
+        far: largest depth of each [N].
+        steps: S, the number of depths: the middles of S equal parts from near to far.
+
+    Returns:
+        [N, S] in [0, 1].
+    """
     near = at_least_float32(near)
     far = at_least_float32(far)
     # An error of half a pixel, as in bfloat16, would give another colour.
@@ -72,14 +89,18 @@ def _swept(
 
     Args:
         pixels: indices among those of all images.
-        near: least depths in metres.
-        far: largest depths in metres.
+        near: least depths, in the unit of the cameras.
+        far: largest depths, the same.
         colors: smoothed photographs and their masks (:func:`_smoothed`).
         turn: matrices from pixels of a view (second axis) to another (third axis), as is the next.
         shift: what is added in the other view.
         compared: whether two views are compared.
         steps: S, the number of depths.
-        tolerance: mean difference of colours at which the agreement is 1 / e."""
+        tolerance: mean difference of colours at which the agreement is 1 / e.
+
+    Returns:
+        [N, S] in [0, 1].
+    """
     shares = constant(middles, steps, like=near)
     result = near.new_zeros(len(pixels), steps)
     for part in even_parts(len(pixels), _SAMPLES // (steps * (colors.shape[1] - 1))):
@@ -108,7 +129,20 @@ def _best_match(
     compared: Bool[Tensor, "B V V"],
     tolerance: float,
 ) -> Float[Tensor, "n S"]:
-    """Agreement of pixels of any images, at their depths, with the best other view; see :func:`_swept`."""
+    """Agreement of pixels of any images, at their depths, with the best other view.
+
+    Args:
+        pixels: indices among those of all images.
+        depth: depths of each pixel that are tried.
+        colors: as for :func:`_swept`, as are the next.
+        turn: matrices from pixels of a view to another.
+        shift: what is added in the other view.
+        compared: whether two views are compared.
+        tolerance: mean difference of colours at which the agreement is 1 / e.
+
+    Returns:
+        [n, S] in [0, 1].
+    """
     views, _, height, width = colors.shape[1:]
     image = pixels // (height * width)
     place = pixels % (height * width)
@@ -132,8 +166,20 @@ def _match(
     depth: Tensor,
     tolerance: float,
 ) -> Tensor:
-    """Agreement [n, o, S] of colours ``own`` [n, 3] with ``images`` [m, 4, H, W]. ``image``: [n, o], those
-    that each pixel is compared with. ``rays``, ``shift``: [n, o, 3], in these. ``depth``: [n, S]."""
+    """Agreement of the colours of pixels with those of other images at their depths.
+
+    Args:
+        images: smoothed colours and masks of all m images [m, 4, H, W].
+        image: images that each pixel is compared with [n, o].
+        own: colours of the pixels [n, 3].
+        rays: what a unit of depth adds to a point's homogeneous pixel in these images [n, o, 3].
+        shift: that of the camera's centre [n, o, 3].
+        depth: depths of each pixel that are tried [n, S].
+        tolerance: mean difference of colours at which the agreement is 1 / e.
+
+    Returns:
+        [n, o, S] in [0, 1].
+    """
     points = rays[:, :, None] * depth[:, None, :, None] + shift[:, :, None]
     z = points[..., 2]
     front = z > 0
@@ -151,8 +197,17 @@ def _smooth(batch: Batch) -> Tensor:
 def _smoothed(
     images: Float[Tensor, "B V 3 H W"], masks: Bool[Tensor, "B V H W"]
 ) -> Float[Tensor, "B V 4 H W"]:
-    """Mean colours of the subject's pixels in 3 x 3, and the mask as a fourth channel. Pixels that are not
-    finite are left out of the mask: they would spread through sums and samples."""
+    """Mean colours of the subject's pixels in 3 x 3, and the mask as a fourth channel.
+
+    Pixels that are not finite are left out of the mask: they would spread through sums and samples.
+
+    Args:
+        images: colours of the surface [B, V, 3, H, W].
+        masks: of the subject [B, V, H, W].
+
+    Returns:
+        [B, V, 4, H, W].
+    """
     inside = (masks & images.sum(2).isfinite())[:, :, None]
     both = torch.cat((torch.where(inside, images, 0), inside.to(images.dtype)), 2)
     for axis in (-2, -1):  # several times as fast as an average pool
@@ -173,8 +228,15 @@ def _sum_of_three(values: Tensor, axis: int) -> Tensor:
 def _relations(
     intrinsics: Float[Tensor, "B V 3 3"], extrinsics: Float[Tensor, "B V 4 4"]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """``turn`` and ``shift`` [B, j, k] in ``z_k p_k = z_j turn p_j + shift`` for pixels ``p`` of views j and
-    k, and the cosine between the axes of the views."""
+    """What leads from pixels of a view j to those of a view k: ``z_k p_k = z_j turn p_j + shift``.
+
+    Args:
+        intrinsics: K [B, V, 3, 3] in pixels.
+        extrinsics: world to camera [B, V, 4, 4].
+
+    Returns:
+        ``turn`` [B, j, k, 3, 3], ``shift`` [B, j, k, 3], and the cosines between the axes of views [B, j, k].
+    """
     rotation = extrinsics[..., :3, :3]
     translation = extrinsics[..., :3, 3:]
     relative = rotation[:, None] @ rotation[:, :, None].mT

@@ -25,9 +25,11 @@ _REACH = 3.0
 _EVERY = 4
 #: Difference of colours at which an equation has half its weight.
 _OUTLIER = 0.06
-#: Longest step in metres; damping of steps: absolute, and relative to the mean of the matrix's diagonal.
+#: Longest step in metres.
 _LONGEST = 0.05
+#: Damping of steps, absolute.
 _STILL = 1e-3
+#: Damping of steps, relative to the mean of the matrix's diagonal.
 _STIFF = 0.01
 
 
@@ -63,14 +65,30 @@ class _Grid:
         return cls(low, tuple(counts.flip(0).tolist()))
 
     def summed(self, points: Float[Tensor, "n 3"], values: Float[Tensor, "n c"]) -> Float[Tensor, "c z y x"]:
-        """Values summed at the nodes nearest to their points."""
+        """Values summed at the nodes nearest to their points.
+
+        Args:
+            points: [n, 3] within the grid, in metres.
+            values: [n, c] of any unit.
+
+        Returns:
+            Sums [c, z, y, x].
+        """
         x, y, z = ((points - self.low) / _CELL).round().long().unbind(-1)
         sums = values.new_zeros(self.shape[0] * self.shape[1] * self.shape[2], values.shape[1])
         sums.index_add_(0, (z * self.shape[1] + y) * self.shape[2] + x, values)
         return sums.mT.reshape(-1, *self.shape)
 
     def at(self, nodes: Float[Tensor, "c z y x"], points: Float[Tensor, "n 3"]) -> Float[Tensor, "n c"]:
-        """Values at ``points``, interpolated between nodes."""
+        """Values at points, interpolated between nodes.
+
+        Args:
+            nodes: values of the nodes [c, z, y, x].
+            points: [n, 3] in metres; beyond the grid the nearest nodes count.
+
+        Returns:
+            Values [n, c].
+        """
         last = points.new_tensor(self.shape[::-1]) - 1
         place = 2 * (points - self.low) / (_CELL * last) - 1
         found = F.grid_sample(nodes[None], place[None, None, None], padding_mode="border", align_corners=True)
@@ -90,7 +108,14 @@ def _spread(nodes: Float[Tensor, "c z y x"], times: int) -> Float[Tensor, "c z y
 
 
 def pyramid(images: Float[Tensor, "V 3 H W"]) -> list[Float[Tensor, "V 3 _h _w"]]:
-    """Smoothed images of the sizes of :data:`_LEVELS`, the smallest first. ``images``: on black."""
+    """Smoothed images of the sizes of :data:`_LEVELS`.
+
+    Args:
+        images: photographs on black [V, 3, H, W].
+
+    Returns:
+        Images [V, 3, _h, _w], the smallest first.
+    """
     views, _, height, width = images.shape
     found = []
     for smaller, _, _ in _LEVELS:
@@ -117,9 +142,18 @@ def _with_slopes(images: Float[Tensor, "V 3 h w"]) -> Float[Tensor, "V 9 h w"]:
 def scene_flow(
     points: Float[Tensor, "N 3"], shown: Bool[Tensor, "N V"], before: Instant, after: Instant
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
-    """Motion of points in metres, and their rotation vectors. ``points``: on the surface, in the first
-    instant. ``shown``: the views that show them there. ``before``, ``after``: the same views in order; a
-    camera stands still, but its crop may change."""
+    """Motion of surface points between two instants.
+
+    Args:
+        points: on the surface in the first instant [N, 3], in metres.
+        shown: the views that show them there [N, V].
+        before: photographs and cameras of the first instant.
+        after: those of the second, with the same views in order; a camera stands still, but its crop may
+            change.
+
+    Returns:
+        Motions [N, 3] in metres, and rotation vectors [N, 3] in radians.
+    """
     near = ((points - points.nanmedian(0).values).abs() < _REACH).all(-1) if len(points) else shown.any(-1)
     if not near.any():
         return torch.zeros_like(points), torch.zeros_like(points)
@@ -158,7 +192,19 @@ def _equations(
     cameras: Cameras,
     smaller: int,
 ) -> Float[Tensor, "n 9"]:
-    """Normal equations of a step of each point in one view: a symmetric matrix and the right side."""
+    """Normal equations of a step of each point in one view.
+
+    Args:
+        points: where they are now [n, 3], in metres.
+        view: number of the view of each [n].
+        colors: of the points in the first instant [n, 3].
+        maps: photographs of the second instant with their gradients (:func:`_with_slopes`).
+        cameras: of the second instant, for photographs of full size.
+        smaller: how many times smaller ``maps`` are.
+
+    Returns:
+        The stored entries of a symmetric matrix (:data:`_PAIRS`) and the right side [n, 9].
+    """
     pixels, depth = _seen(points, view, cameras)
     value, right, down = sample(maps, view, pixels / smaller).split(3, -1)
     lens = cameras.intrinsics[view]

@@ -25,11 +25,13 @@ Changes = tuple[Tensor, Tensor]
 #: The smallest similarity with ``log``, as its logarithm would be infinite at 0.
 S_MIN = 0.01
 
-#: Tokens computed at once without a gradient; in half precision a smaller number is as fast on a CPU.
+#: Tokens computed at once without a gradient.
 _ROWS = 424
+#: The same in half precision, where a smaller number is as fast on a CPU.
 _HALF_ROWS = 256
-#: Limits of the scores of all tokens on a CPU, and of gathered values of neighbours.
+#: Largest number of scores of all tokens on a CPU.
 _SCORES = 1 << 26
+#: Largest number of gathered values of neighbours.
 _GATHERED = 1 << 25
 
 

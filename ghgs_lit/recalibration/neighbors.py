@@ -7,8 +7,9 @@ from torch import Tensor
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.kernels.pool import at_once, even_parts
 
-#: Distances in memory at once: a block fits a CPU's cache; on a GPU it takes 200 MB with its keys.
+#: Distances in memory at once: a block fits a CPU's cache.
 _BLOCK = 1 << 17
+#: The same on a GPU, where they take 200 MB with their keys.
 _GPU_BLOCK = 1 << 23
 
 

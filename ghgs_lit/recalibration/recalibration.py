@@ -20,8 +20,8 @@ from ghgs_lit.recalibration.neighbors import nearest_neighbors
 from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import DecodedPixels, Points, Tokens
 
-#: Cosines in memory at once, on a CPU and on a GPU.
-_COSINES = 1 << 21
+#: Cosines in memory at once.
+_COSINES = 1 << 21  # on a CPU
 _GPU_COSINES = 1 << 25
 
 

@@ -24,20 +24,21 @@ from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
 
 Renderer = Callable[..., Rendering]
-#: Numbers of the elements of a batch, and a choice of their cameras.
+#: Numbers of the elements of a batch.
 Numbers = Float[Tensor, " B"]
+#: A choice of their cameras.
 Which = Bool[Tensor, "B V"]
 
-#: Steps of the optimiser in a round, and their size at first: radians, and half heights of the subject.
-_STEPS = 15
-_RATE = 0.006
+_STEPS = 15  #: Steps of the optimiser in a round
+_RATE = 0.006  #: Their size at first: radians, and half heights of the subject
 _OUTLINE = 0.5  #: Weight of silhouettes; that of colours is 1
 _SAME = 0.05  #: Largest difference in metres of depths of one surface
 _STAY = 4.0  #: Weight of the squared motion
-#: Relative decrease of the loss for which the cameras of the first and of a later round are kept: with exact
-#: cameras it is up to 0.01 (0.02 from above), with cameras off by a pixel 0.02 to 0.2. ``_FIRST`` also holds
-#: for cameras that silhouettes propose.
+#: Relative decrease of the loss for which the cameras of the first round, and cameras that silhouettes
+#: propose, are kept: with exact cameras it is up to 0.01 (0.02 from above), with cameras off by a pixel 0.02
+#: to 0.2.
 _FIRST = 0.02
+#: The same for the cameras of a later round.
 _LATER = 0.01
 #: With ``_TELLING`` cameras or more (fewer silhouettes tell less), a silhouette distance below ``_EXACT``
 #: pixels means that they are off by half a pixel at most: the first round must gain ``_DOUBTED``.

@@ -25,22 +25,20 @@ from ghgs_lit.refinement.outlines import QUICK, TO, Outlines
 from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Cameras
 
-Lens = Float[Tensor, "V 3 3"]
-Pose = Float[Tensor, "V 4 4"]
-#: Those of ``K`` instants, whose crops differ in intrinsics.
-Lenses = Float[Tensor, "K V 3 3"]
-Middles = Float[Tensor, "K 3"]
-#: One for each camera, and one for each ray.
-Which = Bool[Tensor, " V"]
-Numbers = Int[Tensor, " R"]
-Points = Float[Tensor, "R 3"]
+Lens = Float[Tensor, "V 3 3"]  #: Intrinsics of an instant, in pixels
+Pose = Float[Tensor, "V 4 4"]  #: Extrinsics, the same at all instants
+Lenses = Float[Tensor, "K V 3 3"]  #: Intrinsics of ``K`` instants, whose crops differ
+Middles = Float[Tensor, "K 3"]  #: The subject's middle at ``K`` instants
+Which = Bool[Tensor, " V"]  #: A choice of cameras
+Numbers = Int[Tensor, " R"]  #: A silhouette for each ray
+Points = Float[Tensor, "R 3"]  #: A point or vector for each ray
 
 _DEPTHS = 48  #: Depths tried along a ray
 #: Mean distance of rays in pixels below which silhouettes are consistent.
 _COHERENT = 5e-4
-#: Weight of the squared steps, in pixels, relative to the mean squared distance; and the factor of it for
-#: zooms: lenses are known better than poses.
+#: Weight of the squared steps, in pixels, relative to the mean squared distance.
 _STAY = 1e-3
+#: Its factor for zooms: lenses are known better than poses.
 _KNOWN = 5.0
 #: Cameras are wrong by themselves if the others, as given, miss one another by less than ``_CLEARLY`` times
 #: what they do without any other ones (opposite cameras are nearly exchangeable), counted from ``_EXACT``

@@ -14,8 +14,8 @@ from ghgs_lit.geometry.projection import pixel_centers, sample
 
 _FINER = 4  #: Size of the distance maps relative to photographs
 _FAR = 20.0  #: Distances are clamped to this, in pixels
-_FROM = 0.25
-TO = 8.0  #: Range of depth inside the outline, in pixels, whose rays are tried
+_FROM = 0.25  #: Least depth inside the outline, in pixels, of rays that are tried
+TO = 8.0  #: Largest depth of these
 #: Size of the maps, greatest depth of rays in pixels, and every how many rays one is used.
 CAREFUL = (_FINER, TO, 1)
 QUICK = (1, 1.5, 2)

@@ -26,11 +26,12 @@ FAILED_DOWNLOADS = (
     (b"<html", _WEB_PAGE),
     (b"<?xml", "an XML document, as servers send it for an error"),
 )
-#: Name and file of the checkpoint that comes with the package (docs/model_card.md).
+#: Name of the checkpoint that comes with the package (docs/model_card.md).
 SHIPPED = "shipped"
+#: Its file.
 SHIPPED_FILE = Path(__file__).with_name("shipped.ckpt")
-ZIP = b"PK"
-PICKLE = b"\x80"
+ZIP = b"PK"  #: First bytes of a PyTorch file
+PICKLE = b"\x80"  #: First byte of a file of PyTorch before 1.6
 _ENCRYPTED = 1  # flag of a record
 _FLOATS = ("float64", "float32", "float16", "bfloat16")  # precisions of weights
 

@@ -17,9 +17,9 @@ KEYS = 256
 QUERIES = 96
 
 
-# Multiplications from which the kernel is faster, on one thread and on several, where PyTorch's operator
-# divides small products better: 360 and 1450 tokens in two heads of 32 channels.
+#: Multiplications from which the kernel is faster on one thread: 360 tokens in two heads of 32 channels.
 _SMALL = 1 << 23
+#: The same on several threads, where PyTorch's operator divides small products better: 1450 tokens.
 _LARGE = 1 << 27
 # Processor features that the kernel needs.
 _FEATURES = {"avx2", "fma"}

@@ -10,15 +10,21 @@ from torch import Tensor
 
 from ghgs_lit.kernels import pool
 
-#: Pixels, and rows of an image, in one task.
-_PIXELS = 1024
-_ROWS = 64
+_PIXELS = 1024  #: Pixels in one task
+_ROWS = 64  #: Rows of an image in one task
 
 
 def padded(photo: Float[Tensor, "B V 3 H W"], masks: Bool[Tensor, "B V H W"]) -> Tensor:
-    """Smoothed photographs with their masks as a fourth channel, as one flat array for the kernel. Channels
-    are innermost. A rim of zeros surrounds each photograph, and the end is padded for reads of whole
-    vectors."""
+    """Smoothed photographs with their masks as a fourth channel, as one flat array for the kernel.
+
+    Args:
+        photo: colours of the surface [B, V, 3, H, W], float32.
+        masks: of the subject [B, V, H, W].
+
+    Returns:
+        Channels are innermost. A rim of zeros surrounds each photograph, and the end is padded for reads of
+        whole vectors.
+    """
     from ghgs_lit.geometry.cpu.kernel import smooth_rows  # here: it loads a compiler
     from ghgs_lit.kernels.simd import LANES
 
@@ -43,8 +49,22 @@ def sweep(
     tolerance: float,
 ) -> Float[Tensor, "N S"]:
     """Agreement of pixels with the best other view, as :mod:`ghgs_lit.geometry.photo_consistency`.
-    ``colors``: all views, :func:`padded`. ``pixels``: ascending. ``turn``, ``shift``: map pixels of a view
-    (second axis) to another (third axis). ``shares``: fractions of the way from near to far."""
+
+    Args:
+        colors: all views, of :func:`padded`.
+        pixels: ascending indices among those of all images.
+        near: least depth of each pixel, in the unit of the cameras.
+        far: largest depth of each.
+        size: height and width of an image.
+        turn: matrices from pixels of a view (second axis) to another (third axis), as is the next.
+        shift: what is added in the other view.
+        compared: whether two views are compared.
+        shares: fractions of the way from near to far, in (0, 1).
+        tolerance: mean difference of colours at which the agreement is 1 / e.
+
+    Returns:
+        [N, S] in [0, 1], float32.
+    """
     from ghgs_lit.geometry.cpu.kernel import sweep_pixels  # here: it loads a compiler
 
     result = np.empty((len(pixels), len(shares)), np.float32)

@@ -21,7 +21,17 @@ def _vector(count: int) -> ir.VectorType:
 
 
 def _between(builder, low, high, share):
-    """``low + share (high - low)`` for vectors of any length."""
+    """``low + share (high - low)`` for vectors of any length.
+
+    Args:
+        builder: of LLVM instructions.
+        low: a vector, as is the next.
+        high: of the same length.
+        share: a number.
+
+    Returns:
+        The vector.
+    """
     kind = low.type
     share = everywhere(builder, share, low.type.count)
     function = ir.FunctionType(kind, [kind] * 3)
@@ -31,9 +41,18 @@ def _between(builder, low, high, share):
 
 @intrinsic
 def interpolate(typing_context, pixels, at, line, right, down, out, place):
-    """Write the bilinear interpolation of four pixels to ``out[place:]``. The first is at ``pixels[at]``, the
-    one below it ``line`` numbers later; ``right`` and ``down`` are the weights of the next ones. The two
-    pixels of a line are loaded at once."""
+    """Write the bilinear interpolation of four pixels; the two pixels of a line are loaded at once.
+
+    Args:
+        typing_context: Numba's.
+        pixels: flat array of pixels, channels innermost.
+        at: where the first pixel is in it.
+        line: how many numbers later the pixel below it is.
+        right: weight of the pixels to the right, in [0, 1].
+        down: weight of the pixels below, in [0, 1].
+        out: array for the channels of the result.
+        place: where they start in it, a multiple of :data:`CHANNELS`.
+    """
 
     def emit(context, builder, sig, args):
         pair = _vector(2 * CHANNELS)
@@ -74,7 +93,16 @@ def channels_of(typing_context, pixels, at):
 
 @intrinsic
 def store_places(typing_context, places, at, row, column, line):
-    """Write the indices of pixels, from vectors of whole rows and columns, to ``places[at:]`` (int32)."""
+    """Write the indices of the first channels of 16 pixels.
+
+    Args:
+        typing_context: Numba's.
+        places: int32 array for the indices.
+        at: where they start in it.
+        row: vector of whole rows, as floats.
+        column: vector of whole columns, as floats.
+        line: numbers in a row of pixels.
+    """
 
     def emit(context, builder, sig, args):
         integers = ir.VectorType(I32, LANES)
@@ -97,7 +125,16 @@ _SWEPT = (FLOATS[1], PIXELS, FLOATS[1], FLOATS[1], FLOATS[5], FLOATS[4], MASKS, 
 
 @kernel_for(FLOATS[4], MASKS, FLOATS[1], NUMBER, NUMBER, NUMBER)
 def smooth_rows(photo, masks, out, image, first, last):
-    """Write rows ``first`` to ``last`` of ``image``; see :func:`ghgs_lit.geometry.cpu.padded`."""
+    """Write some rows of an image; see :func:`ghgs_lit.geometry.cpu.padded`.
+
+    Args:
+        photo: colours of all images [m, 3, H, W].
+        masks: [m, H, W].
+        out: the flat array, zeros at first.
+        image: number of the image.
+        first: first row.
+        last: row after the last one.
+    """
     height = masks.shape[1]
     width = masks.shape[2]
     for row in range(first, last):
@@ -140,8 +177,20 @@ def _rays(turn, u, v):
 
 @helper
 def _project(rays, shift, depth, height, width, places, rights, downs):
-    """Project points of rays into an image: indices of pixels, and the weights of the next pixels. Points
-    outside the image or behind the camera, and NaN, are put into the rim, where the mask is 0."""
+    """Project points of rays into an image.
+
+    Points outside the image or behind the camera, and NaN, are put into the rim, where the mask is 0.
+
+    Args:
+        rays: what a unit of depth adds to the homogeneous pixel: three vectors.
+        shift: that of the camera's centre [3].
+        depth: vector of depths.
+        height: of the image, as is the next.
+        width: of the image.
+        places: int32 array [16] for the indices of the pixels to the upper left.
+        rights: array [16] for the weights of the next pixels to the right.
+        downs: array [16] for those of the pixels below.
+    """
     z = simd.fma(rays[2], depth, shift[2])
     inverse = ONE / z
     x = simd.fma(rays[0], depth, shift[0]) * inverse - HALF
@@ -163,7 +212,21 @@ def _difference(first, second):
 
 @helper
 def _load_pixels(colors, pixels, near, far, start, last, height, width, begin, values, own):
-    """Fill ``values`` with the pixels' centres, near and far - near, ``own`` with their colours."""
+    """Load 16 pixels; the last one fills up the vectors.
+
+    Args:
+        colors: all views, of :func:`ghgs_lit.geometry.cpu.padded`.
+        pixels: indices among those of all images.
+        near: least depth of each.
+        far: largest depth of each.
+        start: number of the first of the 16 pixels.
+        last: number after the last pixel.
+        height: of the image, as is the next.
+        width: of the image.
+        begin: where the pixels' image starts in ``colors``.
+        values: array [4 * 16] for u and v of the centres, near, and far - near.
+        own: array [16 * 4] for the colours.
+    """
     for lane in range(LANES):
         i = min(start + lane, last - 1)
         place = pixels[i] % (height * width)
@@ -181,7 +244,25 @@ def sweep_pixels(
     colors, pixels, near, far, turn, shift, compared, shares, tolerance, out, height, width, image, first,
     last,
 ):  # fmt: skip
-    """Write rows ``first`` to ``last``, pixels of ``image``; see :func:`ghgs_lit.geometry.cpu.sweep`."""
+    """Write the agreement of some pixels of an image; see :func:`ghgs_lit.geometry.cpu.sweep`.
+
+    Args:
+        colors: all views, of :func:`ghgs_lit.geometry.cpu.padded`.
+        pixels: ascending indices among those of all images [N].
+        near: least depth of each [N].
+        far: largest depth of each [N].
+        turn: matrices from pixels of a view (second axis) to another (third axis) [B, V, V, 3, 3].
+        shift: what is added in the other view [B, V, V, 3].
+        compared: whether two views are compared [B, V, V].
+        shares: fractions of the way from near to far [S].
+        tolerance: mean difference of colours at which the agreement is 1 / e.
+        out: array [N, S] for the agreement.
+        height: of an image, as is the next.
+        width: of an image.
+        image: number of the pixels' image.
+        first: number of the first pixel.
+        last: number after the last one.
+    """
     views = turn.shape[1]
     element = image // views
     view = image % views

@@ -9,7 +9,19 @@ from ghgs_lit.kernels.tiles import between, cells, load3, load4, rows_of, start,
 
 @triton.jit
 def _row(x, y, z, first, second, third):
-    """The product of a row (x, y, z) with a matrix of three rows."""
+    """The product of a row with a matrix of three rows.
+
+    Args:
+        x: first number of the row.
+        y: second number.
+        z: third number.
+        first: first row of the matrix, three numbers.
+        second: second row.
+        third: third row.
+
+    Returns:
+        Three numbers.
+    """
     return (
         x * first[0] + y * second[0] + z * third[0],
         x * first[1] + y * second[1] + z * third[1],
@@ -19,7 +31,18 @@ def _row(x, y, z, first, second, third):
 
 @triton.jit
 def relations_rows(count, intrinsics, extrinsics, turn, shift, facing, views, ROWS: tl.constexpr):
-    """Write what leads from pixels of view j to those of view k, for rows (element, j, k)."""
+    """Write what leads from pixels of view j to those of view k, for rows (element, j, k).
+
+    Args:
+        count: number of rows B V V.
+        intrinsics: K [B, V, 3, 3].
+        extrinsics: world to camera [B, V, 4, 4].
+        turn: for the matrices [B, V, V, 3, 3].
+        shift: for what is added in view k [B, V, V, 3].
+        facing: for the cosines between the axes of the views [B, V, V].
+        views: V.
+        ROWS: rows of a program.
+    """
     i = rows_of(count, ROWS)
     k = i // (views * views) * views + i % views
     j = i // views
@@ -60,7 +83,17 @@ def relations_rows(count, intrinsics, extrinsics, turn, shift, facing, views, RO
 
 @triton.jit
 def smoothed_rows(count, photo, masks, out, height, width, ROWS: tl.constexpr):
-    """Write the four channels of ``ROWS`` pixels."""
+    """Write the four channels of ``ROWS`` pixels.
+
+    Args:
+        count: number of pixels of all images.
+        photo: colours of the surface [B, V, 3, H, W].
+        masks: of the subject [B, V, H, W].
+        out: for mean colours and masks [B, V, 4, H, W].
+        height: H.
+        width: W.
+        ROWS: pixels of a program.
+    """
     i = rows_of(count, ROWS)
     area = height * width
     image = i // area
@@ -103,7 +136,25 @@ def swept_rows(
     count, pixels, near, far, colors, turn, shift, compared, out, steps, views, height, width, tolerance,
     ROWS: tl.constexpr,
 ):  # fmt: skip
-    """Write the agreement of ``ROWS`` pixels at depths; ``count``: pixels times depths."""
+    """Write the agreement of ``ROWS`` pixels at depths.
+
+    Args:
+        count: pixels times depths, N S.
+        pixels: indices among those of all images [N].
+        near: least depth of each [N].
+        far: largest depth of each [N].
+        colors: smoothed photographs and their masks [B, V, 4, H, W].
+        turn: matrices from pixels of a view (second axis) to another (third axis) [B, V, V, 3, 3].
+        shift: what is added in the other view [B, V, V, 3].
+        compared: whether two views are compared [B, V, V].
+        out: for the agreement [N, S].
+        steps: S.
+        views: V.
+        height: H.
+        width: W.
+        tolerance: mean difference of colours at which the agreement is 1 / e.
+        ROWS: rows of a program.
+    """
     i = rows_of(count, ROWS)
     n = i // steps
     step = i % steps
