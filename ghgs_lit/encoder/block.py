@@ -29,8 +29,16 @@ class Rotary(NamedTuple):
 
 
 def rotary_tables(positions: Int[Tensor, "t 2"], head_width: int, like: Tensor) -> Rotary:
-    """Rotary tables of all tokens. ``positions``: row and column of each. ``head_width``: channels of a head,
-    divisible by 4. ``like``: the tokens; tables are float64 for tokens in float64, else float32."""
+    """Rotary tables of all tokens.
+
+    Args:
+        positions: row and column of each token [t, 2].
+        head_width: channels d of a head, divisible by 4.
+        like: the tokens; tables are float64 for tokens in float64, else float32.
+
+    Returns:
+        Tables [t, d].
+    """
     exponents = torch.arange(0, head_width, 4, device=positions.device, dtype=torch.float32) / head_width
     angles = positions.float()[..., None] * (1.0 / BASE**exponents)
     angles = angles.to(at_least_float32(like).dtype)
@@ -42,7 +50,15 @@ def rotary_tables(positions: Int[Tensor, "t 2"], head_width: int, like: Tensor) 
 
 
 def rotate(x: Float[Tensor, "*batch t d"], rotary: Rotary) -> Float[Tensor, "*batch t d"]:
-    """Rotate channels ``m`` and ``m + d/4`` of each half of a head, in the tables' dtype."""
+    """Rotate channels ``m`` and ``m + d/4`` of each half of a head.
+
+    Args:
+        x: queries or keys [..., t, d].
+        rotary: of these t tokens.
+
+    Returns:
+        [..., t, d], in the wider dtype of both.
+    """
     quarters = x.unflatten(-1, (2, 2, x.shape[-1] // 4))
     return torch.addcmul(x * rotary.cosine, quarters.flip(-2).flatten(-3), rotary.sine)
 
@@ -53,8 +69,13 @@ _GPU_ROTATED = 1 << 25
 
 
 class Attention(nn.Module):
-    """Multi-head self-attention inside each of several packed sequences. ``qk_norm``: layer norm of q and k
-    over the channels of each head, before their rotation."""
+    """Multi-head self-attention inside each of several packed sequences.
+
+    Args:
+        width: channels of the tokens.
+        heads: number of heads, which divides ``width``.
+        qk_norm: layer norm of q and k over the channels of each head, before their rotation.
+    """
 
     def __init__(self, width: int, heads: int, qk_norm: bool):
         super().__init__()
@@ -109,7 +130,15 @@ _GPU_HIDDEN = 1 << 28
 
 
 def draw_normal_(values: Tensor, std: float) -> Tensor:
-    """Draw normal ``values`` in place, but on the meta device, where PyTorch would import its compiler."""
+    """Draw normal ``values`` in place, but not on the meta device, where PyTorch would import its compiler.
+
+    Args:
+        values: any tensor.
+        std: standard deviation; the mean is 0.
+
+    Returns:
+        ``values``.
+    """
     return values if values.is_meta else values.normal_(std=std)
 
 
@@ -137,7 +166,15 @@ class Mlp(nn.Module):
 
 
 class Block(nn.Module):
-    """``x + gamma1 Attention(LN(x))``, then ``x + gamma2 MLP(LN(x))``, on packed sequences."""
+    """``x + gamma1 Attention(LN(x))``, then ``x + gamma2 MLP(LN(x))``, on packed sequences.
+
+    Args:
+        width: channels of the tokens.
+        heads: attention heads, which divide ``width``.
+        qk_norm: as for :class:`Attention`.
+        norm_eps: epsilon of the layer norms.
+        layer_scale: first value of both gammas.
+    """
 
     def __init__(self, width: int, heads: int, qk_norm: bool, norm_eps: float, layer_scale: float):
         super().__init__()
@@ -167,9 +204,18 @@ def run_block(
     checkpointing: bool,
     rotary: Rotary | None = None,
 ) -> Float[Tensor, "t c"]:
-    """``block(x)``, without recording gradients if neither ``x`` nor the block needs one. ``x``: tokens of
-    all sequences, one after another. ``lengths``: tokens of each sequence, inside which attention stays.
-    ``checkpointing``: recompute activations in the backward pass. ``rotary``: None: no rotation."""
+    """``block(x)``, without recording gradients if neither ``x`` nor the block needs one.
+
+    Args:
+        block: to run.
+        x: tokens of all sequences, one after another [t, c].
+        lengths: tokens of each sequence, inside which attention stays.
+        checkpointing: recompute activations in the backward pass.
+        rotary: tables of all tokens; None: no rotation.
+
+    Returns:
+        Tokens [t, c].
+    """
     needs_grad = x.requires_grad or any(p.requires_grad for p in block.parameters())
     with torch.set_grad_enabled(needs_grad and torch.is_grad_enabled()):
         if checkpointing and torch.is_grad_enabled():

@@ -107,7 +107,15 @@ class VGGTOptions(Options):
         return self
 
     def build(self, tokens: str = "all", margin: int = 1) -> "VGGTEncoder":
-        """The stage; arguments as of :class:`VGGTEncoder`."""
+        """The stage.
+
+        Args:
+            tokens: as of :class:`VGGTEncoder`, as is the next.
+            margin: patches around these that are kept, too.
+
+        Returns:
+            The encoder with new weights.
+        """
         return VGGTEncoder(self, tokens, margin)
 
 
@@ -118,12 +126,16 @@ Pair = tuple[Float[Tensor, "t c"], Float[Tensor, "t c"]]
 
 
 class Aggregator(nn.Module):
-    """``depth`` pairs of a frame block and a global block on the patch tokens of ``patch_embed``.
+    """Pairs of a frame block and a global block on patch tokens (VGGT, Wang et al., CVPR 2025).
 
     Each view's sequence is [camera, registers, kept patches]. The first view has its own camera and register
     tokens, so it defines the frame of reference: another first view changes the result; any other permutation
-    of the views only permutes it. ``patch_embed``: images [n, i, H, W] and :class:`KeptPatches` to tokens
-    [N, width]."""
+    of the views only permutes it.
+
+    Args:
+        patch_embed: images [n, i, H, W] and :class:`KeptPatches` to tokens [N, width].
+        options: width, heads, depth and read-out layers.
+    """
 
     def __init__(self, patch_embed: nn.Module, options: VGGTOptions):
         super().__init__()
@@ -150,9 +162,16 @@ class Aggregator(nn.Module):
     def forward(
         self, images: Float[Tensor, "b v i H W"], kept: KeptPatches
     ) -> tuple[list[Pair], Float[Tensor, "N c"]]:
-        """Packed tokens, special ones included, after the frame block and after the global block of each
-        layer in ``layers``; and the patch tokens before the first block. ``kept``: the patches that take
-        part; all others are as if they did not exist."""
+        """Tokens after the blocks of each read-out layer.
+
+        Args:
+            images: [b, v, i, H, W] as ``patch_embed`` takes them.
+            kept: the patches that take part; all others are as if they did not exist.
+
+        Returns:
+            Packed tokens [t, c], special ones included, after the frame block and after the global block of
+            each layer in ``layers``; and the patch tokens [N, c] before the first block.
+        """
         b, v = images.shape[:2]
         patches = self.patch_embed(images.flatten(0, 1), kept)
         # Camera and register tokens: number 0 for the first view, number 1 for all others.
@@ -185,10 +204,12 @@ class VGGTEncoder(nn.Module):
     """VGGT of any size: ``vggt_1b`` takes the published weights, smaller ones train from scratch.
 
     Args:
+        options: of the encoder.
         tokens: ``all``; ``window``: patches of the smallest rectangle that holds the subject; ``subject``:
             patches with a pixel of the subject. Others leave before the first block. Kept patches keep their
             positions; a view with an empty mask has its special tokens only.
-        margin: patches around these that are kept, too."""
+        margin: patches around these that are kept, too.
+    """
 
     def __init__(self, options: VGGTOptions, tokens: str = "all", margin: int = 1):
         super().__init__()
@@ -226,9 +247,21 @@ class VGGTEncoder(nn.Module):
         bounds: DepthBounds | None = None,
         plan: Plan | None = None,
     ) -> Tokens:
-        """Tokens of the patches ``plan.kept`` of all views. ``images``: sides divisible by the patch size.
-        ``masks``: read with ``mask_input`` or ``bounds_input``. ``bounds``: read with ``bounds_input``.
-        ``plan``: None: one for the patches of :meth:`keeps`."""
+        """Tokens of the patches ``plan.kept`` of all views.
+
+        Args:
+            images: photographs [b, v, 3, H, W] in [0, 1], with sides divisible by the patch size.
+            masks: [b, v, H, W]; read with ``mask_input``, ``bounds_input`` or ``semantic``, or without a
+                plan.
+            bounds: in metres; read with ``bounds_input``.
+            plan: None: one for the patches of :meth:`keeps`.
+
+        Returns:
+            Packed tokens with the layers that :attr:`VGGTOptions.layers` names.
+
+        Raises:
+            InputError: images are float64, and weights are not.
+        """
         narrow = images.dtype != torch.float64 or self.aggregator.camera_token.dtype == torch.float64
         require(narrow, "images", "float32 where the weights are no float64", images.dtype)
         plan = planned(masks, self.patch_size, [self.keeps(masks)]) if plan is None else plan
@@ -240,7 +273,14 @@ class VGGTEncoder(nn.Module):
         return Tokens(latent, semantic, *places, kept.grid, self.patch_size)
 
     def keeps(self, masks: Bool[Tensor, "b v H W"]) -> Bool[Tensor, "b v h w"]:
-        """Patches that ``tokens`` and ``margin`` keep; on the CPU where the masks are not read."""
+        """Patches that ``tokens`` and ``margin`` keep.
+
+        Args:
+            masks: of the subject [b, v, H, W].
+
+        Returns:
+            Which patches [b, v, h, w]; on the CPU where the masks are not read.
+        """
         if self.tokens in KEPT:
             return KEPT[self.tokens](masks, self.patch_size, self.margin)
         b, v, height, width = masks.shape
@@ -258,7 +298,16 @@ class VGGTEncoder(nn.Module):
 
 
 def _joined(pairs: list[Pair], kept: KeptPatches, special: int) -> Iterator[Float[Tensor, "N C"]]:
-    """Patch tokens of each frame and global block, concatenated; empties ``pairs`` to free memory."""
+    """Patch tokens of each frame and global block, concatenated; empties ``pairs`` to free memory.
+
+    Args:
+        pairs: packed tokens [t, c] after both blocks, for each layer.
+        kept: the patches that take part.
+        special: number of special tokens in each image.
+
+    Yields:
+        Patch tokens [N, C] of a layer, C = 2 c.
+    """
     while pairs:
         yield torch.cat([kept.take(tokens, special) for tokens in pairs.pop(0)], dim=-1)
 

@@ -43,7 +43,14 @@ class SemanticOptions(Options):
 
 
 def features_of(log_shares: Float[Tensor, "N p"]) -> Float[Tensor, "N p"]:
-    """Square roots of shares; their cosine is the overlap of two distributions."""
+    """Square roots of shares; their cosine is the overlap of two distributions (Bhattacharyya's coefficient).
+
+    Args:
+        log_shares: logarithms of the shares of the parts in a patch [N, p].
+
+    Returns:
+        Features [N, p] of norm 1.
+    """
     return (0.5 * log_shares).exp()
 
 
@@ -80,8 +87,16 @@ class SemanticBranch(nn.Module):
     def log_shares(
         self, images: Float[Tensor, "b v c H W"], masks: Bool[Tensor, "b v H W"], kept: KeptPatches
     ) -> Float[Tensor, "N p"]:
-        """Logarithms, in float32 or wider, of the shares of parts in the patches ``kept`` of
-        :meth:`subject`."""
+        """Logarithms of the shares of parts in patches.
+
+        Args:
+            images: photographs [b, v, 3, H, W] in [0, 1].
+            masks: of the subject [b, v, H, W].
+            kept: the patches of :meth:`subject`, or some of them.
+
+        Returns:
+            [N, p], float32 or wider.
+        """
         x = torch.cat((images, masks[:, :, None].to(images.dtype)), dim=2).flatten(0, 1)
         patches = self.stem((2 * x - 1).to(self.token.dtype), kept)
         x = kept.join(self.token.to(patches.dtype).expand(masks.shape[0] * masks.shape[1], -1, -1), patches)
@@ -93,7 +108,16 @@ class SemanticBranch(nn.Module):
     def forward(
         self, images: Float[Tensor, "b v c H W"], masks: Bool[Tensor, "b v H W"], plan: Plan
     ) -> Float[Tensor, "N p"]:
-        """Features of the patches ``plan.kept``; 0 (cosine 0 with all others) where no subject is shown."""
+        """Features of the kept patches.
+
+        Args:
+            images: photographs [b, v, 3, H, W] in [0, 1].
+            masks: of the subject [b, v, H, W].
+            plan: its ``kept`` have features, its ``shown_patches`` are computed.
+
+        Returns:
+            Features [N, p]; 0 (cosine 0 with all others) where no subject is shown.
+        """
         features = features_of(self.log_shares(images, masks, plan.shown_patches))
         places = torch.searchsorted(plan.kept.index, plan.shown_patches.index)
         return features.new_zeros(len(plan.kept.index), self.parts).index_copy(0, places, features)

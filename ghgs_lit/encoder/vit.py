@@ -40,9 +40,17 @@ _REACH = 2
 
 
 class ConvStem(nn.Module):
-    """Overlapping convolutions, with which a small encoder learns edges and the silhouette much sooner. The
-    image is halved while the patch size is even; a strided convolution does the rest; a last one mixes
-    neighbouring patches. ``channels``: after the first one; doubled at each halving, up to ``width``."""
+    """Overlapping convolutions, with which a small encoder learns edges and the silhouette much sooner.
+
+    The image is halved while the patch size is even; a strided convolution does the rest; a last one mixes
+    neighbouring patches.
+
+    Args:
+        in_channels: of the images.
+        width: channels of a token.
+        patch_size: side of a patch in pixels.
+        channels: after the first convolution; doubled at each halving, up to ``width``.
+    """
 
     def __init__(self, in_channels: int, width: int, patch_size: int, channels: int):
         super().__init__()
@@ -72,9 +80,20 @@ NORM_EPS = 1e-6
 
 
 class VisionTransformer(nn.Module):
-    """DINOv2 ViT; tokens of an image are in the order class, registers, kept patches. ``image_size``: side in
-    pixels of the square image whose position embedding is stored, a multiple of ``patch_size``; it is
-    resampled for other sizes. ``checkpointing``: recompute activations in the backward pass."""
+    """DINOv2 ViT with registers (Oquab et al., TMLR 2024; Darcet et al., ICLR 2024).
+
+    Tokens of an image are in the order class, registers, kept patches.
+
+    Args:
+        in_channels: of the images.
+        width: channels of a token.
+        depth: number of blocks.
+        heads: attention heads of each block, which divide ``width``.
+        patch_size: side of a patch in pixels.
+        image_size: side in pixels of the square image whose position embedding is stored, a multiple of
+            ``patch_size``; it is resampled for other sizes.
+        checkpointing: recompute activations in the backward pass.
+    """
 
     def __init__(
         self,
@@ -112,7 +131,16 @@ class VisionTransformer(nn.Module):
                 nn.init.zeros_(module.bias)
 
     def positions(self, height: int, width: int, dtype: torch.dtype) -> Float[Tensor, "1 t c"]:
-        """Position embedding of the class token and ``height`` x ``width`` patches, resampled in float32."""
+        """Position embedding of the class token and the patches of an image, resampled in float32.
+
+        Args:
+            height: number of rows of patches.
+            width: number of columns of patches.
+            dtype: of the result.
+
+        Returns:
+            [1, 1 + height * width, c].
+        """
         side = math.isqrt(self.pos_embed.shape[1] - 1)
         if (height, width) == (side, side):
             return self.pos_embed.to(dtype)
@@ -122,7 +150,15 @@ class VisionTransformer(nn.Module):
         return torch.cat((table[:, :1], grid.flatten(2).mT), dim=1).to(dtype)
 
     def embed(self, images: Float[Tensor, "n i H W"], kept: KeptPatches) -> Float[Tensor, "t c"]:
-        """Packed input of the first block, with the position embeddings of the whole image."""
+        """Packed input of the first block, with the position embeddings of the whole image.
+
+        Args:
+            images: n images with sides divisible by the patch size [n, i, H, W].
+            kept: the patches that take part.
+
+        Returns:
+            Class, register and patch tokens [t, c].
+        """
         n, _, height, width = images.shape
         patches = self.patch_embed.dense(images)
         positions = self.positions(height // self.patch_size, width // self.patch_size, patches.dtype)
@@ -130,7 +166,15 @@ class VisionTransformer(nn.Module):
         return kept.join(special.expand(n, -1, -1), kept.select(patches + positions[:, 1:]))
 
     def tokens(self, images: Float[Tensor, "n i H W"], kept: KeptPatches) -> Float[Tensor, "t c"]:
-        """Packed class, register and patch tokens after the final norm."""
+        """Tokens after the final norm.
+
+        Args:
+            images: n images with sides divisible by the patch size [n, i, H, W].
+            kept: the patches that take part.
+
+        Returns:
+            Packed class, register and patch tokens [t, c].
+        """
         x = self.embed(images, kept)
         lengths = kept.lengths(self.special)
         for block in self.blocks:

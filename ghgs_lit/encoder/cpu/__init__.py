@@ -26,7 +26,16 @@ _FEATURES = {"avx2", "fma"}
 
 
 def is_supported(q: Tensor, v: Tensor) -> bool:
-    """Whether :func:`attend` is faster than PyTorch for ``q`` [n, a, t, d] and ``v`` [n, a, s, d]."""
+    """Whether :func:`attend` is faster than PyTorch.
+
+    Args:
+        q: queries [n, a, t, d].
+        v: values [n, a, s, d].
+
+    Returns:
+        False while gradients are recorded, for other devices and dtypes than float32 and bfloat16 on a CPU
+        with AVX2, for small products, and for head widths that are no multiples of :data:`WIDTH`.
+    """
     if torch.is_grad_enabled() or v.device.type != "cpu" or v.dtype not in (torch.float32, torch.bfloat16):
         return False
     n, a, t, d = q.shape
@@ -37,8 +46,16 @@ def is_supported(q: Tensor, v: Tensor) -> bool:
 def attend(
     q: Float[Tensor, "n a t d"], k: Float[Tensor, "n a s d"], v: Float[Tensor, "n a s d"]
 ) -> Float[Tensor, "n t a d"]:
-    """``softmax(q k^T / sqrt(d)) v`` of every head, computed in float32, in the dtype of ``v``; see
-    :func:`is_supported`. The result has the same bits with any number of threads."""
+    """``softmax(q k^T / sqrt(d)) v`` of every head, computed in float32, where :func:`is_supported`.
+
+    Args:
+        q: queries [n, a, t, d] of n sequences and a heads.
+        k: keys [n, a, s, d].
+        v: values [n, a, s, d].
+
+    Returns:
+        [n, t, a, d] in the dtype of ``v``, with the same bits with any number of threads.
+    """
     from ghgs_lit.encoder.cpu.kernel import attend_head
 
     out = torch.empty(q.transpose(1, 2).shape)

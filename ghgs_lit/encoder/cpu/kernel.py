@@ -20,8 +20,18 @@ add_values = make_product((KEYS, 1), adds=True)
 
 @kernel_for(*[types.Array(types.float32, 2, "A")] * 4, NUMBER, NUMBER)
 def attend_head(q, k, v, out, first, last):
-    """Write ``softmax(q k^T / sqrt(d)) v`` of queries ``first`` to ``last`` to ``out``; all matrices are
-    [tokens, d] with any strides, ``d`` a multiple of 32."""
+    """Write ``softmax(q k^T / sqrt(d)) v`` of some queries of a head.
+
+    All matrices have any strides, and a width d that is a multiple of 32.
+
+    Args:
+        q: queries [t, d].
+        k: keys [s, d].
+        v: values [s, d].
+        out: for the result [t, d].
+        first: number of the first query.
+        last: number after the last one.
+    """
     tokens, width = k.shape
     scale = np.float32(math.log2(math.e) / math.sqrt(width))
     keys = _packed_keys(k)
@@ -89,7 +99,14 @@ def _packed_values(v):
 
 @helper
 def _pack_queries(q, start, count, packed):
-    """Write tiles of ``ROWS`` queries, each [channels, ROWS]; the last query fills the last tile."""
+    """Write tiles of ``ROWS`` queries, each [channels, ROWS]; the last query fills the last tile.
+
+    Args:
+        q: queries [t, d].
+        start: number of the first one.
+        count: how many there are, up to ``QUERIES``.
+        packed: array [QUERIES * d] for the tiles.
+    """
     steps = q.shape[1]
     for row in range(0, count, ROWS):
         for r in range(ROWS):
@@ -100,7 +117,17 @@ def _pack_queries(q, start, count, packed):
 
 @helper
 def _score(queries, row, keys, key, seen, steps, scores):
-    """Write the products [ROWS, KEYS] of queries and ``seen`` keys, with -inf in the padding after them."""
+    """Write the products of queries and keys, with -inf in the padding after them.
+
+    Args:
+        queries: tiles of :func:`_pack_queries`.
+        row: number of the first of ``ROWS`` queries.
+        keys: panels of :func:`_packed_keys`.
+        key: number of the first key.
+        seen: how many keys there are, up to ``KEYS``.
+        steps: channels d.
+        scores: array [ROWS * KEYS] for the products.
+    """
     for panel in range(0, seen, PANEL):
         product(queries, row * steps, keys, (key + panel) * steps, steps, scores, panel, KEYS)
     for r in range(ROWS):
@@ -119,6 +146,15 @@ def _highest(scores, r, seen):
 
 @helper
 def _scale_down(exponent, sums, totals, r, width):
+    """Multiply what a query has summed up by ``2^exponent``, as its maximum has grown.
+
+    Args:
+        exponent: 0 or less.
+        sums: of weights, in lanes [QUERIES * LANES].
+        totals: of weighted values [QUERIES * d].
+        r: number of the query.
+        width: channels d.
+    """
     factor = simd.exp2_minus(simd.full(min(-exponent, EXP2_LIMIT)))
     memory.store(sums, r * LANES, memory.load(sums, r * LANES) * factor)
     for i in range(r * width, (r + 1) * width, LANES):
@@ -127,7 +163,18 @@ def _scale_down(exponent, sums, totals, r, width):
 
 @helper
 def _weigh(scores, r, seen, scale, top, weights, sums, query):
-    """Write the weights ``2^(scale s - top)`` of a row of scores, and add them to the sum of each lane."""
+    """Write the weights ``2^(scale s - top)`` of a row of scores, and add them to the sum of each lane.
+
+    Args:
+        scores: of :func:`_score`.
+        r: number of the row in them.
+        seen: how many keys there are.
+        scale: ``log2(e) / sqrt(d)``.
+        top: the highest score so far, times ``scale``.
+        weights: array [ROWS * KEYS] for the weights.
+        sums: of weights, in lanes [QUERIES * LANES].
+        query: number of the query in them.
+    """
     total = memory.load(sums, query * LANES)
     minus = simd.full(-scale)
     limit = simd.full(EXP2_LIMIT)
@@ -142,6 +189,17 @@ def _weigh(scores, r, seen, scale, top, weights, sums, query):
 
 @helper
 def _add_values(weights, values, key, seen, totals, row, width):
+    """Add weighted values to the totals of ``ROWS`` queries.
+
+    Args:
+        weights: of these queries [ROWS * KEYS].
+        values: panels of :func:`_packed_values`.
+        key: number of the first key.
+        seen: how many keys there are, up to ``KEYS``.
+        totals: of weighted values [QUERIES * d].
+        row: number of the first query.
+        width: channels d.
+    """
     lines = len(values) // width
     for panel in range(0, width, PANEL):
         at = row * width + panel
@@ -150,6 +208,15 @@ def _add_values(weights, values, key, seen, totals, row, width):
 
 @helper
 def _finish(out, sums, totals, r, width):
+    """Write the weighted values of a query, divided by the sum of its weights.
+
+    Args:
+        out: for the result [d].
+        sums: of weights, in lanes [QUERIES * LANES].
+        totals: of weighted values [QUERIES * d].
+        r: number of the query.
+        width: channels d.
+    """
     share = np.float32(1) / simd.lane_sum(memory.load(sums, r * LANES))
     for i in range(0, width, LANES):
         memory.store_anywhere(out, i, memory.load(totals, r * width + i) * simd.full(share))
