@@ -83,12 +83,12 @@ def missing_extras() -> Iterator[Line]:
 def _gpus() -> list[Line]:
     if not torch.cuda.is_available():
         return [("GPU", f"none that PyTorch can use (built for CUDA {torch.version.cuda})")]
-    found = []
+    lines = []
     for number in range(torch.cuda.device_count()):
         free, total = map(decimal, torch.cuda.mem_get_info(number))
         name = torch.cuda.get_device_properties(number).name
-        found.append((f"GPU {number}", f"{name}, {free} free of {total}, CUDA {torch.version.cuda}"))
-    return found
+        lines.append((f"GPU {number}", f"{name}, {free} free of {total}, CUDA {torch.version.cuda}"))
+    return lines
 
 
 def _gsplat_state() -> str:

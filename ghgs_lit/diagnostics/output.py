@@ -20,8 +20,11 @@ def text(value: Any, form: str) -> str:
 
 def texts(frame: pd.DataFrame, columns: Mapping[str, tuple[str, str]]) -> pd.DataFrame:
     """Table of texts from ``frame``. ``columns``: name and format by heading; absent columns are left out."""
-    known = {heading: column for heading, column in columns.items() if column[0] in frame}
-    return pd.DataFrame({h: [text(v, form) for v in frame[name]] for h, (name, form) in known.items()})
+    table = {}
+    for heading, (name, form) in columns.items():
+        if name in frame:
+            table[heading] = [text(value, form) for value in frame[name]]
+    return pd.DataFrame(table)
 
 
 def pivoted(frame: pd.DataFrame, index: str, columns: str, values: str, form: str) -> pd.DataFrame:

@@ -135,9 +135,9 @@ class Work:
     @classmethod
     def of(cls, works: Sequence["Work"]) -> "Work":
         """Mean over batches, with the largest peaks."""
-        flops, peaks, counts = (
-            pd.DataFrame([getattr(work, name) for work in works]) for name in ("flops", "peaks", "counts")
-        )
+        flops = pd.DataFrame([work.flops for work in works])
+        peaks = pd.DataFrame([work.peaks for work in works])
+        counts = pd.DataFrame([work.counts for work in works])
         return cls(flops.mean().to_dict(), peaks.max().to_dict(), counts.mean().to_dict())
 
 
@@ -171,7 +171,10 @@ def time_cases(
                 forward(case.model, case.renderer, batch, probe)
             for stage, value in probe.seconds().items() if turn >= 0 else ():
                 seconds[number].setdefault(stage, []).append(value / len(batches))
-    return [{stage: Times.of(values) for stage, values in stages.items()} for stages in seconds]
+    times = []
+    for stages in seconds:
+        times.append({stage: Times.of(values) for stage, values in stages.items()})
+    return times
 
 
 @contextmanager
@@ -217,9 +220,9 @@ def record_cases(
                 yardstick = result
                 condition = amplification(record.case, batch, result)
             mine.append(work)
-            found = differences(result, yardstick, batch.masks)
-            found["rel_diff"] = conditioned(result, yardstick, batch, condition)
-            for name, value in found.items():
+            change = differences(result, yardstick, batch.masks)
+            change["rel_diff"] = conditioned(result, yardstick, batch, condition)
+            for name, value in change.items():
                 worst = min if name == "psnr_to_none" else max
                 record.differences[name] = worst(record.differences.get(name, value), value)
             # The error against the truth, as `ghgs evaluate` measures it; its time does not count.
@@ -228,7 +231,8 @@ def record_cases(
             decisions = prediction.decisions
             estimate = Estimate(rendering.image, *depth, decisions=decisions)
             measured = measure(lambda _, known=estimate: known, record.case.label, [batch], metrics, device)
-            record.metrics += [{n: value for n, value in row.items() if n != "seconds"} for row in measured]
+            for row in measured:
+                record.metrics.append({name: value for name, value in row.items() if name != "seconds"})
     times = time_cases(cases, batches, WARMUP, repeats, device)
     for record, mine, seconds in zip(records, works, times, strict=True):
         record.work = Work.of(mine)

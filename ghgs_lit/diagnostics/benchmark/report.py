@@ -97,24 +97,24 @@ def difference_db(mse: float, psnr: float) -> float:
 
 def broken_budgets(rows: Sequence[Row]) -> list[str]:
     """Broken budgets, one line each. PSNR counts for trained weights only; differences count for all."""
-    return [f"{row['preset']}: {said}" for row in totals(rows) for said in _broken(row)]
+    return [f"{row['preset']}: {line}" for row in totals(rows) for line in _broken(row)]
 
 
 def _broken(row: Row) -> list[str]:
-    said = []
+    lines = []
     limit = row["max_rel_diff_budget"]
     difference = row["rel_diff"]
     if limit is not None and not difference <= limit:
-        said.append(f"expected rel_diff up to max_rel_diff={limit:g}; found {difference:g}")
+        lines.append(f"expected rel_diff up to max_rel_diff={limit:g}; found {difference:g}")
     missing = row["differences"]["unmatched"]
     if limit is not None and missing > 0:
-        said.append(f"expected the Gaussians of none; found {missing:.2%} others")
+        lines.append(f"expected the Gaussians of none; found {missing:.2%} others")
     promises_equality = limit is not None
     limit = row["budget_db"]
     loss = max(row["psnr_loss_db"], row["difference_db"] if promises_equality else -math.inf)
     if row["trained"] and limit is not None and not loss <= limit:
-        said.append(f"expected a loss up to {limit:g} dB of PSNR; found {loss:.3g}")
-    return said
+        lines.append(f"expected a loss up to {limit:g} dB of PSNR; found {loss:.3g}")
+    return lines
 
 
 def totals(rows: Sequence[Row]) -> list[Row]:
@@ -147,7 +147,7 @@ def notes_of(content: Mapping[str, Any]) -> list[str]:
     notes = [f"Machine: {in_words(content['machine'])}.", content["about"]]
     if content["random_weights"]:
         notes.append("The weights are random: PSNR says nothing, only run times and differences do.")
-    return notes + content.get("decisions", []) + [f"Budget broken: {said}." for said in content["broken"]]
+    return notes + content.get("decisions", []) + [f"Budget broken: {line}." for line in content["broken"]]
 
 
 def write_numbers(directory: Path, content: Mapping[str, Any], tables: Tables) -> Path:

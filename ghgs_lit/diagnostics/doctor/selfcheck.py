@@ -121,7 +121,10 @@ def _splats_at_thresholds(cameras: Cameras) -> Gaussians:
     right = [-0.4, 0.4, *[0.02 * i for i in range(10)], 0.0, 0.0]
     n = len(depths)
     place = torch.tensor([right, [0.01] * n, depths]).T
-    means = [(place - c.extrinsics[:3, 3]) @ c.extrinsics[:3, :3] for c in (cameras[e, 0] for e in range(2))]
+    means = []
+    for element in range(2):
+        extrinsics = cameras[element, 0].extrinsics
+        means.append((place - extrinsics[:3, 3]) @ extrinsics[:3, :3])
     return Gaussians(
         means=torch.cat(means),
         quaternions=torch.tensor([[0.9, 0.1, -0.3, 0.2]]).repeat(2 * n, 1),
@@ -142,8 +145,9 @@ def _rendered(
     dtype: torch.dtype,
 ) -> dict[str, Tensor]:
     leaves = {n: getattr(splats, n).to(device, dtype, copy=True).requires_grad_() for n in ATTRIBUTES}
-    found = render(Gaussians(**leaves, splits=splats.splits), cameras.to(device), backend, settings=settings)
-    parts = {name: getattr(found, name) for name in ("image", "alpha", "depth")}
+    gaussians = Gaussians(**leaves, splits=splats.splits)
+    rendering = render(gaussians, cameras.to(device), backend, settings=settings)
+    parts = {name: getattr(rendering, name) for name in ("image", "alpha", "depth")}
     sum(part.square().sum() for part in parts.values()).backward()
     return parts | {f"gradient of {name}": leaf.grad for name, leaf in leaves.items()}
 

@@ -31,7 +31,7 @@ class Outcome:
 
     errors: Tensor  #: in units of eps times the condition number [n]; infinite if unbounded
     lost: Tensor  #: whether a value is not finite [n]
-    said: Sequence[str]  #: name of what has the error, for each case
+    places: Sequence[str]  #: name of what has the error, for each case
     gradient: float = 0.0  #: median of the largest gradient
 
 
@@ -57,7 +57,7 @@ def measure(
         none = torch.full((len(seeds),), torch.inf)
         outcomes = dict.fromkeys(chosen, Outcome(none, none > 0, [message] * len(seeds)))
     seconds = (time.perf_counter() - started) / max(len(chosen), 1)
-    return [_row(stage, family, dtype, seeds, found, seconds) for dtype, found in outcomes.items()]
+    return [_row(stage, family, dtype, seeds, outcome, seconds) for dtype, outcome in outcomes.items()]
 
 
 def _row(
@@ -77,7 +77,7 @@ def _row(
             "budget": stage.factor,
             "nonfinite": float(outcome.lost.float().mean()),
             "gradient": outcome.gradient,
-            "worst": f"{outcome.said[case]}, seed {seeds[case]}",
+            "worst": f"{outcome.places[case]}, seed {seeds[case]}",
             "seconds": seconds,
         }
     )
@@ -93,15 +93,15 @@ def evaluate(run: Callable[[Values], Values], inputs: Values, gradients: Sequenc
     with torch.set_grad_enabled(bool(gradients)):
         with torch.autocast("cpu", getattr(torch, dtype) if half else torch.bfloat16, enabled=half):
             outputs = run(leaves)
-        found = {name: value.detach().double() for name, value in outputs.items()}
+        results = {name: value.detach().double() for name, value in outputs.items()}
         if gradients:
             total = sum((value.double() * _weights(name, value)).sum() for name, value in outputs.items())
             wanted = [leaves[name] for name in gradients]
             slopes = torch.autograd.grad(total, wanted, allow_unused=True)
             for name, slope in zip(gradients, slopes, strict=True):
                 slope = torch.zeros_like(leaves[name]) if slope is None else slope
-                found[f"d {name}"] = slope.detach().double()
-    return found
+                results[f"d {name}"] = slope.detach().double()
+    return results
 
 
 def _weights(name: str, value: Tensor) -> Tensor:
@@ -136,9 +136,9 @@ def _spread(run: Callable[[Values], Values], exact: Values, truth: Values, stage
             if value.is_floating_point() and name not in stage.steady:
                 signs = 1 - 2 * torch.randint(2, value.shape, generator=g)
                 moved[name] = value * (1 + step * signs)
-        found = run(moved)
+        results = run(moved)
         for name, value in truth.items():
-            spread[name] = torch.maximum(spread[name], _largest(found[name] - value) / abs(step))
+            spread[name] = torch.maximum(spread[name], _largest(results[name] - value) / abs(step))
     return spread
 
 
@@ -152,9 +152,9 @@ def _largest(values: Tensor) -> Tensor:
 def _compared(stage: Stage, family: str, exact: Values, truth: Values, spread: Values, dtype: str) -> Outcome:
     """Errors of outputs and gradients in units of eps times the condition number."""
     working = torch.float64 if dtype == "float64" else torch.float32
-    found = truth  # where a stage is its own reference
+    results = truth  # where a stage is its own reference
     if dtype != "float64" or stage.reference is not None:
-        found = evaluate(stage.run, _inputs(exact, dtype), stage.gradients, dtype)
+        results = evaluate(stage.run, _inputs(exact, dtype), stage.gradients, dtype)
     eps = torch.finfo(getattr(torch, dtype) if stage.kind == "network" else working).eps
     floor = torch.finfo(working).tiny / eps
     ratios = {}
@@ -165,10 +165,10 @@ def _compared(stage: Stage, family: str, exact: Values, truth: Values, spread: V
             scale = scale * stage.kappa(exact).clamp(min=1)
         if stage.sizes is not None and slope:
             scale = torch.maximum(scale, stage.sizes(exact))
-        ratios[name] = _largest(found[name] - value) / (eps * (scale + spread[name] + floor))
+        ratios[name] = _largest(results[name] - value) / (eps * (scale + spread[name] + floor))
     names = list(ratios)
     table = torch.stack(list(ratios.values())).nan_to_num(nan=math.inf, posinf=math.inf)
-    largest = torch.stack([_largest(found[name]) for name in names])
+    largest = torch.stack([_largest(results[name]) for name in names])
     lost = ~largest.isfinite().all(0)
     if dtype == "float16" and FAMILIES[family].ingredient == "weights":
         # Products may exceed 65 504, float16's largest number; the result must then not be finite.
@@ -199,21 +199,21 @@ def _planted(stage: Stage, value: float, cases: Values, seeds: Sequence[int], dt
     names = [name for name, x in inputs.items() if x.is_floating_point() and name not in stage.steady]
     errors = torch.zeros(len(seeds))
     lost = torch.zeros(len(seeds))
-    said = []
+    places = []
     for i, seed in enumerate(seeds):
         pair = {name: x[[i, (i + 1) % len(seeds)]].clone() for name, x in inputs.items()}
         name = names[i % len(names)]
         g = torch.Generator().manual_seed(seed)
         entries = pair[name][0].view(-1)
         entries[int(torch.randint(len(entries), (), generator=g))] = value
-        said.append(f"in {name}")
+        places.append(f"in {name}")
         try:
-            found = evaluate(stage.run, pair, stage.gradients, dtype)
+            results = evaluate(stage.run, pair, stage.gradients, dtype)
         except InputError:
             continue
-        first, other = torch.stack([x.reshape(2, -1).isfinite().all(1) for x in found.values()]).all(0)
+        first, other = torch.stack([x.reshape(2, -1).isfinite().all(1) for x in results.values()]).all(0)
         lost[i] = not first
         if not other or (first and not stage.silent):
             errors[i] = math.inf
-            said[i] = f"{'vanished' if other else 'reached another case'} from {name}"
-    return Outcome(errors, lost, said)
+            places[i] = f"{'vanished' if other else 'reached another case'} from {name}"
+    return Outcome(errors, lost, places)

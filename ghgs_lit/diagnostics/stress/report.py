@@ -24,7 +24,9 @@ def bounded(error: float | None) -> str:
 
 def counts_of(rows: Sequence[Row]) -> str:
     """Numbers of cases and failures."""
-    return "{} cases, {} failures".format(*(sum(row[name] for row in rows) for name in ("cases", "failures")))
+    cases = sum(row["cases"] for row in rows)
+    failures = sum(row["failures"] for row in rows)
+    return f"{cases} cases, {failures} failures"
 
 
 def tables_of(rows: Sequence[Row]) -> Tables:
@@ -40,7 +42,8 @@ def tables_of(rows: Sequence[Row]) -> Tables:
 
 def to_markdown(rows: Sequence[Row]) -> str:
     """Worst errors, reasons of budgets, and descriptions of families."""
-    stages, families = (list(dict.fromkeys(row[name] for row in rows)) for name in ("stage", "family"))
+    stages = list(dict.fromkeys(row["stage"] for row in rows))
+    families = list(dict.fromkeys(row["family"] for row in rows))
     tables = tables_of(rows)
     tables["Budgets"] = pd.DataFrame({"stage": stages, "reason": [STAGES[name].reason for name in stages]})
     tables["Families"] = pd.DataFrame({"family": families, "inputs": [FAMILIES[f].says for f in families]})
@@ -70,8 +73,13 @@ def write(directory: Path, rows: Sequence[Row], source: dict[str, Any]) -> Path:
     """Write ``stress.md``, ``stress.png`` and ``stress.json``; return the last one's path."""
     write_text_atomically(directory / "stress.md", to_markdown(rows))
     save_figure(draw(rows), directory / "stress.png")
-    totals = {name: sum(row[name] for row in rows) for name in ("cases", "failures")}
-    text = json.dumps({**totals, "cells": list(rows), "provenance": source}, indent=1, allow_nan=False)
+    content = {
+        "cases": sum(row["cases"] for row in rows),
+        "failures": sum(row["failures"] for row in rows),
+        "cells": list(rows),
+        "provenance": source,
+    }
+    text = json.dumps(content, indent=1, allow_nan=False)
     path = directory / "stress.json"
     write_text_atomically(path, text + "\n")
     return path

@@ -34,12 +34,14 @@ def tasks_of(
     for key, names, known in (("stages", stages, STAGES), ("families", families, FAMILIES)):
         for name in names or ():
             choice(key, name, tuple(known))
-    return [
-        Task(name, family, STAGES[name].quick if quick else STAGES[name].seeds)
-        for name in (STAGES if stages is None else stages)
-        for family in (FAMILIES if families is None else families)
-        if STAGES[name].has(family)
-    ]
+    tasks = []
+    for name in STAGES if stages is None else stages:
+        stage = STAGES[name]
+        seeds = stage.quick if quick else stage.seeds
+        for family in FAMILIES if families is None else families:
+            if stage.has(family):
+                tasks.append(Task(name, family, seeds))
+    return tasks
 
 
 def run_tasks(tasks: Sequence[Task], workers: int) -> list[Row]:

@@ -152,11 +152,17 @@ def case_by_case(run: Callable[[Values], Values]) -> Callable[[Values], Values]:
 
     def stacked(values: Values) -> Values:
         count = len(next(iter(values.values())))
-        return stack([run({name: value[i] for name, value in values.items()}) for i in range(count)])
+        results = []
+        for i in range(count):
+            results.append(run({name: value[i] for name, value in values.items()}))
+        return stack(results)
 
     return stacked
 
 
 def stack(cases: list[Values]) -> Values:
     """Stack the values of cases along a new first axis."""
-    return {name: torch.stack([case[name] for case in cases]) for name in cases[0]}
+    stacked = {}
+    for name in cases[0]:
+        stacked[name] = torch.stack([case[name] for case in cases])
+    return stacked

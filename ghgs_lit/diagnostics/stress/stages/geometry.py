@@ -96,7 +96,7 @@ def scene(family: str, g: Generator, views: int, size: int, target: bool = False
     masks = inputs.spoiled(family, g, (root > 0)[:views])
     images = inputs.images(family, g, views + target, 3, size, size)
     images = images * (root > 0)[:, None]
-    found = {
+    values = {
         "images": images[:views],
         "masks": masks,
         "lenses": rig["lenses"][:views],
@@ -105,9 +105,9 @@ def scene(family: str, g: Generator, views: int, size: int, target: bool = False
         "middle": rig["middle"],
     }
     if target:
-        found["target"] = images[:1] if family == "identical" else images[views:]
-        found |= {f"target_{name}": rig[name][views:] for name in ("lenses", "poses")}
-    return found
+        values["target"] = images[:1] if family == "identical" else images[views:]
+        values |= {f"target_{name}": rig[name][views:] for name in ("lenses", "poses")}
+    return values
 
 
 def batch_of(v: Values) -> Batch:
@@ -123,14 +123,14 @@ def _bounds(v: Values) -> Values:
     batch = batch_of(v)
     masks = v["masks"]
     frame = Frame.of(batch)
-    found = _HULL(frame.enter(batch))
+    bounds = _HULL(frame.enter(batch))
     metre = frame.metre.to(v["truth"])[:, None, None, None]
-    found = DepthBounds(found.near * metre, found.far * metre)
-    outside = torch.relu(found.near - v["truth"]) + torch.relu(v["truth"] - found.far)
+    bounds = DepthBounds(bounds.near * metre, bounds.far * metre)
+    outside = torch.relu(bounds.near - v["truth"]) + torch.relu(v["truth"] - bounds.far)
     seen = masks & (v["truth"] > 0)
     return {
-        "near": torch.where(masks, found.near, 0.0),
-        "far": torch.where(masks, found.far, 0.0),
+        "near": torch.where(masks, bounds.near, 0.0),
+        "far": torch.where(masks, bounds.far, 0.0),
         "outside": torch.where(seen, outside, 0.0),
     }
 
@@ -166,8 +166,8 @@ def _sample_slowly(v: Values) -> Values:
 
 
 def _photo_inputs(family: str, g: Generator) -> Values:
-    found = scene(family, g, 3, _SIZE)
-    return {**found, "near": found["truth"] - 0.2, "far": found["truth"] + 0.2}
+    values = scene(family, g, 3, _SIZE)
+    return {**values, "near": values["truth"] - 0.2, "far": values["truth"] + 0.2}
 
 
 def _photo(v: Values) -> Values:

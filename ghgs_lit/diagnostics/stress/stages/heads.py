@@ -24,8 +24,8 @@ def _depth_inputs(family: str, g: Generator) -> Values:
 
 
 def _depth(v: Values) -> Values:
-    found = {name: bounded_depth(v["raw"], v["near"], v["far"], name) for name in BOUNDED}
-    return {**found, "confidence": confidence_of(v["confidence"])}
+    depths = {name: bounded_depth(v["raw"], v["near"], v["far"], name) for name in BOUNDED}
+    return {**depths, "confidence": confidence_of(v["confidence"])}
 
 
 def _attribute_inputs(family: str, g: Generator) -> Values:

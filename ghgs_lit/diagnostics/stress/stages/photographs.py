@@ -36,12 +36,11 @@ def _lens(v: Values) -> Values:
     k1, k2, k3, _ = v["radial"].mT
     opencv = torch.stack((k1, k2, *v["p"].mT, k3), -1).numpy()
     models = {"opencv": (opencv, False), "fisheye": (v["radial"].numpy(), True)}
-    return {
-        name: torch.cat(
-            [undistorting_grid(k, d, _LENS, _LENS, fisheye) for k, d in zip(matrices, lens, strict=True)]
-        )
-        for name, (lens, fisheye) in models.items()
-    }
+    grids = {}
+    for name, (lens, fisheye) in models.items():
+        pairs = zip(matrices, lens, strict=True)
+        grids[name] = torch.cat([undistorting_grid(k, d, _LENS, _LENS, fisheye) for k, d in pairs])
+    return grids
 
 
 def _lens_slowly(v: Values) -> Values:
@@ -73,14 +72,14 @@ def _between_knots(pixels: Tensor) -> Tensor:
 
 def _surface_inputs(views: int, size: int, family: str, g: Generator) -> Values:
     """A sphere with the same colours in all views, where the family is none of images, up to their gains."""
-    found = scene(family, g, views, size)
+    values = scene(family, g, views, size)
     if FAMILIES[family].ingredient != "images":
-        cameras = cameras_of({name: value[None] for name, value in found.items()}, size)
-        around = unproject_maps(found["truth"][None], cameras)[0] - found["middle"]
-        found["images"] = (0.5 + 0.4 * torch.sin(9 * around)).movedim(-1, 1) * (found["truth"] > 0)[:, None]
-        found["images"] = found["images"].contiguous()
+        cameras = cameras_of({name: value[None] for name, value in values.items()}, size)
+        around = unproject_maps(values["truth"][None], cameras)[0] - values["middle"]
+        values["images"] = (0.5 + 0.4 * torch.sin(9 * around)).movedim(-1, 1) * (values["truth"] > 0)[:, None]
+        values["images"] = values["images"].contiguous()
     opacities = inputs.opacities(family, g, views * size * size).view(views, size, size)
-    return {**found, "gains": inputs.uniform(g, 0.7, 1.0, views, 3), "opacities": opacities}
+    return {**values, "gains": inputs.uniform(g, 0.7, 1.0, views, 3), "opacities": opacities}
 
 
 def _seen(v: Values) -> tuple[Gaussians, Batch]:
@@ -129,7 +128,9 @@ def _refined_slowly(v: Values) -> Values:
     side = (((axes[own] * start.means).sum(-1) + shifts[own]) / focal)[:, None]
     odds = (start.opacities.clamp(1e-4, 1 - 1e-4) / (1 - start.opacities.clamp(1e-4, 1 - 1e-4))).log()
     fields = (start.means, start.scales, odds, start.colors)
-    raw, means, squares = ([torch.zeros_like(field) for field in fields] for _ in range(3))
+    raw = [torch.zeros_like(field) for field in fields]
+    means = [torch.zeros_like(field) for field in fields]
+    squares = [torch.zeros_like(field) for field in fields]
 
     def changed(raw: list[Tensor]) -> Gaussians:
         move, grow, more, tint = (c * (x / c).tanh() for c, x in zip((1, 1, 2, 0.05), raw, strict=True))

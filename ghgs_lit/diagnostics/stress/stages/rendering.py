@@ -52,7 +52,7 @@ def _project(v: Values) -> Values:
             RasterSettings(antialiased=True),
         )
     xx, xy, yy = splats.covariances.unbind(-1)
-    found = {
+    values = {
         "centers": splats.centers,
         "inverses": torch.stack((yy, -xy, xx), -1) / splats.determinants[:, None],
         # Fainter splats are not drawn.
@@ -60,12 +60,12 @@ def _project(v: Values) -> Values:
         "covariances": splats.covariances,
     }
     front = (splats.depths > 0)[:, None]
-    return {name: torch.where(front, value, 0.0) for name, value in found.items()}
+    return {name: torch.where(front, value, 0.0) for name, value in values.items()}
 
 
 def _render(backend: str, v: Values) -> Values:
-    found = render(_gaussians(v), _cameras(v), backend, near=1e-6)
-    return {"image": found.image, "alpha": found.alpha}
+    rendering = render(_gaussians(v), _cameras(v), backend, near=1e-6)
+    return {"image": rendering.image, "alpha": rendering.alpha}
 
 
 def _pair(family: str, g: Generator) -> Values:

@@ -47,14 +47,14 @@ def _models(name: str, kicked: bool) -> dict[torch.dtype, GHGS]:
 
 def _in_float32(bounds: Callable[[Batch], DepthBounds | None], batch: Batch) -> DepthBounds | None:
     """Bounds computed in float32, so that their decisions, tested in a stage of their own, agree."""
-    found = bounds(replace(batch, cameras=batch.cameras.to(torch.float32)))
-    return found if found is None else DepthBounds(found.near.double(), found.far.double())
+    computed = bounds(replace(batch, cameras=batch.cameras.to(torch.float32)))
+    return computed if computed is None else DepthBounds(computed.near.double(), computed.far.double())
 
 
 def _inputs(family: str, g: Generator) -> Values:
-    found = scene(family, g, 3, _SIZE, target=True)
-    found["kicked"] = torch.tensor(family == "kicked")
-    return found
+    values = scene(family, g, 3, _SIZE, target=True)
+    values["kicked"] = torch.tensor(family == "kicked")
+    return values
 
 
 def _dense(prediction: Prediction, batch: Batch) -> Values:
