@@ -68,10 +68,18 @@ def _digest(folder: Path) -> str:
 
 
 def kernel(function):
-    """Compile ``function`` on first use; it runs without the interpreter lock. Numba's cache notices a
-    changed file, but not changed globals or other modules whose code was inlined, and installers may keep a
-    file's time stamp. So cached code is stamped with the digest of all sources that it can depend on. Without
-    a writable folder for the cache, each process compiles again."""
+    """Compile ``function`` on first use; it runs without the interpreter lock.
+
+    Numba's cache notices a changed file, but not changed globals or other modules whose code was inlined,
+    and installers may keep a file's time stamp. So cached code is stamped with the digest of all sources
+    that it can depend on. Without a writable folder for the cache, each process compiles again.
+
+    Args:
+        function: called from Python only, with numbers and contiguous arrays.
+
+    Returns:
+        Numba's dispatcher, called like ``function``.
+    """
     compiled = numba.njit(**_OPTIONS)(function)
     with contextlib.suppress(RuntimeError):  # no folder for the cache
         compiled._cache = _Cache(function)
@@ -79,9 +87,16 @@ def kernel(function):
 
 
 def kernel_for(*argument_types):
-    """Decorator that replaces a function by one without arguments, which returns the :func:`kernel` for one
-    signature, compiled at the first call. Other signatures are refused: other array layouts would cause
-    another compilation for no gain."""
+    """Decorator for a kernel with one signature, compiled at the first call.
+
+    Other signatures are refused: other array layouts would cause another compilation for no gain.
+
+    Args:
+        argument_types: Numba types of the arguments, such as ``FLOATS[2]`` and :data:`NUMBER`.
+
+    Returns:
+        A decorator that replaces a function by one without arguments, which returns its :func:`kernel`.
+    """
 
     def decorate(function):
         @cache
@@ -102,9 +117,11 @@ def helper(function):
 
 
 def processor_features() -> set[str]:
-    """LLVM's names of the processor features that kernels may use, such as ``avx512bf16``. Features of this
-    processor, changed by Numba's setting ``NUMBA_CPU_FEATURES``: ``-avx512f`` gives the kernels for AVX2. If
-    ``NUMBA_CPU_NAME`` is set, too, only the features in that setting."""
+    """LLVM's names of the processor features that kernels may use, such as ``avx512bf16``.
+
+    Features of this processor, changed by Numba's setting ``NUMBA_CPU_FEATURES``: ``-avx512f`` gives the
+    kernels for AVX2. If ``NUMBA_CPU_NAME`` is set, too, only the features in that setting.
+    """
     changes = numba.config.CPU_FEATURES
     is_own = numba.config.CPU_NAME is None or changes is None
     own = llvmlite.binding.get_host_cpu_features() if is_own else {}

@@ -22,7 +22,11 @@ PLAIN: dict[str, Callable[..., Any]] = {}
 
 
 def is_supported(*tensors: Tensor | None) -> bool:
-    """Whether kernels compute with these: float32 and whole numbers, on a GPU on which Triton works."""
+    """Whether kernels compute with these: float32 and whole numbers, on a GPU on which Triton works.
+
+    Args:
+        tensors: inputs of an operator, at least one; None: an input that is left out.
+    """
     given = [x for x in tensors if x is not None]
     if any(x.device.type not in DEVICES for x in given):
         return False
@@ -50,8 +54,9 @@ def _triton_works() -> bool:
 
 
 def operator(schema: str, plain: Callable[..., Any], room: str) -> Callable[..., Any]:
-    """An operator of PyTorch that is a kernel on CUDA, and plain PyTorch on any other device. Being one
-    operator, it is one call in profiles.
+    """An operator of PyTorch that is a kernel on CUDA, and plain PyTorch on any other device.
+
+    Being one operator, it is one call in profiles.
 
     Args:
         schema: name, arguments and results in PyTorch's notation.
@@ -59,7 +64,8 @@ def operator(schema: str, plain: Callable[..., Any], room: str) -> Callable[...,
         room: the package whose module ``kernel`` has a function of this name, which launches the kernel.
 
     Returns:
-        The operator, without a gradient."""
+        The operator, without a gradient.
+    """
     name = schema.partition("(")[0]
 
     def launch(*inputs):

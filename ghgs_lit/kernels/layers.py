@@ -28,7 +28,17 @@ ROWS, PANEL = (12, 32) if "avx512f" in processor_features() else (6, 16)
 
 
 def _steps(builder, rows, row_stride: int, step_stride: int, panel, steps, totals) -> None:
-    """Add the products of each row and the panel over ``steps`` numbers to ``totals``."""
+    """Add the products of each row and the panel over ``steps`` numbers to ``totals``.
+
+    Args:
+        builder: of LLVM instructions.
+        rows: pointer to the first number of the first row.
+        row_stride: numbers from row to row.
+        step_stride: numbers from step to step.
+        panel: pointer to the panel, ``PANEL`` floats for each step.
+        steps: numbers of the sum, an LLVM integer.
+        totals: pointers to the sums, [ROWS][PANEL / LANES] vectors.
+    """
     with cgutils.for_range(builder, steps, intp=I64) as loop:
         line = builder.gep(panel, [builder.mul(loop.index, ir.Constant(I64, PANEL))])
         parts = []
@@ -44,12 +54,33 @@ def _steps(builder, rows, row_stride: int, step_stride: int, panel, steps, total
 
 
 def make_product(strides: tuple[int, int], adds: bool):
-    """A function that multiplies ``ROWS`` rows with a panel. ``strides``: distances in numbers from row to
-    row and from step to step, constants for the compiler, which keep all registers free for the tile.
-    ``adds``: add the product to ``out`` instead of overwriting it."""
+    """A function that multiplies ``ROWS`` rows with a panel.
+
+    Args:
+        strides: distances in numbers from row to row and from step to step, constants for the compiler,
+            which keep all registers free for the tile.
+        adds: add the product to ``out`` instead of overwriting it.
+
+    Returns:
+        An intrinsic of Numba: ``product(x, x_at, panels, panel_at, steps, out, out_at, out_stride)``.
+    """
 
     @intrinsic
     def product(typing_context, x, x_at, panels, panel_at, steps, out, out_at, out_stride):
+        """Multiply ``ROWS`` rows of ``x`` with a panel, to ``ROWS`` x ``PANEL`` numbers of ``out``.
+
+        Args:
+            typing_context: Numba's.
+            x: flat float32.
+            x_at: index of the first number of the first row.
+            panels: flat float32, from a cache line on.
+            panel_at: index of the panel, a multiple of 16.
+            steps: numbers of the sum.
+            out: flat float32, from a cache line on.
+            out_at: index of the first number of the tile, a multiple of 16.
+            out_stride: numbers from row to row of ``out``, a multiple of 16.
+        """
+
         def emit(context, builder, sig, args):
             def place(k):
                 return pointer_to(
@@ -104,9 +135,16 @@ def parameters(layers: Sequence[nn.Module]) -> list[nn.Parameter]:
 
 
 def packed(numbers: Sequence[Tensor], transposed: bool = False) -> np.ndarray:
-    """Layers packed into one flat array: for each the weights in tiles of ``ROWS`` outputs, each
-    [inputs, ROWS], then the biases. ``numbers``: weight and bias of each layer. ``transposed``: pack
-    transposed weights, with biases of 0."""
+    """Layers packed into one flat array.
+
+    Args:
+        numbers: weight [outputs, inputs] and bias [outputs] of each layer.
+        transposed: pack transposed weights, with biases of 0.
+
+    Returns:
+        For each layer the weights in tiles of ``ROWS`` outputs, each [inputs, ROWS], then the biases;
+        float32.
+    """
     found = []
     for weight, bias in _pairs(numbers):
         weight, bias = (x.detach().numpy() for x in (weight, bias))
@@ -119,12 +157,21 @@ def packed(numbers: Sequence[Tensor], transposed: bool = False) -> np.ndarray:
 
 
 def _pairs(numbers: Sequence) -> list[tuple]:
+    """Weight and bias of each layer."""
     return list(zip(numbers[::2], numbers[1::2], strict=True))
 
 
 class Sums:
-    """Sums of the gradients of layers for each task of a kernel. ``places``: for each layer, where its packed
-    weights, its transposed weights and its sums begin. ``of_task``: sums of each task, from :func:`learn`."""
+    """Sums of the gradients of layers for each task of a kernel.
+
+    Args:
+        numbers: weight [outputs, inputs] and bias [outputs] of each layer.
+        tasks: number of tasks that run at once.
+
+    Attributes:
+        places: where packed weights, transposed weights and sums of each layer begin, [layers + 1, 3].
+        of_task: sums of each task, from :func:`learn`, [tasks, numbers].
+    """
 
     def __init__(self, numbers: Sequence[Tensor], tasks: int):
         self._shapes = [tuple(weight.shape) for weight, _ in _pairs(numbers)]
@@ -157,7 +204,15 @@ def size(outputs, inputs):
 
 @helper
 def put_rows(table, first, count, line, values):
-    """Copy ``count`` rows of a table from ``first`` on to lines from ``line`` on; repeat the last row."""
+    """Copy rows of a table to lines; the last row is repeated in the other lanes.
+
+    Args:
+        table: float32 [rows, channels].
+        first: first row.
+        count: number of rows, 1 to ``PANEL``.
+        line: first line that is written.
+        values: lines of ``PANEL`` floats, flat.
+    """
     for lane in range(PANEL):
         row = first + min(lane, count - 1)
         for channel in range(table.shape[1]):
@@ -166,14 +221,31 @@ def put_rows(table, first, count, line, values):
 
 @helper
 def linear(layers, at, outputs, inputs, values, result):
-    """``result = W values`` of the packed layer at ``layers[at]``, without its biases."""
+    """``result = W values`` of a packed layer, without its biases.
+
+    Args:
+        layers: packed layers, from :func:`packed`.
+        at: where the layer begins.
+        outputs: channels of the result.
+        inputs: channels of ``values``.
+        values: lines of ``PANEL`` floats, flat.
+        result: gets ``room(outputs)`` lines.
+    """
     for row in range(0, outputs, ROWS):
         product(layers, at + row * inputs, values, 0, inputs, result, row * PANEL, PANEL)
 
 
 @helper
 def rectify(layers, at, outputs, inputs, values):
-    """``values = max(values + b, 0)`` of the packed layer at ``layers[at]``; NaN stays."""
+    """``values = max(values + b, 0)`` with the biases of a packed layer; NaN stays.
+
+    Args:
+        layers: packed layers, from :func:`packed`.
+        at: where the layer begins.
+        outputs: channels of ``values``.
+        inputs: channels of the layer's input.
+        values: lines of ``PANEL`` floats, flat; changed in place.
+    """
     biases = at + lines(outputs) * inputs
     for channel in range(outputs):
         for i in range(channel * PANEL, (channel + 1) * PANEL, LANES):
@@ -189,7 +261,14 @@ def put_ones(line, values):
 
 @helper
 def put_slopes(table, first, count, values):
-    """Copy ``count`` rows of a table to lines; the other lanes become 0."""
+    """Copy rows of a table to lines; the other lanes become 0.
+
+    Args:
+        table: float32 [rows, channels].
+        first: first row.
+        count: number of rows, at most ``PANEL``.
+        values: gets a line of ``PANEL`` floats for each channel.
+    """
     for lane in range(PANEL):
         for channel in range(table.shape[1]):
             value = table[first + lane, channel] if lane < count else ZERO
@@ -198,7 +277,13 @@ def put_slopes(table, first, count, values):
 
 @helper
 def unrectify(values, channels, slopes):
-    """Gradients before a ReLU with results ``values``, in place of ``slopes``, those after it."""
+    """Gradients before a ReLU, in place of those after it.
+
+    Args:
+        values: results of the ReLU, lines of ``PANEL`` floats.
+        channels: number of lines.
+        slopes: gradients of the results; changed in place.
+    """
     for i in range(0, channels * PANEL, LANES):
         is_off = memory.load(values, i) <= ZERO
         memory.store(slopes, i, simd.select(is_off, ZERO, memory.load(slopes, i)))
@@ -206,7 +291,13 @@ def unrectify(values, channels, slopes):
 
 @helper
 def _turn(slopes, channels, turned):
-    """Write lines to ``turned`` as panels of ``PANEL`` channels, with a row for each lane."""
+    """Write lines as panels of ``PANEL`` channels, with a row for each lane.
+
+    Args:
+        slopes: lines of ``PANEL`` floats.
+        channels: number of lines.
+        turned: gets whole panels.
+    """
     for channel in range(channels):
         at = channel // PANEL * PANEL * PANEL + channel % PANEL
         for lane in range(PANEL):
@@ -215,8 +306,17 @@ def _turn(slopes, channels, turned):
 
 @helper
 def learn(values, inputs, slopes, outputs, turned, at, sums):
-    """Add the gradients of a layer's weights and biases to ``sums`` from ``at`` on. ``values``: inputs and a
-    line of ones. ``slopes``: gradients of outputs. ``turned``: room for whole panels."""
+    """Add the gradients of a layer's weights and biases to ``sums``.
+
+    Args:
+        values: inputs of the layer and a line of ones, lines of ``PANEL`` floats.
+        inputs: channels of the layer's input.
+        slopes: gradients of the layer's outputs, lines of ``PANEL`` floats.
+        outputs: channels of the layer's output.
+        turned: room for whole panels of ``slopes``.
+        at: where the layer's sums begin.
+        sums: of one task, as in :class:`Sums`.
+    """
     _turn(slopes, outputs, turned)
     rows = lines(inputs + 1)
     for panel in range(0, outputs, PANEL):

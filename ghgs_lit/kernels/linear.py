@@ -34,7 +34,16 @@ def prefers_onednn(x: Tensor, weight: Tensor) -> bool:
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """``x @ weight.T + bias``, as ``F.linear``."""
+    """``x @ weight.T + bias``, as ``F.linear``.
+
+    Args:
+        x: [..., inputs].
+        weight: [outputs, inputs].
+        bias: [outputs].
+
+    Returns:
+        [..., outputs].
+    """
     if not prefers_onednn(x, weight):
         return F.linear(x, weight, bias)
     k = x.shape[-1]

@@ -1,4 +1,8 @@
-"""Loads and stores of whole vectors."""
+"""Loads and stores of whole vectors.
+
+Functions with ``@intrinsic`` are called in kernels without their first parameter, Numba's
+``typing_context``; ``emit(context, builder, sig, args)`` writes their LLVM instructions.
+"""
 
 from llvmlite import ir
 from numba.core import cgutils, types
@@ -8,13 +12,29 @@ from ghgs_lit.kernels.simd import I32, floats, vector_of
 
 
 def pointer_to(context, builder, array_type, array, index, index_type, kind):
-    """Pointer to the vector ``kind`` at element ``index`` (flat index) of a contiguous array."""
+    """Pointer to a vector at an element of a contiguous array.
+
+    Args:
+        context: Numba's, of the target.
+        builder: of LLVM instructions.
+        array_type: Numba type of the array.
+        array: its LLVM value.
+        index: flat index of the element, an LLVM integer.
+        index_type: Numba type of ``index``.
+        kind: LLVM type of the vector.
+    """
     data = context.make_array(array_type)(context, builder, array).data
     position = context.cast(builder, index, index_type, types.intp)
     return builder.bitcast(builder.gep(data, [position]), kind.as_pointer())
 
 
 def _make_access(alignment_of):
+    """Intrinsics that load and store vectors.
+
+    Args:
+        alignment_of: from a kind of vector to the bytes to which addresses are aligned.
+    """
+
     @intrinsic
     def load(typing_context, array, index):
         """The vector that starts at ``array[index]`` of a contiguous, one-dimensional array."""
@@ -28,7 +48,14 @@ def _make_access(alignment_of):
 
     @intrinsic
     def store(typing_context, array, index, value):
-        """Write a vector to ``array[index]`` and the elements that follow."""
+        """Write a vector to ``array[index]`` and the elements that follow.
+
+        Args:
+            typing_context: Numba's.
+            array: contiguous, one-dimensional, float32 or float64.
+            index: of the first element.
+            value: a vector, or a number for all its lanes.
+        """
         kind = vector_of(array.dtype)
 
         def emit(context, builder, sig, args):

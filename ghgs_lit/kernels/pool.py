@@ -12,12 +12,26 @@ from torch import Tensor, nn
 
 
 def at_once(device: torch.device, cpu: int, gpu: int) -> int:
-    """The limit for ``device``: a CPU needs parts that fit its cache, a GPU few calls."""
+    """The limit for ``device``: a CPU needs parts that fit its cache, a GPU few calls.
+
+    Args:
+        device: where the work is done.
+        cpu: limit for a CPU.
+        gpu: limit for any other device.
+    """
     return cpu if device.type == "cpu" else gpu
 
 
 def even_parts(count: int, most: int) -> list[slice]:
-    """Slices of at most ``most`` of ``count`` rows, of equal size: a small last part would be slow."""
+    """Slices of equal size: a small last part would be slow.
+
+    Args:
+        count: number of rows.
+        most: of rows in a slice.
+
+    Returns:
+        Slices that cover ``range(count)``; an empty one if ``count`` is 0.
+    """
     parts = max(1, -(-count // max(1, most)))
     return [slice(count * i // parts, count * (i + 1) // parts) for i in range(parts)]
 
@@ -77,8 +91,15 @@ def multiplies(*tensors: Tensor) -> bool:
 def run_rows(
     kernel: Callable, arguments: Sequence, ranges: Iterable[Sequence[int]], most: int, work: int
 ) -> None:
-    """:func:`run` ``kernel(*arguments, *numbers, first, last)`` for parts of at most ``most`` rows of each
-    range ``(*numbers, first, last)``."""
+    """:func:`run` a kernel for parts of ranges of rows.
+
+    Args:
+        kernel: called as ``kernel(*arguments, *numbers, first, last)``.
+        arguments: of all calls.
+        ranges: each ``(*numbers, first, last)``.
+        most: rows of a call.
+        work: splats or entries of all ranges; little work uses no extra thread.
+    """
     tasks = [
         partial(kernel, *arguments, *numbers, first + part.start, first + part.stop)
         for *numbers, first, last in ranges
@@ -89,8 +110,12 @@ def run_rows(
 
 
 def run(tasks: list, work: int) -> None:
-    """Call every task (without arguments) on at most ``torch.get_num_threads()`` threads, the caller's
-    included. ``work``: splats or entries of all tasks; little work uses no extra thread."""
+    """Call every task on at most ``torch.get_num_threads()`` threads, the caller's included.
+
+    Args:
+        tasks: functions without arguments.
+        work: splats or entries of all tasks; little work uses no extra thread.
+    """
     helpers = min(torch.get_num_threads(), len(tasks), 1 + work // GRAIN) - 1
     queue = deque(tasks)
 

@@ -1,9 +1,13 @@
 """Explicit vectors inside Numba kernels, compiled directly to LLVM vector instructions.
 
-LLVM cannot vectorise the masked inner loop of a rasterizer. A vector is 64 bytes, 16 floats or 8 doubles: one
-AVX-512 register; on AVX2 and NEON LLVM splits each operation into two or four. A mask is one bit per lane. No
-fast-math flag is set: NaN and infinity behave as IEEE 754 says. A number combined with a vector is put into
-every lane. ``memory`` loads and stores vectors."""
+LLVM cannot vectorise the masked inner loop of a rasterizer. A vector is 64 bytes, 16 floats or 8 doubles:
+one AVX-512 register; on AVX2 and NEON LLVM splits each operation into two or four. A mask is one bit per
+lane. No fast-math flag is set: NaN and infinity behave as IEEE 754 says. A number combined with a vector
+is put into every lane. ``memory`` loads and stores vectors.
+
+Functions with ``@intrinsic`` are called in kernels without their first parameter, Numba's
+``typing_context``; ``emit(context, builder, sig, args)`` writes their LLVM instructions.
+"""
 
 import math
 import operator
@@ -66,6 +70,15 @@ def everywhere(builder, number, count: int):
 
 @lower_cast(types.Number, _Floats)
 def _fill(context, builder, source, kind, value):
+    """A number as a vector that has it in every lane.
+
+    Args:
+        context: Numba's, of the target.
+        builder: of LLVM instructions.
+        source: Numba type of the number.
+        kind: Numba type of the vector.
+        value: LLVM value of the number.
+    """
     return everywhere(builder, context.cast(builder, value, source, _SCALARS[kind]), kind.count)
 
 
@@ -77,9 +90,14 @@ def _common(*args):
 
 
 def _operator(function, family, result, emit):
-    """Define a Python operator for vectors. ``function``: the operator, such as ``operator.add``. ``family``:
-    class of the operands. ``result``: maps the kind of the operands to that of the value. ``emit``: writes
-    the instruction."""
+    """Define a Python operator for vectors.
+
+    Args:
+        function: the operator, such as ``operator.add``.
+        family: class of the operands.
+        result: maps the kind of the operands to that of the value.
+        emit: writes the instruction, from a builder and two operands.
+    """
 
     class Template(AbstractTemplate):
         key = function
@@ -111,17 +129,26 @@ _compare(operator.eq, "==")
 
 
 def constant(kind, value: float):
+    """A vector of a kind with ``value`` in every lane, known to the compiler."""
     return ir.Constant(kind.llvm, [value] * kind.count)
 
 
 def call(builder, name, kind, *args):
-    """Call an LLVM intrinsic whose arguments and result are vectors of one kind."""
+    """Call an LLVM intrinsic whose arguments and result are vectors of one kind.
+
+    Args:
+        builder: of LLVM instructions.
+        name: of the intrinsic without ``llvm.`` and types, such as ``fmuladd``.
+        kind: Numba type of the vectors.
+        args: LLVM values.
+    """
     function = ir.FunctionType(kind.llvm, [kind.llvm] * len(args))
     callee = cgutils.get_or_insert_function(builder.module, function, f"llvm.{name}.{_SUFFIX[kind]}")
     return builder.call(callee, args)
 
 
 def indices(values):
+    """Lanes for LLVM's ``shufflevector``, as a constant."""
     values = list(values)
     return ir.Constant(ir.VectorType(I32, len(values)), values)
 
@@ -140,7 +167,14 @@ def full(typing_context, value):
 
 @intrinsic
 def fma(typing_context, a, b, c):
-    """``a * b + c``, fused where the machine has an instruction for it."""
+    """``a * b + c``, fused where the machine has an instruction for it.
+
+    Args:
+        typing_context: Numba's.
+        a: a vector, or a number for every lane.
+        b: a vector, or a number for every lane.
+        c: a vector, or a number for every lane; at least one of the three is a vector.
+    """
     kind = _common(a, b, c)
     return kind(kind, kind, kind), lambda context, builder, sig, args: call(builder, "fmuladd", kind, *args)
 
@@ -177,7 +211,14 @@ maximum = _make_extreme(">")
 
 @intrinsic
 def select(typing_context, where, a, b):
-    """``a`` in the lanes where the mask is set, ``b`` in the others."""
+    """``a`` in the lanes where the mask is set, ``b`` in the others.
+
+    Args:
+        typing_context: Numba's.
+        where: a mask.
+        a: a vector, or a number for every lane.
+        b: a vector, or a number for every lane; at least one of the two is a vector.
+    """
     kind = _common(a, b)
     return kind(where, kind, kind), lambda context, builder, sig, args: builder.select(*args)
 

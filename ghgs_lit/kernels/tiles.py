@@ -12,7 +12,14 @@ ROWS = 128
 
 
 def start(kernel: Any, count: int, *arguments: Any, **flags: bool) -> None:
-    """Start ``kernel(count, *arguments, **flags, ROWS=ROWS)`` for ``count`` rows, with contiguous tensors."""
+    """Start a kernel with contiguous tensors: ``kernel(count, *arguments, **flags, ROWS=ROWS)``.
+
+    Args:
+        kernel: a function of Triton.
+        count: number of rows; with 0 nothing is started.
+        arguments: tensors and numbers.
+        flags: constants of the compiler.
+    """
     if count > 0:
         read = [x.contiguous() if isinstance(x, Tensor) else x for x in arguments]
         kernel[(triton.cdiv(count, ROWS),)](count, *read, **flags, ROWS=ROWS)
@@ -33,7 +40,15 @@ def load3(table, i):
 
 @triton.jit
 def store3(table, i, x, y, z):
-    """Write rows ``i`` of a table of three columns."""
+    """Write rows of a table of three columns.
+
+    Args:
+        table: pointer to a contiguous table [rows, 3].
+        i: rows, [ROWS].
+        x: first column, [ROWS].
+        y: second column, [ROWS].
+        z: third column, [ROWS].
+    """
     tl.store(table + 3 * i, x)
     tl.store(table + 3 * i + 1, y)
     tl.store(table + 3 * i + 2, z)
@@ -48,7 +63,16 @@ def load4(table, i):
 
 @triton.jit
 def store4(table, i, w, x, y, z):
-    """Write rows ``i`` of a table of four columns."""
+    """Write rows of a table of four columns.
+
+    Args:
+        table: pointer to a contiguous table [rows, 4].
+        i: rows, [ROWS].
+        w: first column, [ROWS].
+        x: second column, [ROWS].
+        y: third column, [ROWS].
+        z: fourth column, [ROWS].
+    """
     tl.store(table + 4 * i, w)
     tl.store(table + 4 * i + 1, x)
     tl.store(table + 4 * i + 2, y)
@@ -73,7 +97,18 @@ def tanh(x):
 
 @triton.jit
 def to_camera(extrinsics, view, x, y, z):
-    """World points in axes of the cameras ``view``."""
+    """World points in axes of their cameras.
+
+    Args:
+        extrinsics: pointer to world-to-camera matrices [V, 4, 4].
+        view: camera of each point, [ROWS].
+        x: of the points in the world, [ROWS].
+        y: of the points in the world, [ROWS].
+        z: of the points in the world, [ROWS].
+
+    Returns:
+        Coordinates to the right, down and ahead of the camera, [ROWS] each.
+    """
     a, b, c, shift = load4(extrinsics, 4 * view)
     right = a * x + b * y + c * z + shift
     a, b, c, shift = load4(extrinsics, 4 * view + 1)
@@ -84,8 +119,16 @@ def to_camera(extrinsics, view, x, y, z):
 
 @triton.jit
 def cells(place, size):
-    """The two cells around a place along an axis of a map, and their weights: 0 beyond its border. NaN, and
-    places far away, are beyond it."""
+    """The two cells around a place along an axis of a map, and their weights.
+
+    Args:
+        place: in cells from the map's border, centres of cells at +0.5, [ROWS].
+        size: cells along the axis.
+
+    Returns:
+        Indices of both cells, clamped to the map, and their weights: 0 beyond its border. NaN, and places
+        far away, are beyond it.
+    """
     place = tl.where(place > -2, tl.where(place < size + 2, place, size + 2), -2) - 0.5
     first = tl.floor(place)
     share = place - first
@@ -99,7 +142,19 @@ def cells(place, size):
 
 @triton.jit
 def between(plane, top, bottom, left, right, above, below, before, after):
-    """Bilinear value of a map between two rows, which begin at ``top`` and ``bottom``, and two columns."""
+    """Bilinear value of a map between two rows and two columns.
+
+    Args:
+        plane: pointer to one channel of a map.
+        top: where the upper row begins in the plane.
+        bottom: where the lower row begins in the plane.
+        left: the left column.
+        right: the right column.
+        above: weight of the upper row.
+        below: weight of the lower row.
+        before: weight of the left column.
+        after: weight of the right column.
+    """
     upper = before * tl.load(plane + top + left) + after * tl.load(plane + top + right)
     lower = before * tl.load(plane + bottom + left) + after * tl.load(plane + bottom + right)
     return above * upper + below * lower

@@ -40,19 +40,29 @@ def render(
     """Render ``B`` sets of Gaussians from cameras [B, T].
 
     Differentiable in means, quaternions, scales, opacities, colours and background. Any number ``C`` of
-    colour channels, any image size and any number of Gaussians per element, including none. Depth is 0 where
-    no Gaussian is seen. InputError: inputs that do not fit together. BackendUnavailable: gsplat cannot run on
-    this machine.
+    colour channels, any image size and any number of Gaussians per element, including none. The image is
+    defined by :class:`ghgs_lit.rendering.settings.RasterSettings`, as in 3D Gaussian Splatting (Kerbl et
+    al. 2023).
 
     Args:
-        gaussians: a zero quaternion is the identity; a Gaussian with NaN in its geometry or opacity is not
-            drawn.
+        gaussians: N Gaussians of all elements, ``splits`` of them in each; a zero quaternion is the
+            identity; a Gaussian with NaN in its geometry or opacity is not drawn.
+        cameras: [B, T], without skew; all of one image size (h, w).
         backend: ``gsplat`` (CUDA), ``cpu`` (float32), ``reference`` (plain PyTorch in the dtype of the
             means, slow; also differentiable in the cameras) or ``auto``: gsplat on CUDA, else cpu.
         background: one number, one per channel, or a tensor that broadcasts with [B, T, C, h, w].
-        near, far: metres (see ``gaussians.metre``); only Gaussians whose centre has ``near <= z <= far`` are
-            drawn.
-        settings: constants of the image; None: those that the Gaussians were made for."""
+        near: metres > 0 (see ``gaussians.metre``); Gaussians whose centre has ``z < near`` are not drawn.
+        far: metres > ``near``; Gaussians whose centre has ``z > far`` are not drawn.
+        settings: constants of the image; None: those that the Gaussians were made for.
+
+    Returns:
+        Image [B, T, C, h, w], alpha [B, T, 1, h, w] in [0, 1], and expected depth [B, T, 1, h, w] in the
+        unit of the means, 0 where no Gaussian is seen.
+
+    Raises:
+        InputError: inputs that do not fit together.
+        BackendUnavailable: gsplat cannot run on this machine.
+    """
     settings = settings or made_for(gaussians)
     require(0 < near < math.inf, "near", "a number of metres > 0", near)
     require(near < far < math.inf, "far", f"more than near = {near}", far)
@@ -74,13 +84,29 @@ def render(
 
 
 def made_for(gaussians: Gaussians, **settings) -> RasterSettings:
-    """The settings that Gaussians were made for, with further ``settings``."""
+    """The settings that Gaussians were made for.
+
+    Args:
+        gaussians: their ``low_pass`` and ``antialiased`` are taken over.
+        settings: further fields of :class:`RasterSettings`.
+    """
     return RasterSettings(low_pass=gaussians.low_pass, antialiased=gaussians.antialiased, **settings)
 
 
 def resolve_backend(backend: str, device: torch.device) -> str:
-    """The backend for tensors on ``device``, with ``auto`` resolved. InputError: it does not run on
-    ``device``. BackendUnavailable: gsplat cannot run on this machine."""
+    """The backend for tensors on ``device``, with ``auto`` resolved.
+
+    Args:
+        backend: one of :data:`BACKENDS`.
+        device: where the Gaussians are.
+
+    Returns:
+        ``gsplat``, ``cpu`` or ``reference``.
+
+    Raises:
+        InputError: an unknown backend, or one that does not run on ``device``.
+        BackendUnavailable: gsplat cannot run on this machine.
+    """
     choice("renderer.backend", backend, BACKENDS)
     if backend == "auto":
         require(device.type in _OF_DEVICE, "renderer.backend=auto", "tensors on cuda or cpu", str(device))
@@ -108,13 +134,27 @@ class Renderer(Options):
     def __call__(
         self, gaussians: Gaussians, cameras: Cameras, background: Background | None = None
     ) -> Rendering:
-        """:func:`render` with these options; ``background`` replaces the configured one if given."""
+        """:func:`render` with these options.
+
+        Args:
+            gaussians: as in :func:`render`.
+            cameras: as in :func:`render`.
+            background: replaces the configured one if given.
+
+        Returns:
+            As :func:`render`.
+
+        Raises:
+            InputError: inputs that do not fit together.
+            BackendUnavailable: gsplat cannot run on this machine.
+        """
         background = self.background if background is None else background
         settings = made_for(gaussians, alpha_max=self.alpha_max)
         return render(gaussians, cameras, self.backend, background, self.near, FAR, settings)
 
 
 def _check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
+    """Raise InputError where shapes of Gaussians and cameras do not fit together, or a camera has skew."""
     count = len(gaussians)
     shapes = {"means": (count, 3), "quaternions": (count, 4), "scales": (count, 3), "opacities": (count,)}
     for name, shape in shapes.items():
@@ -133,6 +173,7 @@ def _check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
 
 
 def _in_one_dtype(gaussians: Gaussians) -> Gaussians:
+    """Gaussians in float64 if any of their tensors is, else in float32."""
     fields = ("means", "quaternions", "scales", "opacities", "colors")
     tensors = {name: at_least_float32(getattr(gaussians, name)) for name in fields}
     is_double = any(tensor.dtype == torch.float64 for tensor in tensors.values())
@@ -161,6 +202,7 @@ def _around_cameras(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, 
 
 
 def _in_metres(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
+    """Gaussians and cameras in metres; ``gaussians.metre`` is the length of a metre in each scene."""
     if gaussians.metre is None:
         return gaussians, cameras
     lengths = _of_each(gaussians.metre.to(gaussians.means), gaussians)[:, None]
@@ -173,6 +215,7 @@ def _in_metres(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Camer
 
 
 def _background(background: Background, color: Float[Tensor, "B T C h w"]) -> Tensor:
+    """The background as a tensor that broadcasts with ``color``; InputError: not one number per channel."""
     tensor = torch.as_tensor(background, dtype=color.dtype, device=color.device)
     if tensor.ndim == 1:
         channels = color.shape[2]

@@ -33,8 +33,14 @@ _expected: dict[Grid, float] = {}
 
 @dataclass(frozen=True)
 class Room:
-    """Room that a rendering had, and the number that it ``needed``, on its device. ``splats``: number of all
-    images together."""
+    """Room that a rendering had, and the number that it ``needed``, on its device.
+
+    Attributes:
+        grid: tiles of an image (rows, columns).
+        splats: number of all images together.
+        capacity: number of intersections that there was room for.
+        needed: number of intersections that there were, a scalar on the device of the rendering.
+    """
 
     grid: Grid
     splats: int
@@ -42,7 +48,14 @@ class Room:
     needed: Int[Tensor, ""]
 
     def expect(self, needed: int) -> bool:
-        """Whether the room sufficed; later renderings expect what was ``needed``."""
+        """Note what was needed; later renderings of the same grid expect it.
+
+        Args:
+            needed: number of intersections, as read by the host.
+
+        Returns:
+            Whether the room sufficed.
+        """
         found = needed / self.splats
         before = _expected.get(self.grid, 0.0)
         _expected[self.grid] = max(found, before + _FALL * (found - before))
@@ -78,8 +91,15 @@ def deferred() -> Iterator[Rooms]:
 
 
 def settled(call: Callable[[], T]) -> T:
-    """The result of ``call``; the host waits once for all renderings inside, and not at all without any.
-    Where one had too little room, ``call`` is repeated with enough for what was seen."""
+    """The result of ``call``, repeated where a rendering inside had too little room.
+
+    The host waits once for all renderings inside, and not at all without any. A repeated call has enough
+    room for what was seen.
+
+    Args:
+        call: anything that renders; it may be called several times. Inside :func:`deferred` it is called
+            once and not checked.
+    """
     if _rooms.get() is not None:
         return call()
     while True:
@@ -98,10 +118,15 @@ def with_room(
     """What is drawn with enough room.
 
     Args:
-        grid: tiles of an image.
+        grid: tiles of an image (rows, columns).
         splats: number of all images together, at least 1.
         find: finds intersections in a capacity, and gives them and the number that is needed.
-        draw: draws intersections."""
+        draw: draws intersections.
+
+    Returns:
+        What ``draw`` returned last. Inside :func:`deferred` it may lack splats: the caller checks the
+        rooms.
+    """
     rooms = _rooms.get()
     while True:
         capacity = size_class(math.ceil(_SPARE * splats * _expected.get(grid, _FIRST)) or 1)
@@ -117,7 +142,11 @@ def with_room(
 
 
 class Coming:
-    """A number on its way to the host, which can go on until it reads it. ``value``: on any device."""
+    """A number on its way to the host, which can go on until it reads it.
+
+    Args:
+        value: a scalar on any device.
+    """
 
     def __init__(self, value: Int[Tensor, ""]):
         self.value = value

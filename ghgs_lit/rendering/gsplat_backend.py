@@ -34,7 +34,11 @@ class BackendUnavailable(InputError):
 
 
 def load() -> Any:
-    """The package gsplat. BackendUnavailable: no CUDA device, or the import fails."""
+    """The package gsplat.
+
+    Raises:
+        BackendUnavailable: no CUDA device, or the import fails.
+    """
     if not torch.cuda.is_available():
         raise BackendUnavailable(
             "renderer.backend=gsplat: needs a CUDA device, but torch.cuda.is_available() is false "
@@ -58,9 +62,25 @@ def load() -> Any:
 def rasterize(
     gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Rendering:
-    """Render on black in float32; see :func:`ghgs_lit.rendering.render`. A limit of alpha below
-    :data:`_ALPHA_MAX` is applied to opacities: for opacities above it, alphas differ by at most
-    ``1 - alpha_max`` from those of other backends."""
+    """Render on black in float32; see :func:`ghgs_lit.rendering.render`.
+
+    A limit of alpha below :data:`_ALPHA_MAX` is applied to opacities: for opacities above it, alphas
+    differ by at most ``1 - alpha_max`` from those of other backends.
+
+    Args:
+        gaussians: on a CUDA device, in metres.
+        cameras: [B, T] on the same device, in metres.
+        settings: constants of the image; those in :data:`_FIXED` are compiled into gsplat.
+        near: metres; least depth of a centre that is drawn.
+        far: metres; greatest depth of a centre that is drawn.
+
+    Returns:
+        Image [B, T, C, h, w], alpha and expected depth [B, T, 1, h, w].
+
+    Raises:
+        InputError: settings that gsplat's kernels do not offer.
+        BackendUnavailable: gsplat cannot run on this machine.
+    """
     default = RasterSettings()
     expected = f"at most {_ALPHA_MAX}, which is compiled into gsplat"
     allowed = settings.alpha_max <= _ALPHA_MAX
@@ -84,7 +104,16 @@ def rasterize(
 def _drawn(
     gsplat: Any, gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Tensor:
-    """Colours, expected depth and alpha of all views, [B, T, C + 2, h, w]."""
+    """Colours, expected depth and alpha of all views, [B, T, C + 2, h, w].
+
+    Args:
+        gsplat: the package, from :func:`load`.
+        gaussians: at least one, in metres.
+        cameras: [B, T], not empty, in metres.
+        settings: constants of the image.
+        near: metres; least depth of a centre that is drawn.
+        far: metres; greatest depth of a centre that is drawn.
+    """
     fields = _sanitized(*_side_by_side(gaussians))
     means, quaternions, scales, opacities, colors = fields
     if settings.alpha_max < _ALPHA_MAX:
@@ -129,8 +158,17 @@ def _is_known(gsplat: Any) -> bool:
 def _without_wait(
     gsplat: Any, seen: dict[str, Any], colors: Tensor, antialiased: bool
 ) -> tuple[Tensor, Tensor]:
-    """What gsplat's ``rasterization`` draws: colours and expected depth [B, T, h, w, C + 1], alpha [..., 1].
-    ``seen``: Gaussians and cameras, by gsplat's names. ``colors``: [B, N, C]."""
+    """What gsplat's ``rasterization`` draws, without its wait of the host.
+
+    Args:
+        gsplat: the package, of a version in :data:`_KNOWN`.
+        seen: Gaussians and cameras, by the names of gsplat's ``fully_fused_projection``.
+        colors: [B, N, C].
+        antialiased: scale opacities by gsplat's compensations.
+
+    Returns:
+        Colours and expected depth [B, T, h, w, C + 1], and alpha [B, T, h, w, 1].
+    """
     radii, centers, depths, conics, compensations = gsplat.fully_fused_projection(
         covars=None, calc_compensations=antialiased, **seen
     )
@@ -174,9 +212,22 @@ def _side_by_side(gaussians: Gaussians) -> tuple[Tensor, ...]:
 def _sanitized(
     means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor
 ) -> tuple[Tensor, ...]:
-    """Gaussians that gsplat draws as the other backends do. gsplat squares quaternions in float32 and does
-    not expect NaN or infinity. So quaternions are normalised, the zero quaternion becomes the identity, and a
-    Gaussian whose geometry or opacity is not finite becomes invisible."""
+    """Gaussians that gsplat draws as the other backends do.
+
+    gsplat squares quaternions in float32 and does not expect NaN or infinity. So quaternions are
+    normalised, the zero quaternion becomes the identity, and a Gaussian whose geometry or opacity is not
+    finite becomes invisible.
+
+    Args:
+        means: [B, N, 3].
+        quaternions: wxyz of any length, [B, N, 4].
+        scales: standard deviations, [B, N, 3].
+        opacities: [B, N].
+        colors: [B, N, C]; returned unchanged.
+
+    Returns:
+        All five, in the order of the arguments.
+    """
     geometry = torch.cat((means, quaternions, scales, opacities[..., None]), dim=-1)
     is_finite = geometry.isfinite().all(-1)
     identity = torch.nn.functional.pad(means.new_ones(1), (0, 3))

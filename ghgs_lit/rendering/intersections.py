@@ -46,15 +46,21 @@ def intersections(
 ) -> Intersections:
     """Intersections of splats with tiles, as gsplat's ``isect_tiles`` and ``isect_offset_encode``.
 
-    Splats are sorted by depth first, and then their places by tile. Both sorts are stable, so that the order
-    is that of gsplat's 64-bit keys, but most bytes are sorted once for a splat instead of once for a tile.
+    Splats are sorted by depth first, and then their places by tile. Both sorts are stable, so that the
+    order is that of gsplat's 64-bit keys, but most bytes are sorted once for a splat instead of once for
+    a tile.
 
     Args:
         centers: in pixels; anything where a radius is 0.
         radii: half sides in pixels of the box that a splat touches; 0 where it is not drawn.
         depths: float32, above 0 where a splat is drawn.
-        height, width: of the images, in pixels.
-        capacity: number of places, at least 1."""
+        height: of the images, in pixels.
+        width: of the images, in pixels.
+        capacity: number of places, at least 1.
+
+    Returns:
+        The splats of each tile in order of depth, and how many places they need.
+    """
     shape = depths.shape[:-1]
     splats = depths.numel()
     rows = -(-height // TILE)
@@ -79,7 +85,16 @@ def intersections(
 
 
 def _boxes(centers: Tensor, radii: Tensor, fixed: "_Fixed") -> Tensor:
-    """Of each splat: number of its tiles, the first one, and the number across (1 or more), [..., N, 3]."""
+    """Tiles of each splat.
+
+    Args:
+        centers: pixels, [..., N, 2].
+        radii: half sides in pixels, [..., N, 2]; 0 where a splat is not drawn.
+        fixed: constants of the images' size, from :func:`_fixed`.
+
+    Returns:
+        Number of its tiles, index of the first one, and the number across (1 or more), int32 [..., N, 3].
+    """
     reach = radii / TILE
     # The negative of the first tile is rounded up as the end is: columns and rows of both, [2, ..., N, 2].
     edges = torch.addcmul(reach, centers, fixed.signs).ceil_()
@@ -93,9 +108,16 @@ def _boxes(centers: Tensor, radii: Tensor, fixed: "_Fixed") -> Tensor:
 
 
 class _Fixed(NamedTuple):
-    """What depends on the number and the size of images alone. ``signs``: scale of the two ends of boxes.
-    ``least``, ``most``: their limits. ``first``: number of each image's first tile. ``every``: numbers of all
-    tiles. ``has_pixels``: as of :class:`Intersections`."""
+    """What depends on the number and the size of images alone.
+
+    Attributes:
+        signs: scale of the two ends of boxes, [2, ..., 1, 1].
+        least: lower limit of the ends, in tiles, [2, ..., 1, 2].
+        most: upper limit of the ends, in tiles, [2, ..., 1, 2].
+        first: number of each image's first tile, [..., 1].
+        every: numbers of all tiles, with the row below each image.
+        has_pixels: as of :class:`Intersections`.
+    """
 
     signs: Tensor
     least: Tensor
@@ -108,6 +130,14 @@ class _Fixed(NamedTuple):
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)  # a validation may ask first, and a training step has them in its graph
 def _fixed(images: torch.Size, rows: int, columns: int, device: torch.device) -> _Fixed:
+    """Constants of :func:`intersections` on a device, kept for later calls.
+
+    Args:
+        images: shape of the batch of images.
+        rows: of tiles that have pixels, in one image.
+        columns: of tiles in one image.
+        device: where the tensors are needed.
+    """
     ends = torch.tensor([-1.0, 1.0]).view(2, *[1] * (len(images) + 2))
     limit = torch.tensor([columns, rows], dtype=torch.float32) * ends
     first = torch.arange(images.numel(), dtype=torch.int32) * ((rows + 1) * columns)
@@ -124,4 +154,5 @@ def _fixed(images: torch.Size, rows: int, columns: int, device: torch.device) ->
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)
 def _places(capacity: int, device: torch.device) -> Int[Tensor, " capacity"]:
+    """Numbers of the places of intersections, kept for later calls."""
     return torch.arange(capacity, device=device)

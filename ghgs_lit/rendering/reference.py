@@ -33,7 +33,19 @@ class Splats:
 def rasterize(
     gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Rendering:
-    """Render on black; see :func:`ghgs_lit.rendering.render`."""
+    """Render on black; see :func:`ghgs_lit.rendering.render`.
+
+    Args:
+        gaussians: of B elements, in float32 or float64.
+        cameras: [B, T], in the dtype of the means.
+        settings: constants of the image.
+        near: least depth of a centre that is drawn, in the unit of the means.
+        far: greatest depth of a centre that is drawn.
+
+    Returns:
+        Image [B, T, C, h, w], alpha and expected depth [B, T, 1, h, w], in the dtype of the means;
+        differentiable in Gaussians and cameras.
+    """
     channels = gaussians.colors.shape[1]
     each = [
         _view(gaussians[element], cameras[element, view], settings, near, far)
@@ -49,7 +61,15 @@ def rasterize(
 def _view(
     gaussians: Gaussians, camera: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Float[Tensor, "channels h w"]:
-    """Sums over the Gaussians that a pixel sees of ``w colour`` (C channels), ``w z`` and ``w``."""
+    """Sums over the Gaussians that a pixel sees of ``w colour`` (C channels), ``w z`` and ``w``.
+
+    Args:
+        gaussians: of one element.
+        camera: one camera, without batch dimensions.
+        settings: constants of the image.
+        near: least depth of a centre that is drawn.
+        far: greatest depth of a centre that is drawn.
+    """
     index = visible(gaussians, camera, settings, near, far)
     splats = project(gaussians.select(index, (len(index),)), camera, settings)
     centers = pixel_centers(camera.height, camera.width, splats.centers).flatten(0, 1)
@@ -62,8 +82,18 @@ def _view(
 def visible(
     gaussians: Gaussians, camera: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Int[Tensor, " n"]:
-    """Indices of the Gaussians to draw, sorted by float32 depth, ties by index: between near and far, with
-    finite centres, a positive, finite determinant and an opacity of at least ``alpha_min``."""
+    """Indices of the Gaussians to draw, sorted by float32 depth, ties by index.
+
+    Drawn are Gaussians with a finite centre, a positive, finite determinant and an opacity of at least
+    ``alpha_min``.
+
+    Args:
+        gaussians: of one element.
+        camera: one camera, without batch dimensions.
+        settings: constants of the image.
+        near: least depth of a centre that is drawn, in the unit of the means.
+        far: greatest depth of a centre that is drawn.
+    """
     splats = project(gaussians, camera, settings)
     depths = splats.depths
     determinants = splats.determinants
@@ -74,7 +104,16 @@ def visible(
 
 
 def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> Splats:
-    """All Gaussians as splats of one camera, also those that it does not see."""
+    """All Gaussians as splats of one camera, also those that it does not see.
+
+    The covariance is that of EWA splatting (Zwicker et al. 2001), ``J W Sigma W^T J^T`` plus ``low_pass``
+    on its diagonal, with the Jacobian J at a centre clamped to the frame and ``frustum_margin``.
+
+    Args:
+        gaussians: n of one element.
+        camera: one camera, without batch dimensions.
+        settings: constants of the image.
+    """
     rotation = camera.extrinsics[:3, :3]
     translation = camera.extrinsics[:3, 3]
     points = gaussians.means @ rotation.mT + translation
@@ -110,7 +149,16 @@ def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> 
 
 
 def _blend(splats: Splats, pixels: Float[Tensor, "P 2"], settings: RasterSettings) -> Float[Tensor, "P c"]:
-    """Composite all splats over ``P`` pixels; see :func:`_view`."""
+    """Composite all splats over ``P`` pixels; see :func:`_view`.
+
+    Args:
+        splats: n, front to back.
+        pixels: centres of pixels (x, y), in pixels.
+        settings: constants of the image.
+
+    Returns:
+        C sums of colours, then those of ``w z`` and ``w``, for each pixel.
+    """
     dx, dy = (pixels[None] - splats.centers[:, None]).unbind(-1)
     xx, xy, _ = splats.covariances[:, None].unbind(-1)
     sigma = 0.5 * (dx * dx / xx + (dy - xy / xx * dx).square() * xx / splats.determinants[:, None])

@@ -9,9 +9,10 @@ class RasterSettings(Options):
     """Constants of the image, the same in all backends.
 
     Each pixel composites Gaussians in the order of their float32 depth, ties by index. A Gaussian has
-    ``alpha = min(alpha_max, opacity exp(-sigma))`` with ``sigma`` half its squared Mahalanobis distance from
-    the pixel's centre; it is skipped where ``alpha < alpha_min`` or ``sigma > extent^2 / 2``. A pixel ends
-    before the first Gaussian behind which its transmittance would not exceed ``stop``."""
+    ``alpha = min(alpha_max, opacity exp(-sigma))`` with ``sigma`` half its squared Mahalanobis distance
+    from the pixel's centre; it is skipped where ``alpha < alpha_min`` or ``sigma > extent^2 / 2``. A
+    pixel ends before the first Gaussian behind which its transmittance would not exceed ``stop``.
+    """
 
     group = "renderer.settings"
     low_pass: Amount = 0.3

@@ -21,9 +21,19 @@ from ghgs_lit.types import Cameras, Gaussians, Rendering
 @dataclass(frozen=True)
 class Plan:
     """The work of a call, without the values of the Gaussians. View ``v`` shows batch element ``v // T``.
-    ``views``: cameras as rows of ``layout.VIEW`` doubles. ``edges`` [B, P + 1]: ends of the parts of each
-    element. ``shifts``: Gaussian ``n`` is splat ``n + shifts[v]`` of view ``v``. ``splats``: their number in
-    all views. ``shape``: (B, T)."""
+
+    Attributes:
+        views: cameras as rows of ``layout.VIEW`` doubles, [B T, VIEW].
+        edges: ends of the parts of each element, [B, P + 1].
+        shifts: Gaussian ``n`` is splat ``n + shifts[v]`` of view ``v``, [B T].
+        splats: their number in all views.
+        shape: (B, T).
+        height: of the images, in pixels.
+        width: of the images, in pixels.
+        settings: constants of the image.
+        near: metres; least depth of a centre that is drawn.
+        far: metres; greatest depth of a centre that is drawn.
+    """
 
     views: np.ndarray
     edges: np.ndarray
@@ -38,6 +48,15 @@ class Plan:
 
     @classmethod
     def of(cls, gaussians, cameras, settings, near, far) -> "Plan":
+        """The plan for Gaussians and cameras, of which no values but those of the cameras are read.
+
+        Args:
+            gaussians: N of B elements.
+            cameras: [B, T].
+            settings: constants of the image.
+            near: metres; least depth of a centre that is drawn.
+            far: metres; greatest depth of a centre that is drawn.
+        """
         counts = np.array(gaussians.splits, dtype=np.int64)
         views_each = cameras.shape[1]
         firsts = np.cumsum(counts) - counts
@@ -72,7 +91,12 @@ class Plan:
 
 
 def _part_edges(firsts: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Ends [B, P + 1] of the parts of each element; all parts but the last are whole vectors."""
+    """Ends [B, P + 1] of the parts of each element; all parts but the last are whole vectors.
+
+    Args:
+        firsts: index of each element's first Gaussian, [B].
+        counts: number of Gaussians of each element, [B].
+    """
     threads = torch.get_num_threads()
     total = int(counts.sum())
     parts = 1 if threads == 1 else max(1, min(-(-2 * threads // max(1, len(counts))), total // pool.GRAIN))
@@ -82,6 +106,7 @@ def _part_edges(firsts: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 def _view_rows(cameras: Cameras, settings: RasterSettings) -> np.ndarray:
+    """Cameras as rows of ``layout.VIEW`` doubles, [B T, VIEW]."""
     intrinsics = cameras.intrinsics.detach().double().flatten(0, -3).numpy()
     extrinsics = cameras.extrinsics.detach().double().flatten(0, -3).numpy()
     rows = np.zeros((len(intrinsics), layout.VIEW))
@@ -109,8 +134,24 @@ _MEMORY = 1 << 32
 def rasterize(
     gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Rendering:
-    """Render on black in float32; see :func:`ghgs_lit.rendering.render`. Differentiable in the Gaussians, not
-    in the cameras. The result has the same bits with any number of threads."""
+    """Render on black in float32; see :func:`ghgs_lit.rendering.render`.
+
+    Differentiable in the Gaussians, not in the cameras. The result has the same bits with any number of
+    threads.
+
+    Args:
+        gaussians: of B elements, on a CPU, in metres.
+        cameras: [B, T], in metres.
+        settings: constants of the image.
+        near: metres; least depth of a centre that is drawn.
+        far: metres; greatest depth of a centre that is drawn.
+
+    Returns:
+        Image [B, T, C, h, w], alpha and expected depth [B, T, 1, h, w].
+
+    Raises:
+        InputError: lists of tiles that would exceed :data:`_MEMORY`.
+    """
     fields = (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.colors)
     plan = Plan.of(gaussians, cameras, settings, near, far)
     return Rendering(*_Rasterize.apply(*(field.float().contiguous() for field in fields), plan))
@@ -118,7 +159,17 @@ def rasterize(
 
 @dataclass
 class _Splats:
-    """Splats of all views, and entries of all tiles; see ``layout``."""
+    """Splats of all views, and entries of all tiles; see ``layout``.
+
+    Attributes:
+        records: [splats, RECORD], float32.
+        boxes: tiles that a splat touches, [splats, 4], int32.
+        entry_starts: first slot of each splat, [splats], int32.
+        tile_starts: first entry of each tile of each view, [B T tiles + 1], int64.
+        entries: [entries, ENTRY], int32.
+        drawn: number of entries that each tile has drawn, [B T tiles], int64.
+        reached: whether an entry was drawn, by slot, [entries], uint8.
+    """
 
     records: np.ndarray
     boxes: np.ndarray
@@ -130,8 +181,20 @@ class _Splats:
 
 
 def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differentiable: bool) -> _Splats:
-    """Project all Gaussians into their views and list the splats of each tile. InputError: the lists and, if
-    ``differentiable``, their gradients would exceed :data:`_MEMORY`."""
+    """Project all Gaussians into their views and list the splats of each tile.
+
+    Args:
+        plan: the work of the call.
+        means: metres, float32 [N, 3].
+        quaternions: wxyz of any length, float32 [N, 4].
+        scales: standard deviations in metres, float32 [N, 3].
+        opacities: float32 [N, 1].
+        colors: float32 [N, C].
+        differentiable: whether there must be memory for gradients, too.
+
+    Raises:
+        InputError: the lists and, if ``differentiable``, their gradients would exceed :data:`_MEMORY`.
+    """
     settings, (tiles_x, tiles_y), total = plan.settings, plan.tiles, plan.splats
     (elements, views), parts = plan.shape, plan.parts
     records = simd.aligned_floats(total * layout.RECORD).reshape(total, layout.RECORD)
@@ -141,6 +204,15 @@ def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differen
     found = np.zeros(counts.shape[:2], np.int64)
 
     def project(b: int, p: int, first: int, last: int, seen_by: slice) -> None:
+        """Project one of ``plan.parts``.
+
+        Args:
+            b: batch element.
+            p: part of the element.
+            first: first Gaussian of the part.
+            last: the Gaussian after its last one.
+            seen_by: views of the element.
+        """
         found[b, p] = projection.project(
             means, quaternions, scales, opacities, colors, first, last, plan.views[seen_by],
             plan.shifts[seen_by], plan.near, plan.far, settings.low_pass, settings.extent, settings.alpha_min,
@@ -163,6 +235,15 @@ def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differen
     entry_starts = np.empty(total, np.int32)
 
     def list_part(b: int, p: int, first: int, last: int, seen_by: slice) -> None:
+        """List the splats of one of ``plan.parts`` in their tiles.
+
+        Args:
+            b: batch element.
+            p: part of the element.
+            first: first Gaussian of the part.
+            last: the Gaussian after its last one.
+            seen_by: views of the element.
+        """
         scatter(
             first, last, plan.shifts[seen_by], depths, boxes, tiles_x, slots[b, p], entry_starts,
             next_free[b, p], entries,
@@ -189,6 +270,20 @@ def _tile_runs(tile_starts: np.ndarray) -> list[np.ndarray]:
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, quaternions, scales, opacities, colors, plan: Plan):
+        """Draw all views.
+
+        Args:
+            ctx: keeps what the backward pass needs.
+            means: metres, float32 [N, 3], contiguous as all tensors here.
+            quaternions: wxyz of any length, float32 [N, 4].
+            scales: standard deviations in metres, float32 [N, 3].
+            opacities: float32 [N].
+            colors: float32 [N, C].
+            plan: the work of the call.
+
+        Returns:
+            Image [B, T, C, h, w], alpha and expected depth [B, T, 1, h, w].
+        """
         arrays = [t.detach().numpy() for t in (means, quaternions, scales, opacities[:, None], colors)]
         found = _prepare(plan, *arrays, differentiable=any(ctx.needs_input_grad))
         channels = colors.shape[1]
@@ -212,6 +307,17 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, d_image, d_alpha, d_depth):
+        """Gradients of the five inputs.
+
+        Args:
+            ctx: what the forward pass has kept.
+            d_image: gradient of the image, [B, T, C, h, w]; None: 0.
+            d_alpha: gradient of alpha, [B, T, 1, h, w]; None: 0.
+            d_depth: gradient of the depth, [B, T, 1, h, w]; None: 0.
+
+        Returns:
+            Gradients in the shapes of the inputs; None for the plan.
+        """
         *inputs, image, alpha, depth = ctx.saved_tensors
         plan = ctx.plan
         found = ctx.found

@@ -18,7 +18,16 @@ _AHEAD = 8
 
 @helper
 def _read(image, first, width, rows, columns, block):
-    """A block of a tile whose first pixel is ``image[first]``; 0 outside ``rows`` x ``columns``."""
+    """A block of a tile, as a vector of 16 floats; 0 outside ``rows`` x ``columns``.
+
+    Args:
+        image: flat float32 image.
+        first: index of the tile's first pixel.
+        width: of the image, in pixels.
+        rows: of the tile that lie in the image, at most 16.
+        columns: of the tile that lie in the image, at most 16.
+        block: number of the block in the tile, 0 to 15.
+    """
     y = block // 4 * 4
     x = block % 4 * 4
     if y + 4 <= rows and x + 4 <= columns:
@@ -36,8 +45,28 @@ def _read_gradients(
     upstream, suffix,
 ):  # fmt: skip
     """Fill ``upstream`` with the gradients of a tile's planes and ``suffix`` with ``S`` of all splats.
-    Gradients of alpha and depth may be missing (size 0). With depth = D / A, ``dL/dD = g / A`` and
-    ``dL/dA = -g depth / A``, so the parts of D and A in ``S`` cancel."""
+
+    With depth = D / A, ``dL/dD = g / A`` and ``dL/dA = -g depth / A``, so the parts of D and A in ``S``
+    cancel.
+
+    Args:
+        view: index of the view.
+        first: index of the tile's first pixel in a plane of the image.
+        height: of the image, in pixels.
+        width: of the image, in pixels.
+        rows: of the tile that lie in the image.
+        columns: of the tile that lie in the image.
+        count: number of channels C, or a tuple of that length.
+        image: flat [V C h w].
+        alpha: flat [V h w].
+        depth: expected depth, flat [V h w].
+        d_image: gradient of the image, flat [V C h w].
+        d_alpha: gradient of alpha, flat [V h w]; of size 0 if there is none.
+        d_depth: gradient of the depth, flat [V h w]; of size 0 if there is none.
+        upstream: gets gradients of the planes (C colours, ``w z``, ``w``), [(C + 2) PIXELS], block by
+            block.
+        suffix: gets ``S``, [PIXELS], block by block.
+    """
     channels = simd.length(count)
     start = view * height * width + first
     for block in range(BLOCKS):
@@ -70,6 +99,26 @@ def _read_gradients(
 def _differentiate_splat(
     records, s, colors, n, count, x0, y0, hit, pixels, transmittance, upstream, suffix, sums, alpha_max, stop
 ):
+    """Gradients of one entry: a splat in a tile. Moves ``transmittance`` and ``suffix`` behind the splat.
+
+    Args:
+        records: [splats, RECORD].
+        s: index of the splat.
+        colors: [N, C].
+        n: index of its Gaussian.
+        count: number of channels C, or a tuple of that length.
+        x0: first column of the tile, in pixels.
+        y0: first row of the tile, in pixels.
+        hit: blocks that the splat reaches, as bits.
+        pixels: places of the tile's pixels, from :func:`tiles.grid`.
+        transmittance: before the splat, [PIXELS]; afterwards behind it.
+        upstream: gradients of the planes, from :func:`_read_gradients`.
+        suffix: ``S`` with this splat, [PIXELS]; afterwards without it.
+        sums: gets a row of 16 lanes for each gradient of an entry (see ``layout``), to be summed over
+            lanes.
+        alpha_max: upper limit of alpha.
+        stop: transmittance at which a pixel ends.
+    """
     channels = simd.length(count)
     zero = simd.full(ZERO)
     numbers = tiles.read_splat(records[s], np.float32(x0), np.float32(y0))
@@ -129,8 +178,32 @@ def backward(
     some_tiles, tiles_x, tiles_y, height, width, views, tile_starts, entries, shifts, records, colors, count,
     alpha_max, stop, drawn, image, alpha, depth, d_image, d_alpha, d_depth, gradients,
 ):  # fmt: skip
-    """Write gradients of the drawn entries of tiles to ``gradients`` [slots x gradient_width], which is flat
-    and starts on a cache line; images and their gradients are flat as in ``forward``."""
+    """Write gradients of the drawn entries of tiles.
+
+    Args:
+        some_tiles: indices of tiles of all views, int64.
+        tiles_x: number of tiles across a view.
+        tiles_y: number of tiles down a view.
+        height: of the images, in pixels.
+        width: of the images, in pixels.
+        views: cameras, float64 [V, VIEW].
+        tile_starts: first entry of each tile, int64 [V tiles + 1].
+        entries: [entries, ENTRY], int32, as ``forward`` has left them.
+        shifts: splat minus Gaussian of each view, int64 [V].
+        records: [splats, RECORD].
+        colors: [N, C].
+        count: number of channels C, or a tuple of that length.
+        alpha_max: upper limit of alpha.
+        stop: transmittance at which a pixel ends.
+        drawn: number of entries that each tile has drawn, int64 [V tiles].
+        image: flat [V C h w], as drawn.
+        alpha: flat [V h w], as drawn.
+        depth: flat [V h w], as drawn.
+        d_image: gradient of the image, flat [V C h w].
+        d_alpha: gradient of alpha, flat [V h w]; of size 0 if there is none.
+        d_depth: gradient of the depth, flat [V h w]; of size 0 if there is none.
+        gradients: gets the gradients by slot, flat [slots x gradient_width], from a cache line on.
+    """
     channels = simd.length(count)
     transmittance = simd.aligned(layout.PIXELS)
     suffix = simd.aligned(layout.PIXELS)

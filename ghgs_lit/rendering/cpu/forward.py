@@ -17,9 +17,20 @@ _FEW = 24
 
 @kernel
 def scatter(first, last, shifts, depths, boxes, tiles_x, slot, entry_starts, next_free, entries):
-    """List the splats of Gaussians ``first`` to ``last`` in every tile that they touch. ``next_free``
-    [T, tiles]: place of the part's next entry in each tile. ``slot``: first slot of the part.
-    ``entry_starts`` gets the first slot of every splat."""
+    """List the splats of Gaussians ``first`` to ``last`` in every tile that they touch.
+
+    Args:
+        first: first Gaussian of the part.
+        last: the Gaussian after its last one.
+        shifts: splat minus Gaussian of each view of the element, int64 [T].
+        depths: positive, float32 [splats, 1].
+        boxes: tiles that a splat touches, int32 [splats, 4].
+        tiles_x: number of tiles across a view.
+        slot: first slot of the part.
+        entry_starts: gets the first slot of every splat, int32 [splats].
+        next_free: place of the part's next entry in each tile, int64 [T, tiles]; moves on.
+        entries: gets the entries, int32 [entries, ENTRY].
+    """
     keys = depths.view(np.int32)
     for t in range(len(shifts)):
         for m in range(first + shifts[t], last + shifts[t]):
@@ -36,6 +47,7 @@ def scatter(first, last, shifts, depths, boxes, tiles_x, slot, entry_starts, nex
 
 @helper
 def _insertion_sort(keys, count):
+    """Sort the first ``count`` keys in place."""
     for i in range(1, count):
         key = keys[i]
         k = i
@@ -47,7 +59,15 @@ def _insertion_sort(keys, count):
 
 @helper
 def _radix_pass(keys, new_keys, count, shift, places):
-    """Sort stably by one digit of the keys, to ``new_keys``."""
+    """Sort stably by one digit of the keys.
+
+    Args:
+        keys: int64, not negative.
+        new_keys: gets the sorted keys.
+        count: number of keys.
+        shift: first bit of the digit.
+        places: room for 256 numbers, int64.
+    """
     places[:] = 0
     for i in range(count):
         places[(keys[i] >> shift) & (_BUCKETS - 1)] += 1
@@ -64,8 +84,22 @@ def _radix_pass(keys, new_keys, count, shift, places):
 
 @helper
 def depth_order(entries, start, end, keys, spare, places):
-    """The entries of a tile sorted stably by depth, as keys whose lower halves are rows of ``entries``. Bits
-    of positive floats sort like integers; relative to a tile's smallest, only a few low digits differ."""
+    """The entries of a tile sorted stably by depth.
+
+    Bits of positive floats sort like integers; relative to a tile's smallest, only a few low digits
+    differ.
+
+    Args:
+        entries: int32 [entries, ENTRY].
+        start: first entry of the tile.
+        end: the entry after its last one; more than ``start``.
+        keys: room for as many int64.
+        spare: room for as many int64.
+        places: room for 256 int64.
+
+    Returns:
+        Keys, a part of ``keys`` or ``spare``, whose lower halves are rows of ``entries``.
+    """
     count = end - start
     least = entries[start, layout.KEY]
     most = entries[start, layout.KEY]
@@ -95,9 +129,17 @@ _COLOR = 8
 
 @helper
 def _touches(numbers, slope_x, slope_y, block):
-    """Which of 16 splats have an ellipse that meets a block, as bits. The smallest p^2 + q^2 over a box lies
-    on its column or row nearest to the splat's centre, at the minimum along it. The comparison is slightly
-    generous, since it only saves work."""
+    """Which of 16 splats have an ellipse that meets a block, as bits.
+
+    The smallest p^2 + q^2 over a box lies on its column or row nearest to the splat's centre, at the
+    minimum along it. The comparison is slightly generous, since it only saves work.
+
+    Args:
+        numbers: vectors of :func:`tiles.read_splat`, one lane for each splat.
+        slope_x: dx / dy of the minimum along a row of pixels.
+        slope_y: dy / dx of the minimum along a column of pixels.
+        block: number of the block in the tile, 0 to 15.
+    """
     side = np.float32(layout.BLOCK - 1)
     left = numbers[0] + np.float32(block % 4 * 4)
     top = numbers[1] + np.float32(block // 4 * 4)
@@ -115,7 +157,17 @@ def _touches(numbers, slope_x, slope_y, block):
 
 @helper
 def _fetch(order, i, entries, shift, records, colors, splats):
-    """Write the splats of a chunk, filled up with the last one; prefetch the records of the next chunk."""
+    """Write the splats of a chunk, filled up with the last one; prefetch the records of the next chunk.
+
+    Args:
+        order: keys of the tile's entries, from :func:`depth_order`.
+        i: first key of the chunk.
+        entries: int32 [entries, ENTRY].
+        shift: splat minus Gaussian in this view.
+        records: [splats, RECORD].
+        colors: [N, C].
+        splats: gets ``_CHUNK`` indices of splats, int64.
+    """
     for k in range(_CHUNK):
         splats[k] = entries[order[min(i + k, len(order) - 1)] & 0xFFFFFFFF, layout.SPLAT]
         if i + k + _CHUNK < len(order):
@@ -125,8 +177,21 @@ def _fetch(order, i, entries, shift, records, colors, splats):
 
 @helper
 def _list_chunk(splats, count, shift, records, colors, x0, y0, live, rows, todo):
-    """Gather ``count`` splats to ``rows``, and write the splats that touch each block, as bits, to ``todo``.
-    ``rows`` has ``_CHUNK`` numbers for each value of ``tiles.read_splat``, the depth, and each channel."""
+    """Gather splats and find the blocks that each touches.
+
+    Args:
+        splats: indices of splats, int64 [_CHUNK].
+        count: number of them that belong to the tile, at most ``_CHUNK``.
+        shift: splat minus Gaussian in this view.
+        records: [splats, RECORD].
+        colors: [N, C].
+        x0: first column of the tile, in pixels.
+        y0: first row of the tile, in pixels.
+        live: blocks through which light still passes, as bits.
+        rows: gets ``_CHUNK`` numbers for each value of :func:`tiles.read_splat`, the depth, and each
+            channel.
+        todo: gets the splats that touch each block, as bits, int64 [BLOCKS].
+    """
     todo[:] = 0
     for i in range(0, count, LANES):
         record = tables.gather_lines(records, splats, i)
@@ -156,12 +221,29 @@ def _list_chunk(splats, count, shift, records, colors, x0, y0, live, rows, todo)
 
 @helper
 def _add(planes, position, value):
+    """Add a vector to the numbers from ``position`` on."""
     memory.store(planes, position, memory.load(planes, position) + value)
 
 
 @helper
 def _draw_block(block, todo, rows, count, pixels, planes, transmittance, alpha_max, stop, hits):
-    """Blend the splats ``todo`` (bits) into a block, front to back; returns whether light still passes."""
+    """Blend splats into a block, front to back.
+
+    Args:
+        block: number of the block in the tile, 0 to 15.
+        todo: the chunk's splats to blend, as bits.
+        rows: their numbers, from :func:`_list_chunk`.
+        count: number of channels C, or a tuple of that length.
+        pixels: places of the tile's pixels, from :func:`tiles.grid`.
+        planes: sums of the tile (C colours, ``w z``, ``w``), [(C + 2) PIXELS]; grow.
+        transmittance: of the tile, [PIXELS]; falls.
+        alpha_max: upper limit of alpha.
+        stop: transmittance at which a pixel ends.
+        hits: gets the block's bit for each splat that reaches it, int32 [_CHUNK].
+
+    Returns:
+        Whether light still passes.
+    """
     at = block * LANES
     bit = np.int32(1) << block
     x = memory.load(pixels, at)
@@ -194,7 +276,17 @@ def _draw_block(block, todo, rows, count, pixels, planes, transmittance, alpha_m
 
 @helper
 def _write(image, first, width, rows, columns, block, value):
-    """Write the part of a block inside ``rows`` x ``columns`` of a tile that starts at ``image[first]``."""
+    """Write the part of a block that lies in the image.
+
+    Args:
+        image: flat float32 image.
+        first: index of the tile's first pixel.
+        width: of the image, in pixels.
+        rows: of the tile that lie in the image, at most 16.
+        columns: of the tile that lie in the image, at most 16.
+        block: number of the block in the tile, 0 to 15.
+        value: the block, a vector of 16 floats.
+    """
     y = block // 4 * 4
     x = block % 4 * 4
     if y + 4 <= rows and x + 4 <= columns:
@@ -209,6 +301,21 @@ def _write(image, first, width, rows, columns, block, value):
 
 @helper
 def _write_planes(planes, view, first, height, width, rows, columns, channels, image, alpha, depth):
+    """Write a tile's sums to the images.
+
+    Args:
+        planes: sums of the tile (C colours, ``w z``, ``w``), [(C + 2) PIXELS].
+        view: index of the view.
+        first: index of the tile's first pixel in a plane of the image.
+        height: of the image, in pixels.
+        width: of the image, in pixels.
+        rows: of the tile that lie in the image.
+        columns: of the tile that lie in the image.
+        channels: C.
+        image: flat [V C h w].
+        alpha: gets the sum of ``w``, flat [V h w].
+        depth: gets the expected depth, the sum of ``w z`` over that of ``w``, flat [V h w].
+    """
     for block in range(BLOCKS):
         at = block * LANES
         for c in range(channels):
@@ -226,9 +333,29 @@ def forward(
     some_tiles, tiles_x, tiles_y, height, width, views, tile_starts, entries, shifts, records, colors, count,
     alpha_max, stop, drawn, reached, image, alpha, depth,
 ):  # fmt: skip
-    """Draw tiles to flat ``image`` [V C h w], ``alpha`` and expected ``depth`` [V h w]. For the backward pass
-    (see ``layout``) the drawn entries are written to ``entries``, their number in each tile to ``drawn``, and
-    their slots are marked in ``reached``. ``count``: number of channels, or a tuple of that length."""
+    """Draw tiles, and note for the backward pass what was drawn (see ``layout``).
+
+    Args:
+        some_tiles: indices of tiles of all views, int64.
+        tiles_x: number of tiles across a view.
+        tiles_y: number of tiles down a view.
+        height: of the images, in pixels.
+        width: of the images, in pixels.
+        views: cameras, float64 [V, VIEW].
+        tile_starts: first entry of each tile, int64 [V tiles + 1].
+        entries: int32 [entries, ENTRY]; the drawn ones are moved to the front of each tile.
+        shifts: splat minus Gaussian of each view, int64 [V].
+        records: [splats, RECORD].
+        colors: [N, C].
+        count: number of channels C, or a tuple of that length.
+        alpha_max: upper limit of alpha.
+        stop: transmittance at which a pixel ends.
+        drawn: gets the number of drawn entries of each tile, int64 [V tiles].
+        reached: gets 1 at the slots of drawn entries, uint8 [entries].
+        image: gets colours on black, flat [V C h w].
+        alpha: flat [V h w].
+        depth: gets the expected depth, flat [V h w].
+    """
     channels = simd.length(count)
     longest = 1
     for tile in some_tiles:

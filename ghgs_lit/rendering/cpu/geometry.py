@@ -15,7 +15,14 @@ K_SCALE = math.sqrt(0.5 * TO_LOG2)
 
 @helper
 def unit(quaternions):
-    """Unit quaternions, and 1 / norm; the identity and 0 for the zero quaternion."""
+    """Unit quaternions, and 1 / norm; the identity and 0 for the zero quaternion.
+
+    Args:
+        quaternions: w, x, y and z.
+
+    Returns:
+        w, x, y, z, and 1 / norm.
+    """
     w, x, y, z = quaternions
     norm = simd.sqrt(w * w + x * x + (y * y + z * z))
     is_zero = norm == 0.0
@@ -26,7 +33,14 @@ def unit(quaternions):
 
 @helper
 def rotation(w, x, y, z):
-    """Rotation matrices of unit quaternions."""
+    """Rotation matrices of unit quaternions, row by row.
+
+    Args:
+        w: real part.
+        x: first imaginary part.
+        y: second imaginary part.
+        z: third imaginary part.
+    """
     x2 = x + x
     y2 = y + y
     z2 = z + z
@@ -48,7 +62,12 @@ def rotation(w, x, y, z):
 
 @helper
 def scaled(r, s):
-    """``R S``: the columns of R times the scales."""
+    """``R S``: the columns of R times the scales.
+
+    Args:
+        r: 3 x 3.
+        s: three scales.
+    """
     return (
         r[0] * s[0], r[1] * s[1], r[2] * s[2], r[3] * s[0], r[4] * s[1], r[5] * s[2],
         r[6] * s[0], r[7] * s[1], r[8] * s[2],
@@ -57,13 +76,30 @@ def scaled(r, s):
 
 @helper
 def dot(a, b, c, x, y, z):
-    """``a x + b y + c z``."""
+    """``a x + b y + c z``.
+
+    Args:
+        a: first number of the first vector.
+        b: its second number.
+        c: its third number.
+        x: first number of the second vector.
+        y: its second number.
+        z: its third number.
+    """
     return simd.fma(a, x, simd.fma(b, y, c * z))
 
 
 @helper
 def camera_points(view, mean):
-    """x / z, y / z, z and 1 / z of world points in camera axes."""
+    """World points in camera axes.
+
+    Args:
+        view: a camera, [VIEW].
+        mean: x, y and z in metres.
+
+    Returns:
+        x / z, y / z, z and 1 / z.
+    """
     r = layout.ROTATION
     t = layout.TRANSLATION
     z = dot(view[r + 6], view[r + 7], view[r + 8], mean[0], mean[1], mean[2]) + view[t + 2]
@@ -83,7 +119,14 @@ def clamped(view, x, y):
 
 @helper
 def affine(view, x, y, inverse):
-    """``J W``, 2 x 3, the local affine map of the projection, at clamped ``x`` and ``y``."""
+    """``J W``, 2 x 3: the local affine map of the projection (EWA splatting, Zwicker et al. 2001).
+
+    Args:
+        view: a camera, [VIEW].
+        x: x / z, from :func:`clamped`.
+        y: y / z, from :func:`clamped`.
+        inverse: 1 / z.
+    """
     fx = view[layout.FX] * inverse
     fy = view[layout.FY] * inverse
     r = layout.ROTATION
@@ -98,7 +141,12 @@ def affine(view, x, y, inverse):
 
 @helper
 def footprint(t, r):
-    """``M = J W R(q) S``, 2 x 3; ``M M^T`` is the covariance before the low-pass filter."""
+    """``M = J W R(q) S``, 2 x 3; ``M M^T`` is the covariance before the low-pass filter.
+
+    Args:
+        t: ``J W``, 2 x 3.
+        r: ``R S``, 3 x 3.
+    """
     return (
         dot(t[0], t[1], t[2], r[0], r[3], r[6]),
         dot(t[0], t[1], t[2], r[1], r[4], r[7]),
@@ -117,7 +165,13 @@ def normal(m):
 
 @helper
 def determinants(m, n, low_pass):
-    """``det(M M^T)`` before and after the low-pass filter, and the diagonal of ``M M^T``."""
+    """``det(M M^T)`` before and after the low-pass filter, and the diagonal of ``M M^T``.
+
+    Args:
+        m: 2 x 3, from :func:`footprint`.
+        n: its :func:`normal`.
+        low_pass: px^2.
+    """
     bare = dot(n[0], n[1], n[2], n[0], n[1], n[2])
     xx = dot(m[0], m[1], m[2], m[0], m[1], m[2])
     yy = dot(m[3], m[4], m[5], m[3], m[4], m[5])

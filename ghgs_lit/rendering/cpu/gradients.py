@@ -21,7 +21,20 @@ _SECOND_MOMENT = geometry.K_SCALE**-4
 
 @helper
 def _gather_splats(m, boxes, entry_starts, reached, gradients, width, lines):
-    """Sum the entries of splats ``m`` to ``m + 8`` into ``lines``; returns the drawn splats, as bits."""
+    """Sum the entries of splats ``m`` to ``m + 8``.
+
+    Args:
+        m: first splat.
+        boxes: tiles that a splat touches, int32 [splats, 4].
+        entry_starts: first slot of each splat, int32 [splats].
+        reached: whether an entry was drawn, by slot, uint8 [entries].
+        gradients: of entries, by slot, flat [slots x width].
+        width: floats of an entry's gradients, in whole vectors.
+        lines: gets the sums of each drawn splat, [8 width]; the lines of others stay.
+
+    Returns:
+        The drawn splats, as bits.
+    """
     drawn = 0
     for lane in range(_WIDE):
         s = m + lane
@@ -42,9 +55,18 @@ def _gather_splats(m, boxes, entry_starts, reached, gradients, width, lines):
 
 @helper
 def _footprint_gradient(moments, record, m, low_pass, antialiased):
-    """``dL/dM`` (2 x 3) and ``dL/d opacity``. The covariance's gradient is ``G = L^-T H L^-1 / 2`` with the
-    whitened second moments H, and ``dL/dM = 2 G M``. With anti-aliasing, opacity also contains
-    ``(det before / det after)^(1/2)``."""
+    """``dL/dM`` (2 x 3) and ``dL/d opacity`` of eight splats.
+
+    The covariance's gradient is ``G = L^-T H L^-1 / 2`` with the whitened second moments H, and ``dL/dM =
+    2 G M``. With anti-aliasing, opacity also contains ``(det before / det after)^(1/2)``.
+
+    Args:
+        moments: gradients of entries, summed (see ``layout``); tuple of vectors.
+        record: record of the splats (see ``layout``); tuple of vectors.
+        m: 2 x 3, from :func:`geometry.footprint`.
+        low_pass: px^2.
+        antialiased: whether opacity was scaled by the determinants.
+    """
     k_xx = record[layout.K_XX]
     k_yx = record[layout.K_YX]
     k_yy = record[layout.K_YY]
@@ -80,8 +102,20 @@ def _footprint_gradient(moments, record, m, low_pass, antialiased):
 
 @helper
 def _point_gradient(view, x, y, clamped_x, clamped_y, inverse, d_u, d_v, d_z, d_t):
-    """``dL/d point`` in camera axes, from the gradients of the centre, the depth and ``J W`` (2 x 3); ``x``
-    and ``y`` are x / z and y / z of the point."""
+    """``dL/d point`` in camera axes.
+
+    Args:
+        view: a camera, [VIEW].
+        x: x / z of the point.
+        y: y / z of the point.
+        clamped_x: x / z at which the Jacobian was taken.
+        clamped_y: y / z at which the Jacobian was taken.
+        inverse: 1 / z.
+        d_u: gradient of the centre's column.
+        d_v: gradient of the centre's row.
+        d_z: gradient of the depth.
+        d_t: gradient of ``J W``, 2 x 3.
+    """
     r = layout.ROTATION
     fx = view[layout.FX] * inverse
     fy = view[layout.FY] * inverse
@@ -98,13 +132,33 @@ def _point_gradient(view, x, y, clamped_x, clamped_y, inverse, d_u, d_v, d_z, d_
 
 @helper
 def _add(sums, k, drawn, value):
-    """Add to a row in the drawn lanes only; values in others may not be finite."""
+    """Add to a row in the drawn lanes only; values in others may not be finite.
+
+    Args:
+        sums: rows of 8 doubles.
+        k: the row.
+        drawn: mask of eight lanes.
+        value: eight doubles.
+    """
     old = memory.load(sums, k * _WIDE)
     memory.store(sums, k * _WIDE, simd.select(drawn, old + value, old))
 
 
 @helper
 def _splat_gradients(view, mean, root, moments, record, drawn, low_pass, antialiased, sums):
+    """Add the gradients of eight splats of one view to those of their Gaussians.
+
+    Args:
+        view: a camera, [VIEW].
+        mean: x, y and z in metres.
+        root: ``R S``, 3 x 3.
+        moments: gradients of entries, summed (see ``layout``).
+        record: record of the splats (see ``layout``).
+        drawn: mask of eight lanes: the splats that were drawn.
+        low_pass: px^2.
+        antialiased: whether opacity was scaled by the determinants.
+        sums: rows of 8 doubles: gradients of the mean, of ``R S`` and of the opacity; grow.
+    """
     x, y, _, inverse = geometry.camera_points(view, mean)
     clamped_x, clamped_y = geometry.clamped(view, x, y)
     t = geometry.affine(view, clamped_x, clamped_y, inverse)
@@ -139,6 +193,7 @@ def _splat_gradients(view, mean, root, moments, record, drawn, low_pass, antiali
 
 @helper
 def _root_rows(sums):
+    """The gradient of ``R S`` as a 3 x 3 matrix, from its rows of ``sums``."""
     at = _ROOT * _WIDE
     return (
         memory.load(sums, at), memory.load(sums, at + 8), memory.load(sums, at + 16),
@@ -149,7 +204,16 @@ def _root_rows(sums):
 
 @helper
 def _quaternion_gradient(w, x, y, z, inverse, d):
-    """Gradient of quaternions from that of their rotation matrices, orthogonal to the quaternions."""
+    """Gradient of quaternions from that of their rotation matrices, orthogonal to the quaternions.
+
+    Args:
+        w: real part of the unit quaternion.
+        x: first imaginary part.
+        y: second imaginary part.
+        z: third imaginary part.
+        inverse: 1 / norm of the quaternion before it was normalised.
+        d: gradient of the rotation matrix, 3 x 3.
+    """
     d_w = 2.0 * (x * (d[7] - d[5]) + y * (d[2] - d[6]) + z * (d[3] - d[1]))
     d_x = 2.0 * (y * (d[1] + d[3]) + z * (d[2] + d[6]) + w * (d[7] - d[5]) - 2.0 * x * (d[4] + d[8]))
     d_y = 2.0 * (x * (d[1] + d[3]) + z * (d[5] + d[7]) + w * (d[2] - d[6]) - 2.0 * y * (d[0] + d[8]))
@@ -166,7 +230,29 @@ def collect(
     means, quaternions, scales, first, last, views, shifts, low_pass, antialiased, records, boxes,
     entry_starts, reached, gradients, d_means, d_quaternions, d_scales, d_opacities, d_colors,
 ):  # fmt: skip
-    """Write the gradients of Gaussians ``first`` to ``last``, summed over ``views``."""
+    """Write the gradients of Gaussians ``first`` to ``last``, summed over ``views``.
+
+    Args:
+        means: metres, [N, 3].
+        quaternions: wxyz of any length, [N, 4].
+        scales: metres, [N, 3].
+        first: first Gaussian of the part.
+        last: the Gaussian after its last one.
+        views: cameras that show the part, float64 [T, VIEW].
+        shifts: splat minus Gaussian of each of these views, int64 [T].
+        low_pass: px^2.
+        antialiased: whether opacity was scaled by the determinants.
+        records: [splats, RECORD].
+        boxes: tiles that a splat touches, int32 [splats, 4].
+        entry_starts: first slot of each splat, int32 [splats].
+        reached: whether an entry was drawn, by slot, uint8 [entries].
+        gradients: of entries, by slot, from ``backward``.
+        d_means: gets [N, 3].
+        d_quaternions: gets [N, 4].
+        d_scales: gets [N, 3].
+        d_opacities: gets [N, 1].
+        d_colors: gets [N, C].
+    """
     channels = d_colors.shape[1]
     width = layout.kernel_gradient_width(channels)
     lines = simd.aligned(_WIDE * width)

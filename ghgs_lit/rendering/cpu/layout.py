@@ -75,7 +75,7 @@ VIEW = 22
 
 
 def gradient_width(channels: int) -> int:
-    """Floats of an entry's gradients, in whole vectors."""
+    """Floats of an entry's gradients with ``channels`` colours, in whole vectors of 16."""
     return -(-(COLOR + channels) // 16) * 16
 
 

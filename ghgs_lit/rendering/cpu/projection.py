@@ -13,7 +13,19 @@ _FAR = 1e30
 
 @helper
 def _extents(view, u, v, a, c, cutoff):
-    """First and last pixels, across and down, whose centres lie in the bounding boxes of splats."""
+    """First and last pixels, across and down, whose centres lie in the bounding boxes of splats.
+
+    Args:
+        view: a camera, [VIEW].
+        u: column of the centre, in pixels.
+        v: row of the centre, in pixels.
+        a: variance across, px^2, with the low-pass filter.
+        c: variance down, px^2, with the low-pass filter.
+        cutoff: largest p^2 + q^2 that is drawn.
+
+    Returns:
+        Left, right, top and bottom.
+    """
     reach = (2.0 / geometry.TO_LOG2) * cutoff
     half_width = simd.minimum(simd.sqrt(reach * a), _FAR)
     half_height = simd.minimum(simd.sqrt(reach * c), _FAR)
@@ -29,7 +41,27 @@ def _project_vector(
     view, mean, root, opacity, near, far, low_pass, extent, alpha_min, antialiased, m, records,
     depths, boxes,
 ):  # fmt: skip
-    """Project eight Gaussians to splats ``m`` to ``m + 8``; returns the visible ones, as bits."""
+    """Project eight Gaussians to splats ``m`` to ``m + 8``.
+
+    Args:
+        view: a camera, [VIEW].
+        mean: x, y and z in metres.
+        root: ``R S``, 3 x 3.
+        opacity: of the Gaussians.
+        near: metres; least depth that is drawn.
+        far: metres; greatest depth that is drawn.
+        low_pass: px^2.
+        extent: standard deviations beyond which a Gaussian is cut off.
+        alpha_min: least alpha that is drawn.
+        antialiased: scale opacity by the determinants.
+        m: first splat.
+        records: gets the records, [splats, RECORD].
+        depths: gets z in metres, [splats, 1].
+        boxes: gets the tiles that each splat touches, int32 [splats, 4]; empty if it is not visible.
+
+    Returns:
+        The visible splats, as bits.
+    """
     x, y, z, inverse = geometry.camera_points(view, mean)
     clamped_x, clamped_y = geometry.clamped(view, x, y)
     footprint = geometry.footprint(geometry.affine(view, clamped_x, clamped_y, inverse), root)
@@ -78,8 +110,33 @@ def project(
     means, quaternions, scales, opacities, colors, first, last, views, shifts, near, far, low_pass, extent,
     alpha_min, antialiased, tiles_x, records, depths, boxes, tile_counts,
 ):  # fmt: skip
-    """Project Gaussians ``first`` to ``last`` into all ``views`` [T]; returns the number of their entries.
-    Fills ``records``, ``depths`` and ``boxes``; adds to ``tile_counts`` [T, tiles]."""
+    """Project Gaussians ``first`` to ``last`` into all ``views``.
+
+    Args:
+        means: metres, [N, 3].
+        quaternions: wxyz of any length, [N, 4].
+        scales: metres, [N, 3].
+        opacities: [N, 1].
+        colors: [N, C].
+        first: first Gaussian of the part.
+        last: the Gaussian after its last one.
+        views: cameras that show the part, float64 [T, VIEW].
+        shifts: splat minus Gaussian of each of these views, int64 [T].
+        near: metres; least depth that is drawn.
+        far: metres; greatest depth that is drawn.
+        low_pass: px^2.
+        extent: standard deviations beyond which a Gaussian is cut off.
+        alpha_min: least alpha that is drawn.
+        antialiased: scale opacities by the determinants.
+        tiles_x: number of tiles across a view.
+        records: gets the records, [splats, RECORD].
+        depths: gets z in metres, [splats, 1].
+        boxes: gets the tiles that each splat touches, int32 [splats, 4].
+        tile_counts: the part's entries in each tile, int64 [T, tiles]; grow.
+
+    Returns:
+        The number of entries.
+    """
     entries = 0
     for n in range(first, last, _WIDE):
         mean = tables.columns3(means, n, last)

@@ -1,4 +1,10 @@
-"""Loads and stores of vectors: 4 x 4 blocks of an image, columns of a table, transposed rows."""
+"""Loads and stores of vectors: 4 x 4 blocks of an image, columns of a table, transposed rows.
+
+Functions with ``@intrinsic`` are called in kernels without their first parameter, Numba's
+``typing_context``; their others are Numba types when a kernel is compiled. ``emit(context, builder, sig,
+args)`` writes the LLVM instructions: ``builder`` adds to the kernel's code, ``args`` are the LLVM values
+of the parameters. Arrays are contiguous.
+"""
 
 from llvmlite import ir
 from numba.core import cgutils, types
@@ -13,7 +19,17 @@ _INT8 = ir.VectorType(I32, DOUBLES)
 
 
 def _block_rows(context, builder, array_type, array, index, stride, index_type):
-    """Addresses of the four rows of four floats of a block whose first pixel is ``array[index]``."""
+    """Addresses of the four rows of four floats of a block whose first pixel is ``array[index]``.
+
+    Args:
+        context: Numba's, of the target.
+        builder: of LLVM instructions.
+        array_type: Numba type of a flat float32 array.
+        array: its LLVM value.
+        index: index of the first pixel, an LLVM integer.
+        stride: floats from one row of the image to the next.
+        index_type: Numba type of ``index`` and ``stride``.
+    """
     data = context.make_array(array_type)(context, builder, array).data
     position, step = (context.cast(builder, value, index_type, types.intp) for value in (index, stride))
     kind = ir.VectorType(ir.FloatType(), 4).as_pointer()
@@ -26,7 +42,14 @@ def _block_rows(context, builder, array_type, array, index, stride, index_type):
 
 @intrinsic
 def load_block(typing_context, array, index, stride):
-    """The 4 x 4 pixels of a flat image from ``index`` on; image rows are ``stride`` floats apart."""
+    """The 4 x 4 pixels of a flat image from ``index`` on, as a vector of 16 floats.
+
+    Args:
+        typing_context: Numba's.
+        array: flat float32 image.
+        index: of the first pixel.
+        stride: floats from one row of the image to the next.
+    """
 
     def emit(context, builder, sig, args):
         rows = _block_rows(context, builder, array, *args, index)
@@ -39,7 +62,15 @@ def load_block(typing_context, array, index, stride):
 
 @intrinsic
 def store_block(typing_context, array, index, stride, value):
-    """Write a vector to 4 x 4 pixels of a flat image."""
+    """Write a vector to 4 x 4 pixels of a flat image.
+
+    Args:
+        typing_context: Numba's.
+        array: flat float32 image.
+        index: of the first pixel.
+        stride: floats from one row of the image to the next.
+        value: 16 floats, row by row.
+    """
 
     def emit(context, builder, sig, args):
         for k, row in enumerate(_block_rows(context, builder, array, *args[:3], index)):
@@ -51,7 +82,14 @@ def store_block(typing_context, array, index, stride, value):
 
 
 def _fold(builder, first, second, width):
-    """A vector with the sums of the two halves of every group of ``width`` lanes of two vectors."""
+    """A vector with the sums of the two halves of every group of ``width`` lanes of two vectors.
+
+    Args:
+        builder: of LLVM instructions.
+        first: 16 floats.
+        second: 16 floats.
+        width: lanes of a group, a power of two.
+    """
     low = [i for i in range(2 * LANES) if i % width < width // 2]
     high = [i + width // 2 for i in low]
     return builder.fadd(
@@ -62,8 +100,15 @@ def _fold(builder, first, second, width):
 
 @intrinsic
 def row_sums(typing_context, array, index, count):
-    """Sums of 16 rows of 16 floats from ``index`` on, row ``k`` in lane ``k``, in a fixed order; with a tuple
-    ``count``, rows from ``COLOR + len(count)`` on count as 0."""
+    """Sums of 16 rows of 16 floats, row ``k`` in lane ``k``, in a fixed order.
+
+    Args:
+        typing_context: Numba's.
+        array: flat float32, aligned to a cache line.
+        index: of the first number.
+        count: number of channels, or a tuple of that length: then rows from ``COLOR + len(count)`` on
+            count as 0.
+    """
     used = layout.COLOR + len(count) if isinstance(count, types.BaseTuple) else LANES
 
     def emit(context, builder, sig, args):
@@ -83,7 +128,17 @@ def row_sums(typing_context, array, index, count):
 
 
 def _flat_rows(context, builder, array_type, args, index_type, count, kind):
-    """Address of row ``index`` of a table with ``count`` columns."""
+    """Address of row ``index`` of a table with ``count`` columns.
+
+    Args:
+        context: Numba's, of the target.
+        builder: of LLVM instructions.
+        array_type: Numba type of the table.
+        args: LLVM values of the table and the index, first and second.
+        index_type: Numba type of the index.
+        count: columns.
+        kind: LLVM type that the address points to.
+    """
     position = builder.mul(
         context.cast(builder, args[1], index_type, types.intp), ir.Constant(args[1].type, count)
     )
@@ -91,7 +146,19 @@ def _flat_rows(context, builder, array_type, args, index_type, count, kind):
 
 
 def _masked(builder, name: str, kind, rows, count: int, *args):
-    """Load or store the first ``rows`` of a vector of eight rows of ``count`` floats."""
+    """Load or store the first rows of a vector of eight rows of ``count`` floats.
+
+    Args:
+        builder: of LLVM instructions.
+        name: ``load`` or ``store``.
+        kind: LLVM type of the vector.
+        rows: how many rows to touch, an LLVM integer; all if more than eight.
+        count: floats of a row.
+        args: the address, after the value if it is a store.
+
+    Returns:
+        The vector that was loaded, 0 in rows that were not; for a store, nothing.
+    """
     wide = ir.VectorType(I64, kind.count)
     lanes = range(kind.count)
     limit = everywhere(builder, rows, kind.count)
@@ -109,12 +176,19 @@ def _masked(builder, name: str, kind, rows, count: int, *args):
 
 
 def _make_columns(count: int):
+    """Two intrinsics, to load and to store eight rows of a float32 table with ``count`` columns."""
     kind = ir.VectorType(ir.FloatType(), DOUBLES * count)
 
     @intrinsic
     def columns(typing_context, array, row, last):
-        """Rows ``row`` to ``row + 8`` of a float32 table, a vector of doubles per column; 0 from ``last``
-        on."""
+        """Rows ``row`` to ``row + 8`` of a table, a vector of doubles per column; 0 from ``last`` on.
+
+        Args:
+            typing_context: Numba's.
+            array: float32 [rows, count].
+            row: first row.
+            last: the row after the last one that is read.
+        """
 
         def emit(context, builder, sig, args):
             address = _flat_rows(context, builder, array, args, row, count, kind)
@@ -129,8 +203,15 @@ def _make_columns(count: int):
 
     @intrinsic
     def store_columns(typing_context, array, row, last, values):
-        """Write a vector of doubles per column to rows ``row`` to ``row + 8``, if before ``last``, of a
-        table."""
+        """Write a vector of doubles per column to rows ``row`` to ``row + 8`` of a table.
+
+        Args:
+            typing_context: Numba's.
+            array: float32 [rows, count].
+            row: first row.
+            last: the row after the last one that is written.
+            values: tuple of ``count`` vectors of eight doubles.
+        """
 
         def emit(context, builder, sig, args):
             columns = cgutils.unpack_tuple(builder, args[3], count)
@@ -166,7 +247,14 @@ def _interleave(builder, columns: list):
 
 @intrinsic
 def store_boxes(typing_context, array, row, values):
-    """Write four vectors of whole doubles to rows ``row`` to ``row + 8`` of an int32 table."""
+    """Write four vectors of whole doubles to rows ``row`` to ``row + 8``.
+
+    Args:
+        typing_context: Numba's.
+        array: int32 [rows, 4].
+        row: first row.
+        values: tuple of four vectors of eight doubles, one for each column.
+    """
 
     def emit(context, builder, sig, args):
         columns = [builder.fptosi(c, _INT8) for c in cgutils.unpack_tuple(builder, args[2], 4)]
@@ -196,7 +284,14 @@ def _transpose(builder, vectors: list):
 
 @intrinsic
 def gather_lines(typing_context, array, rows, index):
-    """The 16 rows of 16 floats given by ``rows[index]`` and the next 15 indices, one vector per column."""
+    """16 rows of 16 floats, one vector per column.
+
+    Args:
+        typing_context: Numba's.
+        array: float32 [rows, 16], aligned to a cache line.
+        rows: int64: which rows of ``array``.
+        index: the first of 16 places in ``rows``.
+    """
 
     def emit(context, builder, sig, args):
         lines = []
@@ -213,7 +308,14 @@ def gather_lines(typing_context, array, rows, index):
 
 @intrinsic
 def store_lines(typing_context, array, row, values):
-    """Write up to 16 vectors of doubles as columns of the rows ``row`` to ``row + 8`` of 16 floats."""
+    """Write up to 16 vectors of doubles as columns of the rows ``row`` to ``row + 8``.
+
+    Args:
+        typing_context: Numba's.
+        array: float32 [rows, 16], aligned to a cache line; columns without a vector get 0.
+        row: first row.
+        values: tuple of at most 16 vectors of eight doubles.
+    """
 
     def emit(context, builder, sig, args):
         columns = [builder.fptrunc(c, _FLOAT8) for c in cgutils.unpack_tuple(builder, args[2], values.count)]
@@ -233,7 +335,14 @@ def store_lines(typing_context, array, row, values):
 
 @intrinsic
 def load_lines(typing_context, array, row, stride):
-    """The first 16 floats of eight rows of ``stride`` floats from ``row`` on, as 16 vectors of doubles."""
+    """The first 16 floats of eight rows, as 16 vectors of doubles.
+
+    Args:
+        typing_context: Numba's.
+        array: float32, flat or a table, aligned to a cache line.
+        row: first row.
+        stride: floats of a row, a multiple of 16.
+    """
 
     def emit(context, builder, sig, args):
         position = builder.mul(args[1], args[2])

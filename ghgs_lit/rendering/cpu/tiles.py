@@ -30,7 +30,19 @@ def grid():
 
 @helper
 def place(tile, tiles_x, tiles_y, height, width):
-    """View, first column and row, rows and columns in the image, and index of the first pixel of a tile."""
+    """Where a tile is.
+
+    Args:
+        tile: index among the tiles of all views.
+        tiles_x: number of tiles across a view.
+        tiles_y: number of tiles down a view.
+        height: of the images, in pixels.
+        width: of the images, in pixels.
+
+    Returns:
+        View, first column and row, rows and columns that lie in the image, and index of the first pixel
+        in a plane of the image.
+    """
     view = tile // (tiles_x * tiles_y)
     inner = tile % (tiles_x * tiles_y)
     y0 = inner // tiles_x * layout.TILE
@@ -42,7 +54,18 @@ def place(tile, tiles_x, tiles_y, height, width):
 
 @helper
 def open_pixels(view, x0, y0, pixels, transmittance):
-    """Set the transmittance to 1 in pixels of the image, to 0 beyond; returns their blocks, as bits."""
+    """Set the transmittance to 1 in pixels of the image, to 0 beyond.
+
+    Args:
+        view: a camera, [VIEW].
+        x0: first column of the tile, in pixels.
+        y0: first row of the tile, in pixels.
+        pixels: places of the tile's pixels, from :func:`grid`.
+        transmittance: gets [PIXELS], block by block.
+
+    Returns:
+        The blocks with pixels of the image, as bits.
+    """
     live = 0
     right = simd.full(np.float32(view[layout.RIGHT] - x0))
     bottom = simd.full(np.float32(view[layout.BOTTOM] - y0))
@@ -59,7 +82,16 @@ def open_pixels(view, x0, y0, pixels, transmittance):
 
 @helper
 def read_splat(record, x0, y0):
-    """Vector from a splat's centre to the tile's first pixel (2), ``K`` (3), opacity and cutoff."""
+    """A splat's numbers for a tile.
+
+    Args:
+        record: one splat's record [RECORD], or a tuple with a vector for each of its numbers.
+        x0: first column of the tile, in pixels.
+        y0: first row of the tile, in pixels.
+
+    Returns:
+        Vector from the splat's centre to the tile's first pixel (2), ``K`` (3), opacity and cutoff.
+    """
     x = x0 - record[layout.COLUMN]
     y = y0 - record[layout.ROW]
     return (
@@ -70,7 +102,16 @@ def read_splat(record, x0, y0):
 
 @helper
 def color(records, s, colors, n, c, count):
-    """Channel ``c`` of ``count`` of splat ``s``, which is Gaussian ``n``."""
+    """A channel of a splat's colour.
+
+    Args:
+        records: [splats, RECORD]; hold colours of at most ``layout.ROOM`` channels.
+        s: index of the splat.
+        colors: [N, C].
+        n: index of its Gaussian.
+        c: the channel.
+        count: number of channels C, or a tuple of that length.
+    """
     if simd.length(count) <= layout.ROOM:
         return records[s, layout.COLORS + c]
     return colors[n, c]
@@ -78,7 +119,14 @@ def color(records, s, colors, n, c, count):
 
 @helper
 def prefetch(records, s, colors, n):
-    """Prefetch splat ``s``, which is Gaussian ``n``: splats of a tile may lie anywhere in memory."""
+    """Prefetch a splat: splats of a tile may lie anywhere in memory.
+
+    Args:
+        records: [splats, RECORD].
+        s: index of the splat.
+        colors: [N, C].
+        n: index of its Gaussian.
+    """
     memory.prefetch(records, s * layout.RECORD)
     if colors.shape[1] > layout.ROOM:
         memory.prefetch(colors, n * colors.shape[1])
@@ -86,18 +134,36 @@ def prefetch(records, s, colors, n):
 
 @helper
 def whiten(numbers, dx, dy):
-    """Whitened coordinates ``p`` and ``q`` of the vector (dx, dy) from a splat's centre."""
+    """Whitened coordinates ``p`` and ``q`` of vectors from a splat's centre (see ``layout``).
+
+    Args:
+        numbers: from :func:`read_splat`.
+        dx: pixels across.
+        dy: pixels down.
+    """
     return numbers[2] * dx, simd.fma(numbers[3], dx, numbers[4] * dy)
 
 
 @helper
 def blend(numbers, p, q, before, alpha_max, stop):
-    """Blend a splat over a block of pixels with transmittance ``before``.
+    """Blend a splat over a block of pixels.
 
-    Returns the unclamped and the clamped alpha; the lanes that the splat reaches, where it is seen, and that
-    stay open; and the transmittance behind it. Where that would fall to ``stop``, the splat is left out and
-    the transmittance becomes 0, which excludes all splats behind. Masked lanes hold zeros, so that vectors
-    are stored whole: a masked store could not be forwarded to the next splat's load."""
+    Masked lanes hold zeros, so that vectors are stored whole: a masked store could not be forwarded to
+    the next splat's load.
+
+    Args:
+        numbers: from :func:`read_splat`.
+        p: first whitened coordinate of the pixels.
+        q: second whitened coordinate of the pixels.
+        before: transmittance in front of the splat.
+        alpha_max: upper limit of alpha.
+        stop: transmittance at which a pixel ends.
+
+    Returns:
+        The unclamped and the clamped alpha; the lanes that the splat reaches, where it is seen, and that
+        stay open; and the transmittance behind it. Where that would fall to ``stop``, the splat is left
+        out and the transmittance becomes 0, which excludes all splats behind.
+    """
     squared = simd.fma(p, p, q * q)
     reached = squared <= numbers[6]
     # Lanes out of reach are clamped to the cutoff: denormal numbers would be slow.
