@@ -145,8 +145,12 @@ class Augmentation(Options):
         )
 
     def imperfections(self, batch: Batch, rngs: Sequence[np.random.Generator]) -> Batch:
-        """The batch (at least two views) with the imperfections of captures; images stay in [0, 1], and no
-        mask becomes empty. ``rngs``: for each element; each kind of variation has a stream of its own."""
+        """The batch with the imperfections of captures; images stay in [0, 1], and no mask becomes empty.
+
+        Args:
+            batch: of at least two views.
+            rngs: for each element; each kind of variation has a stream of its own.
+        """
         streams = [rng.spawn(6) for rng in rngs]
         if self.cut:
             batch = cut(batch, self.cut, [s[4] for s in streams])
@@ -184,6 +188,18 @@ class Augmentation(Options):
         outlines: np.random.Generator,
         behind: np.random.Generator,
     ) -> tuple[Tensor, Tensor, Tensor]:
+        """Photographs of one element as a segmentation would leave them.
+
+        Args:
+            images: on black, in [0, 1], premultiplied.
+            masks: true on the subject.
+            mattes: share of each pixel that shows the subject, in [0, 1].
+            outlines: where errors of masks are drawn from.
+            behind: where backgrounds are drawn from.
+
+        Returns:
+            Images, masks and mattes of the same shapes.
+        """
         wrong = self._masks(masks, outlines)
         has_background, is_refined = behind.uniform(size=2) < (self.background, self.refined)
         if not has_background:

@@ -28,8 +28,16 @@ class BatchBuilder:
     def batch(
         self, specs: Sequence[SampleSpec], size: Size | None = None, target_size: Size | None = None
     ) -> Batch:
-        """Batch of samples with equal numbers of inputs and equal target protocols (or none). ``size``,
-        ``target_size``: (height, width) of inputs and targets (None: those of the photographs)."""
+        """Batch of samples with equal numbers of inputs and equal target protocols (or none).
+
+        Args:
+            specs: the samples, at least one.
+            size: (height, width) of the inputs in pixels; None: that of their photographs.
+            target_size: (height, width) of the targets in pixels; None: that of their photographs.
+
+        Raises:
+            InputError: a file is missing or bad.
+        """
         inputs = [_views(self.inputs, s.subject, s.inputs, self.depths, size) for s in specs]
         bodies = [self.inputs.body(s.subject) for s in specs]
         known = all(body is not None for body in bodies)
@@ -59,14 +67,25 @@ class BatchBuilder:
 def _views(
     photographs: PhotographCache, subject: str, photos: Sequence[Photo], depth: bool, size: Size | None
 ) -> list[View]:
+    """Photographs of a subject.
+
+    Args:
+        photographs: where they are read.
+        subject: its name.
+        photos: (position, view) of each.
+        depth: whether depth maps are read, if there are any.
+        size: (height, width) in pixels; None: that of ``photographs``.
+    """
     return [photographs.view(subject, *photo, depth=depth, size=size) for photo in photos]
 
 
 def _images(views: list[list[View]]) -> Tensor:
+    """Images [B, V, 3, h, w] float32 in [0, 1]."""
     return _stacked(views, "image").permute(0, 1, 4, 2, 3).float().div_(255)
 
 
 def _stacked(views: list[list[View]], name: str) -> Tensor | None:
+    """One array of all views [B, V, ...]; None where a view lacks it."""
     arrays = [getattr(view, name) for row in views for view in row]
     if any(array is None for array in arrays):
         return None
@@ -79,7 +98,16 @@ def _cameras(views: list[list[View]]) -> Cameras:
 
 @dataclass(frozen=True)
 class TrainingBatches(Dataset):
-    """Item ``step`` is the batch of process ``rank`` of ``world`` at that step of the run."""
+    """Item ``step`` is the batch of process ``rank`` of ``world`` at that step of the run.
+
+    Args:
+        builder: reads samples.
+        sampler: draws samples.
+        augmentation: varies batches.
+        length: steps of an epoch.
+        rank: number of this process.
+        world: number of processes.
+    """
 
     builder: BatchBuilder
     sampler: TrainingSampler
@@ -104,7 +132,13 @@ class TrainingBatches(Dataset):
 
 
 class EvaluationBatches(Dataset):
-    """Fixed samples; an item has up to ``batch_size`` consecutive ones with equal target protocols."""
+    """Fixed samples; an item has consecutive ones with equal target protocols.
+
+    Args:
+        builder: reads samples.
+        specs: the samples.
+        batch_size: largest number of samples in an item.
+    """
 
     def __init__(self, builder: BatchBuilder, specs: Sequence[SampleSpec], batch_size: int) -> None:
         self.builder = builder
@@ -122,9 +156,15 @@ class EvaluationBatches(Dataset):
 
 
 class StepSampler(DistributedSampler):
-    """Steps of one epoch, counted from the beginning of the run; ``first_step`` is called when it starts. A
-    ``DistributedSampler``, because with several processes Lightning replaces any other sampler by its own;
-    the datasets divide samples among processes themselves."""
+    """Steps of one epoch, counted from the beginning of the run.
+
+    A ``DistributedSampler``, because with several processes Lightning replaces any other sampler by its
+    own; the datasets divide samples among processes themselves.
+
+    Args:
+        dataset: its length is that of the epoch.
+        first_step: is called when the epoch starts, and gives its first step.
+    """
 
     def __init__(self, dataset: Dataset, first_step: Callable[[], int]) -> None:
         super().__init__(dataset, num_replicas=1, rank=0, shuffle=False)

@@ -44,10 +44,22 @@ Photograph = tuple[str, int, int]
 
 @dataclass
 class Seen:
-    """Result of reading one photograph. ``iou``: of body and mask (:func:`overlap`). Without a body to
-    compare: ``agreement``, the share of the mask that the other masks allow, and ``silhouette``, the coarse
-    mask. ``tall``: the subject's largest side in world units, by body or masks. ``bright``: the mean of the
-    photograph in its mask, 1 for white."""
+    """Result of reading one photograph.
+
+    Attributes:
+        name: of the subject.
+        position: number of the camera.
+        view: its number at the position.
+        iou: of body and mask, in [0, 1] (:func:`overlap`); None: there is no body to compare.
+        agreement: share of the mask that the other masks allow, where there is no body to compare.
+        body: whether the subject has a body.
+        tall: the subject's largest side in world units, by body or masks.
+        bright: mean of the photograph in its mask, 1 for white.
+        digest: of the photograph's pixels.
+        problem: line that says what is wrong.
+        silhouette: coarse mask, where there is no body to compare.
+        tile: picture for the contact sheet.
+    """
 
     name: str
     position: int
@@ -86,8 +98,14 @@ class Phase:
 
 @dataclass
 class Report:
-    """Result of a check. ``problems``: lines ``<place>: expected ...; found ...`` that prevent training;
-    ``notes``: lines that do not. ``lights``: of renders that this package made, ``studio`` or ``none``."""
+    """Result of a check.
+
+    Attributes:
+        phases: results by phase.
+        problems: lines ``<place>: expected ...; found ...`` that prevent training.
+        notes: lines that do not.
+        lights: of renders that this package made, ``studio`` or ``none``.
+    """
 
     phases: dict[str, Phase] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
@@ -144,9 +162,14 @@ class _Readings(Dataset):
 
 def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: float = 0.9) -> Report:
     """Read everything that training and evaluation would read, once, with the workers of ``data``.
-    ``min_iou``: least IoU of a body's silhouette and a mask; clothed people reach 0.75 to 0.95, wrong cameras
-    0 to 0.4. ``min_agreement``, without a body: least share of a mask that the subject's other masks allow;
-    right cameras reach 0.98 to 1."""
+
+    Args:
+        data: the data module.
+        min_iou: least IoU of a body's silhouette and a mask, in [0, 1]; clothed people reach 0.75 to
+            0.95, wrong cameras 0 to 0.4.
+        min_agreement: without a body, least share of a mask that the subject's other masks allow, in [0,
+            1]; right cameras reach 0.98 to 1.
+    """
     report = Report()
     dataset = data.dataset
     # Static cameras allow only one protocol.
@@ -185,6 +208,15 @@ def _read(
     data: PhotographsDataModule,
     label: str,
 ) -> list[Seen]:
+    """Read all photographs of a phase that its protocol may ask for.
+
+    Args:
+        photographs: where they are read.
+        targets: their views are read even if no file of theirs exists.
+        min_iou: least IoU of a body's silhouette and a mask.
+        data: the data module, for its workers.
+        label: beside the bar.
+    """
     reader = photographs.reader
     # Views that the protocol may ask for are read even if no file of theirs exists.
     needed = {RING_VIEW} | targets.view_numbers
@@ -211,8 +243,13 @@ def _pictured(reader: Reader) -> set[Photograph]:
 
 
 def _compare_masks(seen: Sequence[Seen], reader: Reader, least: float) -> None:
-    """Find the agreement of masks without a body; at most one problem for each subject. ``least``: share of
-    a mask that the other masks of its subject must allow."""
+    """Find the agreement of masks without a body; at most one problem for each subject.
+
+    Args:
+        seen: photographs of a phase; ``agreement``, ``tall`` and ``problem`` are filled.
+        reader: of the phase.
+        least: share of a mask that the other masks of its subject must allow.
+    """
     by_subject: dict[str, list[Seen]] = {}
     for one in seen:
         if one.silhouette is not None:
@@ -223,6 +260,13 @@ def _compare_masks(seen: Sequence[Seen], reader: Reader, least: float) -> None:
 
 
 def _compare_subject(seen: Sequence[Seen], reader: Reader, least: float) -> None:
+    """:func:`_compare_masks` of one subject.
+
+    Args:
+        seen: its photographs, at least two.
+        reader: of the phase.
+        least: share of a mask that the others must allow.
+    """
     ring = {one.position: one for one in seen if one.view == RING_VIEW}
     pair = twins({position: one.silhouette.extrinsics for position, one in ring.items()})
     if pair is not None:
@@ -268,7 +312,14 @@ def _notes(published: int | None, phase: str, found: Phase) -> list[str]:
 
 
 def _notes_on_lights(wanted: str, stored: str | None, phase: str, found: Phase) -> list[str]:
-    """A note where renders of this package have other lights than the configuration says."""
+    """A note where renders of this package have other lights than the configuration says.
+
+    Args:
+        wanted: ``data.render.lights`` of the configuration.
+        stored: that of the renders; None: they were made elsewhere.
+        phase: name of the phase.
+        found: its results.
+    """
     if stored in (None, wanted):
         return []
     bright = np.mean(found.known("bright") or [0.0])
@@ -351,7 +402,15 @@ def show(report: Report) -> None:
 
 
 def write(report: Report, folder: Path) -> Path:
-    """Write ``check.json`` and, if there are photographs, ``contact.png``; return ``folder``."""
+    """Write ``check.json`` and, if there are photographs, ``contact.png``.
+
+    Args:
+        report: of a check.
+        folder: is made if it is missing.
+
+    Returns:
+        ``folder``.
+    """
     keys = ("place", "expected", "found")
     rows = dict[str, list[Tile]]()
     content = {

@@ -34,8 +34,12 @@ Targets = TargetProtocol | Mapping[str, Any]
 
 
 def trained_batches(trainer: Trainer | None, length: int) -> int:
-    """Number of batches that each process has trained on so far, also after a resume; 0 without a trainer.
-    ``length``: batches of an epoch, whose last step may have fewer than ``accumulate_grad_batches``."""
+    """Number of batches that each process has trained on so far, also after a resume.
+
+    Args:
+        trainer: Lightning's; None: 0 batches.
+        length: batches of an epoch, whose last step may have fewer than ``accumulate_grad_batches``.
+    """
     if trainer is None:
         return 0
     length = min(length, trainer.num_training_batches)  # trainer.limit_train_batches
@@ -64,8 +68,18 @@ def _protocols(targets: Targets | Sequence[Targets]) -> list[TargetProtocol]:
 
 
 class PhotographsDataModule(LightningDataModule):
-    """Loaders of a data set. ``augmentation``: of training (None: no variation). InputError: an unknown key
-    or impossible value; when data is read, missing or bad files."""
+    """Loaders of a data set.
+
+    Args:
+        dataset: options of the data set.
+        views: choice of the inputs.
+        targets: choice of the targets.
+        seed: of all that is drawn.
+        augmentation: variation of training batches; None: none.
+
+    Raises:
+        InputError: an unknown key or impossible value; when data is read, missing or bad files.
+    """
 
     def __init__(
         self,
@@ -93,7 +107,14 @@ class PhotographsDataModule(LightningDataModule):
         return {**self.dataset.facts, "resampling": self.dataset.resampling}
 
     def prepare_data(self, splits: Sequence[str] = PHASES) -> None:
-        """Make missing data of ``splits``."""
+        """Make missing data.
+
+        Args:
+            splits: names of splits.
+
+        Raises:
+            InputError: the data set has no such split.
+        """
         for split in splits:
             choice("split", split, self.dataset.split_names)
         self.dataset.prepare(splits)
@@ -115,7 +136,11 @@ class PhotographsDataModule(LightningDataModule):
         return self.builder(phase).inputs.reader.subjects
 
     def training_sampler(self, targets: TargetProtocol | None = None) -> TrainingSampler:
-        """Sampler of training (``targets`` None: this module's)."""
+        """Sampler of training.
+
+        Args:
+            targets: choice of the targets; None: this module's.
+        """
         targets = self._possible(targets or self.targets)
         return TrainingSampler(
             self.subjects("train"), self.views, targets, self.dataset.ring, self.dataset.batch_size, self.seed
@@ -133,11 +158,25 @@ class PhotographsDataModule(LightningDataModule):
         world: int = 1,
         builder: BatchBuilder | None = None,
     ) -> TrainingBatches:
+        """Batches of training for one process.
+
+        Args:
+            sampler: draws samples.
+            length: steps of an epoch.
+            rank: number of this process.
+            world: number of processes.
+            builder: reads samples; None: that of ``train``.
+        """
         builder = dataclasses.replace(builder or self.builder("train"), depths=self.trains_on_depths)
         return TrainingBatches(builder, sampler, self.augmentation, length, rank, world)
 
     def _packed_builder(self, batches: float, rank: int) -> BatchBuilder:
-        """Builder of training batches that reads packed files. ``batches``: those of the whole run."""
+        """Builder of training batches that reads packed files.
+
+        Args:
+            batches: number of those of the whole run.
+            rank: number of this process.
+        """
         plain = self.builder("train")
         views = max(self.views.training_counts) + self.targets.per_step
         reads = batches * self.dataset.batch_size * views
@@ -245,6 +284,13 @@ class PhotographsDataModule(LightningDataModule):
     def _evaluation_samples(
         self, subjects: Mapping[str, tuple[int, ...]], protocols: Sequence[TargetProtocol], views: int | None
     ) -> list[SampleSpec]:
+        """Fixed samples, one for each subject.
+
+        Args:
+            subjects: camera positions by name.
+            protocols: choices of targets, which follow one another in each sample.
+            views: number of inputs; None: the view protocol's.
+        """
         data = self.dataset
         count = self.views.evaluation_count if views is None else views
         possible = [self._possible(protocol) for protocol in protocols]

@@ -24,9 +24,18 @@ Shapes = Sequence[tuple[int | None, ...]]
 
 
 def read_photograph(path: Path) -> np.ndarray:
-    """Read [h, w, 3] uint8 in sRGB from an image of 8 bits a channel (grey, palette, RGB or CMYK, alpha
-    ignored). InputError: it is missing or cannot be decoded, has other values, or is turned by its EXIF
-    orientation."""
+    """Read a photograph.
+
+    Args:
+        path: of an image of 8 bits a channel (grey, palette, RGB or CMYK, alpha ignored).
+
+    Returns:
+        [h, w, 3] uint8 in sRGB.
+
+    Raises:
+        InputError: it is missing or cannot be decoded, has other values, or is turned by its EXIF
+            orientation.
+    """
     image = read_image(path)
     turn = orientation_of(image, path)
     if turn != UPRIGHT:
@@ -39,8 +48,18 @@ def read_photograph(path: Path) -> np.ndarray:
 
 
 def read_map(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """Read channel 0 of a mask or depth map of ``size`` (height, width). InputError: it is missing, cannot be
-    decoded, has another size, or does not hold integers."""
+    """Read channel 0 of a mask or depth map.
+
+    Args:
+        path: of an image of whole numbers.
+        size: (height, width) of its photograph.
+
+    Returns:
+        [h, w] as stored.
+
+    Raises:
+        InputError: it is missing, cannot be decoded, has another size, or does not hold integers.
+    """
     array = np.asarray(read_image(path))
     if array.dtype.kind not in "bui":
         raise InputError(f"{path}: expected whole numbers; found {array.dtype}")
@@ -53,13 +72,33 @@ def read_map(path: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def read_array(path: Path, shapes: Shapes) -> np.ndarray:
-    """Read a finite float64 array from an ``.npy`` file; arguments and errors as :func:`check_array`."""
+    """Read an ``.npy`` file.
+
+    Args:
+        path: of the file.
+        shapes: as for :func:`check_array`.
+
+    Returns:
+        A finite float64 array.
+
+    Raises:
+        InputError: it is missing, or as for :func:`check_array`.
+    """
     return check_array(path, read_npy(path, f"an array {_describe(shapes)}"), shapes)
 
 
 def read_vertices(path: Path) -> np.ndarray:
-    """Read vertices [n, 3] float32, n >= 1, from an ``.npy`` file. InputError: it is missing or another
-    array, or a coordinate is beyond 1e6."""
+    """Read vertices of a body or scan.
+
+    Args:
+        path: of an ``.npy`` file.
+
+    Returns:
+        [n, 3] float32, n >= 1.
+
+    Raises:
+        InputError: it is missing or another array, or a coordinate is beyond 1e6.
+    """
     vertices = read_array(path, [(None, 3)])
     require(len(vertices) > 0, str(path), "vertices", "none")
     check_extent(path, vertices)
@@ -67,14 +106,30 @@ def read_vertices(path: Path) -> np.ndarray:
 
 
 def check_extent(place: Path | str, vertices: np.ndarray) -> None:
-    """Refuse coordinates that no scan of a person has in any unit and that would dwarf all others."""
+    """Refuse coordinates that no scan of a person has in any unit and that would dwarf all others.
+
+    Args:
+        place: of the vertices, for the message.
+        vertices: [n, 3].
+
+    Raises:
+        InputError: a coordinate is 1e6 or more.
+    """
     largest = float(np.abs(vertices).max(initial=0))
     require(largest < _FURTHEST, str(place), f"coordinates below {_FURTHEST:.0e}", largest)
 
 
 def check_array(place: Path | str, array: Any, shapes: Shapes) -> np.ndarray:
-    """Convert to a finite float64 array of one of ``shapes``, in which None is any length. InputError: it is
-    not an array of numbers, has another shape, or is not finite."""
+    """Convert to a finite float64 array.
+
+    Args:
+        place: of the array, for the message.
+        array: numbers in any form that NumPy takes.
+        shapes: possible shapes, in which None is any length.
+
+    Raises:
+        InputError: it is not an array of numbers, has another shape, or is not finite.
+    """
     try:
         array = np.asarray(array)
         if array.dtype.kind in "cmM":
@@ -99,7 +154,15 @@ def _describe(shapes: Shapes) -> str:
 
 
 def check_intrinsics(place: Path | str, intrinsics: Any) -> np.ndarray:
-    """Intrinsics [3, 3] float64. InputError: not finite, focal lengths not above 0, or last row not 0 0 1."""
+    """Intrinsics [3, 3] float64.
+
+    Args:
+        place: of the matrix, for the message.
+        intrinsics: [3, 3] in pixels.
+
+    Raises:
+        InputError: not finite, focal lengths not above 0, or last row not 0 0 1.
+    """
     intrinsics = check_array(place, intrinsics, [(3, 3)])
     if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
         raise InputError(
@@ -110,7 +173,15 @@ def check_intrinsics(place: Path | str, intrinsics: Any) -> np.ndarray:
 
 
 def check_extrinsics(place: Path | str, extrinsics: Any) -> np.ndarray:
-    """Extrinsics [4, 4] float64 from [3, 4] or [4, 4]. InputError: not finite, or not a proper rotation."""
+    """Extrinsics [4, 4] float64.
+
+    Args:
+        place: of the matrix, for the message.
+        extrinsics: [3, 4] or [4, 4], world to camera.
+
+    Raises:
+        InputError: not finite, or not a proper rotation.
+    """
     extrinsics = check_array(place, extrinsics, [(3, 4), (4, 4)])
     if len(extrinsics) == 3:
         extrinsics = np.concatenate((extrinsics, [[0, 0, 0, 1]]))
@@ -134,7 +205,15 @@ def _check_last_row(place: Path | str, matrix: np.ndarray) -> None:
 
 
 def check_view(place: Path | str, view: View) -> None:
-    """Check shapes, types and camera of a :class:`View`. InputError: an array or the camera is wrong."""
+    """Check shapes, types and camera of a :class:`View`.
+
+    Args:
+        place: of the photograph, for the message.
+        view: as a reader gives it.
+
+    Raises:
+        InputError: an array or the camera is wrong.
+    """
     size = np.shape(view.mask)
     arrays = {"image": (view.image, (*size, 3), np.uint8), "mask": (view.mask, size, np.bool_)}
     if view.inverse_depth is not None:
@@ -172,6 +251,13 @@ def check_center(path: Path, intrinsics: np.ndarray, height: int, width: int) ->
 
 
 def check_name(name: str) -> str:
-    """Return ``name`` if it can be part of a file name, as results are named after subjects."""
+    """Return ``name`` if it can be part of a file name, as results are named after subjects.
+
+    Args:
+        name: of a subject.
+
+    Raises:
+        InputError: it has other characters than letters, digits and ``. + - _``.
+    """
     require(bool(_SAFE_NAME.fullmatch(name)), "subject", "letters, digits and . + - _ only", name)
     return name

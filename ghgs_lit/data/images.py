@@ -34,7 +34,14 @@ _ROUNDING = 2
 
 
 def read_image(path: Path) -> Image.Image:
-    """Decode an image of :data:`FORMATS`. InputError: it is missing or cannot be decoded."""
+    """Decode an image of :data:`FORMATS`.
+
+    Args:
+        path: of the file; its content says the format.
+
+    Raises:
+        InputError: it is missing or cannot be decoded.
+    """
     require_file(path, "an image")
     try:
         image = Image.open(path, formats=FORMATS)
@@ -57,8 +64,15 @@ def listed_formats() -> Iterator[None]:
 
 
 def orientation_of(image: Image.Image, path: Path) -> int:
-    """The EXIF orientation, 1 to 8. Any other value, such as 0, says that it is not known: viewers show such
-    images as they are stored. A warning where EXIF data is damaged."""
+    """The EXIF orientation, 1 to 8 (CIPA DC-008).
+
+    Any other value, such as 0, says that it is not known: viewers show such images as they are stored. A
+    warning where EXIF data is damaged.
+
+    Args:
+        image: as opened.
+        path: for the warning.
+    """
     try:
         found = image.getexif().get(ExifTags.Base.Orientation, UPRIGHT)
     except Exception as error:  # broken entries raise anything
@@ -68,9 +82,21 @@ def orientation_of(image: Image.Image, path: Path) -> int:
 
 
 def rgb_of(image: Image.Image, path: Path) -> np.ndarray:
-    """Colours [h, w, 3] uint8 in sRGB of a photograph, alpha ignored. An embedded profile, such as Display P3
-    or a linear one, is applied by LittleCMS. A warning where it cannot be read or is of other pixels: colours
-    are taken as sRGB. InputError: the image has not 8 bits a channel (:data:`EIGHT_BITS`)."""
+    """Colours in sRGB of a photograph, alpha ignored.
+
+    An embedded profile, such as Display P3 or a linear one, is applied by LittleCMS. A warning where it
+    cannot be read or is of other pixels: colours are taken as sRGB.
+
+    Args:
+        image: as opened.
+        path: for messages.
+
+    Returns:
+        [h, w, 3] uint8.
+
+    Raises:
+        InputError: the image has not 8 bits a channel (:data:`EIGHT_BITS`).
+    """
     if image.mode not in EIGHT_BITS:
         raise InputError(f"{path}: expected a photograph of 8 bits a channel; found mode {image.mode}")
     profile = image.info.get("icc_profile")
@@ -88,7 +114,14 @@ def rgb_of(image: Image.Image, path: Path) -> np.ndarray:
 @functools.lru_cache(maxsize=64)
 def _to_srgb(profile: bytes, mode: str) -> "tuple[str, ImageCms.ImageCmsTransform | None]":
     """The mode that a profile describes and the transform from it to sRGB, None where it changes nothing.
-    ``mode``: that of the image."""
+
+    Args:
+        profile: ICC profile as it is embedded.
+        mode: Pillow's mode of the image.
+
+    Raises:
+        ValueError: the profile is of other pixels.
+    """
     from PIL import ImageCms
 
     opened = ImageCms.ImageCmsProfile(io.BytesIO(profile))

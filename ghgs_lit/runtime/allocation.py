@@ -19,8 +19,12 @@ _CLEAR = Path("/proc/self/clear_refs")
 
 
 def resident_bytes(field: str = "VmRSS") -> int:
-    """``VmRSS`` (memory now) or ``VmHWM`` (peak since :func:`forget_peak`) of this process; except on Linux
-    both are the peak since its start."""
+    """Memory of this process in bytes.
+
+    Args:
+        field: ``VmRSS`` (now) or ``VmHWM`` (peak since :func:`forget_peak`); except on Linux both are the
+            peak since its start.
+    """
     if _STATUS.exists():
         line = next(line for line in _STATUS.read_text().splitlines() if line.startswith(field + ":"))
         return int(line.split()[1]) * 1024
@@ -47,9 +51,15 @@ def return_free_memory() -> None:
 
 
 def keep_freed_memory() -> bool:
-    """Make glibc keep freed memory for reuse; returns whether that succeeded. By default glibc returns every
-    large block to the system, which clears its pages at the next use: a small model spends a tenth of its
-    forward pass or more on that. ``malloc_trim`` still returns the memory. Limits set by the user stay."""
+    """Make glibc keep freed memory for reuse.
+
+    By default glibc returns every large block to the system, which clears its pages at the next use: a
+    small model spends a tenth of its forward pass or more on that. ``malloc_trim`` still returns the
+    memory. Limits set by the user stay.
+
+    Returns:
+        Whether that succeeded.
+    """
     if any(name.startswith("MALLOC_") or name == "GLIBC_TUNABLES" for name in os.environ):
         return False
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None

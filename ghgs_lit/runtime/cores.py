@@ -17,9 +17,16 @@ _spins: list[IO[str]] = []
 
 
 def spin_if_alone(arguments: Sequence[str], running: Path = Path("/proc/loadavg")) -> None:
-    """Let OpenMP's threads spin before they sleep if no other process runs; call before importing PyTorch. On
-    an idle virtual machine a sleeping thread wakes late: steps of ``experiment=demo`` take 0.75 s instead of
-    0.29. Two spinning processes on the same cores take seven times as long, so only one per machine may."""
+    """Let OpenMP's threads spin before they sleep if no other process runs; call before importing PyTorch.
+
+    On an idle virtual machine a sleeping thread wakes late: steps of ``experiment=demo`` take 0.75 s
+    instead of 0.29. Two spinning processes on the same cores take seven times as long, so only one per
+    machine may.
+
+    Args:
+        arguments: of the command line; threads sleep where one asks for several processes.
+        running: Linux's file of the numbers of running and of all threads.
+    """
     try:
         alone = running.read_text().split()[3].startswith("1/")
         handle = open(Path(tempfile.gettempdir()) / f"ghgs-spins-{os.getuid()}", "a")  # noqa: SIM115
@@ -46,7 +53,14 @@ def use_known_start_method() -> None:
 
 
 def allowed_cores(cgroups: Path = Path("/sys/fs/cgroup")) -> int:
-    """Number of cores by affinity and by a container's quota (control groups of version 2 or 1)."""
+    """Number of cores by affinity and by a container's quota (control groups of version 2 or 1).
+
+    Args:
+        cgroups: where the files of the control groups are.
+
+    Returns:
+        At least 1.
+    """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     for files in (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us")):
         try:

@@ -24,8 +24,14 @@ def has_bfloat16(device: torch.device) -> bool:
 
 
 def fast_precision(stored: torch.dtype, device: torch.device) -> torch.dtype:
-    """Dtype to use for weights that are ``stored`` in one: float32 instead of a half precision that the
-    processor lacks. On a CPU float16 takes four times as long as float32, and loses digits."""
+    """Dtype to use for weights: float32 instead of a half precision that the processor lacks.
+
+    On a CPU float16 takes four times as long as float32, and loses digits.
+
+    Args:
+        stored: dtype of the weights as they are stored.
+        device: where they are used.
+    """
     if device.type == "cpu" and (
         stored == torch.float16 or (stored == torch.bfloat16 and not has_bfloat16(device))
     ):
@@ -34,14 +40,18 @@ def fast_precision(stored: torch.dtype, device: torch.device) -> torch.dtype:
 
 
 def precision_of(name: str, device: torch.device) -> AbstractContextManager:
-    """The context of a forward pass in a precision. InputError: TF32 or float16 on a CPU, or bfloat16 on a
-    device without it.
+    """The context of a forward pass in a precision.
 
     Args:
-        name: one of :data:`PRECISIONS`. ``inherit``: the caller's, but where convolutions round to TF32, as
-            PyTorch has it on CUDA, products do, too, which is said once; ``float32``: :func:`exact`;
-            ``tf32``: all products and convolutions; ``auto``: bfloat16 if the device has it, else float16 on
-            CUDA and float32 on a CPU."""
+        name: one of :data:`PRECISIONS`. ``inherit``: the caller's, but where convolutions round to TF32,
+            as PyTorch has it on CUDA, products do, too, which is said once; ``float32``: :func:`exact`;
+            ``tf32``: all products and convolutions; ``auto``: bfloat16 if the device has it, else float16
+            on CUDA and float32 on a CPU.
+        device: where the pass is.
+
+    Raises:
+        InputError: an unknown precision, TF32 or float16 on a CPU, or bfloat16 on a device without it.
+    """
     choice("precision", name, PRECISIONS)
     if name == "inherit":
         return _inherited() if device.type == "cuda" else nullcontext()
@@ -56,7 +66,12 @@ def precision_of(name: str, device: torch.device) -> AbstractContextManager:
 
 
 def half_precision(name: str, device: torch.device) -> torch.dtype | None:
-    """The half precision of products in a precision ``name`` (:func:`precision_of`); None: float32."""
+    """The half precision of products; None: float32.
+
+    Args:
+        name: one of :data:`PRECISIONS`, as for :func:`precision_of`.
+        device: where the products are; it decides for ``auto``.
+    """
     if name == "auto":
         slow = "float16" if device.type == "cuda" else "float32"
         name = "bfloat16" if has_bfloat16(device) else slow
@@ -64,9 +79,14 @@ def half_precision(name: str, device: torch.device) -> torch.dtype | None:
 
 
 def exact(device: str) -> AbstractContextManager[None]:
-    """Full float32: no autocast, and no products or convolutions with factors rounded to TF32 or bfloat16, as
-    ``torch.set_float32_matmul_precision`` allows, and PyTorch's default for convolutions on CUDA (TF32 has 11
-    bits: 1 mm at 2 m). ``device``: its type."""
+    """Full float32: no autocast, and no products or convolutions with rounded factors.
+
+    Factors are rounded to TF32 or bfloat16 where ``torch.set_float32_matmul_precision`` allows it, and in
+    convolutions on CUDA by PyTorch's default (TF32 has 11 bits: 1 mm at 2 m).
+
+    Args:
+        device: its type, ``cpu`` or ``cuda``.
+    """
     return _float32(device, rounding=False)
 
 
@@ -111,7 +131,12 @@ def _float32(device: str, rounding: bool) -> Iterator[None]:
 
 def round_products(rounding: bool, device: str = "cuda", also_older: bool = True) -> None:
     """Whether products and convolutions of float32 numbers round their factors to TF32 from now on.
-    ``device``: its type. ``also_older``: by the switches that PyTorch had before 2.9, too."""
+
+    Args:
+        rounding: whether they do.
+        device: its type, ``cpu`` or ``cuda``.
+        also_older: by the switches that PyTorch had before 2.9, too.
+    """
     if also_older:
         torch.set_float32_matmul_precision("high" if rounding else "highest")
         torch.backends.cudnn.allow_tf32 = rounding
@@ -186,9 +211,15 @@ def _modules(device: str) -> list[Any]:
 
 
 def keep_rounded(module: nn.Module, dtype: torch.dtype) -> None:
-    """Store weights of linear layers and convolutions in the half precision that autocast rounds them to at
-    every call: the same numbers in half the memory, without a kernel for each weight. From then on the module
-    runs under autocast to ``dtype`` alone."""
+    """Store weights of linear layers and convolutions in the half precision that autocast rounds them to.
+
+    Autocast does so at every call; these are the same numbers in half the memory, without a kernel for
+    each weight. From then on the module runs under autocast to ``dtype`` alone.
+
+    Args:
+        module: changed in place.
+        dtype: bfloat16 or float16.
+    """
     for layer in module.modules():
         if isinstance(layer, nn.Linear | nn.Conv2d | nn.ConvTranspose2d):
             layer.to(dtype)

@@ -45,7 +45,11 @@ class CudaTape:
         self._pool: Any = None
 
     def record(self, call: Callable[[], Result]) -> tuple[Result, Callable[[], None]]:
-        """See :class:`Tape`. The call is made once before on the stream that records, for workspaces."""
+        """See :class:`Tape`. The call is made once before on the stream that records, for workspaces.
+
+        Args:
+            call: starts work of the GPU alone.
+        """
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):
@@ -60,8 +64,14 @@ class CudaTape:
 
 @dataclass
 class _Recording:
-    """``inputs``: where they are copied to. ``result``: where it comes about. ``kept``: memory that is read
-    and that was there before, such as tables in caches, which may forget them."""
+    """What was recorded for one class of inputs.
+
+    Attributes:
+        inputs: where the tensors of inputs are copied to.
+        result: where the result comes about.
+        play: does the work again.
+        kept: memory that is read and that was there before, such as tables in caches, which may forget them.
+    """
 
     inputs: list[Tensor]
     result: Any
@@ -73,13 +83,15 @@ class Recorder:
     """Calls functions of tensors, and plays them back from the second call of a class on.
 
     Args:
-        limit: largest number of recordings; the one that was not used for longest makes room.
-        eager: calls of a class before it is recorded: what comes once is not worth it, and caches are filled.
-        tape: makes recordings.
+        limit: largest number of recordings, at least 1; the one that was not used for longest makes room.
+        eager: calls of a class before it is recorded: what comes once is not worth it, and caches are
+            filled.
+        tape: makes recordings; None: CUDA graphs.
 
     Attributes:
         counts: calls that were ``played``, ``recorded`` (and played), ``eager``, ``refused``.
-        reason: why the last recording failed; empty if none did."""
+        reason: why the last recording failed; empty if none did.
+    """
 
     def __init__(self, limit: int = 8, eager: int = 1, tape: Tape | None = None):
         self.limit = limit
@@ -105,13 +117,19 @@ class Recorder:
         self._recordings.pop(self._class(inputs, key, []), None)
 
     def __call__(self, function: Callable[[Any], Result], inputs: Any, key: Hashable = ()) -> Result:
-        """``function(inputs)``. Without a gradient; ``function`` writes none of its inputs.
+        """``function(inputs)``, without a gradient.
 
         Args:
-            function: depends on ``inputs``, ``key`` and on tensors that stay where they are. The first call
-                of a class is eager, and so are all where recording fails, which is said once.
-            inputs: dataclasses, tuples, lists and dicts of tensors on one device, and of anything hashable.
-            key: all else that may change what ``function`` does."""
+            function: depends on ``inputs``, ``key`` and on tensors that stay where they are, and writes
+                none of its inputs. The first call of a class is eager, and so are all where recording
+                fails, which is said once.
+            inputs: dataclasses, tuples, lists and dicts of tensors on one device, and of anything
+                hashable.
+            key: all else that may change what ``function`` does.
+
+        Returns:
+            Its result, in memory that later calls do not write to.
+        """
         tensors: list[Tensor] = []
         kind = self._class(inputs, key, tensors)
         if kind is None or kind in self._refused or {t.device.type for t in tensors} != {self.tape.device}:
@@ -140,7 +158,13 @@ class Recorder:
             return _played(recording, tensors)
 
     def _class(self, inputs: Any, key: Hashable, tensors: list[Tensor]) -> Hashable | None:
-        """What must be equal for a recording to be valid; None: it cannot be told. Notes the ``tensors``."""
+        """What must be equal for a recording to be valid; None: it cannot be told.
+
+        Args:
+            inputs: as of :meth:`__call__`.
+            key: as of :meth:`__call__`.
+            tensors: gets the tensors of the inputs, in their order.
+        """
         kind = (key, described(inputs, tensors), _surroundings(self.tape.device))
         try:
             hash(kind)
@@ -163,8 +187,14 @@ class Recorder:
 
 
 def described(value: Any, tensors: list[Tensor]) -> Any:
-    """What is fixed in ``value``: sizes and types of its tensors, which are appended to ``tensors``, and all
-    that is no tensor. Values that dataclasses keep beside their fields belong to them."""
+    """What is fixed in ``value``: sizes and types of its tensors, and all that is no tensor.
+
+    Values that dataclasses keep beside their fields belong to them.
+
+    Args:
+        value: dataclasses, tuples, lists and dicts of tensors and of anything else.
+        tensors: gets the tensors of the value, in their order.
+    """
     if isinstance(value, Tensor):
         tensors.append(value)
         return tuple(value.shape), value.dtype, value.device
@@ -208,6 +238,16 @@ def _replaced(value: Any, replace: Callable[[Tensor], Tensor]) -> Any:
 
 
 def _recorded(tape: Tape, function: Callable[[Any], Any], inputs: Any) -> _Recording:
+    """Record ``function(inputs)``.
+
+    Args:
+        tape: makes the recording.
+        function: as of :meth:`Recorder.__call__`.
+        inputs: as of :meth:`Recorder.__call__`; they are copied.
+
+    Raises:
+        NotRecordable: the function reads a value of the device or copies from the host.
+    """
     places: list[Tensor] = []
 
     def place(tensor: Tensor) -> Tensor:
@@ -256,6 +296,17 @@ class _Guard(TorchDispatchMode):
         self._made: set[int] = set()
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        """Call an operator of PyTorch if it can be played back.
+
+        Args:
+            function: the operator.
+            types: PyTorch's: classes of the tensors.
+            args: its positional arguments.
+            kwargs: its named arguments.
+
+        Raises:
+            NotRecordable: it cannot.
+        """
         kwargs = kwargs or {}
         given = list(_tensors((args, tuple(kwargs.values()))))
         reason = _reason(function, given, args, kwargs)
@@ -281,7 +332,14 @@ _INDEXING = ("aten::index", "aten::index_put", "aten::index_put_", "aten::_unsaf
 
 
 def _reason(function: Any, given: list[Tensor], args: tuple, kwargs: dict) -> str | None:
-    """Why an operator cannot be played back; None if it can."""
+    """Why an operator cannot be played back; None if it can.
+
+    Args:
+        function: the operator.
+        given: tensors among its arguments.
+        args: its positional arguments.
+        kwargs: its named arguments.
+    """
     name = function.name().split(".")[0]
     if torch.Tag.data_dependent_output in function.tags:
         return "a value is read"

@@ -37,8 +37,14 @@ def is_watched() -> bool:
 
 @contextmanager
 def watched(model: nn.Module, stages: Mapping[str, str], watcher: Watcher) -> Iterator[None]:
-    """Call ``watcher`` at every call of stages while the context lasts. ``stages``: from names for the
-    watcher to dotted paths in ``model``; a stage that is None or missing is left out."""
+    """Call a watcher at every call of stages while the context lasts.
+
+    Args:
+        model: whose stages are watched.
+        stages: from names for the watcher to dotted paths in ``model``; a stage that is None or missing
+            is left out.
+        watcher: is called.
+    """
     with ExitStack() as stack:
         _watchers.append(watcher)
         stack.callback(_watchers.remove, watcher)
