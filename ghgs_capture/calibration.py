@@ -61,7 +61,7 @@ class Convention:
         """Replace what the user says of the convention.
 
         Args:
-            said: values by the names of :class:`Convention`; None and other keys are ignored.
+            options: values by the names of :class:`Convention`; None and other keys are ignored.
 
         Returns:
             The convention with these values.

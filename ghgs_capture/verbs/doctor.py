@@ -88,12 +88,14 @@ def cameras(options: "Doctor", cfg: DictConfig) -> None:
         save_png(camera_sheet([v.name for v in views], images, best.silhouettes(folder)), picture)
         announce(picture)
     if diagnosis.option:
-        found = {v.name: (calibrate(v.camera, v.convention, v.camera.size), v.camera.size) for v in views}
-        write_text_atomically(calibration, json_text(found))
+        best_cameras = {
+            v.name: (calibrate(v.camera, v.convention, v.camera.size), v.camera.size) for v in views
+        }
+        write_text_atomically(calibration, json_text(best_cameras))
         announce(calibration)
     if not diagnosis.consistent:
-        found = "; ".join(diagnosis.lines)
-        raise InputError(f"{options.cameras}: expected cameras that fit the masks; found {found}")
+        problems = "; ".join(diagnosis.lines)
+        raise InputError(f"{options.cameras}: expected cameras that fit the masks; found {problems}")
 
 
 def machine(options: "Doctor", _: DictConfig) -> None:
