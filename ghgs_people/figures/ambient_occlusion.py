@@ -25,7 +25,14 @@ HOLLOW = 45.0  # share of the light that a hollow loses per metre of depth
 
 
 def occluding_spheres(figure: Figure) -> Spheres:
-    """Centres [s, 3] in the pose and radii [s] of spheres that touch the skin from inside."""
+    """Place spheres inside trunk and limbs that touch the skin from inside.
+
+    Args:
+        figure: the naked person.
+
+    Returns:
+        Centres [s, 3] in the pose and radii [s], metres.
+    """
     body = load_body()
     naked = figure.rest[:BODY_VERTICES]
     centres = []
@@ -52,8 +59,16 @@ def occluding_spheres(figure: Figure) -> Spheres:
 
 
 def visibility(points: np.ndarray, normals: np.ndarray, spheres: Spheres) -> np.ndarray:
-    """Share [g] of the surroundings, weighted by the cosine, that spheres and the ground do not hide from
-    points [g, 3] with unit normals [g, 3]."""
+    """Share of the surroundings, weighted by the cosine, that spheres and the ground do not hide.
+
+    Args:
+        points: [g, 3], metres, the ground at y = 0.
+        normals: [g, 3], unit vectors.
+        spheres: centres [s, 3] and radii [s], metres.
+
+    Returns:
+        [g] from 0 (dark) to 1.
+    """
     light = np.ones(len(points))
     for centre, radius in zip(*spheres, strict=True):
         away = centre - points
@@ -65,7 +80,16 @@ def visibility(points: np.ndarray, normals: np.ndarray, spheres: Spheres) -> np.
 
 
 def ambient_occlusion(piece: Chart, points: np.ndarray, spheres: Spheres) -> np.ndarray:
-    """Factor [g] on the colours of a chart with posed points [g, 3]."""
+    """Darken a chart where the body, the ground or hollows of the surface hide the surroundings.
+
+    Args:
+        piece: the chart.
+        points: its points [g, 3] in the pose, metres.
+        spheres: of the body, in the pose.
+
+    Returns:
+        Factor [g] on the colours, slightly above 1 on ridges.
+    """
     normals = vertex_normals(points, piece.point_faces)
     smooth = points
     for _ in range(5):

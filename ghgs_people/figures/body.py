@@ -48,17 +48,38 @@ class BodyModel:
         return len(self.weights)
 
     def bone(self, name: str) -> int:
-        """Index of a bone."""
+        """Index of a bone.
+
+        Args:
+            name: one of ``bone_names``.
+
+        Raises:
+            ValueError: there is no such bone.
+        """
         return self.bone_names.index(name)
 
     def rest(self, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices [n, 3] and joints [b, 3] of a shape at rest, lowest point of the skin on y = 0."""
+        """A shape at rest, the lowest point of the skin on y = 0.
+
+        Args:
+            coefficients: [k] of the principal components.
+
+        Returns:
+            Vertices [n, 3] and joints [b, 3], metres.
+        """
         points = self.mean + np.tensordot(coefficients, self.components, 1)
         points[:, 1] -= points[:BODY_VERTICES, 1].min()
         return points[: self.vertex_count], points[self.vertex_count :]
 
     def sample_shape(self, rng: np.random.Generator) -> tuple[np.ndarray, bool, float]:
-        """Draw an adult between two stored ones of one sex: coefficients [k], female, age."""
+        """Draw an adult between two stored ones of one sex.
+
+        Args:
+            rng: draws sex, the two adults and the share of each.
+
+        Returns:
+            Coefficients [k], whether female, and age from 0.67 (young) to 1 (old).
+        """
         female = bool(rng.random() < 0.5)
         pool = np.flatnonzero(self.female == female)
         one, two = rng.choice(pool, 2, replace=False)
@@ -97,9 +118,17 @@ def load_body() -> BodyModel:
 def bone_transforms(
     parents: np.ndarray, joints: np.ndarray, rotations: np.ndarray, root: np.ndarray
 ) -> np.ndarray:
-    """Transforms [b, 3, 4] of the bones from rest to pose. ``parents``: [b], -1 for the root; parents come
-    before children. ``joints``: [b, 3] at rest, metres. ``rotations``: [b, 3, 3] of each bone in world axes
-    (not relative to its parent). ``root``: [3], position of the root joint in the pose, metres."""
+    """Forward kinematics: transforms of the bones from rest to pose.
+
+    Args:
+        parents: [b] int, -1 for the root; parents come before children.
+        joints: [b, 3] at rest, metres.
+        rotations: [b, 3, 3] of each bone in world axes (not relative to its parent).
+        root: [3], position of the root joint in the pose, metres.
+
+    Returns:
+        [b, 3, 4], rotations and translations in metres.
+    """
     posed = np.empty_like(joints)
     for bone, parent in enumerate(parents):
         if parent < 0:
@@ -111,6 +140,15 @@ def bone_transforms(
 
 
 def skin(vertices: np.ndarray, weights: np.ndarray, transforms: np.ndarray) -> np.ndarray:
-    """Linear blend skinning of [n, 3] by [n, b] weights and [b, 3, 4] transforms."""
+    """Linear blend skinning.
+
+    Args:
+        vertices: [n, 3] at rest, metres.
+        weights: [n, b] of the bones, rows sum to 1.
+        transforms: [b, 3, 4] of the bones from rest to pose.
+
+    Returns:
+        [n, 3] in the pose.
+    """
     blended = (weights @ transforms.reshape(len(transforms), 12)).reshape(-1, 3, 4)
     return np.einsum("nij,nj->ni", blended[:, :, :3], vertices) + blended[:, :, 3]

@@ -40,17 +40,38 @@ class Chart:
     texel_shares: np.ndarray  # [k, 3] its barycentric coordinates there
 
     def image(self, colours: np.ndarray) -> np.ndarray:
-        """Texture [h, w, 3] uint8 of colours [k, 3] (0 to 1) of covered texels; others copy the nearest."""
+        """Make a texture of the colours of its covered texels; others copy the nearest.
+
+        Args:
+            colours: [k, 3], 0 to 1.
+
+        Returns:
+            [h, w, 3] uint8.
+        """
         return np.rint(255 * np.clip(colours, 0, 1)).astype(np.uint8)[self.nearest].reshape(*self.shape, 3)
 
     def shaded(self, texture: np.ndarray, factor: np.ndarray) -> np.ndarray:
-        """A texture [h, w, 3] times a factor [g] given at the points."""
+        """Multiply a texture by a factor on the surface.
+
+        Args:
+            texture: [h, w, 3] uint8.
+            factor: [g] at the points, at least 0.
+
+        Returns:
+            [h, w, 3] uint8.
+        """
         factor = factor.astype(np.float32)[self.texel_points]
         spread = np.einsum("kc,kc->k", factor, self.texel_shares)[self.nearest].reshape(*self.shape, 1)
         return np.rint(np.minimum(texture * spread, 255)).astype(np.uint8)
 
     def mesh(self, points: np.ndarray, field: np.ndarray, texture: np.ndarray) -> TexturedMesh:
-        """The surface at `points` [g, 3] where `field` [g] is positive."""
+        """Cut the surface out.
+
+        Args:
+            points: [g, 3], metres.
+            field: [g], positive where the surface stays.
+            texture: [h, w, 3] uint8.
+        """
         faces, a, b, t = clip(self.faces, field[self.point_of_vertex])
         vertices = np.concatenate([points[self.point_of_vertex], self.uv], 1)
         vertices = ((1 - t[:, None]) * vertices[a] + t[:, None] * vertices[b]).astype(np.float32)
@@ -85,7 +106,11 @@ RECIPES = {
 
 @cache
 def chart(name: str) -> Chart:
-    """One of the charts in `RECIPES`, built once per process."""
+    """Build a chart, once per process.
+
+    Args:
+        name: one of `RECIPES`.
+    """
     body = load_body()
     recipe = RECIPES[name]
     surface, box = _select(body, name)
@@ -140,7 +165,15 @@ def chart(name: str) -> Chart:
 
 
 def _select(body: BodyModel, name: str) -> tuple[Surface, Sequence[float]]:
-    """The quads of a chart, and the box (left, bottom, right, top) in the UV layout that it fills."""
+    """Choose the quads of a chart.
+
+    Args:
+        body: the base mesh.
+        name: one of `RECIPES`.
+
+    Returns:
+        The quads, and the box (left, bottom, right, top) in the UV layout that the texture shows.
+    """
     surface = body.surfaces["body"]
     margin = 0.0
     if name in ("head", "skin"):

@@ -38,9 +38,15 @@ class Complexion:
 
 
 def sample_complexion(rng: np.random.Generator, female: bool, age: float) -> Complexion:
-    """Draw the colours of a person: with dark skin hair and eyes are dark, with age hair turns grey."""
+    """Draw the colours of a person: with dark skin hair and eyes are dark, with age hair turns grey.
+
+    Args:
+        rng: draws everything.
+        female: whether there may be makeup; a beard otherwise.
+        age: from 0.67 (young) to 1 (old).
+    """
     tone = rng.uniform(0, len(SKINS) - 1)
-    skin = np.array([np.interp(tone, range(len(SKINS)), [s[i] for s in SKINS]) for i in range(3)])
+    skin = np.array([np.interp(tone, range(len(SKINS)), channel) for channel in np.transpose(SKINS)])
     skin = np.clip(skin * (1 + rng.normal(0, 0.025, 3)), 0.08, 0.97)
     dark = tone > 2.6
     hairs = (
@@ -85,19 +91,37 @@ def sample_complexion(rng: np.random.Generator, female: bool, age: float) -> Com
 def _blob(
     point: np.ndarray, centre: tuple[float, float, float], size: tuple[float, float, float]
 ) -> np.ndarray:
-    """1 at `centre`, 0 far away, mirrored in x."""
+    """A soft spot of the face, on both sides.
+
+    Args:
+        point: [k, 3], metres, in the frame of :func:`.place.face_frame`.
+        centre: of the left spot, metres.
+        size: along x, y and z, metres; there it has fallen to 1 / e.
+
+    Returns:
+        [k], 1 at the centre, 0 far away.
+    """
     offset = (np.stack([np.abs(point[:, 0]), point[:, 1], point[:, 2]], 1) - centre) / size
     return np.exp(-(offset**2).sum(1))
 
 
 def _grain(look: Complexion, point: np.ndarray) -> np.ndarray:
+    """Factor [k] on the colours of points [k, 3] of the skin: fine and coarse spots."""
     u = point[:, 0] + 0.5 * point[:, 2]
     v = point[:, 1] + 0.3 * point[:, 2]
     return 1 + 0.030 * look.noise(u / 0.45, v / 0.45) + 0.018 * look.fine(u / 0.12, v / 0.12)
 
 
 def head_texture(look: Complexion, scalp: float) -> np.ndarray:
-    """Texture [h, w, 3] of the head; `scalp` (0 to 1) is how strongly hair covers the scalp."""
+    """Paint the head.
+
+    Args:
+        look: colours of the person.
+        scalp: how strongly hair covers the scalp, 0 to 1.
+
+    Returns:
+        Texture [h, w, 3] uint8.
+    """
     piece = chart("head")
     point = face_frame(piece.texel_place.point)
     above = hairline(piece.texel_place.point)
@@ -133,10 +157,22 @@ def head_texture(look: Complexion, scalp: float) -> np.ndarray:
 
 
 def _masks(piece: Chart) -> np.ndarray:
+    """Masks [k, 3] of lips, eyelids and ears, 0 to 1, of the head's texels."""
     return load_body().head_masks.reshape(-1, 4)[piece.texels, :3] / 255.0
 
 
 def _eyes_and_brows(colour: np.ndarray, look: Complexion, point: np.ndarray, lids: np.ndarray) -> np.ndarray:
+    """Paint eyelids, lashes and brows.
+
+    Args:
+        colour: [k, 3] in [0, 1] of the head's texels.
+        look: colours of the person.
+        point: [k, 3], metres, in the frame of :func:`.place.face_frame`.
+        lids: [k] mask of the eyelids, 0 to 1.
+
+    Returns:
+        Colours [k, 3].
+    """
     x = np.abs(point[:, 0])
     y = point[:, 1]
     z = point[:, 2]
@@ -159,6 +195,17 @@ def _eyes_and_brows(colour: np.ndarray, look: Complexion, point: np.ndarray, lid
 
 
 def _beard(colour: np.ndarray, look: Complexion, point: np.ndarray, lips: np.ndarray) -> np.ndarray:
+    """Paint a beard of the style and strength of ``look``.
+
+    Args:
+        colour: [k, 3] in [0, 1] of the head's texels.
+        look: colours of the person.
+        point: [k, 3], metres, in the frame of :func:`.place.face_frame`.
+        lips: [k] mask of the lips, 0 to 1.
+
+    Returns:
+        Colours [k, 3].
+    """
     if look.beard_style == "none":
         return colour
     x = np.abs(point[:, 0])
@@ -183,7 +230,15 @@ def _beard(colour: np.ndarray, look: Complexion, point: np.ndarray, lips: np.nda
 
 
 def skin_texture(look: Complexion, shoes: Shoes) -> np.ndarray:
-    """Texture [h, w, 3] of neck, arms, hands and legs, with socks."""
+    """Paint neck, arms, hands and legs, with socks.
+
+    Args:
+        look: colours of the person.
+        shoes: with the socks.
+
+    Returns:
+        Texture [h, w, 3] uint8.
+    """
     piece = chart("skin")
     place = piece.texel_place
     colour = look.skin * _grain(look, place.point)[:, None]
@@ -198,7 +253,14 @@ def skin_texture(look: Complexion, shoes: Shoes) -> np.ndarray:
 
 
 def eye_texture(look: Complexion) -> np.ndarray:
-    """Texture [h, w, 3] of both eyeballs: white, iris, pupil."""
+    """Paint white, iris and pupil of both eyeballs.
+
+    Args:
+        look: colours of the person.
+
+    Returns:
+        Texture [h, w, 3] uint8.
+    """
     piece = chart("eyes")
     point = face_frame(piece.texel_place.point)
     folded = np.stack([np.abs(point[:, 0]), point[:, 1], point[:, 2]], 1) - EYE

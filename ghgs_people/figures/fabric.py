@@ -20,7 +20,15 @@ NEUTRALS = (
 
 
 def random_colour(rng: np.random.Generator, neutral: float = 0.4) -> np.ndarray:
-    """A colour of clothes, [3] in [0, 1]; `neutral` is the probability of greys, navy and browns."""
+    """Draw a colour of clothes.
+
+    Args:
+        rng: draws it.
+        neutral: probability of greys, navy and browns.
+
+    Returns:
+        [3] in [0, 1].
+    """
     if rng.random() < neutral:
         return np.clip(np.array(NEUTRALS[rng.integers(len(NEUTRALS))]) + rng.normal(0, 0.025, 3), 0.04, 0.96)
     saturation = rng.uniform(0.35, 0.88)
@@ -42,7 +50,12 @@ class Fabric:
 
 
 def sample_fabric(rng: np.random.Generator, patterns: tuple[str, ...] | None = None) -> Fabric:
-    """Draw a fabric with one of `patterns` (None: any)."""
+    """Draw a fabric.
+
+    Args:
+        rng: draws everything.
+        patterns: names of `PATTERNS` to choose from; None: any.
+    """
     names = tuple(patterns or PATTERNS)
     weights = np.array([PATTERNS[name] for name in names])
     pattern = str(rng.choice(names, p=weights / weights.sum()))
@@ -57,7 +70,16 @@ def sample_fabric(rng: np.random.Generator, patterns: tuple[str, ...] | None = N
 
 
 def _edge(x: np.ndarray, threshold: float, width: float) -> np.ndarray:
-    """1 where x is above `threshold`, with a soft edge."""
+    """A soft threshold.
+
+    Args:
+        x: any shape.
+        threshold: where it is 0.5.
+        width: from there to where it is 0 or 1.
+
+    Returns:
+        1 where ``x`` is above the threshold, 0 below.
+    """
     return smoothstep(threshold - width, threshold + width, x)
 
 
@@ -67,7 +89,16 @@ def _wave(x: np.ndarray) -> np.ndarray:
 
 
 def paint(fabric: Fabric, across: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Colours [k, 3] of points at `across` metres around the body and `along` metres up it."""
+    """Colour points of cloth.
+
+    Args:
+        fabric: pattern and colours.
+        across: [k] metres around the body.
+        along: [k] metres up it.
+
+    Returns:
+        Colours [k, 3], about 0 to 1.
+    """
     one, two, three = fabric.colours
     u = (np.cos(fabric.tilt) * across + np.sin(fabric.tilt) * along) / fabric.scale
     v = (np.cos(fabric.tilt) * along - np.sin(fabric.tilt) * across) / fabric.scale
@@ -94,7 +125,20 @@ def _pattern(
     coarse: np.ndarray,
     fabric: Fabric,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Shares of the second and of the third colour at pattern coordinates `u`, `v` (periods)."""
+    """Evaluate a pattern.
+
+    Args:
+        name: one of `PATTERNS`.
+        u: [k] coordinate across the pattern, periods.
+        v: [k] coordinate along the pattern, periods.
+        along: [k] metres up the body.
+        soft: width of edges, periods.
+        coarse: [k] smooth noise of zero mean and unit variance.
+        fabric: for its noise.
+
+    Returns:
+        Shares [k] of the second and of the third colour, 0 to 1.
+    """
     none = np.zeros_like(u)
     if name == "stripes":
         return _edge(_wave(v), 0.5, 2 * soft), _edge(_wave(v / 4), 0.94, soft)
@@ -134,7 +178,18 @@ def _pattern(
 def print_emblem(
     colour: np.ndarray, x: np.ndarray, y: np.ndarray, centre: tuple[float, float], rng: np.random.Generator
 ) -> np.ndarray:
-    """Print a random emblem on colours [k, 3] at places (x, y), metres, of front or back."""
+    """Print a random emblem on front or back.
+
+    Args:
+        colour: [k, 3] in [0, 1] of the cloth.
+        x: [k] metres to the right, as seen by who looks at it.
+        y: [k] metres up.
+        centre: (x, y) of the emblem's middle, metres.
+        rng: draws kind, colour and size.
+
+    Returns:
+        Colours [k, 3].
+    """
     kind = str(rng.choice(("disc", "letters", "bars", "star", "rings", "number")))
     ink = random_colour(rng, 0.3)
     size = rng.uniform(0.05, 0.10)
@@ -161,7 +216,18 @@ def print_emblem(
 
 
 def _glyphs(u: np.ndarray, v: np.ndarray, count: int, soft: float, rng: np.random.Generator) -> np.ndarray:
-    """Mask [k] of `count` letter-like signs in a row: strokes between the nodes of a small grid."""
+    """Letter-like signs in a row: strokes between the nodes of a small grid.
+
+    Args:
+        u: [k] coordinate to the right, in half sizes of the emblem.
+        v: [k] coordinate upwards, in half sizes of the emblem.
+        count: number of signs.
+        soft: half width of the strokes' edges, in half sizes of the emblem.
+        rng: draws the strokes.
+
+    Returns:
+        Mask [k], 0 to 1.
+    """
     mask = np.zeros_like(u)
     pitch = 2.6 / count
     height = min(0.75, 2.2 / count)

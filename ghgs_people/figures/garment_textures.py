@@ -12,18 +12,45 @@ from ghgs_people.figures.place import Place
 
 
 def _line(distance: np.ndarray, width: float) -> np.ndarray:
-    """1 on a line (distance in metres), 0 beyond `width`."""
+    """A line.
+
+    Args:
+        distance: [k] from its middle, metres.
+        width: beyond which it is 0, metres.
+
+    Returns:
+        Mask [k], 1 on the line.
+    """
     return 1 - smoothstep(0.4 * width, width, np.abs(distance))
 
 
 def _folds(across: np.ndarray, along: np.ndarray, noise: Noise, strength: np.ndarray) -> np.ndarray:
-    """Shading of folds as a factor [k]: hollows are darker."""
+    """Shade folds: hollows are darker.
+
+    Args:
+        across: [k] metres around the body.
+        along: [k] metres up it.
+        noise: of which folds are made.
+        strength: [k] of the shading, relative.
+
+    Returns:
+        Factor [k] on the colours.
+    """
     height = noise(across / 0.95 + 0.13, along / 0.45)
     return 1 + strength * np.clip(0.8 * height, -1.2, 0.5)
 
 
 def top_texture(top: Top, noise: Noise, rng: np.random.Generator) -> np.ndarray:
-    """Texture [h, w, 3] of a top."""
+    """Paint a top or a jacket.
+
+    Args:
+        top: the garment.
+        noise: of its folds.
+        rng: draws the emblem and the colour of the trim.
+
+    Returns:
+        Texture [h, w, 3] uint8 of the chart ``upper``.
+    """
     piece = chart("upper")
     place = piece.texel_place
     on_arm = place.arm > 0.5
@@ -55,7 +82,17 @@ def top_texture(top: Top, noise: Noise, rng: np.random.Generator) -> np.ndarray:
 
 
 def _trim(colour: np.ndarray, edge: np.ndarray, top: Top, rng: np.random.Generator) -> np.ndarray:
-    """Ribs or a stitched hem along all edges; `edge` [k] is the distance to the nearest in metres."""
+    """Paint ribs or a stitched hem along all edges.
+
+    Args:
+        colour: [k, 3] in [0, 1].
+        edge: [k] distance to the nearest edge, metres.
+        top: the garment.
+        rng: draws whether the trim has a colour of its own.
+
+    Returns:
+        Colours [k, 3].
+    """
     if top.kind in ("tee", "tank"):
         if rng.random() < 0.25:
             colour = mix(colour, 1 - smoothstep(0.013, 0.015, edge), top.fabric.colours[1])
@@ -69,7 +106,17 @@ def _trim(colour: np.ndarray, edge: np.ndarray, top: Top, rng: np.random.Generat
 
 
 def _front_closure(colour: np.ndarray, place: Place, top: Top, on_arm: np.ndarray) -> np.ndarray:
-    """Placket and buttons of a shirt, the zip edge of a jacket, chest pocket."""
+    """Paint placket, buttons and chest pocket of a shirt, or the zip edge of a jacket.
+
+    Args:
+        colour: [k, 3] in [0, 1].
+        place: of the k texels.
+        top: the garment.
+        on_arm: [k] bool, texels of sleeves.
+
+    Returns:
+        Colours [k, 3].
+    """
     front = (place.z > 0.08) & ~on_arm
     if top.opening:
         return darken(colour, _line(np.abs(place.x) - top.opening - 0.014, 0.003) * front, 0.3)
@@ -84,7 +131,15 @@ def _front_closure(colour: np.ndarray, place: Place, top: Top, on_arm: np.ndarra
 
 
 def bottom_texture(bottom: Bottom, noise: Noise) -> np.ndarray:
-    """Texture [h, w, 3] of trousers or a skirt."""
+    """Paint trousers or a skirt.
+
+    Args:
+        bottom: the garment.
+        noise: of its folds.
+
+    Returns:
+        Texture [h, w, 3] uint8 of the chart ``lower``, or ``skirt`` for one.
+    """
     if bottom.kind == "skirt":
         return _skirt_texture(bottom, noise)
     piece = chart("lower")
@@ -109,6 +164,17 @@ def bottom_texture(bottom: Bottom, noise: Noise) -> np.ndarray:
 
 
 def _belt(colour: np.ndarray, band: np.ndarray, bottom: Bottom, place: Place) -> np.ndarray:
+    """Paint a belt with its buckle, or the seam of a waistband.
+
+    Args:
+        colour: [k, 3] in [0, 1].
+        band: [k] mask of the belt, 0 to 1.
+        bottom: the garment.
+        place: of the k texels.
+
+    Returns:
+        Colours [k, 3].
+    """
     if bottom.belt is None:
         return darken(colour, _line(place.y - bottom.waist + 0.038, 0.003), 0.3)
     colour = mix(colour, band, bottom.belt)
@@ -117,7 +183,17 @@ def _belt(colour: np.ndarray, band: np.ndarray, bottom: Bottom, place: Place) ->
 
 
 def _denim(fabric: Fabric, across: np.ndarray, place: Place, noise: Noise) -> np.ndarray:
-    """Twill, faded at thigh and knee."""
+    """Paint twill, faded at thigh and knee.
+
+    Args:
+        fabric: for its first colour and its noise.
+        across: [k] metres around the leg.
+        place: of the k texels.
+        noise: of the faded parts.
+
+    Returns:
+        Colours [k, 3].
+    """
     twill = np.sin(2 * np.pi * (across + 0.6 * place.y) / 0.006)
     worn = bump(place.y, 0.62, 0.20) * smoothstep(1.5, 0.3, np.abs(place.leg_angle))
     worn = worn * np.clip(0.75 + 0.35 * noise(across / 0.5, place.y / 0.9), 0, 1.4)
@@ -133,9 +209,20 @@ def _denim(fabric: Fabric, across: np.ndarray, place: Place, noise: Noise) -> np
 
 
 def _pockets(colour: np.ndarray, place: Place, bottom: Bottom) -> np.ndarray:
+    """Paint the seams of pockets, fly and crotch, in a thread of their own on jeans.
+
+    Args:
+        colour: [k, 3] in [0, 1].
+        place: of the k texels.
+        bottom: the garment.
+
+    Returns:
+        Colours [k, 3].
+    """
     thread = np.array([0.72, 0.50, 0.25]) if bottom.kind == "jeans" else None
 
     def stitch(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        """Darken colours [k, 3] where a mask [k] is 1, and show the thread there."""
         colour = darken(colour, mask, 0.35)
         return colour if thread is None else mix(colour, 0.5 * mask, thread)
 
@@ -154,6 +241,7 @@ def _pockets(colour: np.ndarray, place: Place, bottom: Bottom) -> np.ndarray:
 
 
 def _skirt_texture(bottom: Bottom, noise: Noise) -> np.ndarray:
+    """Paint a skirt; arguments and result as of :func:`bottom_texture`."""
     piece = chart("skirt")
     place = piece.texel_place
     across = place.trunk_angle * 0.17
@@ -165,7 +253,14 @@ def _skirt_texture(bottom: Bottom, noise: Noise) -> np.ndarray:
 
 
 def shoe_texture(shoes: Shoes) -> np.ndarray:
-    """Texture [h, w, 3] of shoes: upper, toe cap, laces, sole."""
+    """Paint upper, toe cap, laces and sole of shoes.
+
+    Args:
+        shoes: kind and colours.
+
+    Returns:
+        Texture [h, w, 3] uint8 of the chart ``shoes``.
+    """
     piece = chart("shoes")
     place = piece.texel_place
     colour = np.tile(shoes.upper, (len(place.y), 1))

@@ -33,7 +33,15 @@ class Figure:
 
 
 def neckline(place: Place, kind: str) -> np.ndarray:
-    """Field that is positive below the neckline."""
+    """Field of a neckline.
+
+    Args:
+        place: of n points.
+        kind: crew, scoop, vee, collar or straps.
+
+    Returns:
+        [n] metres below it, negative above.
+    """
     back, slope, radius, rise = {
         "crew": (1.422, 0.50, 0.072, 0.03),
         "scoop": (1.410, 0.82, 0.088, 0.05),
@@ -51,7 +59,15 @@ def neckline(place: Place, kind: str) -> np.ndarray:
 
 
 def top_field(place: Place, top: Top) -> np.ndarray:
-    """Field that is positive where the garment is."""
+    """Field of a top or a jacket.
+
+    Args:
+        place: of n points.
+        top: the garment.
+
+    Returns:
+        [n] metres from its edge, positive where the garment is.
+    """
     hem = place.y - top.hem + 2.0 * place.arm
     sleeve = top.sleeve - place.sleeve
     if top.kind == "tank":  # armholes run from the shoulder strap to under the arm
@@ -65,13 +81,29 @@ def top_field(place: Place, top: Top) -> np.ndarray:
 
 
 def bottom_field(place: Place, bottom: Bottom) -> np.ndarray:
-    """Field that is positive where trousers or a skirt are."""
+    """Field of trousers or a skirt.
+
+    Args:
+        place: of n points.
+        bottom: the garment.
+
+    Returns:
+        [n] metres from its edge, positive where the garment is.
+    """
     hem = bottom.hem if bottom.kind == "skirt" else max(bottom.hem, ANKLE)
     return np.minimum(np.minimum(bottom.waist - place.y, place.y - hem), 0.5 - place.arm)
 
 
 def shoe_field(place: Place, shoes: Shoes) -> np.ndarray:
-    """Field that is positive where shoes are: low in front of the ankle, higher at the heel."""
+    """Field of shoes: they are low in front of the ankle, higher at the heel.
+
+    Args:
+        place: of n points.
+        shoes: the shoes.
+
+    Returns:
+        [n] metres from their upper edge, positive where shoes are.
+    """
     instep = smoothstep(0.06, 0.13, place.z)
     return shoes.top - place.y + 0.02 * instep + 0.008 * np.cos(place.leg_angle)
 
@@ -82,8 +114,17 @@ def shoe_field(place: Place, shoes: Shoes) -> np.ndarray:
 def push_out(
     points: np.ndarray, vertices: np.ndarray, normals: np.ndarray, clearance: np.ndarray
 ) -> np.ndarray:
-    """Move points [g, 3] outwards until they keep a distance ``clearance`` [g] in metres along the normal of
-    the nearest of the body's ``vertices`` [n, 3] with unit ``normals`` [n, 3]."""
+    """Move points outwards until they keep a distance from a body.
+
+    Args:
+        points: [g, 3], metres.
+        vertices: [n, 3] of the body, metres.
+        normals: [n, 3] of the body, unit vectors.
+        clearance: [g], least distance along the normal of the nearest vertex, metres.
+
+    Returns:
+        [g, 3]; no point moves more than 4 cm.
+    """
     _, index = cKDTree(vertices).query(points)
     height = np.einsum("gi,gi->g", points - vertices[index], normals[index])
     lack = np.clip(clearance - height, 0.0, 0.04)
@@ -91,7 +132,16 @@ def push_out(
 
 
 def drape_top(figure: Figure, top: Top, noise: Noise) -> np.ndarray:
-    """Posed points [g, 3] of the upper chart for a top."""
+    """Drape a top or a jacket.
+
+    Args:
+        figure: who wears it.
+        top: the garment.
+        noise: of its folds.
+
+    Returns:
+        Points [g, 3] of the upper chart in the pose, metres.
+    """
     piece = chart("upper")
     place = piece.place
     points = piece.interpolation @ figure.rest
@@ -112,7 +162,15 @@ def drape_top(figure: Figure, top: Top, noise: Noise) -> np.ndarray:
 
 
 def fold_collar(posed: np.ndarray, top: Top) -> tuple[np.ndarray, np.ndarray]:
-    """A collar folded down over its shirt: posed points [g, 3] of the upper chart, and its field [g]."""
+    """Fold a collar down over its shirt.
+
+    Args:
+        posed: points [g, 3] of the shirt in the pose, metres.
+        top: the shirt.
+
+    Returns:
+        Points [g, 3] of the upper chart in the pose, and the collar's field [g], both in metres.
+    """
     piece = chart("upper")
     below = neckline(piece.place, top.neck)
     lift = 0.004 + 0.006 * smoothstep(0.0, 0.03, below)
@@ -136,7 +194,16 @@ def _wrinkles(place: Place, noise: Noise, top: Top) -> np.ndarray:
 
 
 def _hang(points: np.ndarray, place: Place, share: np.ndarray | float) -> np.ndarray:
-    """Let a share (0 to 1) of the cloth hang from chest, shoulder blades and belly over the hollows below."""
+    """Let cloth hang from chest, shoulder blades and belly over the hollows below.
+
+    Args:
+        points: [g, 3] at rest, metres.
+        place: of the points.
+        share: how much of the cloth hangs, 0 to 1; one number or [g].
+
+    Returns:
+        [g, 3].
+    """
     trunk = place.arm < 0.3
     axis = np.array([0.0, np.median(points[trunk, 2])])
     offset = points[:, [0, 2]] - axis
@@ -167,7 +234,16 @@ def _hang(points: np.ndarray, place: Place, share: np.ndarray | float) -> np.nda
 
 
 def drape_trousers(figure: Figure, bottom: Bottom, noise: Noise) -> np.ndarray:
-    """Posed points [g, 3] of the lower chart for trousers or shorts."""
+    """Drape trousers, leggings or shorts.
+
+    Args:
+        figure: who wears them.
+        bottom: the garment.
+        noise: of its folds.
+
+    Returns:
+        Points [g, 3] of the lower chart in the pose, metres.
+    """
     piece = chart("lower")
     place = piece.place
     points = piece.interpolation @ figure.rest
@@ -191,27 +267,48 @@ def drape_trousers(figure: Figure, bottom: Bottom, noise: Noise) -> np.ndarray:
 def _widen_legs(
     figure: Figure, points: np.ndarray, place: Place, bottom: Bottom, folds: np.ndarray
 ) -> np.ndarray:
-    """Widen each leg to the radius of its cut: a straight tube from the thigh to the hem."""
+    """Widen each leg to the radius of its cut: a straight tube from the thigh to the hem.
+
+    Args:
+        figure: who wears the trousers.
+        points: [g, 3] of the lower chart at rest, metres.
+        place: of the points.
+        bottom: the garment.
+        folds: [g] height of folds, metres.
+
+    Returns:
+        [g, 3] at rest.
+    """
     body = load_body()
     joints = [figure.joints[body.bone(f"{name}.L")] for name in ("upperleg01", "lowerleg01", "foot")]
     moved = points.copy()
     for side in (1.0, -1.0):
-        own = np.flatnonzero((place.side == side) & (place.y < CROTCH))
+        leg = np.flatnonzero((place.side == side) & (place.y < CROTCH))
         line = np.array([[side * j[0], j[1], j[2]] for j in joints])
-        centre = np.stack([np.interp(-points[own, 1], -line[:, 1], line[:, i]) for i in (0, 2)], 1)
-        offset = points[own][:, [0, 2]] - centre
+        centre = np.stack([np.interp(-points[leg, 1], -line[:, 1], line[:, i]) for i in (0, 2)], 1)
+        offset = points[leg][:, [0, 2]] - centre
         radius = np.hypot(*offset.T)
-        thigh = radius[np.abs(place.y[own] - 0.69) < 0.03].mean()
+        thigh = radius[np.abs(place.y[leg] - 0.69) < 0.03].mean()
         hem = thigh + bottom.width if bottom.kind == "shorts" else bottom.width
-        cut = np.interp(place.y[own], [bottom.hem, 0.70, CROTCH], [hem, 0.94 * thigh, 0.0])
-        wanted = np.maximum(radius, cut + folds[own])
-        moved[own[:, None], [0, 2]] = centre + offset * (wanted / np.maximum(radius, 1e-6))[:, None]
-        moved[own, 0] = side * np.maximum(side * moved[own, 0], 0.006)
+        cut = np.interp(place.y[leg], [bottom.hem, 0.70, CROTCH], [hem, 0.94 * thigh, 0.0])
+        wanted = np.maximum(radius, cut + folds[leg])
+        moved[leg[:, None], [0, 2]] = centre + offset * (wanted / np.maximum(radius, 1e-6))[:, None]
+        moved[leg, 0] = side * np.maximum(side * moved[leg, 0], 0.006)
     return moved
 
 
 def drape_skirt(figure: Figure, bottom: Bottom, noise: Noise, rng: np.random.Generator) -> np.ndarray:
-    """Posed points [g, 3] of the skirt chart: flared towards the hem, with folds."""
+    """Drape a skirt, flared towards the hem, with folds.
+
+    Args:
+        figure: who wears it.
+        bottom: the garment.
+        noise: of the folds' course.
+        rng: draws number and depth of the folds.
+
+    Returns:
+        Points [g, 3] of the skirt chart in the pose, metres.
+    """
     piece = chart("skirt")
     place = piece.place
     points = piece.interpolation @ figure.rest
@@ -230,7 +327,15 @@ def drape_skirt(figure: Figure, bottom: Bottom, noise: Noise, rng: np.random.Gen
 
 
 def shape_shoes(figure: Figure, shoes: Shoes) -> np.ndarray:
-    """Posed points [g, 3] of the shoe chart: rounded toes, a flat sole below the foot."""
+    """Shape shoes: rounded toes, a flat sole below the foot.
+
+    Args:
+        figure: who wears them.
+        shoes: the shoes.
+
+    Returns:
+        Points [g, 3] of the shoe chart in the pose, metres.
+    """
     piece = chart("shoes")
     place = piece.place
     points = piece.interpolation @ figure.rest
@@ -247,7 +352,17 @@ def shape_shoes(figure: Figure, shoes: Shoes) -> np.ndarray:
 
 
 def _pose(figure: Figure, piece: Chart, points: np.ndarray, clearance: np.ndarray) -> np.ndarray:
-    """Pose a garment by its skinning weights; move it out of the body before and after."""
+    """Pose a garment by its skinning weights; move it out of the body before and after.
+
+    Args:
+        figure: who wears it.
+        piece: its chart.
+        points: [g, 3] at rest, metres.
+        clearance: [g], least distance from the body, metres; negative where it may be inside.
+
+    Returns:
+        [g, 3] in the pose.
+    """
     bare = figure.rest[:BODY_VERTICES]
     points = push_out(points, bare, vertex_normals(bare, figure.faces), clearance)
     posed = skin(points, piece.weights, figure.transforms)

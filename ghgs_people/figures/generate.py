@@ -35,10 +35,17 @@ MAX_POSES = 6  # drawn until the arms are clear of the trunk, each with the arms
 
 
 class Character:
-    """A person apart from the pose: shape, clothes, colours and hair; ``index`` is its number in a family.
+    """A person apart from the pose: shape, clothes, colours and hair.
 
-    ``first`` is the pose that it stands in, of sport or dance where ``active``; ``motion_rng`` draws others.
-    InputError: a number is negative.
+    ``first`` is the pose that it stands in; ``motion_rng`` draws others.
+
+    Args:
+        seed: of a family of people, at least 0.
+        index: number of the person in its family, at least 0.
+        active: whether ``first`` is a pose of sport or dance.
+
+    Raises:
+        InputError: a number is negative.
     """
 
     def __init__(self, seed: int, index: int, active: bool = False) -> None:
@@ -56,7 +63,12 @@ class Character:
         self.cut = under_hat(cut) if self.outfit.beanie else cut
 
     def dressed(self, figure: Figure, spheres: Spheres) -> list[TexturedMesh]:
-        """Skin, clothes, hair and cap over a figure of this shape, the same ones each time."""
+        """Skin, clothes, hair and cap over a figure of this shape, the same ones each time.
+
+        Args:
+            figure: this person in any pose.
+            spheres: of its body in that pose, which cast shadows.
+        """
         scalp = 0.25 if self.cut.style == "bald" else 1.0
         parts = [skin_part(figure, self.outfit, self.look, spheres, scalp)]
         parts += dress(figure, self.outfit, spheres, deepcopy(self.cloth_rng))
@@ -65,7 +77,16 @@ class Character:
         return [part for part in parts if len(part.faces)]  # a jacket may hide all of a collar
 
     def placed(self, parts: list[TexturedMesh], bodies: np.ndarray, first: int) -> Person:
-        """The person of ``parts``, of which the ``first`` ones are in the first pose and stand on y = 0."""
+        """Place meshes in front of the cameras, as the first pose stands.
+
+        Args:
+            parts: meshes in one frame; the ``first`` ones are in the first pose and stand on y = 0.
+            bodies: vertices [k, 3] of the body under them, of all poses one after the other, metres.
+            first: number of parts of the first pose.
+
+        Returns:
+            The person, turned by a random angle about y.
+        """
         turn = Rotation.from_euler("y", self.pose_rng.uniform(-MAX_YAW, MAX_YAW), degrees=True).as_matrix()
         origin = 0.5 * (self.first.posed.min(0) + self.first.posed.max(0))
         origin[1] = min(float(part.vertices[:, 1].min()) for part in parts[:first])
@@ -74,12 +95,19 @@ class Character:
 
 
 def generate(seed: int, index: int, active: bool = False) -> Person:
-    """Person `index` of the family `seed`, the same on every machine, up to rounding; arguments and errors as
-    for :class:`Character`.
+    """Generate a person, the same on every machine, up to rounding.
 
-    An adult of 1.52 to 1.87 m (barefoot and upright), in metres, with feet on y = 0, the bounding box of the
-    body centred over the origin, facing +z up to 30 degrees of yaw. Part 0 is the skin; clothes, hair and a
-    cap follow.
+    An adult of 1.52 to 1.87 m (barefoot and upright), in metres, with feet on y = 0, the bounding box of
+    the body centred over the origin, facing +z up to 30 degrees of yaw. Part 0 is the skin; clothes, hair
+    and a cap follow.
+
+    Args:
+        seed: of a family of people, at least 0.
+        index: number of the person in its family, at least 0.
+        active: whether the pose is one of sport or dance.
+
+    Raises:
+        InputError: a number is negative.
     """
     person = Character(seed, index, active)
     parts = person.dressed(person.first, occluding_spheres(person.first))
@@ -89,7 +117,17 @@ def generate(seed: int, index: int, active: bool = False) -> Person:
 def pose_figure(
     body: BodyModel, coefficients: np.ndarray, rng: np.random.Generator, active: bool = False
 ) -> Figure:
-    """The naked person in a random pose in which the arms do not run into the trunk."""
+    """Draw a pose in which the arms do not run into the trunk.
+
+    Args:
+        body: the base mesh.
+        coefficients: [k] of the person's shape.
+        rng: draws the pose.
+        active: as in sport or dance.
+
+    Returns:
+        The naked person; after `MAX_POSES` attempts the last one.
+    """
     rest, joints = body.rest(coefficients)
     faces = triangles(body.surfaces["body"].quads)
     for attempt in range(MAX_POSES):
@@ -101,7 +139,15 @@ def pose_figure(
 
 
 def arm_depth(posed: np.ndarray, faces: np.ndarray) -> float:
-    """How deep, in metres, forearms and hands are inside trunk and thighs."""
+    """How deep forearms and hands are inside trunk and thighs.
+
+    Args:
+        posed: vertices [BODY_VERTICES, 3] of the skin in the pose, metres.
+        faces: [m, 3] of the skin.
+
+    Returns:
+        Metres, 0 where they are outside.
+    """
     limb, solid = _limbs_and_trunk()
     normals = vertex_normals(posed, faces)
     distance, nearest = cKDTree(posed[solid]).query(posed[limb], distance_upper_bound=0.08)
@@ -123,7 +169,14 @@ def _limbs_and_trunk() -> tuple[np.ndarray, np.ndarray]:
 
 
 def dress(figure: Figure, outfit: Outfit, spheres: Spheres, rng: np.random.Generator) -> list[TexturedMesh]:
-    """Top and jacket, trousers or skirt, shoes; each without what the next one hides."""
+    """Make top and jacket, trousers or skirt, shoes; each without what the next one hides.
+
+    Args:
+        figure: who wears them.
+        outfit: what is worn.
+        spheres: of the body in the pose, which cast shadows.
+        rng: draws folds, emblems and trims.
+    """
     noise = Noise(rng, 2.3, 3.0, 128)
     top = outfit.top
     jacket = outfit.jacket
@@ -134,6 +187,14 @@ def dress(figure: Figure, outfit: Outfit, spheres: Spheres, rng: np.random.Gener
     feet = chart("shoes")
 
     def sew(piece: Chart, points: np.ndarray, field: np.ndarray, texture: np.ndarray) -> TexturedMesh:
+        """Make the mesh of a garment.
+
+        Args:
+            piece: its chart.
+            points: [g, 3] in the pose, metres.
+            field: [g], positive where the garment is.
+            texture: [h, w, 3] uint8, without shadows.
+        """
         return piece.mesh(points, field, piece.shaded(texture, ambient_occlusion(piece, points, spheres)))
 
     field = garments.top_field(upper.place, top)
@@ -170,7 +231,17 @@ def dress(figure: Figure, outfit: Outfit, spheres: Spheres, rng: np.random.Gener
 def skin_part(
     figure: Figure, outfit: Outfit, look: Complexion, spheres: Spheres, scalp: float
 ) -> TexturedMesh:
-    """Head, eyes and the skin that clothes leave bare, as one mesh, so that normals agree at the neck."""
+    """Make head, eyes and the skin that clothes leave bare.
+
+    They are one mesh, so that normals agree at the neck.
+
+    Args:
+        figure: the person.
+        outfit: what covers the skin.
+        look: colours of the person.
+        spheres: of the body in the pose, which cast shadows.
+        scalp: how strongly hair covers the scalp, 0 to 1.
+    """
     textures = {
         "head": head_texture(look, scalp),
         "skin": skin_texture(look, outfit.shoes),
@@ -192,7 +263,11 @@ def skin_part(
 
 
 def join(parts: list[TexturedMesh]) -> TexturedMesh:
-    """One mesh of several opaque ones, their textures side by side."""
+    """One mesh of several opaque ones, their textures side by side.
+
+    Args:
+        parts: at least one.
+    """
     height = max(part.texture.shape[0] for part in parts)
     width = sum(part.texture.shape[1] for part in parts)
     textures = []
@@ -213,7 +288,15 @@ def join(parts: list[TexturedMesh]) -> TexturedMesh:
 
 
 def bare_field(place: Place, outfit: Outfit) -> np.ndarray:
-    """Positive where skin shows, and `OVERLAP` further below the clothes."""
+    """Field of bare skin.
+
+    Args:
+        place: of n points.
+        outfit: what covers the skin.
+
+    Returns:
+        [n] metres, positive where skin shows, and `OVERLAP` further below the clothes.
+    """
     covered = np.maximum(garments.top_field(place, outfit.top), garments.shoe_field(place, outfit.shoes))
     bottom = garments.bottom_field(place, outfit.bottom)
     if outfit.bottom.kind == "skirt":  # below it legs are visible

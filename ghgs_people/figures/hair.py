@@ -36,7 +36,12 @@ class Haircut:
 
 
 def sample_haircut(rng: np.random.Generator, female: bool) -> Haircut:
-    """Draw a haircut."""
+    """Draw a haircut.
+
+    Args:
+        rng: draws everything.
+        female: which of `SHARES` is used.
+    """
     style = str(rng.choice(STYLES, p=SHARES[female]))
     thickness = {
         "bald": 0.0, "crop": rng.uniform(0.006, 0.012), "short": rng.uniform(0.014, 0.026),
@@ -47,7 +52,17 @@ def sample_haircut(rng: np.random.Generator, female: bool) -> Haircut:
 
 
 def make_hair(figure: Figure, cut: Haircut, look: Complexion, rng: np.random.Generator) -> list[TexturedMesh]:
-    """Meshes of the hair in the pose; none for a bald head."""
+    """Make the hair in the pose.
+
+    Args:
+        figure: the person.
+        cut: its haircut.
+        look: its colours.
+        rng: draws place and size of a ponytail or bun.
+
+    Returns:
+        Meshes; none for a bald head.
+    """
     if cut.style == "bald":
         return []
     if cut.style in ("bob", "long"):
@@ -59,7 +74,17 @@ def make_hair(figure: Figure, cut: Haircut, look: Complexion, rng: np.random.Gen
 
 
 def _strands(look: Complexion, across: np.ndarray, along: np.ndarray, curl: float) -> np.ndarray:
-    """Colour [k, 3] of hair: streaks along the strands."""
+    """Colour hair: streaks along the strands.
+
+    Args:
+        look: colours of the person.
+        across: [k] metres across the strands.
+        along: [k] metres along them.
+        curl: strength of curls, 0 to 1.
+
+    Returns:
+        Colours [k, 3].
+    """
     streak = look.fine(across / 0.10, along / 1.6) + 0.7 * look.fine(across / 0.28 + 0.3, along / 2.5)
     clump = look.noise(across / 0.30, along / 0.8)
     curls = look.fine(across / 0.14, along / 0.14) if curl else 0.0
@@ -117,7 +142,15 @@ def _grid_faces(rows: int, columns: int) -> np.ndarray:
 def _grid_mesh(
     figure: Figure, points: np.ndarray, weights: np.ndarray, clearance: float, texture: np.ndarray
 ) -> TexturedMesh:
-    """Skin a grid [rows, columns, 3] and keep it outside the body."""
+    """Skin a grid and keep it outside the body.
+
+    Args:
+        figure: the person.
+        points: [rows, columns, 3] at rest, metres.
+        weights: [rows * columns, b] skinning weights.
+        clearance: least distance from the body at rest, metres; 0.6 of it in the pose.
+        texture: [h, w, 3] uint8 over the whole grid, row 0 at its top.
+    """
     rows, columns, _ = points.shape
     naked = figure.rest[:BODY_VERTICES]
     air = np.full(rows * columns, clearance)
@@ -130,7 +163,15 @@ def _grid_mesh(
 
 
 def _hanging_weights(heights: np.ndarray, neck: float) -> np.ndarray:
-    """Skinning weights [n, b] of hair at rest heights [n]: above the neck the head's, below the chest's."""
+    """Skinning weights of hair: above the neck the head's, below the chest's.
+
+    Args:
+        heights: [n] at rest, metres.
+        neck: height of the neck, metres.
+
+    Returns:
+        [n, b].
+    """
     body = load_body()
     weights = np.zeros((len(heights), len(body.bone_names)))
     chest = smoothstep(neck, neck - 0.16, heights)
@@ -140,6 +181,13 @@ def _hanging_weights(heights: np.ndarray, neck: float) -> np.ndarray:
 
 
 def _texture(look: Complexion, wave: float, length: float) -> np.ndarray:
+    """Texture [512, 512, 3] uint8 of strands that run from top to bottom.
+
+    Args:
+        look: colours of the person.
+        wave: how wavy they are, 0 to 1.
+        length: of the strands, metres.
+    """
     v, u = np.meshgrid((np.arange(512) + 0.5) / 512, (np.arange(512) + 0.5) / 512, indexing="ij")
     swing = 0.012 * wave * np.sin(2 * np.pi * (3.0 * v + 0.25 * look.noise(2 * u, 0.5 * v)))
     colour = _strands(look, (0.5 * u + swing).ravel(), (length * v).ravel(), 0.1)
@@ -188,6 +236,7 @@ def _skull(figure: Figure) -> tuple[np.ndarray, float, Callable[[np.ndarray], np
     tree = cKDTree((head - centre) / radii[:, None])
 
     def radius_at(direction: np.ndarray) -> np.ndarray:
+        """Radius [...] along unit vectors [..., 3]: a mean of the 12 nearest vertices."""
         distance, index = tree.query(direction.reshape(-1, 3), k=12)
         weight = 1 / (distance + 0.06) ** 2
         return ((radii[index] * weight).sum(1) / weight.sum(1)).reshape(direction.shape[:-1])
@@ -201,7 +250,12 @@ def _face(height: np.ndarray) -> np.ndarray:
 
 
 def make_beanie(figure: Figure, fabric: Fabric) -> TexturedMesh:
-    """A knitted cap down to the ears, its brim turned up."""
+    """Make a knitted cap down to the ears, its brim turned up.
+
+    Args:
+        figure: who wears it.
+        fabric: of the cap.
+    """
     piece = chart("scalp")
     points = piece.interpolation @ figure.rest
     for _ in range(12):
@@ -218,12 +272,24 @@ def make_beanie(figure: Figure, fabric: Fabric) -> TexturedMesh:
 
 
 def under_hat(cut: Haircut) -> Haircut:
-    """The haircut below a hat: flat on the scalp."""
+    """The haircut below a hat: flat on the scalp.
+
+    Args:
+        cut: without the hat.
+    """
     style = cut.style if cut.style in ("bald", "bob", "long") else "crop"
     return Haircut(style, min(cut.thickness, 0.007), cut.end, cut.wave)
 
 
 def _tail(figure: Figure, cut: Haircut, look: Complexion, rng: np.random.Generator) -> TexturedMesh:
+    """Make a ponytail or a bun at the back of the head.
+
+    Args:
+        figure: the person.
+        cut: of style ``tail`` or ``bun``.
+        look: colours of the person.
+        rng: draws place and size.
+    """
     body = load_body()
     skull = body.mean[:BODY_VERTICES]
     anchor = int(np.argmin(np.linalg.norm(skull - [0.0, rng.uniform(1.57, 1.64), 0.0], axis=1)))

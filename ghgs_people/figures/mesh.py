@@ -14,8 +14,12 @@ from ghgs_lit.errors import require
 
 @dataclass(frozen=True)
 class TexturedMesh:
-    """One part of a person: triangles with one texture. InputError: an array has another shape or a value
-    that is not finite, or the faces name vertices that do not exist."""
+    """One part of a person: triangles with one texture.
+
+    Raises:
+        InputError: an array has another shape or a value that is not finite, or the faces name vertices
+            that do not exist.
+    """
 
     vertices: np.ndarray  # [n, 3] float32, metres
     faces: np.ndarray  # [m, 3] int64, counter-clockwise seen from outside
@@ -37,15 +41,27 @@ class TexturedMesh:
 
 @dataclass(frozen=True)
 class Person:
-    """A dressed, posed person. ``body_vertices``: [k, 3] float32, the body under the clothes in the frame of
-    the parts; None: unknown."""
+    """A dressed, posed person.
+
+    Args:
+        name: of the person, for files and messages.
+        parts: its meshes, in one frame.
+        body_vertices: [k, 3] float32, the body under the clothes in the frame of the parts; None: unknown.
+    """
 
     name: str
     parts: tuple[TexturedMesh, ...]
     body_vertices: np.ndarray | None
 
     def mapped(self, function: Callable[[np.ndarray], np.ndarray]) -> "Person":
-        """The person with ``function`` applied to all vertices [n, 3], in float64, of parts and body."""
+        """Move the person.
+
+        Args:
+            function: maps vertices [n, 3] float64; applied to parts and body.
+
+        Returns:
+            A new person, float32.
+        """
 
         def move(vertices: np.ndarray) -> np.ndarray:
             return function(vertices.astype(np.float64)).astype(np.float32)
@@ -56,8 +72,15 @@ class Person:
 
 
 def sample_texture(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Colours [n, 3] in [0, 1] of a repeating texture [h, w, 3] uint8, bilinear. ``uv``: [n, 2], origin at
-    the bottom left."""
+    """Look up a repeating texture, bilinear.
+
+    Args:
+        texture: [h, w, 3] uint8, row 0 at the top.
+        uv: [n, 2], origin at the bottom left, 1 is one repetition.
+
+    Returns:
+        Colours [n, 3] float32 in [0, 1].
+    """
     height, width, _ = texture.shape
     x = uv[:, 0] * width - 0.5
     y = (1 - uv[:, 1]) * height - 0.5

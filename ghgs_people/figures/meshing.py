@@ -7,25 +7,55 @@ from scipy.ndimage import distance_transform_edt
 
 
 def triangles(quads: np.ndarray) -> np.ndarray:
-    """Split quads [m, 4] into triangles [2 m, 3]."""
+    """Split quads into triangles.
+
+    Args:
+        quads: [m, 4] indices of corners in order.
+
+    Returns:
+        [2 m, 3].
+    """
     return quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals [n, 3], the mean of the faces around each vertex weighted by area; 0 where they cancel."""
+    """Unit normals, the mean of the faces around each vertex weighted by area.
+
+    Args:
+        vertices: [n, 3].
+        faces: [m, 3], counter-clockwise seen from outside.
+
+    Returns:
+        [n, 3]; 0 where normals cancel.
+    """
     double_areas = trimesh.triangles.cross(vertices[faces])  # their length is what weights them
     return trimesh.geometry.mean_vertex_normals(len(vertices), faces, double_areas)
 
 
 def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit vertex normals [n, 3] float32; vertices that a UV seam splits at one position share one."""
+    """Unit normals of which vertices that a UV seam splits at one position share one.
+
+    Args:
+        vertices: [n, 3]; positions are one where six decimals agree.
+        faces: [m, 3], counter-clockwise seen from outside.
+
+    Returns:
+        [n, 3] float32.
+    """
     first, merged = trimesh.grouping.unique_rows(vertices, digits=6)
     return vertex_normals(vertices[first].astype(np.float64), merged[faces])[merged].astype(np.float32)
 
 
 def subdivide(quads: np.ndarray, count: int) -> tuple[sparse.csr_matrix, np.ndarray]:
-    """Split each quad in four. Returns: the operator [count + edges + m, count] that gives the new vertices,
-    and the new quads [4 m, 4]."""
+    """Split each quad in four, by the middles of edges and faces.
+
+    Args:
+        quads: [m, 4] indices of vertices.
+        count: number of vertices.
+
+    Returns:
+        The operator [count + edges + m, count] that gives the new vertices, and the new quads [4 m, 4].
+    """
     edges = np.sort(np.stack([quads, np.roll(quads, -1, 1)], -1).reshape(-1, 2), 1)
     unique, inverse = np.unique(edges, axis=0, return_inverse=True)
     mid = count + inverse.reshape(-1, 4)
@@ -42,7 +72,15 @@ def subdivide(quads: np.ndarray, count: int) -> tuple[sparse.csr_matrix, np.ndar
 
 
 def neighbour_mean(faces: np.ndarray, count: int) -> sparse.csr_matrix:
-    """Operator [count, count]: half the way to the mean of the neighbours; the border stays in place."""
+    """One step of Laplacian smoothing: half the way to the mean of the neighbours; the border stays.
+
+    Args:
+        faces: [m, c] indices of vertices, triangles or quads.
+        count: number of vertices.
+
+    Returns:
+        Operator [count, count], rows sum to 1.
+    """
     pairs = np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2)
     graph = sparse.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (count, count)).tocsr()
     both = graph + graph.T
@@ -58,9 +96,16 @@ def neighbour_mean(faces: np.ndarray, count: int) -> sparse.csr_matrix:
 
 
 def clip(faces: np.ndarray, field: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Cut a mesh of ``faces`` [m, 3] along the zero line of a ``field`` [n] on its vertices and keep the
-    positive side. Returns: Faces [k, 3] of new vertices, and for each of these two old ones `a`, `b` and the
-    share `t` of `b`: an attribute of the new mesh is `(1 - t) * x[a] + t * x[b]`."""
+    """Cut a mesh along the zero line of a field and keep the positive side.
+
+    Args:
+        faces: [m, 3].
+        field: [n] on the vertices, linear between them.
+
+    Returns:
+        Faces [k, 3] of new vertices, and for each of these two old ones `a`, `b` and the share `t` of
+        `b`: an attribute of the new mesh is `(1 - t) * x[a] + t * x[b]`.
+    """
     count = len(field)
     inside = field[faces] >= 0
     number = inside.sum(1)
@@ -91,9 +136,18 @@ def clip(faces: np.ndarray, field: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
 
 
 def rasterise(uv: np.ndarray, faces: np.ndarray, height: int, width: int) -> tuple[np.ndarray, ...]:
-    """Find the face that each texel of a texture shows. Returns: Flat indices [k] of the covered texels,
-    their face [k] and barycentric coordinates [k, 3], and `nearest` [height * width]: for each texel the
-    position among the k of the nearest covered one. ``uv``: [n, 2] in [0, 1], origin at the bottom left."""
+    """Find the face that each texel of a texture shows.
+
+    Args:
+        uv: [n, 2] in [0, 1], origin at the bottom left.
+        faces: [m, 3] over the n points.
+        height: of the texture, texels.
+        width: of the texture, texels.
+
+    Returns:
+        Flat indices [k] of the covered texels, their face [k] and barycentric coordinates [k, 3], and
+        `nearest` [height * width]: for each texel the position among the k of the nearest covered one.
+    """
     corners = np.stack([uv[faces][..., 0] * width, (1 - uv[faces][..., 1]) * height], -1) - 0.5
     low = np.maximum(np.ceil(corners.min(1) - 1e-6).astype(np.int64), 0)
     high = np.minimum(np.floor(corners.max(1) + 1e-6).astype(np.int64), [width - 1, height - 1])

@@ -4,8 +4,14 @@ import numpy as np
 
 
 class Noise:
-    """A periodic field with zero mean, unit variance and a power spectrum of 1 / f^(2 slope). ``slope``: the
-    larger, the smoother. ``fineness``: lowest number of waves per period."""
+    """A periodic field with zero mean, unit variance and a power spectrum of 1 / f^(2 slope).
+
+    Args:
+        rng: draws the field.
+        slope: the larger, the smoother.
+        fineness: lowest number of waves per period.
+        size: values per period, along both axes.
+    """
 
     def __init__(self, rng: np.random.Generator, slope: float = 1.2, fineness: float = 2.0, size: int = 256):
         frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None]) * size
@@ -16,7 +22,12 @@ class Noise:
         self.field = (field / field.std()).astype(np.float32)
 
     def __call__(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Bilinear values at `u`, `v` in periods, any shape; by hand in float32, faster than SciPy."""
+        """Bilinear values; by hand in float32, faster than SciPy.
+
+        Args:
+            u: column in periods, any shape; the field repeats.
+            v: row in periods, of the shape of ``u``.
+        """
         x = np.asarray(u, np.float32) * np.float32(self.size)
         y = np.asarray(v, np.float32) * np.float32(self.size)
         left = np.floor(x)

@@ -73,7 +73,12 @@ class Outfit:
 
 
 def sample_outfit(rng: np.random.Generator, female: bool) -> Outfit:
-    """Draw an outfit."""
+    """Draw an outfit.
+
+    Args:
+        rng: draws everything.
+        female: whether skirts and cropped tops are possible.
+    """
     skirt = female and rng.random() < 0.36
     dress = skirt and rng.random() < 0.4
     top = _sample_top(rng, female, tucked=skirt or rng.random() < 0.3)
@@ -92,6 +97,13 @@ def sample_outfit(rng: np.random.Generator, female: bool) -> Outfit:
 
 
 def _sample_top(rng: np.random.Generator, female: bool, tucked: bool) -> Top:
+    """Draw a top.
+
+    Args:
+        rng: draws everything.
+        female: whether it may be cropped.
+        tucked: into trousers or skirt.
+    """
     kind = str(rng.choice(("tee", "sweater", "shirt", "tank"), p=(0.40, 0.27, 0.22, 0.11)))
     hem = rng.uniform(0.84, 0.93)
     if kind == "tee":

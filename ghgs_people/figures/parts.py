@@ -26,6 +26,14 @@ _LIMBS = {
 
 
 def _part_of(bone: str) -> str:
+    """Name the part of the body that a bone belongs to.
+
+    Args:
+        bone: its name.
+
+    Returns:
+        One of ``PARTS``.
+    """
     for name, beginnings in _TRUNK.items():
         if bone.startswith(beginnings):
             return name

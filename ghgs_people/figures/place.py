@@ -40,7 +40,12 @@ class Place:
 
 
 def locate(point: np.ndarray, arm_weight: np.ndarray) -> Place:
-    """Places of points [n, 3] of the average body, given their skinning weights [n] of the arm bones."""
+    """Find the places of points of the average body.
+
+    Args:
+        point: [n, 3], metres, on the average body at rest.
+        arm_weight: [n] sum of their skinning weights of the arm bones, 0 to 1.
+    """
     body = load_body()
     joints = body.mean[body.vertex_count :]
     side = np.where(point[:, 0] >= 0, 1.0, -1.0)
@@ -51,10 +56,8 @@ def locate(point: np.ndarray, arm_weight: np.ndarray) -> Place:
     )
     sleeve = np.where(arm_weight > 0.02, along * arm, np.minimum(along, 0.0))
     arm_angle = np.arctan2(radial @ [0.74, 0.67, 0.0], radial @ [0.0, 0.0, 1.0])
-    legs = [joints[body.bone(n + ".L")] for n in ("upperleg01", "lowerleg01", "foot")]
-    centre = np.stack(
-        [np.interp(-folded[:, 1], [-j[1] for j in legs], [j[i] for j in legs]) for i in (0, 2)], 1
-    )
+    legs = np.array([joints[body.bone(n + ".L")] for n in ("upperleg01", "lowerleg01", "foot")])
+    centre = np.stack([np.interp(-folded[:, 1], -legs[:, 1], legs[:, i]) for i in (0, 2)], 1)
     # Above the legs the angle is taken around the middle of each half of the trunk.
     centre[:, 0] += smoothstep(CROTCH - 0.1, 0.95, folded[:, 1]) * (0.09 - centre[:, 0])
     leg_angle = np.arctan2(folded[:, 0] - centre[:, 0], folded[:, 2] - centre[:, 1])
@@ -64,14 +67,23 @@ def locate(point: np.ndarray, arm_weight: np.ndarray) -> Place:
 
 
 def _along(points: np.ndarray, line: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Length [n] along a polyline of joints and offset [n, 3] from it; its ends are extended straight."""
+    """Coordinates along a polyline, whose ends are extended straight.
+
+    Args:
+        points: [n, 3], metres.
+        line: its joints, each [3], metres.
+
+    Returns:
+        Length [n] along the line from its first joint, and offset [n, 3] from it.
+    """
     starts = np.array(line[:-1])  # [s, 3]
     steps = np.diff(line, axis=0)  # [s, 3]
     lengths = np.linalg.norm(steps, axis=1)
     directions = steps / lengths[:, None]
     low = np.zeros(len(steps))
     high = lengths.copy()
-    low[0], high[-1] = -np.inf, np.inf
+    low[0] = -np.inf
+    high[-1] = np.inf
     from_start = points[:, None] - starts
     along = np.clip(np.einsum("nsi,si->ns", from_start, directions), low, high)
     offset = from_start - along[..., None] * directions
@@ -81,14 +93,28 @@ def _along(points: np.ndarray, line: list[np.ndarray]) -> tuple[np.ndarray, np.n
 
 
 def face_frame(point: np.ndarray) -> np.ndarray:
-    """Points [n, 3] of the average head, moved in y and z so that the left eye is at `EYE`."""
+    """Move points so that the left eye is at `EYE` in y and z.
+
+    Args:
+        point: [n, 3] of the average head, metres.
+
+    Returns:
+        [n, 3], metres.
+    """
     body = load_body()
     eyes = body.mean[np.unique(body.surfaces["eyes"].quads)]
     return point + (EYE - eyes[eyes[:, 0] > 0].mean(0)) * [0, 1, 1]
 
 
 def hairline(point: np.ndarray) -> np.ndarray:
-    """Metres above the hairline (positive on the scalp) for points [n, 3] of the average head."""
+    """Height above the hairline.
+
+    Args:
+        point: [n, 3] of the average head, metres.
+
+    Returns:
+        Metres [n], positive on the scalp.
+    """
     point = face_frame(point)
     angle = np.degrees(np.arctan2(np.abs(point[:, 0]), point[:, 2] - 0.105))
     line = np.interp(

@@ -52,20 +52,43 @@ class _Skeleton:
     rotations: np.ndarray
 
     def rest(self, *bones: str, end: str = "") -> np.ndarray:
-        """Joints [k, 3] of k named bones at rest; `end` is added to every name."""
+        """Look up joints at rest.
+
+        Args:
+            bones: names of k bones; a bone begins at its joint.
+            end: added to every name, such as ``.L``.
+
+        Returns:
+            [k, 3], metres.
+        """
         return self.joints[[self.body.bone(bone + end) for bone in bones]]
 
     def rotate(self, bone: str, rotation: np.ndarray) -> None:
-        """Set the rotation [3, 3] of a bone."""
+        """Set the rotation of a bone.
+
+        Args:
+            bone: its name.
+            rotation: [3, 3] in world axes.
+        """
         self.rotations[self.body.bone(bone)] = rotation
 
 
 def sample_pose(
     body: BodyModel, joints: np.ndarray, rng: np.random.Generator, widen: float = 0.0, active: bool = False
 ) -> np.ndarray:
-    """Transforms [b, 3, 4] of the bones from rest to a random pose. ``joints``: [b, 3] at rest, of one shape.
-    ``widen``: 0 to 1, how far the arms move away from the body. ``active``: as in sport and dance, with legs
-    far apart, bent or crossed, in place of standing or walking."""
+    """Draw a pose.
+
+    Args:
+        body: the base mesh.
+        joints: [b, 3] at rest, of one shape, metres.
+        rng: draws everything.
+        widen: how far the arms move away from the body, 0 to 1.
+        active: as in sport and dance, with legs far apart, bent or crossed, in place of standing or
+            walking.
+
+    Returns:
+        Transforms [b, 3, 4] of the bones from rest to the pose, the soles on y = 0.
+    """
     if active:
         stance = str(rng.choice(list(BENT), p=(0.4, 0.3, 0.2, 0.1)))
     else:
@@ -91,7 +114,17 @@ def _gestures(stance: str, rng: np.random.Generator) -> tuple[str, str]:
 
 
 def _bend_trunk(body: BodyModel, local: np.ndarray, stance: str, rng: np.random.Generator) -> np.ndarray:
-    """Twist, lean and bend spine and neck in place; return the rotation of the pelvis [3, 3]."""
+    """Twist, lean and bend spine and neck.
+
+    Args:
+        body: the base mesh.
+        local: [b, 3, 3] rotations relative to the parents, changed in place.
+        stance: one of `STANCES` or `BENT`.
+        rng: draws the angles.
+
+    Returns:
+        Rotation [3, 3] of the pelvis.
+    """
     twist = rng.uniform(-22, 22)
     side = rng.uniform(-5, 5)
     lean = rng.uniform(-4, 7)
@@ -118,6 +151,15 @@ def _bend_trunk(body: BodyModel, local: np.ndarray, stance: str, rng: np.random.
 
 
 def _compose(parents: np.ndarray, local: np.ndarray) -> np.ndarray:
+    """Rotations in world axes.
+
+    Args:
+        parents: [b] int, -1 for the root; parents come before children.
+        local: [b, 3, 3] rotations relative to the parents.
+
+    Returns:
+        [b, 3, 3].
+    """
     rotations = local.copy()
     for bone, parent in enumerate(parents):
         if parent >= 0:
@@ -145,7 +187,17 @@ def _descendants(body: BodyModel, bone: str) -> list[int]:
 def _pose_arm(
     skeleton: _Skeleton, side: int, gesture: str, widen: float, swing: float, rng: np.random.Generator
 ) -> None:
-    """Rotate one arm (side +1: left); `swing` moves it forward (back where negative) when walking."""
+    """Rotate one arm, with its hand and the shoulder girdle.
+
+    Args:
+        skeleton: whose rotations are set.
+        side: +1: left, -1: right.
+        gesture: one of `GESTURES`.
+        widen: how far the arm moves away from the body, 0 to 1.
+        swing: how far the upper arm points forward (back where negative) when walking, about -0.5 to
+            0.5.
+        rng: draws the angles.
+    """
     end = ".L" if side > 0 else ".R"
     mirror = np.array([side, 1.0, 1.0])
     upper, bend, elbow, forearm, curl = GESTURES[gesture]
@@ -184,12 +236,20 @@ def _pose_arm(
 def _pose_hand(
     skeleton: _Skeleton, end: str, hand: np.ndarray, curl: float, rng: np.random.Generator
 ) -> None:
-    """Bend the wrist a little and curl the fingers by `curl` radians."""
+    """Bend the wrist a little and curl the fingers.
+
+    Args:
+        skeleton: whose rotations are set.
+        end: ``.L`` or ``.R``.
+        hand: rotation [3, 3] of the straight hand in world axes.
+        curl: of the fingers, radians.
+        rng: draws small deviations.
+    """
     index, little = skeleton.rest("finger2-1", "finger5-1", end=end)
     across = (index - little) / np.linalg.norm(index - little)
     rest_curl = 0.0
     for finger in FINGERS:
-        one, two, three = skeleton.rest(*(f"{finger}-{i}" for i in (1, 2, 3)), end=end)
+        one, two, three = skeleton.rest(f"{finger}-1", f"{finger}-2", f"{finger}-3", end=end)
         rest_curl += np.cross(across, two - one) @ (three - two)
     across *= np.sign(rest_curl)
     hand = hand @ Rotation.from_rotvec(across * rng.uniform(-0.2, 0.2)).as_matrix()
@@ -214,7 +274,18 @@ def _pose_hand(
 def _pose_legs(
     skeleton: _Skeleton, pelvis: np.ndarray, stance: str, stride: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """Place the soles on the ground, solve hips and knees; return where the root joint goes [3]."""
+    """Place the soles on the ground, solve hips and knees.
+
+    Args:
+        skeleton: whose rotations are set.
+        pelvis: its rotation [3, 3].
+        stance: one of `STANCES` or `BENT`.
+        stride: how far the left foot is in front (behind where negative), in lengths of the leg.
+        rng: draws the feet and how far the legs are bent.
+
+    Returns:
+        Where the root joint goes [3], metres.
+    """
     (root,) = skeleton.rest("root")
     feet = _feet(skeleton, stance, stride, rng)
     ankles = []
@@ -251,7 +322,17 @@ def _pose_legs(
 def _feet(
     skeleton: _Skeleton, stance: str, stride: float, rng: np.random.Generator
 ) -> list[tuple[float, float, float, float]]:
-    """For the left and the right foot: ankle across and forward (metres), yaw and heel lift (degrees)."""
+    """Place the feet.
+
+    Args:
+        skeleton: for the width of the hips and the length of the legs.
+        stance: one of `STANCES` or `BENT`.
+        stride: how far the left foot is in front (behind where negative), in lengths of the leg.
+        rng: draws the deviations.
+
+    Returns:
+        For the left and the right foot: ankle across and forward (metres), yaw and heel lift (degrees).
+    """
     half, leg, _ = skeleton.rest("upperleg01.L")[0]
     half = half * rng.uniform(0.85, 1.25)
     feet = []
@@ -295,7 +376,16 @@ def _solve_leg(
     lengths: tuple[float, float],
     toward: np.ndarray,
 ) -> None:
-    """Two-bone inverse kinematics by the law of cosines; the knee points `toward` a direction [3]."""
+    """Two-bone inverse kinematics by the law of cosines.
+
+    Args:
+        skeleton: whose rotations are set.
+        end: ``.L`` or ``.R``.
+        hip: its joint [3] in the pose, metres.
+        ankle: its joint [3] in the pose, metres.
+        lengths: of thigh and shin, metres.
+        toward: direction [3] that the knee points to.
+    """
     thigh, shin = lengths
     line = ankle - hip
     distance = min(np.linalg.norm(line), 0.999 * (thigh + shin))
