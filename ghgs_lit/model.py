@@ -285,8 +285,7 @@ class GHGS(nn.Module):
         """The model of a checkpoint in evaluation mode.
 
         Args:
-            path: of a checkpoint of this package, or the name of published weights; by default those that
-                come with it.
+            path: of a checkpoint of this package; by default the weights that come with it.
             map_location: the device that the model is moved to.
             dtype: precision of the encoder; None: as in the file, where the device has it. Heads are float32.
 

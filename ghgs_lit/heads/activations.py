@@ -20,6 +20,7 @@ class _Saturate(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, x: Tensor, limit: float, symmetric: bool) -> Tensor:
+        """``x``: raw values. ``limit``: largest argument. ``symmetric``: tanh instead of sigmoid."""
         ctx.save_for_backward(x)
         ctx.limit = limit
         ctx.symmetric = symmetric
@@ -48,9 +49,11 @@ EXP_LIMIT = 80.0
 
 
 def bounded_sigmoid(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """The sigmoid of ``x`` clamped to +-10; beyond, only gradients that lead back into the limits remain. In
-    float32 a plain sigmoid is exactly 1 from 17 on, without a gradient: one step that is too large ends the
-    training of a head."""
+    """The sigmoid of ``x`` clamped to +-10; beyond, only gradients that lead back into the limits remain.
+
+    In float32 a plain sigmoid is exactly 1 from 17 on, without a gradient: one step that is too large ends
+    the training of a head.
+    """
     return _Saturate.apply(x, SIGMOID_LIMIT, False)
 
 
@@ -99,15 +102,19 @@ def footprint_attributes(
     footprint: Float[Tensor, " N"],
     constants: Constants,
 ) -> Attributes:
-    """Offsets in metres, scales in metres, quaternions and opacities.
+    """Offsets, scales, quaternions and opacities in units of a pixel's footprint.
 
     Args:
         offset: raw, as are the next three.
         scale: raw.
-        rotation: raw.
+        rotation: raw; 0 is no rotation.
         opacity: raw.
         footprint: side of a pixel at each Gaussian's depth, in metres.
-        constants: of ``FootprintAttributes``."""
+        constants: of ``FootprintAttributes``.
+
+    Returns:
+        Offsets and scales in metres, unit quaternions, and opacities from ``opacity_floor`` to 1.
+    """
     limit, metres, inward, floor, span, across, thickness, least, bias, _ = constants
     identity = F.pad(rotation.new_ones(1), (0, 3))
     scale = torch.cat((scale[:, :2] + across, scale[:, 2:] + thickness), 1)
@@ -135,7 +142,7 @@ def activated(
     color_limit: float,
     on_surface: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Means, quaternions, scales, opacities and colours of Gaussians.
+    """Gaussians from raw attributes.
 
     Args:
         raw: offsets, scales, rotations, opacities and colours (or None) before activations.
@@ -143,12 +150,16 @@ def activated(
         pixel: row-major indices of their pixels.
         maps: depths in metres.
         points: world points of pixels, in metres.
-        photo: colours of pixels.
+        photo: colours of pixels, in [0, 1].
         share: factors of opacities; None: 1.
         cameras: of the images.
         attributes: offsets, scales, quaternions and opacities of raw ones and of footprints.
         color_limit: largest change of a colour from its pixel's.
-        on_surface: ``raw`` is in axes of the surface."""
+        on_surface: ``raw`` is in axes of the surface.
+
+    Returns:
+        Means in metres [N, 3], quaternions [N, 4], scales in metres [N, 3], opacities [N] and colours [N, 3].
+    """
     *numbers, color = raw
     focal = focal_lengths(cameras).prod(-1).sqrt().flatten()[image]
     depth = maps.depth.flatten(0, 1).flatten(1)[image, pixel]
@@ -180,7 +191,23 @@ def footprint_gaussians(
     constants: Constants,
     on_surface: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """:func:`activated` with :func:`footprint_attributes`, which kernels compute, too."""
+    """:func:`activated` with :func:`footprint_attributes`, which kernels compute, too.
+
+    Args:
+        raw: as of :func:`activated`, as are all but ``constants``.
+        image: numbers of the images (``b * V + v``) that the Gaussians belong to.
+        pixel: row-major indices of their pixels.
+        maps: depths in metres.
+        points: world points of pixels, in metres.
+        photo: colours of pixels, in [0, 1].
+        share: factors of opacities; None: 1.
+        cameras: of the images.
+        constants: of ``FootprintAttributes``, with the limit of colours.
+        on_surface: ``raw`` is in axes of the surface.
+
+    Returns:
+        As of :func:`activated`.
+    """
     attributes = partial(footprint_attributes, constants=constants)
     given = (raw, image, pixel, maps, points, photo, share, cameras)
     return activated(*given, attributes, constants.color_limit, on_surface)

@@ -37,9 +37,10 @@ def decode(
     windows: Sequence[Window | None] | None,
     together: int = 1,
 ) -> Iterator[Part]:
-    """Maps of the images in their windows, in the order of the images. Images with small maps share a window.
-    Without a gradient, larger maps are computed one after another, each in its own window, to save memory and
-    work.
+    """Maps of the images in their windows, in the order of the images.
+
+    Images with small maps share a window. Without a gradient, larger maps are computed one after another,
+    each in its own window, to save memory and work.
 
     Args:
         dpt: the head.
@@ -47,7 +48,11 @@ def decode(
         guide: maps of whole images, if the head has one.
         windows: one for each image; None: whole images. An image without a window is left out; if all are,
             one pixel is decoded, so that gradients of 0 flow.
-        together: number of consecutive images that are decoded at once at least."""
+        together: number of consecutive images that are decoded at once at least.
+
+    Yields:
+        Raw maps of consecutive images.
+    """
     b, v, rows, columns = tokens.grid
     size = (tokens.patch_size * rows, tokens.patch_size * columns)
     if windows is None:
@@ -63,8 +68,13 @@ def decode(
 
 
 def _runs(windows: Sequence[Window | None], most: int, together: int) -> Iterator[slice]:
-    """Slices of about equal size, of at most ``most`` consecutive images that have a window, or of
-    ``together`` of them."""
+    """Slices of consecutive images that have a window, of about equal size.
+
+    Args:
+        windows: one for each image; None where there is none.
+        most: images of a slice, if these are ``together`` or more.
+        together: images that are not parted.
+    """
     start = 0
     for has_window, group in itertools.groupby(windows, bool):
         count = len(list(group))

@@ -37,13 +37,26 @@ BOUNDED = {"bounded_inverse": _bounded_inverse, "linear": _linear}
 def bounded_depth(
     raw: Float[Tensor, "*n"], near: Float[Tensor, "*n"], far: Float[Tensor, "*n"], parameterization: str
 ) -> Float[Tensor, "*n"]:
-    """Depth between ``near`` and ``far``, in metres, from raw values of a head, by one of :data:`BOUNDED`."""
+    """Depth between bounds from raw values of a head.
+
+    Args:
+        raw: of a head; 0 is half of the way, as the parameterization counts it.
+        near: in metres.
+        far: in metres.
+        parameterization: one of :data:`BOUNDED`.
+
+    Returns:
+        Z-depth in metres.
+    """
     return BOUNDED[parameterization](bounded_sigmoid(raw), near, far)
 
 
 def inverse_linear(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """``1 / (x + 1e-8)`` as in the authors' release: of either sign and without bound. Infinite at -1e-8,
-    where the gradient is 0. The argument is replaced, too, or the gradient would be 0 times infinity."""
+    """``1 / (x + 1e-8)`` as in the authors' release: of either sign and without bound.
+
+    Infinite at -1e-8, where the gradient is 0. The argument is replaced, too, or the gradient would be 0
+    times infinity.
+    """
     shifted = x + 1e-8
     is_pole = shifted == 0
     return torch.where(is_pole, torch.inf, 1 / torch.where(is_pole, 1.0, shifted))
@@ -79,6 +92,7 @@ class DepthHeadOptions(Options):
         return self.parameterization in BOUNDED
 
     def build(self, dim_latent: int) -> "DepthHead":
+        """The stage for tokens of width ``dim_latent``."""
         return DepthHead(self, dim_latent)
 
 
@@ -102,9 +116,17 @@ class DepthHead(nn.Module):
         return self.options.is_bounded
 
     def forward(self, tokens: Tokens, batch: Batch, bounds: DepthBounds | None, plan: Plan) -> DepthMaps:
-        """Depths of all pixels; those of the subject are valid if they are finite. ``batch``: images, masks
-        and cameras are read. ``bounds``: None if :attr:`is_bounded` is false. ``plan``: only its
-        ``depth_windows`` are decoded, and other depths have no meaning."""
+        """Depths of all pixels; those of the subject are valid if they are finite.
+
+        Args:
+            tokens: of the encoder.
+            batch: photographs, masks and cameras are read.
+            bounds: in metres; None if :attr:`is_bounded` is false.
+            plan: only its ``depth_windows`` are decoded, and other depths have no meaning.
+
+        Returns:
+            Depths in metres, and confidences of 1 or more, as in published heads.
+        """
         guide = None
         if self.dpt.guide is not None:
             maps = [] if bounds is None else [relative_bounds(bounds, batch.masks)]
@@ -123,7 +145,14 @@ class DepthHead(nn.Module):
 
 
 def finite_maps(depth: Tensor, batch: Batch, confidence: Tensor, bounds: DepthBounds | None) -> DepthMaps:
-    """Depth maps in which depths that are not finite become 1 m and not valid."""
+    """Depth maps in which depths that are not finite become 1 m and not valid.
+
+    Args:
+        depth: [B, V, H, W] in metres.
+        batch: its masks say which pixels are valid.
+        confidence: [B, V, H, W].
+        bounds: that the depths lie between; None: none.
+    """
     finite = depth.isfinite()
     return DepthMaps(torch.where(finite, depth, 1.0), batch.masks & finite, confidence, bounds)
 
@@ -131,8 +160,15 @@ def finite_maps(depth: Tensor, batch: Batch, confidence: Tensor, bounds: DepthBo
 def _whole(
     parts: Iterable[Part], batch: Batch, wanted: Bool[Tensor, "B V H W"] | None
 ) -> Float[Tensor, "o B V H W"]:
-    """Decoded windows in maps of whole images, float32 or wider; 0 except in ``wanted`` (None: everywhere).
-    Images share windows, so the rest of a window depends on other subjects of the batch."""
+    """Decoded windows in maps of whole images, float32 or wider.
+
+    Images share windows, so the rest of a window depends on other subjects of the batch.
+
+    Args:
+        parts: of all images that have a window.
+        batch: its masks give the size.
+        wanted: pixels that keep their values, others are 0; None: all.
+    """
     whole = None
     for part in parts:
         if whole is None:

@@ -29,8 +29,15 @@ BASE = 100.0
 def _axis_waves(
     channels: int, count: int, half_extent: float, dtype: torch.dtype, device: torch.device
 ) -> Float[Tensor, "c n"]:
-    """Sines, then cosines along one axis times ``SCALE``, at the centres of ``count`` cells between
-    ``-half_extent`` and ``+half_extent``, in float32."""
+    """Sines, then cosines along one axis times ``SCALE``, in float32.
+
+    Args:
+        channels: a multiple of 4 divided by 2: as many sines as cosines.
+        count: number of cells.
+        half_extent: the cells lie between its negative and itself; samples are their centres.
+        dtype: of the places of the centres.
+        device: of the result.
+    """
     quarter = channels // 2
     exponents = torch.arange(quarter, dtype=torch.float64, device=device) / quarter
     omega = 1.0 / BASE**exponents
@@ -42,12 +49,21 @@ def _axis_waves(
 def add_positions_(
     x: Float[Tensor, "n c h w"], aspect: float, window: Window | None = None
 ) -> Float[Tensor, "n c h w"]:
-    """Add a position embedding to ``x`` in place: waves of the column in the first half of the channels, of
-    the row in the second.
+    """Add a position embedding in place.
+
+    Waves of the column in the first half of the channels, of the row in the second.
 
     The unit is half the diagonal of the image; samples are cell centres. The waves of each axis are cached (a
-    few kilobytes); the embedding is never built as a map. ``x``: channels are a multiple of 4. ``aspect``:
-    width / height of the image. ``window``: the part of whole maps that ``x`` is; None: all."""
+    few kilobytes); the embedding is never built as a map.
+
+    Args:
+        x: maps, whose channels are a multiple of 4; changed.
+        aspect: width / height of the image.
+        window: the part of whole maps that ``x`` is; None: all.
+
+    Returns:
+        ``x``.
+    """
     window = window or Window.whole(tuple(x.shape[2:]))
     half = x.shape[1] // 2
     dtype = torch.float64 if x.dtype == torch.float64 else torch.float32
@@ -80,8 +96,12 @@ Widths = tuple[int, tuple[int, int, int, int]]
 
 def published_widths(dim_latent: int) -> Widths:
     """Channels of the fused maps, and of the four levels from fine to coarse, in the published proportions.
-    1/8 of the tokens' width (a multiple of 8), and 1/8, 1/4, 1/2, 1/2 (multiples of 4); as published 256, and
-    256, 512, 1024, 1024."""
+
+    1/8 of the tokens' width (a multiple of 8), and 1/8, 1/4, 1/2, 1/2 (multiples of 4).
+
+    Args:
+        dim_latent: width of the tokens; with 2048, as published, 256, and 256, 512, 1024, 1024.
+    """
     levels = tuple(_multiple(dim_latent * part, 4) for part in (1 / 8, 1 / 4, 1 / 2, 1 / 2))
     return _multiple(dim_latent / 8, 8), levels
 
@@ -140,7 +160,13 @@ class Fusion(nn.Module):
     def forward(
         self, x: Float[Tensor, "n c h w"] | None, level: Float[Tensor, "n c h2 w2"], place: "LevelWindows"
     ) -> Float[Tensor, "n c h w"]:
-        """The refined sum of ``x`` and ``level`` in the window ``place.joined``."""
+        """The refined sum of the coarser result and a level in the window ``place.joined``.
+
+        Args:
+            x: the coarser result in this window, which may be overwritten; None for the coarsest level.
+            level: in the window ``place.level``.
+            place: windows of the level.
+        """
         if x is not None:
             level = self.resConfUnit1(level)
         level = place.level.cut(level, place.joined)
@@ -150,7 +176,15 @@ class Fusion(nn.Module):
 
 
 class Scratch(nn.Module):
-    """Everything after the resize layers, under its published names."""
+    """Everything after the resize layers, under its published names.
+
+    Args:
+        out_channels: of the levels, from fine to coarse.
+        features: channels of the fused maps.
+        hidden: channels before the last convolution.
+        output_dim: channels of the result.
+        rectified_skip: as of :class:`ResidualUnit`.
+    """
 
     def __init__(
         self, out_channels: Sequence[int], features: int, hidden: int, output_dim: int, rectified_skip: bool
@@ -186,10 +220,16 @@ class Windows:
 
 
 class DPTHead(nn.Module):
-    """Tokens of four layers to ``output_dim`` raw channels for each pixel, without activation.
-    ``dim_latent``: width of a token of ``Tokens.latent``. ``guide_channels``: channels of a guide at full
-    resolution (:mod:`ghgs_lit.heads.guide`), which keeps a small head sharp; 0: none, as published.
-    ``widths``: None: :func:`published_widths`."""
+    """Tokens of four layers to raw channels for each pixel, without activation (DPT, ICCV 2021).
+
+    Args:
+        dim_latent: width of a token of ``Tokens.latent``.
+        output_dim: channels of the result.
+        rectified_skip: as of :class:`ResidualUnit`.
+        guide_channels: channels of a guide at full resolution (:mod:`ghgs_lit.heads.guide`), which keeps a
+            small head sharp; 0: none, as published.
+        widths: channels inside; None: :func:`published_widths`.
+    """
 
     def __init__(
         self,
@@ -214,13 +254,22 @@ class DPTHead(nn.Module):
     def forward(
         self, tokens: Tokens, guide: Guide | None = None, window: Window | None = None
     ) -> Float[Tensor, "bv o h w"]:
-        """Raw maps of all images, float32 or wider; float16 autocast is turned off. ``guide``: maps of whole
-        images, if ``guide_channels`` is not 0. ``window``: the part of the maps to compute; None: all."""
+        """Raw maps of all images, float32 or wider; float16 autocast is turned off.
+
+        Args:
+            tokens: of four layers.
+            guide: maps of whole images, if ``guide_channels`` is not 0.
+            window: the part of the maps to compute, in pixels; None: all.
+
+        Raises:
+            InputError: there are not four layers of tokens.
+        """
         require(len(tokens.latent) == LEVELS, "tokens.latent", "four layers", len(tokens.latent))
         with without_float16(tokens.semantic.device.type):
             return self._maps(tokens, guide, window)
 
     def _maps(self, tokens: Tokens, guide: Guide | None, window: Window | None) -> Tensor:
+        """:meth:`forward` in the precision that is left; levels are computed from coarse to fine."""
         rows, columns = tokens.grid[2:]
         size = (tokens.patch_size * rows, tokens.patch_size * columns)
         windows = self.windows(window or Window.whole(size), (rows, columns))
@@ -255,7 +304,15 @@ class DPTHead(nn.Module):
         aspect: float,
         result: Window,
     ) -> Float[Tensor, "n o h3 w3"]:
-        """The window ``result`` of the result, from the map before the last interpolation."""
+        """The window ``result`` of the result, from the map before the last interpolation.
+
+        Args:
+            x: half of the fused channels, in ``windows.fused``.
+            guide: maps of the guide at full resolution, in ``windows.full``; None: no guide.
+            windows: of the head.
+            aspect: width / height of the image.
+            result: a part of ``windows.result``.
+        """
         layers = self.scratch.output_conv2
         seen = result.grown(reach(layers))
         x = add_positions_(windows.fused.resize(x, seen), aspect, seen)
@@ -278,8 +335,12 @@ class DPTHead(nn.Module):
         return [Window(Span(rows.start + p.start, rows.start + p.stop, rows.full), columns) for p in parts]
 
     def windows(self, result: Window, grid: tuple[int, int]) -> Windows:
-        """Windows of each level, from fine to coarse, that the window ``result`` of the result depends on.
-        ``grid``: rows and columns of patches."""
+        """Windows of each level, from fine to coarse, that a window of the result depends on.
+
+        Args:
+            result: in pixels.
+            grid: rows and columns of patches.
+        """
         s = self.scratch
         full = result.grown(reach(s.output_conv2))
         fused = full.sources(_times(2 * CELLS[0], grid)).grown(reach(s.output_conv1))
@@ -301,6 +362,7 @@ class DPTHead(nn.Module):
         return Windows(result, full, fused, tuple(levels))
 
     def _level(self, i: int, tokens: Tokens, place: LevelWindows) -> Float[Tensor, "bv c h w"]:
+        """Level ``i``, 0 is the finest, with the channels of the fused maps in ``place.level``."""
         aspect = tokens.grid[3] / tokens.grid[2]
         if tokens.is_dense:  # tokens outside the window are left out without a copy
             b, v, *grid = tokens.grid

@@ -64,7 +64,13 @@ def _mlp(sizes: Sequence[int], activation: type[nn.Module]) -> nn.Sequential:
 
 def float32_last(mlp: nn.Sequential, x: Tensor) -> Tensor:
     """``mlp(x)`` with its last projection in float32 under autocast: offsets of millimetres depend on it.
-    Under float16 autocast all of it is in float32."""
+
+    Under float16 autocast all of it is in float32.
+
+    Args:
+        mlp: layers, the last one linear.
+        x: rows.
+    """
     with without_float16(x.device.type):
         hidden = mlp[:-1](x)
         last = mlp[-1]
@@ -94,7 +100,11 @@ class RawGaussians:
     real: Bool[Tensor, " N"] | None = None
 
     def changed(self, change: Float[Tensor, "N c"]) -> "RawGaussians":
-        """The raw attributes plus ``change``: values of offset, scale, rotation, opacity and color."""
+        """The raw attributes plus a change, without a change of descriptors.
+
+        Args:
+            change: values of offset, scale, rotation, opacity and color, :data:`RAW_VALUES` together.
+        """
         offset, scale, rotation, opacity, color = change.split(_WIDTHS, -1)
         return dataclasses.replace(
             self,
@@ -150,7 +160,12 @@ class FootprintAttributes(Options):
         return _logit((OPACITY_START - self.opacity_floor) / (1 - self.opacity_floor))
 
     def constants(self, offset_limit: float | None, color_limit: float) -> Constants:
-        """Numbers of :func:`ghgs_lit.heads.activations.footprint_attributes`."""
+        """Numbers of :func:`ghgs_lit.heads.activations.footprint_attributes`.
+
+        Args:
+            offset_limit: of ``gaussian_head``, in metres; None: none.
+            color_limit: of ``gaussian_head``.
+        """
         offsets = (offset_limit or 0.0, OFFSET_UNIT, self.inward)
         size = (self.scale_floor, self.scale_range, *self.scale_biases)
         return Constants(*offsets, *size, self.opacity_floor, self.opacity_bias, color_limit)
@@ -172,7 +187,8 @@ class FootprintAttributes(Options):
             rotation: raw.
             opacity: raw.
             footprint: side of a pixel at each Gaussian's depth, in metres.
-            offset_limit: of ``gaussian_head``."""
+            offset_limit: of ``gaussian_head``, in metres; None: none.
+        """
         constants = self.constants(offset_limit, 0.0)
         return footprint_attributes(offset, scale, rotation, opacity, footprint, constants)
 
@@ -184,7 +200,15 @@ def release_attributes(
     opacity: Float[Tensor, " N"],
     footprint: Float[Tensor, " N"],
 ) -> Attributes:
-    """Attributes as in the authors' release: offsets and scales in metres, without bound."""
+    """Attributes as in the authors' release: offsets and scales in metres, without bound.
+
+    Args:
+        offset: raw, as are the next three.
+        scale: raw.
+        rotation: raw.
+        opacity: raw.
+        footprint: not read.
+    """
     return offset, F.softplus(scale, beta=100), unit(rotation), opacity.sigmoid()
 
 
@@ -229,6 +253,7 @@ class GaussianHeadOptions(Options):
         return self
 
     def build(self, dim_latent: int) -> "GaussianHead":
+        """The stage for tokens of width ``dim_latent``."""
         return GaussianHead(self, dim_latent)
 
 
@@ -276,10 +301,17 @@ class GaussianHead(nn.Module):
         depth_maps: DepthMaps,
         plan: Plan,
     ) -> RawGaussians:
-        """Raw attributes of the subject's pixels with a valid point, in the order of element, view, row,
-        column. ``batch``: images, masks and cameras are read. ``plan``: its ``windows`` and the subject's
-        pixels are computed; with ``pixels="all"`` every pixel, to select afterwards: the result is the
-        same."""
+        """Raw attributes of the subject's pixels with a valid point, by element, view, row, column.
+
+        Args:
+            tokens: recalibrated ones.
+            batch: photographs, masks and cameras are read.
+            points: which pixels have a valid point.
+            depth_maps: in metres, read by a guide.
+            plan: its ``windows`` and the subject's pixels are computed; with ``pixels="all"`` every pixel, to
+                select
+                afterwards: the result is the same.
+        """
         views, height, width = points.valid.shape[1:]
         rows = plan.subject.only(points.valid)
         image = rows.index // (height * width)
@@ -293,7 +325,14 @@ class GaussianHead(nn.Module):
         return RawGaussians(*values[:5], color, image, pixel, rows.splits(views), rows.real)
 
     def activate(self, raw: RawGaussians, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
-        """Gaussians from raw attributes, at the points of their pixels."""
+        """Gaussians from raw attributes, at the points of their pixels.
+
+        Args:
+            raw: of :meth:`forward`; rounds change them.
+            batch: photographs, mattes and cameras are read.
+            points: of pixels in the world, in metres.
+            depth_maps: in metres, of these points.
+        """
         numbers = (raw.offset, raw.scale, raw.rotation, raw.opacity, raw.color)
         photo = batch.once(surface_colors)
         share = batch.alpha
@@ -316,6 +355,7 @@ class GaussianHead(nn.Module):
         return Gaussians(*found, raw.splits, raw.image, raw.pixel, **constants)
 
     def _guide(self, batch: Batch, points: Points, depth_maps: DepthMaps) -> Guide | None:
+        """The guide, with relative depths and perhaps photo-consistency; None without one."""
         if self.decoder.guide is None:
             return None
         maps = [relative_depth(at_least_float32(depth_maps.depth), points.valid)]
@@ -327,7 +367,14 @@ class GaussianHead(nn.Module):
     def _of_subject(
         self, part: Part, image: Int[Tensor, " N"], pixel: Int[Tensor, " N"], rows: Rows
     ) -> Sequence[Tensor]:
-        """Descriptors and raw values (:meth:`_raw`) of the pixels in a part, some of ``rows``."""
+        """Descriptors and raw values (:meth:`_raw`) of the pixels in a part.
+
+        Args:
+            part: decoded maps of consecutive images.
+            image: numbers of the images (``b * V + v``) of all pixels of the subject.
+            pixel: their row-major indices.
+            rows: the same pixels by image.
+        """
         row, column, within = _in_part(part, pixel, rows)
         chosen = part.maps.permute(0, 2, 3, 1)[image[within] - part.images.start, row, column]
         return chosen, *self._raw(chosen)
@@ -335,7 +382,14 @@ class GaussianHead(nn.Module):
     def _of_all(
         self, part: Part, image: Int[Tensor, " N"], pixel: Int[Tensor, " N"], rows: Rows
     ) -> Sequence[Tensor]:
-        """:meth:`_of_subject`, but computed for every pixel of the part."""
+        """:meth:`_of_subject`, but computed for every pixel of the part.
+
+        Args:
+            part: decoded maps of consecutive images.
+            image: numbers of the images (``b * V + v``) of all pixels of the subject.
+            pixel: their row-major indices.
+            rows: the same pixels by image.
+        """
         row, column, within = _in_part(part, pixel, rows)
         maps = part.maps.permute(0, 2, 3, 1)
         if rows.real is not None:

@@ -22,14 +22,23 @@ Guide = tuple[Float[Tensor, "n _ H W"], ...]
 
 
 def photo_guide(batch: Batch, *maps: Float[Tensor, "B V _ H W"]) -> Guide:
-    """Photographs, masks or mattes, and further ``maps`` of all images."""
+    """Photographs, masks or mattes, and further maps of all images.
+
+    Args:
+        batch: photographs, masks and mattes are read.
+        maps: further ones, with any number of channels.
+    """
     images = at_least_float32(batch.images)
     return tuple(part.flatten(0, 1) for part in (images, coverage(batch)[:, :, None], *maps))
 
 
 class GuidePyramid(nn.Module):
-    """Three convolutions of a guide, at full, half and quarter resolution, to ``features / 2``, ``features``
-    and ``features`` channels, which are added to the maps of a dense head."""
+    """Three convolutions of a guide, at full, half and quarter resolution, added to maps of a dense head.
+
+    Args:
+        channels: of the guide.
+        features: of the half and the quarter resolution; the full one has half as many.
+    """
 
     def __init__(self, channels: int, features: int):
         super().__init__()
@@ -38,8 +47,12 @@ class GuidePyramid(nn.Module):
         self.to_quarter = nn.Conv2d(features, features, 3, stride=2, padding=1)
 
     def forward(self, guide: Guide, targets: tuple[Window, Window, Window]) -> list[Float[Tensor, "n o h w"]]:
-        """Maps at full, half and quarter resolution of a ``guide`` of whole images, resized to
-        ``targets``."""
+        """Maps at full, half and quarter resolution.
+
+        Args:
+            guide: of whole images.
+            targets: windows of the head's maps, from fine to coarse, that they are resized to.
+        """
         whole = Window.whole(tuple(guide[0].shape[2:]))
         size = whole.full
         sizes = [whole.coarser(factor).full for factor in (1, 2, 4)]

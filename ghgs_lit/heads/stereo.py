@@ -72,8 +72,17 @@ class StereoHead(nn.Module):
     def forward(
         self, tokens: Tokens, batch: Batch, bounds: DepthBounds, plan: Plan | None = None
     ) -> DepthMaps:
-        """Depths of all pixels between the nearest and the farthest bound of their view; those of the subject
-        are valid. ``batch``: images, masks and cameras are read. ``tokens`` and ``plan`` are not read."""
+        """Depths of all pixels between the nearest and the farthest bound of their view.
+
+        Args:
+            tokens: not read.
+            batch: photographs, masks and cameras are read.
+            bounds: in metres.
+            plan: not read.
+
+        Returns:
+            Depths in metres, of which the subject's are valid, with confidences of 1.
+        """
         height, width = batch.masks.shape[2:]
         near, far = subject_range(bounds, batch)
         with without_float16(batch.masks.device.type):
@@ -127,8 +136,14 @@ class Update(nn.Module):
         levels: list[Float[Tensor, "n _ h w"]],
         fraction: Float[Tensor, "n 1 h w"],
     ) -> tuple[Float[Tensor, "n c h w"], Float[Tensor, "n 1 h w"]]:
-        """The next memory, and the change of the raw estimate. ``levels``: correlations from near to far,
-        from fine to coarse. ``fraction``: the estimate, as a share of the way from near to far."""
+        """The next memory, and the change of the raw estimate.
+
+        Args:
+            memory: of the GRU, in (-1, 1).
+            context: features of the view itself.
+            levels: correlations from near to far, from fine to coarse.
+            fraction: the estimate, as a share of the way from near to far.
+        """
         seen = torch.cat([*(look_up(level, fraction) for level in levels), 2 * fraction - 1], 1)
         x = torch.cat((self.seen(seen.to(memory.dtype)).relu(), context), 1)
         forget, reset = self.gates(torch.cat((memory, x), 1)).sigmoid().chunk(2, 1)
@@ -144,7 +159,15 @@ class Update(nn.Module):
 def subject_range(
     bounds: DepthBounds, batch: Batch
 ) -> tuple[Float[Tensor, "B V 1 1"], Float[Tensor, "B V 1 1"]]:
-    """The nearest and the farthest bound of the subject's pixels in each view; of all pixels if none."""
+    """The nearest and the farthest bound of the subject's pixels in each view; of all pixels if none.
+
+    Args:
+        bounds: of all pixels, in metres.
+        batch: masks are read.
+
+    Returns:
+        Near and far in metres.
+    """
     masks = batch.masks
     used = masks | ~masks.any(-1, keepdim=True).any(-2, keepdim=True)
     near = torch.where(used, at_least_float32(bounds.near), torch.inf).amin((-2, -1), keepdim=True)
@@ -153,7 +176,14 @@ def subject_range(
 
 
 def neighboring_views(cameras: Cameras) -> Int[Tensor, "n p"]:
-    """For each image ``b * V + v``, the images whose optical axes have the smallest angles to its own."""
+    """For each image ``b * V + v``, the images whose optical axes have the smallest angles to its own.
+
+    Args:
+        cameras: [B, V].
+
+    Returns:
+        Their numbers, also ``b * V + v``: of :data:`PAIRS` images, or of all others if these are fewer.
+    """
     count, views = cameras.shape
     forward = at_least_float32(cameras.extrinsics)[..., 2, :3]
     facing = (forward[:, :, None] * forward[:, None]).sum(-1)
@@ -173,9 +203,16 @@ def correlations(
     """Products of the features of cells with those of neighbouring views at S depths, over ``sqrt(c)``.
 
     The larger one of the two neighbours, as a surface is often hidden from one; 0 if the point lies behind
-    both or outside their images. ``cameras``: [B, V], of images whose pixels are the cells. ``cells``:
-    indices among those of all images. ``near``, ``far``: in metres. ``steps``: S; depths have equal steps of
-    inverse depth from near to far."""
+    both or outside their images.
+
+    Args:
+        features: of cells, float32 or wider.
+        cameras: [B, V], of images whose pixels are the cells.
+        cells: indices among those of all images.
+        near: in metres.
+        far: in metres.
+        steps: S; depths have equal steps of inverse depth from near to far.
+    """
     height, width = features.shape[-2:]
     flat = features.flatten(0, 1)
     image = cells // (height * width)
@@ -195,9 +232,15 @@ def correlations(
 
 
 def look_up(level: Float[Tensor, "n s h w"], fraction: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n r h w"]:
-    """Values at the estimate and at :data:`RADIUS` steps to either side, interpolated linearly. ``level``:
-    values at equal steps from near to far; the first and the last continue beyond. ``fraction``: the
-    estimate, as a share of the way from near to far."""
+    """Values at the estimate and at :data:`RADIUS` steps to either side, interpolated linearly.
+
+    Args:
+        level: values at equal steps from near to far; the first and the last continue beyond.
+        fraction: the estimate, as a share of the way from near to far.
+
+    Returns:
+        ``2 * RADIUS + 1`` values of each cell.
+    """
     last = level.shape[1] - 1
     around = torch.arange(-RADIUS, RADIUS + 1, device=level.device).view(-1, 1, 1)
     at = (fraction * last + around).clamp(0, last)
@@ -206,8 +249,15 @@ def look_up(level: Float[Tensor, "n s h w"], fraction: Float[Tensor, "n 1 h w"])
 
 
 def upsampled(maps: Float[Tensor, "n 1 h w"], weights: Float[Tensor, "n _ h w"]) -> Float[Tensor, "n h2 w2"]:
-    """Maps at :data:`CELL` times the resolution: each pixel is a convex combination of the 3 x 3 cells around
-    its own, weighted by the softmax of ``weights``; cells beyond the border repeat it."""
+    """Maps at :data:`CELL` times the resolution.
+
+    Each pixel is a convex combination of the 3 x 3 cells around its own; cells beyond the border repeat it
+    (RAFT, Teed and Deng, ECCV 2020).
+
+    Args:
+        maps: of cells.
+        weights: ``9 * CELL**2`` channels, logits of the shares of the cells.
+    """
     n, _, height, width = maps.shape
     shares = weights.view(n, 9, CELL, CELL, height, width).softmax(1)
     around = F.unfold(F.pad(maps, (1, 1, 1, 1), mode="replicate"), 3).view(n, 9, 1, 1, height, width)

@@ -26,7 +26,13 @@ def surface_axes(
     The third axis is the normal away from the camera; the others are the camera's right and down, turned by
     the smallest rotation from its forward axis to the normal. Normals come from depth differences to
     neighbouring valid pixels on the same surface; without any along an axis of the image, its slope is 0.
-    ``image``, ``pixel``: numbers of the images (``b * V + v``) and row-major indices of their pixels."""
+
+    Args:
+        maps: depths in metres, and which of them are valid.
+        cameras: [B, V], of the maps.
+        image: numbers of the images (``b * V + v``).
+        pixel: row-major indices of their pixels.
+    """
     height, width = maps.depth.shape[-2:]
     depth = at_least_float32(maps.depth)
     own = depth.flatten(0, 1).flatten(1)[image, pixel]
