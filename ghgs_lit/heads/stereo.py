@@ -139,7 +139,7 @@ class Update(nn.Module):
         """The next memory, and the change of the raw estimate.
 
         Args:
-            memory: of the GRU, in (-1, 1).
+            memory: of the GRU, from -1 to 1.
             context: features of the view itself.
             levels: correlations from near to far, from fine to coarse.
             fraction: the estimate, as a share of the way from near to far.

@@ -36,8 +36,11 @@ Size = tuple[int, int]
 class CoarseDepths:
     """Depths that coarse predictions found for some elements of a batch.
 
-    ``depth``: in metres; meaningless in other elements. ``confidence``: of the coarse depth head.
-    ``elements``: which elements have depths."""
+    Attributes:
+        depth: in metres; meaningless in other elements.
+        confidence: of the coarse depth head.
+        elements: which elements have depths.
+    """
 
     depth: Float[Tensor, "B V H W"]
     confidence: Float[Tensor, "B V H W"]
@@ -56,8 +59,13 @@ class CoarseDepths:
         return self.depth.new_tensor([STEP if known else 1.0 for known in self.elements])
 
     def maps(self, batch: Batch, bounds: DepthBounds, others: DepthMaps | None = None) -> DepthMaps:
-        """The depths within ``bounds``, in the middle where nothing is known; those of ``others`` in the
-        elements without coarse depths."""
+        """The depths within bounds, in the middle where nothing is known.
+
+        Args:
+            batch: its masks say which pixels are valid.
+            bounds: in metres.
+            others: depths of the elements without coarse ones; None: all elements have some.
+        """
         depth = torch.where(self.depth > 0, self.depth, (bounds.near + bounds.far) / 2)
         depth = torch.minimum(torch.maximum(depth, bounds.near), bounds.far)
         coarse = DepthMaps(depth, batch.masks, self.confidence, bounds)
@@ -83,9 +91,14 @@ def coarse_depths(
     Args:
         batch: as the stages see it, with or without a border around the photographs.
         height: pixels of the subject's height, or of its width if larger, that the weights know.
-        patch_size: of the encoder; sides of the copies are its multiples.
-        least_matte: share of a pixel above which it belongs to the subject.
-        predict: gives the final depth maps of a batch."""
+        patch_size: of the encoder, in pixels; sides of the copies are its multiples.
+        least_matte: share of a pixel above which it belongs to the subject, 0 to 0.5; None: there are
+            none.
+        predict: gives the final depth maps of a batch.
+
+    Returns:
+        Depths at the size of ``batch``, in metres.
+    """
     photographs = batch.photographs if isinstance(batch, PaddedBatch) else batch
     sizes = coarse_sizes(photographs, height, patch_size)
     wanted = sorted({size for size in sizes if size is not None})
@@ -109,7 +122,8 @@ def coarse_sizes(batch: Batch, height: int, patch_size: int) -> list[Size | None
     Args:
         batch: photographs of one size, without a border.
         height: pixels of the subject that the weights know.
-        patch_size: sides are its multiples."""
+        patch_size: sides are its multiples, in pixels.
+    """
     views = batch.masks.shape[1]
     full = batch.masks.shape[2:]
     sizes: list[Size | None] = []
@@ -147,8 +161,15 @@ def shrunk(batch: Batch, size: Size, least_matte: float | None) -> Batch:
 
 
 def enlarged(maps: DepthMaps, size: Size) -> Float[Tensor, "B V H W"]:
-    """Depths in metres at another size, 0 where nothing near is known. Inverse depths are interpolated, which
-    is exact for planes."""
+    """Depths at another size. Inverse depths are interpolated, which is exact for planes.
+
+    Args:
+        maps: depths in metres, and where they are valid.
+        size: height and width in pixels.
+
+    Returns:
+        Depths in metres, 0 where nothing near is known.
+    """
     depth = at_least_float32(maps.depth)
     inverse = torch.where(maps.valid, 1 / torch.where(maps.valid, depth, 1), 0)
     # One pixel around what is known: a finger may lie within the photograph's mask and outside the copy's.

@@ -40,24 +40,45 @@ Real = Bool[Tensor, " N"] | None
 
 
 def equalized(gaussians: Gaussians, batch: Batch, real: Real = None) -> tuple[Gaussians, Batch]:
-    """Gaussians and their photographs, divided by the gains of their cameras. ``real``: which rows are
-    Gaussians; None: all."""
+    """Gaussians and their photographs, divided by the gains of their cameras.
+
+    Args:
+        gaussians: of the batch, with the pixels that they belong to.
+        batch: whose photographs are compared.
+        real: which rows are Gaussians; None: all.
+
+    Returns:
+        Gaussians with other colours, and the batch with other photographs and its ``log_gains``.
+    """
     logs = log_gains(gaussians, batch, real)
     colors = gaussians.colors * torch.exp(-logs).flatten(0, 1)[gaussians.image]
     return dataclasses.replace(gaussians, colors=colors), divided(batch, logs)
 
 
 def divided(batch: Batch, logs: Float[Tensor, "B V 3"]) -> Batch:
-    """The batch with photographs divided by the gains whose logarithms are given."""
+    """The batch with photographs divided by gains, within [0, 1].
+
+    Args:
+        batch: with photographs as they were taken.
+        logs: natural logarithms of the gains of each camera and channel.
+    """
     images = (at_least_float32(batch.images) * torch.exp(-logs)[..., None, None]).clamp(0, 1)
     return batch.recolored(images=images, log_gains=logs)
 
 
 @torch.no_grad()
 def log_gains(gaussians: Gaussians, batch: Batch, real: Real = None) -> Float[Tensor, "B V 3"]:
-    """Natural logarithms of each camera's gains; 0 if views share nothing. Their mean is about 0, as
-    photographs do not tell which camera is right. Pairs of views are compared at the Gaussians that both see,
-    with Cauchy weights, so that wrong depths matter little. ``real``: as of :func:`equalized`."""
+    """Natural logarithms of each camera's gains; 0 if views share nothing.
+
+    Their mean is about 0, as photographs do not tell which camera is right. Pairs of views are compared at
+    the Gaussians that both see, with Cauchy weights, so that wrong depths matter little (gain compensation;
+    Brown and Lowe, IJCV 2007).
+
+    Args:
+        gaussians: of the batch, with the pixels that they belong to.
+        batch: whose photographs are compared.
+        real: which rows are Gaussians; None: all.
+    """
     with exact(gaussians.means.device.type):
         own, logs, theirs, weights = _compared(gaussians, batch, real)
         ratios = logs - theirs
@@ -73,9 +94,16 @@ def log_gains(gaussians: Gaussians, batch: Batch, real: Real = None) -> Float[Te
 
 @torch.no_grad()
 def log_gammas(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
-    """Natural logarithms of cameras' gammas, exponents of their colours, beside the median camera's; about 0
-    if views share nothing. Where those of two views differ, log ratios of their colours change as much
-    with log brightness, while gains only shift them: lines are fitted to these, with Cauchy weights."""
+    """Natural logarithms of cameras' gammas beside the median camera's; about 0 if views share nothing.
+
+    A gamma is the exponent of a camera's colours. Where those of two views differ, log ratios of their
+    colours change as much with log brightness, while gains only shift them: lines are fitted to these, with
+    Cauchy weights.
+
+    Args:
+        gaussians: of the batch, with the pixels that they belong to.
+        batch: whose photographs are compared.
+    """
     with exact(gaussians.means.device.type):
         own, logs, theirs, weights = _compared(gaussians, batch)
         ratios = logs - theirs
@@ -95,7 +123,13 @@ def log_gammas(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
 
 
 def _summed(own: Int[Tensor, " N"], images: int, *values: Float[Tensor, "N V 3"]) -> Float[Tensor, "k I V 3"]:
-    """Sums of values over the Gaussians of each image."""
+    """Sums of values over the Gaussians of each image.
+
+    Args:
+        own: number of the image (``b * V + v``) of each Gaussian.
+        images: number I of images.
+        values: k tensors.
+    """
     stacked = torch.stack(values)
     return stacked.new_zeros(len(values), images, *stacked.shape[2:]).index_add_(1, own, stacked)
 
@@ -113,7 +147,17 @@ def _thinned(gaussians: Gaussians) -> tuple[Gaussians, Int[Tensor, " n"]]:
 def _compared(
     gaussians: Gaussians, batch: Batch, real: Real = None
 ) -> tuple[Int[Tensor, " N"], Float[Tensor, "N V 3"], Float[Tensor, "N V 3"], Float[Tensor, "N V 3"]]:
-    """Own photograph of some Gaussians, logs of their colours in each view and in their own, and weights."""
+    """Colours of some Gaussians in the views that see them.
+
+    Args:
+        gaussians: of the batch, with the pixels that they belong to.
+        batch: whose photographs are compared.
+        real: which rows are Gaussians; None: all.
+
+    Returns:
+        Number of the own photograph of each, logs of their colours in each view and in their own, and weights
+        from 0 to 1.
+    """
     depth = render(gaussians, batch.cameras).depth
     views = batch.masks.shape[1]
     gaussians, index = _thinned(gaussians)
@@ -136,7 +180,13 @@ def _compared(
 def _solved(
     counts: Float[Tensor, "B V V 3"], differences: Float[Tensor, "B V V 3"], prior: float = _PRIOR
 ) -> Float[Tensor, "B V 3"]:
-    """Logs that best fit the sums of differences of views (last V) from own views (first V)."""
+    """Logs of each view that best fit the differences of pairs of views.
+
+    Args:
+        counts: sums of weights at the Gaussians of own views (first V) in other views (last V).
+        differences: weighted sums of the logs of views (last V) less those of own views (first V).
+        prior: weight of logs of 0.
+    """
     counts = counts.movedim(-1, 1)
     differences = differences.movedim(-1, 1)
     both = counts + counts.mT

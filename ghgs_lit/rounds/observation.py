@@ -36,9 +36,20 @@ _STEEP = 4.0
 def slopes(
     gaussians: Gaussians, batch: Batch, directions: Float[Tensor, "N 3"], footprints: Float[Tensor, "N 1"]
 ) -> tuple[Rendering, Float[Tensor, "N s"]]:
-    """The rendered inputs, and the bounded gradient of their squared error with respect to each Gaussian. The
-    error is of colours and mattes. Units are pixels for means, logarithms for scales, logits for opacities.
-    No gradient flows through the values. ``directions``: of the rays. ``footprints``: size of a pixel."""
+    """The rendered inputs, and the bounded gradient of their squared error with respect to each Gaussian.
+
+    The error is of colours and mattes. Units are pixels for means, logarithms for scales, logits for
+    opacities. No gradient flows through the values.
+
+    Args:
+        gaussians: of the batch.
+        batch: whose photographs and mattes are compared with the renders.
+        directions: of the rays of the Gaussians' pixels.
+        footprints: size of a pixel at each Gaussian's depth, in the unit of depth.
+
+    Returns:
+        Renders from the cameras of the batch, and :data:`SLOPES` values of each Gaussian from -1 to 1.
+    """
     # Copies: tensors of inference mode can never have a gradient.
     means, scales, opacities, colors = leaves = [
         getattr(gaussians, name).detach().clone().requires_grad_()
@@ -69,12 +80,19 @@ def slopes(
 
 @torch.no_grad()
 def observe(gaussians: Gaussians, batch: Batch, rendering: Rendering | None = None) -> Float[Tensor, "N V c"]:
-    """:data:`CHANNELS` values of each Gaussian in each view: its own, then the others in cyclic order."""
+    """:data:`CHANNELS` values of each Gaussian in each view: its own, then the others in cyclic order.
+
+    Args:
+        gaussians: of the batch, with the pixels that they belong to.
+        batch: photographs, masks, mattes and cameras are read.
+        rendering: of the Gaussians from these cameras; None: they are rendered.
+    """
     with exact(gaussians.means.device.type):
         return _compare(gaussians, batch, rendering or render(gaussians, batch.cameras))
 
 
 def _compare(gaussians: Gaussians, batch: Batch, rendering: Rendering) -> Float[Tensor, "N V c"]:
+    """:func:`observe` by the kernel of the device, if there is one."""
     views = batch.images.shape[1]
     photo = at_least_float32(batch.images)
     mask = coverage(batch)
@@ -150,14 +168,34 @@ def _cyclic(views: int, **kind: object) -> Tensor:
 def looked_up(
     gaussians: Gaussians, cameras: Cameras, maps: Float[Tensor, "B V c H W"]
 ) -> tuple[Float[Tensor, "N V c"], Float[Tensor, "N V 1"], Bool[Tensor, "N V 1"]]:
-    """Values of maps at projected means in each view, z-depths, and whether the view can see the means."""
+    """Values of maps at projected means, bilinear; 0 beyond the border.
+
+    Args:
+        gaussians: of B elements.
+        cameras: [B, V], of the maps.
+        maps: of all views.
+
+    Returns:
+        Values in each view, z-depths there, and whether the view can see the means: in its frame, in front.
+    """
     return _values_at(gaussians.means, gaussians.image, gaussians.splits, cameras, maps)
 
 
 def _values_at(
     means: Tensor, image: Tensor, splits: Sequence[int], cameras: Cameras, maps: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """:func:`looked_up` at ``means`` that belong to images ``image``."""
+    """:func:`looked_up` at means.
+
+    Args:
+        means: [N, 3] in the world.
+        image: [N], numbers of the images (``b * V + v``) that they belong to, ascending.
+        splits: number of means of each element.
+        cameras: [B, V], of the maps.
+        maps: [B, V, c, H, W].
+
+    Returns:
+        As of :func:`looked_up`.
+    """
     b, views, channels, height, width = maps.shape
     rows = None
     means = means[None]

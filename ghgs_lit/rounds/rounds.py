@@ -38,9 +38,13 @@ SIDE = 5
 
 
 class Windows(NamedTuple):
-    """Positions of Gaussians in maps cropped to the subject of each image. ``place``: index among the pixels
-    of all maps. ``shape``: number, height and width of the maps. ``spare``: 1 if rows that are no Gaussian
-    have a place behind all pixels, else 0."""
+    """Positions of Gaussians in maps cropped to the subject of each image.
+
+    Attributes:
+        place: index among the pixels of all maps.
+        shape: number, height and width of the maps.
+        spare: 1 if rows that are no Gaussian have a place behind all pixels, else 0.
+    """
 
     place: Int[Tensor, " N"]
     shape: tuple[int, int, int]
@@ -75,10 +79,15 @@ def _on_device(numbers: tuple, device: torch.device) -> Tensor:
 
 
 class Exchange(nn.Module):
-    """Adds features of neighbouring pixels' Gaussians to the features of each; untrained, it adds nothing. If
-    several depths explain a colour, neighbours decide, as in recurrent networks of optical flow (RAFT, Teed
-    and Deng, ECCV 2020). Few channels and one convolution keep it cheap. ``width``: of the features.
-    ``channels``: of the features that are exchanged."""
+    """Adds features of neighbouring pixels' Gaussians to the features of each; untrained, it adds nothing.
+
+    If several depths explain a colour, neighbours decide, as in recurrent networks of optical flow (RAFT,
+    Teed and Deng, ECCV 2020). Few channels and one convolution keep it cheap.
+
+    Args:
+        width: of the features.
+        channels: of the features that are exchanged.
+    """
 
     def __init__(self, width: int, channels: int):
         super().__init__()
@@ -92,7 +101,12 @@ class Exchange(nn.Module):
         nn.init.zeros_(self.hear.bias)
 
     def forward(self, known: Float[Tensor, "N w"], windows: Windows) -> Float[Tensor, "N w"]:
-        """``known`` with features of the neighbours added."""
+        """Features with those of the neighbours added.
+
+        Args:
+            known: features of each Gaussian.
+            windows: places of the Gaussians.
+        """
         told = self.tell(known)
         size = math.prod(windows.shape)
         maps = told.new_zeros(size + windows.spare, told.shape[1]).index_copy(0, windows.place, told)
@@ -113,8 +127,14 @@ _PLACE = 2
 
 @dataclass(frozen=True)
 class Search:
-    """Depths around the current one of each Gaussian. ``matches``: photo-consistency at depths from ``down``
-    metres in front of it to ``up`` metres behind it."""
+    """Depths around the current one of each Gaussian.
+
+    Attributes:
+        matches: photo-consistency at depths from ``down`` metres in front of it to ``up`` metres behind it.
+        place: position between near and far (0 to 1), and far - near in metres.
+        down: metres.
+        up: metres.
+    """
 
     matches: Float[Tensor, "N s"]
     place: Float[Tensor, "N 2"]
@@ -130,6 +150,7 @@ class Rays(NamedTuple):
 
     @classmethod
     def of(cls, raw: RawGaussians, batch: Batch) -> "Rays":
+        """The rays of the pixels that the Gaussians belong to."""
         place = raw.image * batch.masks[0, 0].numel() + raw.pixel
         with exact(raw.pixel.device.type):
             return cls(place, ray_directions(batch.cameras).flatten(0, 3)[place])
@@ -146,8 +167,12 @@ class State:
 
 
 def prediction_of(states: Sequence[State], keeps_drafts: bool) -> Prediction:
-    """The prediction of the last state. ``states``: before the first round and after each. ``keeps_drafts``:
-    include the Gaussians before each round."""
+    """The prediction of the last state.
+
+    Args:
+        states: before the first round and after each.
+        keeps_drafts: include the Gaussians before each round.
+    """
     last = states[-1]
     maps = tuple(state.depth_maps for state in states)
     drafts = tuple(state.gaussians for state in states[:-1]) if keeps_drafts else ()
@@ -195,6 +220,7 @@ class RoundsOptions(Options):
     (:mod:`ghgs_lit.rounds.coarse`); null: never."""
 
     def build(self, channels: int) -> "Rounds":
+        """The rounds after a Gaussian head with descriptors of width ``channels``."""
         return Rounds(self, channels)
 
 
@@ -208,9 +234,13 @@ class Rounds(nn.Module):
     """Corrects Gaussians several times with the same weights; untrained, it changes nothing.
 
     Each round can change half as much as the one before, depths stay between near and far, attributes within
-    the bounds of their activations: more rounds than in training do not diverge. ``channels``: width of the
-    Gaussian head's descriptors. The attribute ``count``, the number of rounds outside of training, may be
-    changed at any time."""
+    the bounds of their activations: more rounds than in training do not diverge. The attribute ``count``, the
+    number of rounds outside of training, may be changed at any time.
+
+    Args:
+        options: of the rounds.
+        channels: width of the Gaussian head's descriptors.
+    """
 
     def __init__(self, options: RoundsOptions, channels: int):
         super().__init__()
@@ -237,8 +267,11 @@ class Rounds(nn.Module):
             state: the prediction of the stages, with bounds of depths.
             activate: gives Gaussians from their raw attributes.
             batch: photographs, masks and cameras are read.
-            step: size of the first step, in those after a depth head; one for all elements or one for
-                each."""
+            step: size of the first step, in those after a depth head; one for all elements or one for each.
+
+        Returns:
+            As many states as there are rounds, and one more.
+        """
         if self.options.gains and batch.log_gains is None:
             gaussians, batch = equalized(state.gaussians, batch, state.raw.real)
             state = dataclasses.replace(state, gaussians=gaussians)
@@ -256,6 +289,7 @@ class Rounds(nn.Module):
         return tuple(states)
 
     def _drawn(self) -> int:
+        """The number of rounds of a training step."""
         counts = self.options.training_counts
         return counts[int(torch.randint(len(counts), ()))]
 
@@ -268,8 +302,19 @@ class Rounds(nn.Module):
         windows: Windows | None,
         size: float | Float[Tensor, " N"],
     ) -> tuple[tuple[Tensor, Tensor], Tensor]:
-        """Changes of depths and of raw attributes, and the memory for the next round. ``size``: of the step,
-        as a share of the largest one; one for all Gaussians or one for each."""
+        """What a round changes.
+
+        Args:
+            state: before the round.
+            batch: photographs, masks and cameras are read.
+            rays: of the Gaussians' pixels.
+            memory: of the rounds before.
+            windows: places of the Gaussians in maps; None: nothing is exchanged.
+            size: of the step, as a share of the largest one; one for all Gaussians or one for each.
+
+        Returns:
+            Changes of depths in metres [N] and of raw attributes [N, c], and the memory for the next round.
+        """
         gaussians = state.gaussians.detach()
         drawn = None
         steep = []
@@ -291,7 +336,14 @@ class Rounds(nn.Module):
         memory: Float[Tensor, "N h"],
         windows: Windows | None,
     ) -> tuple[Float[Tensor, "N h"], Float[Tensor, "N c"]]:
-        """The memory after observation and exchange, and the change computed from it."""
+        """The memory after observation and exchange, and the change computed from it.
+
+        Args:
+            each: observations of each view, the own one first.
+            known: what is known of each Gaussian beside them.
+            memory: of the rounds before.
+            windows: places of the Gaussians in maps; None: nothing is exchanged.
+        """
         if multiplies(each, known, memory, self.memory.weight):
             memory = cpu.remembered(self.view, self.update, self.memory, each, known, memory)
         else:
@@ -309,13 +361,27 @@ class Rounds(nn.Module):
     def _remembered(
         self, each: Float[Tensor, "n V c"], known: Float[Tensor, "n k"], memory: Float[Tensor, "n h"]
     ) -> Float[Tensor, "n h"]:
-        """The new memory from the observations of each view (``each``, the own one first) and ``known``."""
+        """The new memory, from what is seen and known.
+
+        Args:
+            each: observations of each view, the own one first.
+            known: what is known of each Gaussian beside them.
+            memory: of the rounds before.
+        """
         own, others = self.view(each).split((1, each.shape[1] - 1), 1)
         seen = (own[:, 0], others.mean(1), others.amax(1))
         return torch.tanh(memory + self.memory(self.update(torch.cat((*seen, known, memory), -1))))
 
     @torch.no_grad()
     def _search(self, state: State, batch: Batch, rays: Rays, reach: float | Tensor) -> Search:
+        """Photo-consistency of depths around the current ones, within their bounds.
+
+        Args:
+            state: before the round.
+            batch: photographs, masks and cameras are read.
+            rays: of the Gaussians' pixels.
+            reach: largest distance, as a share of the way from near to far; one, or [N].
+        """
         maps = state.depth_maps
         depth, near, far = (
             at_least_float32(values).detach().flatten()[rays.place]
@@ -334,7 +400,13 @@ class Rounds(nn.Module):
 
 @torch.no_grad()
 def _footprints(state: State, batch: Batch, rays: Rays) -> Tensor:
-    """Sizes [N, 1] of a pixel at the Gaussians' depths, in the unit of depth."""
+    """Sizes [N, 1] of a pixel at the Gaussians' depths, in the unit of depth.
+
+    Args:
+        state: depths and images of the Gaussians.
+        batch: cameras are read.
+        rays: of the Gaussians' pixels.
+    """
     focal = focal_lengths(batch.cameras).prod(-1).sqrt().flatten()
     depth = at_least_float32(state.depth_maps.depth).flatten()[rays.place]
     return (depth / focal[state.raw.image])[:, None]
@@ -348,6 +420,16 @@ def _moved(
     moved: Float[Tensor, " N"],
     change: Float[Tensor, "N c"],
 ) -> State:
+    """The state after a round.
+
+    Args:
+        state: before it.
+        activate: gives Gaussians from their raw attributes.
+        batch: photographs, mattes and cameras are read.
+        rays: of the Gaussians' pixels, along which they move.
+        moved: changes of depths in metres.
+        change: of raw attributes.
+    """
     raw = state.raw.changed(change)
     maps = state.depth_maps
     pixels = state.points.pixels
