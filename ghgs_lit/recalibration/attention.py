@@ -80,7 +80,11 @@ class SemanticAttention(nn.Module):
             neighbors: for each element [n_b, k_b], as indices in it.
             cosines: of the same shapes, if they are used.
             left_out: of one element, -inf where a neighbour does not count, else 0; one of each token counts
-                at least; None: all."""
+                at least; None: all.
+
+        Returns:
+            Tokens [N, C] in the same order.
+        """
         counts = [len(near) for near in neighbors]
         elements = zip(x.split(counts), neighbors, cosines or [None] * len(counts), strict=True)
         results = [self._recalibrate_element(*element, left_out) for element in elements]
@@ -89,8 +93,17 @@ class SemanticAttention(nn.Module):
     def attention_weights(
         self, x: Float[Tensor, "n C"], rows: slice, near: Int[Tensor, "n k"], cosines: Tensor | None
     ) -> Float[Tensor, "m k a"]:
-        """Softmax weights of each head from the ``m`` tokens ``rows`` to their neighbours, for inspection.
-        ``x``: tokens of one element. ``near``, ``cosines`` [n, k]: of all ``n``."""
+        """Softmax weights of each head from some tokens to their neighbours, for inspection.
+
+        Args:
+            x: the n tokens of one element [n, C].
+            rows: which m tokens.
+            near: neighbours of all n, as indices among them [n, k].
+            cosines: of all n and their neighbours [n, k]; None: similarity is ignored (s = 1).
+
+        Returns:
+            Weights [m, k, a].
+        """
         near = near[rows]
         normed = self.norm1(x)
         q = at_least_float32(self.q_proj(normed[rows]))
@@ -105,7 +118,17 @@ class SemanticAttention(nn.Module):
         cosines: Float[Tensor, "n k"] | None,
         left_out: Float[Tensor, "n k"] | None,
     ) -> Float[Tensor, "n C"]:
-        """Recalibrate one element: keys and values of all tokens first, then the tokens in parts."""
+        """Recalibrate one element: keys and values of all tokens first, then the tokens in parts.
+
+        Args:
+            x: its tokens [n, C].
+            near: neighbours of each, as indices among them [n, k].
+            cosines: of tokens and neighbours [n, k], if they are used.
+            left_out: -inf where a neighbour does not count, else 0 [n, k]; None: all count.
+
+        Returns:
+            Tokens [n, C].
+        """
         linears = (self.q_proj, self.k_proj, self.v_proj, self.o_proj, self.mlp[0], self.mlp[2])
         q_proj, k_proj, v_proj, o_proj, mlp_in, mlp_out = map(_cast_once, linears)
 
@@ -132,8 +155,20 @@ class SemanticAttention(nn.Module):
         near: Int[Tensor, "m k"],
         changes: Changes | None,
     ) -> Float[Tensor, "m i"]:
-        """Weighted values of the neighbours of ``m`` tokens (Eq. 3), in float32 or wider. On a CPU by a
-        product with all tokens: faster than gathering, without a tensor of size m x k x C."""
+        """Weighted values of the neighbours of ``m`` tokens (Eq. 3), in float32 or wider.
+
+        On a CPU by a product with all tokens: faster than gathering, without a tensor of size m x k x C.
+
+        Args:
+            q: queries of these tokens [m, i].
+            k: keys of all tokens of the element [n, i].
+            v: their values [n, i].
+            near: neighbours of the m tokens [m, k].
+            changes: what logits are multiplied by, and what is added [m, k]; None: nothing.
+
+        Returns:
+            Values [m, i], heads concatenated.
+        """
         with exact(q.device.type):
             if q.device.type != "cpu" or self.num_heads * len(q) * len(k) > _SCORES:
                 return self._attend_gathered(q, k, v, near, changes or self.factor_and_bias(None))
@@ -157,7 +192,19 @@ class SemanticAttention(nn.Module):
         changes: Changes,
     ) -> Float[Tensor, "m i"]:
         """Eq. 3 with gathered keys and values of neighbours; nothing is as large as the square of the tokens.
-        If there are several parts, the backward pass computes each again."""
+
+        If there are several parts, the backward pass computes each again.
+
+        Args:
+            q: queries of m tokens [m, i].
+            k: keys of all tokens of the element [n, i].
+            v: their values [n, i].
+            near: neighbours of the m tokens [m, k].
+            changes: what logits are multiplied by, and what is added, of shapes that broadcast to [m, k].
+
+        Returns:
+            Values [m, i], heads concatenated.
+        """
         factor, bias = (x.expand(near.shape) for x in changes)
 
         def attend(q: Tensor, k: Tensor, v: Tensor, index: Tensor, *others: Tensor) -> Tensor:
@@ -181,14 +228,32 @@ class SemanticAttention(nn.Module):
         factor: Float[Tensor, "m k"],
         bias: Float[Tensor, "m k"],
     ) -> Float[Tensor, "m k a"]:
-        """Softmax weights, in each head, of the neighbours of ``m`` tokens; ``k``: keys of the neighbours."""
+        """Softmax weights, in each head, of the neighbours of ``m`` tokens.
+
+        Args:
+            q: queries of the tokens [m, i].
+            k: keys of their neighbours [m, k, i].
+            factor: what logits are multiplied by [m, k].
+            bias: what is added to them [m, k].
+
+        Returns:
+            Weights [m, k, a].
+        """
         products = (q[:, None] * k).unflatten(-1, (self.num_heads, -1)).sum(-1)
         logits = products * (q.shape[1] // self.num_heads) ** -0.5 * factor[..., None] + bias[..., None]
         return logits.softmax(1)
 
     def _changes(self, cosines: Tensor | None, left_out: Tensor | None, rows: slice) -> Changes | None:
-        """:meth:`factor_and_bias` of some tokens, with -inf for neighbours that are left out; None: logits
-        stay."""
+        """:meth:`factor_and_bias` of some tokens, with -inf for neighbours that are left out.
+
+        Args:
+            cosines: of all tokens and their neighbours [n, k], if they are used.
+            left_out: -inf where a neighbour does not count, else 0 [n, k]; None: all count.
+            rows: which m tokens.
+
+        Returns:
+            Both, of shapes that broadcast to [m, k]; None: logits stay.
+        """
         if cosines is None and left_out is None:
             return None
         factor, bias = self.factor_and_bias(None if cosines is None else cosines[rows])
@@ -197,7 +262,14 @@ class SemanticAttention(nn.Module):
         return factor, left_out[rows] if bias is self.zero else bias + left_out[rows]
 
     def factor_and_bias(self, cosines: Float[Tensor, "*n"] | None) -> Changes:
-        """What the semantic similarity multiplies a logit by, and what it adds."""
+        """What the semantic similarity multiplies a logit by, and what it adds.
+
+        Args:
+            cosines: of tokens and neighbours, in [-1, 1]; None: similarity is ignored (s = 1).
+
+        Returns:
+            Two tensors of the shape of ``cosines``, or scalars 1 and 0.
+        """
         if cosines is None:
             return self.one, self.zero
         if self.similarity == "log":
@@ -217,7 +289,16 @@ def _cast_once(linear: nn.Linear) -> Callable[[Tensor], Tensor]:
 def _in_parts(
     function: Callable[[slice], Tensor], count: int, device: torch.device
 ) -> Float[Tensor, "count _"]:
-    """``function`` of all rows; on a CPU without a gradient a part of them at a time, to save memory."""
+    """``function`` of all rows; on a CPU without a gradient a part of them at a time, to save memory.
+
+    Args:
+        function: rows to values [m, _].
+        count: number of all rows.
+        device: that of the values.
+
+    Returns:
+        Values [count, _].
+    """
     most = _HALF_ROWS if torch.is_autocast_enabled("cpu") else _ROWS
     if torch.is_grad_enabled() or count <= most or device.type != "cpu":
         return function(slice(None))

@@ -29,8 +29,17 @@ class TokenAttention:
 def attention_of(
     recalibration: Recalibration, tokens: Tokens, points: Points, query: int
 ) -> TokenAttention | None:
-    """Attention of the packed token ``query`` (Eqs. 3 to 5); None if it takes no part. ``tokens``,
-    ``points``: inputs of the stage."""
+    """Attention of one token (Eqs. 3 to 5).
+
+    Args:
+        recalibration: the stage.
+        tokens: inputs of the stage, as is the next.
+        points: of these tokens.
+        query: index of the packed token.
+
+    Returns:
+        Its neighbours and weights; None if it takes no part.
+    """
     takes_part = recalibration.takes_part(points)
     if not takes_part[query]:
         return None
@@ -47,8 +56,17 @@ def attention_on_other_parts(
     recalibration: Recalibration, tokens: Tokens, points: Points, part: Int[Tensor, " N"]
 ) -> Float[Tensor, "m L"]:
     """Share of each token's attention, in each layer, on tokens that show another body part; mean over heads.
-    ``tokens``, ``points``: inputs of the stage. ``part``: number of the part that a token shows; -1: unknown:
-    such tokens are no queries, and attention to them does not count."""
+
+    Args:
+        recalibration: the stage.
+        tokens: inputs of the stage, as is the next.
+        points: of these tokens.
+        part: number of the part that a token shows [N]; -1: unknown: such tokens are no queries, and
+            attention to them does not count.
+
+    Returns:
+        Shares [m, L] of the m tokens that take part and whose part is known.
+    """
     takes_part = recalibration.takes_part(points)
     element = tokens.image // tokens.grid[1]
     found = []
@@ -65,7 +83,17 @@ def attention_on_other_parts(
 def _near(
     recalibration: Recalibration, tokens: Tokens, points: Points, chosen: Int[Tensor, " n"]
 ) -> Int[Tensor, "n k"]:
-    """Neighbours of the ``chosen`` tokens of an element, as indices among them."""
+    """Neighbours of some tokens of an element.
+
+    Args:
+        recalibration: the stage.
+        tokens: inputs of the stage, as is the next.
+        points: of these tokens.
+        chosen: indices of the n packed tokens.
+
+    Returns:
+        Indices among the chosen ones [n, k].
+    """
     places = recalibration.places(tokens)
     positions = recalibration.positions(tokens, points)
     places = None if places is None else places[chosen]
@@ -87,7 +115,16 @@ class Neighborhood:
 
 @torch.no_grad()
 def neighborhoods(recalibration: Recalibration, tokens: Tokens, points: Points) -> list[Neighborhood]:
-    """The neighbourhood of each element. ``tokens``, ``points``: inputs of the stage."""
+    """The neighbourhood of each element.
+
+    Args:
+        recalibration: the stage.
+        tokens: inputs of the stage, as is the next.
+        points: of these tokens.
+
+    Returns:
+        One for each element of the batch.
+    """
     other = copy.copy(recalibration)
     other.neighborhood = "image_plane" if recalibration.neighborhood == "xyz" else "xyz"
     takes_part = recalibration.takes_part(points)
@@ -129,7 +166,19 @@ def _weights(
     rows: slice,
     plain: bool = False,
 ) -> tuple[Int[Tensor, "n k"], Float[Tensor, "L m k a"]]:
-    """Neighbours of the ``chosen`` tokens of an element, as indices among them, and weights of ``rows``."""
+    """Neighbours and attention weights of some tokens of an element.
+
+    Args:
+        recalibration: the stage.
+        tokens: inputs of the stage, as is the next.
+        points: of these tokens.
+        chosen: indices of the n packed tokens that take part.
+        rows: which m of these are queries.
+        plain: weights for s = 1.
+
+    Returns:
+        Neighbours of all chosen ones, as indices among them [n, k], and weights [L, m, k, a].
+    """
     near = _near(recalibration, tokens, points, chosen)
     block = recalibration.block
     plain |= block.similarity == "none"

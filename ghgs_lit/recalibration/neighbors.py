@@ -21,11 +21,10 @@ def nearest_neighbors(
     places: Int[Tensor, "*b n"] | None = None,
     views: int = 0,
 ) -> Int[Tensor, "*b n k"]:
-    """Indices of the ``min(k, n)`` nearest points of each point in any view, itself included, nearest first.
-    Of one element, or of several with the same number of points.
+    """The nearest points of each point in any view, itself included.
 
-    Distances are computed from differences in float32 or wider: products would lose digits far from the
-    origin.
+    Of one element, or of several with the same number of points. Distances are computed from differences in
+    float32 or wider: products would lose digits far from the origin.
 
     Args:
         points: positions of the tokens, of any dimension d.
@@ -34,7 +33,11 @@ def nearest_neighbors(
         places: a number of each token's place, which orders points at equal distances: nearest number first,
             so that opposite places alternate, and at each place the query's own view, then the next views.
             None: ties by index.
-        views: number of views of an element; read with ``places``."""
+        views: number of views of an element; read with ``places``.
+
+    Returns:
+        Indices [..., n, min(k, n)], nearest first.
+    """
     points = at_least_float32(points)
     n = points.shape[-2]
     k = min(k, n)
@@ -49,7 +52,17 @@ def nearest_neighbors(
 
 
 def _turns(places: Tensor, view: Tensor, views: int, block: slice) -> Int[Tensor, "*b m n"]:
-    """Ranks of tokens at equal distances from the queries ``block``; see ``places``."""
+    """Ranks of tokens at equal distances from some queries; see ``places`` of :func:`nearest_neighbors`.
+
+    Args:
+        places: a number of each token's place [..., n].
+        view: the view of each token [..., n].
+        views: number of views of an element.
+        block: which m tokens are the queries.
+
+    Returns:
+        Ranks [..., m, n], the least first.
+    """
     apart = places[..., None, :] - places[..., block, None]
     turn = (view[..., None, :] - view[..., block, None]) % views
     return (2 * apart.abs() + (apart < 0)) * views + turn
@@ -58,9 +71,19 @@ def _turns(places: Tensor, view: Tensor, views: int, block: slice) -> Int[Tensor
 def _smallest(
     distance: Float[Tensor, "*b m n"], ranks: Int[Tensor, "*b m n"] | None, k: int
 ) -> Int[Tensor, "*b m k"]:
-    """Columns of the ``k`` smallest values of each row, ascending, ties by rank or column; NaN is largest.
+    """Columns of the smallest values of each row; NaN is largest.
+
     ``topk`` does not define the order of equal values, so the rank is the lower half of the key; the upper
-    half is the bits of the distance, since those of non-negative floats sort like their values."""
+    half is the bits of the distance, since those of non-negative floats sort like their values.
+
+    Args:
+        distance: [..., m, n], 0 or more.
+        ranks: order of columns at equal distances [..., m, n], below 2^32; None: by column.
+        k: how many, up to n.
+
+    Returns:
+        Indices of columns [..., m, k], ascending by value.
+    """
     if distance.dtype == torch.float64:
         if ranks is None:
             return distance.sort(dim=-1, stable=True).indices[..., :k]

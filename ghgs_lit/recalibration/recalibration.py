@@ -44,7 +44,17 @@ class RecalibrationOptions(Options):
     """Tokens that take part: subject, those with a point on the subject | all (the release)"""
 
     def build(self, dim_latent: int) -> "Recalibration":
-        """The stage for tokens of width ``dim_latent``. InputError: as :class:`SemanticAttention`."""
+        """The stage.
+
+        Args:
+            dim_latent: width of the tokens.
+
+        Returns:
+            The stage with new weights.
+
+        Raises:
+            InputError: as :class:`SemanticAttention`.
+        """
         return Recalibration(self, dim_latent)
 
 
@@ -59,8 +69,16 @@ class Recalibration(nn.Module):
         self.block = SemanticAttention(dim_latent, options.num_heads, options.similarity)
 
     def forward(self, tokens: Tokens, points: Points, plan: Plan) -> Tokens:
-        """Tokens with recalibrated layers; semantic features and order are unchanged. ``plan``: its ``peers``
-        take part if their points are valid, or if all tokens do."""
+        """Tokens with recalibrated layers; semantic features and order are unchanged.
+
+        Args:
+            tokens: of the encoder.
+            points: of these tokens in the subject's frame.
+            plan: its ``peers`` take part if their points are valid, or if all tokens do.
+
+        Returns:
+            Tokens of the same shapes and precision.
+        """
         rows = plan.peers.only(self.takes_part(points))
         if rows.real is not None:
             return self._filled(tokens, points, rows)
@@ -90,8 +108,18 @@ class Recalibration(nn.Module):
         return dataclasses.replace(tokens, latent=tuple(layers))
 
     def _filled(self, tokens: Tokens, points: Points, rows: Rows) -> Tokens:
-        """:meth:`forward` for elements with the same number of ``rows``, all at once. Rows that do not count
-        are out of reach of the others, and their results are not read."""
+        """:meth:`forward` for elements with the same number of rows, all at once.
+
+        Rows that do not count are out of reach of the others, and their results are not read.
+
+        Args:
+            tokens: of the encoder.
+            points: of these tokens.
+            rows: of packed tokens, the same number in each element, and which of them count.
+
+        Returns:
+            Tokens of the same shapes and precision.
+        """
         shape = (len(rows.counts), rows.counts[0])
         places = self.places(tokens)
         real = rows.real.view(shape)
@@ -140,7 +168,15 @@ class Recalibration(nn.Module):
 
 
 def neighbor_count(k: int | float, tokens: int) -> int:
-    """Neighbours of each of an element's ``tokens``: ``k``, or a share of them below 1, and one at least."""
+    """Neighbours of each of an element's tokens.
+
+    Args:
+        k: their number, or below 1 a share of the tokens.
+        tokens: of the element, that take part.
+
+    Returns:
+        1 or more; a number ``k`` may exceed that of the tokens.
+    """
     return max(round(k * tokens), 1) if k < 1 else int(k)
 
 
@@ -148,8 +184,17 @@ def neighbor_count(k: int | float, tokens: int) -> int:
 def neighbor_cosines(
     semantic: Float[Tensor, "*b n s"], near: Int[Tensor, "*b n k"]
 ) -> Float[Tensor, "*b n k"]:
-    """Cosines of the semantic features of tokens and their neighbours ``near`` (Eq. 4), float32 or wider; 0
-    for zeros. One element, or several with the same number of tokens."""
+    """Cosines of the semantic features of tokens and their neighbours (Eq. 4).
+
+    One element, or several with the same number of tokens.
+
+    Args:
+        semantic: features [..., n, s].
+        near: indices of neighbours [..., n, k].
+
+    Returns:
+        [..., n, k], float32 or wider; 0 for features of zeros.
+    """
     with exact(semantic.device.type):
         semantic = at_least_float32(semantic)
         # Allocated before temporary tensors, so that their memory can be freed.
