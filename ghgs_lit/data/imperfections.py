@@ -50,7 +50,13 @@ def color_gains(
 
 
 def tone_powers(views: int, gamma: float, rng: np.random.Generator) -> Float[np.ndarray, " V"]:
-    """Random powers of stored colours, geometric mean 1 over cameras; ``gamma``: greatest logarithm."""
+    """Random powers of stored colours, geometric mean 1 over cameras.
+
+    Args:
+        views: number of cameras V.
+        gamma: greatest natural logarithm of a power, at least 0.
+        rng: where deviations are drawn from.
+    """
     deviation = rng.uniform(-1, 1, views)
     deviation -= deviation.mean()
     return np.exp(gamma * deviation / max(1, np.abs(deviation).max()))
@@ -59,7 +65,13 @@ def tone_powers(views: int, gamma: float, rng: np.random.Generator) -> Float[np.
 def toned(
     images: Float[Tensor, "B V 3 h w"], alpha: Float[Tensor, "B V h w"] | None, powers: Float[Tensor, "B V"]
 ) -> Float[Tensor, "B V 3 h w"]:
-    """Raise the colours of each view to a power; multiplication by mattes ``alpha`` is undone before."""
+    """Raise the colours of each view to a power; multiplication by mattes is undone before.
+
+    Args:
+        images: in [0, 1], multiplied by ``alpha`` if there is one.
+        alpha: mattes in [0, 1]; None: pixels are of the subject or black.
+        powers: above 0.
+    """
     powers = powers[..., None, None, None]
     if alpha is None:
         return images**powers
@@ -220,7 +232,13 @@ def _of_each(matrices: Float[Tensor, "V n m"]) -> Float[Tensor, "V 4 n m"]:
 def _apart(
     cameras: Cameras, lens: Float[Tensor, "V 3 3"], pose: Float[Tensor, "V 4 4"]
 ) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"]]:
-    """Intrinsics and extrinsics without the common part of their differences from ``cameras``."""
+    """Intrinsics and extrinsics without the common part of their differences from true cameras.
+
+    Args:
+        cameras: true cameras [V].
+        lens: intrinsics with errors, float64.
+        pose: extrinsics with errors, float64.
+    """
     true = cameras.extrinsics.double()
     middle = look_at_point(cameras).double()
     motions = without_common(motions_between(true, pose, middle), true[:, 2, :3])
@@ -236,10 +254,17 @@ _SHOWN = 0.45, 0.95
 
 
 def cut(batch: Batch, chance: float, rngs: list[np.random.Generator]) -> Batch:
-    """Cut a share ``chance`` of the subjects by the frame's lower edge. ``rngs``: one for each element. Half
-    of them are cut in all inputs and targets at about the same height, so that no legs are asked for that no
-    photograph shows; the others in some inputs, at different heights. Photographs are moved down in their
-    frames, and principal points with them."""
+    """Cut a share of the subjects by the frame's lower edge.
+
+    Half of them are cut in all inputs and targets at about the same height, so that no legs are asked for
+    that no photograph shows; the others in some inputs, at different heights. Photographs are moved down
+    in their frames, and principal points with them.
+
+    Args:
+        batch: of at least two views.
+        chance: share of the subjects that are cut, in [0, 1].
+        rngs: one for each element.
+    """
     views = batch.masks.shape[1]
     shares = np.ones(batch.masks.shape[:2])
     ends = np.ones(len(rngs))

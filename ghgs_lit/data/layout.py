@@ -92,7 +92,14 @@ class Completeness:
 
 
 def lights_of(render: Mapping[str, Any]) -> str:
-    """``studio`` or ``none``, of the stored settings of renders, which hold the lights themselves."""
+    """Lights of renders.
+
+    Args:
+        render: stored settings of the renders, which hold the lights themselves.
+
+    Returns:
+        ``studio`` or ``none``.
+    """
     return "none" if render.get("lights") == "none" else "studio"
 
 
@@ -162,7 +169,16 @@ class Layout(Reader):
         self.find(phase, names, limit)
 
     def find(self, phase: str, names: Sequence[str] | None, limit: int | None = None) -> None:
-        """Fill ``subjects`` with complete ones."""
+        """Fill ``subjects`` with complete ones.
+
+        Args:
+            phase: ``train`` or ``val``.
+            names: subjects to read; None: all of the phase.
+            limit: number of subjects, the first ones; None: all.
+
+        Raises:
+            InputError: as for the class.
+        """
         require_folder(self.root, "the root of a rendered data set")
         phases = [phase] if names is None else [phase, *(p for p in PHASES if p != phase)]
         stored = {p: _positions(self.root / p / "img") for p in phases}
@@ -272,7 +288,15 @@ class Layout(Reader):
         return View(image, mask > mask.max() / 2, inverse, *matrices, matte)
 
     def _file(self, name: str, kind: str, position: int, file: str, suffixes: Sequence[str] = ("",)) -> Path:
-        """A file of a position, by any spelling of its name; the usual one where there is none."""
+        """A file of a position, by any spelling of its name; the usual one where there is none.
+
+        Args:
+            name: of the subject.
+            kind: folder of the layout, such as ``img``.
+            position: on the ring.
+            file: name of the file, without its suffix if ``suffixes`` are given.
+            suffixes: possible suffixes; the first is the usual one.
+        """
         folder = self._folder(name, kind, position)
         return find_path(folder, file, suffixes) or folder / f"{file}{suffixes[0]}"
 
@@ -282,7 +306,12 @@ class Layout(Reader):
 
 
 def position_name(name: str, position: int) -> str:
-    """Folder name of a subject's ring position."""
+    """Folder name of a subject's ring position.
+
+    Args:
+        name: of the subject.
+        position: on the ring, at least 0.
+    """
     return f"{name}_{position:03d}"
 
 

@@ -20,7 +20,11 @@ _MOST_BORDER = 0.5
 
 
 def silhouette(view: View) -> Silhouette:
-    """Coarse silhouette of a photograph."""
+    """Coarse silhouette of a photograph, at most 64 cells high and wide.
+
+    Args:
+        view: the photograph; its mask and camera are read.
+    """
     height, width = view.mask.shape
     scale = min(_CELLS / max(height, width), 1)
     size = max(round(height * scale), 1), max(round(width * scale), 1)
@@ -30,7 +34,11 @@ def silhouette(view: View) -> Silhouette:
 
 
 def implausible(mask: np.ndarray) -> str | None:
-    """Message if a mask [h, w] is too small, full or inverted; else None."""
+    """Message if a mask is too small, full or inverted; else None.
+
+    Args:
+        mask: [h, w] bool, true on the subject.
+    """
     border = np.concatenate((mask[0], mask[-1], mask[:, 0], mask[:, -1])).mean()
     if border > _MOST_BORDER:
         return (

@@ -15,9 +15,13 @@ from ghgs_lit.parsing import require_folder
 
 
 class LoadingOptions(Options):
-    """Base options of data sets. ``published``: number of people of each phase in the publication, if any.
-    ``static_cameras``: whether there are no views between the cameras (view numbers are 0). ``ring``: number
-    of positions on a full ring of cameras, among which inputs are evenly spaced."""
+    """Base options of data sets.
+
+    Attributes:
+        published: number of people of each phase in the publication, if any.
+        static_cameras: whether there are no views between the cameras (view numbers are 0).
+        ring: number of positions on a full ring of cameras, among which inputs are evenly spaced.
+    """
 
     group = "data"
     published: ClassVar[Mapping[str, int]] = {}
@@ -51,7 +55,12 @@ class LoadingOptions(Options):
 
     @abstractmethod
     def reader(self, phase: str, strict: bool = True) -> Reader:
-        """Reader of a split; ``strict`` as for :class:`Reader`."""
+        """Reader of a split.
+
+        Args:
+            phase: name of the split.
+            strict: raise the first problem of the data, or collect all, as for :class:`Reader`.
+        """
 
     def has(self, phase: str) -> bool:
         """Whether a phase has subjects; data without ``train`` can be evaluated."""
@@ -63,7 +72,11 @@ class LoadingOptions(Options):
         return PHASES
 
     def prepare(self, splits: Sequence[str] = PHASES) -> None:
-        """Make missing data of these splits; called once, before any process reads."""
+        """Make missing data; called once, before any process reads.
+
+        Args:
+            splits: names of the splits whose data is made.
+        """
         return
 
     def make(self) -> None:
@@ -71,7 +84,14 @@ class LoadingOptions(Options):
         self.prepare()
 
     def check_targets(self, targets: TargetProtocol) -> None:
-        """Refuse a target protocol whose views this data set never has."""
+        """Refuse a target protocol whose views this data set never has.
+
+        Args:
+            targets: the protocol.
+
+        Raises:
+            InputError: it asks for such views.
+        """
         return
 
     @property
@@ -92,7 +112,16 @@ class LoadingOptions(Options):
 
 
 def required_folder(key: str, expected: str, value: str | None) -> Path:
-    """Path configured at ``key``, which need not exist. InputError: it is null."""
+    """Path configured at a key, which need not exist.
+
+    Args:
+        key: of the configuration, for the message.
+        expected: what the folder is, for the message.
+        value: of the key.
+
+    Raises:
+        InputError: it is null.
+    """
     if value is None:
         raise InputError(f"{key}: expected {expected}; found null")
     return Path(value).expanduser()

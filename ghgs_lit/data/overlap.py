@@ -16,7 +16,12 @@ _CELLS = 96
 
 
 def project(vertices: np.ndarray, view: View) -> np.ndarray:
-    """Pixels [m, 2] (u, v), float64, of the vertices [n, 3] in front of the camera."""
+    """Pixels [m, 2] (u, v), float64, of the vertices in front of the camera.
+
+    Args:
+        vertices: [n, 3] in the world, metres.
+        view: its camera is read.
+    """
     pose = view.extrinsics.astype(np.float64)
     matrix = view.intrinsics.astype(np.float64)
     points = vertices.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
@@ -25,9 +30,18 @@ def project(vertices: np.ndarray, view: View) -> np.ndarray:
 
 
 def overlap(vertices: np.ndarray, view: View) -> float | None:
-    """IoU of the silhouette of a body and a mask; None with fewer than :data:`MIN_VERTICES` vertices. The
-    silhouette is taken on a grid so coarse that vertices can be joined without faces. Parts outside the
-    photograph do not count. ``vertices``: [n, 3] in the world, metres."""
+    """IoU of the silhouette of a body and a mask.
+
+    The silhouette is taken on a grid so coarse that vertices can be joined without faces. Parts outside
+    the photograph do not count.
+
+    Args:
+        vertices: [n, 3] in the world, metres.
+        view: the photograph; its mask and camera are read.
+
+    Returns:
+        IoU in [0, 1]; None with fewer than :data:`MIN_VERTICES` vertices.
+    """
     if len(vertices) < MIN_VERTICES:
         return None
     height, width = view.mask.shape
@@ -67,8 +81,15 @@ _DOTS = 400
 
 
 def draw_tile(view: View | None, body: np.ndarray | None) -> Tile:
-    """Draw [176, w, 3] uint8: a photograph (None: a cross), the outline of its mask in green, and some of the
-    vertices ``body`` [n, 3] in red."""
+    """A small picture of a photograph, the outline of its mask in green, and some vertices in red.
+
+    Args:
+        view: the photograph; None: a cross.
+        body: vertices [n, 3] in the world, metres; None: none.
+
+    Returns:
+        [176, w, 3] uint8.
+    """
     if view is None:
         image = Image.new("RGB", (_HEIGHT, _HEIGHT), _GREY)
         draw = ImageDraw.Draw(image)
@@ -87,7 +108,12 @@ def draw_tile(view: View | None, body: np.ndarray | None) -> Tile:
 
 
 def save_sheet(rows: Mapping[str, Sequence[tuple[str, Tile]]], path: Path) -> None:
-    """Save (label, tile) pairs by subject as one picture, a row for each subject."""
+    """Save tiles as one picture, a row for each subject.
+
+    Args:
+        rows: (label, tile) pairs by subject.
+        path: of the picture.
+    """
     width = max(sum(tile.shape[1] + 2 for _, tile in tiles) for tiles in rows.values())
     step = _HEIGHT + 2 * _LINE
     sheet = Image.new("RGB", (width, step * len(rows)))

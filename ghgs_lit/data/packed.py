@@ -171,6 +171,14 @@ class PackedReader(Reader):
         return content if body is None else content | {"body": body}
 
     def _resized(self, name: str, position: int, view: int, depth: bool) -> View:
+        """A photograph as it is packed, read from its own files.
+
+        Args:
+            name: of the subject.
+            position: number of the camera, or position on the ring.
+            view: its number at the position.
+            depth: also read the depth map, if there is any.
+        """
         found = self.reader.checked_view(name, position, view, depth)
         size = self.packing.size
         return found if size is None else resize_view(found, *size, self.packing.resampling)
@@ -194,7 +202,16 @@ class Pack:
         self.body = self._file.get_tensor("body") if "body" in self._file.keys() else None  # noqa: SIM118
 
     def view(self, position: int, view: int, depth: bool) -> View | None:
-        """One photograph with or without its depth map; None: it is not in the file."""
+        """One photograph.
+
+        Args:
+            position: number of the camera, or position on the ring.
+            view: its number at the position.
+            depth: with its depth map, if there is any.
+
+        Returns:
+            The photograph at its packed size; None: it is not in the file.
+        """
         if (position, view) not in self._rows:
             return None
         number, start, height, width, top, bottom, left, right, maps = self._rows[position, view]
@@ -252,8 +269,14 @@ def _digest(facts: list) -> str:
 
 
 def folder_of(data: Path) -> Path:
-    """Folder of the packed photographs of the data set in ``data``: in it, or in the user's cache where it
-    cannot be written to."""
+    """Folder of the packed photographs of a data set.
+
+    Args:
+        data: folder of the data set.
+
+    Returns:
+        A folder in it, or in the user's cache where it cannot be written to.
+    """
     beside = data / "packed"
     if os.access(beside if beside.is_dir() else data, os.W_OK | os.X_OK):
         return beside

@@ -66,6 +66,16 @@ class _Unpickler(pickle.Unpickler):
 
 
 def _load(path: Path, stream: io.BufferedIOBase, also: Mapping[tuple[str, str], Any] = _NOTHING) -> Any:
+    """Read a pickle with the admitted names.
+
+    Args:
+        path: of the file, for messages.
+        stream: where the pickle begins.
+        also: harmless replacements for further names.
+
+    Raises:
+        InputError: it is broken, or names anything else.
+    """
     try:
         return _Unpickler(stream, also).load()
     except _Refused as error:
@@ -77,8 +87,15 @@ def _load(path: Path, stream: io.BufferedIOBase, also: Mapping[tuple[str, str], 
 
 
 def load_pickle(path: Path, also: Mapping[tuple[str, str], Any] = _NOTHING) -> Any:
-    """Read the arrays, scalars and plain containers of a pickle. ``also``: harmless replacements for further
-    names (module, name). InputError: it is missing, broken, or names anything else, which is not called."""
+    """Read the arrays, scalars and plain containers of a pickle.
+
+    Args:
+        path: of the file.
+        also: harmless replacements for further names (module, name).
+
+    Raises:
+        InputError: it is missing, broken, or names anything else, which is not called.
+    """
     if not path.is_file():
         raise InputError(f"{path}: expected a pickle; found no such file")
     with path.open("rb") as stream:
@@ -86,9 +103,17 @@ def load_pickle(path: Path, also: Mapping[tuple[str, str], Any] = _NOTHING) -> A
 
 
 def load_npy(path: Path) -> Any:
-    """Read an ``.npy`` file; pickled objects in it are read as by :func:`load_pickle`. The object in an array
-    without dimensions (``np.save`` of a dictionary) is returned itself. InputError: it is missing, broken, or
-    names anything but arrays and plain containers."""
+    """Read an ``.npy`` file; pickled objects in it are read as by :func:`load_pickle`.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        An array; of one without dimensions (``np.save`` of a dictionary) the object in it.
+
+    Raises:
+        InputError: it is missing, broken, or names anything but arrays and plain containers.
+    """
     if not path.is_file():
         raise InputError(f"{path}: expected an .npy file; found no such file")
     try:

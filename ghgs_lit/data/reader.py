@@ -24,10 +24,18 @@ PHASES = ("train", "val")
 
 
 class Reader(ABC):
-    """Stored photographs of one phase (``train`` or ``val``). ``subjects`` maps each subject (a person, or
-    one frame of a person) to the positions of its cameras. A photograph is identified by (position, view);
-    ``view`` is 0 except on rings that were rendered with further views between cameras. ``strict``: raise the
-    first problem of the data set, or collect all in ``problems``."""
+    """Stored photographs of one phase (``train`` or ``val``).
+
+    A photograph is identified by (position, view); ``view`` is 0 except on rings that were rendered with
+    further views between cameras.
+
+    Args:
+        strict: raise the first problem of the data set, or collect all in ``problems``.
+
+    Attributes:
+        subjects: positions of the cameras of each subject (a person, or one frame of a person).
+        problems: what is wrong with the data set, a line each.
+    """
 
     def __init__(self, strict: bool = True) -> None:
         self.strict = strict
@@ -58,11 +66,22 @@ class Reader(ABC):
         return len(self.subjects)
 
     def views_at(self, name: str, position: int) -> list[int]:
-        """Numbers of the views that have a photograph at a position."""
+        """Numbers of the views that have a photograph at a position.
+
+        Args:
+            name: of the subject.
+            position: number of the camera, or position on the ring.
+        """
         return [0]
 
     def place(self, name: str, position: int, view: int) -> str:
-        """Name of a photograph in messages, preferably the path of its mask."""
+        """Name of a photograph in messages, preferably the path of its mask.
+
+        Args:
+            name: of the subject.
+            position: number of the camera, or position on the ring.
+            view: its number at the position.
+        """
         return f"{name}, camera {position}, view {view}"
 
     def sources(self, name: str) -> Iterable[Path | str]:
@@ -80,6 +99,12 @@ class Reader(ABC):
 
     def checked_view(self, name: str, position: int, view: int, depth: bool) -> View:
         """One photograph as :meth:`read_view`.
+
+        Args:
+            name: of the subject.
+            position: number of the camera, or position on the ring.
+            view: its number at the position.
+            depth: also read the depth map, if there is any.
 
         Raises:
             InputError: a file is missing or bad, the reader gives a wrong view, or the mask is empty.
@@ -102,7 +127,14 @@ class Reader(ABC):
             self.problems.append(str(error))
 
     def problem(self, line: str) -> None:
-        """Raise or collect a problem of the data set."""
+        """Raise or collect a problem of the data set.
+
+        Args:
+            line: ``<place>: expected ...; found ...``.
+
+        Raises:
+            InputError: the reader is strict.
+        """
         with self.collecting():
             raise InputError(line)
 
@@ -124,7 +156,13 @@ class FrameReader(Reader):
         return len(self.sequences)
 
     def existing(self, folder: Path, names: Sequence[str], example: str) -> list[str]:
-        """Existing sequences among ``names``; none is a problem, whose message shows ``example``."""
+        """Existing sequences among names.
+
+        Args:
+            folder: of the sequences.
+            names: of sequences.
+            example: name that the message shows where none of them exists, which is a problem.
+        """
         there = [name for name in names if (folder / name).is_dir()]
         if len(there) < len(names):
             log.warning("%s: %d of %d sequences are there", folder, len(there), len(names))
@@ -191,7 +229,14 @@ class PhotographCache:
         return False
 
     def body(self, name: str) -> np.ndarray | None:
-        """Body vertices as :meth:`Reader.read_body`. InputError: they are bad."""
+        """Body vertices as :meth:`Reader.read_body`.
+
+        Args:
+            name: of the subject.
+
+        Raises:
+            InputError: they are bad.
+        """
 
         def read() -> np.ndarray | None:
             vertices = self.reader.read_body(name)

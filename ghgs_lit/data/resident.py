@@ -137,11 +137,24 @@ class ResidentPhotographs:
         return numbers
 
     def rows(self, subject: str, photos: Sequence[Photo]) -> list[int]:
-        """Numbers of photographs of a subject. KeyError: one is not here."""
+        """Numbers of photographs of a subject.
+
+        Args:
+            subject: its name.
+            photos: (position, view) of each.
+
+        Raises:
+            KeyError: one is not here.
+        """
         return [self.numbers[subject, *photo] for photo in photos]
 
     def cameras(self, rows: Int[Tensor, "B V"], size: Size) -> Cameras:
-        """Cameras of photographs at a size, on the CPU, as of :func:`ghgs_lit.data.view.resize_view`."""
+        """Cameras of photographs at a size, on the CPU, as of :func:`ghgs_lit.data.view.resize_view`.
+
+        Args:
+            rows: numbers of photographs, on the CPU.
+            size: (height, width) in pixels.
+        """
         matrices = self.intrinsics[rows.numpy()]
         if size != self.size:
             matrices = matrices.astype(np.float64)
@@ -151,7 +164,17 @@ class ResidentPhotographs:
     def maps(
         self, rows: Int[Tensor, "B V"], size: Size, depth: bool
     ) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
-        """Images [B, V, 3, h, w] in [0, 1], masks, depths in metres and mattes in [0, 1] [B, V, h, w]."""
+        """Pixels of photographs at a size.
+
+        Args:
+            rows: numbers of photographs.
+            size: (height, width) in pixels.
+            depth: whether depths are asked for.
+
+        Returns:
+            Images [B, V, 3, h, w] in [0, 1], and masks, depths in metres and mattes in [0, 1] [B, V, h,
+            w]; None for depths and mattes that there are none of.
+        """
         mattes = None if self.mattes is None else self.mattes[rows]
         inverse = self.inverse[rows] if depth and self.inverse is not None else None
         images = self.images[rows]
@@ -173,7 +196,12 @@ class ResidentPhotographs:
         return images.float() / 255, masks, known, None if mattes is None else mattes.float() / 255
 
     def batch(self, drawn: Drawn, targets: "ResidentPhotographs") -> Batch:
-        """The batch of a loader's numbers. ``targets``: where target photographs are."""
+        """The batch of a loader's numbers.
+
+        Args:
+            drawn: the numbers, on the device.
+            targets: where target photographs are.
+        """
         images, masks, depths, alpha = self.maps(drawn.inputs, _size(drawn.cameras), True)
         seen, target_masks, _, _ = targets.maps(drawn.targets, _size(drawn.target_cameras), False)
         bodies = [self.bodies[spec.subject] for spec in drawn.specs]

@@ -32,7 +32,12 @@ Several = Annotated[int, Field(ge=2)]
 
 
 def subject_rng(seed: int, name: str) -> np.random.Generator:
-    """Random numbers of one subject, independent of other subjects."""
+    """Random numbers of one subject, independent of other subjects.
+
+    Args:
+        seed: of the run.
+        name: of the subject.
+    """
     digest = hashlib.sha256(name.encode()).digest()
     return np.random.default_rng([seed, int.from_bytes(digest[:8], "little")])
 
@@ -71,7 +76,14 @@ class ViewProtocol(Options):
     each moved by up to one position, as captures are."""
 
     def draw(self, available: Sequence[int], count: int, ring: int, rng: np.random.Generator) -> list[int]:
-        """Positions of the ``count`` inputs of a training sample."""
+        """Positions of the inputs of a training sample.
+
+        Args:
+            available: positions of the subject.
+            count: number of inputs.
+            ring: number of positions of a full ring.
+            rng: where they are drawn from.
+        """
         if self.training != "any":
             start = int(rng.integers(ring))
             positions = np.asarray(even_positions(ring, count))
@@ -82,12 +94,23 @@ class ViewProtocol(Options):
 
 
 def even_positions(ring: int, count: int) -> list[int]:
-    """``count`` evenly spaced positions, floor(i * ring / count): 0, 5, 10 for 3 of 16."""
+    """Evenly spaced positions, floor(i * ring / count): 0, 5, 10 for 3 of 16.
+
+    Args:
+        ring: number of positions of a full ring.
+        count: number of positions that are chosen, at least 1.
+    """
     return [i * ring // count for i in range(count)]
 
 
 def middle(first: int, second: int, ring: int) -> Photo:
-    """Photograph half-way from position ``first`` on to ``second``: at a ring camera or between two."""
+    """Photograph half-way between two positions: at a ring camera or between two.
+
+    Args:
+        first: position where the way begins.
+        second: position where it ends, further on along the ring.
+        ring: number of positions of a full ring.
+    """
     doubled = 2 * first + (second - first) % ring
     return doubled // 2 % ring, MIDDLE_VIEW if doubled % 2 else RING_VIEW
 
@@ -137,7 +160,17 @@ class TargetProtocol(Options):
     def draw(
         self, available: Sequence[int], inputs: Sequence[int], count: int, rng: np.random.Generator
     ) -> tuple[Photo, ...]:
-        """``count`` different photographs at ``available`` positions that are not inputs."""
+        """Different photographs at positions of the subject that are not inputs.
+
+        Args:
+            available: positions of the subject.
+            inputs: positions of the inputs.
+            count: number of photographs.
+            rng: where they are drawn from.
+
+        Raises:
+            InputError: there are fewer.
+        """
         taken = ring_photos(inputs)
         everything = [(position, view) for position in available for view in self.training_views]
         pool = [photo for photo in everything if photo not in taken]
@@ -150,7 +183,17 @@ class TargetProtocol(Options):
     def evaluation(
         self, available: Sequence[int], inputs: Sequence[int], ring: int, rng: np.random.Generator
     ) -> tuple[Photo, ...]:
-        """Targets of an evaluation sample."""
+        """Targets of an evaluation sample.
+
+        Args:
+            available: positions of the subject.
+            inputs: positions of the inputs, in their order on the ring.
+            ring: number of positions of a full ring.
+            rng: where random targets are drawn from.
+
+        Raises:
+            InputError: the subject lacks positions, or more targets are asked for than there are.
+        """
         if self.kind == "cameras":
             return self._cameras(available, inputs)
         count = len(inputs) if self.per_subject == "all" else int(self.per_subject)
@@ -179,7 +222,19 @@ CAMERAS = TargetProtocol(name="cameras", view=RING_VIEW, per_subject="all", trai
 
 @dataclass(frozen=True)
 class TrainingSampler:
-    """Endless sequence of training samples, ``batch_size`` of them in each step and process."""
+    """Endless sequence of training samples.
+
+    Args:
+        subjects: camera positions by name.
+        views: choice of the inputs.
+        targets: choice of the targets.
+        ring: number of positions of a full ring.
+        batch_size: samples of each step and process.
+        seed: of the run.
+
+    Raises:
+        InputError: a subject has too few positions.
+    """
 
     subjects: Mapping[str, tuple[int, ...]]
     views: ViewProtocol
@@ -201,17 +256,35 @@ class TrainingSampler:
                 )
 
     def batch(self, step: int, rank: int = 0, world: int = 1) -> list[SampleSpec]:
-        """Samples of process ``rank`` of ``world`` at ``step``, with equal numbers of inputs."""
+        """Samples of one process at a step, with equal numbers of inputs.
+
+        Args:
+            step: of training.
+            rank: number of the process.
+            world: number of processes.
+        """
         count = int(np.random.default_rng([self.seed, _COUNT, step]).choice(self.views.training_counts))
         return [self._sample(step, index, count) for index in self.indices(step, rank, world)]
 
     def indices(self, step: int, rank: int = 0, world: int = 1) -> range:
-        """Numbers in the run of the samples of :meth:`batch`."""
+        """Numbers in the run of the samples of :meth:`batch`.
+
+        Args:
+            step: of training.
+            rank: number of the process.
+            world: number of processes.
+        """
         first = (step * world + rank) * self.batch_size
         return range(first, first + self.batch_size)
 
     def _sample(self, step: int, index: int, count: int) -> SampleSpec:
-        """Sample number ``index`` of the run, which takes all subjects in a new random order each epoch."""
+        """A sample of the run, which takes all subjects in a new random order each epoch.
+
+        Args:
+            step: of training.
+            index: number of the sample in the run.
+            count: number of inputs.
+        """
         names = list(self.subjects)
         epoch, place = divmod(index, len(names))
         name = names[np.random.default_rng([self.seed, _ORDER, epoch]).permutation(len(names))[place]]

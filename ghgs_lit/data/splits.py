@@ -47,9 +47,16 @@ def split_names(
 
 
 def read_split(split: Split, names: Sequence[str]) -> dict[str, list[str]]:
-    """Ids of ``train`` and ``val``. ``split``: a folder with ``split_train.txt`` and ``split_val.txt`` (one
-    id a line), or a mapping to ids and ranges of ``names`` such as ``0000-0425``. InputError: it is missing
-    or malformed, or an id is in both."""
+    """Ids of ``train`` and ``val``.
+
+    Args:
+        split: a folder with ``split_train.txt`` and ``split_val.txt`` (one id a line), or a mapping to
+            ids and ranges of ``names`` such as ``0000-0425``.
+        names: ids of all scans.
+
+    Raises:
+        InputError: it is missing or malformed, or an id is in both.
+    """
     if isinstance(split, Mapping):
         place: Path | str = "data.split"
         for phase in PHASES:

@@ -19,7 +19,16 @@ SAME_SURFACE = 0.02
 
 
 def area_image(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Resized image [height, width, ...] uint8: mean over the area of each new pixel; bicubic if it grows."""
+    """Resized image: mean over the area of each new pixel; bicubic if it grows.
+
+    Args:
+        image: [h, w, ...] uint8.
+        height: of the result in pixels.
+        width: of the result in pixels.
+
+    Returns:
+        [height, width, ...] uint8.
+    """
     h, w = image.shape[:2]
     if (h, w) == (height, width):
         return image
@@ -32,15 +41,35 @@ def area_image(image: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def area_mask(mask: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Resized mask [height, width] bool: at least half of the new pixel's area is in the mask."""
+    """Resized mask: at least half of the new pixel's area is in the mask.
+
+    Args:
+        mask: [h, w] bool.
+        height: of the result in pixels.
+        width: of the result in pixels.
+
+    Returns:
+        [height, width] bool.
+    """
     if mask.shape == (height, width):
         return mask
     return _area_means(mask[..., None], height, width)[..., 0] > 0.5 - 1e-6
 
 
 def centered_depth(inverse: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Inverse depth [height, width] uint16 at the centres of new pixels, by linear interpolation (exact for
-    planes) among those of the four old pixels that are known and on the nearest surface."""
+    """Inverse depth at the centres of new pixels.
+
+    It is interpolated linearly (exact for planes) among those of the four old pixels that are known and
+    on the nearest surface.
+
+    Args:
+        inverse: [h, w] uint16, 2^15 / metres; 0 where unknown.
+        height: of the result in pixels.
+        width: of the result in pixels.
+
+    Returns:
+        [height, width] uint16.
+    """
     if inverse.shape == (height, width):
         return inverse
     rows, down = neighbors(inverse.shape[0], height)
@@ -60,12 +89,30 @@ def centered_depth(inverse: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def release_image(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Resized image [height, width, ...] uint8 by Pillow's bicubic filter."""
+    """Resized image by Pillow's bicubic filter.
+
+    Args:
+        image: [h, w, ...] uint8.
+        height: of the result in pixels.
+        width: of the result in pixels.
+
+    Returns:
+        [height, width, ...] uint8.
+    """
     return np.asarray(Image.fromarray(image).resize((width, height), Image.Resampling.BICUBIC))
 
 
 def release_mask(mask: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Resized mask [height, width] by OpenCV's nearest neighbour."""
+    """Resized mask by OpenCV's nearest neighbour.
+
+    Args:
+        mask: [h, w].
+        height: of the result in pixels.
+        width: of the result in pixels.
+
+    Returns:
+        [height, width].
+    """
     h, w = mask.shape
     rows, columns = (np.arange(n) * old // n for n, old in ((height, h), (width, w)))
     return np.ascontiguousarray(mask[rows[:, None], columns])
@@ -81,7 +128,15 @@ def _area_means(layers: np.ndarray, height: int, width: int) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def area_weights(old: int, new: int) -> "sparse.csr_array":
-    """Share [new, old] of each new pixel that each old one covers; rows sum to 1."""
+    """Share of each new pixel that each old one covers, along one side.
+
+    Args:
+        old: pixels of the old side.
+        new: pixels of the new side.
+
+    Returns:
+        [new, old]; rows sum to 1.
+    """
     from scipy import sparse  # here: a wrong path is refused before it is needed
 
     edges = np.union1d(np.arange(old + 1) * new, np.arange(new + 1) * old)  # in units of 1 / (old * new)
@@ -92,7 +147,15 @@ def area_weights(old: int, new: int) -> "sparse.csr_array":
 
 
 def neighbors(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
-    """Indices [2, new] of the old pixels around the centres of the new ones, and linear weights [2, new]."""
+    """The two old pixels around the centre of each new one, along one side.
+
+    Args:
+        old: pixels of the old side.
+        new: pixels of the new side.
+
+    Returns:
+        Indices [2, new] and linear weights [2, new].
+    """
     place = (np.arange(new) + 0.5) * old / new - 0.5
     first = np.floor(place)
     second = (place - first).astype(np.float32)
@@ -105,10 +168,17 @@ DEPTH_SCALE = 1 << 15
 
 @dataclass(frozen=True)
 class View:
-    """A photograph, and its camera as float32 matrices [3, 3] and [4, 4]. ``image``: [h, w, 3] uint8, RGB.
-    ``mask``: [h, w] bool, true on the subject. ``inverse_depth``: [h, w] uint16, 2^15 / metres, 0 where
-    unknown; or None. ``matte``: [h, w] uint8, 255 times the share of each pixel that shows the subject, by
-    which the image is premultiplied; or None."""
+    """A photograph and its camera.
+
+    Attributes:
+        image: [h, w, 3] uint8, RGB.
+        mask: [h, w] bool, true on the subject.
+        inverse_depth: [h, w] uint16, 2^15 / metres, 0 where unknown; or None.
+        intrinsics: [3, 3] float32 in pixels, pixel centres at +0.5.
+        extrinsics: [4, 4] float32, world to camera, metres, OpenCV axes.
+        matte: [h, w] uint8, 255 times the share of each pixel that shows the subject, by which the
+            image is premultiplied; or None.
+    """
 
     image: np.ndarray
     mask: np.ndarray
@@ -141,7 +211,13 @@ def _depths() -> np.ndarray:
 
 
 def encode_depth(depth: np.ndarray) -> np.ndarray:
-    """Inverse depth uint16 of metres; 0 stays 0. At 2 m a step is 0.12 mm; nearer than 0.5 m saturates."""
+    """Inverse depth uint16 of metres.
+
+    At 2 m a step is 0.12 mm; nearer than 0.5 m saturates.
+
+    Args:
+        depth: metres, any shape; 0 where unknown, and stays 0.
+    """
     known = depth > 0
     inverse = np.round(DEPTH_SCALE / np.where(known, depth, 1))
     return np.where(known, np.clip(inverse, 1, 65535), 0).astype(np.uint16)

@@ -113,7 +113,12 @@ class Recorder:
         self._refused: set[Hashable] = set()
 
     def forget(self, inputs: Any, key: Hashable = ()) -> None:
-        """Forget the recording of the class of ``inputs``, as of :meth:`__call__`, if there is one."""
+        """Forget the recording of the class of ``inputs``, if there is one.
+
+        Args:
+            inputs: as of :meth:`__call__`.
+            key: as of :meth:`__call__`.
+        """
         self._recordings.pop(self._class(inputs, key, []), None)
 
     def __call__(self, function: Callable[[Any], Result], inputs: Any, key: Hashable = ()) -> Result:

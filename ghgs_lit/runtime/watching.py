@@ -21,10 +21,23 @@ class Watcher:
     """Is called when stages begin and end, also nested ones; subclasses override what they need."""
 
     def begin(self, stage: str, inputs: Inputs = ((), {})) -> Inputs | None:
-        """``stage`` begins; inputs that are returned replace its own."""
+        """A stage begins.
+
+        Args:
+            stage: its name.
+            inputs: positional and named arguments.
+
+        Returns:
+            Inputs that replace its own; None: they stay.
+        """
 
     def end(self, stage: str, result: Any = None) -> None:
-        """``stage`` ends with ``result``."""
+        """A stage ends.
+
+        Args:
+            stage: its name.
+            result: what it returned.
+        """
 
 
 _watchers: list[Watcher] = []
@@ -63,7 +76,12 @@ def watched(model: nn.Module, stages: Mapping[str, str], watcher: Watcher) -> It
 
 @contextmanager
 def inside(stage: str, watcher: Watcher) -> Iterator[None]:
-    """Call ``watcher`` for a stage that lasts as long as the context."""
+    """Call ``watcher`` for a stage that lasts as long as the context.
+
+    Args:
+        stage: its name.
+        watcher: is called.
+    """
     watcher.begin(stage)
     yield
     watcher.end(stage)
@@ -105,7 +123,12 @@ def time_mark(device: torch.device) -> Mark:
 
 
 def seconds_between(begin: Mark, end: Mark) -> float:
-    """Seconds between two marks of the same device, both of which have been reached."""
+    """Seconds between two marks.
+
+    Args:
+        begin: of :func:`time_mark`.
+        end: of the same device; both have been reached.
+    """
     return end - begin if isinstance(begin, float) else begin.elapsed_time(end) / 1e3
 
 

@@ -48,8 +48,18 @@ Camera = tuple[np.ndarray, np.ndarray]
 
 
 def read_cameras(path: Path) -> list[Camera]:
-    """Read the ten colour cameras of a sequence. InputError: the file or a camera is missing or bad, or
-    translations are not in metres."""
+    """Read the ten colour cameras of a sequence.
+
+    Args:
+        path: of ``cameras.json``.
+
+    Returns:
+        Intrinsics [3, 3] in pixels, with centres at integers, and extrinsics [4, 4] in metres of each
+        camera.
+
+    Raises:
+        InputError: the file or a camera is missing or bad, or translations are not in metres.
+    """
     content = read_json(path, "the cameras of a sequence in JSON")
     cameras = [_camera(path, content, f"kinect_color_{k:03d}") for k in KINECTS]
     centers = np.stack([-pose[:3, :3].T @ pose[:3, 3] for _, pose in cameras])
@@ -90,8 +100,18 @@ class _Frame:
 
 class HuMManReader(FrameReader):
     """Frames of the sequences of a phase, each a subject ``<sequence>_<frame>``; positions are the colour
-    cameras. Missing sequences, frames and cameras of a frame are left out. InputError: all sequences are
-    missing, cameras are bad, or the body model cannot be loaded."""
+    cameras.
+
+    Missing sequences, frames and cameras of a frame are left out.
+
+    Args:
+        data: options of the data set.
+        phase: ``train`` or ``val``.
+        strict: raise the first problem of the data, or collect all.
+
+    Raises:
+        InputError: all sequences are missing, cameras are bad, or the body model cannot be loaded.
+    """
 
     def __init__(self, data: "HuMMan", phase: str, strict: bool = True) -> None:
         super().__init__(strict)

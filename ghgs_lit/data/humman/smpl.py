@@ -62,7 +62,14 @@ _REPLACEMENTS = {
 
 
 def read_model(path: Path) -> dict[str, np.ndarray]:
-    """Arrays of an SMPL model file. InputError: the file or an array is missing or bad, or it names code."""
+    """Arrays of an SMPL model file (Loper et al. 2015).
+
+    Args:
+        path: of ``SMPL_NEUTRAL.pkl``.
+
+    Raises:
+        InputError: the file or an array is missing or bad, or it names code.
+    """
     content = load_pickle(path, also=_REPLACEMENTS)
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected the arrays of an SMPL model; found {type(content).__name__}")
@@ -71,8 +78,15 @@ def read_model(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_parameters(path: Path) -> dict[str, np.ndarray]:
-    """Parameters of one frame as float64 vectors. InputError: the file is missing or broken, or a vector is
-    missing, has another length or is not finite."""
+    """Parameters of one frame as float64 vectors.
+
+    Args:
+        path: of an ``.npz`` file with the vectors of :data:`PARAMETERS`.
+
+    Raises:
+        InputError: the file is missing or broken, or a vector is missing, has another length or is not
+            finite.
+    """
     require_file(path, "SMPL parameters")
     try:
         with np.load(path, allow_pickle=False) as archive:
@@ -86,8 +100,14 @@ def read_parameters(path: Path) -> dict[str, np.ndarray]:
 
 
 class Body:
-    """SMPL_NEUTRAL from its file, or a folder with ``smpl/SMPL_NEUTRAL.pkl``. InputError: it is missing or
-    bad, or ``smplx`` is missing."""
+    """SMPL_NEUTRAL from its file.
+
+    Args:
+        path: of the file, or a folder with ``smpl/SMPL_NEUTRAL.pkl``.
+
+    Raises:
+        InputError: it is missing or bad, or ``smplx`` is missing.
+    """
 
     def __init__(self, path: Path) -> None:
         file = path / _FILE if path.is_dir() else path
@@ -98,7 +118,11 @@ class Body:
 
     @torch.no_grad()
     def vertices(self, parameters: dict[str, np.ndarray]) -> np.ndarray:
-        """[6890, 3] float32 in the parameters' frame; ``global_orient`` turns about the pelvis."""
+        """Vertices [6890, 3] float32 in the parameters' frame; ``global_orient`` turns about the pelvis.
+
+        Args:
+            parameters: as of :func:`read_parameters`.
+        """
         tensors = {key: torch.from_numpy(value).float()[None] for key, value in parameters.items()}
         return self.model(**tensors).vertices[0].numpy()
 

@@ -46,8 +46,15 @@ class MattingNetwork(nn.Module):
     def forward(
         self, images: Float[Tensor, "B 3 h w"], mattes: Float[Tensor, "B h w"]
     ) -> tuple[Float[Tensor, "B h w"], Float[Tensor, "B 3 h w"]]:
-        """Mattes (in [0, 1] in evaluation only) and the subject's colours multiplied by them, from ``images``
-        with background in [0, 1] and rough ``mattes`` such as masks of 0 and 1."""
+        """Mattes and the subject's colours multiplied by them.
+
+        Args:
+            images: photographs with background, in [0, 1].
+            mattes: rough mattes in [0, 1], such as masks of 0 and 1.
+
+        Returns:
+            Mattes (in [0, 1] in evaluation only), and colours.
+        """
         height, width = images.shape[2:]
         whole = 2 ** (len(_WIDTHS) - 1)
         x = F.pad(_features(images, mattes), (0, -width % whole, 0, -height % whole), mode="replicate")
@@ -79,6 +86,7 @@ def _convolutions(before: int, after: int) -> nn.Sequential:
 def _features(
     images: Float[Tensor, "B 3 h w"], mattes: Float[Tensor, "B h w"]
 ) -> Float[Tensor, "B features h w"]:
+    """Colours, mask, distance from its outline, and differences from colours inside and outside nearby."""
     with exact(images.device.type):
         inside = np.stack([_insideness(mask) for mask in (mattes > 0.5).cpu().numpy()])
         depth = torch.from_numpy(inside).to(images)[:, None]
@@ -113,10 +121,18 @@ _AROUND = 16
 def refined_matte(
     image: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray, "h w"], pixels: float
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
-    """Subject on black (premultiplied), and its refined matte. ``image``: photograph with its background;
-    best if the subject is 170 to 330 pixels tall, as in training. ``matte``: 255 times the share of each
-    pixel that shows the subject, such as 0 and 255 of a mask. ``pixels``: greatest error of the outline,
-    above 0 (8 in training); holes of twice that width may be filled."""
+    """Subject on black (premultiplied), and its refined matte.
+
+    Args:
+        image: photograph with its background; best if the subject is 170 to 330 pixels tall, as in
+            training.
+        matte: 255 times the share of each pixel that shows the subject, such as 0 and 255 of a mask.
+        pixels: greatest error of the outline, above 0 (8 in training); holes of twice that width may be
+            filled.
+
+    Returns:
+        Image and matte of the same sizes.
+    """
     window = _window(matte > 127, int(pixels) + _AROUND)
     colors, given = (torch.from_numpy(part[window] / np.float32(255)) for part in (image, matte))
     with torch.inference_mode():
@@ -140,5 +156,6 @@ def _network() -> MattingNetwork:
 
 
 def _window(inside: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice]:
+    """The box around what is inside, with a margin in pixels; everything where nothing is inside."""
     lines = (np.nonzero(inside.any(axis))[0] for axis in (1, 0))
     return tuple(slice(max(n[0] - margin, 0), n[-1] + margin + 1) if len(n) else slice(None) for n in lines)

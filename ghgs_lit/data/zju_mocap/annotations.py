@@ -24,9 +24,14 @@ _NEAREST = 0.1
 
 @dataclass(frozen=True)
 class Annotations:
-    """Cameras of a sequence and its photographs: ``intrinsics`` [n, 3, 3] with pixel centres at integers,
-    ``distortions`` k1 k2 p1 p2 (k3) of each camera, ``extrinsics`` [n, 4, 4] in metres; ``frames[f][k]`` is
-    the path of camera k at frame f."""
+    """Cameras of a sequence and its photographs.
+
+    Attributes:
+        intrinsics: [n, 3, 3] in pixels, with pixel centres at integers.
+        distortions: k1 k2 p1 p2 (k3) of each camera.
+        extrinsics: [n, 4, 4], world to camera, metres.
+        frames: ``frames[f][k]`` is the path of camera k at frame f.
+    """
 
     intrinsics: np.ndarray
     distortions: tuple[np.ndarray, ...]
@@ -35,7 +40,14 @@ class Annotations:
 
 
 def read_annotations(path: Path) -> Annotations:
-    """Read and check an ``annots.npy``. InputError: it is missing, unsafe or broken, or an entry is bad."""
+    """Read and check an ``annots.npy``.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        InputError: it is missing, unsafe or broken, or an entry is bad.
+    """
     content = load_npy(path)
     cams, ims = (_entry(path, content, key) for key in ("cams", "ims"))
     lists = {key: _entry(f"{path}: cams", cams, key) for key in ("K", "D", "R", "T")}
@@ -61,7 +73,14 @@ def read_annotations(path: Path) -> Annotations:
 
 
 def frame_number(name: PurePath) -> int:
-    """Frame number in a photograph's name; files of bodies are named after it. InputError: there is none."""
+    """Frame number in a photograph's name; files of bodies are named after it.
+
+    Args:
+        name: path of the photograph.
+
+    Raises:
+        InputError: there is none.
+    """
     field = frame_field(name)
     if not field.isdecimal():
         raise InputError(
@@ -98,6 +117,17 @@ def _distortion(place: str, coefficients: Any) -> np.ndarray:
 
 
 def _frame(path: Path, index: int, entry: Any, cameras: int) -> tuple[PurePosixPath, ...]:
+    """Paths of the photographs of a frame, in the order of the cameras.
+
+    Args:
+        path: of the annotations, for messages.
+        index: of the frame, for messages.
+        entry: of the frame in ``ims``.
+        cameras: number of cameras.
+
+    Raises:
+        InputError: paths are missing, leave the sequence, or have different frame numbers.
+    """
     names = _entry(f"{path}: frame {index}", entry, "ims")
     if len(names) != cameras:
         raise InputError(

@@ -59,8 +59,18 @@ class _Frame:
 
 
 class ZJUMoCapReader(FrameReader):
-    """Chosen frames, each a subject ``CoreView_<id>_<frame number>``; positions are the cameras. Missing
-    sequences are left out. InputError: all sequences are missing, or annotations are bad."""
+    """Chosen frames, each a subject ``CoreView_<id>_<frame number>``; positions are the cameras.
+
+    Missing sequences are left out.
+
+    Args:
+        data: options of the data set.
+        phase: ``train`` or ``val``.
+        strict: raise the first problem of the data, or collect all.
+
+    Raises:
+        InputError: all sequences are missing, or annotations are bad.
+    """
 
     def __init__(self, data: "ZJUMoCap", phase: str, strict: bool = True) -> None:
         super().__init__(strict)
