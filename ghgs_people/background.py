@@ -27,14 +27,14 @@ class Joining(dict[str, tuple[int, ...]]):
         super().__init__(layout.subjects)
         self._layout = layout
         self._names = names
-        self._made = Completeness(layout.root)
+        self._progress = Completeness(layout.root)
         layout.subjects = self
 
     def __iter__(self) -> Iterator[str]:
         if len(self) < len(self._names):
-            whole = self._made.whole("train", self._names)
-            if len(whole) > len(self):
-                self._layout.find("train", whole)
+            complete = self._progress.whole("train", self._names)
+            if len(complete) > len(self):
+                self._layout.find("train", complete)
         return super().__iter__()
 
 

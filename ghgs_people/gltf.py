@@ -103,7 +103,9 @@ def _morphs(tree: dict[str, Any], node: dict[str, Any]) -> list[float]:
 def _worlds(tree: dict[str, Any]) -> dict[int, np.ndarray]:
     """Matrices [4, 4] from each node to the world."""
     nodes = tree["nodes"]
-    below = {child for node in nodes for child in node.get("children", [])}
+    below = set()
+    for node in nodes:
+        below.update(node.get("children", []))
     worlds: dict[int, np.ndarray] = {}
     waiting = [(i, np.eye(4)) for i in range(len(nodes)) if i not in below]
     while waiting:
@@ -237,7 +239,7 @@ def _values(tree: dict[str, Any], buffers: list[bytes], index: int) -> np.ndarra
     number = np.dtype(_NUMBERS[entry["componentType"]])
     columns = _COLUMNS[entry["type"]]
     start = view.get("byteOffset", 0) + entry.get("byteOffset", 0)
-    strides = view.get("byteStride") or columns * number.itemsize, number.itemsize
+    strides = (view.get("byteStride") or columns * number.itemsize, number.itemsize)
     return np.ndarray((entry["count"], columns), number, buffers[view["buffer"]], start, strides)
 
 

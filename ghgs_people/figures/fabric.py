@@ -231,7 +231,7 @@ def _glyphs(u: np.ndarray, v: np.ndarray, count: int, soft: float, rng: np.rando
     mask = np.zeros_like(u)
     pitch = 2.6 / count
     height = min(0.75, 2.2 / count)
-    nodes = np.array([(i, j) for j in (-1.0, 0.0, 1.0) for i in (-0.36, 0.36)])
+    nodes = np.array([(-0.36, -1), (0.36, -1), (-0.36, 0), (0.36, 0), (-0.36, 1), (0.36, 1)])
     for index in range(count):
         centre = (index - (count - 1) / 2) * pitch
         order = rng.permutation(6)[: rng.integers(4, 6)]
