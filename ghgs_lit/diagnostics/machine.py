@@ -29,7 +29,11 @@ def processor_name() -> str:
 
 
 def machine_facts(device: torch.device) -> dict[str, Any]:
-    """Processor, vector width, cores, threads, device and PyTorch's version, as plain data."""
+    """Processor, vector width, cores, threads, device and PyTorch's version, as plain data.
+
+    Args:
+        device: on which models run.
+    """
     return {
         "processor": processor_name(),
         "vectors": torch.backends.cpu.get_cpu_capability(),
@@ -49,7 +53,11 @@ def in_words(machine: dict[str, Any]) -> str:
 
 
 def machine_lines(device: torch.device) -> list[Line]:
-    """Facts about the machine, as pairs of name and value."""
+    """Facts about the machine, as pairs of name and value.
+
+    Args:
+        device: on which models run.
+    """
     facts = machine_facts(device)
     versions = (DISTRIBUTION, "torch", "lightning", "numpy", "numba", "gsplat")
     return [

@@ -29,8 +29,17 @@ _ROUNDINGS = 2  #: Random roundings of photographs that :func:`amplification` ta
 
 
 def relative_difference(found: Tensor, expected: Tensor, share: float = 1.0) -> float:
-    """``|found - expected| / max|expected|``, which a ``share`` of the values does not exceed; infinite if a
-    value is not finite or only ``expected`` is 0 everywhere, 0 without values."""
+    """``|found - expected| / max|expected|``, which a ``share`` of the values does not exceed.
+
+    Args:
+        found: any shape.
+        expected: of the same shape.
+        share: of the values, above 0, at most 1; 1: the largest difference.
+
+    Returns:
+        The difference; infinite if a value of the difference is not finite, or only ``expected`` is 0
+        everywhere; 0 without values.
+    """
     if found.numel() == 0:
         return 0.0
     difference = (found - expected).double().abs().flatten()
@@ -42,7 +51,16 @@ def relative_difference(found: Tensor, expected: Tensor, share: float = 1.0) -> 
 
 
 def partners(found: Gaussians, expected: Gaussians) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
-    """Indices of Gaussians of the same input pixel in both; those without a partner are left out."""
+    """Pair the Gaussians of the same input pixel.
+
+    Args:
+        found: Gaussians of a batch.
+        expected: others of the same batch.
+
+    Returns:
+        Indices of the pairs [n] into both; those without a partner are left out. Without input pixels
+        the first ones of both are pairs.
+    """
     if found.image is None or expected.image is None:
         n = min(len(found), len(expected))
         return torch.arange(n), torch.arange(n)
@@ -59,12 +77,19 @@ Result = tuple[Prediction, Rendering]
 def differences(
     found: Result, expected: Result, masks: Bool[Tensor, "..."], share: float = 1.0
 ) -> dict[str, float]:
-    """Differences of a preset from the yardstick. ``masks``: of the inputs [B, V, H, W].
+    """Differences of a preset from the yardstick.
 
-    Returns :func:`relative_difference` of each attribute of the Gaussians, of the subject's ``depth`` and of
-    the ``render`` (of :data:`MOST` of its values at most); their largest, ``max_rel_diff``; ``mse_to_none``
-    and ``psnr_to_none`` of the renders, the latter in dB; and ``unmatched``, the Gaussians without a partner
-    (of the preset or the yardstick, whichever has more) over the number of the yardstick's.
+    Args:
+        found: prediction of the preset and its render.
+        expected: those of the yardstick, for the same batch.
+        masks: of the inputs, shape [B, V, H, W].
+        share: as for :func:`relative_difference`; of renders at most :data:`MOST`.
+
+    Returns:
+        By name. :func:`relative_difference` of each of :data:`ATTRIBUTES`, of the subject's ``depth``
+        and of the ``render``; their largest, ``max_rel_diff``; ``mse_to_none`` and ``psnr_to_none`` of
+        the renders, the latter in dB; and ``unmatched``, the Gaussians without a partner (of the
+        preset or the yardstick, whichever has more) over the number of the yardstick's.
     """
     (prediction, rendering), (yardstick, reference) = found, expected
     ours = prediction.gaussians
@@ -86,9 +111,19 @@ def differences(
 
 
 def amplification(case: Case, batch: Batch, result: Result) -> dict[str, float]:
-    """Condition of ``result``, what the case gives for the batch, by the names of :func:`differences`: how
-    far most values move where all photographs are rounded once at random, in units of that rounding; at least
-    1. Another order of summation rounds as much in every layer."""
+    """Condition of a result: how far most values move where all photographs are rounded once at random.
+
+    Another order of summation rounds as much in every layer.
+
+    Args:
+        case: gives the result.
+        batch: with targets.
+        result: what the case gives for the batch.
+
+    Returns:
+        The movements by the names of :func:`differences`, in units of that rounding, the larger of
+        two roundings; at least 1.
+    """
     eps = torch.finfo(batch.images.dtype).eps
     largest: dict[str, float] = {}
     for seed in range(_ROUNDINGS):
@@ -101,8 +136,14 @@ def amplification(case: Case, batch: Batch, result: Result) -> dict[str, float]:
 
 
 def conditioned(found: Result, expected: Result, batch: Batch, condition: Mapping[str, float]) -> float:
-    """Largest difference of attributes, depth and render of :data:`MOST` values over their condition, from
-    :func:`amplification`."""
+    """Largest difference of attributes, depth and render of :data:`MOST` values over their condition.
+
+    Args:
+        found: prediction of the preset and its render.
+        expected: those of the yardstick.
+        batch: what both are for.
+        condition: from :func:`amplification`.
+    """
     most = differences(found, expected, batch.masks, MOST)
     return max(most[name] / condition[name] for name in (*ATTRIBUTES, "render", "depth"))
 
@@ -120,6 +161,7 @@ class Times:
 
     @classmethod
     def of(cls, seconds: Sequence[float]) -> "Times":
+        """Quartiles of the seconds of rounds, at least one."""
         low, median, high = np.quantile(seconds, (0.25, 0.5, 0.75)).tolist()
         return cls(median, low, high)
 
@@ -153,15 +195,30 @@ class Record:
 
 
 def order(turn: int, count: int) -> list[int]:
-    """Order of the cases in a round; each begins one case later, so that drift affects all cases alike."""
+    """Order of the cases in a round; each begins one case later, so that drift affects all cases alike.
+
+    Args:
+        turn: number of the round; negative ones do not count.
+        count: number of cases.
+    """
     return [(turn + number) % count for number in range(count)]
 
 
 def time_cases(
     cases: Sequence[Case], batches: Sequence[Batch], warmup: int, repeats: int, device: torch.device
 ) -> list[dict[str, Times]]:
-    """Seconds of each stage of each case, means over batches, in interleaved rounds: ``warmup`` rounds that
-    do not count, then ``repeats``, at least 1."""
+    """Seconds of each stage of each case, in interleaved rounds.
+
+    Args:
+        cases: what is timed.
+        batches: with targets; a round of a case takes the mean over them.
+        warmup: rounds that do not count.
+        repeats: rounds that count, at least 1.
+        device: where models and batches are.
+
+    Returns:
+        For each case its times by stage.
+    """
     seconds: list[dict[str, list[float]]] = [{} for _ in cases]
     for turn in track(range(-warmup, repeats), "rounds"):
         for number in order(turn, len(cases)):
@@ -179,7 +236,11 @@ def time_cases(
 
 @contextmanager
 def threads(count: int | None) -> Iterator[None]:
-    """Run PyTorch with ``count`` threads; None changes nothing."""
+    """Run PyTorch with another number of threads while the context lasts.
+
+    Args:
+        count: at least 1; None: as many as now.
+    """
     before = torch.get_num_threads()
     torch.set_num_threads(count or before)
     try:
@@ -189,7 +250,16 @@ def threads(count: int | None) -> Iterator[None]:
 
 
 def inspect(case: Case, batch: Batch, device: torch.device) -> tuple[Work, Prediction, Rendering]:
-    """Predict a batch once to count FLOPs and once to measure memory."""
+    """Predict a batch once to count FLOPs and once to measure memory.
+
+    Args:
+        case: predicts.
+        batch: with targets, which are rendered.
+        device: where the model and the batch are.
+
+    Returns:
+        The cost, the prediction and the render.
+    """
     with FlopsProbe() as counted:
         forward(case.model, case.renderer, batch, counted)
     memory = PeakProbe(device)
@@ -210,7 +280,18 @@ def _counts(prediction: Prediction) -> dict[str, float]:
 def record_cases(
     cases: Sequence[Case], batches: Sequence[Batch], metrics: ImageMetrics, device: torch.device, repeats: int
 ) -> list[Record]:
-    """Measure work and error of cases, the yardstick first, then their times; ``batches`` need targets."""
+    """Measure work and error of cases, then their times.
+
+    Args:
+        cases: the yardstick first.
+        batches: with targets.
+        metrics: what is measured against the targets.
+        device: where models and batches are.
+        repeats: rounds of the times that count, at least 1.
+
+    Returns:
+        The measurements in the order of the cases.
+    """
     works: list[list[Work]] = [[] for _ in cases]
     records = [Record(case, Work({}, {}, {})) for case in cases]
     for batch in track(batches, "errors"):

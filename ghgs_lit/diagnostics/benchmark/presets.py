@@ -55,7 +55,17 @@ class Case:
 
 
 def combinations(knobs: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
-    """All combinations of values of the knobs. InputError: a knob does not exist or has no list of values."""
+    """All combinations of values of the knobs.
+
+    Args:
+        knobs: list of values by dotted key.
+
+    Returns:
+        Value by key of each combination; without knobs the empty one.
+
+    Raises:
+        InputError: a knob does not exist, or has no list of values.
+    """
     for key, values in knobs.items():
         require(is_below(key, KNOBS), f"knobs.{key}", f"a key of {', '.join(KNOBS)}", key)
         is_list = isinstance(values, Sequence) and not isinstance(values, str)
@@ -66,7 +76,20 @@ def combinations(knobs: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
 def case_config(
     source: Source, skip: Mapping[str, Any], knobs: Mapping[str, Any], shared: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Configuration of a case; ``shared``: nodes that all cases have. InputError: it lacks a knob."""
+    """Configuration of a case.
+
+    Args:
+        source: has the configuration of the model.
+        skip: values of the preset.
+        knobs: changed values by dotted key.
+        shared: nodes that all cases have: ``renderer``, ``precision``.
+
+    Returns:
+        The nodes :data:`KNOBS`, as far as the source has them, as plain data.
+
+    Raises:
+        InputError: it lacks the key of a knob.
+    """
     own = {name: source.config[name] for name in MODEL_NODES if name in source.config}
     node = OmegaConf.create({**own, **shared, "skip": dict(skip)})
     for key, value in knobs.items():
@@ -84,9 +107,22 @@ def cases_of(
     device: torch.device,
     seed: int = 0,
 ) -> list[Case]:
-    """Cases of a model, every preset (values of ``conf/skip`` by name) with every combination of knobs; they
-    share one copy of the weights. The yardstick, if among the presets, comes first, without knobs.
-    InputError: the model refuses a preset or knob, or the weights do not fit it."""
+    """Cases of a model: every preset with every combination of knobs; they share one copy of the weights.
+
+    Args:
+        source: weights and configuration.
+        presets: values of files of ``conf/skip`` by name.
+        knobs: list of values by dotted key.
+        shared: nodes that all cases have: ``renderer``, ``precision``.
+        device: where the models are.
+        seed: of random weights.
+
+    Returns:
+        The cases; the yardstick, if among the presets, comes first, without knobs.
+
+    Raises:
+        InputError: the model refuses a preset or knob, or the weights do not fit it.
+    """
     choices = [(name, change) for name in presets for change in combinations(knobs)]
     if YARDSTICK in presets:
         choices = [(YARDSTICK, {}), *(choice for choice in choices if choice != (YARDSTICK, {}))]
@@ -109,7 +145,18 @@ def cases_of(
 def _model(
     source: Source, config: dict[str, Any], state: dict[str, Tensor], seed: int, device: torch.device
 ) -> GHGS:
-    """A model with the tensors of ``state``, or, if that is empty, with the source's own."""
+    """A model with the tensors of ``state``, or, if that is empty, with the source's own.
+
+    Args:
+        source: weights and configuration.
+        config: of the case.
+        state: tensors of an earlier case by name, which are shared, not copied.
+        seed: of random weights.
+        device: where the weights will be moved to.
+
+    Raises:
+        InputError: the weights do not fit the configuration.
+    """
     if not state and source.checkpoint is None:
         return random_model(config, seed)
     model = GHGS.from_config(config, empty=True)

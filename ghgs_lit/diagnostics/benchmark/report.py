@@ -54,7 +54,14 @@ _COLUMNS = {
 
 
 def rows_of(records: Sequence[Record]) -> list[Row]:
-    """One row for each case (yardstick first) and stage; row ``total`` also has errors and budgets."""
+    """Rows of the tables and of ``benchmark.json``.
+
+    Args:
+        records: the yardstick first.
+
+    Returns:
+        One row for each case and stage; row ``total`` also has errors and budgets.
+    """
     rows: list[Row] = []
     for record in records:
         (means,) = summarize(record.metrics)
@@ -90,17 +97,31 @@ def rows_of(records: Sequence[Record]) -> list[Row]:
 
 
 def difference_db(mse: float, psnr: float) -> float:
-    """PSNR in dB that renders with ``psnr`` lose by a mean squared difference that is independent of their
-    error; unlike the loss against the truth it cannot be 0 or negative by chance."""
+    """PSNR that renders lose by a difference that is independent of their error.
+
+    Unlike the loss against the truth it cannot be 0 or negative by chance.
+
+    Args:
+        mse: mean squared difference of the renders, of images in [0, 1].
+        psnr: of the renders without the difference, in dB.
+
+    Returns:
+        The loss in dB, at least 0.
+    """
     return 10 * math.log10(1 + mse * 10 ** (psnr / 10))
 
 
 def broken_budgets(rows: Sequence[Row]) -> list[str]:
-    """Broken budgets, one line each. PSNR counts for trained weights only; differences count for all."""
+    """Broken budgets, one line each. PSNR counts for trained weights only; differences count for all.
+
+    Args:
+        rows: as of :func:`rows_of`.
+    """
     return [f"{row['preset']}: {line}" for row in totals(rows) for line in _broken(row)]
 
 
 def _broken(row: Row) -> list[str]:
+    """Why a row ``total`` breaks its budget, one line for each reason; none: it is kept."""
     lines = []
     limit = row["max_rel_diff_budget"]
     difference = row["rel_diff"]
@@ -143,7 +164,11 @@ def tables_of(rows: Sequence[Row]) -> Tables:
 
 
 def notes_of(content: Mapping[str, Any]) -> list[str]:
-    """Notes above the tables."""
+    """Notes above the tables.
+
+    Args:
+        content: of ``benchmark.json``.
+    """
     notes = [f"Machine: {in_words(content['machine'])}.", content["about"]]
     if content["random_weights"]:
         notes.append("The weights are random: PSNR says nothing, only run times and differences do.")
@@ -151,7 +176,16 @@ def notes_of(content: Mapping[str, Any]) -> list[str]:
 
 
 def write_numbers(directory: Path, content: Mapping[str, Any], tables: Tables) -> Path:
-    """Write ``benchmark.md`` and ``benchmark.json``; return the latter's path."""
+    """Write ``benchmark.md`` and ``benchmark.json``.
+
+    Args:
+        directory: the run's.
+        content: of the JSON file.
+        tables: of the Markdown file.
+
+    Returns:
+        Path of the JSON file.
+    """
     write_text_atomically(directory / "benchmark.md", document("Benchmark", notes_of(content), tables))
     path = directory / "benchmark.json"
     write_text_atomically(path, json.dumps(plain(content), indent=1, allow_nan=False) + "\n")

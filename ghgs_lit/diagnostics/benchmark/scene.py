@@ -17,7 +17,18 @@ _TALLEST = 0.9
 
 
 def ellipse(share: float, size: tuple[int, int]) -> torch.Tensor:
-    """Mask of ``size`` (height, width): an upright ellipse in the middle, ``share`` of the frame's area."""
+    """Mask of an upright ellipse in the middle of the frame.
+
+    Args:
+        share: of the frame's area that the ellipse covers, above 0.
+        size: (height, width) in pixels.
+
+    Returns:
+        Mask [height, width].
+
+    Raises:
+        InputError: no upright ellipse of at most 0.9 of the height can cover so much.
+    """
     # share = pi / 4 * width * height, both as parts of the frame
     height = min(math.sqrt(4 * share * size[1] / (math.pi * _ASPECT * size[0])), _TALLEST)
     width = 4 * share / (math.pi * height)
@@ -27,8 +38,16 @@ def ellipse(share: float, size: tuple[int, int]) -> torch.Tensor:
 
 
 def ring(count: int, height: int, width: int) -> Cameras:
-    """Cameras [count] that look at the origin from 2 m, evenly around the y axis, with a focal length of one
-    image height."""
+    """Cameras that look at the origin from 2 m, evenly around the y axis.
+
+    Args:
+        count: number of cameras.
+        height: of the images in pixels; the focal length is one height.
+        width: of the images in pixels.
+
+    Returns:
+        Cameras [count].
+    """
     yaw = 2 * math.pi * torch.arange(count, dtype=torch.float64) / count
     zero = torch.zeros_like(yaw)
     right = torch.stack((yaw.cos(), zero, -yaw.sin()), -1)
@@ -42,9 +61,17 @@ def ring(count: int, height: int, width: int) -> Cameras:
 
 
 def ellipsoid_batch(share: float, views: int, size: int | tuple[int, int], batch: int) -> Batch:
-    """Batch of photographs of noise on an ellipsoid of revolution, whose mask is the same in every view; the
-    target is the first input view. ``share``: part of the frame that the subject covers. ``size``: side, or
-    height and width, in pixels."""
+    """Batch of photographs of noise on an ellipsoid of revolution; the mask is the same in every view.
+
+    Args:
+        share: part of the frame that the subject covers.
+        views: number of input views; the first one is the target, too.
+        size: side, or (height, width), in pixels.
+        batch: number of elements, all alike but for the noise.
+
+    Raises:
+        InputError: as for :func:`ellipse`.
+    """
     size = (size, size) if isinstance(size, int) else size
     cameras = ring(views, *size)[None][torch.zeros(batch, dtype=torch.long)]
     masks = ellipse(share, size).expand(batch, views, -1, -1).contiguous()
@@ -55,8 +82,18 @@ def ellipsoid_batch(share: float, views: int, size: int | tuple[int, int], batch
 
 @torch.no_grad()
 def random_model(config: Mapping[str, Any], seed: int = 0) -> GHGS:
-    """A model with random weights, faster than the usual initialisation. No last layer is 0, unlike at the
-    start of training, so that every output depends on the photographs."""
+    """A model with random weights, made faster than by the usual initialisation.
+
+    No last layer is 0, unlike at the start of training, so that every output depends on the
+    photographs.
+
+    Args:
+        config: the nodes of the model as plain data.
+        seed: of the weights.
+
+    Returns:
+        The model in evaluation mode on the CPU; no weight has a gradient.
+    """
     generator = torch.Generator().manual_seed(seed)
     with torch.device("meta"):
         model = GHGS.from_config(config)

@@ -44,13 +44,25 @@ def top_level(names: Iterable[str]) -> list[str]:
 
 
 def watched(model: GHGS, probe: Watcher) -> AbstractContextManager[None]:
-    """Context in which ``probe`` watches the stages of ``model`` and their parts."""
+    """Context in which a probe watches the stages of a model and their parts.
+
+    Args:
+        model: has the stages.
+        probe: is called when they begin and end.
+    """
     return stages_watched(model, {name: name for name in (*STAGES, ROUNDS)} | PARTS, probe)
 
 
 @torch.inference_mode()
 def forward(model: GHGS, renderer: Renderer, batch: Batch, probe: Watcher) -> tuple[Prediction, Rendering]:
-    """Predict the Gaussians of a batch and render its targets under ``probe``."""
+    """Predict the Gaussians of a batch and render its targets under a probe.
+
+    Args:
+        model: in evaluation mode.
+        renderer: draws the targets.
+        batch: with targets, which the model does not see.
+        probe: is called when stages, rendering and the whole begin and end.
+    """
     with watched(model, probe), inside(TOTAL, probe):
         prediction = model(replace(batch, targets=None))
         with inside(RENDER, probe):
@@ -59,9 +71,17 @@ def forward(model: GHGS, renderer: Renderer, batch: Batch, probe: Watcher) -> tu
 
 
 class PeakProbe(Watcher):
-    """Peak memory of each stage: of the process on a CPU, of all tensors on CUDA. ``peaks`` are bytes beyond
-    those held when the first stage began, such as weights and photographs. Systems without Linux's counters
-    have none."""
+    """Peak memory of each stage: of the process on a CPU, of all tensors on CUDA.
+
+    Systems without Linux's counters have none.
+
+    Args:
+        device: where the model runs.
+
+    Attributes:
+        peaks: most bytes by stage beyond those held when the first stage began, such as weights and
+            photographs.
+    """
 
     def __init__(self, device: torch.device):
         self.device = device
@@ -127,8 +147,13 @@ _CPU_ATTENTION = {
 
 
 class FlopsProbe(Watcher):
-    """Context that counts ``flops`` by stage: multiplications and additions of products, including the
-    encoder's compiled kernel, without the rasterizer."""
+    """Context that counts multiplications and additions of products by stage.
+
+    The encoder's compiled kernel counts, too; the rasterizer does not.
+
+    Attributes:
+        flops: number by stage.
+    """
 
     def __init__(self) -> None:
         self.flops: dict[str, int] = {}

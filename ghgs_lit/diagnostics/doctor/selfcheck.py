@@ -42,7 +42,13 @@ _LONGEST = 300  #: Number of characters of an error that are shown
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of a check; ``found``: the error, or why the check was skipped."""
+    """Outcome of a check.
+
+    Attributes:
+        check: what was compared.
+        status: :data:`PASSED`, :data:`FAILED` or :data:`SKIPPED`.
+        found: the error, or why the check was skipped.
+    """
 
     check: str
     status: str
@@ -50,8 +56,15 @@ class Outcome:
 
 
 def selfcheck(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]:
-    """Compare ``device`` with the CPU; yield the outcomes of all checks. An error is an outcome and ends only
-    its check. ``config``: as for ``ghgs train``; its model gets random weights."""
+    """Compare a device with the CPU in float64. An error is an outcome and ends only its check.
+
+    Args:
+        config: as for ``ghgs train``, as plain data; its model gets random weights.
+        device: what is checked.
+
+    Yields:
+        The outcomes of all checks.
+    """
     for check in CHECKS:
         try:
             yield from check(config, device)
@@ -67,7 +80,17 @@ def table(outcomes: Sequence[Outcome]) -> str:
 
 
 def compared(check: str, found: Tensor, expected: Tensor, limit: float) -> Outcome:
-    """Outcome that passes if shapes agree and ``|found - expected| <= limit * |expected|`` (2-norms)."""
+    """Compare a tensor with the expected one by their 2-norms.
+
+    Args:
+        check: name of the check.
+        found: any shape, on any device.
+        expected: of the same shape, on any device.
+        limit: largest ``|found - expected| / |expected|``, absolute where ``expected`` is 0.
+
+    Returns:
+        An outcome that passes if the shapes agree and the limit is kept; NaN fails.
+    """
     error = float("nan")
     if found.shape == expected.shape:
         found = found.detach().cpu().double()
@@ -79,8 +102,15 @@ def compared(check: str, found: Tensor, expected: Tensor, limit: float) -> Outco
 
 
 def renderer(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]:
-    """Check images and gradients of random splats with and without antialiasing, and of splats around the
-    renderer's thresholds."""
+    """Check images and gradients of splats: random, antialiased, and around the renderer's thresholds.
+
+    Args:
+        config: as for ``ghgs train``; names the renderer's backend.
+        device: what is checked.
+
+    Yields:
+        An outcome for each image and gradient; one alone where the backend cannot run.
+    """
     backend = config["renderer"]["backend"]
     try:
         backend = resolve_backend(backend, device)
@@ -144,6 +174,19 @@ def _rendered(
     device: torch.device,
     dtype: torch.dtype,
 ) -> dict[str, Tensor]:
+    """Render splats, and differentiate the sum of all squared values.
+
+    Args:
+        splats: of n elements.
+        cameras: [n, T].
+        settings: of the rasterizer.
+        backend: gsplat, cpu or reference.
+        device: where it runs.
+        dtype: of the splats.
+
+    Returns:
+        ``image``, ``alpha``, ``depth``, and ``gradient of <attribute>``.
+    """
     leaves = {n: getattr(splats, n).to(device, dtype, copy=True).requires_grad_() for n in ATTRIBUTES}
     gaussians = Gaussians(**leaves, splits=splats.splits)
     rendering = render(gaussians, cameras.to(device), backend, settings=settings)
@@ -153,8 +196,17 @@ def _rendered(
 
 
 def stages(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]:
-    """Check each stage in each precision that the device has, set as a user sets it; the first that fails is
-    the one to examine. ``inherit`` may round as the process does."""
+    """Check each stage in each precision that the device has, set as a user sets it.
+
+    The first that fails is the one to examine. ``inherit`` may round as the process does.
+
+    Args:
+        config: as for ``ghgs train``; its model gets random weights.
+        device: what is checked.
+
+    Yields:
+        An outcome for each stage and precision; one alone for a precision that the device lacks.
+    """
     batch = _small_batch(config)
     expected = _results(random_model(config).double(), _in_float64(batch))
     for precision in PRECISIONS:
@@ -174,8 +226,15 @@ def stages(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]
 
 
 def gradient(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]:
-    """Check the gradient of all weights in float32, as ``trainer.precision=32-true`` has it; one of
-    :data:`_MODELS` random models must pass."""
+    """Check the gradient of all weights in float32, as ``trainer.precision=32-true`` has it.
+
+    Args:
+        config: as for ``ghgs train``; its model gets random weights.
+        device: what is checked.
+
+    Yields:
+        One outcome: the first of :data:`_MODELS` random models that passes, or the last one.
+    """
     batch = _small_batch(config)
     outcomes = []
     for seed in range(_MODELS):
@@ -210,6 +269,7 @@ def _unsupported(precision: str, device: torch.device) -> str | None:
 
 @torch.no_grad()
 def _results(model: GHGS, batch: Batch) -> dict[str, Tensor]:
+    """What the stages give for the subject, by the name of the stage, on the CPU."""
     seen = Results()
     with watched(model, {name: name for name in ("encoder", "recalibration")}, seen):
         prediction = model(batch).to("cpu")

@@ -23,10 +23,19 @@ NO_CAMERA = {
 
 
 def normal(g: Generator, *shape: int) -> Tensor:
+    """Standard normal values of a shape."""
     return torch.randn(shape, generator=g, dtype=F64)
 
 
 def uniform(g: Generator, low: float, high: float, *shape: int) -> Tensor:
+    """Uniform values of a shape.
+
+    Args:
+        g: source of the numbers.
+        low: least value.
+        high: bound of the values.
+        *shape: of the result.
+    """
     return low + (high - low) * torch.rand(shape, generator=g, dtype=F64)
 
 
@@ -42,7 +51,19 @@ def place(family: str, g: Generator) -> Tensor:
 
 
 def cameras(family: str, g: Generator, views: int, size: int, middle: Tensor) -> tuple[Tensor, Tensor]:
-    """Lenses [v, 4] (focal lengths, principal point) and poses [v, 3, 4], two units from ``middle``."""
+    """Cameras on a circle around the scene, two units from its middle (further if "long").
+
+    Args:
+        family: "wide", "long", "skewed", "mirrored", "degenerate" and :data:`UNITS` change them.
+        g: source of the numbers.
+        views: number of cameras.
+        size: side of the images in pixels.
+        middle: of the scene in the world [3].
+
+    Returns:
+        Lenses [v, 4] (two focal lengths and the principal point, in pixels), and poses [v, 3, 4]
+        (world to camera).
+    """
     unit = UNITS.get(family, 1.0)
     focal = {"wide": 0.1 * size, "long": 1e5}.get(family, float(uniform(g, 0.8, 1.2)) * size)
     distance = 2.0 * unit * (focal / size if family == "long" else 1.0)
@@ -73,7 +94,7 @@ def _towards_middle(angle: float) -> Tensor:
 
 
 def intrinsics(lenses: Tensor) -> Tensor:
-    """Intrinsics [..., 3, 3] from lenses."""
+    """Intrinsics [..., 3, 3] from lenses [..., 4]."""
     fx, fy, cx, cy = lenses.unbind(-1)
     zero = torch.zeros_like(fx)
     one = torch.ones_like(fx)
@@ -81,13 +102,34 @@ def intrinsics(lenses: Tensor) -> Tensor:
 
 
 def matrices(lenses: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
-    """Intrinsics [..., 3, 3] and extrinsics [..., 4, 4] from lenses and poses."""
+    """Matrices of cameras.
+
+    Args:
+        lenses: [..., 4], focal lengths and principal point in pixels.
+        poses: [..., 3, 4], world to camera.
+
+    Returns:
+        Intrinsics [..., 3, 3] and extrinsics [..., 4, 4].
+    """
     last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=poses.dtype).expand(*poses.shape[:-2], 1, 4)
     return intrinsics(lenses), torch.cat((poses, last), -2)
 
 
 def points(family: str, g: Generator, count: int, middle: Tensor, poses: Tensor | None = None) -> Tensor:
-    """World points [count, 3] around ``middle``; families relative to a camera need ``poses``."""
+    """World points around the middle of a scene.
+
+    Args:
+        family: "duplicates", "collapsed", "far", "behind", "beside", "on_camera" and :data:`UNITS`
+            change them.
+        g: source of the numbers.
+        count: number of points.
+        middle: of the scene [3].
+        poses: [v, 3, 4], world to camera; the first is what families relative to a camera need. None:
+            these families change nothing.
+
+    Returns:
+        Points [count, 3].
+    """
     around = middle + 0.3 * UNITS.get(family, 1.0) * normal(g, count, 3)
     if family == "duplicates":
         return around[torch.arange(count) // 2]
@@ -111,7 +153,13 @@ def points(family: str, g: Generator, count: int, middle: Tensor, poses: Tensor 
 
 
 def depths(family: str, g: Generator, *shape: int) -> Tensor:
-    """Depths of about two units."""
+    """Depths of about two units.
+
+    Args:
+        family: "equal_depths", the depths of :data:`FACTORS` and :data:`UNITS` change them.
+        g: source of the numbers.
+        *shape: of the result.
+    """
     values = uniform(g, 1.5, 2.5, *shape) * UNITS.get(family, 1.0)
     if family == "equal_depths":
         return torch.full_like(values, float(uniform(g, 1.5, 2.5)))
@@ -119,10 +167,22 @@ def depths(family: str, g: Generator, *shape: int) -> Tensor:
 
 
 def quaternions(family: str, g: Generator, count: int) -> Tensor:
+    """Quaternions [count, 4] of any length; the families of :data:`FACTORS` change it."""
     return normal(g, count, 4) * FACTORS["quaternions"].get(family, 1.0)
 
 
 def scales(family: str, g: Generator, count: int, unit: float = 0.05) -> Tensor:
+    """Scales of splats.
+
+    Args:
+        family: "thin", "zero_scale", "tiny_scale", "huge_scale" and :data:`UNITS` change them.
+        g: source of the numbers.
+        count: number of splats.
+        unit: largest ordinary scale, in units of the scene.
+
+    Returns:
+        Scales [count, 3].
+    """
     values = unit * uniform(g, 0.2, 1.0, count, 3) * UNITS.get(family, 1.0)
     if family == "thin":
         return values * torch.tensor([1.0, 1e-6, 1e-6], dtype=F64)
@@ -131,12 +191,24 @@ def scales(family: str, g: Generator, count: int, unit: float = 0.05) -> Tensor:
 
 
 def opacities(family: str, g: Generator, count: int) -> Tensor:
+    """Opacities [count], 0.05 to 0.98; all 0 if "transparent", all 1 if "opaque"."""
     values = uniform(g, 0.05, 0.98, count)
     fixed = {"transparent": 0.0, "opaque": 1.0}
     return torch.full_like(values, fixed[family]) if family in fixed else values
 
 
 def features(family: str, g: Generator, count: int, width: int) -> Tensor:
+    """Features of tokens.
+
+    Args:
+        family: "parallel_features", "opposite_features" and those of :data:`FACTORS` change them.
+        g: source of the numbers.
+        count: number of tokens.
+        width: of a feature.
+
+    Returns:
+        Features [count, width].
+    """
     values = normal(g, count, width)
     if family == "parallel_features":
         return values[:1].expand(count, width).clone()
@@ -146,13 +218,14 @@ def features(family: str, g: Generator, count: int, width: int) -> Tensor:
 
 
 def raw(family: str, g: Generator, *shape: int) -> Tensor:
-    """Raw values of a head."""
+    """Raw values of a head of a shape: standard normal, or large where "saturated" or "extreme"."""
     values = normal(g, *shape)
     factor = {"saturated": 100.0, "extreme": 1e4}.get(family)
     return values if factor is None else values.sign() * factor * uniform(g, 0.5, 1.5, *shape)
 
 
 def images(family: str, g: Generator, *shape: int) -> Tensor:
+    """Images of a shape, uniform in 0 to 1; "constant", "black" and "out_of_range" change them."""
     values = uniform(g, 0, 1, *shape)
     if family == "constant":
         return torch.full_like(values, float(uniform(g, 0, 1)))
@@ -160,13 +233,19 @@ def images(family: str, g: Generator, *shape: int) -> Tensor:
 
 
 def disc(size: int) -> Tensor:
-    """Mask of a disc in the middle [size, size]."""
+    """Mask [size, size] of a disc in the middle."""
     offset = torch.arange(size, dtype=F64) + 0.5 - size / 2
     return offset[:, None].square() + offset.square() < (0.3 * size) ** 2
 
 
 def spoiled(family: str, g: Generator, masks: Tensor) -> Tensor:
-    """Masks [v, h, w] of a subject; families of masks spoil that of the last view."""
+    """Masks of a subject; families of masks spoil that of the last view.
+
+    Args:
+        family: "empty_mask", "one_pixel", "noise_mask" and "wrong_mask" change them.
+        g: source of the numbers.
+        masks: [v, h, w]; stays as it is.
+    """
     masks = masks.clone()
     if family == "empty_mask":
         masks[-1] = False

@@ -38,7 +38,17 @@ class Outcome:
 def measure(
     stage: Stage, family: str, seeds: Sequence[int], dtypes: Sequence[str] | None = None
 ) -> list[Row]:
-    """Cells of a family, one for each dtype of the stage (among ``dtypes``, if given)."""
+    """Cells of a stage and family. What a stage raises is a failure of all its cases.
+
+    Args:
+        stage: a row of the matrix.
+        family: a key of :data:`FAMILIES` that the stage has.
+        seeds: one for each case.
+        dtypes: among those of the stage; None: all of them.
+
+    Returns:
+        One row for each dtype.
+    """
     started = time.perf_counter()
     chosen = [dtype for dtype in stage.dtypes if dtypes is None or dtype in dtypes]
     # A case depends on stage, family and seed only.
@@ -63,6 +73,16 @@ def measure(
 def _row(
     stage: Stage, family: str, dtype: str, seeds: Sequence[int], outcome: Outcome, seconds: float
 ) -> Row:
+    """A cell of the matrix as plain data.
+
+    Args:
+        stage: of the cell.
+        family: of the cell.
+        dtype: of the cell.
+        seeds: of its cases, for the worst one.
+        outcome: errors of the cases.
+        seconds: that the cell took.
+    """
     errors = outcome.errors
     case = int(outcome.errors.argmax())
     return plain(
@@ -84,7 +104,18 @@ def _row(
 
 
 def evaluate(run: Callable[[Values], Values], inputs: Values, gradients: Sequence[str], dtype: str) -> Values:
-    """Outputs and gradients of their weighted sum as float64; half precisions run in autocast."""
+    """Run a function, and differentiate a weighted sum of all its outputs.
+
+    Args:
+        run: from inputs to outputs [n, ...] of n cases.
+        inputs: [n, ...] by name; floating-point ones have the working precision.
+        gradients: names of the inputs to differentiate by; none: no gradients are computed.
+        dtype: one of :data:`ghgs_lit.diagnostics.stress.stage.DTYPES`; bfloat16 and float16 run in
+            autocast.
+
+    Returns:
+        Outputs by name, and gradients as ``d <input>``, in float64.
+    """
     leaves = {
         name: value.detach().requires_grad_(name in gradients) if value.is_floating_point() else value
         for name, value in inputs.items()
@@ -111,6 +142,16 @@ def _weights(name: str, value: Tensor) -> Tensor:
 
 
 def _comparison(stage: Stage, family: str, cases: Values) -> Callable[[str], Outcome]:
+    """The check of a family whose outputs are compared with the reference, which runs once for all dtypes.
+
+    Args:
+        stage: of the cases.
+        family: of the cases.
+        cases: inputs [n, ...] by name in float64.
+
+    Returns:
+        From a dtype to the outcome.
+    """
     # Inputs that all dtypes represent exactly: their rounding is not the stage's error.
     exact = _inputs(_inputs(cases, "float32"), "float64")
     run = partial(evaluate, stage.reference or stage.run, gradients=stage.gradients, dtype="float64")
@@ -125,8 +166,19 @@ def _inputs(cases: Values, dtype: str) -> Values:
 
 def _spread(run: Callable[[Values], Values], exact: Values, truth: Values, stage: Stage) -> Values:
     """Largest change of each output of the reference under random roundings of the inputs, over their size.
-    Two roundings have size eps. Two more are opposite and as large as the budget, so that one of them flips
-    any decision within it (a ray that grazes a box)."""
+
+    Two roundings have size eps. Two more are opposite and as large as the budget, so that one of them
+    flips any decision within it (a ray that grazes a box).
+
+    Args:
+        run: the reference, with gradients among its outputs.
+        exact: inputs [n, ...] by name in float64.
+        truth: outputs of ``run`` for them.
+        stage: says which inputs are steady, and the budget.
+
+    Returns:
+        Changes [n] by the names of ``truth``.
+    """
     spread = {name: torch.zeros(len(value), dtype=torch.float64) for name, value in truth.items()}
     for seed, size in ((0, 1), (1, 1), (2, stage.factor), (2, -stage.factor)):
         g = torch.Generator().manual_seed(seed)
@@ -150,7 +202,16 @@ def _largest(values: Tensor) -> Tensor:
 
 
 def _compared(stage: Stage, family: str, exact: Values, truth: Values, spread: Values, dtype: str) -> Outcome:
-    """Errors of outputs and gradients in units of eps times the condition number."""
+    """Errors of outputs and gradients in units of eps times the condition number.
+
+    Args:
+        stage: is run.
+        family: of the cases.
+        exact: inputs [n, ...] by name in float64, which all dtypes represent exactly.
+        truth: outputs and gradients of the reference.
+        spread: from :func:`_spread`.
+        dtype: in which the stage runs.
+    """
     working = torch.float64 if dtype == "float64" else torch.float32
     results = truth  # where a stage is its own reference
     if dtype != "float64" or stage.reference is not None:
@@ -180,6 +241,13 @@ def _compared(stage: Stage, family: str, exact: Values, truth: Values, spread: V
 
 
 def _refused(stage: Stage, cases: Values, dtype: str) -> Outcome:
+    """Error of cases that must be refused: 0 where an InputError is raised, else infinite.
+
+    Args:
+        stage: is run for each case by itself.
+        cases: inputs [n, ...] by name in float64.
+        dtype: in which the stage runs.
+    """
     inputs = _inputs(cases, dtype)
     errors = []
     for i in range(len(next(iter(cases.values())))):
@@ -193,8 +261,19 @@ def _refused(stage: Stage, cases: Values, dtype: str) -> Outcome:
 
 
 def _planted(stage: Stage, value: float, cases: Values, seeds: Sequence[int], dtype: str) -> Outcome:
-    """Plant ``value``, which is not finite, in one input. The error is 0 if it is refused, or shows in the
-    outputs and reaches no other case; else infinite."""
+    """Plant a value that is not finite in one entry of one input of each case.
+
+    Args:
+        stage: is run for each case beside the next one.
+        value: NaN or an infinity.
+        cases: inputs [n, ...] by name in float64.
+        seeds: of the cases [n], which choose the entries.
+        dtype: in which the stage runs.
+
+    Returns:
+        Errors of 0 where the value is refused, or shows in the outputs (unless the stage is silent)
+        and reaches no other case; else infinite.
+    """
     inputs = _inputs(cases, dtype)
     names = [name for name, x in inputs.items() if x.is_floating_point() and name not in stage.steady]
     errors = torch.zeros(len(seeds))

@@ -18,7 +18,11 @@ from ghgs_lit.files import write_text_atomically
 
 
 def bounded(error: float | None) -> str:
-    """Text of an error, with three digits."""
+    """Text of an error, with three digits.
+
+    Args:
+        error: in units of eps times the condition number; None: unbounded.
+    """
     return "no bound" if error is None else f"{error:.3g}"
 
 
@@ -70,7 +74,16 @@ def draw(rows: Sequence[Row]) -> Figure:
 
 
 def write(directory: Path, rows: Sequence[Row], source: dict[str, Any]) -> Path:
-    """Write ``stress.md``, ``stress.png`` and ``stress.json``; return the last one's path."""
+    """Write ``stress.md``, ``stress.png`` and ``stress.json``.
+
+    Args:
+        directory: the run's.
+        rows: cells of the matrix.
+        source: provenance.
+
+    Returns:
+        Path of the JSON file.
+    """
     write_text_atomically(directory / "stress.md", to_markdown(rows))
     save_figure(draw(rows), directory / "stress.png")
     content = {

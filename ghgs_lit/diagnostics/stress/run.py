@@ -30,7 +30,16 @@ class Task:
 def tasks_of(
     stages: Sequence[str] | None = None, families: Sequence[str] | None = None, quick: bool = False
 ) -> list[Task]:
-    """Tasks of the chosen stages and families (None: all). InputError: an unknown name."""
+    """Tasks of the chosen stages and families.
+
+    Args:
+        stages: names; None: all.
+        families: names; None: all. A stage has no task of a family that does not apply to it.
+        quick: few cases of each.
+
+    Raises:
+        InputError: an unknown name.
+    """
     for key, names, known in (("stages", stages, STAGES), ("families", families, FAMILIES)):
         for name in names or ():
             choice(key, name, tuple(known))
@@ -45,7 +54,12 @@ def tasks_of(
 
 
 def run_tasks(tasks: Sequence[Task], workers: int) -> list[Row]:
-    """Rows of all tasks. ``workers``: number of processes; 0: this one."""
+    """Rows of all tasks, in their order.
+
+    Args:
+        tasks: what to run.
+        workers: number of processes; 0: this one.
+    """
     if workers == 0:
         return [row for task in track(tasks, "stages and families") for row in task.run()]
     # Spawned: a forked child would inherit locks of threads that it does not have.

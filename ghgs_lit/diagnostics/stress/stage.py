@@ -10,7 +10,12 @@ from torch import Generator, Tensor
 
 @dataclass(frozen=True)
 class Family:
-    """A kind of inputs. ``ingredient``: what it changes (None: it applies to every stage)."""
+    """A kind of inputs.
+
+    Attributes:
+        ingredient: what it changes; None: it applies to every stage.
+        says: what the inputs are, in words.
+    """
 
     ingredient: str | None
     says: str
@@ -148,7 +153,11 @@ class Stage:
 
 
 def case_by_case(run: Callable[[Values], Values]) -> Callable[[Values], Values]:
-    """Turn a function of one case into one of stacked cases."""
+    """Turn a function of one case into one of stacked cases.
+
+    Args:
+        run: takes the values of a case without the first axis.
+    """
 
     def stacked(values: Values) -> Values:
         count = len(next(iter(values.values())))
@@ -161,7 +170,7 @@ def case_by_case(run: Callable[[Values], Values]) -> Callable[[Values], Values]:
 
 
 def stack(cases: list[Values]) -> Values:
-    """Stack the values of cases along a new first axis."""
+    """Stack the values of cases, which have the same names and shapes, along a new first axis."""
     stacked = {}
     for name in cases[0]:
         stacked[name] = torch.stack([case[name] for case in cases])

@@ -20,12 +20,29 @@ _SIZE = 12
 
 
 def _rig(family: str, g: Generator, views: int = 1, size: int = _SIZE) -> Values:
+    """Cameras around the middle of a scene.
+
+    Args:
+        family: of the case.
+        g: source of the numbers.
+        views: number of cameras.
+        size: side of the images in pixels.
+
+    Returns:
+        ``lenses`` [views, 4], ``poses`` [views, 3, 4] and ``middle`` [3].
+    """
     middle = inputs.place(family, g)
     lenses, poses = inputs.cameras(family, g, views, size, middle)
     return {"lenses": lenses, "poses": poses, "middle": middle}
 
 
 def cameras_of(values: Values, size: int = _SIZE) -> Cameras:
+    """Cameras of stacked cases.
+
+    Args:
+        values: ``lenses`` [..., 4] and ``poses`` [..., 3, 4].
+        size: side of the images in pixels.
+    """
     return Cameras(*inputs.matrices(values["lenses"], values["poses"]), size, size)
 
 
@@ -64,6 +81,13 @@ def _rays_inputs(family: str, g: Generator) -> Values:
 
 
 def _hits(cameras: Cameras, middle: Tensor, half: Tensor) -> Tensor:
+    """Whether the rays of pixels hit a box [..., h, w], by the slabs between its faces.
+
+    Args:
+        cameras: whose rays.
+        middle: of the box [3].
+        half: of its edges [3].
+    """
     directions = ray_directions(cameras)
     centers = cameras.centers[:, None, None]
     faces = [(middle + sign * half - centers) / directions for sign in (-1, 1)]
@@ -80,7 +104,20 @@ def _rays(v: Values) -> Values:
 
 
 def scene(family: str, g: Generator, views: int, size: int, target: bool = False) -> Values:
-    """Photographs, masks and true depths of a sphere of 0.5 units."""
+    """Photographs, masks and true depths of a sphere of 0.5 units.
+
+    Args:
+        family: of the case.
+        g: source of the numbers.
+        views: number v of input views.
+        size: side s of the images in pixels.
+        target: whether there is a target view, too.
+
+    Returns:
+        ``images`` [v, 3, s, s], ``masks`` and ``truth`` [v, s, s] (true depths, 0 beside the sphere),
+        ``lenses`` [v, 4], ``poses`` [v, 3, 4] and ``middle`` [3]; with a target ``target`` [1, 3, s, s],
+        ``target_lenses`` and ``target_poses``.
+    """
     rig = _rig(family, g, views + target, size)
     unit = inputs.UNITS.get(family, 1.0)
     intrinsics, extrinsics = inputs.matrices(rig["lenses"], rig["poses"])
@@ -111,6 +148,7 @@ def scene(family: str, g: Generator, views: int, size: int, target: bool = False
 
 
 def batch_of(v: Values) -> Batch:
+    """Batch of stacked cases without targets, from ``images``, ``masks``, ``lenses`` and ``poses``."""
     return Batch(v["images"], v["masks"], cameras_of(v, v["images"].shape[-1]))
 
 

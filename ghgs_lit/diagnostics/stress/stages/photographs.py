@@ -71,7 +71,17 @@ def _between_knots(pixels: Tensor) -> Tensor:
 
 
 def _surface_inputs(views: int, size: int, family: str, g: Generator) -> Values:
-    """A sphere with the same colours in all views, where the family is none of images, up to their gains."""
+    """A sphere with the same colours in all views, up to their gains, where the family is none of images.
+
+    Args:
+        views: number v of input views.
+        size: side s of the images in pixels.
+        family: of the case.
+        g: source of the numbers.
+
+    Returns:
+        As :func:`scene`, with ``gains`` [v, 3] and ``opacities`` [v, s, s].
+    """
     values = scene(family, g, views, size)
     if FAMILIES[family].ingredient != "images":
         cameras = cameras_of({name: value[None] for name, value in values.items()}, size)

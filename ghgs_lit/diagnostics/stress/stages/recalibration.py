@@ -33,6 +33,7 @@ def _distances_slowly(v: Values) -> Values:
 
 
 def _neighbor_table(g: Generator, count: int, k: int) -> Tensor:
+    """Indices [count, k] of ``k`` different tokens for each of ``count``."""
     return torch.stack([torch.randperm(count, generator=g)[:k] for _ in range(count)])
 
 

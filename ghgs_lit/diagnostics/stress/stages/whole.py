@@ -26,8 +26,14 @@ _TINY += ("encoder.vit.channels=8", "recalibration.k=4", "recalibration.num_head
 
 @cache
 def _models(name: str, kicked: bool) -> dict[torch.dtype, GHGS]:
-    """A model in both precisions: the weights of the package, or a tiny one without the zero layers of its
-    initialisation."""
+    """A model in both precisions, with the weights of the package or tiny.
+
+    A tiny one has random weights instead of the layers of 0 of its initialisation.
+
+    Args:
+        name: a file of ``conf/model``, or :data:`SHIPPED`.
+        kicked: whether every weight is moved by 10.
+    """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(3)
         if name == SHIPPED:
