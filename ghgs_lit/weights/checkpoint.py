@@ -26,10 +26,21 @@ STATE_PREFIX = "model."  #: Prefix of the model's tensors in the state of a Ligh
 
 
 def read_checkpoint(path: str | Path, whole: bool = False) -> dict[str, Any]:
-    """Read a checkpoint of this package, including frozen weights that it shares (:mod:`.frozen`). Tensors
-    are mapped from the disk, not read. ``whole``: read every byte once and refuse a damaged file (2 s for 1
-    GB). FileNotFoundError: there is no such file. InputError: it is not a checkpoint of this package, or its
-    frozen weights are missing."""
+    """Read a checkpoint of this package, including frozen weights that it shares (:mod:`.frozen`).
+
+    Tensors are mapped from the disk, not read.
+
+    Args:
+        path: of the file, or :data:`ghgs_lit.weights.reading.SHIPPED`.
+        whole: read every byte once and refuse a damaged file (2 s for 1 GB).
+
+    Returns:
+        Its content: ``state_dict``, ``config``, ``format_version`` and further facts.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: it is not a checkpoint of this package, or its frozen weights are missing.
+    """
     _check_sums(path, whole)
     checkpoint = open_file(path)
     for key, kind in (("state_dict", Mapping), ("config", Mapping), ("format_version", int)):
@@ -51,8 +62,20 @@ def read_checkpoint(path: str | Path, whole: bool = False) -> dict[str, Any]:
 
 
 def read_config(path: str | Path) -> dict[str, Any]:
-    """The configuration in a checkpoint, which is read once until the file changes: commands ask several
-    times. Raises as :func:`read_checkpoint` does."""
+    """The configuration in a checkpoint.
+
+    The file is read once until it changes: commands ask several times.
+
+    Args:
+        path: as for :func:`read_checkpoint`.
+
+    Returns:
+        A copy, as nested mappings of plain values.
+
+    Raises:
+        FileNotFoundError: as :func:`read_checkpoint`.
+        InputError: as :func:`read_checkpoint`.
+    """
     file = file_of(path)
     known = file.stat() if file.is_file() else None  # None: reading says what is wrong
     return copy.deepcopy(_config(str(path), known and (known.st_ino, known.st_mtime_ns, known.st_size)))
@@ -91,7 +114,14 @@ def _check_sums(path: str | Path, whole: bool) -> None:
 
 
 def describe(content: Any) -> str:
-    """Content of an unexpected file in a few words, for messages."""
+    """Content of an unexpected file in a few words, for messages.
+
+    Args:
+        content: anything that a file may hold.
+
+    Returns:
+        The first keys of a mapping, or the type of anything else.
+    """
     if not isinstance(content, Mapping):
         return f"a {type(content).__name__}"
     names = [repr(name) for name in content]
@@ -100,7 +130,15 @@ def describe(content: Any) -> str:
 
 
 def model_state(checkpoint: Mapping[str, Any], prefix: str = STATE_PREFIX) -> dict[str, Tensor]:
-    """Tensors of the model; a LightningModule's checkpoint also holds those of losses."""
+    """Tensors of the model; a LightningModule's checkpoint also holds those of losses.
+
+    Args:
+        checkpoint: of :func:`read_checkpoint`.
+        prefix: what the names of the wanted tensors start with.
+
+    Returns:
+        Tensors by name, without the prefix.
+    """
     return {
         key.removeprefix(prefix): value
         for key, value in checkpoint["state_dict"].items()
@@ -109,8 +147,16 @@ def model_state(checkpoint: Mapping[str, Any], prefix: str = STATE_PREFIX) -> di
 
 
 def require_fit(module: nn.Module, state: Mapping[str, Any], source: str | Path) -> None:
-    """Check that keys and shapes are exactly those of ``module``, whose tensors may be on the meta device.
-    InputError: a key is missing, unknown or has another shape; names source, key and both shapes."""
+    """Check that keys and shapes are exactly those of a module.
+
+    Args:
+        module: its tensors may be on the meta device.
+        state: tensors by name.
+        source: of the state, for messages.
+
+    Raises:
+        InputError: a key is missing, unknown or has another shape; names source, key and both shapes.
+    """
     own = module.state_dict()
     for key in own:
         require(key in state, f"{source}: {key}", f"a tensor of shape {tuple(own[key].shape)}", "nothing")
@@ -120,7 +166,15 @@ def require_fit(module: nn.Module, state: Mapping[str, Any], source: str | Path)
 
 
 def require_finite(state: Mapping[str, Tensor], source: str | Path) -> None:
-    """Refuse weights with NaN or infinity, which make every prediction empty. ``source``: for messages."""
+    """Refuse weights with NaN or infinity, which make every prediction empty.
+
+    Args:
+        state: tensors by name.
+        source: of the state, for messages.
+
+    Raises:
+        InputError: a number is not finite; names source and key.
+    """
     for key, value in state.items():
         # The sum is not finite if any term is not, and needs no second tensor. Half precision would overflow.
         total = value.sum(dtype=torch.promote_types(value.dtype, torch.float32))
@@ -128,14 +182,32 @@ def require_finite(state: Mapping[str, Tensor], source: str | Path) -> None:
 
 
 def load_strictly(module: nn.Module, state: Mapping[str, Any], source: str | Path) -> None:
-    """Copy all of ``state`` into ``module``; raises as :func:`require_fit` and :func:`require_finite` do."""
+    """Copy all of a state into a module.
+
+    Args:
+        module: whose tensors are overwritten.
+        state: tensors by name.
+        source: of the state, for messages.
+
+    Raises:
+        InputError: as :func:`require_fit` and :func:`require_finite`.
+    """
     require_fit(module, state, source)
     require_finite(state, source)
     module.load_state_dict(state)
 
 
 def require_shape(key: str, own: Tensor, found: Any) -> None:
-    """Refuse a value that differs in shape from the model's tensor ``own`` or holds no floats."""
+    """Refuse a value that differs in shape from the model's tensor or holds no floats.
+
+    Args:
+        key: place of the value, for messages.
+        own: the model's tensor.
+        found: the value, a tensor or anything else.
+
+    Raises:
+        InputError: names the key and both shapes, or the dtype.
+    """
     expected = f"shape {tuple(own.shape)} of the configured model"
     require(shape_of(found) == tuple(own.shape), key, expected, shape_of(found))
     require(found.is_floating_point(), key, "floating point numbers", found.dtype)
@@ -149,7 +221,14 @@ def shape_of(value: Any) -> tuple[int, ...] | str:
 def write_checkpoint(
     path: str | Path, state: Mapping[str, Tensor], config: Mapping[str, Any], **facts: Any
 ) -> None:
-    """Write a checkpoint with the model's tensors, its configuration and further ``facts``."""
+    """Write a checkpoint, whole or not at all.
+
+    Args:
+        path: of the file.
+        state: tensors of the model by name.
+        config: the whole configuration, as plain data.
+        facts: further entries of the file, plain data.
+    """
     content = {
         "state_dict": {f"{STATE_PREFIX}{key}": value for key, value in state.items()},
         "config": dict(config),
@@ -164,10 +243,17 @@ def load_weights(
 ) -> None:
     """Give a :class:`ghgs_lit.model.GHGS` the weights of a checkpoint, mapped from the file, not copied.
 
-    The model's own weights may be on the meta device. ``dtype``: precision of the encoder (None: as in the
-    file, but float32 on a CPU without that half precision, and for float64); the heads are float32.
-    ``device``: where the weights will be moved to. FileNotFoundError: there is no such file. InputError: it
-    is not a checkpoint of this package, or its weights are not finite or do not fit the model.
+    Args:
+        model: its own weights may be on the meta device.
+        path: as for :func:`read_checkpoint`.
+        dtype: precision of the encoder (None: as in the file, but float32 on a CPU without that half
+            precision, and for float64); the heads are float32.
+        device: where the weights will be moved to.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: it is not a checkpoint of this package, or its weights are not finite or do not fit the
+            model.
     """
     checkpoint = read_checkpoint(path, whole=True)
     require_fit(model, model_state(checkpoint), path)
@@ -185,8 +271,16 @@ def load_weights(
 
 
 def check_preset(model: nn.Module, checkpoint: Mapping[str, Any], path: str | Path) -> None:
-    """Compare the model's token preset with those that the checkpoint was trained with. ``skip=auto`` drops
-    presets that were not trained; fewer than all tokens with the authors' weights give a warning."""
+    """Compare the model's token preset with those that the checkpoint was trained with.
+
+    ``skip=auto`` drops presets that were not trained; fewer than all tokens with the authors' weights give a
+    warning.
+
+    Args:
+        model: a :class:`ghgs_lit.model.GHGS`, whose ``auto`` may be replaced.
+        checkpoint: its content.
+        path: of the checkpoint, for messages.
+    """
     is_release = "release" in (checkpoint.get("imported") or {})
     if model.auto is not None:
         model.auto = model.auto.trained_by({} if is_release else checkpoint["config"])

@@ -15,9 +15,19 @@ from ghgs_lit.weights.switches import differences
 
 
 def export_weights(checkpoint: str | Path, vggt: str | Path | None, release: str | Path | None) -> list[str]:
-    """Write the tensors of ``checkpoint``, bit for bit, under their published names; return a report.
-    ``vggt``: file for the encoder (safetensors or PyTorch, by its suffix). ``release``: PyTorch file for all
-    other stages. InputError: both are None, or a tensor has no published name; then nothing is written."""
+    """Write the tensors of a checkpoint, bit for bit, under their published names.
+
+    Args:
+        checkpoint: of this package.
+        vggt: file for the encoder (safetensors or PyTorch, by its suffix); None: not written.
+        release: PyTorch file for all other stages; None: not written.
+
+    Returns:
+        A report, a line for each file.
+
+    Raises:
+        InputError: both are None, or a tensor has no published name; then nothing is written.
+    """
     require(vggt is not None or release is not None, "vggt", "vggt=<file>, release=<file> or both", None)
     content = read_checkpoint(checkpoint, whole=True)
     state = model_state(content)
@@ -44,8 +54,16 @@ def export_weights(checkpoint: str | Path, vggt: str | Path | None, release: str
 
 
 def write_tensors(path: str | Path, tensors: dict[str, Tensor], entry: str | None = None) -> None:
-    """Write tensors as safetensors or a PyTorch file, by the suffix of ``path``. ``entry``: key of the
-    PyTorch file that holds them, if any. InputError: it is given for safetensors, which are not nested."""
+    """Write tensors as safetensors or a PyTorch file, by the suffix of the path.
+
+    Args:
+        path: of the file.
+        tensors: by name.
+        entry: key of the PyTorch file that holds them, if any.
+
+    Raises:
+        InputError: ``entry`` is given for safetensors, which are not nested.
+    """
     if Path(path).suffix == ".safetensors":
         require(entry is None, "release", f"a PyTorch file (.pth), which holds {entry!r}", ".safetensors")
         write_atomically(path, lambda temporary: save_file(tensors, temporary, metadata={"format": "pt"}))
@@ -55,8 +73,17 @@ def write_tensors(path: str | Path, tensors: dict[str, Tensor], entry: str | Non
 
 
 def write_inference(checkpoint: str | Path, path: str | Path, dtype: str) -> None:
-    """Write the model of ``checkpoint`` without optimizer, losses and progress. ``dtype`` of all weights:
-    ``float16``, ``bfloat16`` or ``float32``. InputError: a weight overflows it, or both are one file."""
+    """Write the model of a checkpoint without optimizer, losses and progress.
+
+    Args:
+        checkpoint: of a whole model.
+        path: of the file to write.
+        dtype: of all weights: ``float16``, ``bfloat16`` or ``float32``.
+
+    Raises:
+        InputError: a weight overflows the dtype, both are one file, or the checkpoint holds the encoder
+            alone.
+    """
     if resolved(checkpoint) == resolved(path):
         raise InputError(f"inference={path}: expected another file than the checkpoint; found the same")
     content = read_checkpoint(checkpoint, whole=True)

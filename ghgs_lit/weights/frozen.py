@@ -23,7 +23,14 @@ PATTERN = "frozen-*.pt"  #: Names of the files
 
 
 def digest_of(tensors: Mapping[str, Tensor]) -> str:
-    """SHA-256 of names, dtypes, shapes and bytes."""
+    """SHA-256 of names, dtypes, shapes and bytes.
+
+    Args:
+        tensors: by name, in any order.
+
+    Returns:
+        64 hexadecimal digits.
+    """
     digest = hashlib.sha256()
     for name in sorted(tensors):
         tensor = tensors[name].detach().cpu().contiguous()
@@ -40,8 +47,15 @@ class Frozen:
         self._digest = ""
 
     def stored(self, checkpoint: dict[str, Any], folder: Path) -> dict[str, Any]:
-        """``checkpoint`` with a reference to the shared file in ``folder`` in place of frozen tensors, or
-        unchanged if they are small."""
+        """A checkpoint with a reference to the shared file in place of its frozen tensors.
+
+        Args:
+            checkpoint: whose ``frozen`` names some of its tensors.
+            folder: that the checkpoint will be in; the shared file is written there if it is new.
+
+        Returns:
+            The content to write; ``checkpoint`` unchanged if frozen tensors are small (:data:`OWN`).
+        """
         state = checkpoint.get("state_dict", {})
         tensors = {name: state[name] for name in checkpoint.get("frozen", ())}
         if sum(tensor.nbytes for tensor in tensors.values()) <= OWN:
@@ -70,8 +84,19 @@ def _write(path: Path, tensors: Mapping[str, Tensor]) -> None:
 
 
 def joined(path: str | Path, checkpoint: Mapping[str, Any], whole: bool = False) -> dict[str, Any]:
-    """``checkpoint``, read from ``path``, with the tensors of its shared file, if any. ``whole``: check their
-    SHA-256. InputError: there is no such file beside the checkpoint, or it holds something else."""
+    """A checkpoint with the tensors of its shared file, if any.
+
+    Args:
+        path: that the checkpoint was read from.
+        checkpoint: its content.
+        whole: check the SHA-256 of the shared tensors.
+
+    Returns:
+        The content with all tensors.
+
+    Raises:
+        InputError: there is no such file beside the checkpoint, or it holds something else.
+    """
     if "frozen_file" not in checkpoint:
         return dict(checkpoint)
     place = f"{path}: frozen_file"

@@ -29,9 +29,18 @@ def is_repository(name: str) -> bool:
 
 
 def fetch(repository: str) -> tuple[str, Path, str]:
-    """Name, path and SHA-256 of the weights of ``owner/repository``, from the local cache or the hub.
-    InputError: the package, the network or the repository is missing, or the checksum is not the published
-    one."""
+    """Weights of a repository, from the local cache or the hub.
+
+    Args:
+        repository: ``owner/repository``.
+
+    Returns:
+        Its name, the path of the file and its SHA-256.
+
+    Raises:
+        InputError: the package, the network or the repository is missing, or the checksum is not the
+            published one.
+    """
     hub = installed("huggingface_hub", "hub", repository)
     cached = hub.try_to_load_from_cache(repository, FILE)
     if not isinstance(cached, str):
@@ -79,7 +88,14 @@ class Source:
     skipped: Counter = field(default_factory=Counter)  #: ignored tensors by the first part of their name
 
     def tensors(self) -> dict[str, Tensor]:
-        """All tensors of the file, mapped from the disk."""
+        """All tensors of the file, mapped from the disk.
+
+        Returns:
+            Tensors by published names.
+
+        Raises:
+            InputError: the file holds something else, or lacks ``entry``.
+        """
         content = open_file(self.path)
         if self.entry is not None:
             found = content.get(self.entry) if isinstance(content, Mapping) else None
@@ -96,7 +112,14 @@ class Source:
         return {own: tensors[published] for own, published in self.used.items()}
 
     def match(self, model: Mapping[str, Tensor]) -> None:
-        """Fill ``used`` and ``skipped``; refuse names and shapes that do not fit the model's tensors."""
+        """Fill ``used`` and ``skipped``.
+
+        Args:
+            model: the model's tensors by name.
+
+        Raises:
+            InputError: a name or a shape does not fit the model's tensors, or two names mean one tensor.
+        """
         for name, tensor in self.tensors().items():
             where = f"{self.path}: {name}"
             if name.startswith(tuple(self.ignored)):
@@ -117,7 +140,18 @@ class Source:
 
 
 def sources(vggt: str | None, release: str | None) -> Iterator[Source]:
-    """Yield the files to read; a repository of the hub is downloaded first."""
+    """The files to read; a repository of the hub is downloaded first.
+
+    Args:
+        vggt: a file of VGGT-1B's weights, or a repository of the hub.
+        release: the authors' checkpoint, if it is wanted.
+
+    Yields:
+        The encoder's file, then that of the other stages.
+
+    Raises:
+        InputError: ``vggt`` is None, or as :func:`fetch` and :func:`local`.
+    """
     require(vggt is not None, "vggt", "a file or facebook/VGGT-1B (heads need their encoder)", None)
     file = fetch(vggt) if is_repository(vggt) else local(vggt)
     yield Source("vggt", *file, names.VGGT, names.VGGT_IGNORED)
@@ -126,7 +160,18 @@ def sources(vggt: str | None, release: str | None) -> Iterator[Source]:
 
 
 def local(name: str) -> tuple[str, Path, str]:
-    """Name, path and SHA-256 of a file of weights; raises as :func:`open_file` does."""
+    """A file of weights.
+
+    Args:
+        name: its path.
+
+    Returns:
+        Its name, path and SHA-256.
+
+    Raises:
+        FileNotFoundError: as :func:`open_file`.
+        InputError: as :func:`open_file`.
+    """
     path = Path(name)
     open_file(path)
     return path.name, path, sha256(path)
@@ -140,19 +185,23 @@ def import_weights(
     release: str | None = None,
     dtype: str = "float32",
 ) -> list[str]:
-    """Write a checkpoint with published weights and nothing else; return a report.
+    """Write a checkpoint with published weights and nothing else.
 
     Args:
-        state: Tensors that the files must fill, on the meta device: those of the model, or without
+        state: tensors that the files must fill, on the meta device: those of the model, or without
             ``release`` those of its encoder.
-        config: Nodes of the model. Without ``release`` the checkpoint keeps that of the encoder alone.
-        out: The checkpoint.
-        vggt: A file of VGGT-1B's weights, or a repository of the Hugging Face hub.
-        release: The authors' checkpoint, with all other stages.
-        dtype: Precision of the encoder, such as ``bfloat16``; heads are float32.
+        config: nodes of the model. Without ``release`` the checkpoint keeps that of the encoder alone.
+        out: the checkpoint.
+        vggt: a file of VGGT-1B's weights, or a repository of the Hugging Face hub.
+        release: the authors' checkpoint, with all other stages.
+        dtype: precision of the encoder, such as ``bfloat16``; heads are float32.
 
-    FileNotFoundError: a file is missing. InputError: a tensor does not fit; names the file, the tensor and
-    both shapes.
+    Returns:
+        A report: a line for each file, and without ``release`` one about the other stages.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        InputError: a tensor does not fit; names the file, the tensor and both shapes.
     """
     files = list(sources(vggt, release))
     for source in files:
@@ -180,7 +229,15 @@ def import_weights(
 
 
 def match_files(state: Mapping[str, Tensor], files: Sequence[Source]) -> None:
-    """Fill ``Source.used`` by names and shapes. InputError: a tensor is in no file, or does not fit."""
+    """Fill ``Source.used`` by names and shapes.
+
+    Args:
+        state: the model's tensors by name.
+        files: that together hold all of them.
+
+    Raises:
+        InputError: a tensor is in no file, or does not fit.
+    """
     for source in files:
         source.match(state)
     for name in (name for name in state if not any(name in source.used for source in files)):

@@ -31,7 +31,15 @@ UNPUBLISHED = ".guide."  #: Part of the names of tensors that only our variants 
 
 
 def to_ours(name: str, table: Mapping[str, str]) -> str | None:
-    """Our name of a published tensor; None if ``table`` has none."""
+    """Our name of a published tensor.
+
+    Args:
+        name: the published one.
+        table: our prefixes by published ones.
+
+    Returns:
+        The name; None if ``table`` has none.
+    """
     for published, own in table.items():
         if name.startswith(published):
             return own + name.removeprefix(published)
@@ -39,7 +47,15 @@ def to_ours(name: str, table: Mapping[str, str]) -> str | None:
 
 
 def to_published(name: str, table: Mapping[str, str]) -> str | None:
-    """The published name of one of our tensors; None if it has none."""
+    """The published name of one of our tensors.
+
+    Args:
+        name: ours.
+        table: our prefixes by published ones.
+
+    Returns:
+        The name; None if it has none.
+    """
     if UNPUBLISHED in name:
         return None
     for published, own in table.items():

@@ -44,9 +44,20 @@ def file_of(path: str | Path) -> Path:
 
 
 def open_file(path: str | Path) -> Any:
-    """Content of a safetensors or PyTorch file, or :data:`SHIPPED`; the first bytes tell the format. No code
-    in it is executed (``weights_only=True``). FileNotFoundError: there is no such file. InputError: it has
-    another format, is truncated, or holds code."""
+    """Content of a safetensors or PyTorch file; the first bytes tell the format.
+
+    No code in it is executed (``weights_only=True``).
+
+    Args:
+        path: of the file, or :data:`SHIPPED`.
+
+    Returns:
+        What the file holds; tensors are mapped from the disk, except in files of PyTorch before 1.6.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: it has another format, is truncated, or holds code.
+    """
     path = file_of(path)
     start = require_weights(path)
     if start.startswith(ZIP):
@@ -66,7 +77,18 @@ def _unfit(path: Path, found: str) -> InputError:
 
 
 def require_weights(path: str | Path) -> bytes:
-    """First bytes of a file that may hold weights; raises as :func:`open_file` does."""
+    """First bytes of a file that may hold weights.
+
+    Args:
+        path: as for :func:`open_file`.
+
+    Returns:
+        Up to 64 bytes.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: it is a directory, empty, or what a failed download leaves.
+    """
     path = file_of(path)
     if path.is_dir():
         raise _unfit(path, "a directory")
@@ -84,8 +106,16 @@ def require_weights(path: str | Path) -> bytes:
 
 
 def require_stored(path: Path) -> None:
-    """Refuse a PyTorch file whose records are not stored as they are, as PyTorch writes them: mapped from the
-    disk, compressed ones would be other numbers, and unpacked they may fill the memory."""
+    """Refuse a PyTorch file whose records are not stored as they are, as PyTorch writes them.
+
+    Mapped from the disk, compressed ones would be other numbers, and unpacked they may fill the memory.
+
+    Args:
+        path: of a file in ZIP format.
+
+    Raises:
+        InputError: a record is compressed or encrypted, or records claim more bytes than the file has.
+    """
     try:
         with zipfile.ZipFile(path) as archive:
             records = archive.infolist()
@@ -135,8 +165,18 @@ def _open_safetensors(path: Path) -> "dict[str, Tensor]":
 
 
 def require_dense(tensors: "Mapping[str, Any]", path: str | Path) -> None:
-    """Refuse tensors that weights never are: sparse, of 8 bits, or of fewer stored numbers than their shape
-    says, which a copy would expand without limit."""
+    """Refuse tensors that weights never are.
+
+    They are sparse, of 8 bits, or of fewer stored numbers than their shape says, which a copy would expand
+    without limit.
+
+    Args:
+        tensors: by name; values of other types are not looked at.
+        path: of their file, for messages.
+
+    Raises:
+        InputError: names the file and the tensor.
+    """
     import torch
 
     for name, value in tensors.items():
@@ -159,9 +199,18 @@ def require_dense(tensors: "Mapping[str, Any]", path: str | Path) -> None:
 def cast(
     open_tensors: "Callable[[], Mapping[str, Tensor]]", dtype_of: "Callable[[str, torch.dtype], torch.dtype]"
 ) -> "dict[str, Tensor]":
-    """Tensors of a mapped file, each converted to ``dtype_of(name, stored precision)`` unless it has it.
-    ``open_tensors`` maps the file and returns its tensors by name. Pages that were read count as memory, so
-    the file is mapped again after every 256 MB: only the result and one chunk are held."""
+    """Tensors of a mapped file in other precisions.
+
+    Pages that were read count as memory, so the file is mapped again after every 256 MB: only the result and
+    one chunk are held.
+
+    Args:
+        open_tensors: maps the file and returns its tensors by name.
+        dtype_of: a tensor's name and stored precision to the wanted one.
+
+    Returns:
+        Tensors by name, each converted unless it has its precision.
+    """
     tensors = open_tensors()
     names = list(tensors)
     target = {name: dtype_of(name, tensor.dtype) for name, tensor in tensors.items()}

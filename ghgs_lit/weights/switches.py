@@ -37,8 +37,16 @@ def release_switches() -> dict[tuple[str, ...], Any]:
 
 
 def differences(config: Mapping[str, Any], other: Mapping[str, Any] | None = None) -> list[str]:
-    """Switches in which ``config`` differs from ``other`` (None: the release), as ``<key>=<value> for <other
-    value>``. Stages that ``other`` lacks, as a checkpoint of ``ghgs pretext`` does, are not compared."""
+    """Switches in which a configuration differs from another.
+
+    Args:
+        config: the whole configuration.
+        other: another one; None: the release. Stages that it lacks, as a checkpoint of ``ghgs pretext`` does,
+            are not compared.
+
+    Returns:
+        A text ``<key>=<value> for <other value>`` for each.
+    """
     found = []
     for (group, key), value in release_switches().items():
         if other is not None and group not in other:
