@@ -76,8 +76,8 @@ import sys
 from tests.helpers.people import rendered
 batches = iter(rendered(sys.argv[1], workers=2, steps_per_epoch=10**6).train_dataloader())
 next(batches)
-print(*[process.pid for process in batches._workers], flush=True)
 try:
+    print(*[process.pid for process in batches._workers], flush=True)
     while True:
         next(batches)
 except KeyboardInterrupt:
