@@ -68,7 +68,11 @@ class CameraRefinement:
             first round on that does not make its photographs agree better.
         predict: gives the prediction of a batch, as a model does.
         renderer: draws Gaussians, with gradients.
-        shared: the elements of a batch are instants of one rig, whose cameras move alike in all of them."""
+        shared: the elements of a batch are instants of one rig, whose cameras move alike in all of them.
+
+    Raises:
+        InputError: ``rounds`` is below 1.
+    """
 
     def __init__(
         self, rounds: int, predict: Callable[[Batch], Prediction], renderer: Renderer, shared: bool = False
@@ -80,7 +84,14 @@ class CameraRefinement:
         self.shared = shared
 
     def __call__(self, batch: Batch) -> Batch:
-        """The batch with corrected cameras; targets stay as they are. ``batch``: two views or more."""
+        """The batch with corrected cameras; targets stay as they are.
+
+        Args:
+            batch: with two views or more.
+
+        Returns:
+            The batch; cameras of elements that do not agree better are those given.
+        """
         frame = Frame.of(batch).shared if self.shared else Frame.of(batch)
         inside, moved, free, first = self._coherent(frame.enter(batch))
         for _ in range(self.rounds):
@@ -97,8 +108,14 @@ class CameraRefinement:
 
     @torch.no_grad()
     def _coherent(self, batch: Batch) -> tuple[Batch, Bool[Tensor, " B"], Which, Numbers]:
-        """The batch with cameras of consistent silhouettes; which elements these improve; which cameras may
-        be wrong (all, unless silhouettes and prediction agree on a few); and what the first round must gain.
+        """Cameras of consistent silhouettes, where a prediction confirms them.
+
+        Args:
+            batch: in the subject's frame.
+
+        Returns:
+            The batch with these cameras; which elements they improve [B]; which cameras may be wrong [B, V]
+            (all, unless silhouettes and prediction agree on a few); what the first round must gain [B].
         """
         cameras, free, distance = coherent_cameras(batch, self.shared)
         are_right = (distance < _EXACT) & (batch.masks.shape[1] >= _TELLING)
@@ -127,7 +144,16 @@ class CameraRefinement:
         return self._loss(self.renderer(views.gaussians, views.cameras, background=0.0), views, batch)
 
     def _loss(self, drawn: Rendering, views: _Views, batch: Batch) -> Numbers:
-        """L1 of colours and silhouettes per pixel of an element's subject, or with ``shared`` its mean."""
+        """L1 of colours and silhouettes per pixel of an element's subject, or with ``shared`` its mean.
+
+        Args:
+            drawn: renders of the views.
+            views: what they are compared with.
+            batch: that the views are of.
+
+        Returns:
+            Losses [B].
+        """
         image = drawn.image[:, 0]
         alpha = drawn.alpha[:, 0, 0]
         # Where the other views lack the surface of the photograph, what lies behind it is drawn.
@@ -142,7 +168,17 @@ class CameraRefinement:
     def _corrected(
         self, prediction: Prediction, batch: Batch, free: Which, worth: Numbers
     ) -> tuple[Cameras, Bool[Tensor, " B"]]:
-        """Cameras after one round, and which elements gain ``worth``; the cameras of the others stay."""
+        """Cameras after one round.
+
+        Args:
+            prediction: of the batch.
+            batch: in the subject's frame.
+            free: which cameras may move.
+            worth: relative decrease of the loss that each element must exceed.
+
+        Returns:
+            Cameras, and which elements gain that much [B]; the cameras of the others stay.
+        """
         cameras = batch.cameras
         losses = []
         views = _views(prediction, batch)
@@ -170,12 +206,31 @@ class CameraRefinement:
 
 
 def _of_free(motions: Float[Tensor, "B V 6"], axes: Float[Tensor, "B V 3"], free: Which) -> Tensor:
-    """Motions of the free cameras: without their common motion if all are free; 0 for fixed cameras."""
+    """Motions of the free cameras: without their common motion if all are free; 0 for fixed cameras.
+
+    Args:
+        motions: rotation vectors in radians and shifts in half heights [B, V, 6].
+        axes: optical axes of the cameras [B, V, 3].
+        free: which cameras may move.
+
+    Returns:
+        Motions [B, V, 6].
+    """
     all_are = free.all(1)[:, None, None]
     return torch.where(all_are, without_common(motions, axes), motions * free[..., None])
 
 
 def _chosen(which: Which, first: Cameras, second: Cameras) -> Cameras:
+    """Cameras of one of two rigs.
+
+    Args:
+        which: cameras that are taken from the first, of a shape that broadcasts to [B, V].
+        first: cameras [B, V].
+        second: cameras [B, V] of the same photographs.
+
+    Returns:
+        Cameras [B, V].
+    """
     which = which[..., None, None]
     lenses = torch.where(which, first.intrinsics, second.intrinsics)
     poses = torch.where(which, first.extrinsics, second.extrinsics)
@@ -183,7 +238,15 @@ def _chosen(which: Which, first: Cameras, second: Cameras) -> Cameras:
 
 
 def pixels_moved(before: Batch, after: Batch) -> list[list[float]]:
-    """Root mean square motion in pixels of a box around the subject in each photograph [B][V]."""
+    """How far a correction of cameras moves a box around the subject in each photograph.
+
+    Args:
+        before: the batch with the given cameras.
+        after: the batch with the corrected ones.
+
+    Returns:
+        Root mean square motions of the corners in pixels, [B][V].
+    """
     frame = Frame.of(before)
     corners = HEIGHT / 2 * torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], device=before.masks.device)] * 3)
     seen = []

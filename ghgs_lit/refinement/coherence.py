@@ -99,11 +99,18 @@ class _Alignment:
 
 @torch.no_grad()
 def contradiction(batch: Batch) -> tuple[Float[Tensor, " B"], Float[Tensor, "B V"]]:
-    """Mean distances in pixels by which rays near outlines miss other silhouettes: of all views, and of the
-    others without each (0 for three views or fewer: two nearly always agree); a quick check.
+    """How far rays near outlines miss other silhouettes; a quick check.
 
-    With exact cameras that of all is up to 0.0025, with ones off by 1.5 pixels 0.007 to 0.09; where one is
-    off, the others' is that of exact cameras. ``batch``: as for :func:`coherent_cameras`."""
+    With exact cameras the distance of all views is up to 0.0025, with ones off by 1.5 pixels 0.007 to 0.09;
+    where one is off, the others' is that of exact cameras.
+
+    Args:
+        batch: as for :func:`coherent_cameras`.
+
+    Returns:
+        Mean distances in pixels: of all views [B], and of the others without each [B, V] (0 for three views
+        or fewer: two nearly always agree).
+    """
     found = []
     without = []
     for mattes, lens, pose in zip(*_on_cpu(batch), strict=True):
@@ -116,8 +123,14 @@ def contradiction(batch: Batch) -> tuple[Float[Tensor, " B"], Float[Tensor, "B V
 
 
 def culprit(without: Sequence[float]) -> int | None:
-    """Which of several views, or sets of them, is wrong by itself, where it is clear: the others agree
-    without it alone. ``without``: mean distances of the others, in pixels."""
+    """Which of several views, or sets of them, is wrong by itself: the others agree without it alone.
+
+    Args:
+        without: mean distances of the others without each, in pixels; two or more.
+
+    Returns:
+        Its number, where it is clear; else None.
+    """
     first, second = sorted(range(len(without)), key=without.__getitem__)[:2]
     is_clear = without[first] + _EXACT < _CLEARLY * (without[second] + _EXACT)
     return first if is_clear else None
@@ -137,12 +150,17 @@ def coherent_cameras(
     Where moving a minority of the cameras is as good as moving all, the others stay. Silhouettes do not tell
     this from all cameras moving by less, relative to one another.
 
-    Also returned is which cameras were free to move, and by how many pixels rays near outlines miss other
-    silhouettes with the given cameras, on average: 0 to 0.00014 with exact cameras and mattes; with four
-    cameras 0.0001 to 0.0004 if off by up to half a pixel, 0.002 by one, 0.04 to 0.08 by three; infinite where
-    no silhouette has an outline. ``batch``: in the subject's frame (:class:`ghgs_lit.geometry.frame.Frame`).
-    ``shared``: the elements are instants of one rig, in one frame; its cameras move and zoom alike in all.
-    ``alone``: a minority of the cameras may move by itself."""
+    Args:
+        batch: in the subject's frame (:class:`ghgs_lit.geometry.frame.Frame`).
+        shared: the elements are instants of one rig, in one frame; its cameras move and zoom alike in all.
+        alone: a minority of the cameras may move by itself.
+
+    Returns:
+        The cameras; which of them were free to move [B, V]; and by how many pixels rays near outlines miss
+        other silhouettes with the given cameras, on average [B]: 0 to 0.00014 with exact cameras and mattes;
+        with four cameras 0.0001 to 0.0004 if off by up to half a pixel, 0.002 by one, 0.04 to 0.08 by three;
+        infinite where no silhouette has an outline.
+    """
     cameras = batch.cameras
     # On a CPU: many short steps, and distances to outlines are computed there anyway.
     mattes, lens, pose = _on_cpu(batch)
@@ -163,7 +181,18 @@ def coherent_cameras(
 def _coherent(
     mattes: Float[Tensor, "K V H W"], lens: Lenses, pose: Pose, middle: Middles, alone: bool
 ) -> tuple[Lenses, Pose, Which, float]:
-    """Intrinsics and extrinsics of one rig, which were free, and the mean distance with the given ones."""
+    """:func:`coherent_cameras` of one rig.
+
+    Args:
+        mattes: of K instants [K, V, H, W].
+        lens: intrinsics of each instant.
+        pose: extrinsics, the same at all instants.
+        middle: the subject's middle at each instant, in the frame.
+        alone: a minority of the cameras may move by itself.
+
+    Returns:
+        Intrinsics and extrinsics, which were free, and the mean distance in pixels with the given ones.
+    """
     silhouettes = _Silhouettes(tuple(Outlines.of(each) for each in mattes), middle)
     every = torch.ones(len(pose), dtype=torch.bool)
     if not any(len(outlines.depth) for outlines in silhouettes.outlines):
@@ -227,7 +256,7 @@ class _Silhouettes:
     middle: Middles
 
     def distance(self, lens: Lenses, pose: Pose, views: Sequence[int] = ()) -> float:
-        """Mean distance by which rays miss other silhouettes, without those of ``views``."""
+        """Mean distance in pixels by which rays miss other silhouettes, without those of ``views``."""
         kept = [view for view in range(len(pose)) if view not in views]
         missed = 0.0
         rays = 0
@@ -240,6 +269,7 @@ class _Silhouettes:
         return missed / max(rays, 1)
 
     def equations(self, lens: Lenses, pose: Pose, phase: _Phase) -> "_Equations":
+        """Equations of a Gauss-Newton step of all cameras, summed over the instants."""
         pixel = _pixel(lens, pose)
         parts = zip(self.outlines, lens, self.middle, strict=True)
         return reduce(add, (_equations(*part, pose, phase, pixel) for part in parts))
@@ -248,7 +278,19 @@ class _Silhouettes:
 def _equations(
     outlines: Outlines, lens: Lens, middle: Float[Tensor, " 3"], pose: Pose, phase: _Phase, pixel: Tensor
 ) -> _Equations:
-    """Unknowns: motions about the frame's origin and zooms of all cameras, in about a pixel."""
+    """Equations of one instant.
+
+    Args:
+        outlines: of its silhouettes.
+        lens: its intrinsics.
+        middle: the subject's middle [3] in the frame.
+        pose: extrinsics in the frame.
+        phase: which distances are minimised.
+        pixel: half the height of the subject, in pixels: what motions and zooms are multiplied by.
+
+    Returns:
+        Equations of the motions about the frame's origin and the zooms of all cameras, in about a pixel.
+    """
     count = len(pose)
     pose = _placed(pose, middle)
     near = outlines.depth <= phase.to
@@ -280,7 +322,17 @@ def _pixel(lens: Lenses, pose: Pose) -> Float[Tensor, ""]:
 
 
 def _stepped(steps: Float[Tensor, "V 7"], lens: Lenses, pose: Pose, are_all: bool) -> tuple[Lenses, Pose]:
-    """Intrinsics and extrinsics after a step, without what is common to all cameras if ``are_all`` free."""
+    """Cameras after a step.
+
+    Args:
+        steps: motions and zooms, in about a pixel [V, 7].
+        lens: intrinsics of each instant.
+        pose: extrinsics.
+        are_all: all cameras are free, so that what is common to all is left out.
+
+    Returns:
+        Intrinsics and extrinsics.
+    """
     motions, zooms = (steps / _pixel(lens, pose)).split((6, 1), -1)
     if are_all:
         motions = without_common(motions, pose[:, 2, :3])
@@ -293,8 +345,19 @@ def _stepped(steps: Float[Tensor, "V 7"], lens: Lenses, pose: Pose, are_all: boo
 def _best_points(
     outlines: Outlines, lens: Lens, pose: Pose, view: Numbers, pixels: Float[Tensor, "R 2"]
 ) -> tuple[Points, Numbers, Float[Tensor, " R"]]:
-    """The point of each ray that is deepest in the other silhouettes, the silhouette that it is least deep
-    in, and its signed depth in that in pixels. ``view``: the silhouette of each ray, ascending."""
+    """The point of each ray that is deepest in the other silhouettes.
+
+    Args:
+        outlines: of the silhouettes of one instant.
+        lens: its intrinsics.
+        pose: extrinsics around the subject's middle.
+        view: the silhouette of each ray, ascending.
+        pixels: that the rays pass [R, 2].
+
+    Returns:
+        Points [R, 3]; the other silhouette that each is least deep in [R]; and its signed depth in that in
+        pixels [R].
+    """
     centers = -(pose[:, :3, :3].mT @ pose[:, :3, 3:])[..., 0]
     along = torch.linspace(-HEIGHT / 2, HEIGHT / 2, _DEPTHS).to(pixels)
     views = range(len(pose))
@@ -319,7 +382,18 @@ def _best_points(
 
 
 def _gradients(outlines: Outlines, lens: Lens, pose: Pose, points: Points, other: Numbers) -> Points:
-    """Derivatives of the distances with respect to the points, in the world's axes."""
+    """Derivatives of the distances with respect to the points.
+
+    Args:
+        outlines: of the silhouettes of one instant.
+        lens: its intrinsics.
+        pose: extrinsics.
+        points: one for each ray.
+        other: the silhouette that each distance is in.
+
+    Returns:
+        Vectors [R, 3] in the world's axes, in pixels per unit of the frame.
+    """
     seen, depth = project(points, lens[other], pose[other])
     slopes = outlines.slopes(other, seen) * lens[other][:, [0, 1], [0, 1]]
     inside = world_to_camera(points, pose[other])
@@ -331,8 +405,18 @@ def _gradients(outlines: Outlines, lens: Lens, pose: Pose, points: Points, other
 def _rows(
     points: Points, gradients: Points, pose: Float[Tensor, "R 4 4"], middle: Float[Tensor, " 3"]
 ) -> Float[Tensor, "R 7"]:
-    """Derivatives of the distances by a camera's rotation vector about the frame's origin, its shift in half
-    heights and the logarithm of its focal length, which moves points away from the optical axis."""
+    """Derivatives of the distances with respect to a camera's motion and zoom.
+
+    Args:
+        points: one for each ray, around the subject's middle.
+        gradients: derivatives with respect to these.
+        pose: extrinsics of the camera of each ray [R, 4, 4].
+        middle: the subject's middle [3] in the frame.
+
+    Returns:
+        [R, 7]: by the rotation vector about the frame's origin, the shift in half heights, and the logarithm
+        of the focal length, which moves points away from the optical axis.
+    """
     across = world_to_camera(points, pose)[:, :2]
     zoom = ((pose[:, :3, :3] @ gradients[..., None])[:, :2, 0] * across).sum(-1, keepdim=True)
     return torch.cat((torch.linalg.cross(points + middle, gradients), HEIGHT / 2 * gradients, zoom), -1)

@@ -36,6 +36,16 @@ class Outlines:
 
     @classmethod
     def of(cls, mattes: Float[Tensor, "V H W"], look: tuple[int, float, int] = CAREFUL) -> "Outlines":
+        """Outlines of the silhouettes of one instant.
+
+        Args:
+            mattes: shares of pixels that show the subject [V, H, W], in [0, 1], on a CPU.
+            look: size of the maps relative to the mattes, greatest depth of rays in pixels, and every how
+                many rays one is used.
+
+        Returns:
+            Distance maps, and the rays in ascending order of silhouettes.
+        """
         (finer, to, every), size = look, (mattes.shape[1], mattes.shape[2])
         larger = F.interpolate(mattes[:, None], scale_factor=finer, mode="bilinear", align_corners=False)
         distance = soft_signed_distance if finer == 1 else lambda matte: signed_distance(matte > 0.5)
@@ -48,7 +58,14 @@ class Outlines:
         return cls(maps, *(each[near][::every] for each in (view, pixels, depth)), size, finer)
 
     def of_views(self, kept: Sequence[int]) -> "Outlines":
-        """Those of some silhouettes, ascending."""
+        """Those of some silhouettes.
+
+        Args:
+            kept: their numbers, ascending.
+
+        Returns:
+            The outlines, whose silhouettes are numbered anew.
+        """
         if len(kept) == len(self.maps):
             return self
         numbers = torch.tensor(kept)
@@ -59,7 +76,15 @@ class Outlines:
         )
 
     def at(self, view: Int[Tensor, "*n"], pixels: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
-        """Distances at pixels; beyond the photograph those at its border, where a subject may go on."""
+        """Distances at pixels; beyond the photograph those at its border, where a subject may go on.
+
+        Args:
+            view: number of the silhouette of each pixel [...].
+            pixels: ``(u, v)`` in the photograph [..., 2].
+
+        Returns:
+            Signed distances [...] in pixels, above 0 inside.
+        """
         half = 0.5 / self.finer
         within = torch.minimum(pixels.clamp(min=half), pixels.new_tensor(self.size[::-1]) - half)
         return sample(self.maps, view, self.finer * within)[..., 0]
@@ -67,7 +92,19 @@ class Outlines:
     def along(
         self, view: int, lens: Tensor, pose: Tensor, start: Tensor, ahead: Tensor, depths: Float[Tensor, " D"]
     ) -> Float[Tensor, "R D"]:
-        """Distances in a silhouette (lens [3, 3], pose [4, 4]) at ``start`` [3] + depth ``ahead`` [R, 3]."""
+        """Distances in a silhouette at the points ``start + depth * ahead`` of rays.
+
+        Args:
+            view: number of the silhouette.
+            lens: its intrinsics [3, 3] in pixels.
+            pose: its extrinsics [4, 4].
+            start: where all rays start [3], in the world.
+            ahead: what a unit of depth adds to each ray [R, 3].
+            depths: that are tried on each ray [D].
+
+        Returns:
+            Signed distances [R, D] in pixels, above 0 inside; without a meaning behind the camera.
+        """
         # Places from -1 to 1 over the photograph: ratios of functions that are linear in depth.
         height, width = self.size
         onto = lens.new_tensor([[2 / width, 0, -1], [0, 2 / height, -1], [0, 0, 1]]) @ lens
@@ -80,6 +117,15 @@ class Outlines:
         return F.grid_sample(one, places, padding_mode="border", align_corners=False)[0, 0]
 
     def slopes(self, view: Int[Tensor, " n"], pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
+        """Gradients of the distances in the photograph.
+
+        Args:
+            view: number of the silhouette of each pixel [n].
+            pixels: ``(u, v)`` [n, 2].
+
+        Returns:
+            Changes of the distance per pixel to the right and down [n, 2].
+        """
         steps = _REACH * torch.eye(2).to(pixels)
         rises = [self.at(view, pixels + step) - self.at(view, pixels - step) for step in steps]
         return torch.stack(rises, -1) / (2 * _REACH)

@@ -59,13 +59,16 @@ class Report:
 
 
 class Descent:
-    """Bounded changes of Gaussians, at first 0, and their optimiser. InputError: ``means`` change, but the
-    Gaussians belong to no pixel.
+    """Bounded changes of Gaussians, at first 0, and their optimiser.
 
     Args:
         gaussians: predicted from ``batch``, each at a pixel of an input.
         batch: None where ``means`` do not change.
-        changes: what may change, as for :class:`Refinement`."""
+        changes: what may change, as for :class:`Refinement`.
+
+    Raises:
+        InputError: ``means`` change, but the Gaussians belong to no pixel.
+    """
 
     def __init__(self, gaussians: Gaussians, batch: Batch | None, changes: Mapping[str, Change]):
         self.start = gaussians.detach()
@@ -85,7 +88,16 @@ class Descent:
         return self._changed()
 
     def step(self, renderer: Renderer, seen: Seen, weights: Weights = WEIGHTS) -> Rendering:
-        """Take a step towards ``seen``. Returns: the renders before it."""
+        """Take a step towards photographs.
+
+        Args:
+            renderer: draws the inputs, with gradients.
+            seen: of :func:`seen_by`.
+            weights: of L1, 1 - SSIM and L1 of the silhouette.
+
+        Returns:
+            The renders before the step.
+        """
         with exact(self.start.means.device.type), torch.enable_grad():
             drawn = renderer(self._changed(), seen[2], background=0.0)
             self._optimizer.zero_grad()
@@ -115,7 +127,11 @@ class Refinement:
         steps: of the optimiser, 1 or more.
         renderer: draws the inputs, with gradients.
         changes: by field, what may change: means in footprints of their pixels, scales by their logarithm,
-            opacities by their logit, quaternions, colours. Other fields stay."""
+            opacities by their logit, quaternions, colours. Other fields stay.
+
+    Raises:
+        InputError: ``steps`` is below 1.
+    """
 
     def __init__(self, steps: int, renderer: Renderer, changes: Mapping[str, Change] = NEAR):
         require(steps >= 1, "refine", "1 or more steps", steps)
@@ -124,7 +140,18 @@ class Refinement:
         self.changes = changes
 
     def __call__(self, gaussians: Gaussians, batch: Batch) -> Gaussians:
-        """The refined Gaussians. InputError: they do not belong to pixels of ``batch``."""
+        """The refined Gaussians.
+
+        Args:
+            gaussians: predicted from ``batch``.
+            batch: whose photographs they get nearer to.
+
+        Returns:
+            Gaussians in the same order, without a gradient.
+
+        Raises:
+            InputError: they do not belong to pixels of ``batch``.
+        """
         return deque(self.states(gaussians, batch), maxlen=1).pop()
 
     def states(self, gaussians: Gaussians, batch: Batch) -> Iterator[Gaussians]:
@@ -139,10 +166,20 @@ class Refinement:
     def report(
         self, gaussians: Gaussians, refined: Gaussians, batch: Batch, predict: Callable[[Batch], Gaussians]
     ) -> Report:
-        """The gain of a refinement. Of four inputs or more the last is held out (two that remain would show
-        too little of a person), which takes as long as prediction and refinement. ``batch``: one element,
-        from which both were predicted. ``predict``: gives the Gaussians of a batch, here of the inputs
-        without the last."""
+        """The gain of a refinement.
+
+        Of four inputs or more the last is held out (two that remain would show too little of a person), which
+        takes as long as prediction and refinement.
+
+        Args:
+            gaussians: before the refinement.
+            refined: after it.
+            batch: one element, from which both were predicted.
+            predict: gives the Gaussians of a batch, here of the inputs without the last.
+
+        Returns:
+            PSNR before and after.
+        """
         inputs = tuple(self._psnr(splats, batch) for splats in (gaussians, refined))
         held_out = None
         *seen, hidden = range(batch.images.shape[1])
@@ -178,6 +215,17 @@ def _footprints(gaussians: Gaussians, batch: Batch) -> Tensor:
 
 
 def _loss(drawn: Rendering, photographs: Tensor, silhouettes: Tensor, weights: Weights) -> Tensor:
+    """Difference of renders and photographs (the paper's L_render, and L1 of silhouettes).
+
+    Args:
+        drawn: renders of the inputs.
+        photographs: on black [B, V, 3, H, W].
+        silhouettes: shares of pixels that show the subject [B, V, 1, H, W].
+        weights: of L1, 1 - SSIM (not computed if 0) and L1 of the silhouette.
+
+    Returns:
+        A scalar.
+    """
     l1, dissimilar, outline = weights
     loss = l1 * (drawn.image - photographs).abs().mean() + outline * (drawn.alpha - silhouettes).abs().mean()
     if not dissimilar:

@@ -157,10 +157,16 @@ def sheet(
     """A picture of one subject: inputs, their depths, then target, render and error of each target.
 
     Args:
+        batch: photographs, masks, and depths and targets where they are known.
         image: renders of the targets [B, T, 3, h, w]; without targets, renders of the inputs, which then
             stand below them with their errors; None: no renders.
+        element: number of the subject in the batch.
         depth: predicted depths [B, V, H, W], metres; None: no row of them.
-        depth_valid: where they are defined [B, V, H, W]; None: in the masks."""
+        depth_valid: where they are defined [B, V, H, W]; None: in the masks.
+
+    Returns:
+        Picture [h, w, 3] uint8.
+    """
     views = batch.views[element] if batch.views else tuple(map(str, range(batch.images.shape[1])))
     rows = [row([to_uint8(i) for i in batch.images[element]], [f"input {name}" for name in views])]
     if image is not None and batch.targets is None:
