@@ -34,8 +34,23 @@ def activate(
     constants: Constants,
     on_surface: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """:func:`ghgs_lit.heads.activations.footprint_gaussians`; see :func:`is_supported`. ``image``, ``pixel``:
-    ascending."""
+    """:func:`ghgs_lit.heads.activations.footprint_gaussians`, where :func:`is_supported`.
+
+    Args:
+        raw: offsets, scales, rotations, opacities and colours (or None) before activations.
+        image: numbers of the images (``b * V + v``) that the Gaussians belong to, ascending.
+        pixel: row-major indices of their pixels, ascending within an image.
+        maps: depths in metres.
+        points: world points of pixels, in metres.
+        photo: colours of pixels, in [0, 1].
+        share: factors of opacities; None: 1.
+        cameras: of the images.
+        constants: of ``FootprintAttributes``, with the limit of colours.
+        on_surface: ``raw`` is in axes of the surface.
+
+    Returns:
+        Means, quaternions, scales, opacities and colours.
+    """
     from ghgs_lit.heads.cpu.kernel import activate as compiled  # here: it loads a compiler
 
     *raw, color = raw

@@ -64,6 +64,14 @@ def _exp(x):
 
 @helper
 def _unit(w, x, y, z):
+    """Quaternions divided by their length; 0 stays 0. The largest number is divided out first.
+
+    Args:
+        w: real part of 16 quaternions.
+        x: second part, as are the next two.
+        y: third part.
+        z: fourth part.
+    """
     largest = simd.maximum(simd.maximum(w, ZERO - w), simd.maximum(x, ZERO - x))
     largest = simd.maximum(largest, simd.maximum(simd.maximum(y, ZERO - y), simd.maximum(z, ZERO - z)))
     is_zero = largest == ZERO
@@ -79,6 +87,7 @@ def _unit(w, x, y, z):
 
 @helper
 def _multiply(p, q):
+    """The product of two quaternions."""
     return (
         p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
         p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
@@ -94,6 +103,7 @@ def _cross(a, b):
 
 @helper
 def _rotate(q, v):
+    """The vector ``v`` rotated by the unit quaternion ``q``."""
     axis = q[1], q[2], q[3]
     x, y, z = _cross(axis, v)
     twice = x + x, y + y, z + z
@@ -103,7 +113,14 @@ def _rotate(q, v):
 
 @helper
 def _slope(values, line, own, footprint):
-    """Relative change of depth along an axis, from the pixels before and after; see ``surface_axes``."""
+    """Relative change of depth along an axis, from the pixels before and after; see ``surface_axes``.
+
+    Args:
+        values: lines of the Gaussians.
+        line: that of the depths after; depths before are in the next one.
+        own: depths of the Gaussians, in metres.
+        footprint: sides of their pixels there, in metres.
+    """
     after = _line(values, line) - own
     before = _line(values, line + 1) - own
     near_after = simd.minimum(ONE, (FAR - simd.maximum(after, ZERO - after) / footprint) / RANGE)
@@ -117,7 +134,16 @@ def _slope(values, line, own, footprint):
 
 @helper
 def _axes(values, camera, turn, row, column, own):
-    """Quaternions from axes of the surface to the world; see ``surface_axes``."""
+    """Quaternions from axes of the surface to the world; see ``surface_axes``.
+
+    Args:
+        values: lines of the Gaussians.
+        camera: intrinsics [3, 3] in pixels.
+        turn: quaternion from the camera's axes to the world.
+        row: of the pixels.
+        column: of the pixels.
+        own: depths of the Gaussians, in metres.
+    """
     footprint = own / camera[0, 0]
     right = _slope(values, AROUND, own, footprint)
     down = _slope(values, AROUND + 2, own, footprint)
@@ -134,7 +160,25 @@ def _read(
     offset, scale, rotation, opacity, color, pixel, depth, valid, points, photo, share, image, start, last,
     values,
 ):  # fmt: skip
-    """Fill ``values`` with Gaussians from ``start`` on; the last one is repeated."""
+    """Fill lines with 16 Gaussians; the last one is repeated.
+
+    Args:
+        offset: [N, 3], raw, as are the next four.
+        scale: [N, 3].
+        rotation: [N, 4].
+        opacity: [N].
+        color: [N, 3]; without rows: 0.
+        pixel: [N], row-major indices of their pixels.
+        depth: [images, H, W] in metres.
+        valid: [images, H, W], which depths are.
+        points: [images, H, W, 3], world points in metres.
+        photo: [images, 3, H, W], colours.
+        share: [images, H, W], factors of opacities; without rows: 1.
+        image: number of the image that they belong to.
+        start: the first Gaussian.
+        last: end of the Gaussians of this task, excluded.
+        values: ``LINES`` lines, written.
+    """
     height = depth.shape[1]
     width = depth.shape[2]
     for lane in range(LANES):
@@ -164,7 +208,33 @@ def activate(
     offset, scale, rotation, opacity, color, pixel, depth, valid, points, photo, share, intrinsics, turns,
     constants, on_surface, means, quaternions, scales, opacities, colors, image, first, last,
 ):  # fmt: skip
-    """Write Gaussians ``first`` to ``last`` of ``image``; see :func:`ghgs_lit.heads.cpu.activate`."""
+    """Write Gaussians of one image; see :func:`ghgs_lit.heads.cpu.activate`.
+
+    Args:
+        offset: [N, 3], raw, as are the next four.
+        scale: [N, 3].
+        rotation: [N, 4].
+        opacity: [N].
+        color: [N, 3]; without rows: 0.
+        pixel: [N], row-major indices of their pixels.
+        depth: [images, H, W] in metres.
+        valid: [images, H, W], which depths are.
+        points: [images, H, W, 3], world points in metres.
+        photo: [images, 3, H, W], colours.
+        share: [images, H, W], factors of opacities; without rows: 1.
+        intrinsics: [images, 3, 3] in pixels.
+        turns: [images, 4], quaternions from the cameras' axes to the world.
+        constants: numbers of :class:`ghgs_lit.heads.activations.Constants`.
+        on_surface: raw values are in axes of the surface.
+        means: [N, 3] in metres; written, as are the next four.
+        quaternions: [N, 4].
+        scales: [N, 3] in metres.
+        opacities: [N].
+        colors: [N, 3].
+        image: number of the image.
+        first: the first Gaussian.
+        last: end of the Gaussians, excluded.
+    """
     limit, unit, inward, floor, span, across, thickness, least, bias, change = constants
     camera = intrinsics[image]
     width = depth.shape[2]

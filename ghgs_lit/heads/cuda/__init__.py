@@ -20,12 +20,18 @@ _POINTS = 9
 
 
 def is_supported(*tensors: Tensor | None, fixed: Sequence[Tensor | None]) -> bool:
-    """Whether the kernels compute with these tensors. ``fixed``: those that may not need a gradient."""
+    """Whether the kernels compute with these tensors.
+
+    Args:
+        tensors: all inputs; None: one that is left out.
+        fixed: those that may not need a gradient.
+    """
     is_needed = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in fixed)
     return not is_needed and gpu.is_supported(*tensors)
 
 
 def _plain(*inputs) -> tuple[Tensor, ...]:
+    """:func:`activate` in plain PyTorch; inputs in the order of ``_INPUTS``."""
     *raw, image, pixel, depth, valid, points, photo, share = inputs[:12]
     intrinsics, extrinsics, constants, on_surface = inputs[12:]
     maps = DepthMaps(depth, valid, depth)
@@ -35,6 +41,10 @@ def _plain(*inputs) -> tuple[Tensor, ...]:
 
 
 def _plain_back(*inputs) -> list[Tensor]:
+    """Gradients of raw values and points in plain PyTorch.
+
+    Inputs are those of :func:`_plain` and gradients of its results.
+    """
     *inputs, slopes = inputs
     places = [place for place in (*_RAW, _POINTS) if inputs[place] is not None]
     for place in places:
@@ -86,7 +96,22 @@ def activate(
     constants: Constants,
     on_surface: bool,
 ) -> tuple[Tensor, ...]:
-    """:func:`ghgs_lit.heads.activations.footprint_gaussians`, differentiable in ``raw`` and ``points``; see
-    :func:`is_supported`."""
+    """:func:`ghgs_lit.heads.activations.footprint_gaussians`, differentiable in ``raw`` and ``points``.
+
+    Args:
+        raw: offsets, scales, rotations, opacities and colours (or None) before activations.
+        image: [N], numbers of the images (``b * V + v``) that the Gaussians belong to.
+        pixel: [N], row-major indices of their pixels.
+        maps: depths in metres.
+        points: [B, V, H, W, 3], world points of pixels, in metres.
+        photo: [B, V, 3, H, W], colours of pixels, in [0, 1].
+        share: [B, V, H, W], factors of opacities; None: 1.
+        cameras: of the images.
+        constants: of ``FootprintAttributes``, with the limit of colours.
+        on_surface: ``raw`` is in axes of the surface.
+
+    Returns:
+        Means, quaternions, scales, opacities and colours.
+    """
     seen = (image, pixel, maps.depth, maps.valid, points, photo, share)
     return _Activate.apply(*raw, *seen, cameras.intrinsics, cameras.extrinsics, list(constants), on_surface)

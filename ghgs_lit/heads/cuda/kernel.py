@@ -28,19 +28,36 @@ def _sigmoid(x):
 
 @triton.jit
 def _back(slope, own, x, limit):
-    """Gradient of an activation with slope ``own``: beyond the limit only what leads back into it remains."""
+    """Gradient of an activation: beyond the limit only what leads back into it remains.
+
+    Args:
+        slope: gradient of its result.
+        own: slope of the activation.
+        x: its argument.
+        limit: largest argument.
+    """
     return tl.where((tl.abs(x) <= limit) | (slope * x > 0), slope * own, 0.0)
 
 
 @triton.jit
 def _tanh_back(slope, x):
+    """Gradient of a tanh within its limit."""
     shrunk = tl.exp(-2 * tl.abs(clamp(x, -TANH, TANH)))
     return _back(slope, 4 * shrunk / ((1 + shrunk) * (1 + shrunk)), x, TANH)
 
 
 @triton.jit
 def _unit(w, x, y, z):
-    """Four numbers divided by their length, and the length; 0 stays 0. The largest is divided out first."""
+    """Quaternions divided by their length, and the length; 0 stays 0.
+
+    The largest number is divided out first.
+
+    Args:
+        w: real part.
+        x: second part.
+        y: third part.
+        z: fourth part.
+    """
     largest = tl.maximum(tl.maximum(tl.abs(w), tl.abs(x)), tl.maximum(tl.abs(y), tl.abs(z)))
     scale = 1 / tl.where(largest == 0, 1.0, largest)
     w = w * scale
@@ -55,7 +72,18 @@ def _unit(w, x, y, z):
 
 @triton.jit
 def _multiply(a, b, c, d, w, x, y, z):
-    """The product of two quaternions."""
+    """The product of two quaternions.
+
+    Args:
+        a: real part of the first.
+        b: its second part.
+        c: its third part.
+        d: its fourth part.
+        w: real part of the second.
+        x: its second part.
+        y: its third part.
+        z: its fourth part.
+    """
     return (
         a * w - b * x - c * y - d * z,
         a * x + b * w + c * z - d * y,
@@ -66,7 +94,17 @@ def _multiply(a, b, c, d, w, x, y, z):
 
 @triton.jit
 def _rotate(w, a, b, c, x, y, z):
-    """The vector (x, y, z) rotated by a unit quaternion."""
+    """The vector (x, y, z) rotated by a unit quaternion.
+
+    Args:
+        w: real part of the quaternion.
+        a: its second part.
+        b: its third part.
+        c: its fourth part.
+        x: first coordinate of the vector.
+        y: second one.
+        z: third one.
+    """
     p = 2 * (b * z - c * y)
     q = 2 * (c * x - a * z)
     r = 2 * (a * y - b * x)
@@ -105,7 +143,19 @@ def _to_world(extrinsics, image):
 
 @triton.jit
 def _neighbour(depth, valid, image, row, column, own, footprint, height, width):
-    """How much deeper a neighbour is, times its weight from 0 to 1, and the weight: 0 for another surface."""
+    """How much deeper a neighbour is, times its weight from 0 to 1, and the weight: 0 for another surface.
+
+    Args:
+        depth: [images, height, width] in metres.
+        valid: [images, height, width], which depths are.
+        image: number of the image.
+        row: of the neighbour, perhaps outside the image.
+        column: of the neighbour.
+        own: depth of the pixel itself.
+        footprint: side of the pixel there, in metres.
+        height: of the images.
+        width: of the images.
+    """
     inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
     place = (image * height + row) * width + column
     is_valid = inside & (tl.load(valid + place, inside, 0) != 0)
@@ -116,7 +166,21 @@ def _neighbour(depth, valid, image, row, column, own, footprint, height, width):
 
 @triton.jit
 def _slope(depth, valid, image, row, column, down, right, own, footprint, height, width):
-    """Relative change of depth from a pixel to the one ``down`` rows and ``right`` columns away."""
+    """Relative change of depth from a pixel to the next along an axis.
+
+    Args:
+        depth: [images, height, width] in metres.
+        valid: [images, height, width], which depths are.
+        image: number of the image.
+        row: of the pixel.
+        column: of the pixel.
+        down: rows to the next pixel.
+        right: columns to the next pixel.
+        own: depth of the pixel.
+        footprint: side of the pixel there, in metres.
+        height: of the images.
+        width: of the images.
+    """
     after, near = _neighbour(depth, valid, image, row + down, column + right, own, footprint, height, width)
     before, other = _neighbour(depth, valid, image, row - down, column - right, own, footprint, height, width)
     return (after - before) / ((1 + near * other) * own + after + before)
@@ -124,7 +188,19 @@ def _slope(depth, valid, image, row, column, down, right, own, footprint, height
 
 @triton.jit
 def _axes(depth, valid, intrinsics, extrinsics, image, pixel, own, height, width):
-    """The quaternion from axes of the surface to the world."""
+    """The quaternion from axes of the surface to the world.
+
+    Args:
+        depth: [images, height, width] in metres.
+        valid: [images, height, width], which depths are.
+        intrinsics: [images, 3, 3] in pixels.
+        extrinsics: [images, 4, 4].
+        image: number of the image.
+        pixel: row-major index.
+        own: depth of the pixel.
+        height: of the images.
+        width: of the images.
+    """
     row = pixel // width
     column = pixel % width
     fx, skew, cx = load3(intrinsics, image * 3)
@@ -142,7 +218,14 @@ def _axes(depth, valid, intrinsics, extrinsics, image, pixel, own, height, width
 
 @triton.jit
 def _depth_and_footprint(depth, intrinsics, image, place):
-    """Depths, and sides of the pixels there, in metres."""
+    """Depths, and sides of the pixels there, in metres.
+
+    Args:
+        depth: [images, height, width] in metres.
+        intrinsics: [images, 3, 3] in pixels.
+        image: number of the image.
+        place: index of the pixel among those of all images.
+    """
     own = tl.load(depth + place)
     fx = tl.load(intrinsics + image * 9)
     fy = tl.load(intrinsics + image * 9 + 4)
@@ -151,11 +234,28 @@ def _depth_and_footprint(depth, intrinsics, image, place):
 
 @triton.jit
 def _offset(x, limit, unit, HAS_LIMIT: tl.constexpr):
+    """A coordinate of an offset in metres.
+
+    Args:
+        x: raw value.
+        limit: largest offset in metres.
+        unit: offset in metres for a raw value of 1 where there is no limit.
+        HAS_LIMIT: whether there is one.
+    """
     return limit * tanh(clamp(x, -TANH, TANH)) if HAS_LIMIT else unit * x
 
 
 @triton.jit
 def _offset_back(slope, x, limit, unit, HAS_LIMIT: tl.constexpr):
+    """Gradient of the raw value of an offset's coordinate.
+
+    Args:
+        slope: gradient of the coordinate.
+        x: raw value.
+        limit: largest offset in metres.
+        unit: offset in metres for a raw value of 1 where there is no limit.
+        HAS_LIMIT: whether there is one.
+    """
     return _tanh_back(limit * slope, x) if HAS_LIMIT else unit * slope
 
 
@@ -167,7 +267,26 @@ def activate_rows(
     HAS_LIMIT: tl.constexpr, HAS_COLOR: tl.constexpr, HAS_SHARE: tl.constexpr, ON_SURFACE: tl.constexpr,
     ROWS: tl.constexpr,
 ):  # fmt: skip
-    """Write ``ROWS`` Gaussians; see :func:`activate`."""
+    """Write ``ROWS`` Gaussians; see :func:`activate`.
+
+    Args:
+        count: number N of Gaussians.
+        offset, scale, rotation, opacity, color: raw, [N, 3], [N, 3], [N, 4], [N] and [N, 3].
+        image: [N], numbers of the images (``b * V + v``) that they belong to.
+        pixel: [N], row-major indices of their pixels.
+        depth, valid: [B, V, height, width], in metres, and which depths are valid.
+        points: [B, V, height, width, 3], world points in metres.
+        photo: [B, V, 3, height, width], colours.
+        share: [B, V, height, width], factors of opacities.
+        intrinsics, extrinsics: [B, V, 3, 3] in pixels, and [B, V, 4, 4].
+        means, quaternions, scales, opacities, colors: [N, 3], [N, 4], [N, 3], [N] and [N, 3], written.
+        height, width: of the images.
+        limit, unit, inward, floor, span, across, thickness, least, bias, change: numbers of
+            :class:`ghgs_lit.heads.activations.Constants`, in their order.
+        HAS_LIMIT, HAS_COLOR, HAS_SHARE: whether there are a limit of offsets, raw colours, factors.
+        ON_SURFACE: raw values are in axes of the surface.
+        ROWS: Gaussians of a program.
+    """
     i = rows_of(count, ROWS)
     view = tl.load(image + i)
     at = tl.load(pixel + i)
@@ -208,7 +327,26 @@ def activate_back_rows(
     HAS_LIMIT: tl.constexpr, HAS_COLOR: tl.constexpr, HAS_SHARE: tl.constexpr, ON_SURFACE: tl.constexpr,
     ROWS: tl.constexpr,
 ):  # fmt: skip
-    """Write the gradients of ``ROWS`` Gaussians; see :func:`activate_back`."""
+    """Write the gradients of ``ROWS`` Gaussians; see :func:`activate_back`.
+
+    Args:
+        count: number N of Gaussians.
+        offset, scale, rotation, opacity, color: raw, [N, 3], [N, 3], [N, 4], [N] and [N, 3].
+        image: [N], numbers of the images (``b * V + v``) that they belong to.
+        pixel: [N], row-major indices of their pixels.
+        depth, valid: [B, V, height, width], in metres, and which depths are valid.
+        share: [B, V, height, width], factors of opacities.
+        intrinsics, extrinsics: [B, V, 3, 3] in pixels, and [B, V, 4, 4].
+        of_means, of_quaternions, of_scales, of_opacities, of_colors: gradients of the results.
+        d_offset, d_scale, d_rotation, d_opacity, d_color: written, gradients of raw values.
+        d_points: [B, V, height, width, 3], gradients of points are added.
+        height, width: of the images.
+        limit, unit, inward, floor, span, across, thickness, least, bias, change: numbers of
+            :class:`ghgs_lit.heads.activations.Constants`, in their order.
+        HAS_LIMIT, HAS_COLOR, HAS_SHARE: whether there are a limit of offsets, raw colours, factors.
+        ON_SURFACE: raw values are in axes of the surface.
+        ROWS: Gaussians of a program.
+    """
     i = rows_of(count, ROWS)
     view = tl.load(image + i)
     at = tl.load(pixel + i)
@@ -255,6 +393,14 @@ def activate_back_rows(
 
 
 def _flags(constants: list[float], color: Tensor | None, share: Tensor | None, on_surface: bool) -> dict:
+    """What the kernels are compiled for.
+
+    Args:
+        constants: numbers of :class:`ghgs_lit.heads.activations.Constants`, in their order.
+        color: raw colours; None: none.
+        share: factors of opacities; None: none.
+        on_surface: raw values are in axes of the surface.
+    """
     flags = {"HAS_LIMIT": constants[0] > 0, "HAS_COLOR": color is not None, "HAS_SHARE": share is not None}
     return {**flags, "ON_SURFACE": on_surface}
 

@@ -26,10 +26,19 @@ def remembered(
     known: Float[Tensor, "N k"],
     before: Float[Tensor, "N h"],
 ) -> Float[Tensor, "N h"]:
-    """``tanh(before + memory(update(seen, known, before)))``, differentiable in ``before`` and the layers;
-    see :meth:`ghgs_lit.rounds.Rounds._remembered`. ``seen``: results of ``view`` for the Gaussian's own view,
-    and their mean and maximum over the other views. ``view``, ``update``: two layers each. ``each``:
-    observations of each view, the own one first."""
+    """``tanh(before + memory(update(seen, known, before)))``, differentiable in ``before`` and the layers.
+
+    As :meth:`ghgs_lit.rounds.Rounds._remembered`. ``seen``: results of ``view`` for the Gaussian's own view,
+    and their mean and maximum over the other views.
+
+    Args:
+        view: two layers, for each view.
+        update: two layers.
+        memory: the last layer.
+        each: observations of each view, the own one first; float32 on a CPU, as are the next two.
+        known: what is known of each Gaussian beside them.
+        before: memory of the rounds before.
+    """
     from ghgs_lit.kernels.layers import parameters  # here, like the kernels: it loads a compiler
 
     return _Remember.apply(each, known, before, *parameters((*view, *update, memory)))
@@ -82,8 +91,17 @@ def compare(
     near: float,
     out: Float[Tensor, "N V 11"],
 ) -> None:
-    """Write the values of :func:`ghgs_lit.rounds.observation.observe` to ``out``. ``rendering``: of the
-    Gaussians from ``cameras``. ``near``: scale in metres of the distance behind the rendered surface."""
+    """Write the values of :func:`ghgs_lit.rounds.observation.observe`.
+
+    Args:
+        gaussians: on a CPU, with the pixels that they belong to.
+        cameras: [B, V], of the photographs.
+        photo: photographs in [0, 1].
+        mask: share of each pixel that shows the subject.
+        rendering: of the Gaussians from ``cameras``.
+        near: scale in metres of the distance behind the rendered surface.
+        out: written.
+    """
     from ghgs_lit.rounds.cpu.kernel import observe  # here: it loads a compiler
 
     inputs = (

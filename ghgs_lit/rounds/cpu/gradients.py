@@ -24,7 +24,17 @@ _LAYERS = (FLOATS[1], FLOATS[1], types.Array(types.int64, 2, "C"), FLOATS[1])
 
 @helper
 def _unsee(view, hidden, views, shown, seen, slopes, own):
-    """Write the gradient of a view's values to ``own``; of equal maxima the first view gets the gradient."""
+    """Write the gradient of a view's values; of equal maxima the first view gets the gradient.
+
+    Args:
+        view: number of the view, 0 is the own one.
+        hidden: channels of a view.
+        views: number of views.
+        shown: values of the view, lines of ``PANEL`` floats.
+        seen: values of the own view, mean and maximum of the others.
+        slopes: gradients of ``seen``; of a maximum that is given to this view it becomes 0.
+        own: written, gradients of ``shown``.
+    """
     size = hidden * PANEL
     share = ONE / np.float32(views - 1)
     for i in range(0, size, LANES):
@@ -41,12 +51,23 @@ def _unsee(view, hidden, views, shown, seen, slopes, own):
 
 @helper
 def _of(view, views, buffer):
+    """The part of a buffer that belongs to a view."""
     each = len(buffer) // views
     return buffer[view * each : (view + 1) * each]
 
 
 @helper
 def _layer(layers, place, outputs, inputs, before, after):
+    """``after = max(W before + b, 0)``, and a line of ones below.
+
+    Args:
+        layers: packed layers, from :func:`ghgs_lit.kernels.layers.packed`.
+        place: where the layer begins.
+        outputs: channels of ``after``.
+        inputs: channels of ``before``.
+        before: lines of ``PANEL`` floats.
+        after: written.
+    """
     linear(layers, place, outputs, inputs, before, after)
     rectify(layers, place, outputs, inputs, after)
     put_ones(outputs, after)
@@ -54,7 +75,23 @@ def _layer(layers, place, outputs, inputs, before, after):
 
 @helper
 def _look(each, known, before, layers, places, start, count, given, one, two, seen, up, narrow):
-    """Compute the inputs of all layers: two of each view, two of the update and the last one."""
+    """Compute the inputs of all layers: two of each view, two of the update and the last one.
+
+    Args:
+        each: [N, V, c], observations of each view, the own one first.
+        known: [N, k], what is known of each Gaussian beside them.
+        before: [N, h], memory of the rounds before.
+        layers: packed layers, from :func:`ghgs_lit.kernels.layers.packed`.
+        places: [layers + 1, 3], of :class:`ghgs_lit.kernels.layers.Sums`.
+        start: first row.
+        count: number of rows, 1 to ``PANEL``.
+        given: written, observations of each view in lines of ``PANEL`` floats, as are all that follow.
+        one: written, results of the first layer of each view.
+        two: written, results of the second layer of each view.
+        seen: written, inputs of the update.
+        up: written, results of its first layer.
+        narrow: written, results of its second layer.
+    """
     views = each.shape[1]
     channels = each.shape[2]
     hidden = before.shape[1]
@@ -80,8 +117,23 @@ def _look(each, known, before, layers, places, start, count, given, one, two, se
 def remember_back(
     each, known, before, after, slopes, layers, backs, places, sums, d_before, first, last
 ):  # fmt: skip
-    """Write ``d_before`` of rows ``first`` to ``last`` and add to ``sums``; see
-    :func:`ghgs_lit.rounds.cpu.remembered`."""
+    """Write gradients of the memory before, and add those of layers; see
+    :func:`ghgs_lit.rounds.cpu.remembered`.
+
+    Args:
+        each: [N, V, c], observations of each view, the own one first.
+        known: [N, k], what is known of each Gaussian beside them.
+        before: [N, h], memory of the rounds before.
+        after: [N, h], the new memory.
+        slopes: [N, h], gradients of ``after``.
+        layers: packed layers, from :func:`ghgs_lit.kernels.layers.packed`.
+        backs: the same, transposed.
+        places: [layers + 1, 3], of :class:`ghgs_lit.kernels.layers.Sums`.
+        sums: gradients of the layers are added, one task's.
+        d_before: [N, h], written in these rows.
+        first: first row.
+        last: end of the rows, excluded.
+    """
     views = each.shape[1]
     channels = each.shape[2]
     hidden = before.shape[1]

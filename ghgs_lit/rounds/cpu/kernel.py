@@ -18,7 +18,15 @@ _MAPS = (FLOATS[5], FLOATS[4], FLOATS[5], FLOATS[5], FLOATS[5])
 
 @helper
 def see(view, hidden, views, shown, seen):
-    """Add a view's values to ``seen``: those of the own view, the others' mean, the others' maximum."""
+    """Add a view's values to those of the own view, the others' mean and the others' maximum.
+
+    Args:
+        view: number of the view, 0 is the own one; called in their order.
+        hidden: channels of a view.
+        views: number of views.
+        shown: values of the view, ``hidden`` lines of ``PANEL`` floats.
+        seen: written or added to, 3 ``hidden`` lines.
+    """
     size = hidden * PANEL
     share = ONE / np.float32(views - 1)
     for i in range(0, size, LANES):
@@ -36,7 +44,17 @@ def see(view, hidden, views, shown, seen):
 
 @kernel_for(FLOATS[3], FLOATS[2], FLOATS[2], FLOATS[1], FLOATS[2], NUMBER, NUMBER)
 def remember(each, known, before, layers, after, first, last):
-    """Write rows ``first`` to ``last`` of ``after``; see :func:`ghgs_lit.rounds.cpu.remembered`."""
+    """Write rows of the new memory; see :func:`ghgs_lit.rounds.cpu.remembered`.
+
+    Args:
+        each: [N, V, c], observations of each view, the own one first.
+        known: [N, k], what is known of each Gaussian beside them.
+        before: [N, h], memory of the rounds before.
+        layers: packed layers, from :func:`ghgs_lit.kernels.layers.packed`.
+        after: [N, h], written in these rows.
+        first: first row.
+        last: end of the rows, excluded.
+    """
     views = each.shape[1]
     channels = each.shape[2]
     hidden = before.shape[1]
@@ -77,12 +95,26 @@ def remember(each, known, before, layers, after, first, last):
 
 @helper
 def _axis(row, x, y, z):
+    """Coordinate of points along an axis of a camera, in metres.
+
+    Args:
+        row: of [R t], of the axis.
+        x: coordinates in the world, 16 points, as are the next two.
+        y: second coordinates.
+        z: third coordinates.
+    """
     return row[0] * x + (row[1] * y + (row[2] * z + row[3]))
 
 
 @helper
 def _put_cells(place, side, cells):
-    """Write the two cells around positions along an axis and their weights, 0 beyond the border."""
+    """Write the two cells around positions along an axis and their weights, 0 beyond the border.
+
+    Args:
+        place: positions in pixels, with centres at +0.5.
+        side: pixels along the axis.
+        cells: written: the first cells, the second ones, and the weights of both.
+    """
     place = place - HALF
     first = simd.floor(place)
     share = place - first
@@ -95,12 +127,21 @@ def _put_cells(place, side, cells):
 
 @helper
 def _between(plane, rows, columns, weights):
+    """Bilinear value of a map.
+
+    Args:
+        plane: [H, W].
+        rows: numbers of two rows.
+        columns: numbers of two columns.
+        weights: of the four pixels, row by row.
+    """
     upper = weights[0] * plane[rows[0], columns[0]] + weights[1] * plane[rows[0], columns[1]]
     return upper + (weights[2] * plane[rows[1], columns[0]] + weights[3] * plane[rows[1], columns[1]])
 
 
 @helper
 def _cells(lane, down, across):
+    """Rows, columns and weights of the four pixels around one of 16 points, from :func:`_put_cells`."""
     rows = np.uint64(down[lane]), np.uint64(down[LANES + lane])
     columns = np.uint64(across[lane]), np.uint64(across[LANES + lane])
     top = down[2 * LANES + lane]
@@ -112,7 +153,23 @@ def _cells(lane, down, across):
 
 @helper
 def _project(camera, pose, x, y, z, height, width, down, across, z_depth):
-    """Write the cells around points in a view, and their depths; returns the visible points, as bits."""
+    """Write the cells around points in a view, and their depths.
+
+    Args:
+        camera: intrinsics [3, 3] in pixels.
+        pose: extrinsics [4, 4].
+        x: coordinates in the world, in metres, 16 points, as are the next two.
+        y: second coordinates.
+        z: third coordinates.
+        height: of the view in pixels.
+        width: of the view in pixels.
+        down: written, cells along a column, from :func:`_put_cells`.
+        across: written, cells along a row.
+        z_depth: written, depths in metres.
+
+    Returns:
+        The points that the view can see, as bits.
+    """
     distance = _axis(pose[2], x, y, z)
     inverse = ONE / distance
     right = _axis(pose[0], x, y, z) * inverse
@@ -130,7 +187,24 @@ def _project(camera, pose, x, y, z, height, width, down, across, z_depth):
 def observe(
     means, colors, image, intrinsics, extrinsics, photo, mask, drawn, alpha, depth, near, out, first, last
 ):
-    """Write rows ``first`` to ``last`` of one element; see :func:`ghgs_lit.rounds.cpu.compare`."""
+    """Write rows of the observations of one element; see :func:`ghgs_lit.rounds.cpu.compare`.
+
+    Args:
+        means: [N, 3] in metres.
+        colors: [N, 3].
+        image: [N], numbers of the images (``b * V + v``) that the Gaussians belong to.
+        intrinsics: [B, V, 3, 3] in pixels.
+        extrinsics: [B, V, 4, 4].
+        photo: [B, V, 3, H, W], photographs.
+        mask: [B, V, H, W], share of each pixel that shows the subject.
+        drawn: [B, V, 3, H, W], rendered colours.
+        alpha: [B, V, 1, H, W], rendered opacities.
+        depth: [B, V, 1, H, W], rendered depths in metres.
+        near: scale in metres of the distance behind the rendered surface.
+        out: [N, V, 11], written in these rows.
+        first: first row.
+        last: end of the rows, excluded.
+    """
     views = photo.shape[1]
     height = photo.shape[3]
     width = photo.shape[4]

@@ -15,7 +15,27 @@ def observe_rows(
     count, means, colors, image, intrinsics, extrinsics, photo, mask, drawn, alpha, depth, out,
     views, height, width, scale, ROWS: tl.constexpr,
 ):  # fmt: skip
-    """Write ``ROWS`` rows of ``out`` [N, V, 11]; ``count``: N V. See :func:`observe`."""
+    """Write ``ROWS`` observations of a Gaussian in a view; see :func:`observe`.
+
+    Args:
+        count: number of observations, N V.
+        means: [N, 3] in metres.
+        colors: [N, 3].
+        image: [N], numbers of the images (``b * V + v``) that the Gaussians belong to.
+        intrinsics: [B, V, 3, 3] in pixels.
+        extrinsics: [B, V, 4, 4].
+        photo: [B, V, 3, height, width], photographs.
+        mask: [B, V, height, width], share of each pixel that shows the subject.
+        drawn: [B, V, 3, height, width], rendered colours.
+        alpha: [B, V, 1, height, width], rendered opacities.
+        depth: [B, V, 1, height, width], rendered depths in metres.
+        out: [N, V, 11], written.
+        views: V.
+        height: of the photographs.
+        width: of the photographs.
+        scale: of the distance behind the rendered surface, in metres.
+        ROWS: observations of a program.
+    """
     i = rows_of(count, ROWS)
     gaussian = i // views
     turn = i % views
