@@ -17,23 +17,52 @@ class Extent(NamedTuple):
     right: int
 
     def coarser(self, stride: int, count: int) -> "Extent":
-        """The extent in cells of ``stride`` x ``stride`` pixels, of which ``count`` are touched."""
+        """The extent in cells of ``stride`` x ``stride`` pixels.
+
+        Args:
+            stride: side of a cell in pixels.
+            count: number of cells that are touched.
+
+        Returns:
+            The extent, whose bounding box holds every touched cell.
+        """
         bottom, right = ((end - 1) // stride + 1 for end in (self.bottom, self.right))
         return Extent(count, self.top // stride, bottom, self.left // stride, right)
 
     def cells(self, stride: int) -> int:
-        """Number of cells of ``stride`` x ``stride`` pixels that the bounding box touches."""
+        """Number of cells of ``stride`` x ``stride`` pixels that the bounding box touches.
+
+        Args:
+            stride: side of a cell in pixels.
+
+        Returns:
+            The number; 0 for an empty mask.
+        """
         _, top, bottom, left, right = self.coarser(stride, 0)
         return (bottom - top) * (right - left) if self.count else 0
 
 
 def extents(masks: Bool[Tensor, "n H W"]) -> list[Extent]:
-    """Extent of each mask; the host waits for a GPU once."""
+    """Extent of each mask; the host waits for a GPU once.
+
+    Args:
+        masks: [n, H, W].
+
+    Returns:
+        n extents.
+    """
     return [Extent(*numbers) for numbers in extent_numbers(masks).tolist()]
 
 
 def extent_numbers(masks: Bool[Tensor, "n H W"]) -> Int[Tensor, "n 5"]:
-    """The numbers of each mask's :class:`Extent`."""
+    """The numbers of each mask's :class:`Extent`, where the masks are, without a wait.
+
+    Args:
+        masks: [n, H, W].
+
+    Returns:
+        Count, top, bottom, left and right [n, 5].
+    """
     found = [masks.sum((1, 2))]
     for lines in (masks.any(2).to(torch.uint8), masks.any(1).to(torch.uint8)):
         found += [lines.argmax(1), lines.shape[1] - lines.flip(1).argmax(1)]
@@ -41,8 +70,16 @@ def extent_numbers(masks: Bool[Tensor, "n H W"]) -> Int[Tensor, "n 5"]:
 
 
 def true_places(mask: Bool[Tensor, "..."], count: int, repeats: bool = False) -> Int[Tensor, " n"]:
-    """Flat indices of the ``count`` True values, as ``nonzero`` but without waiting for a GPU. ``repeats``:
-    there may be fewer; the first is repeated there."""
+    """Flat indices of the True values, as ``nonzero`` but without waiting for a GPU.
+
+    Args:
+        mask: bools of any shape.
+        count: how many are True.
+        repeats: there may be fewer; the first is repeated there.
+
+    Returns:
+        Ascending indices [count].
+    """
     flat = mask.flatten()
     if flat.device.type == "cpu":
         return flat.nonzero()[:, 0]

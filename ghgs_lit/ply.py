@@ -35,13 +35,33 @@ _GROUPS = {
 
 
 def write_ply(gaussians: Gaussians, path: str | Path) -> None:
-    """Write the Gaussians of one subject (RGB colours). InputError: several subjects, or other colours."""
+    """Write the Gaussians of one subject.
+
+    Args:
+        gaussians: of one subject, with RGB colours.
+        path: of the file, which is written whole or not at all.
+
+    Raises:
+        InputError: several subjects, or other colours.
+    """
     data = ply_bytes(gaussians)
     write_atomically(path, lambda temporary: temporary.write_bytes(data))
 
 
 def ply_bytes(gaussians: Gaussians) -> bytes:
-    """The content of the file that :func:`write_ply` writes."""
+    """The content of the file that :func:`write_ply` writes.
+
+    The format is that of 3D Gaussian Splatting (Kerbl et al., SIGGRAPH 2023), whose viewers read it.
+
+    Args:
+        gaussians: of one subject, with RGB colours.
+
+    Returns:
+        A binary PLY.
+
+    Raises:
+        InputError: several subjects, or other colours.
+    """
     require(len(gaussians.splits) == 1, "write_ply", "the Gaussians of one subject", len(gaussians.splits))
     channels = gaussians.colors.shape[1]
     require(channels == 3, "write_ply", "colours of 3 channels", channels)
@@ -64,14 +84,30 @@ def ply_bytes(gaussians: Gaussians) -> bytes:
 
 
 def stored_values(gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
-    """Means, scales, unit quaternions, opacities and colours on the CPU, by field name."""
+    """Values of Gaussians as files hold them.
+
+    Args:
+        gaussians: of any number of subjects.
+        dtype: of the result.
+
+    Returns:
+        Means, scales, unit quaternions, opacities and colours on the CPU, by field name.
+    """
     names = ("means", "scales", "quaternions", "opacities", "colors")
     values = {name: getattr(gaussians, name).detach().to("cpu", dtype) for name in names}
     return values | {"quaternions": torch.nn.functional.normalize(values["quaternions"], dim=-1)}
 
 
 def vertices_ply(columns: Mapping[str, np.ndarray], comments: Sequence[str] = ()) -> bytes:
-    """The content of a binary PLY with a vertex for each row of the columns [N]."""
+    """The content of a binary PLY with a vertex for each row of the columns.
+
+    Args:
+        columns: numbers of each property by name [N].
+        comments: lines of the header.
+
+    Returns:
+        A little-endian binary PLY.
+    """
     vertices = np.rec.fromarrays(list(columns.values()), names=list(columns))
     content = BytesIO()
     elements = [PlyElement.describe(np.asarray(vertices), "vertex")]
@@ -89,9 +125,20 @@ def _read(path: Path) -> PlyData:
 
 
 def read_ply(path: Path) -> Gaussians:
-    """Read a 3DGS PLY as the Gaussians of one subject, without view-dependent colours. A file without this
-    package's comment is taken to be made for 3D Gaussian Splatting's own renderer: a low-pass of 0.3 px^2,
-    not antialiased. InputError: it is no such file."""
+    """Read a 3DGS PLY as the Gaussians of one subject, without view-dependent colours.
+
+    A file without this package's comment is taken to be made for 3D Gaussian Splatting's own renderer: a
+    low-pass of 0.3 px^2, not antialiased.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        The Gaussians, float32, on the CPU.
+
+    Raises:
+        InputError: it is no such file.
+    """
     try:
         content = _read(path)
         vertices = content["vertex"]

@@ -31,7 +31,15 @@ DecodedPixels = Literal["all", "subject"]
 
 
 def map_tensors(value: _T, fn: Callable[[Tensor], Tensor]) -> _T:
-    """Apply ``fn`` to every tensor inside nested dataclasses, tuples, named ones too, lists and dicts."""
+    """Apply a function to every tensor inside nested dataclasses, tuples, named ones too, lists and dicts.
+
+    Args:
+        value: a tensor, such a container, or anything else, which stays.
+        fn: what a tensor becomes.
+
+    Returns:
+        A container of the same kind.
+    """
     if isinstance(value, Tensor):
         return fn(value)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -103,7 +111,17 @@ class Cameras(_TensorStruct):
         return dataclasses.replace(self, intrinsics=intrinsics, height=height, width=width)
 
     def cropped(self, top: int, left: int, height: int, width: int) -> "Cameras":
-        """The same cameras for a crop that starts at row ``top`` and column ``left``; negative ones pad."""
+        """The same cameras for a crop.
+
+        Args:
+            top: row of the image that the crop starts at; negative: rows that are padded.
+            left: column that it starts at, the same.
+            height: of the crop in pixels.
+            width: of the crop in pixels.
+
+        Returns:
+            Cameras with other principal points.
+        """
         intrinsics = self.intrinsics.clone()
         intrinsics[..., 0, 2] -= left
         intrinsics[..., 1, 2] -= top
@@ -150,7 +168,7 @@ class Batch(_TensorStruct):
     views: tuple[tuple[str, ...], ...] = ()
 
     def of_views(self, views: Sequence[int]) -> "Batch":
-        """The batch with only the photographs of these numbers, and the same targets."""
+        """The batch with only the photographs of these numbers, in their order, and the same targets."""
         views = list(views)
         names = ("images", "masks", "cameras", "depths", "alpha", "log_gains")
         parts = {name: value[:, views] for name in names if (value := getattr(self, name)) is not None}
@@ -165,14 +183,14 @@ class Batch(_TensorStruct):
         return changed
 
     def once(self, function: Callable[["Batch"], _T]) -> _T:
-        """``function`` of this batch, computed once and kept for other stages."""
+        """``function`` of this batch, computed once and kept for other stages that pass the same function."""
         known = self.__dict__.setdefault("_known", {})
         if function not in known:
             known[function] = function(self)
         return known[function]
 
     def note(self, extents: Sequence[Extent], pixels: Int[Tensor, " n"]) -> None:
-        """Keep what a plan read of the masks as :attr:`extents` and :attr:`pixels`."""
+        """Keep what a plan read of the masks: :attr:`extents`, and :attr:`pixels` in ascending order."""
         self.__dict__.update(extents=list(extents), pixels=pixels)
 
     @cached_property
@@ -222,7 +240,7 @@ class Tokens(_TensorStruct):
         return dataclasses.replace(self, latent=tuple(layer[index] for layer in self.latent), **parts)
 
     def of_images(self, images: slice) -> "Tokens":
-        """The tokens of consecutive images, as one element; the host may wait for a GPU."""
+        """The tokens of consecutive images ``b * V + v``, as one element; the host may wait for a GPU."""
         b, v, h, w = self.grid
         if images == slice(0, b * v):
             part = self
@@ -323,7 +341,17 @@ class Gaussians(_TensorStruct):
         return dataclasses.replace(self, **both, splits=(len(self) + len(others),))
 
     def __getitem__(self, element: int) -> "Gaussians":
-        """The Gaussians of one batch element."""
+        """The Gaussians of one batch element.
+
+        Args:
+            element: its number; negative: from the last.
+
+        Returns:
+            The Gaussians, as one element.
+
+        Raises:
+            IndexError: there is no such element.
+        """
         if not -len(self.splits) <= element < len(self.splits):
             raise IndexError(f"batch element {element} of Gaussians with {len(self.splits)} elements")
         element %= len(self.splits)

@@ -206,7 +206,15 @@ def subject_center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Te
 
 
 def in_cameras(points: Float[Tensor, "B 3"], extrinsics: Float[Tensor, "B V 4 4"]) -> Float[Tensor, "B V 3"]:
-    """One point of each element in the axes of all its cameras."""
+    """One point of each element in the axes of all its cameras.
+
+    Args:
+        points: [B, 3] in the world.
+        extrinsics: world to camera [B, V, 4, 4].
+
+    Returns:
+        Points [B, V, 3].
+    """
     return world_to_camera(points[:, None].expand(*extrinsics.shape[:2], 3), extrinsics)
 
 

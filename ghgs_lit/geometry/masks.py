@@ -72,7 +72,14 @@ def patches_in_window(
 
 
 def between(hits: Bool[Tensor, "*batch n"]) -> Bool[Tensor, "*batch n"]:
-    """True from the first to the last True along the last axis."""
+    """True from the first to the last True along the last axis.
+
+    Args:
+        hits: any bools [..., n].
+
+    Returns:
+        Bools [..., n]; none where there is no True.
+    """
     first, last = first_and_last(hits)
     index = constant(torch.arange, hits.shape[-1], like=hits, dtype=torch.long)
     return (index >= first[..., None]) & (index <= last[..., None])

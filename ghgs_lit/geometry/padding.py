@@ -80,7 +80,14 @@ class Padding:
         return row * self.full[1] + column
 
     def cut_pixels(self, pixels: Int[Tensor, " n"]) -> Int[Tensor, " n"]:
-        """Indices of pixels among those of all images, among those of all photographs."""
+        """Indices of pixels among those of all images, as indices among those of all photographs.
+
+        Args:
+            pixels: that lie within the photographs [n].
+
+        Returns:
+            Indices [n].
+        """
         image = pixels // (self.height * self.width)
         pixel = pixels % (self.height * self.width)
         return image * (self.full[0] * self.full[1]) + self._cut_pixel(pixel)

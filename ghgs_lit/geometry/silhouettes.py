@@ -72,7 +72,14 @@ class Silhouette:
         return self.grown[row, column] & (z > 0)
 
     def extent(self, focus: np.ndarray) -> np.ndarray:
-        """Height and width [2] of the mask at the depth of ``focus`` [3], in world units."""
+        """Size of the mask at the depth of a point.
+
+        Args:
+            focus: point [3] of the world.
+
+        Returns:
+            Height and width [2] in the unit of the world; 0 for an empty mask.
+        """
         rows, columns = np.nonzero(self.mask)
         cells = np.array([np.ptp(rows) + 1, np.ptp(columns) + 1]) if len(rows) else np.zeros(2)
         depth = abs((self.extrinsics[:3, :3] @ focus + self.extrinsics[:3, 3])[2])
@@ -158,7 +165,14 @@ def hull_in_view(silhouettes: Sequence[Silhouette], index: int) -> np.ndarray:
 
 
 def subject_sphere(silhouettes: Sequence[Silhouette]) -> tuple[np.ndarray, float]:
-    """The subject's middle [3], and an upper limit of its radius."""
+    """Where the subject of silhouettes is, and how large.
+
+    Args:
+        silhouettes: of one subject at one instant.
+
+    Returns:
+        Its middle [3] in the world, and an upper limit of its radius in the unit of the world.
+    """
     rays = []
     centers = np.stack([s.center for s in silhouettes])
     for s in silhouettes:

@@ -208,6 +208,18 @@ class SemanticAttention(nn.Module):
         factor, bias = (x.expand(near.shape) for x in changes)
 
         def attend(q: Tensor, k: Tensor, v: Tensor, index: Tensor, *others: Tensor) -> Tensor:
+            """Weighted values of the neighbours of a part of the tokens.
+
+            Args:
+                q: queries of the part [p, i].
+                k: keys of all tokens of the element [n, i].
+                v: their values [n, i].
+                index: neighbours of the part's tokens [p, k].
+                others: factor and bias of their logits [p, k].
+
+            Returns:
+                Values [p, i], heads concatenated.
+            """
             weights = self._weights(q, k[index], *others)
             return (weights[..., None] * v[index].unflatten(-1, (self.num_heads, -1))).sum(1).flatten(1)
 

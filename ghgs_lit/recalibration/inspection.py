@@ -145,8 +145,16 @@ Call = tuple[Recalibration, Tokens, Points]
 
 @contextmanager
 def seen_calls(recalibration: nn.Module | None) -> Iterator[list[Call]]:
-    """A list that gets the calls of the stage while the context lasts; it stays empty for None and a stage
-    without neighbours. Nothing is computed, so that what is timed takes no longer."""
+    """Calls of the stage while the context lasts.
+
+    Nothing is computed, so that what is timed takes no longer.
+
+    Args:
+        recalibration: the stage; None, or one without neighbours: the list stays empty.
+
+    Yields:
+        A list that gets the inputs of each call.
+    """
     found: list[Call] = []
     if not isinstance(recalibration, Recalibration):
         yield found

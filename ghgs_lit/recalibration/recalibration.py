@@ -153,7 +153,15 @@ class Recalibration(nn.Module):
         return valid if self.tokens == "subject" else torch.ones_like(valid)
 
     def positions(self, tokens: Tokens, points: Points) -> Float[Tensor, "N d"]:
-        """Position of each token in the space where neighbours are searched; see ``neighborhood``."""
+        """Position of each token in the space where neighbours are searched; see ``neighborhood``.
+
+        Args:
+            tokens: of the encoder.
+            points: of these tokens.
+
+        Returns:
+            [N, 3] in the frame, or [N, 2] in pixels (row, column); without a gradient.
+        """
         if self.neighborhood == "xyz":
             return points.tokens.detach()
         # Half pixels are exact in float32, so equal distances are equal numbers.

@@ -155,7 +155,18 @@ class Refinement:
         return deque(self.states(gaussians, batch), maxlen=1).pop()
 
     def states(self, gaussians: Gaussians, batch: Batch) -> Iterator[Gaussians]:
-        """The Gaussians before the first step and after each; arguments and errors as for a call."""
+        """The Gaussians before the first step and after each.
+
+        Args:
+            gaussians: predicted from ``batch``.
+            batch: whose photographs they get nearer to.
+
+        Yields:
+            Gaussians without a gradient, ``steps`` + 1 times.
+
+        Raises:
+            InputError: they do not belong to pixels of ``batch``.
+        """
         seen = seen_by(batch)
         search = Descent(gaussians, batch, self.changes)
         yield gaussians.detach()

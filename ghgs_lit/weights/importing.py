@@ -20,7 +20,14 @@ FILE = "model.safetensors"
 
 
 def is_repository(name: str) -> bool:
-    """Whether ``name`` looks like ``owner/repository`` rather than like a file."""
+    """Whether a name looks like ``owner/repository`` rather than like a file.
+
+    Args:
+        name: of a source of weights.
+
+    Returns:
+        False where there is a file of that name, or where it ends as a file of weights does.
+    """
     return (
         re.fullmatch(r"[\w.-]+/[\w.-]+", name) is not None
         and Path(name).suffix not in (".pt", ".pth", ".bin", ".ckpt", ".safetensors")

@@ -77,7 +77,16 @@ def interpolate(typing_context, pixels, at, line, right, down, out, place):
 
 @intrinsic
 def channels_of(typing_context, pixels, at):
-    """The channels of 16 pixels from ``pixels[at]`` on, one vector per channel."""
+    """The channels of 16 pixels, one vector per channel.
+
+    Args:
+        typing_context: Numba's.
+        pixels: flat array of pixels, channels innermost.
+        at: where the first pixel is in it.
+
+    Returns:
+        :data:`CHANNELS` vectors.
+    """
 
     def emit(context, builder, sig, args):
         address = pointer_to(context, builder, pixels, *args, at, _vector(LANES * CHANNELS))
