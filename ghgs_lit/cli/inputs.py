@@ -188,9 +188,9 @@ def _require_same(trained: Mapping[str, Any], key: str, value: Any) -> None:
     """
     plain = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
     for name, wanted in flatten(plain, key).items():
-        own = lookup(trained, name)
-        same = own == wanted or is_below(name, FREE)
-        require(same, name, f"{own!r}, which the checkpoint's weights were trained with", wanted)
+        before = lookup(trained, name)
+        same = before == wanted or is_below(name, FREE)
+        require(same, name, f"{before!r}, which the checkpoint's weights were trained with", wanted)
 
 
 def _require_ablation(trained: Mapping[str, Any]) -> None:
@@ -202,10 +202,10 @@ def _require_ablation(trained: Mapping[str, Any]) -> None:
     Raises:
         InputError: another one was chosen.
     """
-    own = ablation_of(trained)
+    before = ablation_of(trained)
     wanted = HydraConfig.get().runtime.choices["ablation"]
     switches = "recalibration.neighborhood=... and .similarity=... act"
-    require(wanted == own, "ablation", f"{own}, as the checkpoint was trained ({switches})", wanted)
+    require(wanted == before, "ablation", f"{before}, as the checkpoint was trained ({switches})", wanted)
 
 
 def with_chosen_targets(config: dict[str, Any]) -> dict[str, Any]:

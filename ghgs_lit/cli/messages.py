@@ -132,8 +132,8 @@ def _hint(verb: str, key: str) -> str:
             return f" ({of}={' or '.join(holding)} has it)"
     # A key without its group is close, too: lr for optimizer.lr.
     whole = {known.rpartition(".")[2]: known for known in keys}.get(key)
-    own = [known for known in keys if known.startswith(f"{group}.")]
-    meant = f" (did you mean {whole}?)" if whole else did_you_mean(key, own or (*keys, *folders))
+    of_group = [known for known in keys if known.startswith(f"{group}.")]
+    meant = f" (did you mean {whole}?)" if whole else did_you_mean(key, of_group or (*keys, *folders))
     added = next((f"+{text}" for text in overrides if text.partition("=")[0] == key), "")
     return f"{meant}; +{key}=... adds it" if _can_add(verb, chosen, key, added) else meant
 
@@ -176,7 +176,11 @@ def _system(error: OSError) -> str:
 
 
 def raised_by_hydra(error: Exception) -> bool:
-    """Whether an error concerns the command line: raised in Hydra's code, or by its YAML."""
+    """Whether an error concerns the command line: raised in Hydra's code, or by its YAML.
+
+    Args:
+        error: with its traceback.
+    """
     if isinstance(error, YAMLError):
         return True
     *_, (innermost, _) = traceback.walk_tb(error.__traceback__)

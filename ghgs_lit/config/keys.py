@@ -86,7 +86,12 @@ def require_plain(config: Any, where: str) -> None:
 
 
 def lookup(config: Any, key: str) -> Any:
-    """The value at a dotted key, or None."""
+    """The value at a dotted key, or None.
+
+    Args:
+        config: nested mappings; other values have no keys.
+        key: dotted key.
+    """
     for name in key.split("."):
         if not isinstance(config, Mapping) or name not in config:
             return None
@@ -105,7 +110,12 @@ def is_hyperparameter(key: str) -> bool:
 
 
 def is_below(key: str, parents: Iterable[str]) -> bool:
-    """Whether a dotted key is one of ``parents`` or lies below one."""
+    """Whether a dotted key is one of some others or lies below one.
+
+    Args:
+        key: the dotted key.
+        parents: dotted keys.
+    """
     return any(key == parent or key.startswith(f"{parent}.") for parent in parents)
 
 
@@ -119,7 +129,14 @@ ABLATIONS = {
 
 
 def switches_of(config: Mapping[str, Any]) -> tuple[bool, bool]:
-    """Whether the model of ``config`` finds neighbours in 3D, and weights attention by similarity."""
+    """The switches of the ablation in a model.
+
+    Args:
+        config: whole configuration as plain data.
+
+    Returns:
+        Whether the model finds neighbours in 3D, and whether it weights attention by similarity.
+    """
     recalibration = config["recalibration"]
     # A plug-in may have other keys.
     return recalibration.get("neighborhood", "xyz") == "xyz", recalibration.get("similarity") != "none"

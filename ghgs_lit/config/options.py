@@ -256,7 +256,7 @@ def _input_error(cls: type[Options], key: str, values: Mapping, error: Validatio
     """
     errors = error.errors(include_url=False)
     first = next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])
-    own = first.get("ctx", {}).get("error")
+    cause = first.get("ctx", {}).get("error")
     path = [key] if key else []
     field = None
     nested = cls
@@ -274,8 +274,8 @@ def _input_error(cls: type[Options], key: str, values: Mapping, error: Validatio
         values = values.get(name)
         nested = options_of(field.annotation)
     dotted = ".".join(path)
-    if isinstance(own, InputError):  # raised by a validator of several fields
-        return InputError(f"{dotted}.{own}" if dotted else str(own))
+    if isinstance(cause, InputError):  # raised by a validator of several fields
+        return InputError(f"{dotted}.{cause}" if dotted else str(cause))
     if first["type"] == "extra_forbidden":
         name = first["loc"][-1]
         known = list(cls.model_fields)
@@ -283,7 +283,7 @@ def _input_error(cls: type[Options], key: str, values: Mapping, error: Validatio
         return InputError(f"{dotted} key: {text}" if dotted else f"{name}: {text}")
     if first["type"] == "missing" and first["loc"][-1] in cls.model_fields:
         return InputError(f"{dotted}: expected a value; found none")
-    wanted = str(own) if own is not None else expected(field) if field is not None else first["msg"]
+    wanted = str(cause) if cause is not None else expected(field) if field is not None else first["msg"]
     return InputError(f"{dotted}: expected {wanted}; found {shown(_plain(values))}")
 
 

@@ -105,6 +105,12 @@ def _defaults(entries: Any) -> Iterator[str]:
 
 
 def _may_set(key: str, value: Any) -> bool:
+    """Whether a file outside of the package may set a key to a value.
+
+    Args:
+        key: dotted key below ``hydra``.
+        value: unresolved.
+    """
     if key in _CLASSES:
         return isinstance(value, str) and re.fullmatch(_CLASSES[key], value) is not None
     if any(part.startswith("_") for part in key.split(".")):  # a word of Hydra's instantiate
@@ -116,7 +122,12 @@ def _may_set(key: str, value: Any) -> bool:
 
 
 def _is_plain(value: Any, key: str) -> bool:
-    """Whether a value is one, in one line; of what Hydra instantiates not a reference to another node."""
+    """Whether a value is one, in one line; of what Hydra instantiates not a reference to another node.
+
+    Args:
+        value: without lists and mappings.
+        key: dotted key below ``hydra``.
+    """
     if not isinstance(value, str):
         return value is None or isinstance(value, bool | int | float)
     refers = re.match(r"\s*\$\{(?!hydra\.|sqlite:|now:)", value) and is_below(key, ["launcher", "sweeper"])

@@ -266,7 +266,7 @@ def _load(group: str) -> None:
 
 
 def kinds_of(group: str) -> list[str | None]:
-    """All kinds of a group, including registered ones."""
+    """All kinds of a group, including registered ones; None: the group has no kinds."""
     _load(group)
     return [*KINDS.get(group, {}), *(kind for of, kind in _REGISTERED if of == group)]
 

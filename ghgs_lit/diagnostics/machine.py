@@ -46,7 +46,11 @@ def machine_facts(device: torch.device) -> dict[str, Any]:
 
 
 def in_words(machine: dict[str, Any]) -> str:
-    """:func:`machine_facts` on one line."""
+    """:func:`machine_facts` on one line.
+
+    Args:
+        machine: these facts.
+    """
     device = "" if machine["device"] == "cpu" else f"{machine['device']}, "
     cores = f"{machine['threads']} of {machine['cores']} cores"
     return f"{device}{machine['processor']} ({machine['vectors']}, {cores}), torch {machine['torch']}"

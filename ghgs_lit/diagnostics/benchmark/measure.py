@@ -295,12 +295,12 @@ def record_cases(
     works: list[list[Work]] = [[] for _ in cases]
     records = [Record(case, Work({}, {}, {})) for case in cases]
     for batch in track(batches, "errors"):
-        for record, mine in zip(records, works, strict=True):
+        for record, case_works in zip(records, works, strict=True):
             work, *result = inspect(record.case, batch, device)
             if record.case.is_yardstick:
                 yardstick = result
                 condition = amplification(record.case, batch, result)
-            mine.append(work)
+            case_works.append(work)
             change = differences(result, yardstick, batch.masks)
             change["rel_diff"] = conditioned(result, yardstick, batch, condition)
             for name, value in change.items():
@@ -315,7 +315,7 @@ def record_cases(
             for row in measured:
                 record.metrics.append({name: value for name, value in row.items() if name != "seconds"})
     times = time_cases(cases, batches, WARMUP, repeats, device)
-    for record, mine, seconds in zip(records, works, times, strict=True):
-        record.work = Work.of(mine)
+    for record, case_works, seconds in zip(records, works, times, strict=True):
+        record.work = Work.of(case_works)
         record.times = seconds
     return records

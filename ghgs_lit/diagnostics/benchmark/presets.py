@@ -90,8 +90,8 @@ def case_config(
     Raises:
         InputError: it lacks the key of a knob.
     """
-    own = {name: source.config[name] for name in MODEL_NODES if name in source.config}
-    node = OmegaConf.create({**own, **shared, "skip": dict(skip)})
+    model_nodes = {name: source.config[name] for name in MODEL_NODES if name in source.config}
+    node = OmegaConf.create({**model_nodes, **shared, "skip": dict(skip)})
     for key, value in knobs.items():
         if OmegaConf.select(node, key, default=None) is None:
             require(key in flatten(OmegaConf.to_container(node)), f"knobs.{key}", "an existing key", key)

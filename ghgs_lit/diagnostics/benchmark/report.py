@@ -144,7 +144,11 @@ def totals(rows: Sequence[Row]) -> list[Row]:
 
 
 def tables_of(rows: Sequence[Row]) -> Tables:
-    """Tables of cost and error of cases, and of the seconds of their stages."""
+    """Tables of cost and error of cases, and of the seconds of their stages.
+
+    Args:
+        rows: as of :func:`rows_of`.
+    """
 
     def promises(row: Row) -> bool:
         return row["max_rel_diff_budget"] is not None or (row["trained"] and row["budget_db"] is not None)

@@ -40,12 +40,17 @@ def uniform(g: Generator, low: float, high: float, *shape: int) -> Tensor:
 
 
 def directions(g: Generator, *shape: int) -> Tensor:
-    """Unit vectors along the last axis."""
+    """Unit vectors along the last axis of a shape."""
     return functional.normalize(normal(g, *shape), dim=-1)
 
 
 def place(family: str, g: Generator) -> Tensor:
-    """Middle of the scene in the world [3]."""
+    """Middle of the scene in the world [3].
+
+    Args:
+        family: "shifted" (1e4 units from the origin instead of 0.1) and :data:`UNITS` change it.
+        g: source of the numbers.
+    """
     away = 1e4 if family == "shifted" else 0.1
     return directions(g, 3) * away * UNITS.get(family, 1.0)
 

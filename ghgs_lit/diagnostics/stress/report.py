@@ -27,14 +27,18 @@ def bounded(error: float | None) -> str:
 
 
 def counts_of(rows: Sequence[Row]) -> str:
-    """Numbers of cases and failures."""
+    """Numbers of cases and failures, in words."""
     cases = sum(row["cases"] for row in rows)
     failures = sum(row["failures"] for row in rows)
     return f"{cases} cases, {failures} failures"
 
 
 def tables_of(rows: Sequence[Row]) -> Tables:
-    """Worst error of each stage and dtype, beside its cases and its budget."""
+    """Worst error of each stage and dtype, beside its cases and its budget.
+
+    Args:
+        rows: cells of the matrix.
+    """
     frame = pd.DataFrame(rows)
     frame["error"] = frame.error.astype(float).fillna(np.inf)
     worst = frame.groupby(["stage", "dtype"], sort=False).error.max().reset_index()
@@ -55,7 +59,11 @@ def to_markdown(rows: Sequence[Row]) -> str:
 
 
 def draw(rows: Sequence[Row]) -> Figure:
-    """Picture of the largest error over budget of each stage and family."""
+    """Picture of the largest error over budget of each stage and family, on a scale of 1e-6 to 1e3.
+
+    Args:
+        rows: cells of the matrix.
+    """
     frame = pd.DataFrame(rows)
     frame = frame.assign(ratio=(frame.error.astype(float) / frame.budget).fillna(np.inf))
     ratios = frame.pivot_table(index="stage", columns="family", values="ratio", aggfunc="max", sort=False)

@@ -130,12 +130,12 @@ def _renders(gaussians: Gaussians, batch: Batch, backend: str) -> Values:
 def _refined_slowly(v: Values) -> Values:
     """The same with Adam (Kingma and Ba, 2015, Algorithm 1) and all changes written out."""
     start, batch = _seen(v)
-    own = start.image
+    views = start.image
     photographs = batch.images * batch.masks[:, :, None]
-    focal = batch.cameras.intrinsics[0, :, [0, 1], [0, 1]].prod(-1).sqrt()[own]
+    focal = batch.cameras.intrinsics[0, :, [0, 1], [0, 1]].prod(-1).sqrt()[views]
     axes = batch.cameras.extrinsics[0, :, 2, :3]
     shifts = batch.cameras.extrinsics[0, :, 2, 3]
-    side = (((axes[own] * start.means).sum(-1) + shifts[own]) / focal)[:, None]
+    side = (((axes[views] * start.means).sum(-1) + shifts[views]) / focal)[:, None]
     odds = (start.opacities.clamp(1e-4, 1 - 1e-4) / (1 - start.opacities.clamp(1e-4, 1 - 1e-4))).log()
     fields = (start.means, start.scales, odds, start.colors)
     raw = [torch.zeros_like(field) for field in fields]
