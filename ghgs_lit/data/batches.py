@@ -142,11 +142,10 @@ class EvaluationBatches(Dataset):
 
     def __init__(self, builder: BatchBuilder, specs: Sequence[SampleSpec], batch_size: int) -> None:
         self.builder = builder
-        self.specs = [
-            alike[i : i + batch_size]
-            for alike in (list(group) for _, group in groupby(specs, lambda s: s.protocols))
-            for i in range(0, len(alike), batch_size)
-        ]
+        self.specs = []
+        for _, group in groupby(specs, lambda s: s.protocols):
+            alike = list(group)
+            self.specs += [alike[i : i + batch_size] for i in range(0, len(alike), batch_size)]
 
     def __len__(self) -> int:
         return len(self.specs)

@@ -186,14 +186,14 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
             report.problems.append(str(error))
             continue
         photographs = PhotographCache(reader, None, min(dataset.cache_images_mb, _CACHE_MB))
-        found = Phase(reader, _read(photographs, targets, min_iou, data, f"checking {phase}"))
-        _compare_masks(found.seen, reader, min_agreement)
-        report.phases[phase] = found
-        report.problems += reader.problems + [seen.problem for seen in found.seen if seen.problem]
-        report.notes += _notes(dataset.published.get(phase), phase, found)
+        results = Phase(reader, _read(photographs, targets, min_iou, data, f"checking {phase}"))
+        _compare_masks(results.seen, reader, min_agreement)
+        report.phases[phase] = results
+        report.problems += reader.problems + [seen.problem for seen in results.seen if seen.problem]
+        report.notes += _notes(dataset.published.get(phase), phase, results)
         if (wanted := getattr(getattr(dataset, "render", None), "lights", None)) is not None:
             report.lights = Completeness(dataset.folder).lights
-            report.notes += _notes_on_lights(wanted, report.lights, phase, found)
+            report.notes += _notes_on_lights(wanted, report.lights, phase, results)
     report.problems += _in_both(str(dataset.root), report.phases)
     if not report.problems:
         report.problems += _cannot_sample(data, targets, "train" in report.phases)
@@ -235,11 +235,11 @@ def _pictured(reader: Reader) -> set[Photograph]:
     def some(items: Sequence, count: int) -> list:
         return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, count).round().astype(int))]
 
-    return {
-        (name, position, RING_VIEW)
-        for name in some(list(reader.subjects), _PICTURED_SUBJECTS)
-        for position in some(reader.subjects[name], _PICTURED_VIEWS)
-    }
+    pictured = set()
+    for name in some(list(reader.subjects), _PICTURED_SUBJECTS):
+        for position in some(reader.subjects[name], _PICTURED_VIEWS):
+            pictured.add((name, position, RING_VIEW))
+    return pictured
 
 
 def _compare_masks(seen: Sequence[Seen], reader: Reader, least: float) -> None:
@@ -288,17 +288,17 @@ def _compare_subject(seen: Sequence[Seen], reader: Reader, least: float) -> None
         )
 
 
-def _notes(published: int | None, phase: str, found: Phase) -> list[str]:
-    reader = found.reader
+def _notes(published: int | None, phase: str, results: Phase) -> list[str]:
+    reader = results.reader
     notes = []
     if published is not None and reader.people != published:
         notes.append(f"{phase}: expected {published} people as published; found {reader.people}")
-    if found.bodies < len(reader.subjects):
+    if results.bodies < len(reader.subjects):
         notes.append(
-            f"{phase}: expected a body for each of {len(reader.subjects)} subjects; found {found.bodies} "
+            f"{phase}: expected a body for each of {len(reader.subjects)} subjects; found {results.bodies} "
             "(no Chamfer term; cameras are checked by their masks alone)"
         )
-    if sizes := found.known("tall"):
+    if sizes := results.known("tall"):
         tall = np.median(sizes)
         if tall > _TALLEST:
             notes.append(f"{phase}: expected metres; found subjects {tall:.0f} units tall (millimetres?)")
@@ -311,18 +311,18 @@ def _notes(published: int | None, phase: str, found: Phase) -> list[str]:
     return notes
 
 
-def _notes_on_lights(wanted: str, stored: str | None, phase: str, found: Phase) -> list[str]:
+def _notes_on_lights(wanted: str, stored: str | None, phase: str, results: Phase) -> list[str]:
     """A note where renders of this package have other lights than the configuration says.
 
     Args:
         wanted: ``data.render.lights`` of the configuration.
         stored: that of the renders; None: they were made elsewhere.
         phase: name of the phase.
-        found: its results.
+        results: its results.
     """
     if stored in (None, wanted):
         return []
-    bright = np.mean(found.known("bright") or [0.0])
+    bright = np.mean(results.known("bright") or [0.0])
     why = "lit again where textures have light of their own" if stored == "studio" else "not lit"
     return [
         f"{phase}: expected renders with data.render.lights={wanted}; found {stored} ({why}), subjects of"

@@ -207,8 +207,8 @@ class PhotographsDataModule(LightningDataModule):
         views = tuple(sorted({RING_VIEW, *self.targets.training_views}))
         there = sum(map(len, reader.subjects.values())) * len(views)
         packing = Packing(folder_of(data.folder), size, data.resampling, views, depths, writes=reads > there)
-        said = log.info if rank == 0 else log.debug
-        reader = packed_reader(reader, packing, data.packed_gb, said)
+        announce = log.info if rank == 0 else log.debug
+        reader = packed_reader(reader, packing, data.packed_gb, announce)
         if reader is photographs.reader:
             return photographs
         return PhotographCache(reader, photographs.size, 0, data.resampling)  # the system keeps pages

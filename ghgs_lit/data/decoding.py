@@ -137,10 +137,10 @@ def check_array(place: Path | str, array: Any, shapes: Shapes) -> np.ndarray:
         array = array.astype(np.float64)
     except (ValueError, TypeError, OverflowError) as error:
         raise InputError(f"{place}: expected an array {_describe(shapes)}; found {error}") from error
-    fits = any(
-        array.ndim == len(shape) and all(s in (None, a) for s, a in zip(shape, array.shape, strict=True))
-        for shape in shapes
-    )
+    fits = False
+    for shape in shapes:
+        pairs = zip(shape, array.shape, strict=False)
+        fits |= array.ndim == len(shape) and all(wanted in (None, side) for wanted, side in pairs)
     if not fits:
         found = "x".join(map(str, array.shape))
         raise InputError(f"{place}: expected an array {_describe(shapes)}; found {found}")
@@ -150,7 +150,10 @@ def check_array(place: Path | str, array: Any, shapes: Shapes) -> np.ndarray:
 
 
 def _describe(shapes: Shapes) -> str:
-    return " or ".join("x".join("n" if s is None else str(s) for s in shape) for shape in shapes)
+    texts = []
+    for shape in shapes:
+        texts.append("x".join("n" if side is None else str(side) for side in shape))
+    return " or ".join(texts)
 
 
 def check_intrinsics(place: Path | str, intrinsics: Any) -> np.ndarray:

@@ -74,11 +74,11 @@ def orientation_of(image: Image.Image, path: Path) -> int:
         path: for the warning.
     """
     try:
-        found = image.getexif().get(ExifTags.Base.Orientation, UPRIGHT)
+        orientation = image.getexif().get(ExifTags.Base.Orientation, UPRIGHT)
     except Exception as error:  # broken entries raise anything
         warnings.warn(f"{path}: expected EXIF data; found {error!r}: shown as it is stored", stacklevel=2)
         return UPRIGHT
-    return int(found) if found in range(1, 9) else UPRIGHT
+    return int(orientation) if orientation in range(1, 9) else UPRIGHT
 
 
 def rgb_of(image: Image.Image, path: Path) -> np.ndarray:

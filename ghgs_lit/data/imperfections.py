@@ -299,11 +299,11 @@ def _rows(masks: Bool[Tensor, "B V H W"], shares: Float[np.ndarray, "B V"]) -> l
     """Rows by which photographs move down so that the given share of the mask's height remains."""
     height = masks.shape[2]
     views = masks.shape[1]
-    found = []
+    moved = []
     for seen, share in zip(extents(masks.flatten(0, 1)), shares.flatten(), strict=True):
         end = math.ceil(seen.top + share * (seen.bottom - seen.top))
-        found.append(height - end if seen.count and share < 1 else 0)
-    return [found[start : start + views] for start in range(0, len(found), views)]
+        moved.append(height - end if seen.count and share < 1 else 0)
+    return [moved[start : start + views] for start in range(0, len(moved), views)]
 
 
 def _lowered(maps: Tensor | None, rows: list[list[int]]) -> Tensor | None:

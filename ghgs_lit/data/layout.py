@@ -73,8 +73,9 @@ class Completeness:
         path = self.folder / "plan.json"
         plan = read_json(path) if path.exists() else {}
         subjects = plan.values() if isinstance(plan, dict) else [plan]
-        fits = all(isinstance(names, list) and all(isinstance(n, str) for n in names) for names in subjects)
-        require(fits, str(path), "lists of subjects by phase", plan)
+        for names in subjects:
+            fits = isinstance(names, list) and all(isinstance(name, str) for name in names)
+            require(fits, str(path), "lists of subjects by phase", plan)
         return plan
 
     def marker(self, phase: str, name: str) -> Path:
@@ -191,7 +192,9 @@ class Layout(Reader):
                 self.problem(f"{self.root}: expected each subject in train or in val; found {name!r} in both")
         planned = self._complete.plan.get(phase, [])
         wanted = (sorted({*stored[phase], *planned}) if names is None else list(map(composed, names)))[:limit]
-        homes = {name: next((p for p in phases if name in stored[p]), phase) for name in wanted}
+        homes = {}
+        for name in wanted:
+            homes[name] = next((p for p in phases if name in stored[p]), phase)
         half = self._complete.missing
         missing = [name for name, home in homes.items() if name not in stored[home] or half(home, [name])]
         if missing and self.strict:
@@ -225,11 +228,11 @@ class Layout(Reader):
         yield from () if body is None else (body,)
 
     def files(self, name: str) -> Iterator[Path]:
-        own = self.subjects[name]
-        views = {position: self.views_at(name, position) for position in own}
-        counts = Counter(view for position in own for view in views[position])
-        usual = {view for view, count in counts.items() if 2 * count > len(own)}
-        for position in sorted(self._usual_positions.union(own)):
+        positions = self.subjects[name]
+        views = {position: self.views_at(name, position) for position in positions}
+        counts = Counter(view for position in positions for view in views[position])
+        usual = {view for view, count in counts.items() if 2 * count > len(positions)}
+        for position in sorted(self._usual_positions.union(positions)):
             for view in sorted(usual.union(views.get(position, ()))):
                 yield self._file(name, "img", position, str(view), _IMAGE_SUFFIXES)
                 yield self._file(name, "mask", position, f"{view}.png")

@@ -89,10 +89,10 @@ class PackedReader(Reader):
 
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
         pack = self.pack(name)
-        found = None
+        packed_view = None
         if pack is not None and depth <= self.packing.depths:
-            found = pack.view(position, view, depth)
-        return self._resized(name, position, view, depth) if found is None else found
+            packed_view = pack.view(position, view, depth)
+        return self._resized(name, position, view, depth) if packed_view is None else packed_view
 
     checked_view = read_view  # was checked before it was packed
 
@@ -126,8 +126,8 @@ class PackedReader(Reader):
         facts = []
         for source in sorted(map(str, self.reader.sources(name))):
             with contextlib.suppress(OSError):  # an option, or a file that may be missing
-                found = os.stat(source)
-                facts.append((found.st_size, found.st_mtime_ns, found.st_ctime_ns))
+                status = os.stat(source)
+                facts.append((status.st_size, status.st_mtime_ns, status.st_ctime_ns))
             facts.append(source)
         if not facts:
             return None
@@ -154,12 +154,14 @@ class PackedReader(Reader):
         for position in self.subjects[name]:
             for view in self.packing.views:
                 try:
-                    found = self._resized(name, position, view, self.packing.depths)
+                    photograph = self._resized(name, position, view, self.packing.depths)
                 except InputError:  # said when it is drawn
                     continue
-                row, part = _packed(found)
+                row, part = _packed(photograph)
                 rows.append((position, view, start, *row))
-                matrices.append(np.concatenate((found.intrinsics.ravel(), found.extrinsics.ravel())))
+                matrices.append(
+                    np.concatenate((photograph.intrinsics.ravel(), photograph.extrinsics.ravel()))
+                )
                 parts.append(part)
                 start += len(part)
         content = {
@@ -179,9 +181,9 @@ class PackedReader(Reader):
             view: its number at the position.
             depth: also read the depth map, if there is any.
         """
-        found = self.reader.checked_view(name, position, view, depth)
+        stored = self.reader.checked_view(name, position, view, depth)
         size = self.packing.size
-        return found if size is None else resize_view(found, *size, self.packing.resampling)
+        return stored if size is None else resize_view(stored, *size, self.packing.resampling)
 
 
 class Pack:
@@ -277,9 +279,9 @@ def folder_of(data: Path) -> Path:
     Returns:
         A folder in it, or in the user's cache where it cannot be written to.
     """
-    beside = data / "packed"
-    if os.access(beside if beside.is_dir() else data, os.W_OK | os.X_OK):
-        return beside
+    in_data = data / "packed"
+    if os.access(in_data if in_data.is_dir() else data, os.W_OK | os.X_OK):
+        return in_data
     cache = Path(os.environ.get("GHGS_CACHE") or "~/.cache/ghgs_lit").expanduser()
     return cache / "packed" / _digest([str(data.resolve())])
 

@@ -90,8 +90,10 @@ class ResidentPhotographs:
 
         def read(*photo: Any) -> View:
             """A photograph as it is kept, which no cache keeps, too."""
-            found = reader.checked_view(*photo, depths)
-            return found if stored else resize_view(found, *photographs.size, photographs.resampling)
+            photograph = reader.checked_view(*photo, depths)
+            return (
+                photograph if stored else resize_view(photograph, *photographs.size, photographs.resampling)
+            )
 
         self.numbers: dict[tuple[str, int, int], int] = {}
         for name, positions in list(reader.subjects.items()):

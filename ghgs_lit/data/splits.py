@@ -61,7 +61,9 @@ def read_split(split: Split, names: Sequence[str]) -> dict[str, list[str]]:
         place: Path | str = "data.split"
         for phase in PHASES:
             require(split.get(phase) is not None, place, f"a list {phase!r}", split.get(phase))
-        chosen = {p: [name for entry in split[p] for name in _expand(entry, names)] for p in PHASES}
+        chosen = {}
+        for phase in PHASES:
+            chosen[phase] = [name for entry in split[phase] for name in _expand(entry, names)]
     else:
         place = Path(split).expanduser()
         require_folder(place, "a folder with split_train.txt and split_val.txt")

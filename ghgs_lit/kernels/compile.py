@@ -101,10 +101,10 @@ def kernel_for(*argument_types):
     def decorate(function):
         @cache
         def compiled():
-            found = kernel(function)
-            found.compile(argument_types)
-            found.disable_compile()
-            return found
+            dispatcher = kernel(function)
+            dispatcher.compile(argument_types)
+            dispatcher.disable_compile()
+            return dispatcher
 
         return compiled
 
@@ -124,8 +124,8 @@ def processor_features() -> set[str]:
     """
     changes = numba.config.CPU_FEATURES
     is_own = numba.config.CPU_NAME is None or changes is None
-    own = llvmlite.binding.get_host_cpu_features() if is_own else {}
-    features = {name for name, found in own.items() if found}
+    host = llvmlite.binding.get_host_cpu_features() if is_own else {}
+    features = {name for name, is_there in host.items() if is_there}
     for change in filter(None, (changes or "").split(",")):
         (features.add if change[0] == "+" else features.discard)(change[1:])
     return features

@@ -89,7 +89,9 @@ def make_product(strides: tuple[int, int], adds: bool):
 
             count = PANEL // LANES
             # These become registers, since their addresses stay in this function.
-            totals = [[cgutils.alloca_once(builder, floats.llvm) for _ in range(count)] for _ in range(ROWS)]
+            totals = []
+            for _ in range(ROWS):
+                totals.append([cgutils.alloca_once(builder, floats.llvm) for _ in range(count)])
             for row in totals:
                 for total in row:
                     builder.store(constant(floats, 0.0), total)
@@ -145,15 +147,15 @@ def packed(numbers: Sequence[Tensor], transposed: bool = False) -> np.ndarray:
         For each layer the weights in tiles of ``ROWS`` outputs, each [inputs, ROWS], then the biases;
         float32.
     """
-    found = []
+    parts = []
     for weight, bias in _pairs(numbers):
         weight, bias = (x.detach().numpy() for x in (weight, bias))
         weight = weight.T if transposed else weight
         outputs, inputs = weight.shape
         both = np.zeros((room(outputs), inputs + 1), np.float32)
         both[:outputs, :-1], both[:outputs, -1] = weight, 0 if transposed else bias
-        found += [both[:, :-1].reshape(-1, ROWS, inputs).swapaxes(1, 2).ravel(), both[:, -1]]
-    return np.concatenate(found)
+        parts += [both[:, :-1].reshape(-1, ROWS, inputs).swapaxes(1, 2).ravel(), both[:, -1]]
+    return np.concatenate(parts)
 
 
 def _pairs(numbers: Sequence) -> list[tuple]:
@@ -184,10 +186,10 @@ class Sums:
 
     def gradients(self) -> list[Tensor]:
         """Gradients of weight and bias of each layer."""
-        found = np.split(self.of_task.sum(0), self.places[1:-1, 2])
+        sums = np.split(self.of_task.sum(0), self.places[1:-1, 2])
         both = [
             part.reshape(block).swapaxes(1, 2).reshape(-1, block[1])[: shape[0], : shape[1] + 1]
-            for part, block, shape in zip(found, self._blocks, self._shapes, strict=True)
+            for part, block, shape in zip(sums, self._blocks, self._shapes, strict=True)
         ]
         return [x for each in both for x in (torch.tensor(each[:, :-1]), torch.tensor(each[:, -1]))]
 

@@ -62,8 +62,8 @@ def _multiply(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
 def _convolve(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
     """The product as a convolution, with rows as pixels and channels innermost, so that nothing is copied."""
     pixels = x.reshape(1, 1, -1, x.shape[-1]).permute(0, 3, 1, 2)
-    found = F.conv2d(pixels, weight[:, :, None, None], bias)
-    return found.permute(0, 2, 3, 1).reshape(*x.shape[:-1], len(weight))
+    products = F.conv2d(pixels, weight[:, :, None, None], bias)
+    return products.permute(0, 2, 3, 1).reshape(*x.shape[:-1], len(weight))
 
 
 class Linear(nn.Linear):

@@ -100,12 +100,11 @@ def run_rows(
         most: rows of a call.
         work: splats or entries of all ranges; little work uses no extra thread.
     """
-    tasks = [
-        partial(kernel, *arguments, *numbers, first + part.start, first + part.stop)
-        for *numbers, first, last in ranges
-        for part in even_parts(last - first, most)
-        if last > first
-    ]
+    tasks = []
+    for *numbers, first, last in ranges:
+        parts = even_parts(last - first, most) if last > first else []
+        for part in parts:
+            tasks.append(partial(kernel, *arguments, *numbers, first + part.start, first + part.stop))
     run(tasks, work)
 
 

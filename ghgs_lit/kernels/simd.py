@@ -315,8 +315,8 @@ def tanh(x):
     """The hyperbolic tangent of floats, within 1e-7; NaN stays."""
     distance = maximum(x, _ZERO - x)
     shrunk = exp2_minus(minimum(full(EXP2_LIMIT), distance * _TWICE))
-    found = (_ONE - shrunk) / (_ONE + shrunk)
-    return select(x < _ZERO, _ZERO - found, found)
+    size = (_ONE - shrunk) / (_ONE + shrunk)
+    return select(x < _ZERO, _ZERO - size, size)
 
 
 # log2(m) = 2 / ln 2 (s + s^3 / 3 + s^5 / 5 + ...), s = (m - 1) / (m + 1): 1e-14 for m in [1/sqrt 2, sqrt 2).

@@ -56,9 +56,9 @@ class Room:
         Returns:
             Whether the room sufficed.
         """
-        found = needed / self.splats
+        per_splat = needed / self.splats
         before = _expected.get(self.grid, 0.0)
-        _expected[self.grid] = max(found, before + _FALL * (found - before))
+        _expected[self.grid] = max(per_splat, before + _FALL * (per_splat - before))
         return needed <= self.capacity
 
 
@@ -130,10 +130,10 @@ def with_room(
     rooms = _rooms.get()
     while True:
         capacity = size_class(math.ceil(_SPARE * splats * _expected.get(grid, _FIRST)) or 1)
-        found, needed = find(capacity)
+        intersections, needed = find(capacity)
         room = Room(grid, splats, capacity, needed)
         number = Coming(needed) if rooms is None else None
-        drawn = draw(found)
+        drawn = draw(intersections)
         if rooms is not None:
             rooms.rooms.append(room)
             return drawn

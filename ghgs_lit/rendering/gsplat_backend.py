@@ -180,13 +180,13 @@ def _without_wait(
     colors = torch.cat((colors[:, None].expand(*depths.shape, -1), depths[..., None]), -1)
 
     def find(capacity: int) -> tuple[Intersections, Tensor]:
-        found = intersections(centers.detach(), radii, depths.detach(), height, width, capacity)
-        return found, found.needed
+        listed = intersections(centers.detach(), radii, depths.detach(), height, width, capacity)
+        return listed, listed.needed
 
     draw = partial(gsplat.rasterize_to_pixels, centers, conics, colors, opacities, width, height, TILE)
 
-    def drawn(found: Intersections) -> tuple[Tensor, Tensor]:
-        return draw(found.offsets, found.splats, masks=found.has_pixels)
+    def drawn(listed: Intersections) -> tuple[Tensor, Tensor]:
+        return draw(listed.offsets, listed.splats, masks=listed.has_pixels)
 
     grid = (-(-height // TILE), -(-width // TILE))
     values, alpha = with_room(grid, depths.numel(), find, drawn)

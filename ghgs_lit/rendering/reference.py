@@ -47,11 +47,10 @@ def rasterize(
         differentiable in Gaussians and cameras.
     """
     channels = gaussians.colors.shape[1]
-    each = [
-        _view(gaussians[element], cameras[element, view], settings, near, far)
-        for element in range(cameras.shape[0])
-        for view in range(cameras.shape[1])
-    ]
+    each = []
+    for element in range(cameras.shape[0]):
+        for view in range(cameras.shape[1]):
+            each.append(_view(gaussians[element], cameras[element, view], settings, near, far))
     empty = gaussians.means.new_zeros(0, channels + 2, cameras.height, cameras.width)
     sums = torch.stack(each) if each else empty
     image, depth, alpha = sums.unflatten(0, cameras.shape).split((channels, 1, 1), dim=2)

@@ -55,9 +55,9 @@ def register_resolvers() -> None:
             sweeps = {run.path.parent for run in begun_by_job(runs, f"sweep_*/*/{MARKER}")}
             folders = [sweep for sweep in sweeps if lookup(read_yaml(sweep / PLAN), _TASK) == command]
         else:
-            own = hash_of_run(_root_=_root_)
+            own_hash = hash_of_run(_root_=_root_)
             begun = begun_by_job(runs, f"*/{MARKER}")
-            folders = [run.path for run in begun if run.marker.config_hash == own]
+            folders = [run.path for run in begun if run.marker.config_hash == own_hash]
         return max((path.name for path in folders), default=name)
 
     def sqlite(path: str) -> str:

@@ -77,14 +77,14 @@ def summarize(rows: Sequence[Row]) -> list[Row]:
         One row for each, with the number of ``subjects`` and the means.
     """
     names = metric_names(rows)
-    return [
-        {
-            **dict(zip(("method", "views", "targets"), key, strict=True)),
-            "subjects": len(subjects),
-            **{name: mean(mean(row.get(name) for row in own) for own in subjects.values()) for name in names},
-        }
-        for key, subjects in by_protocol(rows).items()
-    ]
+    summary = []
+    for (method, views, targets), subjects in by_protocol(rows).items():
+        entry = {"method": method, "views": views, "targets": targets, "subjects": len(subjects)}
+        for name in names:
+            of_subjects = [mean(row.get(name) for row in of_one) for of_one in subjects.values()]
+            entry[name] = mean(of_subjects)
+        summary.append(entry)
+    return summary
 
 
 def plain(value: Any) -> Any:
@@ -189,10 +189,10 @@ def validated(model: type[Model], content: Any, where: str) -> Model:
     except ValidationError as error:
         first = error.errors()[0]
     key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"])
-    said = {"missing": "expected a value; found none", "extra_forbidden": "expected no such key"}
+    phrases = {"missing": "expected a value; found none", "extra_forbidden": "expected no such key"}
     expected = first["msg"].replace("Input should", "expected to")
     otherwise = f"{expected}; found {reprlib.repr(first['input'])}"
-    raise InputError(f"{where}{key}: {said.get(first['type'], otherwise)}")
+    raise InputError(f"{where}{key}: {phrases.get(first['type'], otherwise)}")
 
 
 def read_results(path: Path) -> dict[str, Any]:

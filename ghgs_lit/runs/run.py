@@ -199,8 +199,8 @@ class RunDirectory:
         """
         resume = config.get("resume")
         if self._has(resume) or self.goes_on(config):
-            own = resume if self._has(resume) else self.checkpoint
-            return str(own) if own is not None else _given(resume)
+            checkpoint = resume if self._has(resume) else self.checkpoint
+            return str(checkpoint) if checkpoint is not None else _given(resume)
         owned = self.marker is not None
         there = self._there(*WRITTEN) if owned else self._there(*WRITTEN, SESSIONS)
         if not there:

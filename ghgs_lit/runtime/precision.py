@@ -20,7 +20,7 @@ def has_bfloat16(device: torch.device) -> bool:
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     capabilities = torch.cpu.get_capabilities() if device.type == "cpu" else {}
-    return any(found is True for name, found in capabilities.items() if "bf16" in name)
+    return any(value is True for name, value in capabilities.items() if "bf16" in name)
 
 
 def fast_precision(stored: torch.dtype, device: torch.device) -> torch.dtype:

@@ -184,9 +184,9 @@ class Recorder:
 
     def _refuse(self, kind: Hashable, error: Exception) -> None:
         self.counts["refused"] += 1
-        said = self.reason
+        earlier_reason = self.reason
         self.reason = " ".join(str(error).split())[:300] or type(error).__name__
-        if not said:
+        if not earlier_reason:
             warnings.warn(f"not recorded as a CUDA graph, but called as always: {self.reason}", stacklevel=4)
         self._refused.add(kind)
 

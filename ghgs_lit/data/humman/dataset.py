@@ -132,15 +132,17 @@ class HuMManReader(FrameReader):
         there = {k: _frames_of(path / "kinect_color" / f"kinect_{k:03d}") for k in KINECTS}
         # Existing frames are listed, because any number may be asked for.
         numbers = [number for number in sorted(set().union(*there.values())) if number in frames]
-        found = {number: tuple(k for k in KINECTS if number in there[k]) for number in numbers}
-        if not found:
+        positions_of = {}
+        for number in numbers:
+            positions_of[number] = tuple(k for k in KINECTS if number in there[k])
+        if not positions_of:
             raise InputError(
                 f"{path / 'kinect_color'}: expected frames such as {frames[0]:06d}.png; found none of "
                 f"{len(frames)} (frame numbers are multiples of 6)"
             )
-        if len(found) < len(frames):
-            log.info("%s: %d of %d frames are there", path, len(found), len(frames))
-        for number, positions in found.items():
+        if len(positions_of) < len(frames):
+            log.info("%s: %d of %d frames are there", path, len(positions_of), len(frames))
+        for number, positions in positions_of.items():
             if len(positions) < len(KINECTS):
                 lacking = sorted(set(KINECTS) - set(positions))
                 log.warning("%s: frame %06d lacks kinects %s, left out", path, number, lacking)

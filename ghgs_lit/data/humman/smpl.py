@@ -90,13 +90,15 @@ def read_parameters(path: Path) -> dict[str, np.ndarray]:
     require_file(path, "SMPL parameters")
     try:
         with np.load(path, allow_pickle=False) as archive:
-            found = {key: archive[key] for key in PARAMETERS if key in archive}
+            arrays = {key: archive[key] for key in PARAMETERS if key in archive}
     except Exception as error:  # zipfile, zlib and NumPy raise many types
         raise InputError(f"{path}: expected an .npz file of arrays; found {error}") from error
     for key in PARAMETERS:
-        if key not in found:
-            raise InputError(f"{path}: expected {key}; found {sorted(found)}")
-    return {key: check_array(f"{path}: {key}", np.ravel(found[key]), [(n,)]) for key, n in PARAMETERS.items()}
+        if key not in arrays:
+            raise InputError(f"{path}: expected {key}; found {sorted(arrays)}")
+    return {
+        key: check_array(f"{path}: {key}", np.ravel(arrays[key]), [(n,)]) for key, n in PARAMETERS.items()
+    }
 
 
 class Body:

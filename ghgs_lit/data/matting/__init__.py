@@ -67,14 +67,14 @@ class MattingNetwork(nn.Module):
             x = block(torch.cat((finer.pop(), F.interpolate(x, scale_factor=2.0, mode="nearest")), 1))
         out = self.out(x)[..., :height, :width].float()
         # A correction of up to 1.1 can invert a mask; the initial one is 0.
-        found = mattes + 1.1 * torch.tanh(out[:, 0])
-        share = found.clamp(0, 1)
+        estimate = mattes + 1.1 * torch.tanh(out[:, 0])
+        share = estimate.clamp(0, 1)
         # A pixel mixes the colours of subject and background; the network predicts their difference.
         colors = images + (1 - share.detach())[:, None] * out[:, 1:]
         if not self.training:
-            found = share
+            estimate = share
             colors = colors.clamp(0, 1)
-        return found, found[:, None] * colors
+        return estimate, estimate[:, None] * colors
 
 
 def _convolutions(before: int, after: int) -> nn.Sequential:
@@ -136,12 +136,12 @@ def refined_matte(
     window = _window(matte > 127, int(pixels) + _AROUND)
     colors, given = (torch.from_numpy(part[window] / np.float32(255)) for part in (image, matte))
     with torch.inference_mode():
-        found, subject = _network()(colors.permute(2, 0, 1)[None], given[None])
+        estimate, subject = _network()(colors.permute(2, 0, 1)[None], given[None])
     # Pixels near enough to the outline to change.
     is_open = np.abs(signed_distance(matte[window] > 127)) + 0.5 <= pixels
     result = np.zeros_like(image), np.zeros_like(matte)
     kept = given.numpy(), (given[..., None] * colors).numpy()
-    alpha = np.where(is_open, found[0].numpy(), kept[0])
+    alpha = np.where(is_open, estimate[0].numpy(), kept[0])
     premultiplied = np.where(is_open[..., None], subject[0].permute(1, 2, 0).numpy(), kept[1])
     for whole, part in zip(result, (premultiplied, alpha), strict=True):
         whole[window] = np.round(255 * part)

@@ -96,11 +96,11 @@ def frame_field(name: PurePath) -> str:
 
 
 def _entry(place: Path | str, content: Any, key: str) -> Any:
-    found = content.get(key) if isinstance(content, Mapping) else None
-    if found is None or not isinstance(found, (Mapping, Sequence, np.ndarray)):
+    entry = content.get(key) if isinstance(content, Mapping) else None
+    if entry is None or not isinstance(entry, (Mapping, Sequence, np.ndarray)):
         known = sorted(map(str, content)) if isinstance(content, Mapping) else type(content).__name__
         raise InputError(f"{place}: expected an entry {key!r}; found {known}")
-    return found
+    return entry
 
 
 def _extrinsics(place: str, rotation: Any, translation: Any) -> np.ndarray:

@@ -206,11 +206,9 @@ class Table:
     @property
     def blocks(self) -> list[list[int]]:
         """Indices of reported rows, then of measured rows; empty blocks are left out."""
-        parts = [
-            [i for i, line in enumerate(self.lines) if line.is_reported == reported]
-            for reported in (True, False)
-        ]
-        return [part for part in parts if part]
+        reported = [i for i, line in enumerate(self.lines) if line.is_reported]
+        measured = [i for i, line in enumerate(self.lines) if not line.is_reported]
+        return [block for block in (reported, measured) if block]
 
     def block_title(self, block: list[int]) -> str:
         """Title of a block, for tables with reported rows.
@@ -258,10 +256,9 @@ def reported_table(name: str) -> tuple[str, dict[str, dict[int | str, dict[str, 
     """
     table = _content()["tables"][name]
     metrics = _content()["metrics"]
-    rows = {
-        method: {group: dict(zip(metrics, figures, strict=True)) for group, figures in groups.items()}
-        for method, groups in table["rows"].items()
-    }
+    rows = {}
+    for method, groups in table["rows"].items():
+        rows[method] = {group: dict(zip(metrics, row, strict=True)) for group, row in groups.items()}
     return table["data"], rows
 
 

@@ -82,12 +82,13 @@ class Plan:
     def parts(self) -> list[tuple[int, int, int, int, slice]]:
         """Parts as (batch element, part, first Gaussian, last Gaussian, views of the element)."""
         views = self.shape[1]
-        return [
-            (b, p, int(edges[p]), int(edges[p + 1]), slice(b * views, (b + 1) * views))
-            for b, edges in enumerate(self.edges)
-            for p in range(len(edges) - 1)
-            if edges[p] < edges[p + 1]
-        ]
+        parts = []
+        for b, edges in enumerate(self.edges):
+            seen_by = slice(b * views, (b + 1) * views)
+            for p in range(len(edges) - 1):
+                if edges[p] < edges[p + 1]:
+                    parts.append((b, p, int(edges[p]), int(edges[p + 1]), seen_by))
+        return parts
 
 
 def _part_edges(firsts: np.ndarray, counts: np.ndarray) -> np.ndarray:
@@ -201,7 +202,7 @@ def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differen
     depths = np.empty((total, 1), np.float32)
     boxes = np.empty((total, 4), np.int32)
     counts = np.zeros((elements, plan.edges.shape[1] - 1, views, tiles_x * tiles_y), np.int64)
-    found = np.zeros(counts.shape[:2], np.int64)
+    part_entries = np.zeros(counts.shape[:2], np.int64)
 
     def project(b: int, p: int, first: int, last: int, seen_by: slice) -> None:
         """Project one of ``plan.parts``.
@@ -213,7 +214,7 @@ def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differen
             last: the Gaussian after its last one.
             seen_by: views of the element.
         """
-        found[b, p] = projection.project(
+        part_entries[b, p] = projection.project(
             means, quaternions, scales, opacities, colors, first, last, plan.views[seen_by],
             plan.shifts[seen_by], plan.near, plan.far, settings.low_pass, settings.extent, settings.alpha_min,
             settings.antialiased, tiles_x, records, depths, boxes, counts[b, p],
@@ -221,7 +222,7 @@ def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differen
 
     pool.run([partial(project, *part) for part in parts], total)
     tile_starts = np.concatenate(([0], counts.sum(1).reshape(-1).cumsum()))
-    slots = np.cumsum(found).reshape(found.shape) - found
+    slots = np.cumsum(part_entries).reshape(part_entries.shape) - part_entries
     size = int(tile_starts[-1])
     each = 4 * (layout.ENTRY + (layout.gradient_width(colors.shape[1]) if differentiable else 0))
     require(
@@ -285,23 +286,23 @@ class _Rasterize(torch.autograd.Function):
             Image [B, T, C, h, w], alpha and expected depth [B, T, 1, h, w].
         """
         arrays = [t.detach().numpy() for t in (means, quaternions, scales, opacities[:, None], colors)]
-        found = _prepare(plan, *arrays, differentiable=any(ctx.needs_input_grad))
+        splats = _prepare(plan, *arrays, differentiable=any(ctx.needs_input_grad))
         channels = colors.shape[1]
         size = (plan.height, plan.width)
         image, alpha, depth = (_zeros(*plan.shape, planes, *size) for planes in (channels, 1, 1))
         outputs = [_flat(t) for t in (image, alpha, depth)]
         pool.run([
             partial(
-                forward, tiles, *plan.tiles, *size, plan.views, found.tile_starts, found.entries, plan.shifts,
-                found.records, arrays[4], _channels(channels), *plan.constants, found.drawn, found.reached,
-                *outputs,
+                forward, tiles, *plan.tiles, *size, plan.views, splats.tile_starts, splats.entries,
+                plan.shifts, splats.records, arrays[4], _channels(channels), *plan.constants, splats.drawn,
+                splats.reached, *outputs,
             )
-            for tiles in _tile_runs(found.tile_starts)
-        ], len(found.entries))  # fmt: skip
+            for tiles in _tile_runs(splats.tile_starts)
+        ], len(splats.entries))  # fmt: skip
         ctx.save_for_backward(means, quaternions, scales, opacities, colors, image, alpha, depth)
         ctx.set_materialize_grads(False)
         ctx.plan = plan
-        ctx.found = found
+        ctx.splats = splats
         return image, alpha, depth
 
     @staticmethod
@@ -320,30 +321,30 @@ class _Rasterize(torch.autograd.Function):
         """
         *inputs, image, alpha, depth = ctx.saved_tensors
         plan = ctx.plan
-        found = ctx.found
+        splats = ctx.splats
         settings = ctx.plan.settings
         means, quaternions, scales, _, colors = (t.detach().numpy() for t in inputs)
-        gradients = _scratch(len(found.entries) * layout.gradient_width(colors.shape[1]))
+        gradients = _scratch(len(splats.entries) * layout.gradient_width(colors.shape[1]))
         d_image = _zeros(*image.shape) if d_image is None else d_image
         images = [_flat(t) for t in (image, alpha, depth, d_image, d_alpha, d_depth)]
         pool.run([
             partial(
-                backward, tiles, *plan.tiles, plan.height, plan.width, plan.views, found.tile_starts,
-                found.entries, plan.shifts, found.records, colors, _channels(colors.shape[1]),
-                *plan.constants, found.drawn, *images, gradients,
+                backward, tiles, *plan.tiles, plan.height, plan.width, plan.views, splats.tile_starts,
+                splats.entries, plan.shifts, splats.records, colors, _channels(colors.shape[1]),
+                *plan.constants, splats.drawn, *images, gradients,
             )
-            for tiles in _tile_runs(found.tile_starts)
-        ], len(found.entries))  # fmt: skip
+            for tiles in _tile_runs(splats.tile_starts)
+        ], len(splats.entries))  # fmt: skip
         results = [torch.empty_like(t) for t in inputs]
         d_means, d_quaternions, d_scales, d_opacities, d_colors = (t.numpy() for t in results)
         pool.run([
             partial(
                 collect, means, quaternions, scales, first, last, plan.views[seen_by], plan.shifts[seen_by],
-                settings.low_pass, settings.antialiased, found.records, found.boxes, found.entry_starts,
-                found.reached, gradients, d_means, d_quaternions, d_scales, d_opacities[:, None], d_colors,
+                settings.low_pass, settings.antialiased, splats.records, splats.boxes, splats.entry_starts,
+                splats.reached, gradients, d_means, d_quaternions, d_scales, d_opacities[:, None], d_colors,
             )
             for _, _, first, last, seen_by in plan.parts
-        ], len(found.entries) // 2)  # fmt: skip
+        ], len(splats.entries) // 2)  # fmt: skip
         return *results, None
 
 

@@ -376,7 +376,7 @@ def forward(
         planes[:] = ZERO
         live = tiles.open_pixels(views[view], x0, y0, pixels, transmittance)
         start = tile_starts[tile]
-        found = 0
+        kept_count = 0
         shift = shifts[view]
         order = depth_order(entries, start, tile_starts[tile + 1], keys, spare, places)
         for i in range(0, len(order), _CHUNK):
@@ -391,16 +391,16 @@ def forward(
                     live &= ~(1 << block)
             for k in range(chunk):
                 if hits[k] != 0:
-                    kept[found, 0], kept[found, 1] = hits[k], splats[k]
-                    kept[found, 2] = entries[order[i + k] & 0xFFFFFFFF, layout.SLOT]
-                    reached[kept[found, 2]] = 1
-                    found += 1
+                    kept[kept_count, 0], kept[kept_count, 1] = hits[k], splats[k]
+                    kept[kept_count, 2] = entries[order[i + k] & 0xFFFFFFFF, layout.SLOT]
+                    reached[kept[kept_count, 2]] = 1
+                    kept_count += 1
             if live == 0:
                 break
-        for i in range(found):
+        for i in range(kept_count):
             for k in range(3):
                 entries[start + i, k] = kept[i, k]
-        drawn[tile] = found
+        drawn[tile] = kept_count
         _write_planes(
             planes, view, first, height, width, height_here, width_here, channels, image, alpha, depth
         )
