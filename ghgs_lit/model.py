@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Hashable, Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -162,8 +163,8 @@ class GHGS(nn.Module):
             plan: which patches become tokens.
         """
         tokens = self.encoder(batch.images, batch.masks, bounds, plan)
-        heads = (parameter for name in HEADS for parameter in getattr(self, name).parameters())
-        return tokens.in_precision(next(heads, tokens.semantic).dtype)
+        parameters = itertools.chain.from_iterable(getattr(self, name).parameters() for name in HEADS)
+        return tokens.in_precision(next(parameters, tokens.semantic).dtype)
 
     def decoded(
         self,
@@ -231,11 +232,11 @@ class GHGS(nn.Module):
 
     def _settings(self) -> Hashable:
         """All that may be changed after a model was made and decides what it computes, but its weights."""
-        found: list[Hashable] = [self.skip.pixels, self.keeps_drafts]
+        settings: list[Hashable] = [self.skip.pixels, self.keeps_drafts]
         for name in (*STAGES, "rounds"):
             of_stage = getattr(getattr(self, name), "__dict__", {}).items()
-            found += [(name, *item) for item in of_stage if isinstance(item[1], (str, int, float, tuple))]
-        return repr(found)
+            settings += [(name, *item) for item in of_stage if isinstance(item[1], (str, int, float, tuple))]
+        return repr(settings)
 
     def _apply(self, *arguments: Any, **options: Any) -> "GHGS":
         self.playback.recorder.clear()  # weights move
@@ -269,7 +270,8 @@ class GHGS(nn.Module):
         encoder = stage("encoder", tokens=skip.tokens, margin=skip.margin)
         heads = {name: stage(name, dim_latent=encoder.dim_latent) for name in HEADS}
         layers = config["encoder"].get("layers")  # a plug-in's may not say
-        fused = any(isinstance(part, DPTHead) for head in heads.values() for part in head.modules())
+        modules = itertools.chain.from_iterable(head.modules() for head in heads.values())
+        fused = any(isinstance(module, DPTHead) for module in modules)
         fits = layers is None or not fused or len(layers) == LEVELS
         require(fits, "encoder.layers", f"{LEVELS} layers, which the dense heads fuse", list(layers or ()))
         rounds = stage("rounds", channels=heads["gaussian_head"].channels) if "rounds" in config else None

@@ -109,29 +109,29 @@ def _check_shapes(batch: Batch, patch_size: int) -> None:
 
 def _findings_of_cameras(batch: Batch) -> list[Finding]:
     """Checks of cameras and masks, which are always made."""
-    found = [
+    findings = [
         (f"cameras.{name}", "finite values", ~getattr(batch.cameras, name).isfinite().flatten(2).all(-1))
         for name in ("intrinsics", "extrinsics")
     ]
     focal = batch.cameras.intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2]
-    found.append(("cameras.intrinsics", "focal lengths above 0", ~(focal > 0).all(-1)))
-    found.append(("masks", "the subject in one view at least", ~batch.masks.flatten(1).any(1)))
-    return found
+    findings.append(("cameras.intrinsics", "focal lengths above 0", ~(focal > 0).all(-1)))
+    findings.append(("masks", "the subject in one view at least", ~batch.masks.flatten(1).any(1)))
+    return findings
 
 
 def _findings_of_values(batch: Batch) -> list[Finding]:
     """Checks of every value of photographs, mattes, depths and bodies."""
     within = "finite values within [0, 1]"
-    found = [("images", within, _beyond(batch.images, 1.0))]
+    findings = [("images", within, _beyond(batch.images, 1.0))]
     if batch.alpha is not None:
-        found.append(("alpha", within, _beyond(batch.alpha, 1.0)))
+        findings.append(("alpha", within, _beyond(batch.alpha, 1.0)))
     if batch.depths is not None:
         expected = "finite depths of 0 or more metres"
-        found.append(("depths", expected, _beyond(batch.depths, torch.finfo().max)))
+        findings.append(("depths", expected, _beyond(batch.depths, torch.finfo().max)))
     if batch.body_vertices:
         infinite = torch.stack([~vertices.isfinite().all() for vertices in batch.body_vertices])
-        found.append(("body_vertices", "finite coordinates", infinite))
-    return found
+        findings.append(("body_vertices", "finite coordinates", infinite))
+    return findings
 
 
 def _beyond(values: Tensor, highest: float) -> Tensor:

@@ -320,7 +320,7 @@ class GaussianHead(nn.Module):
         parts = decode(self.decoder, tokens, guide, plan.windows, plan.together)
         of_part = self._of_subject if plan.pixels == "subject" else self._of_all
         raw = zip(*(of_part(part, image, pixel, rows) for part in parts), strict=True)
-        values = [torch.cat(values) for values in raw]
+        values = [torch.cat(of_parts) for of_parts in raw]
         color = values[5] if len(values) > 5 else None
         return RawGaussians(*values[:5], color, image, pixel, rows.splits(views), rows.real)
 
@@ -341,18 +341,18 @@ class GaussianHead(nn.Module):
         given = (numbers, raw.image, raw.pixel, depth_maps, points.pixels, photo, share, batch.cameras)
         on_surface = options.axes == "surface"
         if not isinstance(self.attributes, FootprintAttributes):
-            found = activated(*given, self.attributes, options.color_limit, on_surface)
+            fields = activated(*given, self.attributes, options.color_limit, on_surface)
         else:
             constants = self.attributes.constants(options.offset_limit, options.color_limit)
             if cuda.is_supported(*inputs, fixed=(photo, share, batch.cameras.intrinsics)):
                 activate = cuda.activate
             else:
                 activate = cpu.activate if cpu.is_supported(*inputs) else footprint_gaussians
-            found = activate(*given, constants, on_surface)
+            fields = activate(*given, constants, on_surface)
         if raw.real is not None:
-            found = (*found[:3], found[3] * raw.real, *found[4:])
+            fields = (*fields[:3], fields[3] * raw.real, *fields[4:])
         constants = {"low_pass": options.low_pass, "antialiased": options.antialiased}
-        return Gaussians(*found, raw.splits, raw.image, raw.pixel, **constants)
+        return Gaussians(*fields, raw.splits, raw.image, raw.pixel, **constants)
 
     def _guide(self, batch: Batch, points: Points, depth_maps: DepthMaps) -> Guide | None:
         """The guide, with relative depths and perhaps photo-consistency; None without one."""
@@ -397,10 +397,9 @@ class GaussianHead(nn.Module):
             return [values[index] for values in (maps, *self._raw(maps))]
         # One image at a time, to save memory: hidden layers are wider than the maps.
         of_images = zip(*(values.split(rows.counts[part.images]) for values in (row, column)), strict=True)
-        each = [
-            [values[index] for values in (own, *self._raw(own))]
-            for own, index in zip(maps, of_images, strict=True)
-        ]
+        each = []
+        for own, index in zip(maps, of_images, strict=True):
+            each.append([values[index] for values in (own, *self._raw(own))])
         return [torch.cat(values) for values in zip(*each, strict=True)]
 
     def _raw(self, descriptors: Float[Tensor, "*n c"]) -> tuple[Tensor, ...]:

@@ -67,6 +67,6 @@ class GuidePyramid(nn.Module):
         half = F.relu(self.to_half(full))
         maps = (full, half, F.relu(self.to_quarter(half)))
         return [
-            seen.coarser(factor).resize(found, target)
-            for found, factor, target in zip(maps, (1, 2, 4), targets, strict=True)
+            seen.coarser(factor).resize(level, target)
+            for level, factor, target in zip(maps, (1, 2, 4), targets, strict=True)
         ]

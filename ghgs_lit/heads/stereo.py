@@ -100,9 +100,9 @@ class StereoHead(nn.Module):
         cameras = batch.cameras.cropped(0, 0, *images.shape[-2:]).resized(*features.shape[-2:])
         inside = F.max_pool2d(images[:, :, 3], CELL) > 0
         cells = true_places(inside, int(inside.sum()))
-        found = correlations(features, cameras, cells, near, far, self.options.consistency_depths)
-        volume = found.new_zeros(inside.numel(), found.shape[1]).index_copy(0, cells, found)
-        volume = volume.view(-1, *inside.shape[2:], found.shape[1]).movedim(-1, 1)
+        matches = correlations(features, cameras, cells, near, far, self.options.consistency_depths)
+        volume = matches.new_zeros(inside.numel(), matches.shape[1]).index_copy(0, cells, matches)
+        volume = volume.view(-1, *inside.shape[2:], matches.shape[1]).movedim(-1, 1)
         levels = [volume] + [F.avg_pool3d(volume[:, None], (2**i, 1, 1))[:, 0] for i in range(1, LEVELS)]
         memory = memory.tanh()
         context = context.relu()
@@ -227,8 +227,8 @@ def correlations(
         points = points[:, None].expand(-1, other.shape[1], -1, -1)
         pixels, z = project(points, *(m[other][:, :, None] for m in matrices))
     there = sample(flat, other[..., None].expand(z.shape), pixels)
-    found = (there * flat.flatten(2)[image, :, place][:, None, None]).sum(-1) / flat.shape[1] ** 0.5
-    return torch.where(z > 0, found, 0).amax(1)
+    products = (there * flat.flatten(2)[image, :, place][:, None, None]).sum(-1) / flat.shape[1] ** 0.5
+    return torch.where(z > 0, products, 0).amax(1)
 
 
 def look_up(level: Float[Tensor, "n s h w"], fraction: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n r h w"]:

@@ -69,7 +69,7 @@ class KeptPatches:
 
     def lengths(self, special: int) -> list[int]:
         """Number of tokens of each image, with ``special`` special ones."""
-        return [count + special for element in self._counts for count in element]
+        return [extent.count + special for extent in self._extents]
 
     def element_lengths(self, special: int) -> list[int]:
         """Number of tokens of each batch element, with ``special`` special ones in each view."""

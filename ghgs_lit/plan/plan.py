@@ -154,12 +154,13 @@ class Plan:
         """Windows of whole cells around the subject, None without one; of ``classes`` the same for all."""
         size = tuple(self.masks.shape[2:])
         each = subject_windows(self.extents, size)
-        found = [window and window.coarser(cell).finer(cell, size) for window in each]
+        whole_cells = [window and window.coarser(cell).finer(cell, size) for window in each]
         if not self.classes:
-            return found
-        hull = functools.reduce(Window.hull, filter(None, found), next(filter(None, found), None))
-        spans = [Span(0, 1, full) for full in size] if hull is None else hull
-        return [Window(*(span.coarser(cell).widened().finer(cell, span.full) for span in spans))] * len(found)
+            return whole_cells
+        filled = [window for window in whole_cells if window is not None]
+        spans = functools.reduce(Window.hull, filled) if filled else [Span(0, 1, full) for full in size]
+        widened = [span.coarser(cell).widened().finer(cell, span.full) for span in spans]
+        return [Window(*widened)] * len(whole_cells)
 
 
 def planned(
@@ -188,11 +189,14 @@ def planned(
     shown = patches_around_subject(masks, patch_size, 0)
     asked = [masks, *choices]
     numbers = [shown.flatten(2).sum(-1), *(extent_numbers(each.flatten(0, 1)) for each in asked)]
-    counts, *found = _read([*numbers, *([torch.stack(list(flags))] if flags else [])])
-    extents, *of_choices = (
-        tuple(Extent(*values[first : first + 5]) for first in range(0, len(values), 5))
-        for values in found[: len(asked)]
-    )
+    if flags:
+        numbers.append(torch.stack(list(flags)))
+    counts, *values = _read(numbers)
+    of_masks = []
+    for rows in values[: len(asked)]:
+        firsts = range(0, len(rows), 5)
+        of_masks.append(tuple(Extent(*rows[first : first + 5]) for first in firsts))
+    extents, *of_choices = of_masks
     shown_extents = tuple(e.coarser(patch_size, n) for e, n in zip(extents, counts, strict=True))
     decisions = ()
     kept = choices[0]
@@ -204,7 +208,7 @@ def planned(
         each = [of_choices[best[image // v]][image] for image in range(b * v)]
         kept_extents = tuple(each)
     patches = KeptPatches(kept, masks.device, kept_extents)
-    known = tuple(bool(value) for values in found[len(asked) :] for value in values)
+    known = tuple(map(bool, values[-1])) if flags else ()
     classes = rounds_up(masks.device) if classes is None else classes
     facts = (extents, shown_extents, patch_size, pixels, tokens, classes, decisions, known)
     return Plan(masks, shown, patches, *facts)
@@ -214,7 +218,8 @@ def _read(tensors: Sequence[Tensor]) -> list[list[int]]:
     """The values of integer tensors; of all that are not on the CPU at once."""
     there = [tensor.flatten() for tensor in tensors if tensor.device.type != "cpu"]
     values = iter(torch.cat(there).tolist() if there else ())
-    return [
-        tensor.flatten().tolist() if tensor.device.type == "cpu" else list(islice(values, tensor.numel()))
-        for tensor in tensors
-    ]
+    read = []
+    for tensor in tensors:
+        is_here = tensor.device.type == "cpu"
+        read.append(tensor.flatten().tolist() if is_here else list(islice(values, tensor.numel())))
+    return read

@@ -168,11 +168,11 @@ class AutoSkip:
             encoder: a :class:`ghgs_lit.encoder.VGGTEncoder`.
             masks: the subject's pixels; sides are divisible by the patch size.
         """
-        found = []
+        kept = []
         for preset in self.presets.values():
             with seeing(encoder, preset.view):
-                found.append(encoder.keeps(masks))
-        return found
+                kept.append(encoder.keeps(masks))
+        return kept
 
     def choose(
         self, encoder: Any, counts: Sequence[Int[Tensor, "B V"]]

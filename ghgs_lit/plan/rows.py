@@ -81,13 +81,13 @@ class Rows:
 
     def only(self, valid: Bool[Tensor, "..."]) -> "Rows":
         """The rows that are ``valid``: others are left out, or no longer real where rows are filled."""
-        found = valid.flatten()[self.index]
+        stays = valid.flatten()[self.index]
         if self.real is not None:
-            return dataclasses.replace(self, real=self.real & found)
-        if bool(found.all()):
+            return dataclasses.replace(self, real=self.real & stays)
+        if bool(stays.all()):
             return self
-        counts = tuple(int(part.sum()) for part in found.split(self.counts))
-        return dataclasses.replace(self, index=self.index[found], counts=counts)
+        counts = tuple(int(part.sum()) for part in stays.split(self.counts))
+        return dataclasses.replace(self, index=self.index[stays], counts=counts)
 
     def places(self, total: int) -> tuple[Bool[Tensor, " t"], Int[Tensor, " t"]]:
         """Where pixels or tokens are among the rows.
@@ -101,8 +101,8 @@ class Rows:
         numbers = torch.arange(len(self.index), device=self.index.device)
         # Rows that do not count go to one place more, which is cut off.
         target = self.index if self.real is None else torch.where(self.real, self.index, total)
-        found = numbers.new_full((total + 1,), -1).scatter_(0, target, numbers)[:total]
-        return found >= 0, found.clamp(min=0)
+        row_of = numbers.new_full((total + 1,), -1).scatter_(0, target, numbers)[:total]
+        return row_of >= 0, row_of.clamp(min=0)
 
     def within(self, images: slice) -> slice:
         """The rows of consecutive images, which are whole groups."""

@@ -119,10 +119,10 @@ class Window(NamedTuple):
             return self.cut(maps, target)
         if self.is_whole and target.is_whole:
             return F.interpolate(maps, target.full, mode="bilinear", align_corners=True)
-        found = at_least_float32(maps).permute(0, 2, 3, 1)  # channels are innermost
+        resized = at_least_float32(maps).permute(0, 2, 3, 1)  # channels are innermost
         for axis, source, wanted in zip((1, 2), self, target, strict=True):
-            found = _interpolate(found, axis, source, wanted)
-        return found.permute(0, 3, 1, 2).to(maps.dtype)
+            resized = _interpolate(resized, axis, source, wanted)
+        return resized.permute(0, 3, 1, 2).to(maps.dtype)
 
 
 def _interpolate(maps: Tensor, axis: int, source: Span, target: Span) -> Tensor:

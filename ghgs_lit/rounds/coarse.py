@@ -105,15 +105,15 @@ def coarse_depths(
     if not wanted:
         return None
     full = tuple(photographs.masks.shape[2:])
-    found = at_least_float32(photographs.images).new_zeros(2, *photographs.masks.shape)
+    depths = at_least_float32(photographs.images).new_zeros(2, *photographs.masks.shape)
     for size in wanted:
-        chosen = torch.tensor([i for i, own in enumerate(sizes) if own == size], device=found.device)
+        chosen = torch.tensor([i for i, own in enumerate(sizes) if own == size], device=depths.device)
         maps = predict(shrunk(_elements(photographs, chosen), size, least_matte))
         grown = torch.stack((enlarged(maps, full), _resized(maps.confidence, full)))
-        found = found.index_copy(1, chosen, grown.to(found.dtype))
+        depths = depths.index_copy(1, chosen, grown.to(depths.dtype))
     if isinstance(batch, PaddedBatch):
-        found = torch.stack([batch.padding.pad(each) for each in found])
-    return CoarseDepths(*found, tuple(size is not None for size in sizes))
+        depths = torch.stack([batch.padding.pad(each) for each in depths])
+    return CoarseDepths(*depths, tuple(size is not None for size in sizes))
 
 
 def coarse_sizes(batch: Batch, height: int, patch_size: int) -> list[Size | None]:
@@ -176,8 +176,8 @@ def enlarged(maps: DepthMaps, size: Size) -> Float[Tensor, "B V H W"]:
     weight, around = (F.avg_pool2d(values, 3, 1, 1) for values in (maps.valid.to(depth.dtype), inverse))
     inverse = torch.where(maps.valid, inverse, around / torch.where(weight > 0, weight, 1))
     weight = _resized((weight > 0).to(depth.dtype), size)
-    found = _resized(inverse, size)
-    return torch.where(found > 0, weight / torch.where(found > 0, found, 1), 0)
+    inverse = _resized(inverse, size)
+    return torch.where(inverse > 0, weight / torch.where(inverse > 0, inverse, 1), 0)
 
 
 def _resized(maps: Float[Tensor, "B c H W"], size: Size) -> Float[Tensor, "B c h w"]:

@@ -163,8 +163,8 @@ def _compared(
     gaussians, index = _thinned(gaussians)
     shares = coverage(batch)[:, :, None]
     maps = torch.cat((batch.once(surface_colors) * shares, shares, depth), 2).to(batch.cameras.extrinsics)
-    found, z, can_see = looked_up(gaussians, batch.cameras, maps)
-    color, share, depth = found.split((3, 1, 1), -1)
+    values, z, can_see = looked_up(gaussians, batch.cameras, maps)
+    color, share, depth = values.split((3, 1, 1), -1)
     color = color / torch.where(share > 0, share, 1)
     near = _NEAR if gaussians.metre is None else _NEAR * gaussians.metre[gaussians.image // views, None, None]
     weights = torch.where(can_see, torch.exp(-((z - depth) / near).square()), 0)

@@ -140,8 +140,8 @@ def _compared(
     views = photo.shape[1]
     cameras = Cameras(intrinsics, extrinsics, *photo.shape[-2:])
     maps = torch.cat((photo, photo - drawn, mask[:, :, None], alpha, depth), 2)
-    found, z, can_see = _values_at(means, image, splits, cameras, maps)
-    color, error, mask, alpha, depth = found.split((3, 3, 1, 1, 1), -1)
+    seen, z, can_see = _values_at(means, image, splits, cameras, maps)
+    color, error, mask, alpha, depth = seen.split((3, 3, 1, 1, 1), -1)
     behind = torch.tanh((z - depth) / scale)
     values = torch.cat((color - colors[:, None], error, mask, alpha, behind), -1)
     values = torch.cat((torch.where(can_see, values, 0), can_see.to(values)), -1)
@@ -208,9 +208,9 @@ def _values_at(
     size = constant(torch.tensor, (width, height), like=pixels)
     # Pixels far outside are clamped: large numbers are not exact.
     grid = (2 / size * pixels - 1).clamp(-3, 3).flatten(0, 1)[:, None]
-    found = F.grid_sample(maps.flatten(0, 1), grid, align_corners=False)[:, :, 0]
+    sampled = F.grid_sample(maps.flatten(0, 1), grid, align_corners=False)[:, :, 0]
     can_see = (z > 0) & ((pixels >= 0) & (pixels <= size)).all(-1)
-    of_image = found.view(b, views, channels, -1).permute(0, 3, 1, 2)
+    of_image = sampled.view(b, views, channels, -1).permute(0, 3, 1, 2)
     each = (of_image, z.mT[..., None], can_see.mT[..., None])
     return tuple(values[0] if rows is None else values[rows] for values in each)
 

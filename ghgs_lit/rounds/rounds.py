@@ -107,13 +107,13 @@ class Exchange(nn.Module):
             known: features of each Gaussian.
             windows: places of the Gaussians.
         """
-        told = self.tell(known)
+        sent = self.tell(known)
         size = math.prod(windows.shape)
-        maps = told.new_zeros(size + windows.spare, told.shape[1]).index_copy(0, windows.place, told)
-        maps = self.across(maps[:size].view(*windows.shape, told.shape[1]).permute(0, 3, 1, 2))
+        maps = sent.new_zeros(size + windows.spare, sent.shape[1]).index_copy(0, windows.place, sent)
+        maps = self.across(maps[:size].view(*windows.shape, sent.shape[1]).permute(0, 3, 1, 2))
         place = windows.place.clamp(max=size - 1) if windows.spare else windows.place
-        heard = maps.permute(0, 2, 3, 1).flatten(0, 2).index_select(0, place)
-        return known + self.hear(F.relu(heard))
+        received = maps.permute(0, 2, 3, 1).flatten(0, 2).index_select(0, place)
+        return known + self.hear(F.relu(received))
 
 
 #: Gaussians that go through the network at once on a CPU.

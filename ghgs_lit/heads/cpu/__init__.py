@@ -66,7 +66,6 @@ def activate(
     numbers = tuple(np.float32(x) for x in constants)
     ends = np.searchsorted(image.numpy(), np.arange(len(turns) + 1)).tolist()
     given = (*arrays, numbers, on_surface, *(x.numpy() for x in out))
-    pool.run_rows(
-        compiled(), given, [(view, *pair) for view, pair in enumerate(pairwise(ends))], _TASK, count
-    )
+    ranges = [(view, *pair) for view, pair in enumerate(pairwise(ends))]
+    pool.run_rows(compiled(), given, ranges, _TASK, count)
     return tuple(out)

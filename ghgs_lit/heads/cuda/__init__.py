@@ -51,10 +51,11 @@ def _plain_back(*inputs) -> list[Tensor]:
         inputs[place] = inputs[place].detach().requires_grad_()
     with torch.enable_grad():
         pairs = zip(_plain(*inputs), slopes, strict=True)
-        outputs, slopes = zip(*((out, slope) for out, slope in pairs if out.requires_grad), strict=True)
+        learned = [(output, slope) for output, slope in pairs if output.requires_grad]
+        outputs, slopes = zip(*learned, strict=True)
         gradients = torch.autograd.grad(outputs, [inputs[place] for place in places], slopes)
-    found = dict(zip(places, gradients, strict=True))
-    return [found.get(place, inputs[0].new_empty(0)) for place in (*_RAW, _POINTS)]
+    at_place = dict(zip(places, gradients, strict=True))
+    return [at_place.get(place, inputs[0].new_empty(0)) for place in (*_RAW, _POINTS)]
 
 
 _activate = gpu.operator(f"activate({_INPUTS}) -> ({', '.join(['Tensor'] * 5)})", _plain, __name__)
@@ -66,10 +67,10 @@ class _Activate(torch.autograd.Function):
     def forward(ctx, *inputs):
         *tensors, ctx.constants, ctx.on_surface = inputs
         ctx.save_for_backward(*tensors)
-        found = _activate(*inputs)
+        outputs = _activate(*inputs)
         if tensors[4] is None:  # colours are those of the photographs
-            ctx.mark_non_differentiable(found[4])
-        return found
+            ctx.mark_non_differentiable(outputs[4])
+        return outputs
 
     @staticmethod
     @torch.autograd.function.once_differentiable

@@ -419,9 +419,9 @@ def activate_back(*inputs) -> list[Tensor]:
     """The operator of :mod:`ghgs_lit.heads.cuda`."""
     *tensors, constants, on_surface, slopes = inputs
     offset, color, image, depth, points, share = (tensors[k] for k in (0, 4, 5, 7, 9, 11))
-    found = [offset.new_empty(0 if x is None else x.shape) for x in tensors[:5]]
-    found.append(points.new_zeros(points.shape))
-    given = (*tensors[:9], *tensors[11:], *slopes, *found)
+    gradients = [offset.new_empty(0 if x is None else x.shape) for x in tensors[:5]]
+    gradients.append(points.new_zeros(points.shape))
+    given = (*tensors[:9], *tensors[11:], *slopes, *gradients)
     flags = _flags(constants, color, share, on_surface)
     start(activate_back_rows, len(image), *given, *depth.shape[-2:], *constants, **flags)
-    return found
+    return gradients
