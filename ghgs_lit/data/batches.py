@@ -18,8 +18,13 @@ from ghgs_lit.types import Batch, Cameras, Targets
 
 @dataclass(frozen=True)
 class BatchBuilder:
-    """Reads samples into a :class:`Batch`. ``inputs``, ``targets``: photographs at the sizes of either.
-    ``depths``: whether depth maps of the inputs are read, if there are any."""
+    """Reads samples into a :class:`Batch`.
+
+    Args:
+        inputs: photographs at the size of the inputs.
+        targets: photographs at the size of the targets.
+        depths: whether depth maps of the inputs are read, if there are any.
+    """
 
     inputs: PhotographCache
     targets: PhotographCache

@@ -258,6 +258,14 @@ class Layout(Reader):
         return next((path for path in paths if path is not None), None)
 
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
+        """See :meth:`Reader.read_view`.
+
+        Args:
+            name: of the subject.
+            position: on the ring.
+            view: its number at the position, as in names of files.
+            depth: also read the depth map, if its file exists.
+        """
         image = read_photograph(self._file(name, "img", position, str(view), _IMAGE_SUFFIXES))
         size = image.shape[:2]
         mask = read_map(self._file(name, "mask", position, f"{view}.png"), size)

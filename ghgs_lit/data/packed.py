@@ -88,6 +88,14 @@ class PackedReader(Reader):
         self._writes = packing.writes
 
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
+        """See :meth:`Reader.read_view`; photographs have the size of the packing.
+
+        Args:
+            name: of the subject.
+            position: number of the camera, or position on the ring.
+            view: its number at the position.
+            depth: also read the depth map; from its own file where depth maps are not packed.
+        """
         pack = self.pack(name)
         packed_view = None
         if pack is not None and depth <= self.packing.depths:

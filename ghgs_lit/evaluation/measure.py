@@ -27,10 +27,17 @@ Renderer = Callable[[Gaussians, Cameras], Rendering]
 
 @dataclass(frozen=True)
 class Estimate:
-    """Prediction of a method for a batch; None: not predicted. ``image``: renders [B, T, 3, h, w] of the
-    targets. ``depth``: of the inputs [B, V, H, W], metres, defined where ``depth_valid``. ``gaussians``: what
-    was drawn. For each element: number of Gaussians and subject depths that are ``not_finite``; ``decisions``
-    of ``skip=auto``. ``recalibrated``: the recalibration with its inputs, where it has neighbours."""
+    """Prediction of a method for a batch; None: not predicted.
+
+    Attributes:
+        image: renders of the targets, [B, T, 3, h, w].
+        depth: of the inputs, metres, [B, V, H, W].
+        depth_valid: where ``depth`` is defined, [B, V, H, W] bool.
+        gaussians: what was drawn.
+        not_finite: number of Gaussians and subject depths of each element that are not finite.
+        decisions: of ``skip=auto``, for each element.
+        recalibrated: the recalibration with its inputs, where it has neighbours.
+    """
 
     image: Tensor
     depth: Tensor | None = None
@@ -46,8 +53,16 @@ Method = Callable[[Batch], Estimate]
 
 @dataclass(frozen=True)
 class ModelMethod:
-    """A model with its renderer and optional refinement of Gaussians and cameras. Refined Gaussians leave the
-    predicted depths, so there is no depth estimate then."""
+    """A model with its renderer and optional refinement of Gaussians and cameras.
+
+    Refined Gaussians leave the predicted depths, so there is no depth estimate then.
+
+    Args:
+        model: predicts a batch.
+        renderer: draws Gaussians from the target cameras.
+        refinement: of the predicted Gaussians; None: none.
+        cameras: refinement of the input cameras before the prediction; None: none.
+    """
 
     model: nn.Module
     renderer: Renderer

@@ -27,14 +27,30 @@ def start(kernel: Any, count: int, *arguments: Any, **flags: bool) -> None:
 
 @triton.jit
 def rows_of(count, ROWS: tl.constexpr):
-    """Rows of this program; beyond the last one it is repeated, so that no row need be masked."""
+    """Rows of this program; beyond the last one it is repeated, so that no row need be masked.
+
+    Args:
+        count: number of rows.
+        ROWS: rows of a program.
+
+    Returns:
+        Numbers of rows, int64 [ROWS].
+    """
     i = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     return tl.minimum(i, count - 1)
 
 
 @triton.jit
 def load3(table, i):
-    """Numbers of rows ``i`` of a table of three columns."""
+    """Numbers of rows of a table of three columns.
+
+    Args:
+        table: pointer to a contiguous table [rows, 3].
+        i: rows, [ROWS].
+
+    Returns:
+        The columns, [ROWS] each.
+    """
     return tl.load(table + 3 * i), tl.load(table + 3 * i + 1), tl.load(table + 3 * i + 2)
 
 
@@ -56,7 +72,15 @@ def store3(table, i, x, y, z):
 
 @triton.jit
 def load4(table, i):
-    """Numbers of rows ``i`` of a table of four columns."""
+    """Numbers of rows of a table of four columns.
+
+    Args:
+        table: pointer to a contiguous table [rows, 4].
+        i: rows, [ROWS].
+
+    Returns:
+        The columns, [ROWS] each.
+    """
     at = table + 4 * i
     return tl.load(at), tl.load(at + 1), tl.load(at + 2), tl.load(at + 3)
 

@@ -35,7 +35,15 @@ OUTPUTS = "config.yaml, checkpoints/, metrics.json, metrics.csv, sessions.jsonl,
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A run of a sweep. ``name``: hash of its configuration; ``shown``: the overrides to print."""
+    """A run of a sweep.
+
+    Attributes:
+        name: hash of its configuration.
+        overrides: of the job, with its directory.
+        shown: overrides to print.
+        config: resolved configuration.
+        run: its directory.
+    """
 
     name: str
     overrides: tuple[str, ...]
@@ -128,8 +136,13 @@ def _print_states(
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """What a dry run has found. ``reasons``: why runs would be refused. ``notes``: what else they should
-    know. ``step``: seconds of a training step, None where it was not taken."""
+    """What a dry run has found.
+
+    Attributes:
+        reasons: why runs would be refused.
+        notes: what else they should know.
+        step: seconds of a training step; None: it was not taken.
+    """
 
     reasons: Sequence[str] = ()
     notes: Sequence[str] = ()

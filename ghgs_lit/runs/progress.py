@@ -20,7 +20,13 @@ def on_terminal() -> bool:
 
 
 class Lines:
-    """Progress lines, appended to the file ``log``, if any, and printed (not beside a bar)."""
+    """Progress lines, appended to a file and printed (not beside a bar).
+
+    Args:
+        log: file that lines are appended to; None: none.
+        every: seconds between two lines.
+        printed: whether lines are printed.
+    """
 
     def __init__(self, log: Path | None = None, every: float = EVERY, printed: bool = True) -> None:
         self.log = log

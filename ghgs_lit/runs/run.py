@@ -46,9 +46,15 @@ PLAN = "multirun.yaml"  #: Configuration of a sweep's last command, beside its r
 
 
 class Identity(BaseModel):
-    """Content of ``run.json``. ``id``: of the run, wherever it is moved, also for loggers elsewhere.
-    ``settings_hash``: of the configuration without what may change while it trains. ``resume``: the value
-    that it began with. ``job``: of SLURM, which worked on it last."""
+    """Content of ``run.json``.
+
+    Attributes:
+        id: of the run, wherever it is moved, also for loggers elsewhere.
+        config_hash: of the configuration.
+        settings_hash: of the configuration without what may change while it trains.
+        resume: value of ``resume`` that it began with.
+        job: of SLURM, which worked on it last.
+    """
 
     model_config = ConfigDict(strict=True)
     id: str
@@ -73,8 +79,13 @@ class State(StrEnum):
 
 
 class RunDirectory:
-    """Directory of a run; it need not exist. ``config_hash``: results of another configuration are none of
-    this run; None: whatever its configuration is."""
+    """Directory of a run; it need not exist.
+
+    Args:
+        path: of the directory.
+        config_hash: results of another configuration are none of this run; None: whatever its
+            configuration is.
+    """
 
     def __init__(self, path: Path, config_hash: str | None = None) -> None:
         self.path = resolved(path)

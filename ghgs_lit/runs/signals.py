@@ -14,9 +14,16 @@ STOP = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 
 
 class Interrupted(SystemExit):
-    """This process was asked to stop by signal ``number``; the exit code is 128 + ``number``. A
-    ``SystemExit``, because Hydra takes any ``Exception`` for one failed job and starts the next one.
-    ``explained``: whether the line that says how to go on was printed."""
+    """This process was asked to stop by a signal; the exit code is 128 + its number.
+
+    A ``SystemExit``, because Hydra takes any ``Exception`` for one failed job and starts the next one.
+
+    Args:
+        number: of the signal.
+
+    Attributes:
+        explained: whether the line that says how to go on was printed.
+    """
 
     def __init__(self, number: int) -> None:
         super().__init__(128 + number)

@@ -117,6 +117,12 @@ def _say_rounding() -> None:
 
 @contextmanager
 def _float32(device: str, rounding: bool) -> Iterator[None]:
+    """Full float32 or TF32 while the context lasts, without autocast.
+
+    Args:
+        device: its type.
+        rounding: whether factors are rounded to TF32.
+    """
     before = _Rounding.now(device)
     changes = rounding or before.is_any
     if changes:
@@ -157,8 +163,13 @@ def rounding_state(device: str) -> Hashable:
 
 @dataclass(frozen=True)
 class _Rounding:
-    """State of PyTorch's switches. ``of_older``: for products, and for convolutions on CUDA; None where
-    PyTorch refuses to read them, since newer ones were set to what these cannot express."""
+    """State of PyTorch's switches.
+
+    Attributes:
+        of_modules: ``fp32_precision`` of :func:`_modules`.
+        of_older: for products, and for convolutions on CUDA; None where PyTorch refuses to read them,
+            since newer ones were set to what these cannot express.
+    """
 
     of_modules: list[str]
     of_older: tuple[str, bool] | None

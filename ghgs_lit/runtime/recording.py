@@ -275,7 +275,12 @@ def _recorded(tape: Tape, function: Callable[[Any], Any], inputs: Any) -> _Recor
 
 
 def _played(recording: _Recording, tensors: list[Tensor]) -> Any:
-    """The result for other values, in memory of its own."""
+    """The result for other values, in memory of its own.
+
+    Args:
+        recording: of the class of the inputs.
+        tensors: of the inputs, in the order of :func:`described`.
+    """
     torch._foreach_copy_(recording.inputs, tensors)
     recording.play()
     results: dict[int, Tensor] = {}

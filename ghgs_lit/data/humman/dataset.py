@@ -128,6 +128,15 @@ class HuMManReader(FrameReader):
         self.subjects = dict(list(self.subjects.items())[: data.limit.of(phase)])
 
     def _add(self, path: Path, frames: Sequence[int]) -> None:
+        """Add the frames of a sequence as subjects.
+
+        Args:
+            path: folder of the sequence.
+            frames: numbers of frames that are wanted; those that are not there are left out.
+
+        Raises:
+            InputError: cameras are bad, or no frame is there.
+        """
         cameras = read_cameras(path / "cameras.json")
         there = {k: _frames_of(path / "kinect_color" / f"kinect_{k:03d}") for k in KINECTS}
         # Existing frames are listed, because any number may be asked for.
@@ -151,6 +160,14 @@ class HuMManReader(FrameReader):
             self.subjects[name] = positions
 
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
+        """See :meth:`Reader.read_view`.
+
+        Args:
+            name: of the subject, ``<sequence>_<frame>``.
+            position: number of the Kinect, 0 to 9.
+            view: not used; there are no views between cameras.
+            depth: not used; no depth maps are read.
+        """
         frame = self.frames[name]
         path = frame.file("kinect_color", position)
         image = read_photograph(path)

@@ -86,6 +86,16 @@ class ZJUMoCapReader(FrameReader):
         self.subjects = dict(list(self.subjects.items())[: data.limit.of(phase)])
 
     def _add(self, path: Path, frames: tuple[int, int, int], cameras: int | None) -> None:
+        """Add the frames of a sequence as subjects.
+
+        Args:
+            path: folder of the sequence.
+            frames: start, stop and step of the wanted indices in ``annots.npy``.
+            cameras: number of cameras that are used, the first ones; None: all.
+
+        Raises:
+            InputError: annotations are bad, or there are fewer cameras or no such frame.
+        """
         annotations = read_annotations(path / "annots.npy")
         count = len(annotations.intrinsics)
         if cameras is not None and cameras > count:
@@ -105,6 +115,14 @@ class ZJUMoCapReader(FrameReader):
         self.subjects |= dict.fromkeys(named, tuple(range(count if cameras is None else cameras)))
 
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
+        """See :meth:`Reader.read_view`.
+
+        Args:
+            name: of the subject, ``CoreView_<id>_<frame number>``.
+            position: number of the camera, in the order of ``annots.npy``.
+            view: not used; there are no views between cameras.
+            depth: not used; the data set has no depth maps.
+        """
         frame = self.frames[name]
         photograph = frame.annotations.frames[frame.index][position]
         path = _find(frame.folder, photograph, photograph.suffix)
@@ -158,6 +176,16 @@ class ZJUMoCapReader(FrameReader):
         return folders
 
     def _mask(self, folder: Path, photograph: PurePosixPath, size: tuple[int, int]) -> np.ndarray:
+        """The union of a photograph's masks in all configured folders.
+
+        Args:
+            folder: of the sequence.
+            photograph: path of the photograph, as in ``annots.npy``.
+            size: (height, width) of the photograph.
+
+        Returns:
+            [h, w] bool.
+        """
         paths = [_find(masks, photograph, ".png") for masks in self._mask_folders(folder)]
         return functools.reduce(np.logical_or, [read_map(path, size) != 0 for path in paths])
 
