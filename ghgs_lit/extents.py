@@ -63,10 +63,10 @@ def extent_numbers(masks: Bool[Tensor, "n H W"]) -> Int[Tensor, "n 5"]:
     Returns:
         Count, top, bottom, left and right [n, 5].
     """
-    found = [masks.sum((1, 2))]
+    numbers = [masks.sum((1, 2))]
     for lines in (masks.any(2).to(torch.uint8), masks.any(1).to(torch.uint8)):
-        found += [lines.argmax(1), lines.shape[1] - lines.flip(1).argmax(1)]
-    return torch.stack(found, dim=1)
+        numbers += [lines.argmax(1), lines.shape[1] - lines.flip(1).argmax(1)]
+    return torch.stack(numbers, dim=1)
 
 
 def true_places(mask: Bool[Tensor, "..."], count: int, repeats: bool = False) -> Int[Tensor, " n"]:
@@ -85,5 +85,5 @@ def true_places(mask: Bool[Tensor, "..."], count: int, repeats: bool = False) ->
         return flat.nonzero()[:, 0]
     index = torch.arange(len(flat), device=flat.device)
     target = torch.where(flat, flat.cumsum(0) - 1, count)  # all others go to the last place
-    found = flat.to(torch.uint8).argmax().repeat(count + 1) if repeats else index.new_empty(count + 1)
-    return found.scatter_(0, target, index)[:count]
+    places = flat.to(torch.uint8).argmax().repeat(count + 1) if repeats else index.new_empty(count + 1)
+    return places.scatter_(0, target, index)[:count]

@@ -73,11 +73,10 @@ def ply_bytes(gaussians: Gaussians) -> bytes:
         "opacities": torch.logit(opacities)[:, None],
         "scales": values["scales"].clamp(min=_SMALLEST_SCALE).log(),
     }
-    columns = {
-        name: values[group][:, i].numpy().astype("<f4")
-        for group, names in _GROUPS.items()
-        for i, name in enumerate(names)
-    }
+    columns = {}
+    for group, names in _GROUPS.items():
+        for i, name in enumerate(names):
+            columns[name] = values[group][:, i].numpy().astype("<f4")
     low_pass = float(gaussians.low_pass)
     antialiased = bool(gaussians.antialiased)
     return vertices_ply(columns, [_CONSTANTS.format(low_pass=low_pass, antialiased=antialiased)])
@@ -142,11 +141,11 @@ def read_ply(path: Path) -> Gaussians:
     try:
         content = _read(path)
         vertices = content["vertex"]
-        columns = {
-            group: torch.from_numpy(np.stack([np.asarray(vertices[n], np.float32) for n in names], -1))
-            for group, names in _GROUPS.items()
-            if group != "normals"
-        }
+        columns = {}
+        for group, names in _GROUPS.items():
+            if group != "normals":
+                numbers = [np.asarray(vertices[name], np.float32) for name in names]
+                columns[group] = torch.from_numpy(np.stack(numbers, -1))
         matches = filter(None, map(_CONSTANTS_PATTERN.fullmatch, content.comments))
         constants = [{"low_pass": float(m[1]), "antialiased": m[2] == "True"} for m in matches]
     except (PlyParseError, KeyError, ValueError, MemoryError, OverflowError) as error:

@@ -143,8 +143,10 @@ class Targets(_TensorStruct):
         """The targets of one protocol."""
         chosen = [number for number, protocol in enumerate(self.protocols) if protocol == name]
         parts = (each[:, chosen] for each in (self.images, self.masks, self.cameras))
-        names = tuple(tuple(names[number] for number in chosen) for names in self.names)
-        return Targets(*parts, names, (name,) * len(chosen))
+        names = []
+        for subject in self.names:
+            names.append(tuple(subject[number] for number in chosen))
+        return Targets(*parts, tuple(names), (name,) * len(chosen))
 
 
 @dataclass(frozen=True)
@@ -172,8 +174,10 @@ class Batch(_TensorStruct):
         views = list(views)
         names = ("images", "masks", "cameras", "depths", "alpha", "log_gains")
         parts = {name: value[:, views] for name in names if (value := getattr(self, name)) is not None}
-        said = tuple(tuple(row[view] for view in views) for row in self.views)
-        return dataclasses.replace(self, **parts, views=said)
+        kept = []
+        for subject in self.views:
+            kept.append(tuple(subject[view] for view in views))
+        return dataclasses.replace(self, **parts, views=tuple(kept))
 
     def recolored(self, **changes: Tensor) -> "Batch":
         """The batch with other colours and the same masks, whose extents stay known."""
@@ -195,8 +199,7 @@ class Batch(_TensorStruct):
 
     @cached_property
     def extents(self) -> list[Extent]:
-        """Extent of the subject in each image ``b * V + v``; the host waits for a GPU at the first use, if no
-        plan read it."""
+        """Extent of the subject in each image ``b * V + v``; the host may wait for a GPU at the first use."""
         return extents(self.masks.flatten(0, 1))
 
     @cached_property
@@ -357,9 +360,9 @@ class Gaussians(_TensorStruct):
         element %= len(self.splits)
         start = sum(self.splits[:element])
         count = self.splits[element]
-        found = self.select(slice(start, start + count), (count,))
+        gaussians = self.select(slice(start, start + count), (count,))
         metre = None if self.metre is None else self.metre[element : element + 1]
-        return dataclasses.replace(found, metre=metre)
+        return dataclasses.replace(gaussians, metre=metre)
 
 
 @dataclass(frozen=True)

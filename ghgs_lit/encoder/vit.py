@@ -70,7 +70,8 @@ class ConvStem(nn.Module):
         self.norm = nn.LayerNorm(width)
 
     def forward(self, images: Float[Tensor, "n i H W"], kept: KeptPatches) -> Float[Tensor, "N c"]:
-        p, (rows, columns) = self.patch_size, kept.box(_REACH)
+        p = self.patch_size
+        rows, columns = kept.box(_REACH)
         x = self.reduce(images[..., p * rows.start : p * rows.stop, p * columns.start : p * columns.stop])
         x = x + self.mix(F.gelu(self.mix_norm(x)))
         return self.norm(x.movedim(1, -1)[kept.image, kept.row - rows.start, kept.column - columns.start])

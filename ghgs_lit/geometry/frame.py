@@ -121,7 +121,7 @@ class Frame:
                 tokens=_to_world(points.tokens, points.token_image // views, world),
             ),
             depth_maps=maps,
-            rounds=tuple(_in_unit(found, metre, known) for found in prediction.rounds),
+            rounds=tuple(_in_unit(each_round, metre, known) for each_round in prediction.rounds),
             drafts=tuple(self._gaussians(draft, views, world) for draft in prediction.drafts),
         )
 
@@ -163,10 +163,10 @@ def _to_world(
     Returns:
         Points [..., 3].
     """
-    *axes, found = world[element].unbind(-2)
+    *axes, result = world[element].unbind(-2)
     for coordinate, axis in zip(points.to(world.dtype)[..., None].unbind(-2), axes, strict=True):
-        found = torch.addcmul(found, coordinate, axis)
-    return found
+        result = torch.addcmul(result, coordinate, axis)
+    return result
 
 
 def subject_center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Tensor, "B 3"]:

@@ -39,8 +39,8 @@ def photo_consistency(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Te
         [B, V, S, H, W] in [0, 1]; 0 outside the subject, and where no other view has the point in its mask.
     """
     near, far = (bound.flatten()[batch.pixels] for bound in (bounds.near, bounds.far))
-    found = consistency_of(batch, batch.pixels, near, far, steps)
-    result = found.new_zeros(batch.masks.numel(), steps).index_copy_(0, batch.pixels, found)
+    agreement = consistency_of(batch, batch.pixels, near, far, steps)
+    result = agreement.new_zeros(batch.masks.numel(), steps).index_copy_(0, batch.pixels, agreement)
     return result.view(*batch.masks.shape, steps).permute(0, 1, 4, 2, 3)
 
 
@@ -148,19 +148,19 @@ def _best_match(
     place = pixels % (height * width)
     centers = F.pad(pixel_centers(height, width, depth).flatten(0, 1)[place], (0, 1), value=1.0)
     flat = colors.flatten(0, 1)
-    own = flat.flatten(2)[image, :3, place]
+    pixel_colors = flat.flatten(2)[image, :3, place]
     k = (image[:, None] + torch.arange(1, views, device=image.device)) % views
     pair = image[:, None] * views + k
     rays = (turn.flatten(0, 2)[pair] * centers[:, None, None]).sum(-1)
     other = image[:, None] // views * views + k
-    found = _match(flat, other, own, rays, shift.flatten(0, 2)[pair], depth, tolerance)
-    return torch.where(compared.flatten()[pair][..., None], found, 0).amax(1)
+    agreement = _match(flat, other, pixel_colors, rays, shift.flatten(0, 2)[pair], depth, tolerance)
+    return torch.where(compared.flatten()[pair][..., None], agreement, 0).amax(1)
 
 
 def _match(
     images: Tensor,
     image: Tensor,
-    own: Tensor,
+    pixel_colors: Tensor,
     rays: Tensor,
     shift: Tensor,
     depth: Tensor,
@@ -171,7 +171,7 @@ def _match(
     Args:
         images: smoothed colours and masks of all m images [m, 4, H, W].
         image: images that each pixel is compared with [n, o].
-        own: colours of the pixels [n, 3].
+        pixel_colors: colours of the pixels [n, 3].
         rays: what a unit of depth adds to a point's homogeneous pixel in these images [n, o, 3].
         shift: that of the camera's centre [n, o, 3].
         depth: depths of each pixel that are tried [n, S].
@@ -185,7 +185,7 @@ def _match(
     front = z > 0
     pixels = points[..., :2] / torch.where(front, z, 1.0)[..., None]
     seen = sample(images, image[..., None].expand(z.shape), pixels)
-    difference = (seen[..., :3] - own[:, None, None]).abs().mean(-1)
+    difference = (seen[..., :3] - pixel_colors[:, None, None]).abs().mean(-1)
     return torch.exp(-difference / tolerance) * seen[..., 3] * front
 
 
@@ -218,11 +218,11 @@ def _smoothed(
 
 def _sum_of_three(values: Tensor, axis: int) -> Tensor:
     """Sum of each value and its two neighbours along an axis, with 0 beyond the border."""
-    found = values.clone()
+    sums = values.clone()
     inner = values.shape[axis] - 1
-    found.narrow(axis, 1, inner).add_(values.narrow(axis, 0, inner))
-    found.narrow(axis, 0, inner).add_(values.narrow(axis, 1, inner))
-    return found
+    sums.narrow(axis, 1, inner).add_(values.narrow(axis, 0, inner))
+    sums.narrow(axis, 0, inner).add_(values.narrow(axis, 1, inner))
+    return sums
 
 
 def _relations(

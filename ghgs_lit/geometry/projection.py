@@ -241,5 +241,5 @@ def sample(
     layer = (2 * image.to(pixels) + 1) / count - 1
     grid = torch.stack(((2 / width * u - 1).clamp(-3, 3), (2 / height * v - 1).clamp(-3, 3), layer), -1)
     grid = grid.reshape(1, 1, 1, -1, 3)
-    found = F.grid_sample(maps.transpose(0, 1)[None], grid, align_corners=False)
-    return found[0, :, 0, 0].mT.reshape(*image.shape, maps.shape[1])
+    values = F.grid_sample(maps.transpose(0, 1)[None], grid, align_corners=False)
+    return values[0, :, 0, 0].mT.reshape(*image.shape, maps.shape[1])

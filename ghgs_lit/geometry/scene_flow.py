@@ -91,8 +91,8 @@ class _Grid:
         """
         last = points.new_tensor(self.shape[::-1]) - 1
         place = 2 * (points - self.low) / (_CELL * last) - 1
-        found = F.grid_sample(nodes[None], place[None, None, None], padding_mode="border", align_corners=True)
-        return found[0, :, 0, 0].mT
+        mixed = F.grid_sample(nodes[None], place[None, None, None], padding_mode="border", align_corners=True)
+        return mixed[0, :, 0, 0].mT
 
 
 def _spread(nodes: Float[Tensor, "c z y x"], times: int) -> Float[Tensor, "c z y x"]:
@@ -117,15 +117,15 @@ def pyramid(images: Float[Tensor, "V 3 H W"]) -> list[Float[Tensor, "V 3 _h _w"]
         Images [V, 3, _h, _w], the smallest first.
     """
     views, _, height, width = images.shape
-    found = []
+    levels = []
     for smaller, _, _ in _LEVELS:
         # Means of windows that overlap by half; of 3 x 3 pixels at full size.
         side = 2 * smaller if smaller > 1 else 3
         mean = images.new_full((1, 1, side, side), 1 / side**2)
         rim = (side - smaller + 1) // 2
         low = F.conv2d(images.reshape(-1, 1, height, width), mean, stride=smaller, padding=rim)
-        found.append(low.view(views, 3, *low.shape[2:]))
-    return found
+        levels.append(low.view(views, 3, *low.shape[2:]))
+    return levels
 
 
 def _with_slopes(images: Float[Tensor, "V 3 h w"]) -> Float[Tensor, "V 9 h w"]:
@@ -159,7 +159,8 @@ def scene_flow(
         return torch.zeros_like(points), torch.zeros_like(points)
     some = points[::_EVERY]
     seen = (shown & near[:, None])[::_EVERY]
-    grid, (index, view) = _Grid.around(points[near]), seen.nonzero().unbind(-1)
+    grid = _Grid.around(points[near])
+    index, view = seen.nonzero().unbind(-1)
     moved = points.new_zeros(3, *grid.shape)
     from_, _ = _seen(some[index], view, before.cameras)
     for level, was, now in zip(_LEVELS, before.levels, after.levels, strict=True):

@@ -97,4 +97,4 @@ def seen_surfaces(batch: Batch) -> list[Float[Tensor, "_ 3"]]:
     """
     points = unproject_maps(batch.depths, batch.cameras)
     known = batch.masks & (batch.depths > 0)
-    return [own[seen] for own, seen in zip(points, known, strict=True)]
+    return [of_element[seen] for of_element, seen in zip(points, known, strict=True)]

@@ -47,7 +47,8 @@ def attention_of(
     chosen = (takes_part & (element == element[query])).nonzero()[:, 0]
     row = int((chosen == query).nonzero())
     stage = (recalibration, tokens, points, chosen, slice(row, row + 1))
-    (near, weights), (_, plain) = _weights(*stage), _weights(*stage, plain=True)
+    near, weights = _weights(*stage)
+    _, plain = _weights(*stage, plain=True)
     return TokenAttention(query, chosen[near[row]], weights[:, 0].mT, plain[:, 0].mT)
 
 
@@ -69,15 +70,15 @@ def attention_on_other_parts(
     """
     takes_part = recalibration.takes_part(points)
     element = tokens.image // tokens.grid[1]
-    found = []
+    shares = []
     for number in range(tokens.grid[0]):
         chosen = (takes_part & (element == number)).nonzero()[:, 0]
         near, weights = _weights(recalibration, tokens, points, chosen, slice(None))
-        own = part[chosen, None]
+        query_part = part[chosen, None]
         others = part[chosen][near]
-        differs = (own != others) & (others >= 0)
-        found.append((weights.mean(-1) * differs).sum(-1).T[own[:, 0] >= 0])
-    return torch.cat(found)
+        differs = (query_part != others) & (others >= 0)
+        shares.append((weights.mean(-1) * differs).sum(-1).T[query_part[:, 0] >= 0])
+    return torch.cat(shares)
 
 
 def _near(
@@ -129,14 +130,14 @@ def neighborhoods(recalibration: Recalibration, tokens: Tokens, points: Points) 
     other.neighborhood = "image_plane" if recalibration.neighborhood == "xyz" else "xyz"
     takes_part = recalibration.takes_part(points)
     element = tokens.image // tokens.grid[1]
-    found = []
+    results = []
     for number in range(tokens.grid[0]):
         chosen = (takes_part & (element == number)).nonzero()[:, 0]
         near, changed = (_near(stage, tokens, points, chosen) for stage in (recalibration, other))
         is_near = near.new_zeros(len(chosen), len(chosen), dtype=torch.bool).scatter_(1, near, True)
         shared = is_near.gather(1, changed).float().mean().item() if len(chosen) else 1.0
-        found.append(Neighborhood(len(chosen), near.shape[1], shared))
-    return found
+        results.append(Neighborhood(len(chosen), near.shape[1], shared))
+    return results
 
 
 #: A stage with its inputs, as :func:`neighborhoods` takes them.
@@ -155,13 +156,13 @@ def seen_calls(recalibration: nn.Module | None) -> Iterator[list[Call]]:
     Yields:
         A list that gets the inputs of each call.
     """
-    found: list[Call] = []
+    calls: list[Call] = []
     if not isinstance(recalibration, Recalibration):
-        yield found
+        yield calls
         return
-    hook = recalibration.register_forward_pre_hook(lambda stage, inputs: found.append((stage, *inputs[:2])))
+    hook = recalibration.register_forward_pre_hook(lambda stage, inputs: calls.append((stage, *inputs[:2])))
     try:
-        yield found
+        yield calls
     finally:
         hook.remove()
 

@@ -44,8 +44,8 @@ def nearest_neighbors(
     # Filled, not concatenated: small results between freed blocks of distances would fragment the memory.
     index = torch.empty(*points.shape[:-1], k, dtype=torch.int64, device=points.device)
     for rows in even_parts(n, at_once(points.device, _BLOCK, _GPU_BLOCK) // max(points[..., 0].numel(), 1)):
-        own = points[..., rows, :]
-        distance = torch.cdist(own, points, compute_mode="donot_use_mm_for_euclid_dist")
+        queries = points[..., rows, :]
+        distance = torch.cdist(queries, points, compute_mode="donot_use_mm_for_euclid_dist")
         ranks = None if places is None else _turns(places, view, views, rows)
         index[..., rows, :] = _smallest(distance, ranks, k)
     return index

@@ -211,8 +211,8 @@ def neighbor_cosines(
         most = at_once(semantic.device, _COSINES, _GPU_COSINES)
         count = directions.shape[-2]
         for rows in even_parts(count, most // max(1, len(directions.flatten(0, -2)))):
-            own = directions[..., rows, :]
-            products = linear(own, directions) if own.dim() == 2 else own @ directions.mT
+            queries = directions[..., rows, :]
+            products = linear(queries, directions) if queries.dim() == 2 else queries @ directions.mT
             torch.gather(products, -1, near[..., rows, :], out=cosines[..., rows, :])
     return cosines
 

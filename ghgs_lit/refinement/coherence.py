@@ -87,14 +87,14 @@ class _Alignment:
     distances: tuple[float, ...] = ()
 
     def after(self, phase: _Phase, silhouettes: "_Silhouettes") -> "_Alignment":
-        found = self
+        aligned = self
         for _ in range(phase.steps):
-            equations = silhouettes.equations(found.lens, found.pose, phase)
+            equations = silhouettes.equations(aligned.lens, aligned.pose, phase)
             steps = equations.solved(self.free)
             are_all = bool(self.free.all())
-            moved = _stepped(steps, found.lens, found.pose, are_all)
-            found = _Alignment(*moved, self.free, (*found.distances, equations.distance))
-        return found
+            moved = _stepped(steps, aligned.lens, aligned.pose, are_all)
+            aligned = _Alignment(*moved, self.free, (*aligned.distances, equations.distance))
+        return aligned
 
 
 @torch.no_grad()
@@ -111,15 +111,15 @@ def contradiction(batch: Batch) -> tuple[Float[Tensor, " B"], Float[Tensor, "B V
         Mean distances in pixels: of all views [B], and of the others without each [B, V] (0 for three views
         or fewer: two nearly always agree).
     """
-    found = []
+    of_all = []
     without = []
     for mattes, lens, pose in zip(*_on_cpu(batch), strict=True):
         silhouettes = _Silhouettes((Outlines.of(mattes, QUICK),), pose.new_zeros(1, 3))
-        found.append(silhouettes.distance(lens[None], pose))
+        of_all.append(silhouettes.distance(lens[None], pose))
         views = range(len(pose))
         each = [silhouettes.distance(lens[None], pose, (v,)) if len(pose) > 3 else 0.0 for v in views]
         without.append(each)
-    return torch.tensor(found), torch.tensor(without)
+    return torch.tensor(of_all), torch.tensor(without)
 
 
 def culprit(without: Sequence[float]) -> int | None:
@@ -171,7 +171,7 @@ def coherent_cameras(
     lenses, poses, free, distances = zip(*rigs, strict=True)
     count = len(pose) // len(rigs)
     device = batch.masks.device
-    poses, free = (torch.stack(found).repeat_interleave(count, 0) for found in (poses, free))
+    poses, free = (torch.stack(values).repeat_interleave(count, 0) for values in (poses, free))
     lenses = torch.cat(lenses).to(cameras.intrinsics)
     poses = poses.to(cameras.extrinsics)
     moved = replace(cameras, intrinsics=lenses, extrinsics=poses)
@@ -201,16 +201,16 @@ def _coherent(
     if given.distance < _COHERENT:
         return lens, pose, every, given.distance
     start = _Alignment(lens, pose, every)
-    found = start.after(_MEET, silhouettes)
+    aligned = start.after(_MEET, silhouettes)
     few = _minority(silhouettes, lens, pose) if alone and given.distance > _BUMPED else None
     if few is not None:
         apart = _Alignment(lens, pose, few).after(_MEET, silhouettes)
         # Two of three views nearly always agree.
         rest = 0.1 * _COHERENT if len(pose) == 3 else max(_COHERENT, _REST * given.distance)
-        enough = max(_AS_WELL * found.distances[-1], rest)
-        found = apart if apart.distances[-1] < enough else found
-    found = found.after(_LIE, silhouettes)
-    return found.lens, found.pose, found.free, given.distance
+        enough = max(_AS_WELL * aligned.distances[-1], rest)
+        aligned = apart if apart.distances[-1] < enough else aligned
+    aligned = aligned.after(_LIE, silhouettes)
+    return aligned.lens, aligned.pose, aligned.free, given.distance
 
 
 def _minority(silhouettes: "_Silhouettes", lens: Lenses, pose: Pose) -> Which | None:

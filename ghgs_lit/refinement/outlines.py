@@ -46,7 +46,8 @@ class Outlines:
         Returns:
             Distance maps, and the rays in ascending order of silhouettes.
         """
-        (finer, to, every), size = look, (mattes.shape[1], mattes.shape[2])
+        finer, to, every = look
+        size = (mattes.shape[1], mattes.shape[2])
         larger = F.interpolate(mattes[:, None], scale_factor=finer, mode="bilinear", align_corners=False)
         distance = soft_signed_distance if finer == 1 else lambda matte: signed_distance(matte > 0.5)
         maps = torch.from_numpy(np.stack([distance(one) for one in larger[:, 0].numpy()]))[:, None] / finer

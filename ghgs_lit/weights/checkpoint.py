@@ -44,8 +44,8 @@ def read_checkpoint(path: str | Path, whole: bool = False) -> dict[str, Any]:
     _check_sums(path, whole)
     checkpoint = open_file(path)
     for key, kind in (("state_dict", Mapping), ("config", Mapping), ("format_version", int)):
-        found = checkpoint.get(key) if isinstance(checkpoint, Mapping) else None
-        if not isinstance(found, kind):
+        value = checkpoint.get(key) if isinstance(checkpoint, Mapping) else None
+        if not isinstance(value, kind):
             names = map(str, checkpoint) if isinstance(checkpoint, Mapping) else ()
             is_published = any(name == RELEASE_ENTRY or name.startswith(tuple(VGGT)) for name in names)
             hint = " (`ghgs import` makes a checkpoint of published weights)" * is_published
@@ -157,12 +157,12 @@ def require_fit(module: nn.Module, state: Mapping[str, Any], source: str | Path)
     Raises:
         InputError: a key is missing, unknown or has another shape; names source, key and both shapes.
     """
-    own = module.state_dict()
-    for key in own:
-        require(key in state, f"{source}: {key}", f"a tensor of shape {tuple(own[key].shape)}", "nothing")
+    tensors = module.state_dict()
+    for key in tensors:
+        require(key in state, f"{source}: {key}", f"a tensor of shape {tuple(tensors[key].shape)}", "nothing")
     for key, value in state.items():
-        require(key in own, f"{source}: {key}", "no such key in the configured model", shape_of(value))
-        require_shape(f"{source}: {key}", own[key], value)
+        require(key in tensors, f"{source}: {key}", "no such key in the configured model", shape_of(value))
+        require_shape(f"{source}: {key}", tensors[key], value)
 
 
 def require_finite(state: Mapping[str, Tensor], source: str | Path) -> None:

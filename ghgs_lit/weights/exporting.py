@@ -34,20 +34,20 @@ def export_weights(checkpoint: str | Path, vggt: str | Path | None, release: str
     encoder = {name: tensor for name, tensor in state.items() if name.startswith("encoder.")}
     heads = {name: tensor for name, tensor in state.items() if name not in encoder}
     files = []
-    for path, own, table, entry in (
+    for path, part, table, entry in (
         (vggt, encoder, names.VGGT, None),
         (release, heads, names.RELEASE, names.RELEASE_ENTRY),
     ):
         if path is not None:
-            require(bool(own), str(checkpoint), f"tensors for {path}", "the encoder alone")
-            named = {names.to_published(name, table): name for name in own}
+            require(bool(part), str(checkpoint), f"tensors for {path}", "the encoder alone")
+            named = {names.to_published(name, table): name for name in part}
             if None in named:
                 differing = ", ".join(differences(content["config"]))
                 raise InputError(
                     f"{checkpoint}: expected a model of the release's form for release=<file>; found one"
                     f" without a published form, with {named[None]} (it differs in {differing})"
                 )
-            files.append((path, {published: own[name] for published, name in named.items()}, entry))
+            files.append((path, {published: part[name] for published, name in named.items()}, entry))
     for file in files:
         write_tensors(*file)
     return [f"{path}: {len(tensors)} tensors" for path, tensors, _ in files]

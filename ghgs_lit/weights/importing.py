@@ -61,11 +61,11 @@ def fetch(repository: str) -> tuple[str, Path, str]:
             ) from error
     path = Path(cached)
     # The name of a file in the cache is the published checksum.
-    found = sha256(path)
+    digest = sha256(path)
     published = path.resolve().name
-    is_whole = found == published or not re.fullmatch(r"[0-9a-f]{64}", published)
-    require(is_whole, str(path.resolve()), f"SHA-256 {published}", f"{found}: a broken download: delete it")
-    return repository, path, found
+    is_whole = digest == published or not re.fullmatch(r"[0-9a-f]{64}", published)
+    require(is_whole, str(path.resolve()), f"SHA-256 {published}", f"{digest}: a broken download: delete it")
+    return repository, path, digest
 
 
 def sha256(path: Path) -> str:
@@ -105,10 +105,10 @@ class Source:
         """
         content = open_file(self.path)
         if self.entry is not None:
-            found = content.get(self.entry) if isinstance(content, Mapping) else None
-            if not isinstance(found, Mapping):
+            nested = content.get(self.entry) if isinstance(content, Mapping) else None
+            if not isinstance(nested, Mapping):
                 raise InputError(f"{self.path}: expected the entry {self.entry!r}; found {describe(content)}")
-            content = found
+            content = nested
         if not isinstance(content, Mapping) or not content or not isinstance(next(iter(content)), str):
             raise InputError(f"{self.path}: expected tensors by name; found {describe(content)}")
         return dict(content)
@@ -116,7 +116,7 @@ class Source:
     def used_tensors(self) -> dict[str, Tensor]:
         """The used tensors by our names."""
         tensors = self.tensors()
-        return {own: tensors[published] for own, published in self.used.items()}
+        return {ours: tensors[published] for ours, published in self.used.items()}
 
     def match(self, model: Mapping[str, Tensor]) -> None:
         """Fill ``used`` and ``skipped``.
@@ -132,12 +132,12 @@ class Source:
             if name.startswith(tuple(self.ignored)):
                 self.skipped[name.split(".")[0]] += 1
                 continue
-            own = names.to_ours(name, self.table)
-            require(own is not None, where, f"a tensor of {KINDS[self.key]}", "an unknown one")
-            require(own in model, where, "no such tensor in the configured model", shape_of(tensor))
-            require(own not in self.used, where, "one tensor of this meaning", f"{self.used.get(own)} too")
-            require_shape(where, model[own], tensor)
-            self.used[own] = name
+            ours = names.to_ours(name, self.table)
+            require(ours is not None, where, f"a tensor of {KINDS[self.key]}", "an unknown one")
+            require(ours in model, where, "no such tensor in the configured model", shape_of(tensor))
+            require(ours not in self.used, where, "one tensor of this meaning", f"{self.used.get(ours)} too")
+            require_shape(where, model[ours], tensor)
+            self.used[ours] = name
 
     def report(self) -> str:
         """Numbers of used and ignored tensors, as one line."""
@@ -222,11 +222,11 @@ def import_weights(
         return getattr(torch, dtype) if name.startswith("encoder.") else torch.float32
 
     for source in files:
-        found = cast(source.used_tensors, precision)
-        for name, tensor in found.items():
+        converted = cast(source.used_tensors, precision)
+        for name, tensor in converted.items():
             where = f"{source.path}: {source.used[name]}"
             require(bool(tensor.isfinite().all()), where, f"finite numbers in {dtype}", "others")
-        tensors |= found
+        tensors |= converted
     encoder = {"encoder": {**config["encoder"], "weights": files[0].label}}
     config = encoder if release is None else {**config, **encoder}
     facts = {s.key: {"name": s.label, "sha256": s.checksum, "tensors": len(s.used)} for s in files}
@@ -247,7 +247,9 @@ def match_files(state: Mapping[str, Tensor], files: Sequence[Source]) -> None:
     """
     for source in files:
         source.match(state)
-    for name in (name for name in state if not any(name in source.used for source in files)):
+    for name in state:
+        if any(name in source.used for source in files):
+            continue
         for source in reversed(files):
             published = names.to_published(name, source.table)
             expected = f"a tensor of shape {tuple(state[name].shape)}"

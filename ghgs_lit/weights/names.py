@@ -40,9 +40,9 @@ def to_ours(name: str, table: Mapping[str, str]) -> str | None:
     Returns:
         The name; None if ``table`` has none.
     """
-    for published, own in table.items():
+    for published, ours in table.items():
         if name.startswith(published):
-            return own + name.removeprefix(published)
+            return ours + name.removeprefix(published)
     return None
 
 
@@ -58,7 +58,7 @@ def to_published(name: str, table: Mapping[str, str]) -> str | None:
     """
     if UNPUBLISHED in name:
         return None
-    for published, own in table.items():
-        if name.startswith(own):
-            return published + name.removeprefix(own)
+    for published, ours in table.items():
+        if name.startswith(ours):
+            return published + name.removeprefix(ours)
     return None

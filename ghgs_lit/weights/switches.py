@@ -27,13 +27,11 @@ def release_switches() -> dict[tuple[str, ...], Any]:
         ((group, option),) = ((key.removeprefix("override /"), value) for key, value in choice.items())
         if group not in ("metrics", "renderer"):  # not parts of the model
             node[group] = OmegaConf.to_container(OmegaConf.load(conf_dir() / group / f"{option}.yaml"))
-    return {
-        (group, key): value
-        for group, values in node.items()
-        if group not in ("defaults", "compat")
-        for key, value in values.items()
-        if key != "defaults"
-    }
+    switches = {}
+    for group, values in node.items():
+        if group not in ("defaults", "compat"):
+            switches |= {(group, key): value for key, value in values.items() if key != "defaults"}
+    return switches
 
 
 def differences(config: Mapping[str, Any], other: Mapping[str, Any] | None = None) -> list[str]:
@@ -47,12 +45,12 @@ def differences(config: Mapping[str, Any], other: Mapping[str, Any] | None = Non
     Returns:
         A text ``<key>=<value> for <other value>`` for each.
     """
-    found = []
+    texts = []
     for (group, key), value in release_switches().items():
         if other is not None and group not in other:
             continue
         expected = value if other is None else lookup(other, f"{group}.{key}")
-        own = lookup(config, f"{group}.{key}")
-        if own != expected:
-            found.append(f"{group}.{key}={own} for {expected}")
-    return found
+        configured = lookup(config, f"{group}.{key}")
+        if configured != expected:
+            texts.append(f"{group}.{key}={configured} for {expected}")
+    return texts

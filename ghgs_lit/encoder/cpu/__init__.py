@@ -66,11 +66,10 @@ def attend(
     parts = max(1, min(-(-2 * torch.get_num_threads() // len(heads)), t // QUERIES))
     edges = [t * p // (parts * QUERIES) * QUERIES for p in range(parts)] + [t]
     compiled = attend_head()
-    tasks = [
-        partial(compiled, *(x[head] for x in arrays), first, last)
-        for head in heads
-        for first, last in pairwise(edges)
-    ]
+    tasks = []
+    for head in heads:
+        matrices = [x[head] for x in arrays]
+        tasks += [partial(compiled, *matrices, first, last) for first, last in pairwise(edges)]
     pool.run(tasks, work=n * a * t * d)
     return out.to(v.dtype)
 

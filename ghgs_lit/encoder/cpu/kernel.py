@@ -45,7 +45,9 @@ def attend_head(q, k, v, out, first, last):
     for start in range(first, last, QUERIES):
         count = min(QUERIES, last - start)
         _pack_queries(q, start, count, queries)
-        totals[:], sums[:], highest[:] = 0, 0, LOWEST
+        totals[:] = 0
+        sums[:] = 0
+        highest[:] = LOWEST
         for key in range(0, tokens, KEYS):
             seen = min(KEYS, tokens - key)
             for row in range(0, count, ROWS):
@@ -138,10 +140,10 @@ def _score(queries, row, keys, key, seen, steps, scores):
 @helper
 def _highest(scores, r, seen):
     """The highest score of a row. NaN is ignored here; it reaches the result through the weights."""
-    found = simd.full(LOWEST)
+    highest = simd.full(LOWEST)
     for i in range(0, seen, LANES):
-        found = simd.maximum(memory.load(scores, r * KEYS + i), found)
-    return simd.lane_max(found)
+        highest = simd.maximum(memory.load(scores, r * KEYS + i), highest)
+    return simd.lane_max(highest)
 
 
 @helper

@@ -220,7 +220,7 @@ def _difference(first, second):
 
 
 @helper
-def _load_pixels(colors, pixels, near, far, start, last, height, width, begin, values, own):
+def _load_pixels(colors, pixels, near, far, start, last, height, width, begin, values, centers):
     """Load 16 pixels; the last one fills up the vectors.
 
     Args:
@@ -234,7 +234,7 @@ def _load_pixels(colors, pixels, near, far, start, last, height, width, begin, v
         width: of the image.
         begin: where the pixels' image starts in ``colors``.
         values: array [4 * 16] for u and v of the centres, near, and far - near.
-        own: array [16 * 4] for the colours.
+        centers: array [16 * 4] for the colours.
     """
     for lane in range(LANES):
         i = min(start + lane, last - 1)
@@ -245,7 +245,7 @@ def _load_pixels(colors, pixels, near, far, start, last, height, width, begin, v
         values[2 * LANES + lane], values[3 * LANES + lane] = near[i], far[i] - near[i]
         at = begin + ((row + 1) * (width + 2) + column + 1) * CHANNELS
         for channel in range(CHANNELS):
-            own[lane * CHANNELS + channel] = colors[at + channel]
+            centers[lane * CHANNELS + channel] = colors[at + channel]
 
 
 @kernel_for(*_SWEPT, types.float32, FLOATS[2], *[NUMBER] * 5)
@@ -279,19 +279,19 @@ def sweep_pixels(
     size = (height + 2) * line
     rate = np.float32(math.log2(math.e)) / (THREE * tolerance)
     values = simd.aligned(4 * LANES)
-    own = simd.aligned(4 * LANES)
-    found = simd.aligned(4 * LANES)
+    centers = simd.aligned(4 * LANES)
+    shown = simd.aligned(4 * LANES)
     rights = simd.aligned(LANES)
     downs = simd.aligned(LANES)
     places = np.empty(LANES, np.int32)
     best = simd.aligned(len(shares) * LANES)
     for start in range(first, last, LANES):
-        _load_pixels(colors, pixels, near, far, start, last, height, width, image * size, values, own)
+        _load_pixels(colors, pixels, near, far, start, last, height, width, image * size, values, centers)
         u = memory.load(values, 0)
         v = memory.load(values, LANES)
         low = memory.load(values, 2 * LANES)
         length = memory.load(values, 3 * LANES)
-        red, green, blue, _ = channels_of(own, 0)
+        red, green, blue, _ = channels_of(centers, 0)
         best[:] = ZERO
         for other in range(views):
             if other == view or not compared[element, view, other]:
@@ -304,9 +304,9 @@ def sweep_pixels(
                 _project(rays, moved, depth, height, width, places, rights, downs)
                 for lane in range(LANES):
                     interpolate(
-                        colors, begin + places[lane], line, rights[lane], downs[lane], found, lane * CHANNELS
+                        colors, begin + places[lane], line, rights[lane], downs[lane], shown, lane * CHANNELS
                     )
-                r, g, b, seen = channels_of(found, 0)
+                r, g, b, seen = channels_of(shown, 0)
                 difference = _difference(r, red) + _difference(g, green) + _difference(b, blue)
                 exponent = simd.minimum(simd.full(EXP2_LIMIT), difference * rate)
                 agreement = seen * simd.exp2_minus(exponent)

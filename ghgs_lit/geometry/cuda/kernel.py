@@ -99,13 +99,11 @@ def smoothed_rows(count, photo, masks, out, height, width, ROWS: tl.constexpr):
     image = i // area
     row = i % area // width
     column = i % width
-    red = tl.zeros_like(i)
-    green = tl.zeros_like(i)
-    blue = tl.zeros_like(i)
-    number = tl.zeros_like(i)
-    red = red.to(tl.float32)
-    green = green.to(tl.float32)
-    blue, number, own = blue.to(tl.float32), number.to(tl.float32), number.to(tl.float32)
+    red = tl.zeros_like(i).to(tl.float32)
+    green = tl.zeros_like(i).to(tl.float32)
+    blue = tl.zeros_like(i).to(tl.float32)
+    number = tl.zeros_like(i).to(tl.float32)
+    center = tl.zeros_like(i).to(tl.float32)
     for k in tl.static_range(9):
         y = row + k // 3 - 1
         x = column + k % 3 - 1
@@ -122,13 +120,13 @@ def smoothed_rows(count, photo, masks, out, height, width, ROWS: tl.constexpr):
         blue = blue + tl.where(inside, b, 0.0)
         number = number + tl.where(inside, 1.0, 0.0)
         if k == 4:
-            own = tl.where(inside, 1.0, 0.0)
+            center = tl.where(inside, 1.0, 0.0)
     scale = 1 / tl.maximum(number, 1.0)
     at = out + image * 4 * area + row * width + column
     tl.store(at, red * scale)
     tl.store(at + area, green * scale)
     tl.store(at + 2 * area, blue * scale)
-    tl.store(at + 3 * area, own)
+    tl.store(at + 3 * area, center)
 
 
 @triton.jit
@@ -196,9 +194,9 @@ def swept_rows(
         b = between(there + 2 * area, top, bottom, left, right, above, below, before, after)
         seen = between(there + 3 * area, top, bottom, left, right, above, below, before, after)
         difference = (tl.abs(r - red) + tl.abs(g - green) + tl.abs(b - blue)) / 3
-        found = tl.exp(-difference / tolerance) * seen
+        agreement = tl.exp(-difference / tolerance) * seen
         is_compared = is_front & (tl.load(compared + pair) != 0)
-        best = tl.maximum(best, tl.where(is_compared, found, 0.0))
+        best = tl.maximum(best, tl.where(is_compared, agreement, 0.0))
     tl.store(out + i, best)
 
 
