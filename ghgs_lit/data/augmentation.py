@@ -117,7 +117,12 @@ class Augmentation(Options):
         return drawn, tuple(max(1, round(r * side)) for r, side in zip(ratios, drawn, strict=True))
 
     def is_exact(self, seed: int, step: int) -> bool:
-        """Whether the inputs of a training step are as they are read."""
+        """Whether the inputs of a training step are as they are read.
+
+        Args:
+            seed: of the run.
+            step: of training.
+        """
         limits = (
             *(self.exposure, self.white_balance, self.gamma, self.cut, self.calibration),
             *(self.mask_offset, self.mask_ragged, self.mask_hole_chance),

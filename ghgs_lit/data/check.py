@@ -359,7 +359,14 @@ def _cannot_sample(data: PhotographsDataModule, targets: TargetProtocol, trainin
 
 
 def split_line(line: str) -> tuple[str, str, str]:
-    """Place, expected and found of an error message."""
+    """Place, expected and found of an error message.
+
+    Args:
+        line: ``<place>: expected ...; found ...``.
+
+    Returns:
+        The three parts; of another line two empty texts and the line.
+    """
     match = _LINE.fullmatch(line)
     return (match["place"], match["expected"], match["found"]) if match else ("", "", line)
 

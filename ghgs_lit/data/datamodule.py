@@ -120,7 +120,14 @@ class PhotographsDataModule(LightningDataModule):
         self.dataset.prepare(splits)
 
     def builder(self, phase: str) -> BatchBuilder:
-        """Batch builder of a split, made at its first use."""
+        """Batch builder of a split, made at its first use.
+
+        Args:
+            phase: name of the split.
+
+        Raises:
+            InputError: the data set has no such split.
+        """
         choice("split", phase, self.dataset.split_names)
         if phase not in self._builders:
             data = self.dataset
@@ -233,7 +240,12 @@ class PhotographsDataModule(LightningDataModule):
         return loader_of(batches, workers, sampler=steps)
 
     def on_after_batch_transfer(self, batch: Batch | Drawn, dataloader_idx: int) -> Batch:
-        """Photographs of a batch whose numbers have come to the device."""
+        """Photographs of a batch whose numbers have come to the device.
+
+        Args:
+            batch: photographs, or numbers of those on the device.
+            dataloader_idx: Lightning's; not used.
+        """
         if not isinstance(batch, Drawn):
             return batch
         return self._resident.inputs.batch(batch, self._resident.targets)
@@ -308,7 +320,11 @@ class PhotographsDataModule(LightningDataModule):
         return targets
 
     def workers(self, batches: float) -> int:
-        """Number of loading processes for this many batches, where ``data.workers`` does not say it."""
+        """Number of loading processes, by :func:`automatic_workers` where ``data.workers`` does not say it.
+
+        Args:
+            batches: number of batches that are loaded; infinite where it is not known.
+        """
         if self.dataset.workers != "auto":
             return self.dataset.workers
         if self.trainer is None:

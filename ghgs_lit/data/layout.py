@@ -79,15 +79,30 @@ class Completeness:
         return plan
 
     def marker(self, phase: str, name: str) -> Path:
-        """File that marks a subject as complete."""
+        """File that marks a subject as complete.
+
+        Args:
+            phase: ``train`` or ``val``.
+            name: of the subject.
+        """
         return self.folder / "done" / phase / name
 
     def missing(self, phase: str, names: Sequence[str]) -> list[str]:
-        """Those of ``names`` that are not completely rendered."""
+        """Those of several subjects that are not completely rendered; none of data that was made elsewhere.
+
+        Args:
+            phase: ``train`` or ``val``.
+            names: of the subjects.
+        """
         return [name for name in names if not self.marker(phase, name).exists()] if self.rendered_here else []
 
     def whole(self, phase: str, names: Sequence[str]) -> list[str]:
-        """Those of ``names`` that are completely rendered."""
+        """Those of several subjects that are completely rendered.
+
+        Args:
+            phase: ``train`` or ``val``.
+            names: of the subjects.
+        """
         missing = set(self.missing(phase, names))
         return [name for name in names if name not in missing]
 

@@ -52,12 +52,20 @@ def implausible(mask: np.ndarray) -> str | None:
 
 
 def height(silhouettes: Sequence[Silhouette]) -> float:
-    """Median height of the subject in world units, from the silhouettes."""
+    """Median height of the subject in world units.
+
+    Args:
+        silhouettes: of one subject.
+    """
     focus, _ = subject_sphere(silhouettes)
     return float(np.median([s.extent(focus)[0] for s in silhouettes]))
 
 
 def twins(poses: Mapping[_T, np.ndarray]) -> tuple[_T, _T] | None:
-    """Names of the first two equal poses [4, 4]; None if all differ."""
+    """Names of the first two equal poses; None if all differ.
+
+    Args:
+        poses: [4, 4] by name.
+    """
     pairs = itertools.combinations(poses, 2)
     return next((p for p in pairs if np.allclose(poses[p[0]], poses[p[1]], rtol=1e-6, atol=1e-6)), None)

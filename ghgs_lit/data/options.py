@@ -96,7 +96,11 @@ class LoadingOptions(Options):
 
     @property
     def folder(self) -> Path:
-        """Folder of the data, ``root`` of a subclass. InputError: ``data.root`` is null or not a folder."""
+        """Folder of the data, ``root`` of a subclass.
+
+        Raises:
+            InputError: ``data.root`` is null or not a folder.
+        """
         folder = required_folder("data.root", "the folder of the data set", self.root)
         require_folder(folder)
         return folder

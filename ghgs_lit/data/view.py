@@ -224,7 +224,11 @@ def encode_depth(depth: np.ndarray) -> np.ndarray:
 
 
 def half_centers(intrinsics: np.ndarray) -> np.ndarray:
-    """Convert intrinsics [3, 3] from pixel centres at integers to centres at +0.5."""
+    """Convert intrinsics from pixel centres at integers to centres at +0.5.
+
+    Args:
+        intrinsics: [3, 3] in pixels.
+    """
     return intrinsics + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
 

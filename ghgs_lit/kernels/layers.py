@@ -131,7 +131,11 @@ def room(channels: int) -> int:
 
 
 def parameters(layers: Sequence[nn.Module]) -> list[nn.Parameter]:
-    """Weight and bias of each linear layer."""
+    """Weight and bias of each linear layer, in the order that :func:`packed` expects.
+
+    Args:
+        layers: such as those of an ``nn.Sequential``; others than linear ones are left out.
+    """
     linears = (layer for layer in layers if isinstance(layer, nn.Linear))
     return [x for layer in linears for x in (layer.weight, layer.bias)]
 
@@ -200,7 +204,12 @@ lines = helper(room)
 
 @helper
 def size(outputs, inputs):
-    """Floats of a packed layer."""
+    """Floats of a packed layer.
+
+    Args:
+        outputs: channels of its result.
+        inputs: channels of its input.
+    """
     return lines(outputs) * (inputs + 1)
 
 
@@ -256,7 +265,12 @@ def rectify(layers, at, outputs, inputs, values):
 
 @helper
 def put_ones(line, values):
-    """Fill a line with ones, the input of biases."""
+    """Fill a line with ones, the input of biases.
+
+    Args:
+        line: the line, counted from the first one.
+        values: lines of ``PANEL`` floats, flat.
+    """
     for i in range(line * PANEL, (line + 1) * PANEL, LANES):
         memory.store(values, i, simd.full(ONE))
 

@@ -23,7 +23,12 @@ _WIDE_PRODUCTS = _WIDE_PRODUCTS and torch.backends.cpu.get_cpu_capability() == "
 
 
 def prefers_onednn(x: Tensor, weight: Tensor) -> bool:
-    """Whether oneDNN computes :func:`linear` faster."""
+    """Whether oneDNN computes :func:`linear` faster.
+
+    Args:
+        x: [..., inputs].
+        weight: [outputs, inputs].
+    """
     if not _WIDE_PRODUCTS or x.device.type != "cpu" or torch.is_autocast_enabled("cpu"):
         return False
     work = x.numel() * len(weight)

@@ -62,7 +62,13 @@ class _LanesModel(models.PrimitiveModel):
 
 
 def everywhere(builder, number, count: int):
-    """A vector with ``number`` in each of ``count`` lanes."""
+    """A vector with a number in each lane.
+
+    Args:
+        builder: of LLVM instructions.
+        number: LLVM value.
+        count: lanes.
+    """
     undefined = ir.Constant(ir.VectorType(number.type, count), ir.Undefined)
     one = builder.insert_element(undefined, number, ir.Constant(I32, 0))
     return builder.shuffle_vector(one, undefined, indices([0] * count))

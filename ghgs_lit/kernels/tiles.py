@@ -105,7 +105,13 @@ def store4(table, i, w, x, y, z):
 
 @triton.jit
 def clamp(x, low, high):
-    """``x`` between ``low`` and ``high``; NaN stays."""
+    """``x`` between two limits; NaN stays.
+
+    Args:
+        x: [ROWS].
+        low: lower limit.
+        high: upper limit.
+    """
     return tl.where(x > high, high, tl.where(x < low, low, x))
 
 

@@ -215,7 +215,15 @@ def _in_metres(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Camer
 
 
 def _background(background: Background, color: Float[Tensor, "B T C h w"]) -> Tensor:
-    """The background as a tensor that broadcasts with ``color``; InputError: not one number per channel."""
+    """The background as a tensor that broadcasts with the image.
+
+    Args:
+        background: as of :func:`render`.
+        color: the rendered image, for its channels, dtype and device.
+
+    Raises:
+        InputError: neither one number nor one per channel.
+    """
     tensor = torch.as_tensor(background, dtype=color.dtype, device=color.device)
     if tensor.ndim == 1:
         channels = color.shape[2]

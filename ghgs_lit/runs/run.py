@@ -190,7 +190,11 @@ class RunDirectory:
 
     @property
     def marker(self) -> Identity | None:
-        """Content of ``run.json``; None: the folder is no run's. InputError: it is another file."""
+        """Content of ``run.json``; None: the folder is no run's.
+
+        Raises:
+            InputError: It is another file.
+        """
         path = self.path / MARKER
         if not path.is_file():
             return None

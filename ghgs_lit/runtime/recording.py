@@ -297,8 +297,14 @@ def _played(recording: _Recording, tensors: list[Tensor]) -> Any:
 
 
 class _Guard(TorchDispatchMode):
-    """Refuses what a recording cannot repeat, before it is done: reading a value of the device, and copying
-    from the host, whose memory will hold something else. ``kept``: memory that was not made inside."""
+    """Refuses what a recording cannot repeat, before it is done.
+
+    That is: reading a value of the device, and copying from the host, whose memory will hold something
+    else.
+
+    Attributes:
+        kept: memory that was not made inside, by its address.
+    """
 
     def __init__(self) -> None:
         super().__init__()

@@ -236,9 +236,12 @@ OPACITY = 0.5
 class PerScene:
     """3D Gaussian splatting (Kerbl et al. 2023) on the inputs, a Gaussian for each pixel, as a method.
 
-    Gaussians start at :func:`photo_depth`. None is added or pruned: one for each pixel of each photograph is
-    more than the photographs determine. ``renderer``: draws inputs and targets. ``steps``: of the optimiser,
-    at least 1.
+    Gaussians start at :func:`photo_depth`. None is added or pruned: one for each pixel of each photograph
+    is more than the photographs determine.
+
+    Args:
+        renderer: Draws inputs and targets.
+        steps: Of the optimiser, at least 1.
     """
 
     renderer: Renderer

@@ -35,9 +35,16 @@ TITLES = {
 
 @dataclass(frozen=True)
 class Layout:
-    """Rows and groups of columns of a table. ``rows``: ``ablation`` (all four combinations) or ``methods``.
-    ``columns``: one group for each of ``views`` or ``data``. ``heading`` of each group: ``views``, ``data``
-    or ``none``. ``reported``: the paper's table whose figures are shown beside the measured ones."""
+    """Rows and groups of columns of a table.
+
+    Attributes:
+        name: Of the layout, for ``ghgs table``.
+        rows: ``ablation`` (all four combinations) or ``methods``.
+        columns: One group for each of ``views`` or ``data``.
+        views: Numbers of input views that are shown.
+        heading: Of each group: ``views``, ``data`` or ``none``.
+        reported: The paper's table whose figures are shown beside the measured ones; None: none.
+    """
 
     name: str
     rows: str
@@ -58,8 +65,17 @@ LAYOUTS = {
 
 @dataclass(frozen=True)
 class TableOptions:
-    """What a table shows. ``views``, ``targets``, ``metrics``: a selection; None: those of the layout and the
-    runs. ``unit``: regular expression whose first group is the person, if subjects are frames of people."""
+    """What a table shows.
+
+    Attributes:
+        layout: Rows and columns.
+        views: A selection of numbers of views; None: those of the layout.
+        targets: A selection of target protocols; None: those of the runs.
+        metrics: A selection of metrics; None: those of the runs.
+        reported: Whether the paper's figures are shown where the layout has some.
+        test: How rows are compared.
+        unit: Regular expression whose first group is the person, if subjects are frames of people.
+    """
 
     layout: Layout
     views: tuple[int, ...] | None = None
@@ -154,12 +170,23 @@ CELL = ["line", "group", "metric"]
 class Table:
     """A table, with everything that a writer of a format needs.
 
-    ``rows``: measurements, as in :class:`Sweep`. ``planned``: training runs of the table, finished or not.
-    ``configs``: configuration of our model by ``source``. ``cells``, by ``CELL``: ``mean`` over subjects and
-    seeds (nan: no number), ``deviation`` over seeds, ``seeds`` and ``lacking`` (seeds of planned runs without
-    results) as tuples, ``count`` of subjects, ``runs`` (hashes or files), ``best`` (of its column, as
-    printed), ``test`` (a :class:`Comparison` or None), ``marked`` (significant). ``reported_on``: data of the
-    reported figures, if any.
+    Attributes:
+        options: What it shows.
+        rows: Measurements, as in :class:`Sweep`.
+        planned: Training runs of the table, finished or not.
+        configs: Configuration of our model by ``source``.
+        stub: Headings of the columns that name a row.
+        groups: Groups of columns.
+        metrics: Names of the metrics of each group.
+        lines: Rows of the table.
+        cells: By ``CELL``: ``mean`` over subjects and seeds (nan: no number), ``deviation`` over seeds,
+            ``seeds`` and ``lacking`` (seeds of planned runs without results) as tuples, ``count`` of
+            subjects, ``runs`` (hashes or files), ``best`` (of its column, as printed), ``test`` (a
+            :class:`Comparison` or None), ``marked`` (significant).
+        caption: Above the table.
+        notes: Below the table.
+        reported_on: Data of the reported figures, if any.
+        comparisons: Number of comparisons that are corrected together.
     """
 
     options: TableOptions
@@ -182,7 +209,11 @@ class Table:
 
     @property
     def tested(self) -> list[str]:
-        """Metrics that are tested: the option's, else the first that subjects have. InputError: others."""
+        """Metrics that are tested: the option's, else the first that subjects have.
+
+        Raises:
+            InputError: The option names a metric that the table lacks.
+        """
         chosen = self.options.test.metrics
         if chosen is None:
             return [name for name in self.metrics if name not in TRAINING][:1]

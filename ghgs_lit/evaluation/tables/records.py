@@ -46,11 +46,16 @@ _ENCODER_KEYS = ("width", "heads", "depth", "layers", "vit")
 class Variant:
     """Identity of a row of a table.
 
-    ``kind``: ``model`` (ours), ``baseline``, ``other`` (another method) or ``reported`` (by the paper).
-    ``ablation``: the option that was chosen; empty for other methods. ``switches``: whether its 3D
-    unprojection and semantic consistency are on. ``has_semantics``: whether the semantic features were
-    trained (published weights or `ghgs pretext`); unknown before training starts, so it does not distinguish
-    rows. ``extra``: further configuration keys and values that do.
+    Attributes:
+        kind: ``model`` (ours), ``baseline``, ``other`` (another method) or ``reported`` (by the paper).
+        name: Of the method.
+        model: Name of the model, with what sets it apart from the shipped one; empty for other methods.
+        encoder: Name of its encoder; empty for other methods.
+        ablation: The option that was chosen; empty for other methods.
+        switches: Whether its 3D unprojection and semantic consistency are on.
+        has_semantics: Whether the semantic features were trained (published weights or `ghgs pretext`);
+            unknown before training starts, so it does not distinguish rows.
+        extra: Further configuration keys and values that do.
     """
 
     kind: str
@@ -75,7 +80,14 @@ class Variant:
 
 @dataclass(frozen=True)
 class Planned:
-    """A training run, finished or not, with the cells that it fills."""
+    """A training run with the cells that it fills.
+
+    Attributes:
+        variant: Row of its cells.
+        data: Name of its data set.
+        seed: Of the run.
+        done: Whether it has results.
+    """
 
     variant: Variant
     data: str
@@ -85,10 +97,15 @@ class Planned:
 
 @dataclass
 class Sweep:
-    """All runs below the directories of a sweep. ``rows``: one for each run, method, number of views, target
-    protocol and subject, with ``variant``, ``SETTING``, ``views``, ``seed``, ``source`` (the file), ``run``
-    (the configuration's hash), ``git`` (in words), ``subject``, and the metrics, averaged over the subject's
-    targets. ``configs``: configuration of our model by ``source``."""
+    """All runs below the directories of a sweep.
+
+    Attributes:
+        rows: One for each run, method, number of views, target protocol and subject, with ``variant``,
+            ``SETTING``, ``views``, ``seed``, ``source`` (the file), ``run`` (the configuration's hash),
+            ``git`` (in words), ``subject``, and the metrics, averaged over the subject's targets.
+        planned: Training runs, finished or not.
+        configs: Configuration of our model by ``source``.
+    """
 
     rows: pd.DataFrame = field(default_factory=pd.DataFrame)
     planned: list[Planned] = field(default_factory=list)
@@ -261,7 +278,12 @@ def _read_run(path: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
 
 
 def _with_variants(rows: pd.DataFrame, model: Variant | None) -> pd.DataFrame:
-    """Rows of a run whose ``method`` is replaced by their ``variant``; ``model``: that of the model's."""
+    """Rows of a run whose ``method`` is replaced by their ``variant``.
+
+    Args:
+        rows: Of one run.
+        model: Variant of the model's rows; None: there are none.
+    """
     variants = {name: model if name == METHOD else Variant("baseline", name) for name in rows["method"]}
     return rows.drop(columns="method").assign(variant=[variants[name] for name in rows["method"]])
 

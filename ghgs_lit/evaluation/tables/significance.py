@@ -26,10 +26,22 @@ RATIO = 2.0
 @dataclass(frozen=True)
 class Comparison:
     """Comparison of a row with the reference row of its column, on the seeds and subjects that both have.
-    ``difference``: mean of row minus reference; None without pairs. ``low``, ``high``: its interval at level
-    1 - alpha, not corrected. ``p``: two-sided p-value, ``corrected`` by Holm. ``error``: standard error, with
-    ``freedom``. ``smallest``: the difference that is found with a probability of ``POWER`` among all
-    comparisons of the table. Interval, p-values and these are None with fewer than two seeds or subjects."""
+
+    Interval, p-values and all that follows from them are None with fewer than two seeds or subjects.
+
+    Attributes:
+        seeds: Number of seeds.
+        subjects: Number of subjects.
+        difference: Mean of row minus reference; None without pairs.
+        low: Lower end of its interval at level 1 - alpha, not corrected.
+        high: Upper end of that interval.
+        p: Two-sided p-value.
+        corrected: The same, corrected by Holm.
+        error: Standard error of the difference.
+        freedom: Degrees of freedom of the error.
+        smallest: The difference that is found with a probability of ``POWER`` among all comparisons of the
+            table.
+    """
 
     seeds: int
     subjects: int
@@ -45,7 +57,13 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Pool:
-    """Variance of a row over seeds, pooled over ``rows``; ``freedom``: degrees of freedom, 0 if unknown."""
+    """Variance of a row over seeds, pooled over several rows.
+
+    Attributes:
+        variance: The pooled variance.
+        freedom: Degrees of freedom, 0 if unknown.
+        rows: Number of rows.
+    """
 
     variance: float
     freedom: int

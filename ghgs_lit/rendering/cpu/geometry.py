@@ -111,7 +111,13 @@ def camera_points(view, mean):
 
 @helper
 def clamped(view, x, y):
-    """x / z and y / z clamped to the frame and its margin, for the Jacobian."""
+    """x / z and y / z clamped to the frame and its margin, for the Jacobian.
+
+    Args:
+        view: a camera, [VIEW].
+        x: x / z.
+        y: y / z.
+    """
     x = simd.minimum(simd.maximum(x, view[layout.X_LOW]), view[layout.X_HIGH])
     y = simd.minimum(simd.maximum(y, view[layout.Y_LOW]), view[layout.Y_HIGH])
     return x, y
