@@ -91,8 +91,11 @@ class _Scene:
 
 
 class Playback:
-    """Predictions of a model, played back where they can be. ``recorder``: makes and keeps recordings, two
-    for each class."""
+    """Predictions of a model, played back where they can be.
+
+    Args:
+        recorder: makes and keeps recordings, two for each class of scenes; None: one that keeps 16.
+    """
 
     def __init__(self, recorder: Recorder | None = None):
         self.recorder = recorder or Recorder(limit=16)

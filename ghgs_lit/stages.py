@@ -34,8 +34,11 @@ OPTIONS = ("rounds", "skip", "model")
 
 
 class Bounds(Protocol):
-    """Near and far of each pixel's ray; options: ``build()``. ``is_bounded`` is false for a stage that gives
-    None; it needs a depth head without bounds."""
+    """Near and far of each pixel's ray; options: ``build()``.
+
+    Attributes:
+        is_bounded: false for a stage that gives None; it needs a depth head without bounds.
+    """
 
     is_bounded: bool
 
@@ -52,8 +55,14 @@ class Bounds(Protocol):
 
 class Encoder(Protocol):
     """Photographs to tokens; options: ``build(tokens, margin)``, which choose the patches (``conf/skip``).
-    ``dim_latent`` is the width of a layer of the tokens, ``patch_size`` the side of a patch in pixels,
-    ``bounds_input``: bounds are read. ``tokens`` and ``margin`` can be set later and change ``keeps``."""
+
+    Attributes:
+        dim_latent: width of a layer of the tokens.
+        patch_size: side of a patch in pixels.
+        bounds_input: whether bounds are read.
+        tokens: which patches have tokens; can be set later, as can ``margin``, and changes :meth:`keeps`.
+        margin: patches around these that have some, too.
+    """
 
     dim_latent: int
     patch_size: int
@@ -86,7 +95,11 @@ class Encoder(Protocol):
 
 
 class DepthHead(Protocol):
-    """Tokens to depths, between bounds where ``is_bounded``; options: ``build(dim_latent)``."""
+    """Tokens to depths; options: ``build(dim_latent)``.
+
+    Attributes:
+        is_bounded: whether depths lie between bounds, which are then needed.
+    """
 
     is_bounded: bool
 
@@ -118,8 +131,11 @@ class Unprojection(Protocol):
 
 
 class Recalibration(Protocol):
-    """Tokens to tokens; options: ``build(dim_latent)``. ``tokens``: ``all`` with background tokens, for which
-    all pixels need a depth; else ``subject``."""
+    """Tokens to tokens; options: ``build(dim_latent)``.
+
+    Attributes:
+        tokens: ``all`` with background tokens, for which all pixels need a depth; else ``subject``.
+    """
 
     tokens: DecodedPixels
 
@@ -134,8 +150,13 @@ class Recalibration(Protocol):
 
 
 class GaussianHead(Protocol):
-    """Tokens to Gaussians in two steps; options: ``build(dim_latent)``. The first may give any type, but
-    rounds need :class:`ghgs_lit.heads.gaussian.RawGaussians` with descriptors of width ``channels``."""
+    """Tokens to Gaussians in two steps; options: ``build(dim_latent)``.
+
+    The first step may give any type, but rounds need :class:`ghgs_lit.heads.gaussian.RawGaussians`.
+
+    Attributes:
+        channels: width of the descriptors of these.
+    """
 
     channels: int
 
@@ -185,7 +206,11 @@ class Renderer(Protocol):
 
 
 class Loss(Protocol):
-    """The training objective; options: ``build()``. ``reads_depths``: true depths must be loaded."""
+    """The training objective; options: ``build()``.
+
+    Attributes:
+        reads_depths: whether true depths must be loaded.
+    """
 
     reads_depths: bool
 

@@ -162,8 +162,11 @@ class ModelOptions(Options):
 
 
 class Surrounding:
-    """A layer around the stages for one batch; ``leave`` may use what ``enter`` found. ``findings``: what
-    ``enter`` expects of values, to be read later."""
+    """A layer around the stages for one batch; :meth:`leave` may use what :meth:`enter` found.
+
+    Attributes:
+        findings: what :meth:`enter` expects of values, to be read later.
+    """
 
     findings: Sequence[Finding] = ()
 
@@ -225,7 +228,12 @@ class Border(Surrounding):
 
 
 def side_multiple(options: ModelOptions, patch_size: int) -> int:
-    """The number of pixels that must divide height and width of photographs."""
+    """The number of pixels that must divide height and width of photographs.
+
+    Args:
+        options: with a border, any size will do.
+        patch_size: of the encoder, in pixels.
+    """
     return 1 if options.pad == "multiple" else patch_size
 
 

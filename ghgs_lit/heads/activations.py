@@ -20,7 +20,14 @@ class _Saturate(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, x: Tensor, limit: float, symmetric: bool) -> Tensor:
-        """``x``: raw values. ``limit``: largest argument. ``symmetric``: tanh instead of sigmoid."""
+        """The activation of ``x`` within its limit.
+
+        Args:
+            ctx: of autograd.
+            x: raw values.
+            limit: largest argument.
+            symmetric: tanh instead of sigmoid.
+        """
         ctx.save_for_backward(x)
         ctx.limit = limit
         ctx.symmetric = symmetric
@@ -63,7 +70,7 @@ def bounded_tanh(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 
 def confidence_of(raw: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """A confidence of at least 1, as in published heads, finite for any raw value."""
+    """A confidence of at least 1, as in published heads (VGGT), finite for any raw value but NaN."""
     return 1 + raw.clamp(max=EXP_LIMIT).exp()
 
 

@@ -85,8 +85,20 @@ RAW_VALUES = sum(_WIDTHS)
 
 @dataclass(frozen=True)
 class RawGaussians:
-    """Attributes before their activations, and the descriptors that they are computed from. ``real``: which
-    rows become Gaussians, others get opacity 0; None: all."""
+    """Attributes before their activations, and the descriptors that they are computed from.
+
+    Attributes:
+        descriptors: of the Gaussians' pixels, from the dense head.
+        offset: from the point of the pixel.
+        scale: along three axes.
+        rotation: a quaternion less the one without rotation, where attributes are in footprints.
+        opacity: 0 is the start of training, where attributes are in footprints.
+        color: change of the pixel's colour; None: none.
+        image: numbers of the images (``b * V + v``) that the Gaussians belong to, ascending.
+        pixel: row-major indices of their pixels.
+        splits: number of rows of each element.
+        real: which rows become Gaussians, others get opacity 0; None: all.
+    """
 
     descriptors: Float[Tensor, "N c"]
     offset: Float[Tensor, "N 3"]

@@ -80,7 +80,11 @@ class Rows:
         return cls(index.flatten(), (size,) * groups, images, (order <= total).flatten())
 
     def only(self, valid: Bool[Tensor, "..."]) -> "Rows":
-        """The rows that are ``valid``: others are left out, or no longer real where rows are filled."""
+        """The rows that are valid: others are left out, or no longer real where rows are filled.
+
+        Args:
+            valid: of all pixels or tokens, in any shape.
+        """
         stays = valid.flatten()[self.index]
         if self.real is not None:
             return dataclasses.replace(self, real=self.real & stays)
@@ -105,12 +109,20 @@ class Rows:
         return row_of >= 0, row_of.clamp(min=0)
 
     def within(self, images: slice) -> slice:
-        """The rows of consecutive images, which are whole groups."""
+        """The rows of consecutive images.
+
+        Args:
+            images: their numbers ``b * V + v``; whole groups.
+        """
         first = images.start // self.images
         last = images.stop // self.images
         return slice(sum(self.counts[:first]), sum(self.counts[:last]))
 
     def splits(self, images: int) -> tuple[int, ...]:
-        """The number of rows of each element of ``images`` images."""
+        """The number of rows of each element.
+
+        Args:
+            images: number of images of an element; whole groups.
+        """
         step = images // self.images
         return tuple(sum(self.counts[first : first + step]) for first in range(0, len(self.counts), step))

@@ -52,7 +52,12 @@ class Windows(NamedTuple):
 
     @classmethod
     def of(cls, raw: RawGaussians, batch: Batch) -> "Windows":
-        """Positions in maps of the size of the largest subject, each of which begins at its own subject."""
+        """Positions in maps of the size of the largest subject, each of which begins at its own subject.
+
+        Args:
+            raw: Gaussians of the batch, with the pixels that they belong to.
+            batch: its extents are read, or known from a plan.
+        """
         filled = [extent for extent in batch.extents if extent.count]
         height = max((extent.bottom - extent.top for extent in filled), default=1)
         width = max((extent.right - extent.left for extent in filled), default=1)
@@ -186,7 +191,12 @@ Activate = Callable[[RawGaussians, Batch, Points, DepthMaps], Gaussians]
 
 
 def replaced(activate: Activate, training: bool) -> Activate:
-    """``activate`` for Gaussians that the next round replaces: in training without a gradient."""
+    """``activate`` for Gaussians that the next round replaces.
+
+    Args:
+        activate: gives Gaussians from their raw attributes.
+        training: whether these are made without a gradient, which the loss would not need.
+    """
     return torch.no_grad()(activate) if training else activate
 
 

@@ -28,8 +28,8 @@ def remembered(
 ) -> Float[Tensor, "N h"]:
     """``tanh(before + memory(update(seen, known, before)))``, differentiable in ``before`` and the layers.
 
-    As :meth:`ghgs_lit.rounds.Rounds._remembered`. ``seen``: results of ``view`` for the Gaussian's own view,
-    and their mean and maximum over the other views.
+    As :meth:`ghgs_lit.rounds.Rounds._remembered`; what is seen are results of ``view`` for the Gaussian's own
+    view, and their mean and maximum over the other views.
 
     Args:
         view: two layers, for each view.
