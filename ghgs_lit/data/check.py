@@ -334,7 +334,8 @@ def _in_both(root: str, phases: dict[str, Phase]) -> list[str]:
     """Problems: subjects, or photographs under different names, in both ``train`` and ``val``."""
     if set(phases) != set(PHASES):
         return []
-    train, val = (phases[phase] for phase in PHASES)
+    train = phases["train"]
+    val = phases["val"]
     both = sorted(set(train.reader.subjects) & set(val.reader.subjects))
     lines = [f"{root}: expected each subject in train or in val; found {name!r} in both" for name in both]
     trained = {one.digest: one for one in train.seen if one.digest is not None}

@@ -114,9 +114,11 @@ def save_sheet(rows: Mapping[str, Sequence[tuple[str, Tile]]], path: Path) -> No
         rows: (label, tile) pairs by subject.
         path: of the picture.
     """
-    width = max(sum(tile.shape[1] + 2 for _, tile in tiles) for tiles in rows.values())
+    widths = []
+    for tiles in rows.values():
+        widths.append(sum(tile.shape[1] + 2 for _, tile in tiles))
     step = _HEIGHT + 2 * _LINE
-    sheet = Image.new("RGB", (width, step * len(rows)))
+    sheet = Image.new("RGB", (max(widths), step * len(rows)))
     draw = ImageDraw.Draw(sheet)
     for n, (name, tiles) in enumerate(rows.items()):
         draw.text((2, n * step), name, "white")

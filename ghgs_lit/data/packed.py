@@ -253,7 +253,8 @@ def _packed(view: View) -> tuple[tuple[int, ...], np.ndarray]:
         if array.ndim == 2:
             shown = shown | (array != 0)
     shown[0, 0] |= not shown.any()  # a part has a pixel
-    rows, columns = (np.flatnonzero(shown.any(axis)) for axis in (1, 0))
+    rows = np.flatnonzero(shown.any(1))
+    columns = np.flatnonzero(shown.any(0))
     top = int(rows[0])
     bottom = int(rows[-1]) + 1
     left = int(columns[0])

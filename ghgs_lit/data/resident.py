@@ -315,8 +315,9 @@ def _depths(inverse: Int[Tensor, "*batch h w"]) -> Float[Tensor, "*batch h w"]:
 
 def _area_means(maps: Shaped[Tensor, "*batch H W"], size: Size) -> Float[Tensor, "*batch h w"]:
     """Means over the areas of new pixels."""
-    old = tuple(maps.shape[-2:])
-    down, across = (_weights(*pair, maps.device) for pair in zip(old, size, strict=True))
+    height, width = maps.shape[-2:]
+    down = _weights(height, size[0], maps.device)
+    across = _weights(width, size[1], maps.device)
     with exact(maps.device.type):
         return down @ maps.float() @ across.T
 

@@ -114,7 +114,8 @@ def release_mask(mask: np.ndarray, height: int, width: int) -> np.ndarray:
         [height, width].
     """
     h, w = mask.shape
-    rows, columns = (np.arange(n) * old // n for n, old in ((height, h), (width, w)))
+    rows = np.arange(height) * h // height
+    columns = np.arange(width) * w // width
     return np.ascontiguousarray(mask[rows[:, None], columns])
 
 

@@ -75,5 +75,6 @@ def operator(schema: str, plain: Callable[..., Any], room: str) -> Callable[...,
     _library.define(schema)
     _library.impl(name, plain, "CompositeExplicitAutograd")
     _library.impl(name, launch, "CUDA")
-    KERNELS[name], PLAIN[name] = launch, plain
+    KERNELS[name] = launch
+    PLAIN[name] = plain
     return getattr(torch.ops.ghgs_lit, name).default

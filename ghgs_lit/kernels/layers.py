@@ -6,7 +6,11 @@ Matrix products stay in registers: a tile of the result is ``ROWS`` x ``PANEL``;
 Values are stored by channel: a channel is a line of ``PANEL`` floats, one lane for each row. So the result of
 a layer is the input of the next without another layout. The gradient of a layer's input is a product with the
 transposed weights; that of its weights and biases is a sum over lanes, for which the input has a line of ones
-below its channels."""
+below its channels.
+
+``emit(context, builder, sig, args)`` writes the LLVM instructions of a function with ``@intrinsic``, which
+kernels call without its first parameter, Numba's ``typing_context``.
+"""
 
 from collections.abc import Sequence
 
@@ -153,11 +157,12 @@ def packed(numbers: Sequence[Tensor], transposed: bool = False) -> np.ndarray:
     """
     parts = []
     for weight, bias in _pairs(numbers):
-        weight, bias = (x.detach().numpy() for x in (weight, bias))
+        weight = weight.detach().numpy()
         weight = weight.T if transposed else weight
         outputs, inputs = weight.shape
         both = np.zeros((room(outputs), inputs + 1), np.float32)
-        both[:outputs, :-1], both[:outputs, -1] = weight, 0 if transposed else bias
+        both[:outputs, :-1] = weight
+        both[:outputs, -1] = 0 if transposed else bias.detach().numpy()
         parts += [both[:, :-1].reshape(-1, ROWS, inputs).swapaxes(1, 2).ravel(), both[:, -1]]
     return np.concatenate(parts)
 

@@ -119,7 +119,9 @@ def _sets_apart(override: str, shared: set[str]) -> bool:
 
 def _print_table(planned: Sequence[PlannedRun], columns: Mapping[str, Sequence[str]]) -> None:
     shared = _shared(planned)
-    overrides = [" ".join(o for o in item.shown if o not in shared) for item in planned]
+    overrides = []
+    for item in planned:
+        overrides.append(" ".join(o for o in item.shown if o not in shared))
     table = {"run": [item.name for item in planned], **columns, "overrides": overrides}
     print(tabulate(table, "keys", disable_numparse=True))
 

@@ -79,7 +79,8 @@ def launch() -> str | None:
 
 def slurm_job() -> str | None:
     """Name of the SLURM job, which it keeps when it is queued again; None: outside of SLURM."""
-    array, task = (os.environ.get(f"SLURM_ARRAY_{name}_ID") for name in ("JOB", "TASK"))
+    array = os.environ.get("SLURM_ARRAY_JOB_ID")
+    task = os.environ.get("SLURM_ARRAY_TASK_ID")
     return f"{array}_{task}" if array and task else os.environ.get("SLURM_JOB_ID")
 
 

@@ -81,7 +81,9 @@ def summarize(rows: Sequence[Row]) -> list[Row]:
     for (method, views, targets), subjects in by_protocol(rows).items():
         entry = {"method": method, "views": views, "targets": targets, "subjects": len(subjects)}
         for name in names:
-            of_subjects = [mean(row.get(name) for row in of_one) for of_one in subjects.values()]
+            of_subjects = []
+            for of_one in subjects.values():
+                of_subjects.append(mean(row.get(name) for row in of_one))
             entry[name] = mean(of_subjects)
         summary.append(entry)
     return summary
@@ -129,7 +131,8 @@ def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str,
         "seed": provenance.get("seed"),
         "config_hash": provenance.get("config_hash"),
     }
-    columns = [*(key for key in KEYS if any(key in row for row in rows)), *metric_names(rows), *origin]
+    known = set().union(*rows)
+    columns = [*(key for key in KEYS if key in known), *metric_names(rows), *origin]
     table = io.StringIO()
     writer = csv.DictWriter(table, columns, restval="", lineterminator="\n")
     writer.writeheader()

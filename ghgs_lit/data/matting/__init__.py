@@ -134,7 +134,8 @@ def refined_matte(
         Image and matte of the same sizes.
     """
     window = _window(matte > 127, int(pixels) + _AROUND)
-    colors, given = (torch.from_numpy(part[window] / np.float32(255)) for part in (image, matte))
+    colors = torch.from_numpy(image[window] / np.float32(255))
+    given = torch.from_numpy(matte[window] / np.float32(255))
     with torch.inference_mode():
         estimate, subject = _network()(colors.permute(2, 0, 1)[None], given[None])
     # Pixels near enough to the outline to change.

@@ -49,7 +49,8 @@ def read_annotations(path: Path) -> Annotations:
         InputError: it is missing, unsafe or broken, or an entry is bad.
     """
     content = load_npy(path)
-    cams, ims = (_entry(path, content, key) for key in ("cams", "ims"))
+    cams = _entry(path, content, "cams")
+    ims = _entry(path, content, "ims")
     lists = {key: _entry(f"{path}: cams", cams, key) for key in ("K", "D", "R", "T")}
     counts = {key: len(values) for key, values in lists.items()}
     if len(set(counts.values())) != 1 or not counts["K"]:

@@ -164,7 +164,8 @@ def _measured_lines(variants: list[Variant], planned: list[Planned], layout: Lay
     if layout.rows == "ablation":
         first = variants[0]
         papers = [replace(first, ablation=name, switches=pair) for pair, name in ABLATIONS.items()]
-        return [_ablation_line(variant) for variant in (*papers, *(v for v in begun if v.is_own))]
+        own = [variant for variant in begun if variant.is_own]
+        return [_ablation_line(variant) for variant in (*papers, *own)]
     order = ("baseline", "other", "model")
     models = [v for v in begun if v.kind == "model"]
     return [

@@ -25,7 +25,9 @@ def differing(
     flat = [flatten(config) for config in configs]
     keys = dict.fromkeys(key for values in flat for key in values)
     known = [key for key in keys if not is_below(key, expected)]
-    texts = {key: list(dict.fromkeys(str(values.get(key, ABSENT)) for values in flat)) for key in known}
+    texts = {}
+    for key in known:
+        texts[key] = list(dict.fromkeys(str(values.get(key, ABSENT)) for values in flat))
     return {key: values for key, values in texts.items() if len(values) > 1}
 
 

@@ -170,7 +170,9 @@ def _about_training(table: Table) -> list[str]:
     notes = []
     if "steps" in ours and ours["steps"].nunique() > 1:
         steps = ours.dropna(subset="steps").groupby("variant", sort=False)["steps"].agg(list)
-        rows = [f"{stubs[variant]}: {_range([round(n) for n in each])}" for variant, each in steps.items()]
+        rows = []
+        for variant, counts in steps.items():
+            rows.append(f"{stubs[variant]}: {_range([round(count) for count in counts])}")
         notes.append(f"Rows were trained for different numbers of steps ({'; '.join(rows)}).")
     seeds = ours.groupby("variant", sort=False)["seed"].unique().map(sorted)
     if seeds.map(tuple).nunique() > 1:

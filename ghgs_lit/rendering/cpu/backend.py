@@ -116,9 +116,12 @@ def _view_rows(cameras: Cameras, settings: RasterSettings) -> np.ndarray:
         focal = intrinsics[:, axis, axis]
         center = intrinsics[:, axis, 2]
         margin = settings.frustum_margin * 0.5 * size / focal
-        rows[:, layout.FX + axis], rows[:, layout.CX + axis] = focal, center
-        rows[:, low], rows[:, low + 1] = -center / focal - margin, (size - center) / focal + margin
-    rows[:, layout.RIGHT], rows[:, layout.BOTTOM] = cameras.width - 1, cameras.height - 1
+        rows[:, layout.FX + axis] = focal
+        rows[:, layout.CX + axis] = center
+        rows[:, low] = -center / focal - margin
+        rows[:, low + 1] = (size - center) / focal + margin
+    rows[:, layout.RIGHT] = cameras.width - 1
+    rows[:, layout.BOTTOM] = cameras.height - 1
     rows[:, layout.ROTATION : layout.ROTATION + 9] = extrinsics[:, :3, :3].reshape(-1, 9)
     rows[:, layout.TRANSLATION : layout.TRANSLATION + 3] = extrinsics[:, :3, 3]
     return rows
@@ -196,8 +199,11 @@ def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differen
     Raises:
         InputError: the lists and, if ``differentiable``, their gradients would exceed :data:`_MEMORY`.
     """
-    settings, (tiles_x, tiles_y), total = plan.settings, plan.tiles, plan.splats
-    (elements, views), parts = plan.shape, plan.parts
+    settings = plan.settings
+    tiles_x, tiles_y = plan.tiles
+    total = plan.splats
+    elements, views = plan.shape
+    parts = plan.parts
     records = simd.aligned_floats(total * layout.RECORD).reshape(total, layout.RECORD)
     depths = np.empty((total, 1), np.float32)
     boxes = np.empty((total, 4), np.int32)
@@ -289,7 +295,9 @@ class _Rasterize(torch.autograd.Function):
         splats = _prepare(plan, *arrays, differentiable=any(ctx.needs_input_grad))
         channels = colors.shape[1]
         size = (plan.height, plan.width)
-        image, alpha, depth = (_zeros(*plan.shape, planes, *size) for planes in (channels, 1, 1))
+        image = _zeros(*plan.shape, channels, *size)
+        alpha = _zeros(*plan.shape, 1, *size)
+        depth = _zeros(*plan.shape, 1, *size)
         outputs = [_flat(t) for t in (image, alpha, depth)]
         pool.run([
             partial(

@@ -391,7 +391,8 @@ def forward(
                     live &= ~(1 << block)
             for k in range(chunk):
                 if hits[k] != 0:
-                    kept[kept_count, 0], kept[kept_count, 1] = hits[k], splats[k]
+                    kept[kept_count, 0] = hits[k]
+                    kept[kept_count, 1] = splats[k]
                     kept[kept_count, 2] = entries[order[i + k] & 0xFFFFFFFF, layout.SLOT]
                     reached[kept[kept_count, 2]] = 1
                     kept_count += 1

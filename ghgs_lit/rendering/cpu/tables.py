@@ -31,7 +31,8 @@ def _block_rows(context, builder, array_type, array, index, stride, index_type):
         index_type: Numba type of ``index`` and ``stride``.
     """
     data = context.make_array(array_type)(context, builder, array).data
-    position, step = (context.cast(builder, value, index_type, types.intp) for value in (index, stride))
+    position = context.cast(builder, index, index_type, types.intp)
+    step = context.cast(builder, stride, index_type, types.intp)
     kind = ir.VectorType(ir.FloatType(), 4).as_pointer()
     addresses = []
     for _ in range(4):
@@ -54,7 +55,8 @@ def load_block(typing_context, array, index, stride):
     def emit(context, builder, sig, args):
         rows = _block_rows(context, builder, array, *args, index)
         a, b, c, d = (builder.load(row, align=4) for row in rows)
-        upper, lower = (builder.shuffle_vector(x, y, indices(range(8))) for x, y in ((a, b), (c, d)))
+        upper = builder.shuffle_vector(a, b, indices(range(8)))
+        lower = builder.shuffle_vector(c, d, indices(range(8)))
         return builder.shuffle_vector(upper, lower, indices(range(16)))
 
     return floats(array, index, index), emit
