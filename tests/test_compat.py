@@ -14,6 +14,7 @@ from ghgs_lit.types import Batch, Cameras, DepthMaps, Tokens
 from ghgs_lit.weights import names
 from ghgs_lit.weights.switches import release_switches
 from tests.helpers.models import config, make_model
+from tests.helpers.plans import plan_of
 from tests.helpers.scenes import make_batch
 from tests.helpers.weights import PUBLISHED
 from tests.helpers.weights import config as imported_config
@@ -118,7 +119,7 @@ def test_no_value_of_the_head_flips_or_explodes_a_depth(name):
     for value in EXTREMES:
         with torch.no_grad():
             last.bias[0] = value
-        maps = head(packed, batch, SubjectBox()(batch))
+        maps = head(packed, batch, SubjectBox()(batch), plan_of(batch.masks))
         assert torch.equal(maps.valid, batch.masks)
         assert (maps.bounds.near > 0).all()
         assert (maps.depth >= maps.bounds.near * (1 - 1e-6)).all()
