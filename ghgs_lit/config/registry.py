@@ -311,6 +311,8 @@ def read_node(node: Any, key: str) -> Options:
     Raises:
         InputError: names the first wrong key, what was expected and what was found.
     """
+    if isinstance(node, Options):
+        return node
     group = key.split(".")[0]
     if not isinstance(node, Mapping):
         raise InputError(f"{key}: expected a mapping of its keys; found {shown(node)}")

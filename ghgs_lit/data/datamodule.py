@@ -10,6 +10,7 @@ import torch
 from lightning import LightningDataModule, Trainer
 from torch.utils.data import DataLoader
 
+from ghgs_lit.config.registry import read_node
 from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.batches import BatchBuilder, EvaluationBatches, StepSampler, TrainingBatches
 from ghgs_lit.data.options import LoadingOptions
@@ -64,7 +65,7 @@ def planned_batches(trainer: Trainer | None, length: int) -> float:
 
 def _protocols(targets: Targets | Sequence[Targets]) -> list[TargetProtocol]:
     several = targets if isinstance(targets, Sequence) and not isinstance(targets, str) else (targets,)
-    return [TargetProtocol.read(protocol, "targets") for protocol in several]
+    return [read_node(protocol, "targets") for protocol in several]
 
 
 class PhotographsDataModule(LightningDataModule):
@@ -91,9 +92,9 @@ class PhotographsDataModule(LightningDataModule):
     ) -> None:
         super().__init__()
         self.dataset = dataset
-        self.views = ViewProtocol.read(views, "views")
-        self.targets = TargetProtocol.read(targets, "targets")
-        self.augmentation = Augmentation.read(augmentation or {}, "augmentation")
+        self.views = read_node(views, "views")
+        self.targets = read_node(targets, "targets")
+        self.augmentation = read_node(augmentation or {}, "augmentation")
         dataset.check_targets(self.targets)
         self.seed = seed
         #: Whether training reads depth maps; evaluation reads them all the same, for its depth error.

@@ -93,6 +93,10 @@ class Frame:
         intrinsics = inside.intrinsics.to(world.intrinsics)
         return dataclasses.replace(world, intrinsics=intrinsics, extrinsics=extrinsics.to(world.extrinsics))
 
+    def in_world(self, dtype: torch.dtype) -> Float[Tensor, "B 4 3"]:
+        """Axes of each element in the world, as long as a metre, and its origin."""
+        return torch.cat((self.metre[:, None, None] * self.axes, self.origin[:, None]), 1).to(dtype)
+
     def leave(self, prediction: Prediction, dtype: torch.dtype) -> Prediction:
         """The prediction in the world.
 
@@ -110,15 +114,15 @@ class Frame:
         known: dict[Tensor, Tensor] = {}
         metre = self.metre.to(prediction.depth)[:, None, None, None]
         maps = _in_unit(prediction.depth_maps, metre, known)
-        world = torch.cat((self.metre[:, None, None] * self.axes, self.origin[:, None]), 1).to(dtype)
+        world = self.in_world(dtype)
         return dataclasses.replace(
             prediction,
             gaussians=self._gaussians(prediction.gaussians, views, world),
             depth=maps.depth,
             points=dataclasses.replace(
                 points,
-                pixels=_to_world(points.pixels, everyone[:, None, None, None], world),
-                tokens=_to_world(points.tokens, points.token_image // views, world),
+                pixels=to_world(points.pixels, everyone[:, None, None, None], world),
+                tokens=to_world(points.tokens, points.token_image // views, world),
             ),
             depth_maps=maps,
             rounds=tuple(_in_unit(each_round, metre, known) for each_round in prediction.rounds),
@@ -131,7 +135,7 @@ class Frame:
         turn = matrix_to_quaternion(self.axes.mT).to(gaussians.quaternions)
         return dataclasses.replace(
             gaussians,
-            means=_to_world(gaussians.means, element, world),
+            means=to_world(gaussians.means, element, world),
             quaternions=multiply_quaternions(turn[element], gaussians.quaternions),
             scales=gaussians.scales * lengths[element, None],
             metre=lengths if gaussians.metre is None else lengths * gaussians.metre,
@@ -150,7 +154,7 @@ def _in_unit(maps: DepthMaps, metre: Float[Tensor, "B 1 1 1"], known: dict[Tenso
     return dataclasses.replace(maps, depth=scaled(maps.depth), bounds=bounds)
 
 
-def _to_world(
+def to_world(
     points: Float[Tensor, "*n 3"], element: Int[Tensor, "*#n"], world: Float[Tensor, "B 4 3"]
 ) -> Float[Tensor, "*n 3"]:
     """Points in the world, computed in its precision; the error is that of rounding the result.

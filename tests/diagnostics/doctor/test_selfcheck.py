@@ -130,8 +130,8 @@ def test_a_weight_without_its_gradient_fails(monkeypatch):
     """The gradient of one stage of several is missing."""
     right = Recalibration.forward
 
-    def detached(self, tokens, points):
-        out = right(self, tokens, points)
+    def detached(self, tokens, points, plan):
+        out = right(self, tokens, points, plan)
         return out if out.latent[0].dtype == torch.float64 else out.detach()
 
     monkeypatch.setattr(Recalibration, "forward", detached)

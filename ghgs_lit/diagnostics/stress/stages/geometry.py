@@ -7,7 +7,7 @@ from ghgs_lit.bounds import VisualHull
 from ghgs_lit.bounds.rays import depths_in_box, ray_directions
 from ghgs_lit.diagnostics.stress import inputs
 from ghgs_lit.diagnostics.stress.stage import Stage, Values
-from ghgs_lit.geometry.frame import Frame
+from ghgs_lit.geometry.frame import Frame, to_world
 from ghgs_lit.geometry.masks import relative_bounds, relative_depth
 from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.geometry.photo_consistency import photo_consistency
@@ -182,7 +182,7 @@ def _frame(v: Values) -> Values:
     batch = batch_of(v)
     frame = Frame.of(batch)
     element = torch.arange(len(v["points"]))[:, None]
-    world = frame._to_world(v["points"], element, v["points"].dtype)
+    world = to_world(v["points"], element, frame.in_world(v["points"].dtype))
     return {"extrinsics": frame.enter(batch).cameras.extrinsics, "world": world}
 
 
