@@ -202,8 +202,9 @@ def test_several_workers_make_the_same_files(scans, reference, tmp_path, monkeyp
 def test_people_are_rendered_inside_a_worker_of_joblib(scans, reference, tmp_path):
     """A sweep with ``hydra/launcher=joblib`` makes its people in joblib's worker, in further processes."""
     loky = pytest.importorskip("joblib.externals.loky")
-    worker = loky.get_reusable_executor(max_workers=1)
-    worker.submit(render_boxes, tmp_path / "out", scans, 3, 1, settings=SMALL, workers=2).result()
+    # Not the executor that joblib shares in a process: it would lack what joblib gives its own.
+    with loky.ProcessPoolExecutor(max_workers=1) as worker:
+        worker.submit(render_boxes, tmp_path / "out", scans, 3, 1, settings=SMALL, workers=2).result()
     assert contents(tmp_path / "out") == reference
 
 
