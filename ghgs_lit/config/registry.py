@@ -12,7 +12,7 @@ import gc
 import importlib
 import importlib.metadata
 import importlib.util
-import json
+import marshal
 import os
 import pkgutil
 import sys
@@ -298,7 +298,7 @@ def class_of(group: str, kind: Any, key: str) -> type[Options]:
 
 
 #: Options of the nodes that were read, by class, key and values.
-_READ: dict[tuple[type[Options], str, str], Options] = {}
+_READ: dict[tuple[type[Options], str, bytes], Options] = {}
 
 
 def read_node(node: Any, key: str) -> Options:
@@ -319,11 +319,18 @@ def read_node(node: Any, key: str) -> Options:
     values = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else dict(node)
     kind = None if None in KINDS[group] else values.pop("kind", None)
     cls = class_of(group, kind, key)
-    # Options do not change: a node is read once in a process, whoever asks for it.
-    text = json.dumps(values, sort_keys=True, default=repr)
-    if (cls, key, text) not in _READ:
-        _READ[cls, key, text] = cls.read(values, key)
-    return _READ[cls, key, text]
+    # Options do not change: a node is read once in a process, whoever asks for it. Types and order count.
+    try:
+        known = (
+            cls,
+            key,
+            marshal.dumps(values, 2),
+        )  # version 2: without references, equal bytes
+    except ValueError:  # not plain data, as a Python user may give
+        return cls.read(values, key)
+    if known not in _READ:
+        _READ[known] = cls.read(values, key)
+    return _READ[known]
 
 
 def build(node: Any, key: str, **extra: Any) -> Any:

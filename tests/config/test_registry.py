@@ -6,6 +6,7 @@ import inspect
 import pkgutil
 from itertools import chain
 
+import numpy as np
 import pytest
 
 import ghgs_capture
@@ -141,3 +142,16 @@ def test_a_node_without_a_kind_names_those_that_there_are():
         build({}, "bounds")
     with pytest.raises(InputError, match=r"bounds: expected a mapping of its keys; found 'box'"):
         build("box", "bounds")
+
+
+def test_a_node_is_read_once_and_taken_for_no_other():
+    """The order of cameras is that of the views; printed arrays leave out their middle."""
+    node = {"kind": "people_in_rig", "cameras": {"left": {}, "right": {}}}
+    options = read_node(node, "data")
+    assert read_node(dict(node), "data") is options
+    turned = read_node({**node, "cameras": {"right": {}, "left": {}}}, "data")
+    assert (list(options.cameras), list(turned.cameras)) == (["left", "right"], ["right", "left"])
+    arrays = [np.zeros(2000), np.zeros(2000)]
+    arrays[1][1000] = 1
+    read = [read_node({**node, "cameras": {"left": array}}, "data").cameras["left"] for array in arrays]
+    assert [array.sum() for array in read] == [0, 1]
