@@ -45,11 +45,16 @@ class SemanticAttention(nn.Module):
             multiplies by s (Eq. 3), ``product_clamped`` by max(s, 0) (the authors' release), ``log`` adds
             log(max(s, S_MIN)), which lowers the weight of dissimilar neighbours instead of pulling their
             logit to 0, ``none`` ignores it (s = 1).
+        has_places: whether the value of a neighbour also says where it lies from the query, by a linear map
+            of the difference of their places that starts at 0 (not the paper's). By linearity that is the map
+            of a head's mean place minus the query's: no tensor of all pairs.
 
     Raises:
         InputError: the heads do not divide C / 4."""
 
-    def __init__(self, dim: int, num_heads: int = 8, similarity: Similarity = "product"):
+    def __init__(
+        self, dim: int, num_heads: int = 8, similarity: Similarity = "product", has_places: bool = False
+    ):
         super().__init__()
         expected = f"heads that divide a quarter of the token width ({dim} / 4)"
         require(dim % (4 * num_heads) == 0, "recalibration.num_heads", expected, num_heads)
@@ -65,6 +70,10 @@ class SemanticAttention(nn.Module):
         self.o_proj = Linear(inner, dim)
         self.norm2 = nn.LayerNorm(dim)
         self.mlp = nn.Sequential(Linear(dim, dim), nn.GELU(), Linear(dim, dim))
+        self.place_proj = None
+        if has_places:
+            self.place_proj = nn.Linear(3, inner, bias=False)
+            nn.init.zeros_(self.place_proj.weight)
 
     def forward(
         self,
@@ -72,6 +81,7 @@ class SemanticAttention(nn.Module):
         neighbors: Sequence[Tensor],
         cosines: Sequence[Tensor] | None,
         left_out: Float[Tensor, "N k"] | None = None,
+        places: Sequence[Tensor] | None = None,
     ) -> Float[Tensor, "N C"]:
         """Recalibrated tokens.
 
@@ -81,12 +91,14 @@ class SemanticAttention(nn.Module):
             cosines: of the same shapes, if they are used.
             left_out: of one element, -inf where a neighbour does not count, else 0; one of each token counts
                 at least; None: all.
+            places: for each element [n_b, 3], in units of the subject; read with ``has_places``.
 
         Returns:
             Tokens [N, C] in the same order.
         """
         counts = [len(near) for near in neighbors]
-        elements = zip(x.split(counts), neighbors, cosines or [None] * len(counts), strict=True)
+        nothing = [None] * len(counts)
+        elements = zip(x.split(counts), neighbors, cosines or nothing, places or nothing, strict=True)
         results = [self._recalibrate_element(*element, left_out) for element in elements]
         return results[0] if len(results) == 1 else torch.cat(results)
 
@@ -116,6 +128,7 @@ class SemanticAttention(nn.Module):
         x: Float[Tensor, "n C"],
         near: Int[Tensor, "n k"],
         cosines: Float[Tensor, "n k"] | None,
+        places: Float[Tensor, "n 3"] | None,
         left_out: Float[Tensor, "n k"] | None,
     ) -> Float[Tensor, "n C"]:
         """Recalibrate one element: keys and values of all tokens first, then the tokens in parts.
@@ -124,6 +137,7 @@ class SemanticAttention(nn.Module):
             x: its tokens [n, C].
             near: neighbours of each, as indices among them [n, k].
             cosines: of tokens and neighbours [n, k], if they are used.
+            places: of the tokens [n, 3]; None: values know none.
             left_out: -inf where a neighbour does not count, else 0 [n, k]; None: all count.
 
         Returns:
@@ -137,24 +151,49 @@ class SemanticAttention(nn.Module):
             return at_least_float32(torch.cat((k_proj(normed), v_proj(normed)), dim=-1))
 
         k, v = _in_parts(keys_values, len(x), x.device).chunk(2, dim=-1)
+        if places is not None:
+            places = places.to(v.dtype)
+            v = self._with_places(v, places)
 
         def recalibrate(rows: slice) -> Float[Tensor, "m C"]:
             q = at_least_float32(q_proj(self.norm1(x[rows])))
             y = self._attend(q, k, v, near[rows], self._changes(cosines, left_out, rows))
+            if places is not None:
+                y = self._moved(y, places[rows])
             residual = x[rows] + o_proj(y)
             # One expression, so that the input of each layer is freed before the next one runs.
             return residual + mlp_out(self.mlp[1](mlp_in(self.norm2(residual))))
 
         return _in_parts(recalibrate, len(x), x.device)
 
+    def _with_places(self, v: Float[Tensor, "n i"], places: Float[Tensor, "n 3"]) -> Float[Tensor, "n j"]:
+        """Values with the place of their token behind the channels of each head, j = i + 3 a."""
+        heads = v.unflatten(1, (self.num_heads, -1))
+        return torch.cat((heads, places[:, None].expand(-1, self.num_heads, -1)), dim=-1).flatten(1)
+
+    def _moved(self, y: Float[Tensor, "m j"], places: Float[Tensor, "m 3"]) -> Float[Tensor, "m i"]:
+        """Weighted values of m tokens with what the places of their neighbours add, in float32 or wider.
+
+        Args:
+            y: weighted values of :meth:`_with_places`.
+            places: of the m tokens.
+
+        Returns:
+            Values [m, i], heads concatenated.
+        """
+        values, mean = y.unflatten(1, (self.num_heads, -1)).tensor_split([-3], dim=-1)
+        weight = self.place_proj.weight.to(y.dtype).unflatten(0, (self.num_heads, -1))
+        with exact(y.device.type):
+            return (values + torch.einsum("max,aix->mai", mean - places[:, None], weight)).flatten(1)
+
     def _attend(
         self,
         q: Float[Tensor, "m i"],
         k: Float[Tensor, "n i"],
-        v: Float[Tensor, "n i"],
+        v: Float[Tensor, "n j"],
         near: Int[Tensor, "m k"],
         changes: Changes | None,
-    ) -> Float[Tensor, "m i"]:
+    ) -> Float[Tensor, "m j"]:
         """Weighted values of the neighbours of ``m`` tokens (Eq. 3), in float32 or wider.
 
         On a CPU by a product with all tokens: faster than gathering, without a tensor of size m x k x C.
@@ -162,12 +201,12 @@ class SemanticAttention(nn.Module):
         Args:
             q: queries of these tokens [m, i].
             k: keys of all tokens of the element [n, i].
-            v: their values [n, i].
+            v: their values [n, j].
             near: neighbours of the m tokens [m, k].
             changes: what logits are multiplied by, and what is added [m, k]; None: nothing.
 
         Returns:
-            Values [m, i], heads concatenated.
+            Values [m, j], heads concatenated.
         """
         with exact(q.device.type):
             if q.device.type != "cpu" or self.num_heads * len(q) * len(k) > _SCORES:
@@ -187,10 +226,10 @@ class SemanticAttention(nn.Module):
         self,
         q: Float[Tensor, "m i"],
         k: Float[Tensor, "n i"],
-        v: Float[Tensor, "n i"],
+        v: Float[Tensor, "n j"],
         near: Int[Tensor, "m k"],
         changes: Changes,
-    ) -> Float[Tensor, "m i"]:
+    ) -> Float[Tensor, "m j"]:
         """Eq. 3 with gathered keys and values of neighbours; nothing is as large as the square of the tokens.
 
         If there are several parts, the backward pass computes each again.
@@ -198,12 +237,12 @@ class SemanticAttention(nn.Module):
         Args:
             q: queries of m tokens [m, i].
             k: keys of all tokens of the element [n, i].
-            v: their values [n, i].
+            v: their values [n, j].
             near: neighbours of the m tokens [m, k].
             changes: what logits are multiplied by, and what is added, of shapes that broadcast to [m, k].
 
         Returns:
-            Values [m, i], heads concatenated.
+            Values [m, j], heads concatenated.
         """
         factor, bias = (x.expand(near.shape) for x in changes)
 
@@ -213,12 +252,12 @@ class SemanticAttention(nn.Module):
             Args:
                 q: queries of the part [p, i].
                 k: keys of all tokens of the element [n, i].
-                v: their values [n, i].
+                v: their values [n, j].
                 index: neighbours of the part's tokens [p, k].
                 others: factor and bias of their logits [p, k].
 
             Returns:
-                Values [p, i], heads concatenated.
+                Values [p, j], heads concatenated.
             """
             weights = self._weights(q, k[index], *others)
             return (weights[..., None] * v[index].unflatten(-1, (self.num_heads, -1))).sum(1).flatten(1)

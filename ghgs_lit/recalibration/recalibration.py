@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from ghgs_lit.config.options import Count, Options, Width
@@ -42,6 +42,15 @@ class RecalibrationOptions(Options):
     tokens in pixels, as if all views were one (ablation: no unprojection)"""
     tokens: Literal["subject", "all"] = "subject"
     """Tokens that take part: subject, those with a point on the subject | all (the release)"""
+    positions: Literal["none", "relative"] = "none"
+    """What values of attention know of places: none (the paper) | relative: where each neighbour lies from
+    the token, in units of the subject (not the paper's; with neighborhood=xyz)"""
+
+    @model_validator(mode="after")
+    def _places_are_3d(self) -> "RecalibrationOptions":
+        fits = self.positions == "none" or self.neighborhood == "xyz"
+        self.require(fits, "positions", "none with neighborhood=image_plane, where tokens have no 3D points")
+        return self
 
     def build(self, dim_latent: int) -> "Recalibration":
         """The stage.
@@ -66,7 +75,8 @@ class Recalibration(nn.Module):
         self.k = options.k
         self.neighborhood = options.neighborhood
         self.tokens = options.tokens
-        self.block = SemanticAttention(dim_latent, options.num_heads, options.similarity)
+        self.has_places = options.positions == "relative"
+        self.block = SemanticAttention(dim_latent, options.num_heads, options.similarity, self.has_places)
 
     def forward(self, tokens: Tokens, points: Points, plan: Plan) -> Tokens:
         """Tokens with recalibrated layers; semantic features and order are unchanged.
@@ -101,9 +111,13 @@ class Recalibration(nn.Module):
         if self.block.similarity != "none":
             semantic = part(tokens.semantic).split(counts)
             cosines = [neighbor_cosines(*pair) for pair in zip(semantic, neighbors, strict=True)]
+        around = None
+        if self.has_places:
+            pairs = zip(*(part(x).split(counts) for x in (points.tokens, points.tokens_valid)), strict=True)
+            around = [places_around(*pair) for pair in pairs]
         layers = []
         for layer in tokens.latent:
-            new = self.block(part(layer), neighbors, cosines).to(layer.dtype)
+            new = self.block(part(layer), neighbors, cosines, places=around).to(layer.dtype)
             layers.append(new if len(new) == len(layer) else layer.index_copy(0, chosen, new))
         return dataclasses.replace(tokens, latent=tuple(layers))
 
@@ -125,6 +139,9 @@ class Recalibration(nn.Module):
         real = rows.real.view(shape)
         of_tokens = (self.positions(tokens, points), tokens.image)
         where, image = (values[rows.index].unflatten(0, shape) for values in of_tokens)
+        around = None
+        if self.has_places:
+            around = [places_around(where, real & points.tokens_valid[rows.index].view(shape)).flatten(0, 1)]
         where = where.masked_fill(~real[..., None], torch.inf)
         places = None if places is None else places[rows.index].view(shape)
         most = min(neighbor_count(self.k, shape[1]), shape[1])
@@ -143,7 +160,8 @@ class Recalibration(nn.Module):
         takes_part, number = rows.places(len(tokens.image))
         layers = []
         for layer in tokens.latent:
-            new = self.block(layer[rows.index], [near.flatten(0, 1)], cosines, left_out).to(layer.dtype)
+            new = self.block(layer[rows.index], [near.flatten(0, 1)], cosines, left_out, around)
+            new = new.to(layer.dtype)
             layers.append(torch.where(takes_part[:, None], new.index_select(0, number), layer))
         return dataclasses.replace(tokens, latent=tuple(layers))
 
@@ -186,6 +204,33 @@ def neighbor_count(k: int | float, tokens: int) -> int:
         1 or more; a number ``k`` may exceed that of the tokens.
     """
     return max(round(k * tokens), 1) if k < 1 else int(k)
+
+
+@torch.no_grad()
+def places_around(
+    points: Float[Tensor, "*b n 3"], is_subject: Bool[Tensor, "*b n"]
+) -> Float[Tensor, "*b n 3"]:
+    """Places of tokens around the middle of the subject, in units of its size.
+
+    The middle is the mean of the subject's points, the unit their root mean square distance from it, so that
+    places depend neither on the world's origin nor on its unit.
+
+    Args:
+        points: of the tokens of an element, or of several with the same number.
+        is_subject: which points lie on the subject; middle and unit are of these.
+
+    Returns:
+        Places, float32 or wider; 0 for points that are not finite, or if all of the subject's coincide.
+    """
+    points = at_least_float32(points)
+    is_finite = points.isfinite().all(-1)
+    weights = (is_subject & is_finite).to(points.dtype)
+    weights = (weights / weights.sum(-1, keepdim=True).clamp(min=1))[..., None]
+    points = torch.where(is_finite[..., None], points, 0)
+    middle = (weights * points).sum(-2, keepdim=True)
+    around = torch.where(is_finite[..., None], points - middle, 0)
+    unit_length = (weights * around.square()).sum((-2, -1), keepdim=True).sqrt()
+    return around / torch.where(unit_length > 0, unit_length, torch.inf)
 
 
 @torch.no_grad()
