@@ -33,6 +33,7 @@ from ghgs_lit.config import compose, resolve
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.kernels import gpu
 from ghgs_lit.model import GHGS
+from ghgs_lit.rendering.intersections import intersections
 
 SMALL = ("encoder.width=32", "encoder.heads=2", "encoder.vit.channels=8", "recalibration.k=8")
 #: Names of types in Triton.
@@ -40,6 +41,7 @@ TYPES = {
     torch.float32: "*fp32",
     torch.int64: "*i64",
     torch.int32: "*i32",
+    torch.int16: "*i16",
     torch.bool: "*i1",
     torch.uint8: "*u8",
 }
@@ -123,6 +125,8 @@ def main() -> None:
                 model.eval()(batch)
             prediction = model.train()(batch).gaussians
             sum(getattr(prediction, name).sum() for name in ("means", "scales", "colors")).backward()
+        boxes = torch.rand(1, 9, 2)
+        intersections(boxes, boxes.ceil().int(), boxes[..., 0], 60, 75, 100)
 
 
 if __name__ == "__main__":

@@ -234,7 +234,8 @@ def step(call: Call) -> None:
     """A training step of experiment=shipped on a batch that is ready, two rounds; parts by themselves"""
     for size in reversed(call.sizes.batches):
         made = _Step(call, call.config(*call.shipped), call.batch(size, call.sizes.side))
-        _stepped(call, f"batch of {size}", made)
+        with precision_of("tf32", torch.device("cuda")):  # as trainer=gpu
+            _stepped(call, f"batch of {size}", made)
         del made
         gc.collect()
 
@@ -275,16 +276,17 @@ def kernels(call: Call) -> None:
     with _Calls() as calls:
         means = model(batch).gaussians.means
         means.sum().backward()
-    for name, plain in PLAIN.items():
-        if name not in calls.inputs:
-            call.add(name, refused="not called")
-            continue
-        function, inputs = calls.inputs[name]
-        moved = _bytes(inputs) + _bytes(function(*inputs))
-        kinds = {"kernel": function, "eager": plain, "compiled": torch.compile(plain, dynamic=False)}
-        for kind, run in kinds.items():
-            _chain(call, name, kind, partial(run, *inputs), moved)
+    for name in set(PLAIN) - set(calls.inputs):
+        call.add(name, refused="not called")
+    moved = {}
+    for name, (function, inputs) in calls.inputs.items():
+        moved[name] = _bytes(inputs) + _bytes(function(*inputs))
+        for kind, run in {"kernel": function, "eager": PLAIN[name]}.items():
+            _chain(call, name, kind, partial(run, *inputs), moved[name])
     _attention(call)
+    for name, (_, inputs) in calls.inputs.items():  # takes longest
+        compiled = torch.compile(PLAIN[name], dynamic=False)
+        _chain(call, name, "compiled", partial(compiled, *inputs), moved[name])
 
 
 @torch.no_grad()

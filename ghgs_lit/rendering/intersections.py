@@ -8,9 +8,11 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int, Int32
 from torch import Tensor
+
+from ghgs_lit.geometry.constants import constant
+from ghgs_lit.kernels import gpu
 
 #: Side of a tile in pixels: gsplat's default.
 TILE = 16
@@ -62,67 +64,115 @@ def intersections(
         The splats of each tile in order of depth, and how many places they need.
     """
     shape = depths.shape[:-1]
-    splats = depths.numel()
     rows = -(-height // TILE)
     columns = -(-width // TILE)
     fixed = _fixed(shape, rows, columns, centers.device)
-    boxes = _boxes(centers, radii, fixed).view(splats, 3)
+    centers = centers.reshape(-1, depths.shape[-1], 2)
+    radii = radii.reshape(centers.shape)
     _, order = depths.contiguous().view(torch.int32).flatten().sort(stable=True)
-    tiles, first, across = boxes[order].unbind(1)
-    ends = tiles.cumsum(0)
-    begins = ends - tiles
-    # Places behind the last intersection find the last row here, by which their tile is the last one.
-    last = len(fixed.every) - 1
-    known = F.pad(torch.stack((begins, first - begins, across, order), 1), (0, 0, 0, 1), value=last)
-    place = _places(capacity, centers.device)
-    begin, shifted, across, splat = known[torch.searchsorted(ends, place, right=True)].unbind(1)
-    row = (place - begin) // across
-    tile = torch.addcmul(shifted + place, row, columns - across).clamp_(max=last)
+    if gpu.is_supported(centers, radii):
+        boxes = _BOXED(centers, radii, order, rows, columns)
+        ends = boxes[0].cumsum(0)
+        tile, splat = _PLACED(ends, boxes, order, fixed.every, capacity, columns)
+    else:
+        boxes = _boxed(centers, radii, order, rows, columns)
+        ends = boxes[0].cumsum(0)
+        tile, splat = _placed(ends, boxes, order, fixed.every, capacity, columns)
     # A radix sort passes once over each byte.
-    tile, order = tile.to(fixed.every.dtype).sort(stable=True)
+    tile, order = tile.sort(stable=True)
     offsets = torch.searchsorted(tile, fixed.every, out_int32=True).view(fixed.has_pixels.shape)
-    return Intersections(splat[order].clamp_(max=splats - 1).int(), offsets, fixed.has_pixels, ends[-1])
+    return Intersections(splat[order], offsets, fixed.has_pixels, ends[-1])
 
 
-def _boxes(centers: Tensor, radii: Tensor, fixed: "_Fixed") -> Tensor:
+def _boxed(
+    centers: Float[Tensor, "I N 2"],
+    radii: Int[Tensor, "I N 2"],
+    order: Int[Tensor, " I*N"],
+    rows: int,
+    columns: int,
+) -> Int32[Tensor, "3 I*N"]:
     """Tiles of each splat.
 
     Args:
-        centers: pixels, [..., N, 2].
-        radii: half sides in pixels, [..., N, 2]; 0 where a splat is not drawn.
-        fixed: constants of the images' size, from :func:`_fixed`.
+        centers: in pixels.
+        radii: half sides in pixels; 0 where a splat is not drawn.
+        order: splats of all images, in the order of the result.
+        rows: of tiles that have pixels, in one image.
+        columns: of tiles in one image.
 
     Returns:
-        Number of its tiles, index of the first one, and the number across (1 or more), int32 [..., N, 3].
+        Number of each splat's tiles, index of the first one, and the number across (1 or more).
     """
+    sizes = constant(_sizes, columns, rows, like=centers)
     reach = radii / TILE
-    # The negative of the first tile is rounded up as the end is: columns and rows of both, [2, ..., N, 2].
-    edges = torch.addcmul(reach, centers, fixed.signs).ceil_()
-    edges = torch.clamp(edges, fixed.least, fixed.most).int()
-    size = edges.sum(0, dtype=torch.int32)
-    column, row = edges[0].unbind(-1)
-    columns = fixed.has_pixels.shape[-1]
-    first = fixed.first - torch.add(column, row, alpha=columns)
-    tiles = size.prod(-1, dtype=torch.int32) * (radii > 0).all(-1)
-    return torch.stack((tiles, first, size[..., 0].clamp(min=1)), -1)
+    begin = torch.clamp(torch.floor(centers / TILE - reach), centers.new_zeros(()), sizes).int()
+    end = torch.clamp(torch.ceil(centers / TILE + reach), centers.new_zeros(()), sizes).int()
+    size = end - begin
+    image = constant(torch.arange, len(centers), like=order)
+    first = image[:, None] * ((rows + 1) * columns) + begin[..., 1] * columns + begin[..., 0]
+    tiles = size.prod(-1) * (radii > 0).all(-1)
+    boxes = torch.stack((tiles, first, size[..., 0].clamp(min=1)))
+    return boxes.flatten(1)[:, order].int()
+
+
+def _sizes(columns: int, rows: int, **kind: object) -> Tensor:
+    """Tiles across and down, [2]."""
+    return torch.tensor((columns, rows), **kind)
+
+
+def _placed(
+    ends: Int[Tensor, " N"],
+    boxes: Int32[Tensor, "3 N"],
+    order: Int[Tensor, " N"],
+    every: Int[Tensor, " tiles"],
+    capacity: int,
+    columns: int,
+) -> tuple[Int[Tensor, " capacity"], Int32[Tensor, " capacity"]]:
+    """What each place holds: splats one after another, the tiles of each by rows.
+
+    Args:
+        ends: places up to the end of each splat's.
+        boxes: as of :func:`_boxed`.
+        order: splats of the rows of ``ends`` and ``boxes``.
+        every: numbers of all tiles; places that no splat needs are of the last one.
+        capacity: number of places.
+        columns: of tiles in one image.
+
+    Returns:
+        The tile of each place, in the type of ``every``, and its splat.
+    """
+    place = constant(torch.arange, capacity, like=ends)
+    row = torch.searchsorted(ends, place, right=True)
+    is_needed = row < len(order)
+    row = row.clamp(max=len(order) - 1)
+    number, first, across = boxes[:, row]
+    step = place - (ends[row] - number)
+    below = step // across
+    tile = torch.where(is_needed, first + below * columns + step - below * across, len(every) - 1)
+    return tile.to(every.dtype), torch.where(is_needed, order[row], len(order) - 1).int()
+
+
+_BOXED = gpu.operator(
+    "boxed(Tensor centers, Tensor radii, Tensor order, int rows, int columns) -> Tensor",
+    _boxed,
+    "ghgs_lit.rendering.cuda",
+)
+_PLACED = gpu.operator(
+    "placed(Tensor ends, Tensor boxes, Tensor order, Tensor every, int capacity, int columns) "
+    "-> (Tensor, Tensor)",
+    _placed,
+    "ghgs_lit.rendering.cuda",
+)
 
 
 class _Fixed(NamedTuple):
     """What depends on the number and the size of images alone.
 
     Attributes:
-        signs: scale of the two ends of boxes, [2, ..., 1, 1].
-        least: lower limit of the ends, in tiles, [2, ..., 1, 2].
-        most: upper limit of the ends, in tiles, [2, ..., 1, 2].
-        first: number of each image's first tile, [..., 1].
         every: numbers of all tiles, with the row below each image.
         has_pixels: as of :class:`Intersections`.
     """
 
-    signs: Tensor
-    least: Tensor
-    most: Tensor
-    first: Tensor
     every: Tensor
     has_pixels: Tensor
 
@@ -138,21 +188,8 @@ def _fixed(images: torch.Size, rows: int, columns: int, device: torch.device) ->
         columns: of tiles in one image.
         device: where the tensors are needed.
     """
-    ends = torch.tensor([-1.0, 1.0]).view(2, *[1] * (len(images) + 2))
-    limit = torch.tensor([columns, rows], dtype=torch.float32) * ends
-    first = torch.arange(images.numel(), dtype=torch.int32) * ((rows + 1) * columns)
     count = images.numel() * (rows + 1) * columns
     every = torch.arange(count, dtype=torch.int16 if count <= 2**15 else torch.int32)
     has_pixels = torch.ones(*images, rows + 1, columns, dtype=torch.bool)
     has_pixels[..., -1, :] = False
-    made = _Fixed(
-        ends / TILE, limit.clamp(max=0), limit.clamp(min=0), first.view(*images, 1), every, has_pixels
-    )
-    return _Fixed(*(tensor.to(device, non_blocking=True) for tensor in made))
-
-
-@lru_cache(maxsize=64)
-@torch.inference_mode(False)
-def _places(capacity: int, device: torch.device) -> Int[Tensor, " capacity"]:
-    """Numbers of the places of intersections, kept for later calls."""
-    return torch.arange(capacity, device=device)
+    return _Fixed(every.to(device, non_blocking=True), has_pixels.to(device, non_blocking=True))

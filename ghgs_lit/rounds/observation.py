@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from itertools import accumulate
 
 import torch
 import torch.nn.functional as F
@@ -216,6 +215,6 @@ def _values_at(
 
 
 def _rows(element: Int[Tensor, " N"], splits: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """The element of each Gaussian, and its number among those of the element."""
-    first = torch.tensor((0, *accumulate(splits))).to(element.device, non_blocking=True)
+    """The element of each Gaussian, ascending, and its number among those of the element."""
+    first = torch.searchsorted(element, constant(torch.arange, len(splits), like=element))
     return element, torch.arange(len(element), device=element.device) - first[element]
