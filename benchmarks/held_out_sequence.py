@@ -33,7 +33,8 @@ from ghgs_capture.rig import INSTANTS, Rig, corrected_rig
 from ghgs_capture.temporal import Temporal
 from ghgs_lit import GHGS
 from ghgs_lit.data.view import area_image
-from ghgs_lit.metrics.functional import box_of, decibels, flicker_in_place, mean_over, psnr
+from ghgs_lit.metrics.flicker import flicker_in_place
+from ghgs_lit.metrics.functional import box_of, decibels, mean_over, psnr
 from ghgs_lit.refinement import CameraRefinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.rounds.gains import divided

@@ -131,13 +131,15 @@ class Cameras(_TensorStruct):
 @dataclass(frozen=True)
 class Targets(_TensorStruct):
     """Photographs to predict, from cameras other than the input cameras. ``names``: the photographs of each
-    subject. ``protocols``: the target protocol of each of the ``T`` targets, the same for all subjects."""
+    subject. ``protocols``: the target protocol of each of the ``T`` targets, the same for all subjects.
+    ``depths``: true z-depths in metres, 0 where unknown; None: unknown."""
 
     images: Float[Tensor, "B T 3 h w"]
     masks: Bool[Tensor, "B T h w"]
     cameras: Cameras
     names: tuple[tuple[str, ...], ...] = ()
     protocols: tuple[str, ...] = ()
+    depths: Float[Tensor, "B T h w"] | None = None
 
     def of_protocol(self, name: str) -> "Targets":
         """The targets of one protocol."""
@@ -146,7 +148,8 @@ class Targets(_TensorStruct):
         names = []
         for subject in self.names:
             names.append(tuple(subject[number] for number in chosen))
-        return Targets(*parts, tuple(names), (name,) * len(chosen))
+        depths = None if self.depths is None else self.depths[:, chosen]
+        return Targets(*parts, tuple(names), (name,) * len(chosen), depths)
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,13 @@ class BatchBuilder:
         inputs: photographs at the size of the inputs.
         targets: photographs at the size of the targets.
         depths: whether depth maps of the inputs are read, if there are any.
+        target_depths: whether those of the targets are, too; only measurements need them.
     """
 
     inputs: PhotographCache
     targets: PhotographCache
     depths: bool = True
+    target_depths: bool = True
 
     def batch(
         self, specs: Sequence[SampleSpec], size: Size | None = None, target_size: Size | None = None
@@ -59,13 +61,14 @@ class BatchBuilder:
         )
 
     def _targets(self, specs: Sequence[SampleSpec], size: Size | None) -> Targets:
-        views = [_views(self.targets, s.subject, s.targets, False, size) for s in specs]
+        views = [_views(self.targets, s.subject, s.targets, self.target_depths, size) for s in specs]
         return Targets(
             images=_images(views),
             masks=_stacked(views, "mask"),
             cameras=_cameras(views),
             names=tuple(tuple(map(photo_name, s.targets)) for s in specs),
             protocols=specs[0].protocols,
+            depths=_stacked(views, "depth"),
         )
 
 

@@ -175,7 +175,8 @@ class PhotographsDataModule(LightningDataModule):
             world: number of processes.
             builder: reads samples; None: that of ``train``.
         """
-        builder = dataclasses.replace(builder or self.builder("train"), depths=self.trains_on_depths)
+        builder = builder or self.builder("train")
+        builder = dataclasses.replace(builder, depths=self.trains_on_depths, target_depths=False)
         return TrainingBatches(builder, sampler, self.augmentation, length, rank, world)
 
     def _packed_builder(self, batches: float, rank: int) -> BatchBuilder:

@@ -126,7 +126,9 @@ def _surface_errors(batch: Batch, gaussians: Gaussians) -> list[float | None]:
 def _rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[Row]:
     targets = batch.targets
     (b, t) = batch.targets.images.shape[:2]
-    flat = metrics(estimate.image.flatten(0, 1), targets.images.flatten(0, 1), targets.masks.flatten(0, 1))
+    depths = None if targets.depths is None else targets.depths.flatten(0, 1)
+    pictures = (each.flatten(0, 1) for each in (estimate.image, targets.images, targets.masks))
+    flat = metrics(*pictures, depths)
     values = {name: value.reshape(b, t).tolist() for name, value in flat.items()}
     surfaces = [] if estimate.gaussians is None else _surface_errors(batch, estimate.gaussians)
     around = [] if estimate.recalibrated is None else neighborhoods(*estimate.recalibrated)

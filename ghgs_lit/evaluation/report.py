@@ -19,7 +19,8 @@ from ghgs_lit.runs.results import METHOD, Row, metric_names, summarize, write_re
 #: Print a line once per process: all runs of a sweep lack the same.
 print_once = cache(print)
 #: Printed metrics and their decimals.
-PRINTED = {"psnr": 2, "psnr_box": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1, "seconds": 2}
+PRINTED = {"psnr": 2, "psnr_box": 2, "psnr_edge": 2, "ssim": 4, "lpips": 4, "flip": 4}
+PRINTED |= {"spill": 1, "sharpness": 2, "depth_error_mm": 1, "seconds": 2}
 #: Descriptions of splits for readers of the results.
 SPLITS = {
     "train": "the subjects that were trained on",

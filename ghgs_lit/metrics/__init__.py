@@ -2,9 +2,10 @@
 
 from ghgs_lit.metrics.flip import flip_map
 from ghgs_lit.metrics.functional import PSNR_CAP, depth_error_mm, psnr, ssim, surface_error_mm
-from ghgs_lit.metrics.protocol import ImageMetrics, MetricsOptions
+from ghgs_lit.metrics.protocol import FURTHER, ImageMetrics, MetricsOptions
 
 __all__ = [
+    "FURTHER",
     "PSNR_CAP",
     "ImageMetrics",
     "MetricsOptions",

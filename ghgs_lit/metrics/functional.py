@@ -1,12 +1,6 @@
 """Image metrics as pure functions: one value for each RGB image in [0, 1] (data range 1).
 
-A ``region`` selects the pixels that count. Where it is empty the value is nan, and averages leave it out.
-
-Flicker is the change of a render's error from one instant to the next. The literature measures how frames
-change along an estimated optical flow (warping error: Lai et al. 2018, Learning Blind Video Temporal
-Consistency) or unlike the true video (tOF, tLP: Chu et al. 2020, TecoGAN). Here the motion of the surface is
-known and the true image subtracted: an error that moves with the surface does not flicker. A black render has
-the flicker of the photographs."""
+A ``region`` selects the pixels that count. Where it is empty the value is nan, and averages leave it out."""
 
 import torch
 import torch.nn.functional as F
@@ -16,9 +10,8 @@ from torch import Tensor
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.chamfer import nearest
 from ghgs_lit.geometry.masks import between, first_and_last
-from ghgs_lit.geometry.projection import at_least_float32, project, sample
+from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.runtime.precision import exact
-from ghgs_lit.types import Cameras
 
 REGIONS = ("image", "box", "subject", "crop", "edge")
 PADDINGS = ("valid", "reflect", "zeros")
@@ -30,6 +23,10 @@ scripts of GHG and LIFe-GoM crop."""
 EDGE, BESIDE, INNER = 2, 3, 4
 """Pixels from the subject's outline, in rows and columns: of the region ``edge`` at most, of what
 :func:`spill` and :func:`sharpness` count more than and at least."""
+DEPTH_STEP = 0.02
+"""Least relative difference of the depths of neighbouring pixels at an edge of depth: 5 cm at 2.5 m."""
+BRIGHTNESS = 0.40
+"""Mean of the subject in the images that :func:`psnr_box_40` compares: that of well lit photographs."""
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 """Side and standard deviation, in pixels, of SSIM's Gaussian window."""
 
@@ -107,12 +104,35 @@ def grown(mask: Bool[Tensor, "n h w"], pixels: int) -> Bool[Tensor, "n h w"]:
     return F.max_pool2d(mask[:, None].float(), 2 * pixels + 1, 1, pixels)[:, 0].bool()
 
 
-def region_of(mask: Bool[Tensor, "n h w"], name: str) -> Bool[Tensor, "n h w"] | None:
+def depth_edges(depth: Float[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
+    """Pixels on both sides of an edge of depth: beside a neighbour :data:`DEPTH_STEP` nearer or farther.
+
+    Args:
+        depth: z in metres; 0 is unknown, and no edge.
+
+    Returns:
+        A mask of each map."""
+    edges = torch.zeros_like(depth, dtype=torch.bool)
+    for axis in (1, 2):
+        count = depth.shape[axis] - 1
+        first = depth.narrow(axis, 0, count)
+        second = depth.narrow(axis, 1, count)
+        nearer = torch.minimum(first, second)
+        is_edge = (nearer > 0) & ((first - second).abs() > DEPTH_STEP * nearer)
+        edges.narrow(axis, 0, count).logical_or_(is_edge)
+        edges.narrow(axis, 1, count).logical_or_(is_edge)
+    return edges
+
+
+def region_of(
+    mask: Bool[Tensor, "n h w"], name: str, depth: Float[Tensor, "n h w"] | None = None
+) -> Bool[Tensor, "n h w"] | None:
     """The pixels of a region.
 
     Args:
         mask: of the subject.
         name: one of :data:`REGIONS`.
+        depth: true z in metres, 0 where unknown; its edges belong to ``edge``. None: unknown.
 
     Returns:
         A mask; None for the whole image.
@@ -125,7 +145,8 @@ def region_of(mask: Bool[Tensor, "n h w"], name: str) -> Bool[Tensor, "n h w"] |
     if name == "crop":
         return crop_of(mask)
     if name == "edge":
-        return grown(mask, EDGE) & grown(~mask, EDGE)
+        outline = grown(mask, EDGE) & grown(~mask, EDGE)
+        return outline if depth is None else outline | grown(depth_edges(depth), EDGE - 1)
     return box_of(mask) if name == "box" else mask
 
 
@@ -169,6 +190,26 @@ def psnr(
     Returns:
         dB for each image, at most :data:`PSNR_CAP`; nan where the region is empty."""
     return decibels(mean_over(squared_error(image, target), region))
+
+
+def psnr_box_40(
+    image: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"], mask: Bool[Tensor, "n h w"]
+) -> Float[Tensor, " n"]:
+    """PSNR in the subject's box of images that are scaled so that the subject's mean is :data:`BRIGHTNESS`.
+
+    Errors grow with light: the same prediction of a person lit twice as brightly has 6 dB less. Scaled, dark
+    and bright people can be compared. Values above 1 stay.
+
+    Args:
+        image: renders.
+        target: photographs in [0, 1].
+        mask: of the subject.
+
+    Returns:
+        dB for each image, at most :data:`PSNR_CAP`; nan where the subject is empty or black."""
+    light = mean_over(at_least_float32(target).mean(1), mask)
+    gain = torch.where(light > 0, BRIGHTNESS / light, torch.nan)
+    return decibels(mean_over(squared_error(image, target), box_of(mask)) * gain.square())
 
 
 def _gaussian_window(like: Tensor) -> Float[Tensor, " size"]:
@@ -354,51 +395,3 @@ def surface_error_mm(
         return surface.new_tensor(torch.inf)
     back = (surface - opaque[nearest(surface, opaque)]).norm(dim=1).mean()
     return 500 * (there + back)
-
-
-#: Largest distance in metres of a visible point from the depth map.
-VISIBLE = 0.005
-
-
-def flicker(
-    errors: Float[Tensor, "2 t c h w"],
-    points: Float[Tensor, "2 n 3"],
-    depths: Float[Tensor, "2 t h w"],
-    cameras: Cameras,
-) -> Float[Tensor, " t"]:
-    """Mean absolute change of each camera's error at the points visible at both instants.
-
-    Args:
-        errors: renders minus photographs, of images in [0, 1].
-        points: of the surface at both instants, in the world, in metres.
-        depths: true z-depths in metres, 0 where there is none.
-        cameras: [2, t].
-
-    Returns:
-        A value for each camera, in units of the images; nan if no point is visible."""
-    pixels, z = project(points[:, None], cameras.intrinsics[:, :, None], cameras.extrinsics[:, :, None])
-    image = torch.arange(2 * z.shape[1], device=z.device).view(2, -1, 1).expand(z.shape)
-    # Beside the silhouette the 0 of the background makes the depth too small: such points are left out.
-    off = sample(depths.flatten(0, 1)[:, None], image, pixels)[..., 0] - z
-    seen = ((z > 0) & (off.abs() < VISIBLE)).all(0)
-    before, after = sample(errors.flatten(0, 1), image, pixels)
-    change = torch.where(seen, (after - before).abs().mean(-1), 0)
-    return change.sum(-1) / seen.sum(-1)
-
-
-def flicker_in_place(
-    errors: Float[Tensor, "2 t c h w"], masks: Bool[Tensor, "2 t h w"]
-) -> Float[Tensor, " t"]:
-    """Mean absolute change of each camera's error in the box around both instants' masks.
-
-    No truth but the photographs is needed.
-
-    Args:
-        errors: renders minus photographs, of images in [0, 1], by cameras that stand still.
-        masks: of the subject.
-
-    Returns:
-        A value for each camera, in units of the images; nan if the box is empty."""
-    box = box_of(masks.any(0))
-    change = torch.where(box, (errors[1] - errors[0]).abs().mean(1), 0)
-    return change.sum((1, 2)) / box.sum((1, 2))

@@ -13,11 +13,14 @@ from ghgs_lit.errors import InputError, installed
 from ghgs_lit.metrics.flip import PIXELS_PER_DEGREE, flip_map
 from ghgs_lit.metrics.functional import (
     BESIDE,
+    BRIGHTNESS,
+    DEPTH_STEP,
     EDGE,
     INNER,
     PSNR_CAP,
     decibels,
     mean_inside,
+    psnr_box_40,
     region_of,
     sharpness,
     spill,
@@ -30,8 +33,8 @@ NETWORK = "vgg"
 _ALL = ("psnr", "ssim", "flip")
 #: Metrics of each region; SSIM and FLIP look at windows, which single pixels of a region do not fill.
 MEASURED = {"image": _ALL, "box": _ALL, "crop": _ALL, "subject": ("psnr", "ssim"), "edge": ("psnr",)}
-#: Further metrics, named without a region, that come with the region ``edge``.
-OUTLINE = {"spill": spill, "sharpness": sharpness}
+#: Further metrics, and the region that each comes with.
+FURTHER = {"psnr_box_40": ("box", psnr_box_40), "spill": ("edge", spill), "sharpness": ("edge", sharpness)}
 
 
 class LPIPS:
@@ -88,9 +91,10 @@ class MetricsOptions(Options):
         "subject",
         "edge",
     )
-    """Where PSNR, SSIM and FLIP are measured: all pixels, the box of the mask, its pixels (without FLIP), the
-    window around the box that GHG and LIFe-GoM crop (1000 x 500 of 1024 x 1024), its outline (PSNR alone,
-    with light beside the subject and sharpness inside it)."""
+    """Where PSNR, SSIM and FLIP are measured: all pixels, the box of the mask (with PSNR at one brightness),
+    its pixels (without FLIP), the window around the box that GHG and LIFe-GoM crop (1000 x 500 of
+    1024 x 1024), its outline and edges of true depth (PSNR alone, with light beside the subject and sharpness
+    inside it)."""
     lpips: Literal["auto", "require", "off"] = "auto"
     """auto: left out, with a message, where torchvision or its weights are missing; require: an error."""
 
@@ -114,7 +118,7 @@ class ImageMetrics:
 
     Their names are ``psnr``, ``ssim``, ``flip`` and ``lpips`` for the whole image, with ``_box``,
     ``_subject``, ``_crop`` or ``_edge`` added for the other regions (those of :data:`MEASURED`; LPIPS for the
-    whole image only), and those of :data:`OUTLINE`.
+    whole image only), and those of :data:`FURTHER`.
 
     Args:
         options: the protocol.
@@ -156,8 +160,7 @@ class ImageMetrics:
         for region in self.options.regions:
             for metric in MEASURED[region]:
                 names.append(metric if region == "image" else f"{metric}_{region}")
-        if "edge" in self.options.regions:
-            names += OUTLINE
+        names += [name for name, (region, _) in FURTHER.items() if region in self.options.regions]
         if self.lpips is not None:
             names.append("lpips")
         return names
@@ -182,12 +185,14 @@ class ImageMetrics:
             said["flip"] = f"FLIP at {PIXELS_PER_DEGREE:.2f} pixels a degree"
         if "box" in options.regions:
             said["box"] = "the smallest upright box of the subject's mask in the target"
+            said["psnr_box_40"] = f"psnr_box of images scaled to a mean of {BRIGHTNESS:.2f} in the mask"
         if "subject" in options.regions:
             said["subject"] = "the pixels of the subject's mask in the target"
         if "crop" in options.regions:
             said["crop"] = "1000/1024 of the height and 500/1024 of the width, around the mask's box"
         if "edge" in options.regions:
             said["edge"] = f"pixels at most {EDGE} rows and columns from the outline of the subject's mask"
+            said["edge"] += f", and from steps of more than {DEPTH_STEP:.0%} of the true depth where known"
             said["spill"] = f"light farther than {BESIDE} pixels from the mask, per mille of the subject's"
             said["sharpness"] = f"energy of the Laplacian over the target's, {INNER} pixels inside the mask"
         if self.lpips is not None:
@@ -195,7 +200,11 @@ class ImageMetrics:
         return said
 
     def __call__(
-        self, image: Float[Tensor, "n 3 h w"], target: Float[Tensor, "n 3 h w"], mask: Bool[Tensor, "n h w"]
+        self,
+        image: Float[Tensor, "n 3 h w"],
+        target: Float[Tensor, "n 3 h w"],
+        mask: Bool[Tensor, "n h w"],
+        depth: Float[Tensor, "n h w"] | None = None,
     ) -> dict[str, Tensor]:
         """All metrics of the protocol.
 
@@ -203,10 +212,11 @@ class ImageMetrics:
             image: renders, RGB in [0, 1] or a little outside.
             target: the photographs, RGB in [0, 1].
             mask: of the subject in the photographs.
+            depth: true z in the photographs in metres, 0 where unknown; None: unknown.
 
         Returns:
             One value per image by each of :attr:`names`; nan where a region is empty."""
-        return self.measure(image, target, mask, self._of_protocol)
+        return self.measure(image, target, mask, self._of_protocol, depth)
 
     @torch.no_grad()
     def measure(
@@ -215,12 +225,13 @@ class ImageMetrics:
         target: Float[Tensor, "n 3 h w"],
         mask: Bool[Tensor, "n h w"],
         names: Iterable[str],
+        depth: Float[Tensor, "n h w"] | None = None,
     ) -> dict[str, Tensor]:
         """Some metrics of the protocol, without the work for all others.
 
         Args:
-            image, target, mask: as of a call.
-            names: of metrics (:data:`MEASURED` with a region, :data:`OUTLINE`, ``lpips``).
+            image, target, mask, depth: as of a call.
+            names: of metrics (:data:`MEASURED` with a region, :data:`FURTHER`, ``lpips``).
 
         Returns:
             One value per image by each of the names."""
@@ -236,14 +247,15 @@ class ImageMetrics:
             if name == "lpips":
                 values[name] = self.lpips(image, target)
                 continue
-            if name in OUTLINE:
-                values[name] = OUTLINE[name](image, target, mask)
+            if name in FURTHER:
+                _, further = FURTHER[name]
+                values[name] = further(image, target, mask)
                 continue
             metric, _, region = name.partition("_")
             if metric not in maps:
                 maps[metric] = self._map(metric, image, target)
             if region not in regions:
-                regions[region] = region_of(mask, region or "image")
+                regions[region] = region_of(mask, region or "image", depth)
             mean = mean_inside(maps[metric], regions[region])
             values[name] = decibels(mean) if metric == "psnr" else mean
         return values

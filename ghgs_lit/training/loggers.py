@@ -19,7 +19,7 @@ from ghgs_lit.parsing import read_rows
 from ghgs_lit.runs.run import RunDirectory
 
 #: Final values by which runs are compared; ``metrics.json`` has all.
-COMPARED = ("depth_error_mm", "flip", "lpips", "psnr", "psnr_box", "ssim")
+COMPARED = ("depth_error_mm", "flip", "lpips", "psnr", "psnr_box", "psnr_edge", "sharpness", "spill", "ssim")
 #: Groups of tags that TensorBoard shows first: it sorts them by name.
 _FIRST = ("loss", "val", "values", "view")
 #: Settings that compare runs even where all have the same.

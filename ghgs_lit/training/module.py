@@ -15,7 +15,7 @@ from ghgs_lit.errors import require
 from ghgs_lit.geometry.unprojection import seen_surfaces
 from ghgs_lit.heads.inspection import offsets_at_limit, seen_attributes
 from ghgs_lit.losses import Losses
-from ghgs_lit.metrics import MetricsOptions, depth_error_mm, surface_error_mm
+from ghgs_lit.metrics import FURTHER, MetricsOptions, depth_error_mm, surface_error_mm
 from ghgs_lit.model import GHGS
 from ghgs_lit.plan.presets import KeptTokens, seeing
 from ghgs_lit.training.base import BudgetedModule, image_mean
@@ -26,7 +26,7 @@ from ghgs_lit.types import Batch, Cameras, DepthMaps, Gaussians, Prediction, Ren
 from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint
 
 #: Metrics of validations, as the run's protocol defines them; LPIPS where it has one.
-VALIDATED = ("psnr", "psnr_box", "ssim", "lpips")
+VALIDATED = ("psnr", "psnr_box", "ssim", "lpips", *FURTHER, "psnr_edge")
 
 
 def drawn_budget(budgets: Sequence[str | int], numbers: Sequence[int]) -> str | int:
@@ -220,7 +220,8 @@ class GHGSModule(BudgetedModule):
         """Values of each target view [b * t] by name, without LPIPS where the protocol has none."""
         known = [name for name in names if name != "lpips" or self.metrics.lpips is not None]
         flat = (values.flatten(0, 1) for values in (image, targets.images, targets.masks))
-        return self.metrics.measure(*flat, known)
+        depths = None if targets.depths is None else targets.depths.flatten(0, 1)
+        return self.metrics.measure(*flat, known, depths)
 
     def _rounds(self, batch: Batch, prediction: Prediction) -> dict[str, Tensor]:
         """PSNR in dB and depth error in mm before each round."""

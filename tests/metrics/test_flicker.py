@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ghgs_lit.metrics.functional import flicker, flicker_in_place
+from ghgs_lit.metrics.flicker import flicker, flicker_in_place
 from ghgs_lit.types import Cameras
 
 SIDE, FOCAL, DISTANCE = 24, 12.0, 2.0

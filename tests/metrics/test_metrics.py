@@ -258,7 +258,7 @@ def test_a_protocol_reports_its_metrics_by_name():
     assert list(values) == metrics.names
     assert set(values) == {
         "psnr", "ssim", "flip", "psnr_box", "ssim_box", "flip_box", "psnr_subject", "ssim_subject",
-        "psnr_edge", "spill", "sharpness",
+        "psnr_box_40", "psnr_edge", "spill", "sharpness",
     }  # fmt: skip
     assert torch.equal(values["psnr"], psnr((image * 1.5).clamp(0, 1), target))
     difference = flip_map((image * 1.5).clamp(0, 1), target)

@@ -1,10 +1,94 @@
-"""Metrics of what eyes see: light beside the subject, sharpness inside it, where Gaussians end."""
+"""Metrics of what eyes see: outlines and edges of depth, light beside the subject, sharpness inside it,
+errors at one brightness, where Gaussians end."""
 
+import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 
-from ghgs_lit.metrics import surface_error_mm
-from ghgs_lit.metrics.functional import region_of, sharpness, spill
+from ghgs_lit.metrics import PSNR_CAP, MetricsOptions, surface_error_mm
+from ghgs_lit.metrics.functional import depth_edges, psnr_box_40, region_of, sharpness, spill
+
+SEEN = ("psnr_edge", "spill", "sharpness", "psnr_box_40")
+METRICS = MetricsOptions(lpips="off").build()
+SIDE = 48
+
+
+def _people(n=4):
+    """Noise on blobs, renders of it, and depths with a step of 0, 5, 10 and 15 cm through the blobs."""
+    rng = np.random.default_rng(3)
+    masks = ndimage.gaussian_filter(rng.normal(size=(n, SIDE, SIDE)), (0, 5, 5)) > 0.02
+    targets = rng.uniform(size=(n, 3, SIDE, SIDE)) * masks[:, None]
+    images = np.clip(targets + rng.normal(scale=0.2, size=targets.shape), 0, 1)
+    farther = 2.0 + 0.05 * np.arange(n)[:, None, None]
+    depths = np.where(np.arange(SIDE) < SIDE // 2, 2.0, farther) * masks
+    return images, targets, masks, depths
+
+
+def _distance(pixels):
+    """Rows and columns from each pixel to the nearest of some."""
+    return ndimage.distance_transform_cdt(~pixels, "chessboard")
+
+
+@pytest.mark.parametrize("person", range(4))
+def test_what_eyes_see_is_what_scipy_computes(person):
+    """Bands by distance transforms, Laplacians by ndimage, brightness by scaling both images."""
+    image, target, mask, depth = (each[person] for each in _people())
+    inputs = [torch.from_numpy(each)[None] for each in (image, target, mask)]
+    found = METRICS.measure(*inputs, SEEN, torch.from_numpy(depth)[None])
+    found = {name: value.item() for name, value in found.items()}
+    outside = _distance(mask)
+    inside = _distance(~mask)
+
+    # The only step of depths is between two columns, and one of 0 or 5 of 200 cm (2.5 %) or more.
+    edges = np.zeros_like(mask)
+    middle = slice(SIDE // 2 - 1, SIDE // 2 + 1)
+    edges[:, middle] = mask[:, middle].all(1, keepdims=True) & (person > 0)
+    assert (depth_edges(torch.from_numpy(depth)[None])[0].numpy() == edges).all()
+    outline = np.maximum(outside, inside) <= 2
+    band = outline | ndimage.binary_dilation(edges, np.ones((3, 3)))
+    squared = ((image - target) ** 2).mean(0)
+    assert found["psnr_edge"] == pytest.approx(-10 * np.log10(squared[band].mean()))
+    alone = METRICS.measure(*inputs, ["psnr_edge"])["psnr_edge"].item()
+    assert alone == pytest.approx(-10 * np.log10(squared[outline].mean()))
+    assert (band.sum() > outline.sum()) == (person > 0)
+
+    beside = image.mean(0)[outside > 3].sum()
+    assert found["spill"] == pytest.approx(1000 * beside / target.mean(0)[mask].sum())
+
+    inner = inside > 4
+    inner[[0, -1]] = False
+    inner[:, [0, -1]] = False
+    energy = {}
+    for name, picture in (("image", image), ("target", target)):
+        laplacian = np.stack([ndimage.laplace(channel) for channel in picture])
+        energy[name] = (laplacian[:, inner] ** 2).sum()
+    assert found["sharpness"] == pytest.approx(energy["image"] / energy["target"])
+
+    rows, columns = (slice(hit.min(), hit.max() + 1) for hit in np.nonzero(mask))
+    gain = 0.40 / target[:, mask].mean()
+    scaled = (gain * image - gain * target)[:, rows, columns]
+    assert found["psnr_box_40"] == pytest.approx(-10 * np.log10((scaled**2).mean()))
+
+
+def test_what_eyes_see_of_nobody_is_absent():
+    """No subject or no light: nan, which means leave out, as of all regions; equal images have the cap."""
+    images, targets, masks, depths = (torch.from_numpy(each) for each in _people(2))
+    nobody = METRICS.measure(images, targets, masks & False, SEEN, 0 * depths)
+    assert all(values.isnan().all() for values in nobody.values())
+    black = METRICS.measure(images, 0 * targets, masks, SEEN)
+    assert [name for name, values in black.items() if values.isnan().all()] == list(SEEN[1:])
+    assert (psnr_box_40(targets, targets, masks) == PSNR_CAP).all()
+
+
+def test_brightness_changes_the_psnr_of_the_box_but_not_at_one_brightness():
+    """Half the light is 6 dB more in the box, and nothing at one brightness."""
+    images, targets, masks, _ = (torch.from_numpy(each) for each in _people(2))
+    names = ("psnr_box", "psnr_box_40")
+    bright = METRICS.measure(images, targets, masks, names)
+    dark = METRICS.measure(images / 2, targets / 2, masks, names)
+    assert (dark["psnr_box"] - bright["psnr_box"]).tolist() == pytest.approx([20 * np.log10(2)] * 2)
+    assert dark["psnr_box_40"].tolist() == pytest.approx(bright["psnr_box_40"].tolist())
 
 
 def test_light_beside_the_subject_and_sharpness_inside_it():

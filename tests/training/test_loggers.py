@@ -111,7 +111,7 @@ def test_tags_are_grouped_by_what_they_are(run):
         "work/train/budget", "work/train/gaussians", "work/train/gradient_norm", "work/train/learning_rate",
         "work/train/skipped_steps",
         "val/psnr", "val/psnr_box", "val/ssim", "val/depth_error_mm", "val/lpips",
-        "val/surface_mm",
+        "val/surface_mm", "val/psnr_box_40", "val/psnr_edge", "val/spill", "val/sharpness",
     }  # fmt: skip
 
 

@@ -23,6 +23,7 @@ ERRORS = (
     "flip",
     "flip_box",
     "lpips",
+    "psnr_box_40",
     "psnr_edge",
     "spill",
     "sharpness",

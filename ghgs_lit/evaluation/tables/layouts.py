@@ -24,6 +24,7 @@ TITLES = {
     "depth_error_mm": "Depth error (mm)",
     "surface_mm": "Surface error (mm)",
     "gaussians": "Gaussians",
+    "psnr_box_40": "PSNR box at 0.40",
     "spill": "Spill (‰)",
     "sharpness": "Sharpness",
     "prediction_seconds": "Prediction (s)",
