@@ -54,7 +54,9 @@ class Compiler:
         self.capabilities = capabilities
         self.done: set[Any] = set()
 
-    def run(self, kernel: Any, *arguments: Any, grid: Any, warmup: bool, **flags: Any) -> None:
+    def run(
+        self, kernel: Any, *arguments: Any, grid: Any, warmup: bool, num_warps: int = 4, **flags: Any
+    ) -> None:
         names = [name for name in kernel.arg_names if name not in flags]
         signature = {name: _type(value) for name, value in zip(names, arguments, strict=True)}
         signature |= dict.fromkeys(flags, "constexpr")
@@ -68,7 +70,7 @@ class Compiler:
             if key not in self.done:
                 self.done.add(key)
                 source = ASTSource(fn=kernel, signature=signature, constexprs={**flags, **known})
-                compiled = triton.compile(source, target=GPUTarget("cuda", capability, 32))
+                compiled = triton.compile(source, GPUTarget("cuda", capability, 32), {"num_warps": num_warps})
                 said = [name.lower() for name, value in flags.items() if value is True]
                 title = " ".join((kernel.__name__.removesuffix("_rows"), *said))
                 print(f"{title}: {capability}, {_needs(compiled)}", flush=True)

@@ -29,6 +29,7 @@ from ghgs_lit.kernels.pool import at_once, even_parts, multiplies
 from ghgs_lit.plan.rows import size_class
 from ghgs_lit.rounds import cpu
 from ghgs_lit.rounds.gains import equalized
+from ghgs_lit.rounds.memory import fits, remembered
 from ghgs_lit.rounds.observation import CHANNELS, SLOPES, observe, slopes
 from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Prediction
@@ -356,6 +357,9 @@ class Rounds(nn.Module):
         """
         if multiplies(each, known, memory, self.memory.weight):
             memory = cpu.remembered(self.view, self.update, self.memory, each, known, memory)
+        elif fits(each, known, memory, self.memory.weight):
+            layers = (self.view[0], self.view[2], self.update[0], self.update[2], self.memory)
+            memory = remembered(layers, each, known, memory)
         else:
             memory = self._remembered_in_parts(each, known, memory)
         memory = memory if windows is None else self.exchange(memory, windows)
