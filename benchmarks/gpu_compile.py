@@ -34,6 +34,7 @@ from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.kernels import gpu
 from ghgs_lit.model import GHGS
 from ghgs_lit.rendering.intersections import intersections
+from ghgs_lit.runtime.precision import round_products
 
 SMALL = ("encoder.width=32", "encoder.heads=2", "encoder.vit.channels=8", "recalibration.k=8")
 #: Names of types in Triton.
@@ -121,6 +122,7 @@ def main() -> None:
             mock.patch.object(triton.JITFunction, "run", lambda *a, **b: compiler.run(*a, **b))
         )
         stack.enter_context(device.drawing_nothing())
+        round_products(True, "cpu")  # as on a GPU
         for overrides in (("model=recurrent",), ("model=hull", "skip=fast")):
             model = GHGS.from_config(resolve(compose("train", [*SMALL, *overrides])))
             with torch.no_grad():

@@ -355,11 +355,11 @@ class Rounds(nn.Module):
             memory: of the rounds before.
             windows: places of the Gaussians in maps; None: nothing is exchanged.
         """
-        if multiplies(each, known, memory, self.memory.weight):
-            memory = cpu.remembered(self.view, self.update, self.memory, each, known, memory)
-        elif fits(each, known, memory, self.memory.weight):
+        if fits(each, known, memory, self.memory.weight):
             layers = (self.view[0], self.view[2], self.update[0], self.update[2], self.memory)
             memory = remembered(layers, each, known, memory)
+        elif multiplies(each, known, memory, self.memory.weight):
+            memory = cpu.remembered(self.view, self.update, self.memory, each, known, memory)
         else:
             memory = self._remembered_in_parts(each, known, memory)
         memory = memory if windows is None else self.exchange(memory, windows)

@@ -73,6 +73,7 @@ def test_a_prediction_and_its_gradients_with_kernels_are_plain_pytorchs():
         expected, slopes = predicted()
     with kernels() as called:
         found, found_slopes = predicted()
-    assert set(called) == set(gpu.KERNELS)
+    # Lists of splats are gsplat's, and the memory of rounds is plain PyTorch's in float32.
+    assert set(called) == set(gpu.KERNELS) - {"boxed", "placed", "remember"}
     close(found, expected, 1e-4)
     assert (found_slopes - slopes).norm() < 1e-3 * slopes.norm()

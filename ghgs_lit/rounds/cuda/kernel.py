@@ -111,7 +111,9 @@ def part_of(table, row, first, count, length, COLUMNS: tl.constexpr):
 
 
 @triton.jit
-def times(x, weight, first, count, length, outputs, INPUTS: tl.constexpr, OUTPUTS: tl.constexpr):
+def times(
+    x, weight, first, count, length, top, outputs, INPUTS: tl.constexpr, OUTPUTS: tl.constexpr
+):  # fmt: skip
     """Product of rows with a part of the weight of a linear layer.
 
     Args:
@@ -120,24 +122,25 @@ def times(x, weight, first, count, length, outputs, INPUTS: tl.constexpr, OUTPUT
         first: column of the part.
         count: number of its columns.
         length: inputs of the layer.
+        top: row of the part.
         outputs: of the layer.
         INPUTS: ``count`` or more, a power of two.
-        OUTPUTS: ``outputs`` or more, a power of two.
+        OUTPUTS: rows of the part, a power of two.
 
     Returns:
-        Products [ROWS, OUTPUTS], 0 from ``outputs`` on.
+        Products [ROWS, OUTPUTS], 0 beyond the layer's outputs.
     """
     column = tl.arange(0, INPUTS)[:, None]
-    row = tl.arange(0, OUTPUTS)[None]
+    row = top + tl.arange(0, OUTPUTS)[None]
     inside = (column < count) & (row < outputs)
     part = tl.load(weight + row * length + first + column, mask=inside, other=0.0)
     return tl.dot(x, part, input_precision="tf32")
 
 
 @triton.jit
-def biases(bias, outputs, OUTPUTS: tl.constexpr):
-    """A bias as a row [1, OUTPUTS], 0 from ``outputs`` on."""
-    column = tl.arange(0, OUTPUTS)
+def biases(bias, top, outputs, OUTPUTS: tl.constexpr):
+    """Part of a bias from ``top`` on as a row [1, OUTPUTS], 0 from ``outputs`` on."""
+    column = top + tl.arange(0, OUTPUTS)
     return tl.load(bias + column, mask=column < outputs, other=0.0)[None]
 
 
@@ -166,9 +169,10 @@ def seen_by(
         HIDDEN: ``hidden`` or more.
     """
     x = part_of(each, row, 0, channels, channels, CHANNELS)
-    x = times(x, view_0, 0, channels, channels, hidden, CHANNELS, HIDDEN) + biases(bias_0, hidden, HIDDEN)
-    x = times(positive(x), view_1, 0, hidden, hidden, hidden, HIDDEN, HIDDEN)
-    return positive(x + biases(bias_1, hidden, HIDDEN))
+    x = times(x, view_0, 0, channels, channels, 0, hidden, CHANNELS, HIDDEN)
+    x = positive(x + biases(bias_0, 0, hidden, HIDDEN))
+    x = times(x, view_1, 0, hidden, hidden, 0, hidden, HIDDEN, HIDDEN)
+    return positive(x + biases(bias_1, 0, hidden, HIDDEN))
 
 
 @triton.jit
@@ -204,35 +208,38 @@ def remember_rows(
         CHANNELS: powers of two that hold these, as are the next ones.
         HIDDEN: of ``hidden``.
         MORE: of ``more``.
-        WIDE: of ``wide``.
+        WIDE: values of the update that are computed together.
         ROWS: Gaussians of a program.
     """
     i = rows_of(count, ROWS)
     length = 4 * hidden + more
-    x = seen_by(each, i * views, view_0, bias_0, view_1, bias_1, channels, hidden, CHANNELS, HIDDEN)
-    updated = times(x, update_0, 0, hidden, length, wide, HIDDEN, WIDE) + biases(bias_2, wide, WIDE)
-    total = tl.zeros_like(x)
-    most = tl.zeros_like(x)  # no value is negative
+    own = seen_by(each, i * views, view_0, bias_0, view_1, bias_1, channels, hidden, CHANNELS, HIDDEN)
+    mean = tl.zeros_like(own)
+    most = tl.zeros_like(own)  # no value is negative
     for view in range(1, views):
-        x = seen_by(
-            each, i * views + view, view_0, bias_0, view_1, bias_1, channels, hidden, CHANNELS, HIDDEN
-        )
-        total += x
+        row = i * views + view
+        x = seen_by(each, row, view_0, bias_0, view_1, bias_1, channels, hidden, CHANNELS, HIDDEN)
+        mean += x
         most = tl.maximum(most, x, propagate_nan=tl.PropagateNan.ALL)
-    updated += times(total / (views - 1), update_0, hidden, hidden, length, wide, HIDDEN, WIDE)
-    updated += times(most, update_0, 2 * hidden, hidden, length, wide, HIDDEN, WIDE)
-    x = part_of(known, i, 0, more, more, MORE)
-    updated += times(x, update_0, 3 * hidden, more, length, wide, MORE, WIDE)
+    mean = mean / (views - 1)
+    known = part_of(known, i, 0, more, more, MORE)
     before = part_of(memory, i, 0, hidden, hidden, HIDDEN)
-    updated += times(before, update_0, 3 * hidden + more, hidden, length, wide, HIDDEN, WIDE)
-    x = times(positive(updated), update_1, 0, wide, wide, hidden, WIDE, HIDDEN)
-    x = positive(x + biases(bias_3, hidden, HIDDEN))
-    x = times(x, last, 0, hidden, hidden, hidden, HIDDEN, HIDDEN) + biases(bias_4, hidden, HIDDEN)
+    updated = tl.zeros_like(own)
+    for top in range(0, wide, WIDE):
+        x = times(own, update_0, 0, hidden, length, top, wide, HIDDEN, WIDE)
+        x += times(mean, update_0, hidden, hidden, length, top, wide, HIDDEN, WIDE)
+        x += times(most, update_0, 2 * hidden, hidden, length, top, wide, HIDDEN, WIDE)
+        x += times(known, update_0, 3 * hidden, more, length, top, wide, MORE, WIDE)
+        x += times(before, update_0, 3 * hidden + more, hidden, length, top, wide, HIDDEN, WIDE)
+        x = positive(x + biases(bias_2, top, wide, WIDE))
+        updated += times(x, update_1, top, wide - top, wide, 0, hidden, WIDE, HIDDEN)
+    x = positive(updated + biases(bias_3, 0, hidden, HIDDEN))
+    x = times(x, last, 0, hidden, hidden, 0, hidden, HIDDEN, HIDDEN) + biases(bias_4, 0, hidden, HIDDEN)
     column = tl.arange(0, HIDDEN)[None]
     tl.store(out + i[:, None] * hidden + column, tanh(before + x), mask=column < hidden)
 
 
-#: Gaussians of a program: their values and one weight fit into registers.
+#: Gaussians of a program: their values and a part of a weight fit into registers.
 _TOGETHER = 32
 
 
@@ -241,10 +248,10 @@ def remember(each: Tensor, known: Tensor, memory: Tensor, weights: list[Tensor])
     count, views, channels = each.shape
     out = torch.empty_like(memory, memory_format=torch.contiguous_format)
     numbers = (channels, memory.shape[1], known.shape[1], len(weights[4]))
-    names = ("CHANNELS", "HIDDEN", "MORE", "WIDE")
-    sizes = {name: max(triton.next_power_of_2(n), 16) for name, n in zip(names, numbers, strict=True)}
+    names = ("CHANNELS", "HIDDEN", "MORE")
+    sizes = {name: max(triton.next_power_of_2(n), 16) for name, n in zip(names, numbers, strict=False)}
     if count:
         read = [x.contiguous() for x in (each, known, memory, *weights)]
         grid = (triton.cdiv(count, _TOGETHER),)
-        remember_rows[grid](count, *read, out, views, *numbers, **sizes, ROWS=_TOGETHER, num_warps=8)
+        remember_rows[grid](count, *read, out, views, *numbers, **sizes, WIDE=32, ROWS=_TOGETHER, num_warps=8)
     return out
