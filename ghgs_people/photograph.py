@@ -19,7 +19,8 @@ import trimesh
 
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.types import Cameras
-from ghgs_people.figures.mesh import Person, sample_texture
+from ghgs_people.cpu import kernel
+from ghgs_people.figures.mesh import Person
 from ghgs_people.figures.meshing import smooth_normals
 
 # Rays traced at once: they fit the processor's cache, which is three times as fast as a whole photograph.
@@ -138,19 +139,25 @@ class Studio:
         parts = [part for part in person.parts if len(part.faces)]
         if not parts:
             raise InputError(f"{person.name}: expected a mesh with faces; found none")
-        self.lights = lights
+        lit = lights or LightRig(np.empty((0, 3)), np.empty(0), 1.0, 0.0)
+        arrays = lit.directions.astype(np.float64), lit.strengths.astype(np.float64)
+        self._lights = (*arrays, float(lit.ambient), float(lit.softness))
         self.samples = samples
         counts = np.cumsum([0] + [len(part.vertices) for part in parts])
         self._vertices = np.concatenate([part.vertices for part in parts]).astype(np.float32)
         self._faces = np.concatenate([p.faces + n for p, n in zip(parts, counts, strict=False)]).astype(
             np.int32
         )
-        self._uv = np.concatenate([part.uv for part in parts]).astype(np.float32)
-        self._normals = np.concatenate([smooth_normals(part.vertices, part.faces) for part in parts])
-        self._part = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
-        self._textures = [part.texture for part in parts]
+        uv = np.concatenate([part.uv for part in parts]).astype(np.float32)
+        normals = np.concatenate([smooth_normals(part.vertices, part.faces) for part in parts])
         corners = self._vertices[self._faces].astype(np.float64)
-        self._face_normals = trimesh.unitize(trimesh.triangles.cross(corners)).astype(np.float32)
+        flat = trimesh.unitize(trimesh.triangles.cross(corners)).astype(np.float32)
+        numbers = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part.faces) for part in parts])
+        self._surface = (np.concatenate((uv, normals), 1)[self._faces], flat, numbers)
+        shapes = np.array([part.texture.shape[:2] for part in parts])
+        first = np.cumsum([0, *shapes.prod(1)])[:-1, None]
+        texels = np.concatenate([part.texture.reshape(-1, 3) for part in parts])
+        self._textures = (texels, np.concatenate((first, shapes), 1))
         scenes, meshes = _embree()
         self._scene = scenes.EmbreeScene(robust=True)
         meshes.TriangleMesh(self._scene, self._vertices, self._faces)
@@ -178,107 +185,34 @@ class Studio:
             expected = "finite values and focal lengths above 0"
             is_right = bool(is_finite and min(matrix[0, 0], matrix[1, 1]) > 0)
             require(is_right, f"camera {n}", expected, matrix.tolist())
-            top, bottom, left, right = self._window(matrix, pose, *size[1:])
-            step = max(1, _CHUNK // max(1, (right - left) * self.samples**2))
-            for row in range(top, bottom, step):
-                window = (n, slice(row, min(row + step, bottom)), slice(left, right))
-                images[window], alphas[window], depths[window] = self._expose(matrix, pose, *window[1:])
+            self._expose(matrix, pose, images[n], alphas[n], depths[n])
         return RenderedViews(images, alphas, depths)
 
-    def _window(
-        self, matrix: np.ndarray, pose: np.ndarray, height: int, width: int
-    ) -> tuple[int, int, int, int]:
-        """Find the part of an image that all vertices project into.
-
-        Args:
-            matrix: intrinsics [3, 3], pixels.
-            pose: extrinsics [4, 4], world to camera, metres.
-            height: of the image, pixels.
-            width: of the image, pixels.
-
-        Returns:
-            Top, bottom, left and right in pixels; the whole image where the person is partly behind the
-            camera.
-        """
-        points = self._vertices @ pose[:3, :3].T + pose[:3, 3]
-        if points[:, 2].min() <= 1e-3:  # partly behind the camera: the projection has no bounds
-            return 0, height, 0, width
-        pixels = points @ matrix.T
-        low = np.floor((pixels[:, :2] / pixels[:, 2:]).min(0)).astype(int)
-        high = np.ceil((pixels[:, :2] / pixels[:, 2:]).max(0)).astype(int)
-        left, right = np.clip((low[0], high[0]), 0, width)
-        top, bottom = np.clip((low[1], high[1]), 0, height)
-        return int(top), int(bottom), int(left), int(right)
-
     def _expose(
-        self, matrix: np.ndarray, pose: np.ndarray, rows: slice, columns: slice
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Photograph a window of an image.
+        self, matrix: np.ndarray, pose: np.ndarray, image: np.ndarray, alpha: np.ndarray, depth: np.ndarray
+    ) -> None:
+        """Photograph the person with one camera.
 
         Args:
             matrix: intrinsics [3, 3], pixels.
             pose: extrinsics [4, 4], world to camera, metres.
-            rows: h rows of the image.
-            columns: w columns of the image.
-
-        Returns:
-            Image [h, w, 3], matte [h, w] and depth [h, w] in metres.
+            image: [h, w, 3], filled; black before.
+            alpha: [h, w], filled; 0 before.
+            depth: [h, w], filled, in metres; 0 before.
         """
         n = self.samples
-        h = rows.stop - rows.start
-        w = columns.stop - columns.start
-        y = (rows.start + (np.arange(h * n) + 0.5) / n - matrix[1, 2]) / matrix[1, 1]
-        u = columns.start + (np.arange(w * n) + 0.5) / n - matrix[0, 2]
-        x = (u - matrix[0, 1] * y[:, None]) / matrix[0, 0]
-        rays = np.stack((x, np.broadcast_to(y[:, None], x.shape), np.ones_like(x)), -1)
-        # [h, n, w, n] -> one row of n * n samples per pixel. Rays have z = 1, so distances are depths.
-        rays = rays.reshape(h, n, w, n, 3).transpose(0, 2, 1, 3, 4).reshape(-1, 3)
-        directions = (rays @ pose[:3, :3]).astype(np.float32)
-        origin = (-pose[:3, :3].T @ pose[:3, 3]).astype(np.float32)
-
-        hits = self._scene.run(np.tile(origin, (len(directions), 1)), directions, output=True)
-        hit = hits["primID"] >= 0
-        u = hits["u"]
-        v = hits["v"]
-        depth = np.where(hit, hits["tfar"], 0)
-        weights = np.stack((1 - u - v, u, v), -1)
-        colors = np.zeros((len(rays), 3), np.float32)
-        colors[hit] = self._shade(directions[hit], hits["primID"][hit], weights[hit])
-
-        hit = hit.reshape(h, w, n * n)
-        depth = depth.reshape(h, w, n * n)
+        covered = np.zeros(alpha.shape, bool)
+        kernel.cover()(self._vertices, self._faces, matrix, pose, covered)
+        pixels = np.flatnonzero(covered)
         offset = np.abs(np.arange(n) - (n - 1) / 2)
         order = np.argsort(offset[:, None] ** 2 + offset**2, axis=None, kind="stable")
-        nearest = order[hit[..., order].argmax(-1)]
-        alpha = hit.mean(-1, dtype=np.float32)
-        center = np.take_along_axis(depth, nearest[..., None], -1)[..., 0]
-        image = colors.reshape(h, w, n * n, 3).mean(2)
-        return np.clip(image, 0, 1), alpha, np.where(alpha > 0, center, 0)
-
-    def _shade(self, directions: np.ndarray, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Colour what rays hit.
-
-        Args:
-            directions: [n, 3] of the rays.
-            face: [n] index of the face that each hits.
-            weights: [n, 3] barycentric coordinates of the hit.
-
-        Returns:
-            [n, 3] in [0, 1] where textures alone are shown; light may exceed 1.
-        """
-        colors = np.empty((len(face), 3), np.float32)
-        part = self._part[face]
-        for k in np.unique(part):
-            index = np.flatnonzero(part == k)
-            uv = np.einsum("nk,nkc->nc", weights[index], self._uv[self._faces[face[index]]])
-            colors[index] = sample_texture(self._textures[k], uv)
-        if self.lights is None:
-            return colors
-        flat = self._face_normals[face]
-        smooth = trimesh.unitize(np.einsum("nk,nkc->nc", weights, self._normals[self._faces[face]]))
-        cancelled = np.square(smooth).sum(-1, keepdims=True) < 0.5
-        normals = np.where(cancelled, flat, smooth)
-        # The flat normal decides, so that all smooth normals of a face flip together.
-        behind = np.einsum("nc,nc->n", flat, directions) > 0
-        normals = np.where(behind[:, None], -normals, normals)
-        return colors * self.lights.shade(normals)[:, None]
+        maps = (image.reshape(-1, 3), alpha.reshape(-1), depth.reshape(-1))
+        step = max(1, _CHUNK // n**2)
+        origins = np.tile((-pose[:3, :3].T @ pose[:3, 3]).astype(np.float32), (step * n**2, 1))
+        for first in range(0, len(pixels), step):
+            some = pixels[first : first + step]
+            rays = np.empty((len(some) * n**2, 3), np.float32)
+            kernel.aim()(some, alpha.shape[1], n, matrix, pose, rays)
+            hits = self._scene.run(origins[: len(rays)], rays, output=True)
+            hits = tuple(hits[name] for name in ("primID", "u", "v", "tfar"))
+            kernel.expose()(some, order, rays, hits, self._surface, self._textures, self._lights, *maps)

@@ -69,30 +69,3 @@ class Person:
         parts = tuple(replace(part, vertices=move(part.vertices)) for part in self.parts)
         body = None if self.body_vertices is None else move(self.body_vertices)
         return replace(self, parts=parts, body_vertices=body)
-
-
-def sample_texture(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Look up a repeating texture, bilinear.
-
-    Args:
-        texture: [h, w, 3] uint8, row 0 at the top.
-        uv: [n, 2], origin at the bottom left, 1 is one repetition.
-
-    Returns:
-        Colours [n, 3] float32 in [0, 1].
-    """
-    height, width, _ = texture.shape
-    x = uv[:, 0] * width - 0.5
-    y = (1 - uv[:, 1]) * height - 0.5
-    left = np.floor(x)
-    top = np.floor(y)
-    fx = (x - left).astype(np.float32)
-    fy = (y - top).astype(np.float32)
-    columns = np.stack((left, left + 1)).astype(np.int64) % width
-    rows = np.stack((top, top + 1)).astype(np.int64) % height
-    texels = texture.reshape(-1, 3)
-    total = np.zeros((len(uv), 3), np.float32)
-    for i, wy in enumerate((1 - fy, fy)):
-        for j, wx in enumerate((1 - fx, fx)):
-            total += (wx * wy)[:, None] * (texels[rows[i] * width + columns[j]].astype(np.float32) / 255)
-    return total

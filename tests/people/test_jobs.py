@@ -199,6 +199,16 @@ def test_several_workers_make_the_same_files(scans, reference, tmp_path, monkeyp
     assert contents(tmp_path / "out") == reference
 
 
+def test_workers_have_one_thread_each(monkeypatch):
+    """Products of 15 workers with 15 threads each wait for one another; the caller's settings come back."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    with jobs.one_thread_each():
+        assert os.environ["OMP_NUM_THREADS"] == os.environ["OPENBLAS_NUM_THREADS"] == "1"
+    assert os.environ["OMP_NUM_THREADS"] == "7"
+    assert "OPENBLAS_NUM_THREADS" not in os.environ
+
+
 def test_people_are_rendered_inside_a_worker_of_joblib(scans, reference, tmp_path):
     """A sweep with ``hydra/launcher=joblib`` makes its people in joblib's worker, in further processes."""
     loky = pytest.importorskip("joblib.externals.loky")

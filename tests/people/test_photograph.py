@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.ndimage import map_coordinates
 
 import ghgs_lit
 from ghgs_lit.data.sampling import subject_rng
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import pixel_centers, project, unproject_maps
 from ghgs_lit.types import Cameras
-from ghgs_people.figures.mesh import Person, TexturedMesh, sample_texture
+from ghgs_people.figures.mesh import Person, TexturedMesh
 from ghgs_people.figures.meshing import smooth_normals
 from ghgs_people.photograph import Lights, Studio
 from ghgs_people.rig import Rig
@@ -165,8 +166,64 @@ def test_texture_is_upright_and_bilinear():
     image, _, _ = shoot([quad(half=0.5, texture=texture)], front_camera(32), samples=1)
     assert image[12, 12, 0] > 0.8 > 0.2 > image[12, 12, 1]
     assert image[19, 19, 1] > 0.8 > 0.2 > image[19, 19, 0]
-    uv = np.array([[0.25, 0.75], [0.5, 0.75], [0.5, 0.5], [1.25, 1.75]], np.float32)
-    np.testing.assert_allclose(sample_texture(texture, uv)[:, 0], [1, 0.5, 0.25, 1], atol=1e-6)
+
+
+def sample_texture(texture, uv):
+    """Bilinear colours [n, 3] of a repeating texture, by SciPy in float64."""
+    height, width, _ = texture.shape
+    places = [(1 - uv[:, 1]) * height - 0.5, uv[:, 0] * width - 0.5]
+    return np.stack(
+        [map_coordinates(c / 255, places, order=1, mode="grid-wrap") for c in np.moveaxis(texture, 2, 0)], -1
+    )
+
+
+def photographed(part, camera, samples, lights):
+    """Image, matte and depth of a mesh by its formulas: all rays against all faces, in float64."""
+    corners = part.vertices[part.faces].astype(np.float64)
+    normals = smooth_normals(part.vertices, part.faces).astype(np.float64)[part.faces]
+    matrix = camera.intrinsics[0].double().numpy()
+    pose = camera.extrinsics[0].double().numpy()
+    place = (np.arange(camera.width * samples) + 0.5) / samples
+    columns, rows = np.meshgrid(place, place)
+    rays = np.stack((columns, rows, np.ones_like(rows)), -1) @ np.linalg.inv(matrix).T @ pose[:3, :3]
+    origin = -pose[:3, :3].T @ pose[:3, 3]
+    image, matte, depth = np.zeros((*rows.shape, 3)), np.zeros(rows.shape), np.full(rows.shape, np.inf)
+    for face in range(len(corners)):
+        a, b, c = corners[face]
+        flat = np.cross(b - a, c - a)
+        t = flat @ (a - origin) / (rays @ flat)
+        offset = origin + t[..., None] * rays - a
+        v, w = (np.linalg.pinv(np.stack((b - a, c - a), -1)) @ offset[..., None])[..., 0].transpose(2, 0, 1)
+        hit = (np.minimum(np.minimum(v, w), 1 - v - w) >= 0) & (t > 0) & (t < depth)
+        weights = np.stack((1 - v - w, v, w), -1)[hit]
+        smooth = weights @ normals[face] * -np.sign(rays[hit] @ flat)[:, None]
+        light = lights.shade(smooth / np.linalg.norm(smooth, axis=-1, keepdims=True))
+        image[hit] = sample_texture(part.texture, weights @ part.uv[part.faces[face]]) * light[:, None]
+        matte[hit] = 1
+        depth[hit] = t[hit]
+    side = (camera.height, samples, camera.width, samples)
+    middle = slice(samples // 2, None, samples)
+    return image.reshape(*side, 3).mean((1, 3)), matte.reshape(side).mean((1, 3)), depth[middle, middle]
+
+
+@pytest.mark.parametrize("samples", [1, 3])
+def test_photograph_follows_its_formulas(samples):
+    """Kernels, and the choice of the rays that are cast, against all rays and all faces in float64."""
+    rng = np.random.default_rng(samples)
+    sphere = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
+    vertices = np.float32(sphere.vertices * rng.uniform(0.6, 1.4, (len(sphere.vertices), 1)))
+    uv = np.float32(rng.uniform(-2, 2, (len(vertices), 2)))
+    texture = rng.integers(0, 256, (7, 5, 3), np.uint8)
+    part = TexturedMesh(vertices, np.asarray(sphere.faces), uv, texture)
+    camera = front_camera(40, 1.8, shift=1.3)
+    lights = Lights(exposure=0.4).draw(rng)
+    taken = Studio(Person("p", (part,), None), lights, samples).shoot(camera)
+    image, matte, depth = photographed(part, camera, samples, lights)
+    np.testing.assert_array_equal(taken.alphas[0], np.float32(matte))
+    assert 0.3 < matte.mean() < 0.7
+    shown = np.isfinite(depth)
+    np.testing.assert_allclose(taken.depths[0][shown], depth[shown], rtol=1e-5)
+    np.testing.assert_allclose(taken.images[0], image, atol=2e-4)
 
 
 def test_light_is_lambertian_seam_free_and_the_same_for_every_view():

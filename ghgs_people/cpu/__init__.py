@@ -1,0 +1,1 @@
+"""Photographs on cores: kernels that Numba compiles."""
