@@ -49,6 +49,7 @@ NOT_RUN = [
     (r"ghgs stress dump=", "needs a training step that was not finite"),
     (r"ghgs (train|evaluate|benchmark) .*split=bench", "renders forty people"),
     (r"ghgs table .*runs/ablation", "needs twelve runs"),
+    (r"(GHGS_PLUGINS=\S+ )?ghgs (train|table) .*controls", "needs 21 runs"),
     (r"ghgs (train|table) .*runs/peers", "needs five runs"),
     (r"ghgs (train|export) .*runs/shipped", "renders 344 people"),
     (r"ghgs evaluate .*per_scene", "fits Gaussians to each person, for minutes"),
