@@ -28,6 +28,7 @@ from ghgs_lit.runtime.recording import CudaTape, Recorder
 from ghgs_lit.runtime.watching import Inputs, Watcher
 from ghgs_lit.runtime.watching import watched as stages_watched
 from ghgs_lit.stages import STAGES
+from ghgs_lit.training import captured
 from ghgs_lit.types import Batch, map_tensors
 
 PRECISIONS = ("float32", "tf32", "bfloat16")
@@ -102,7 +103,7 @@ def prediction(call: Call) -> None:
 
 def _recording(call: Call, model: GHGS) -> GHGS:
     """The model with recordings on this device."""
-    model.playback = Playback(Recorder(tape=CudaTape(call.gpu.device.type)))
+    model.playback = Playback(*(Recorder(tape=CudaTape(call.gpu.device.type)) for _ in range(2)))
     return model
 
 
@@ -183,7 +184,7 @@ class _Step:
 
     def __init__(self, call: Call, config: Config, batch: Batch, autocast: bool = False):
         self.device, self.host, self.autocast = call.gpu.device, batch, autocast
-        self.model = _built(call, config).train()
+        self.model = _recording(call, _built(call, config)).train()
         if self.model.rounds is not None:
             self.model.rounds._drawn = lambda: 2
         self.renderer, self.losses = (build(config[name], name) for name in ("renderer", "loss"))
@@ -211,6 +212,12 @@ class _Step:
         self.optimizer.step()
         self.optimizer.zero_grad()
 
+    def captured(self) -> None:
+        """The step with stages, rendering, loss and gradients played back."""
+        self.data()
+        captured.played(self.model, self.renderer, self.losses, self.batch).total.backward()
+        self.optimize()
+
     @property
     def parts(self) -> list[Callable[[], None]]:
         return [self.data, self.forward, self.render, self.loss, self.backward, self.optimize]
@@ -230,12 +237,21 @@ def _stepped(call: Call, name: str, step: _Step) -> None:
         call.add(f"{name}: {part.__name__}", ms=ms, **call.gpu.work(part, 1))
 
 
+def _captured(call: Call, name: str, step: _Step) -> None:
+    """Row of a step that is played back."""
+    ms = call.gpu.milliseconds(step.captured, call.sizes.repeats)
+    recorder = step.model.playback.steps
+    work = call.gpu.work(step.captured, 2)
+    call.add(name, ms=ms, reason=recorder.reason, **work, **recorder.counts)
+
+
 def step(call: Call) -> None:
     """A training step of experiment=shipped on a batch that is ready, two rounds; parts by themselves"""
     for size in reversed(call.sizes.batches):
         made = _Step(call, call.config(*call.shipped), call.batch(size, call.sizes.side))
         with precision_of("tf32", torch.device("cuda")):  # as trainer=gpu
             _stepped(call, f"batch of {size}", made)
+            _captured(call, f"batch of {size}, captured", made)
         del made
         gc.collect()
 

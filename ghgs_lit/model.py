@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Hashable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,10 @@ from ghgs_lit.heads.dpt import LEVELS, DPTHead
 from ghgs_lit.plan import Plan, SkipOptions, planned
 from ghgs_lit.playback import Playback
 from ghgs_lit.rendering.capacity import settled
-from ghgs_lit.rounds import CoarseDepths, Rounds, State, coarse_depths, prediction_of, replaced
+from ghgs_lit.rounds import CoarseDepths, Rounds, State, coarse_depths, coarse_sizes, prediction_of, replaced
 from ghgs_lit.runtime.precision import PRECISIONS, precision_of
 from ghgs_lit.stages import HEADS, OPTIONS, STAGES
-from ghgs_lit.surroundings import Finding, ModelOptions, any_bad, refuse, surroundings
+from ghgs_lit.surroundings import Finding, ModelOptions, Surrounding, any_bad, left, refuse, surroundings
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Prediction, Tokens
 from ghgs_lit.weights.checkpoint import load_weights, read_config
 from ghgs_lit.weights.reading import SHIPPED
@@ -98,15 +98,53 @@ class GHGS(nn.Module):
         Raises:
             InputError: the batch does not fit the stages.
         """
+        return self.finished(*self.prepared(batch))
+
+    def prepared(self, batch: Batch) -> tuple[Sequence[Surrounding], Batch, Plan]:
+        """What precedes the stages.
+
+        Args:
+            batch: as of :meth:`forward`.
+
+        Returns:
+            The layers around the stages, the batch inside of them, and its plan.
+
+        Raises:
+            InputError: the batch does not fit the stages.
+        """
         around = surroundings(self.options, self.encoder.patch_size, self.checks_values)
+        findings: list[Finding] = []
         for layer in around:
             batch = layer.enter(batch)
-        plan = self.plan(batch, [finding for layer in around for finding in layer.findings])
-        with precision_of(self.precision, batch.masks.device):
+            findings += layer.findings
+            layer.findings = ()
+        return around, batch, self.plan(batch, findings)
+
+    def finished(self, around: Sequence[Surrounding], batch: Batch, plan: Plan) -> Prediction:
+        """The prediction for what is prepared.
+
+        Args:
+            around: the layers around the stages.
+            batch: inside of them.
+            plan: of the batch.
+        """
+        with self.in_precision(batch.masks.device):
             prediction = self._predicted(batch, plan, self._coarse(batch))
-        for layer in reversed(around):
-            prediction = layer.leave(prediction)
-        return dataclasses.replace(plan.trimmed(prediction), decisions=plan.decisions)
+        prediction = plan.trimmed(left(around, prediction))
+        return dataclasses.replace(prediction, decisions=plan.decisions)
+
+    def in_precision(self, device: torch.device) -> AbstractContextManager[None]:
+        """The precision of the stages' products on a device, while the context lasts."""
+        return precision_of(self.precision, device)
+
+    def needs_copies(self, batch: Batch) -> bool:
+        """Whether subjects are so tall that smaller copies of their photographs are predicted, too.
+
+        Args:
+            batch: as the stages see it.
+        """
+        height = None if self.rounds is None else self.rounds.options.height
+        return height is not None and any(coarse_sizes(batch, height, self.encoder.patch_size))
 
     def plan(self, batch: Batch, findings: Sequence[Finding] = ()) -> Plan:
         """What the stages work on; a GPU is waited for once.
@@ -142,10 +180,10 @@ class GHGS(nn.Module):
     def _predicted(self, batch: Batch, plan: Plan, coarse: CoarseDepths | None) -> Prediction:
         """:meth:`_predict`, played back where it can be; renderings have room enough."""
         if self.options.capture == "auto" and not self.training and self.playback.fits(batch, plan):
-            return self.playback(self, batch, plan, coarse, self._settings())
-        return settled(lambda: self._predict(batch, plan, coarse))
+            return self.playback(self, batch, plan, coarse, self.settings())
+        return settled(lambda: self.predict(batch, plan, coarse))
 
-    def _predict(self, batch: Batch, plan: Plan, coarse: CoarseDepths | None = None) -> Prediction:
+    def predict(self, batch: Batch, plan: Plan, coarse: CoarseDepths | None = None) -> Prediction:
         """The stages of Figure 2: bounds, tokens, and what is decoded from them."""
         bounds = self.bounded(batch)
         return self.decoded(batch, bounds, self.encoded(batch, bounds, plan), plan, coarse)
@@ -230,7 +268,7 @@ class GHGS(nn.Module):
         sizes = (self.rounds.options.height, self.encoder.patch_size)
         return coarse_depths(batch, *sizes, self.options.matte, predict)
 
-    def _settings(self) -> Hashable:
+    def settings(self) -> Hashable:
         """All that may be changed after a model was made and decides what it computes, but its weights."""
         settings: list[Hashable] = [self.skip.pixels, self.keeps_drafts]
         for name in (*STAGES, "rounds"):
@@ -239,11 +277,11 @@ class GHGS(nn.Module):
         return repr(settings)
 
     def _apply(self, *arguments: Any, **options: Any) -> "GHGS":
-        self.playback.recorder.clear()  # weights move
+        self.playback.clear()  # weights move
         return super()._apply(*arguments, **options)
 
     def _load_from_state_dict(self, *arguments: Any, **options: Any) -> None:
-        self.playback.recorder.clear()  # weights may be replaced
+        self.playback.clear()  # weights may be replaced
         super()._load_from_state_dict(*arguments, **options)
 
     @classmethod

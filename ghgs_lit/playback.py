@@ -60,7 +60,7 @@ class Pieces(Protocol):
 
 
 @dataclass(frozen=True)
-class _Scene:
+class Scene:
     """What the pieces read of a batch and its plan, as inputs of a recording: tensors, and numbers of the
     class."""
 
@@ -73,7 +73,7 @@ class _Scene:
     tokens: DecodedPixels
 
     @classmethod
-    def of(cls, batch: Batch, plan: Plan) -> "_Scene":
+    def of(cls, batch: Batch, plan: Plan) -> "Scene":
         """The inputs that the pieces read; what only losses read is left out."""
         bare = dataclasses.replace(batch, targets=None, body_vertices=None, subjects=(), views=())
         facts = (plan.patch_size, plan.pixels, plan.tokens)
@@ -95,10 +95,17 @@ class Playback:
 
     Args:
         recorder: makes and keeps recordings, two for each class of scenes; None: one that keeps 16.
+        steps: the same of training steps (:mod:`ghgs_lit.training.captured`), one for each class.
     """
 
-    def __init__(self, recorder: Recorder | None = None):
+    def __init__(self, recorder: Recorder | None = None, steps: Recorder | None = None):
         self.recorder = recorder or Recorder(limit=16)
+        self.steps = steps or Recorder(limit=32)
+
+    def clear(self) -> None:
+        """Forget all recordings: after weights have moved."""
+        self.recorder.clear()
+        self.steps.clear()
 
     def fits(self, batch: Batch, plan: Plan) -> bool:
         """Whether recordings of this batch are worth a try.
@@ -110,9 +117,13 @@ class Playback:
         Returns:
             True where its sizes are those of a class, on a device that records, and no gradient is wanted.
         """
+        return self.repeats(batch, plan) and not torch.is_grad_enabled()
+
+    def repeats(self, batch: Batch, plan: Plan) -> bool:
+        """:meth:`fits`, with or without a gradient."""
         here = batch.masks.device.type == self.recorder.tape.device
         sized = type(batch) is Batch and plan.is_of_class and plan.kept.is_whole
-        return here and sized and not torch.is_grad_enabled() and not is_watched()
+        return here and sized and not is_watched()
 
     def __call__(
         self,
@@ -134,7 +145,7 @@ class Playback:
         Returns:
             The prediction; its Gaussians fill their size class.
         """
-        scene = _Scene.of(batch, plan)
+        scene = Scene.of(batch, plan)
         bounds = self.recorder(lambda inputs: pieces.bounded(inputs.read()[0]), scene, ("bounds", key))
         tokens = pieces.encoded(batch, bounds, plan)
 
@@ -152,4 +163,4 @@ class Playback:
         return settled(lambda: pieces.decoded(batch, bounds, tokens, plan, coarse))
 
 
-_Decoded = tuple[_Scene, DepthBounds | None, Tokens, CoarseDepths | None]
+_Decoded = tuple[Scene, DepthBounds | None, Tokens, CoarseDepths | None]

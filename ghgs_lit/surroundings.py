@@ -8,6 +8,7 @@ cameras' world. :class:`ModelOptions` (``conf/model``) choose the layers. Checks
 which :meth:`ghgs_lit.model.GHGS.plan` reads together with all else that a GPU must be waited for."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -19,7 +20,7 @@ from ghgs_lit.config.options import Options, Text
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.geometry.masks import with_matte
-from ghgs_lit.geometry.padding import pad_to_patches
+from ghgs_lit.geometry.padding import Padding, pad_to_patches
 from ghgs_lit.types import Batch, Prediction
 
 #: Colours may leave [0, 1] by this much, as resizing does.
@@ -157,8 +158,8 @@ class ModelOptions(Options):
     """Pixels that show a larger share of the subject become Gaussians, whose colours and opacities know that
     share; null: masks decide, mattes are ignored."""
     capture: Literal["auto", "off"] = "auto"
-    """auto: on CUDA, predictions of scenes of one size class are recorded as CUDA graphs and played back;
-    off: every operator is called each time."""
+    """auto: on CUDA, predictions and training steps of scenes of one size class are recorded as CUDA graphs
+    and played back; off: every operator is called each time."""
 
 
 class Surrounding:
@@ -179,6 +180,19 @@ class Surrounding:
         return prediction
 
 
+def left(around: Sequence[Surrounding], prediction: Prediction) -> Prediction:
+    """The prediction outside of all layers.
+
+    Args:
+        around: the layers, the outermost first.
+        prediction: of the stages.
+    """
+    for layer in reversed(around):
+        prediction = layer.leave(prediction)
+    return prediction
+
+
+@dataclass
 class CheckedPhotographs(Surrounding):
     """Photographs to be checked; masks are thresholds of soft mattes, if any.
 
@@ -188,17 +202,26 @@ class CheckedPhotographs(Surrounding):
         least_matte: pixels that show a larger share of the subject are its mask, 0 to 0.5; None: masks stay.
     """
 
-    def __init__(self, side_multiple: int, checks_values: bool, least_matte: float | None) -> None:
-        self.options = side_multiple, checks_values
-        self.least_matte = least_matte
+    side_multiple: int
+    checks_values: bool
+    least_matte: float | None
 
     def enter(self, batch: Batch) -> Batch:
-        self.findings = findings_of(batch, *self.options)
+        self.findings = findings_of(batch, self.side_multiple, self.checks_values)
         return with_matte(batch, self.least_matte)
 
 
+@dataclass
 class SubjectFrame(Surrounding):
-    """Metres around the subject inside, the cameras' world outside (:mod:`ghgs_lit.geometry.frame`)."""
+    """Metres around the subject inside, the cameras' world outside (:mod:`ghgs_lit.geometry.frame`).
+
+    Attributes:
+        frame: of the batch that entered.
+        dtype: of its cameras.
+    """
+
+    frame: Frame | None = None
+    dtype: torch.dtype | None = None
 
     def enter(self, batch: Batch) -> Batch:
         self.frame = Frame.of(batch)
@@ -209,6 +232,7 @@ class SubjectFrame(Surrounding):
         return self.frame.leave(prediction, self.dtype)
 
 
+@dataclass
 class Border(Surrounding):
     """Photographs padded to whole patches inside (:mod:`ghgs_lit.geometry.padding`).
 
@@ -216,8 +240,8 @@ class Border(Surrounding):
         patch_size: of the encoder, in pixels.
     """
 
-    def __init__(self, patch_size: int) -> None:
-        self.patch_size = patch_size
+    patch_size: int
+    padding: Padding | None = None
 
     def enter(self, batch: Batch) -> Batch:
         self.padding = pad_to_patches(batch.masks, self.patch_size)

@@ -40,7 +40,8 @@ def test_a_section_runs_in_a_rehearsal(section, tmp_path, one_thread):
         ]
     if section == "step":
         parts = ("data", "forward", "render", "loss", "backward", "optimize")
-        assert names == ["batch of 1", *(f"batch of 1: {part}" for part in parts)]
+        each = [f"batch of 1: {part}" for part in parts]
+        assert names == ["batch of 1", *each, "batch of 1, captured"]
         assert all(row["ms"] > 0 and row["launches"] > 0 and len(row["longest"]) <= 40 for row in found)
 
 

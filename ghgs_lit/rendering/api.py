@@ -184,6 +184,8 @@ def _in_one_dtype(gaussians: Gaussians) -> Gaussians:
 
 def _of_each(values: Tensor, gaussians: Gaussians) -> Tensor:
     """``values`` of the elements [B, ...], repeated for each of their Gaussians."""
+    if len(set(gaussians.splits)) == 1:  # no number has to be copied to a GPU
+        return values.repeat_interleave(gaussians.splits[0], dim=0)
     counts = torch.tensor(gaussians.splits).to(values.device, non_blocking=True)
     return values.repeat_interleave(counts, dim=0, output_size=len(gaussians))
 

@@ -8,7 +8,8 @@ et al., ECCV 2024; ReSplat, Xu et al., 2025)."""
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated, NamedTuple
@@ -257,6 +258,7 @@ class Rounds(nn.Module):
         super().__init__()
         self.options = options
         self.count = options.count
+        self._known_count: int | None = None
         hidden = options.hidden
         depths = options.depths
         self.view = _two_layers(CHANNELS, hidden, hidden)
@@ -292,12 +294,21 @@ class Rounds(nn.Module):
         rays = Rays.of(state.raw, batch)
         if isinstance(step, Tensor):
             step = step[state.raw.image // batch.masks.shape[1]]
-        count = self._drawn() if self.training else self.count
+        count = (self._known_count or self._drawn()) if self.training else self.count
         for number in range(count):
             change, memory = self._round(states[-1], batch, rays, memory, windows, step * 0.5**number)
             shown = activate if number == count - 1 else replaced(activate, self.training)
             states.append(_moved(states[-1], shown, batch, rays, *change))
         return tuple(states)
+
+    @contextmanager
+    def drawn(self) -> Iterator[None]:
+        """Draw the number of rounds of a training step now, for all that is called inside."""
+        self._known_count = self._drawn()
+        try:
+            yield
+        finally:
+            self._known_count = None
 
     def _drawn(self) -> int:
         """The number of rounds of a training step."""

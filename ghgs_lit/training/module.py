@@ -19,6 +19,7 @@ from ghgs_lit.metrics import FURTHER, MetricsOptions, depth_error_mm, surface_er
 from ghgs_lit.model import GHGS
 from ghgs_lit.plan.presets import KeptTokens, seeing
 from ghgs_lit.training.base import BudgetedModule, image_mean
+from ghgs_lit.training.captured import Outcome, is_recordable, played
 from ghgs_lit.training.faults import Step
 from ghgs_lit.training.guard import Guard
 from ghgs_lit.training.optimization import Optimization
@@ -160,6 +161,20 @@ class GHGSModule(BudgetedModule):
         total, values = self.losses(prediction, rendering, step.batch)
         return prediction, total, values
 
+    def _called(self, step: Step) -> Outcome:
+        """The forward pass of a step, operator by operator."""
+        prediction, total, values = self.forward_losses(step)
+        return Outcome(total, values, len(prediction.gaussians))
+
+    def _played(self, step: Step) -> Outcome | None:
+        """The forward pass of a step, played back; None where it must be called."""
+        parts = (self.model, self.renderer, self.losses, step.batch)
+        if not is_recordable(*parts):
+            return None
+        torch.manual_seed(step.seed)
+        with token_budget(self.model, step.budget):
+            return played(*parts)
+
     def _step(self, batch: Batch, batch_idx: int) -> Step:
         """All inputs of a training step."""
         device = self.device.type
@@ -179,13 +194,13 @@ class GHGSModule(BudgetedModule):
         Returns:
             The total loss, without dimensions."""
         step = self._step(batch, batch_idx)
-        prediction, total, values = self.forward_losses(step)
+        total, values, gaussians = self._played(step) or self._called(step)
         self.guard.note(step, total)
         size = len(batch.images)
         self.log("loss/total", total.detach(), prog_bar=True, batch_size=size)
         self.log_dict({f"loss/{name}": v.detach() for name, v in values.items()}, batch_size=size)
         skipped = float(self.guard.skipped)
-        self.log_numbers(size, skipped_steps=skipped, gaussians=len(prediction.gaussians) / size)
+        self.log_numbers(size, skipped_steps=skipped, gaussians=gaussians / size)
         return total
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:

@@ -303,5 +303,5 @@ def test_graphs_are_made_as_pytorch_documents(monkeypatch):
         play()
     assert result == 5
     once = ["wait", [], "in", "call", "out", "wait"]
-    then = [["pool", "stream"], "in", "call", "out", "play"]
+    then = [["capture_error_mode", "pool", "stream"], "in", "call", "out", "play"]
     assert log == [*once, "pool", *then, *once, *then]

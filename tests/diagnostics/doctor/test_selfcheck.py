@@ -74,14 +74,14 @@ def test_it_runs_on_the_pretend_device():
 def test_it_checks_what_a_user_has(monkeypatch):
     """``inherit`` leaves the process as it is, with convolutions in TF32, and may round as much; the gradient
     is that of a training in float32."""
-    right, seen = GHGS._predict, []
+    right, seen = GHGS.predict, []
 
     def noted(self, batch, kept, coarse=None):
         if batch.images.dtype == torch.float32:
             seen.append((self.precision, self.training, rounds_products("cuda")))
         return right(self, batch, kept, coarse)
 
-    monkeypatch.setattr(GHGS, "_predict", noted)
+    monkeypatch.setattr(GHGS, "predict", noted)
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)  # PyTorch's default, which trainings change
     with pretend_device():
         found = [*stages(settings(), DEVICE), *gradient(settings(), DEVICE)]

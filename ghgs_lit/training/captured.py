@@ -1,0 +1,170 @@
+"""Training steps whose work is recorded on a GPU for each class of batches, and played back.
+
+A step of a small model asks a GPU for thousands of launches, and the host takes longer to ask than the GPU
+to do. What follows a plan depends on sizes alone, in training as in predictions
+(:mod:`ghgs_lit.playback`). So the stages, the rendering, the loss and the gradients of all weights are one
+CUDA graph here. What surrounds it is called as always: the plan before it; hooks of weights, clipping and
+the optimizer after it, which find a loss with a gradient as usual."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from ghgs_lit.losses import Losses
+from ghgs_lit.model import GHGS
+from ghgs_lit.plan import Plan
+from ghgs_lit.playback import Scene
+from ghgs_lit.rendering.api import Renderer
+from ghgs_lit.rendering.capacity import Rooms, deferred
+from ghgs_lit.runtime.watching import is_watched
+from ghgs_lit.surroundings import Surrounding, left
+from ghgs_lit.types import Batch, Prediction
+
+
+class Outcome(NamedTuple):
+    """Of a forward pass.
+
+    Attributes:
+        total: the loss, without dimensions, with a gradient.
+        values: its unweighted terms by name.
+        gaussians: number of Gaussians of the batch.
+    """
+
+    total: Tensor
+    values: dict[str, Tensor]
+    gaussians: int
+
+
+class _Known(torch.autograd.Function):
+    """A loss whose gradients are known: ``apply(total, gradients, *weights)``."""
+
+    @staticmethod
+    def forward(ctx: Any, total: Tensor, gradients: Sequence[Tensor], *weights: nn.Parameter) -> Tensor:
+        ctx.gradients = gradients
+        return total.clone()
+
+    @staticmethod
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
+        gradients = ctx.gradients
+        del ctx.gradients
+        return None, None, *torch._foreach_mul(gradients, slope)
+
+
+class _Pass(nn.Module):
+    """Stages, rendering and loss, of a batch that is prepared; its weights can be replaced by others.
+
+    Args:
+        model: of the training.
+        renderer: draws its Gaussians.
+        losses: compares them.
+    """
+
+    def __init__(self, model: GHGS, renderer: Renderer, losses: Losses):
+        super().__init__()
+        self.model = model
+        self.renderer = renderer
+        self.losses = losses
+
+    def forward(
+        self, around: Sequence[Surrounding], batch: Batch, plan: Plan, seen: Batch
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss and its terms. Gaussians that fill a size class are drawn, too, with opacity 0.
+
+        Args:
+            around: layers around the stages.
+            batch: inside of them.
+            plan: of the batch.
+            seen: the batch outside of them, with targets.
+        """
+        prediction = self._predicted(around, batch, plan)
+        rendering = self.renderer(prediction.gaussians, seen.targets.cameras)
+        return self.losses(prediction, rendering, seen)
+
+    def _predicted(self, around: Sequence[Surrounding], batch: Batch, plan: Plan) -> Prediction:
+        with self.model.in_precision(batch.masks.device):
+            return left(around, self.model.predict(batch, plan))
+
+
+def is_recordable(model: nn.Module, renderer: Callable, losses: Callable, batch: Batch) -> bool:
+    """Whether training steps can be recorded at all.
+
+    Args:
+        model: of the training.
+        renderer: of the training; others than this package's may do what depends on values.
+        losses: likewise.
+        batch: of a step.
+
+    Returns:
+        True on a device that records, with ``model.capture=auto``, where the gradient needs no scaling.
+    """
+    known = isinstance(model, GHGS) and isinstance(renderer, Renderer) and isinstance(losses, Losses)
+    if not known or model.options.capture == "off" or is_watched():
+        return False
+    device = batch.masks.device.type
+    if torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device) == torch.float16:
+        return False  # gradients would underflow before they are scaled
+    return model.training and device == model.playback.steps.tape.device
+
+
+def played(model: GHGS, renderer: Renderer, losses: Losses, batch: Batch) -> Outcome | None:
+    """The forward pass of a training step, played back from the third batch of a class on.
+
+    Args:
+        model: of the training.
+        renderer: of the training.
+        losses: of the training.
+        batch: on the device of the training, with targets; :func:`is_recordable`.
+
+    Returns:
+        The loss; None where this batch must be called: its subjects are tall, or its sizes are no class.
+    """
+    with nullcontext() if model.rounds is None else model.rounds.drawn():
+        around, inside, plan = model.prepared(batch)
+        if not model.playback.repeats(inside, plan) or model.needs_copies(inside):
+            return None
+        targets = dataclasses.replace(batch.targets, names=(), protocols=())
+        bodies = batch.body_vertices if losses.weights.chamfer else None
+        seen = dataclasses.replace(batch, targets=targets, body_vertices=bodies, subjects=(), views=())
+        return _recorded(_Pass(model, renderer, losses), around, Scene.of(inside, plan), seen, plan)
+
+
+def _recorded(
+    one_pass: _Pass, around: Sequence[Surrounding], scene: Scene, seen: Batch, plan: Plan
+) -> Outcome:
+    """The loss, whose gradients come from a recording.
+
+    Args:
+        one_pass: what is recorded.
+        around: layers around the stages.
+        scene: the batch inside of them.
+        seen: the batch outside of them, without names.
+        plan: of the batch.
+    """
+    weights = {name: weight for name, weight in one_pass.named_parameters() if weight.requires_grad}
+
+    def differentiated(inputs: tuple) -> tuple[Tensor, dict[str, Tensor], tuple, Rooms]:
+        around, scene, seen = inputs
+        # Gradients of the weights themselves would be summed on the stream that first asked for them.
+        twins = {name: weight.detach().requires_grad_() for name, weight in weights.items()}
+        with torch.enable_grad(), deferred() as rooms:
+            total, values = functional_call(one_pass, twins, (around, *scene.read(), seen))
+            with torch.autocast(total.device.type, enabled=False):
+                gradients = torch.autograd.grad(total, list(twins.values()), allow_unused=True)
+        return total.detach(), {name: value.detach() for name, value in values.items()}, gradients, rooms
+
+    recorder = one_pass.model.playback.steps
+    inputs = (tuple(around), scene, seen)
+    key = (one_pass.model.settings(), repr((one_pass.renderer, one_pass.losses)), tuple(weights))
+    with torch.no_grad():
+        total, values, gradients, rooms = recorder(differentiated, inputs, key)
+        while not rooms.suffice():
+            recorder.forget(inputs, key)
+            total, values, gradients, rooms = recorder(differentiated, inputs, key)
+    used = [pair for pair in zip(weights.values(), gradients, strict=True) if pair[1] is not None]
+    known = _Known.apply(total, [gradient for _, gradient in used], *[weight for weight, _ in used])
+    return Outcome(known, values, sum(plan.counts))

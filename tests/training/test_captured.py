@@ -1,0 +1,131 @@
+"""Training steps that are played back, on the pretend device with a stand-in for CUDA graphs."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from benchmarks.device import drawing_nothing
+from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
+from ghgs_lit.playback import Playback
+from ghgs_lit.rendering import capacity
+from ghgs_lit.rendering.api import Renderer
+from ghgs_lit.runtime.recording import Recorder
+from ghgs_lit.training.captured import is_recordable, played
+from tests.helpers.losses import losses_of
+from tests.helpers.models import make_model
+from tests.helpers.pretend_device import DEVICE, pretend_device
+from tests.helpers.tape import OperatorTape
+
+LOSSES = losses_of({"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 0.0, "depth": 0.2})
+
+
+@pytest.fixture(autouse=True)
+def there():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    with pretend_device() as log, drawing_nothing():
+        yield log
+    torch.set_num_threads(threads)
+
+
+def recording(*overrides):
+    """A model in training that records its steps, with two rounds if it has some."""
+    model = make_model(*overrides).to(DEVICE).train()
+    model.playback = Playback(*(Recorder(tape=OperatorTape()) for _ in range(2)))
+    if model.rounds is not None:
+        model.rounds._drawn = lambda: 2
+    return model
+
+
+def scene(size=1, color=1.0, holes=0):
+    batch = ellipsoid_batch(0.15, 3, 28, size)
+    batch.masks[0, 0, 14, 14 : 14 + holes] = False
+    names = tuple(f"subject {holes} {number}" for number in range(size))
+    batch = dataclasses.replace(batch, images=color * batch.images, subjects=names)
+    return dataclasses.replace(batch, depths=2.0 * batch.masks).to(DEVICE)
+
+
+def slopes(model, total):
+    """Gradients of a loss by the names of weights, on the CPU."""
+    model.zero_grad()
+    total.backward()
+    named = [(name, weight.grad) for name, weight in model.named_parameters()]
+    return {name: slope.cpu() for name, slope in named if slope is not None}
+
+
+def called(model, batch):
+    """The loss and its terms, operator by operator."""
+    prediction = model(batch)
+    rendering = Renderer()(prediction.gaussians, batch.targets.cameras)
+    return *LOSSES(prediction, rendering, batch), len(prediction.gaussians)
+
+
+@pytest.mark.parametrize(("kind", "size"), [("model=paper", 1), ("model=recurrent", 2)])
+def test_losses_and_gradients_are_those_of_a_step_that_is_called(kind, size):
+    """Of other batches of a class, also where a loss is divided among parts of a step."""
+    model = recording(kind)
+    for holes, color in ((0, 1.0), (1, 0.9), (2, 0.8)):
+        batch = scene(size, color, holes)
+        total, values, gaussians = called(model, batch)
+        wanted = slopes(model, total / 2)
+        found = played(model, Renderer(), LOSSES, batch)
+        assert found.gaussians == gaussians
+        torch.testing.assert_close(found.total.detach().cpu(), total.detach().cpu(), rtol=1e-6, atol=0)
+        assert {name: float(value.cpu()) for name, value in found.values.items()} == pytest.approx(
+            {name: float(value.detach().cpu()) for name, value in values.items()}, rel=1e-6
+        )
+        slope = slopes(model, found.total / 2)
+        assert slope.keys() == wanted.keys()
+        for name in wanted:
+            assert (slope[name] - wanted[name]).abs().max() <= 1e-5 * wanted[name].abs().max(), name
+    assert dict(model.playback.steps.counts) == {"eager": 1, "recorded": 1, "played": 1}
+
+
+def test_weights_that_move_are_read_where_they_are():
+    """An optimizer moves them in place; the next step that is played back sees it."""
+    model, batch = recording("model=paper"), scene()
+    optimizer = torch.optim.SGD(model.parameters(), lr=1e-2)
+    totals = []
+    for _ in range(4):
+        found = played(model, Renderer(), LOSSES, batch)
+        totals.append(float(found.total.detach().cpu()))
+        wanted = float(called(model, batch)[0].detach().cpu())
+        assert totals[-1] == pytest.approx(wanted, rel=1e-6)
+        slopes(model, found.total)
+        optimizer.step()
+    assert len(set(totals)) == 4
+    model.to(DEVICE)
+    assert not model.playback.steps._recordings
+
+
+def test_rounds_are_drawn_once_and_are_a_class_each():
+    model, batch = recording("model=recurrent"), scene()
+    counts = iter([1, 1, 2, 1])
+    model.rounds._drawn = lambda: next(counts)
+    for _ in range(4):
+        played(model, Renderer(), LOSSES, batch)
+    assert next(counts, None) is None
+    assert dict(model.playback.steps.counts) == {"eager": 2, "recorded": 1, "played": 1}
+
+
+def test_too_little_room_is_answered_by_another_recording(monkeypatch):
+    model, batch = recording("model=paper"), scene()
+    for _ in range(3):
+        played(model, Renderer(), LOSSES, batch)
+    suffice = iter([False])
+    monkeypatch.setattr(capacity.Rooms, "suffice", lambda self: next(suffice, True))
+    played(model, Renderer(), LOSSES, batch)
+    assert model.playback.steps.counts["recorded"] == 2
+
+
+def test_what_cannot_be_recorded_is_called():
+    """Other devices, renderers and losses, predictions, ``model.capture=off``."""
+    model, batch = recording("model=paper"), scene()
+    assert is_recordable(model, Renderer(), LOSSES, batch)
+    assert not is_recordable(model, Renderer(), LOSSES, batch.to("cpu"))
+    assert not is_recordable(model, lambda *_: None, LOSSES, batch)
+    assert not is_recordable(model, Renderer(), lambda *_: None, batch)
+    assert not is_recordable(model.eval(), Renderer(), LOSSES, batch)
+    model.train().options = model.options.model_copy(update={"capture": "off"})
+    assert not is_recordable(model, Renderer(), LOSSES, batch)
