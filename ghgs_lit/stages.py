@@ -152,7 +152,7 @@ class Recalibration(Protocol):
 class GaussianHead(Protocol):
     """Tokens to Gaussians in two steps; options: ``build(dim_latent)``.
 
-    The first step may give any type, but rounds need :class:`ghgs_lit.heads.gaussian.RawGaussians`.
+    The first step may give any type, but rounds need :class:`ghgs_lit.heads.attributes.RawGaussians`.
 
     Attributes:
         channels: width of the descriptors of these.

@@ -21,8 +21,8 @@ from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.geometry.undistortion import undistorting_grid
 from ghgs_lit.geometry.unprojection import subject_tokens
 from ghgs_lit.heads.activations import confidence_of
+from ghgs_lit.heads.attributes import FootprintAttributes, release_attributes
 from ghgs_lit.heads.depth import BOUNDED, bounded_depth, inverse_linear
-from ghgs_lit.heads.gaussian import FootprintAttributes, release_attributes
 from ghgs_lit.losses import terms
 from ghgs_lit.plan.window import Span, Window
 from ghgs_lit.recalibration import SemanticAttention

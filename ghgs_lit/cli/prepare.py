@@ -9,7 +9,8 @@ from omegaconf import DictConfig
 from ghgs_lit.cli.runtime import announce, output_dir
 from ghgs_lit.config import build
 from ghgs_lit.config.nodes import Check
-from ghgs_lit.data.check import inspect, show, write
+from ghgs_lit.data.check import inspect
+from ghgs_lit.data.check_report import show, write
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.reader import PHASES
 from ghgs_lit.errors import InputError

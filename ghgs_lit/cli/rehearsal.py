@@ -18,7 +18,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.protocols import check_evaluation
 from ghgs_lit.model import GHGS
 from ghgs_lit.runs import job
-from ghgs_lit.runs.grid import Rehearsal
+from ghgs_lit.runs.planned import Rehearsal
 from ghgs_lit.training import GHGSModule, start
 from ghgs_lit.weights.checkpoint import read_checkpoint
 

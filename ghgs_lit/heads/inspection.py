@@ -9,7 +9,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.heads.activations import bounded_tanh
-from ghgs_lit.heads.gaussian import GaussianHead, RawGaussians
+from ghgs_lit.heads.attributes import RawGaussians
+from ghgs_lit.heads.gaussian import GaussianHead
 
 NEAR_LIMIT = 0.95
 """Share of ``gaussian_head.offset_limit`` from which on an offset counts as at its limit."""

@@ -25,7 +25,8 @@ from ghgs_lit.config.options import Options, Width
 from ghgs_lit.geometry.photo_consistency import consistency_of
 from ghgs_lit.geometry.projection import at_least_float32, focal_lengths
 from ghgs_lit.heads.activations import bounded_tanh
-from ghgs_lit.heads.gaussian import RAW_VALUES, RawGaussians, float32_last
+from ghgs_lit.heads.attributes import RAW_VALUES, RawGaussians
+from ghgs_lit.heads.gaussian import float32_last
 from ghgs_lit.kernels.pool import at_once, even_parts, multiplies
 from ghgs_lit.plan.rows import size_class
 from ghgs_lit.rounds import cpu

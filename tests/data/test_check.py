@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ghgs_lit.data.check import inspect, show, write
+from ghgs_lit.data.check import inspect
+from ghgs_lit.data.check_report import show, write
 from ghgs_lit.errors import InputError
 from tests.helpers.people import TINY, render_boxes, rendered
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from ghgs_lit.heads.activations import bounded_sigmoid, bounded_tanh, confidence_of
+from ghgs_lit.heads.attributes import FootprintAttributes
 from ghgs_lit.heads.depth import BOUNDED, bounded_depth, inverse_linear
-from ghgs_lit.heads.gaussian import FootprintAttributes
 
 FAR_OUT = (-1e4, -90.0, -17.0, 17.0, 90.0, 1e4)
 

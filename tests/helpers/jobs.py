@@ -11,8 +11,9 @@ from ghgs_lit.cli.runtime import output_dir
 from ghgs_lit.config import VERSION_BASE, conf_dir
 from ghgs_lit.config.compose import plain
 from ghgs_lit.runs import job as job_module
-from ghgs_lit.runs.grid import PlannedRun, Rehearsal, run_all
+from ghgs_lit.runs.grid import run_all
 from ghgs_lit.runs.job import register_resolvers, train_once
+from ghgs_lit.runs.planned import PlannedRun, Rehearsal
 from ghgs_lit.runs.provenance import config_hash, provenance
 from ghgs_lit.runs.results import write_results
 from ghgs_lit.runs.run import RunDirectory

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ghgs_lit.data.check import inspect, show, split_line, write
+from ghgs_lit.data.check import inspect
+from ghgs_lit.data.check_report import show, split_line, write
 from ghgs_lit.errors import InputError
 from ghgs_people.thuman2 import THuman2
 from scripts.miniatures import thuman2 as miniature

@@ -12,7 +12,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from ghgs_lit.cli import train as train_verb
 from ghgs_lit.config import compose
 from ghgs_lit.errors import InputError
-from ghgs_lit.runs import grid, job
+from ghgs_lit.runs import job, planned
 from ghgs_lit.runs.grid import combinations, run_all
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.results import read_results
@@ -274,7 +274,7 @@ def test_a_sweep_over_all_options_of_a_group(monkeypatch, capsys, tmp_path):
 @pytest.mark.parametrize(("value", "seconds"), [("01:02:03:04", 93784), ({"minutes": 2}, 120), (None, None)])
 def test_time_budgets(value, seconds):
     """Expected times of a plan depend on both forms that Lightning accepts."""
-    assert grid.time_budget({"trainer": {"max_time": value}}) == seconds
+    assert planned.time_budget({"trainer": {"max_time": value}}) == seconds
 
 
 def composed(*overrides: str):

@@ -4,7 +4,8 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from ghgs_lit.runs.grid import PlannedRun, write_plan
+from ghgs_lit.runs.grid import write_plan
+from ghgs_lit.runs.planned import PlannedRun
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.training.loggers import TensorBoardOptions
 

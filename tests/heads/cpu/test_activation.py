@@ -8,7 +8,7 @@ import torch
 from ghgs_lit.bounds import VisualHull
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.heads import gaussian
-from ghgs_lit.heads.gaussian import RawGaussians
+from ghgs_lit.heads.attributes import RawGaussians
 from ghgs_lit.types import DepthMaps, Points
 from tests.heads.test_gaussian import make_head
 from tests.helpers.scenes import make_batch, with_soft_rims

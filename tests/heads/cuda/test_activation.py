@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from ghgs_lit.heads.gaussian import RawGaussians
+from ghgs_lit.heads.attributes import RawGaussians
 from ghgs_lit.types import map_tensors
 from tests.heads.cpu.test_activation import FIELDS, scene
 from tests.heads.test_gaussian import make_head

@@ -9,9 +9,9 @@ from ghgs_lit.diagnostics.stress import inputs
 from ghgs_lit.diagnostics.stress.stage import Stage, Values
 from ghgs_lit.geometry.rotations import quaternion_to_matrix, unit
 from ghgs_lit.heads.activations import confidence_of
+from ghgs_lit.heads.attributes import FootprintAttributes
 from ghgs_lit.heads.depth import BOUNDED, bounded_depth
 from ghgs_lit.heads.dpt import DPTHead
-from ghgs_lit.heads.gaussian import FootprintAttributes
 from ghgs_lit.types import Tokens
 
 
