@@ -1,7 +1,6 @@
 """``ghgs predict``: turn photographs into a splat and the other files that ``formats`` lists."""
 
 import contextlib
-import json
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -9,24 +8,21 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from statistics import geometric_mean
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from omegaconf import DictConfig
 
 from ghgs_capture import export
 from ghgs_capture.backgrounds import Backgrounds
 from ghgs_capture.capture import Capture
-from ghgs_capture.export.reports import REPORT
-from ghgs_capture.export.unseen import GUESSED
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.formats.json_and_toml import json_text
 from ghgs_capture.prediction import TimedPrediction, crop_size, in_frame, predict, predict_batch
-from ghgs_capture.rig import INSTANTS, Rig, corrected_rig, turned_from
+from ghgs_capture.rig import INSTANTS, Rig, corrected_rig
 from ghgs_capture.temporal import Temporal
-from ghgs_capture.tones import tone_lines, without_tones
+from ghgs_capture.tones import without_tones
+from ghgs_capture.verbs.advice import advice_of, moved_line, rig_advice
 from ghgs_capture.verbs.photographs import capture_folder, check_cameras
 from ghgs_lit.cli import inputs
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
@@ -41,12 +37,6 @@ from ghgs_lit.weights.checkpoint import read_config
 if TYPE_CHECKING:  # it would import Lightning, which takes seconds
     from ghgs_capture.verbs import Predict
     from ghgs_lit.data.datamodule import PhotographsDataModule
-
-
-#: PSNR in dB, in the subject's box, below which the render of an input counts as poor.
-LOW_PSNR = 25.0
-#: Degrees that a camera is turned by, from which weights for one rig are said to be for another.
-OTHER_RIG = 5.0
 
 
 @torch.no_grad()
@@ -132,15 +122,7 @@ def predict_photographs(options: "Predict", config: dict[str, Any], directory: P
     """
     folder = capture_folder(config)
     output = export.output_options(options)
-    several = len(folder.instants) > 1
-    read = folder.input_files
-    directories = {name: directory / name if several else directory for name in folder.instants}
-    others = ["rig.json"] if options.refine_cameras else []
-    together = export.Instants(len(directories), output, others) if several else None
-    for name, path in directories.items():
-        export.require_free(path, export.output_files(output, list(folder.paths[name])), read)
-    if together:
-        export.require_free(directory, together.files, read)
+    directories, together = _free_places(folder, output, directory, bool(options.refine_cameras))
     if folder.note:
         print(folder.note, flush=True)
     if options.check_cameras:
@@ -192,6 +174,35 @@ def predict_photographs(options: "Predict", config: dict[str, Any], directory: P
             print(f"skip.every={model.skip.every}: {temporal.anew} instants predicted anew", flush=True)
     if left_out:
         print(f"left out: {left_out} of {len(folder.instants)} instants", flush=True)
+
+
+def _free_places(
+    folder: CaptureFolder, output: export.OutputOptions, directory: Path, moves_cameras: bool
+) -> tuple[dict[str, Path], export.Instants | None]:
+    """Where the files of each instant go, and of all together.
+
+    Args:
+        folder: of the photographs.
+        output: which files are written.
+        directory: of a single instant; several get a folder each in it.
+        moves_cameras: several instants also share a file of corrected cameras.
+
+    Returns:
+        The directory of each instant by name, and what several of them share; None for a single one.
+
+    Raises:
+        InputError: a file would be written over that is read.
+    """
+    several = len(folder.instants) > 1
+    read = folder.input_files
+    directories = {name: directory / name if several else directory for name in folder.instants}
+    others = ["rig.json"] if moves_cameras else []
+    together = export.Instants(len(directories), output, others) if several else None
+    for name, path in directories.items():
+        export.require_free(path, export.output_files(output, list(folder.paths[name])), read)
+    if together:
+        export.require_free(directory, together.files, read)
+    return directories, together
 
 
 def shared_by(
@@ -252,80 +263,6 @@ def mended_by(backgrounds: Backgrounds, given: Capture) -> Capture:
         line = f"instant {given.name}: the background mends masks of {', '.join(mended)}"
         print(f"{line} (refine_masks=0 leaves them)", flush=True)
     return capture
-
-
-def advice_of(directory: Path) -> Iterator[str]:
-    """Advice from a prediction's report.
-
-    Args:
-        directory: where the report lies.
-
-    Yields:
-        Lines about gains that were undone, why the prediction may be poor and what may help.
-    """
-    report = json.loads((directory / REPORT).read_text())
-    shares = {name: geometric_mean(each) - 1 for name, each in report.get("gains", {}).items()}
-    deviations = []
-    for name, share in shares.items():
-        if round(100 * share):
-            deviations.append(f"{name} {abs(share):.0%} {'darker' if share < 0 else 'brighter'}")
-    if deviations:
-        yield f"gains: {', '.join(deviations)} than the mean of the cameras, undone"
-    yield from tone_lines(report.get("tones", {}), "undone (refine_tones=0 leaves it)")
-    quality = report["psnr_box_of_inputs"].values()
-    if len(quality) < 3:
-        yield f"{len(quality)} photographs leave much unseen: 3 to 5 all around show a person"
-    for edge, names in report["cut"].items():
-        yield f"{', '.join(names)} end at the subject's {edge}: what no photograph shows is missing"
-    guessed = [part for part, share in report["seen_once"].items() if share > GUESSED]
-    if guessed:
-        yield f"at {', '.join(guessed)} of its height at most one photograph shows most of it: a guess"
-    low = min(quality)
-    high = max(quality)
-    if low < LOW_PSNR:
-        left = [key for key in ("refine_cameras", "refine_masks") if key not in report]
-        hint = f" ({' and '.join(f'{key}=4' for key in left)} may mend them)" if left else ""
-        yield (
-            f"photographs come back at {low:.1f} to {high:.1f} dB only, sound ones at 30 or more: mostly"
-            f" cameras or masks are off{hint}; sheet.png shows where"
-        )
-
-
-def rig_advice(trained: Mapping[str, Any], batch: Batch) -> Iterator[str]:
-    """Say where photographs are not of the rig that ``ghgs adapt`` trained weights for.
-
-    Args:
-        trained: configuration of the weights.
-        batch: the photographs, of one element.
-
-    Yields:
-        Lines; none for weights that are for any rig.
-    """
-    data = trained.get("data", {})
-    count = len(batch.views[0])
-    if data.get("kind") != "people_in_rig":
-        return
-    hint = "checkpoint=shipped, or ghgs adapt with these cameras, may predict them better"
-    if count not in (counts := trained["views"]["training_counts"]):
-        yield f"the weights were adapted to {' or '.join(map(str, counts))} photographs, not {count}; {hint}"
-    rig = np.array([camera["extrinsics"] for camera in data["cameras"].values()])
-    turned = turned_from(rig, batch.cameras.extrinsics[0].double().cpu().numpy())
-    if turned > OTHER_RIG:
-        yield f"the weights were adapted to another rig: a camera is {turned:.0f} degrees off; {hint}"
-
-
-def moved_line(moved: dict[str, float]) -> str:
-    """The message about corrected cameras, which names them if only some moved.
-
-    Args:
-        moved: pixels by which the subject moved in each photograph, by camera.
-
-    Returns:
-        A line of text.
-    """
-    off = [name for name, pixels in moved.items() if pixels]
-    moved_alone = f": {', '.join(off)} beside the others" if 0 < len(off) < len(moved) else ""
-    return f"refine_cameras: moved by {', '.join(f'{p:.2f}' for p in moved.values())} pixels{moved_alone}"
 
 
 def captures_of(folder: CaptureFolder) -> Iterator[tuple[Capture, float]]:

@@ -8,7 +8,7 @@ import torch
 from ghgs_capture.export import OutputOptions, write_prediction
 from ghgs_capture.export.subject import exported_subject
 from ghgs_capture.export.unseen import GUESSED, unseen
-from ghgs_capture.verbs.predict import advice_of
+from ghgs_capture.verbs.advice import advice_of
 from ghgs_lit.rendering import Renderer, render
 from ghgs_lit.types import Batch, Prediction
 from tests.helpers.splats import body, camera_ring

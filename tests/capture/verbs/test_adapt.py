@@ -9,7 +9,7 @@ import torch
 
 from ghgs_capture.verbs import adapt
 from ghgs_capture.verbs.adapt import _fill_of, with_rig
-from ghgs_capture.verbs.predict import rig_advice
+from ghgs_capture.verbs.advice import rig_advice
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.data.view import half_centers

@@ -14,7 +14,7 @@ from plyfile import PlyData
 from scipy.ndimage import binary_dilation
 
 from ghgs_capture.rig import Rig
-from ghgs_capture.verbs.predict import moved_line
+from ghgs_capture.verbs.advice import moved_line
 from ghgs_lit.weights.checkpoint import write_checkpoint
 from tests.helpers.figures import PARTS, Figure
 from tests.helpers.models import config, make_model
