@@ -22,7 +22,7 @@ from ghgs_lit.rendering.capacity import settled
 from ghgs_lit.rounds import CoarseDepths, Rounds, State, coarse_depths, coarse_sizes, prediction_of, replaced
 from ghgs_lit.runtime.precision import PRECISIONS, precision_of
 from ghgs_lit.stages import HEADS, OPTIONS, STAGES
-from ghgs_lit.surroundings import Finding, ModelOptions, Surrounding, any_bad, left, refuse, surroundings
+from ghgs_lit.surroundings import Finding, ModelOptions, Surrounding, any_bad, entered, left, refuse
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Prediction, Tokens
 from ghgs_lit.weights.checkpoint import load_weights, read_config
 from ghgs_lit.weights.reading import SHIPPED
@@ -112,13 +112,13 @@ class GHGS(nn.Module):
         Raises:
             InputError: the batch does not fit the stages.
         """
-        around = surroundings(self.options, self.encoder.patch_size, self.checks_values)
-        findings: list[Finding] = []
-        for layer in around:
-            batch = layer.enter(batch)
-            findings += layer.findings
-            layer.findings = ()
-        return around, batch, self.plan(batch, findings)
+        asked = (self.options, self.encoder.patch_size, self.checks_values)
+        enter = functools.partial(entered, *asked)
+        if self.options.capture == "auto":
+            around, inside, findings = self.playback.entered(enter, batch, repr(asked))
+        else:
+            around, inside, findings = enter(batch)
+        return around, inside, self.plan(inside, findings)
 
     def finished(self, around: Sequence[Surrounding], batch: Batch, plan: Plan) -> Prediction:
         """The prediction for what is prepared.

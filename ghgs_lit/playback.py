@@ -1,13 +1,13 @@
 """Predictions whose work is recorded on a GPU for each class of scenes, and played back.
 
-What follows a plan (:mod:`ghgs_lit.plan`) depends on sizes alone, and on a GPU these are size classes. So two
-pieces of a prediction, the bounds and all that comes after the encoder, are the same work for every batch of
-a class. Recorded once as CUDA graphs (:mod:`ghgs_lit.runtime.recording`), each starts at once instead of by
-thousands of calls. The encoder stays eager: it has few and large kernels, and its semantic branch works on as
-many patches as a scene shows."""
+What follows a plan (:mod:`ghgs_lit.plan`) depends on sizes alone, and on a GPU these are size classes. So
+pieces of a prediction are the same work for every batch of a class: what precedes the plan, the bounds, and
+all that comes after the encoder. Recorded once as CUDA graphs (:mod:`ghgs_lit.runtime.recording`), each
+starts at once instead of by thousands of calls. The encoder stays eager: it has few and large kernels, and
+its semantic branch works on as many patches as a scene shows."""
 
 import dataclasses
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -20,9 +20,13 @@ from ghgs_lit.plan import Plan
 from ghgs_lit.plan.patches import KeptPatches
 from ghgs_lit.rendering.capacity import Rooms, deferred, settled
 from ghgs_lit.rounds import CoarseDepths
-from ghgs_lit.runtime.recording import Recorder
+from ghgs_lit.runtime.recording import Recorder, described
 from ghgs_lit.runtime.watching import is_watched
+from ghgs_lit.surroundings import Finding, Surrounding
 from ghgs_lit.types import Batch, DecodedPixels, DepthBounds, Prediction, Tokens
+
+#: Layers around the stages, the batch inside of them, and what is expected of its values.
+_Entered = tuple[Sequence[Surrounding], Batch, list[Finding]]
 
 
 class Pieces(Protocol):
@@ -94,7 +98,7 @@ class Playback:
     """Predictions of a model, played back where they can be.
 
     Args:
-        recorder: makes and keeps recordings, two for each class of scenes; None: one that keeps 16.
+        recorder: makes and keeps recordings, three for each class of scenes; None: one that keeps 16.
         steps: the same of training steps (:mod:`ghgs_lit.training.captured`), one for each class.
     """
 
@@ -106,6 +110,29 @@ class Playback:
         """Forget all recordings: after weights have moved."""
         self.recorder.clear()
         self.steps.clear()
+
+    def entered(self, enter: Callable[[Batch], _Entered], batch: Batch, key: Hashable) -> _Entered:
+        """What precedes the plan, played back where no gradient is wanted; its work depends on sizes alone.
+
+        Args:
+            enter: gives layers around the stages, the batch inside of them, and findings.
+            batch: outside of all layers.
+            key: all that ``enter`` depends on.
+        """
+        here = type(batch) is Batch and batch.masks.device.type == self.recorder.tape.device
+        tensors: list[Tensor] = []
+        described(batch, tensors)
+        if not here or is_watched() or any(tensor.requires_grad for tensor in tensors):
+            return enter(batch)
+        targets = batch.targets and dataclasses.replace(batch.targets, names=(), protocols=())
+        bare = dataclasses.replace(batch, targets=targets, subjects=(), views=())
+        with torch.no_grad():
+            around, inside, findings = self.recorder(enter, bare, ("entered", key))
+        # Names take no part; what was computed of the batch stays with it.
+        vars(inside).update(subjects=batch.subjects, views=batch.views)
+        if targets is not None:
+            vars(inside.targets).update(names=batch.targets.names, protocols=batch.targets.protocols)
+        return around, inside, findings
 
     def fits(self, batch: Batch, plan: Plan) -> bool:
         """Whether recordings of this batch are worth a try.

@@ -180,6 +180,32 @@ class Surrounding:
         return prediction
 
 
+def entered(
+    options: ModelOptions, patch_size: int, checks_values: bool, batch: Batch
+) -> tuple[Sequence[Surrounding], Batch, list[Finding]]:
+    """The batch inside of all layers.
+
+    Args:
+        options: as of :func:`surroundings`.
+        patch_size: as of :func:`surroundings`.
+        checks_values: as of :func:`surroundings`.
+        batch: outside of all layers.
+
+    Returns:
+        The layers, the outermost first; the batch; what is expected of values, to be read later.
+
+    Raises:
+        InputError: a shape or a dtype is wrong.
+    """
+    around = surroundings(options, patch_size, checks_values)
+    findings: list[Finding] = []
+    for layer in around:
+        batch = layer.enter(batch)
+        findings += layer.findings
+        layer.findings = ()
+    return around, batch, findings
+
+
 def left(around: Sequence[Surrounding], prediction: Prediction) -> Prediction:
     """The prediction outside of all layers.
 

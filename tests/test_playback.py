@@ -65,7 +65,7 @@ def test_other_scenes_of_a_class_are_predicted_as_eagerly(kind):
         assert len(found.gaussians) == int(batch.masks.cpu().sum()) == len(wanted.gaussians)
         close(found.gaussians.to("cpu"), wanted.gaussians.to("cpu"))
         torch.testing.assert_close(found.depth.cpu(), wanted.depth.cpu(), rtol=1e-5, atol=1e-5)
-    assert counts(model) == {"eager": 2, "recorded": 2, "played": 4}
+    assert counts(model) == {"eager": 3, "recorded": 3, "played": 6}
 
 
 def test_what_changes_a_prediction_is_another_class():
@@ -78,7 +78,7 @@ def test_what_changes_a_prediction_is_another_class():
     assert len(found.rounds) == 2
     model(scene(views=3))
     model(scene(0.3))
-    assert counts(model) == {"recorded": 2, "eager": 8}
+    assert counts(model) == {"recorded": 3, "eager": 10, "played": 2}  # what precedes the plan
 
 
 def test_what_is_watched_or_has_a_gradient_is_called():
@@ -93,7 +93,7 @@ def test_what_is_watched_or_has_a_gradient_is_called():
         assert model(scene()).gaussians.means.requires_grad
     eager(model, scene())
     model.train()(scene())
-    assert counts(model) == before
+    assert counts(model) == before | {"played": 2}  # what precedes the plan
 
 
 def test_too_little_room_is_answered_by_an_eager_call(monkeypatch):
@@ -145,3 +145,19 @@ def test_what_is_played_back_is_not_asked_for(there):
     print(eager, played, waits, as_many)
     assert 3 * played < eager
     assert as_many <= waits
+
+
+def test_what_precedes_the_plan_keeps_names_and_gradients():
+    """Batches that differ in names alone are one class; cameras that are learned get their gradient."""
+    model = recording("model=paper")
+    for name in ("a", "b", "c"):
+        batch = dataclasses.replace(scene(), subjects=(name,), views=(("0", "1"),))
+        _, inside, _ = model.prepared(batch)
+        assert (inside.subjects, inside.views) == ((name,), (("0", "1"),))
+    assert counts(model) == {"eager": 1, "recorded": 1, "played": 1}
+    with torch.enable_grad():
+        moved = batch.cameras.extrinsics.clone().requires_grad_()
+        cameras = dataclasses.replace(batch.cameras, extrinsics=moved)
+        _, inside, _ = model.prepared(dataclasses.replace(batch, cameras=cameras))
+    assert inside.cameras.extrinsics.requires_grad
+    assert counts(model) == {"eager": 1, "recorded": 1, "played": 1}
