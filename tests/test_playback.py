@@ -148,7 +148,7 @@ def test_what_is_played_back_is_not_asked_for(there):
 
 
 def test_what_precedes_the_plan_keeps_names_and_gradients():
-    """Batches that differ in names alone are one class; cameras that are learned get their gradient."""
+    """Batches that differ in names alone are one class; photographs that are learned get their gradient."""
     model = recording("model=paper")
     for name in ("a", "b", "c"):
         batch = dataclasses.replace(scene(), subjects=(name,), views=(("0", "1"),))
@@ -156,8 +156,7 @@ def test_what_precedes_the_plan_keeps_names_and_gradients():
         assert (inside.subjects, inside.views) == ((name,), (("0", "1"),))
     assert counts(model) == {"eager": 1, "recorded": 1, "played": 1}
     with torch.enable_grad():
-        moved = batch.cameras.extrinsics.clone().requires_grad_()
-        cameras = dataclasses.replace(batch.cameras, extrinsics=moved)
-        _, inside, _ = model.prepared(dataclasses.replace(batch, cameras=cameras))
-    assert inside.cameras.extrinsics.requires_grad
+        photographs = batch.images.clone().requires_grad_()
+        _, inside, _ = model.prepared(dataclasses.replace(batch, images=photographs))
+    assert inside.images.requires_grad
     assert counts(model) == {"eager": 1, "recorded": 1, "played": 1}
