@@ -32,7 +32,7 @@ MODEL_NODES = (*STAGES, *OPTIONS, "compat")
 OF_MACHINE = ("cache_dir", "cache_images_mb", "packed_gb", "render_workers", "resident", "workers")
 
 #: Keys that may change in a trained model: they change neither shape nor meaning of any tensor.
-FREE = ("bounds", "model.pad", "rounds.count", "skip", "unprojection", "recalibration.k")
+FREE = ("bounds", "encoder.precision", "model.pad", "rounds.count", "skip", "unprojection", "recalibration.k")
 FREE += ("recalibration.neighborhood", "recalibration.similarity", "recalibration.tokens")
 
 

@@ -20,6 +20,7 @@ from ghgs_lit.cli.inputs import build_data, check_size, choices, given_keys, ove
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import build, resolve
 from ghgs_lit.config.compose import chosen_options
+from ghgs_lit.config.registry import read_node
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.protocols import check_evaluation
@@ -227,6 +228,8 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
         model, renderer, losses, build(config["optimizer"], "optimizer"), config, config.get("token_budgets")
     )
     step = prepare_start(config, module, directory)
+    if "feature_cache" in config:  # of verbs that train the whole model
+        read_node(config["feature_cache"], "feature_cache").attach(model, data)
     config = start.with_origin(config, model)
     module.config = {**module.config, **config}
     quiet()

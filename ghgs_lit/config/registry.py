@@ -120,6 +120,10 @@ KINDS: dict[str, dict[str | None, str]] = {
     "views": {None: "ghgs_lit.data.sampling.ViewProtocol"},
     "targets": {None: "ghgs_lit.data.sampling.TargetProtocol"},
     "augmentation": {None: "ghgs_lit.data.augmentation.Augmentation"},
+    "feature_cache": {
+        "none": "ghgs_lit.training.features.NoFeatureCache",
+        "disk": "ghgs_lit.training.features.DiskFeatureCache",
+    },
     "callbacks": {
         "checkpoints": "ghgs_lit.training.checkpoints.CheckpointOptions",
         "costs": "ghgs_lit.training.cost.CostsOptions",

@@ -88,6 +88,12 @@ class Augmentation(Options):
         return self
 
     @property
+    def changes_photographs(self) -> bool:
+        """Whether some step sees pixels of the inputs that no other step does."""
+        limits = (self.exposure, self.white_balance, self.gamma, self.cut, self.mask_offset, self.mask_ragged)
+        return self.sizes is not None or (self.chance > 0 and any((*limits, self.mask_hole_chance)))
+
+    @property
     def varies_sizes(self) -> bool:
         """Whether steps have inputs or targets of different sizes."""
         return self.sizes is not None or self.target_scale is not None

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator
+from contextlib import nullcontext
 from typing import Literal
 
 import torch
@@ -23,6 +24,7 @@ from ghgs_lit.geometry.masks import (
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.plan import Plan, planned
 from ghgs_lit.plan.patches import KeptPatches
+from ghgs_lit.runtime.precision import bfloat16_where_possible
 from ghgs_lit.types import DepthBounds, Tokens
 
 #: Fields of each kind of patch embedding.
@@ -83,6 +85,9 @@ class VGGTOptions(Options):
     """all | none | last_<n>: the last n pairs of blocks"""
     checkpointing: bool = False
     """true: recompute activations in the backward pass, to save memory"""
+    precision: Literal["inherit", "bfloat16"] = "inherit"
+    """Of products of the encoder alone: inherit, that of the whole model (the paper's tables: float32) |
+    bfloat16, where the device has it: half the time on a GPU (the authors ran theirs in float16)"""
     weights: Text | None = None
     """Name of the published weights that the semantic features learned from, or pretext; written by
     ghgs import and ghgs pretext, a note for tables only"""
@@ -220,6 +225,7 @@ class VGGTEncoder(nn.Module):
         self.dim_latent = 2 * options.width
         self.mask_input = options.mask_input
         self.bounds_input = options.bounds_input
+        self.precision = options.precision
         extra = [0.5] * self.mask_input
         # Not in checkpoints, so they need storage even in a model that is built on the meta device.
         for name, values in (("mean", IMAGENET_MEAN), ("std", IMAGENET_STD)):
@@ -239,6 +245,11 @@ class VGGTEncoder(nn.Module):
         self.requires_grad_(False)
         for blocks in (self.aggregator.frame_blocks, self.aggregator.global_blocks):
             blocks[depth - count :].requires_grad_(True)
+
+    @property
+    def keeps_features(self) -> bool:
+        """Whether tokens are read from disk in training, which no recording of a GPU's work can hold."""
+        return getattr(self.aggregator.patch_embed, "cache", None) is not None
 
     def forward(
         self,
@@ -266,7 +277,8 @@ class VGGTEncoder(nn.Module):
         require(narrow, "images", "float32 where the weights are no float64", images.dtype)
         plan = planned(masks, self.patch_size, [self.keeps(masks)]) if plan is None else plan
         kept = plan.kept
-        pairs, patches = self.aggregator(self._normalized(images, masks, bounds), kept)
+        with bfloat16_where_possible(images.device) if self.precision == "bfloat16" else nullcontext():
+            pairs, patches = self.aggregator(self._normalized(images, masks, bounds), kept)
         latent = tuple(_joined(pairs, kept, self.aggregator.special))
         semantic = patches.detach() if self.semantic is None else self.semantic(images, masks, plan)
         places = (kept.image, kept.row, kept.column)

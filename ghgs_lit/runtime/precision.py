@@ -65,6 +65,11 @@ def precision_of(name: str, device: torch.device) -> AbstractContextManager:
     return torch.autocast(device.type, half)
 
 
+def bfloat16_where_possible(device: torch.device) -> AbstractContextManager:
+    """Products in bfloat16 where the device has it; elsewhere the caller's precision."""
+    return torch.autocast(device.type, torch.bfloat16) if has_bfloat16(device) else nullcontext()
+
+
 def half_precision(name: str, device: torch.device) -> torch.dtype | None:
     """The half precision of products; None: float32.
 

@@ -100,10 +100,13 @@ def is_recordable(model: nn.Module, renderer: Callable, losses: Callable, batch:
         batch: of a step.
 
     Returns:
-        True on a device that records, with ``model.capture=auto``, where the gradient needs no scaling.
+        True on a device that records, with ``model.capture=auto``, where the gradient needs no scaling and
+        no tokens are read from disk.
     """
     known = isinstance(model, GHGS) and isinstance(renderer, Renderer) and isinstance(losses, Losses)
     if not known or model.options.capture == "off" or is_watched():
+        return False
+    if getattr(model.encoder, "keeps_features", False):  # a plug-in's may not say
         return False
     device = batch.masks.device.type
     if torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device) == torch.float16:

@@ -126,6 +126,9 @@ def test_what_cannot_be_recorded_is_called():
     assert not is_recordable(model, Renderer(), LOSSES, batch.to("cpu"))
     assert not is_recordable(model, lambda *_: None, LOSSES, batch)
     assert not is_recordable(model, Renderer(), lambda *_: None, batch)
+    model.encoder.aggregator.patch_embed.cache = object()  # tokens on disk
+    assert not is_recordable(model, Renderer(), LOSSES, batch)
+    model.encoder.aggregator.patch_embed.cache = None
     assert not is_recordable(model.eval(), Renderer(), LOSSES, batch)
     model.train().options = model.options.model_copy(update={"capture": "off"})
     assert not is_recordable(model, Renderer(), LOSSES, batch)
