@@ -144,7 +144,9 @@ class BudgetedModule(L.LightningModule):
 
     def configure_optimizers(self) -> dict[str, Any]:
         """The optimizer of all weights and its schedule, which follows the used budget."""
-        optimizer = self.optimization.optimizer(self, fused=self._scaler is None)
+        options = getattr(self.model, "options", None)
+        records = getattr(options, "capture", "auto") == "auto"
+        optimizer = self.optimization.optimizer(self, self._scaler is None, records)
         groups = optimizer.param_groups
         self._options = [{k: v for k, v in group.items() if k != "params"} for group in groups]
 

@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from ghgs_lit.runtime.recording import Recorder
+
 #: Newton-Schulz: odd polynomials that take singular values in (0, 1] close to 1 (Jordan et al.).
 COEFFICIENTS = (3.4445, -4.7750, 2.0315)
 ITERATIONS = 5
@@ -152,6 +154,12 @@ def _orthogonalized(matrices: Tensor) -> Tensor:
     return factor @ matrices
 
 
+def _layout(weight: Tensor) -> torch.memory_format:
+    """How a weight lies in memory."""
+    is_last = weight.dim() == 4 and not weight.is_contiguous()
+    return torch.channels_last if is_last else torch.contiguous_format
+
+
 class Muon(torch.optim.AdamW):
     """Muon for the matrices among parameters, AdamW for all others.
 
@@ -160,15 +168,24 @@ class Muon(torch.optim.AdamW):
         matrix_lr: learning rate of matrices, whose steps are as long as AdamW's with this rate. A number, or,
             as AdamW's ``lr``, a tensor without dimensions on the parameters' device, so that a recorded step
             follows the schedule.
+        records: whether a GPU's products are recorded as a CUDA graph.
         **options: of AdamW; weight decay is for both."""
 
-    def __init__(self, parameters: Iterable[nn.Parameter], matrix_lr: float | Tensor, **options: Any):
+    def __init__(
+        self,
+        parameters: Iterable[nn.Parameter],
+        matrix_lr: float | Tensor,
+        records: bool = True,
+        **options: Any,
+    ):
         parameters = list(parameters)
         others = [p for p in parameters if not is_matrix(p)]
         matrices = [p for p in parameters if is_matrix(p)]
         groups = [{"params": others, "orthogonal": False}]
         groups.append({"params": matrices, "orthogonal": True, "lr": matrix_lr})
         super().__init__([group for group in groups if group["params"]], **options)
+        on_gpu = any(parameter.is_cuda for parameter in matrices)
+        self.recorder = Recorder(limit=2) if records and on_gpu else None
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Tensor] | None = None) -> Tensor | None:
@@ -202,10 +219,16 @@ class Muon(torch.optim.AdamW):
         averages = [self.state[parameter]["momentum"] for parameter in moved]
         torch._foreach_lerp_(averages, gradients, 1 - MOMENTUM)
         directions = torch._foreach_lerp(gradients, averages, MOMENTUM)  # Nesterov momentum
-        steps = orthogonalized([direction.flatten(1) for direction in directions])
+        directions = [direction.flatten(1) for direction in directions]
+        record = self.recorder
+        steps = orthogonalized(directions) if record is None else record(orthogonalized, directions)
         torch._foreach_mul_(steps, [-ROOT_MEAN_SQUARE * max(step.shape) ** 0.5 for step in steps])
         torch._foreach_mul_(steps, group["lr"])
         torch._foreach_mul_(moved, 1 - group["lr"] * group["weight_decay"])
-        torch._foreach_add_(moved, [x.view_as(p) for x, p in zip(steps, moved, strict=True)])
+        # One that lies in memory otherwise than its weight would make PyTorch add one after the other.
+        shaped = []
+        for step, weight in zip(steps, moved, strict=True):
+            shaped.append(step.view_as(weight).contiguous(memory_format=_layout(weight)))
+        torch._foreach_add_(moved, shaped)
         for parameter in moved:
             parameter.grad = None

@@ -59,7 +59,7 @@ class Optimization(Options):
     skip_nonfinite: Index = 0
     """Steps in a row that are not finite and are skipped before the run stops; 0: it stops at the first."""
 
-    def optimizer(self, module: nn.Module, fused: bool = True) -> torch.optim.AdamW:
+    def optimizer(self, module: nn.Module, fused: bool = True, records: bool = True) -> torch.optim.AdamW:
         """The optimizer of all trained parameters.
 
         On a GPU it counts steps there (``capturable``), so that its step can be recorded as a CUDA graph; the
@@ -69,6 +69,7 @@ class Optimization(Options):
             module: a model, or a LightningModule with all that has weights, on the device of the training.
             fused: PyTorch's fastest AdamW. It undoes the scaling of a loss (``16-mixed``) inside its step,
                 too late for clipping gradients.
+            records: whether Muon's products are recorded as a CUDA graph on a GPU.
 
         Returns:
             AdamW, or Muon where there is a ``matrix_scale``.
@@ -85,7 +86,7 @@ class Optimization(Options):
         options |= {"eps": EPS, "fused": fused, "capturable": on_gpu}
         if self.matrix_scale is None:
             return torch.optim.AdamW(parameters, **options)
-        return Muon(parameters, matrix_lr=self.matrix_scale * self.lr, **options)
+        return Muon(parameters, self.matrix_scale * self.lr, records, **options)
 
     def drop_frozen_gradients(self, module: nn.Module, progress: float) -> None:
         """Remove gradients of frozen parameters, so that the optimizer leaves them unchanged, also by weight

@@ -7,11 +7,13 @@ import torch
 from torch import nn
 
 from ghgs_lit.model import GHGS
+from ghgs_lit.runtime.recording import Recorder
 from ghgs_lit.training import Optimization, muon
 from ghgs_lit.training.muon import Muon, is_matrix, orthogonalized
 from ghgs_lit.training.optimization import hold_rates, plain_rates
 from ghgs_lit.training.restoring import check_optimizer_state, check_schedules
 from tests.helpers.pretend_device import DEVICE, pretend_device
+from tests.helpers.tape import OperatorTape
 
 OPTIONS = {"lr": 0.01, "betas": (0.9, 0.98), "eps": 1e-8, "weight_decay": 0.1}
 
@@ -236,3 +238,23 @@ def test_parameters_without_gradient_stay():
     optimizer.step()
     moved = {name for name, p in model.named_parameters() if not torch.equal(p, before[name])}
     assert moved == {"square", "tall", "wide", "output", "token"}
+
+
+def test_products_that_are_played_back_take_the_same_steps():
+    """Weights of a convolution in another layout, too."""
+    models = []
+    with pretend_device():
+        for tape in (None, OperatorTape()):
+            model = Small().to(DEVICE)
+            model.conv.data = model.conv.data.contiguous(memory_format=torch.channels_last)
+            optimizer = Muon(model.parameters(), matrix_lr=0.02, **OPTIONS)
+            optimizer.recorder = tape and Recorder(tape=tape)
+            for seed in range(4):
+                for number, parameter in enumerate(model.parameters()):
+                    value = torch.linspace(-1, 1, parameter.numel()).mul(7 * number + seed + 1).sin()
+                    parameter.grad = value.view(parameter.shape).to(DEVICE)
+                optimizer.step()
+            models.append(model)
+        for one, other in zip(models[0].parameters(), models[1].parameters(), strict=True):
+            assert torch.equal(one.cpu(), other.cpu())
+    assert dict(optimizer.recorder.counts) == {"eager": 1, "recorded": 1, "played": 2}
