@@ -1,59 +1,84 @@
-"""Backgrounds of cameras that stand still, and masks corrected by them.
+"""Backgrounds of cameras that stand still, and masks of a sequence that are mended by them.
 
 Such a camera shows the same background in every instant, and at each pixel some instants show it without the
-subject. Large parts of a mask that show the background are removed, large parts beside it that do not are
-added. Outlines stay as they are: finding them is the work of mattes."""
+subject. A mask is tested by leaving its view out (:mod:`ghgs_capture.agreement`); those that pass stay as
+they are. Others are cut anew from what differs from the background, from colours, and from the hull of the
+other masks. Large parts that change are taken over; outlines stay: finding them is the work of mattes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import ndimage
 
+from ghgs_capture.agreement import MISSED, Agreement, reach_of
 from ghgs_capture.capture import Capture
-from ghgs_capture.crops import Photograph
+from ghgs_capture.crops import Photograph, shrunk
+from ghgs_capture.minimum_cut import NEIGHBOURS, minimum_cut, neighbour_pairs
 from ghgs_lit.runtime.cores import allowed_cores
 
+#: Instants, spread over a sequence, for its backgrounds: at each pixel several lack the subject.
+BACKGROUND_INSTANTS = 24
+#: Pixels of the longer side of a subject, about, in which masks are cut: as many as a model sees.
+_SUBJECT = 256
 _MIN_BACKGROUND = 6  #: Least number of photographs for a background
-#: Levels of 255 by which photographs of a background differ at most, and the subject at least.
+#: Levels of 255 by which photographs of a background differ at most.
 _STEADY = 20.0
-_DIFFERENT = 12.0
-_DEVIATIONS = 4.0  #: Deviations of the noise beyond which a pixel differs
+#: Least deviation of the noise in levels, and deviations at which a pixel may be of either.
+_NOISE = 2.0
+_DEVIATIONS = 5.0
 #: Shares of area: of the mask, for a large part; of the largest part, below which one is a speck.
 _LARGE = 0.03
 _SPECK = 0.05
-_DARK = 0.3  #: Least share of the light that a shadow leaves
+_SHADED = (0.4, 1.0)  #: Share of the light that a shadow leaves
+_BINS = 16  #: Levels of a channel that a histogram of colours counts together
 #: Correlation of brightness above which a part shows the background: a grey shirt is no grey wall.
 _ALIKE = 0.9
+# Energies of a pixel, in those of a pixel of the background: what the background says at least and at most;
+# what colours do where it is not known; the given mask; a place inside and outside of the others' hull, and
+# outside of two of them.
+_FROM_BACKGROUND = (-4.0, 6.0)
+_FROM_COLORS = 3.0
+_FROM_MASK = 1.0
+_IN_HULL = 1.0
+_OUT_OF_HULL = 2.0
+_OUT_OF_TWO = 4.0
+#: Cost of different labels of neighbours of one colour, and the share of it that remains at an edge of
+#: several times ``_CONTRAST`` levels.
+_TOGETHER = 6.0
+_AT_EDGE = 0.1
+_CONTRAST = 10.0
+_ROUNDS = 3  #: Masks mended in one round are the others' hulls in the next
 
 
 @dataclass(frozen=True)
 class _Background:
-    """The background of one camera: ``image`` [h, w, 3] float32 where it is ``known`` [h, w]."""
+    """The background of one camera."""
 
-    image: np.ndarray
-    known: np.ndarray
+    image: np.ndarray  #: [h, w, 3] float32, levels from 0 to 255
+    known: np.ndarray  #: [h, w] bool
+    odds: np.ndarray  #: [bins, bins, bins] log of how much likelier a colour is the subject's
 
     @classmethod
-    def of(cls, photographs: Sequence[Photograph]) -> "_Background":
+    def of(cls, photographs: Sequence[Photograph], covered: Sequence[np.ndarray]) -> "_Background":
         """The background that photographs of one camera share.
 
         At each pixel it is the mean of a quarter of them (at least three), those that agree best.
 
         Args:
             photographs: three or more of one camera, of one size.
+            covered: where each may show the subject [h, w].
 
         Returns:
             The background; known where enough photographs show it without the subject and differ by
             less than ``_STEADY`` levels.
         """
-        images = np.stack([photograph.image for photograph in photographs]).astype(np.float32)
+        images = np.stack([photograph.image for photograph in photographs])
         count = max(3, len(images) // 4)
-        reach = _reach(images.shape[1:3])
-        light = images.sum(-1)
-        for brightness, photograph in zip(light, photographs, strict=True):
-            brightness[ndimage.binary_dilation(photograph.mask, iterations=reach)] = np.inf
+        light = images.sum(-1, dtype=np.float32)
+        for brightness, hidden in zip(light, covered, strict=True):
+            brightness[hidden] = np.inf
         order = light.argsort(0)
         light = np.take_along_axis(light, order, 0)
         with np.errstate(invalid="ignore"):
@@ -61,70 +86,129 @@ class _Background:
         width[~np.isfinite(width)] = np.inf
         chosen = np.take_along_axis(order, width.argmin(0) + np.arange(count)[:, None, None], 0)
         images = np.take_along_axis(images, chosen[..., None], 0)
-        steady = np.ptp(images, axis=0).max(-1) < _STEADY
-        return cls(images.mean(0), steady & np.isfinite(width.min(0)))
+        known = (np.ptp(images, axis=0).max(-1) < _STEADY) & np.isfinite(width.min(0))
+        image = images.mean(0, dtype=np.float32)
+        subject = [photograph.image[photograph.mask] for photograph in photographs]
+        odds = _log_histogram(np.concatenate(subject)) - _log_histogram(image[known])
+        return cls(image, known, odds.clip(-_FROM_COLORS, _FROM_COLORS))
 
-    def mended(self, photograph: Photograph) -> Photograph:
-        """Correct the mask of a photograph by this background.
+    def mended(
+        self, photograph: Photograph, inside: np.ndarray | None = None, most: np.ndarray | None = None
+    ) -> Photograph:
+        """Cut the mask of a photograph anew.
 
         Args:
             photograph: of this camera, of the background's size.
+            inside: pixels by which each pixel lies inside the hull of the other masks [h, w]; None: there
+                are no others.
+            most: the same of the others but one.
 
         Returns:
-            The photograph with a corrected mask; itself where the background does not contradict
-            it.
+            The photograph with a corrected mask; itself where no large part changes.
         """
-        reach = _reach(self.known.shape)
-        box = tuple(slice(max(a - 24 * reach, 0), b + 24 * reach) for a, b in photograph.extents)
-        seen = (photograph.image, photograph.matte, self.image, self.known)
-        mended_part = _mended(*(pixels[box] for pixels in seen), reach)
-        if mended_part is None:
+        reach = reach_of(self.known.shape)
+        there = photograph.mask if most is None else photograph.mask | (most > -reach)
+        spans = [np.nonzero(there.any(axis))[0][[0, -1]] for axis in (1, 0)]
+        margin = (24 if most is None else 8) * reach  # without hulls, parts are looked for nearby
+        box = tuple(slice(max(first - margin, 0), last + margin) for first, last in spans)
+        evidence = self._evidence(photograph, box)
+        hull = None
+        if inside is not None:
+            hull = inside[box]
+            outside = np.where(hull < -reach, -_OUT_OF_HULL, 0)
+            evidence += np.where(hull > 0, _IN_HULL, outside)
+            evidence -= np.where(most[box] < -reach, _OUT_OF_TWO, 0)
+        costs = self._costs(photograph, box)
+        cut = minimum_cut(evidence, costs)
+        changed = self._changed(photograph, cut, box, hull)
+        if changed is None:
             return photograph
         matte = photograph.matte.copy()
-        matte[box] = mended_part
+        matte[box] = changed
         return replace(photograph, matte=matte)
 
+    def _evidence(self, photograph: Photograph, box: tuple[slice, slice]) -> np.ndarray:
+        """What background, colours and mask say about each pixel of a box; above 0: the subject."""
+        image, behind, known = photograph.image[box], self.image[box], self.known[box]
+        mask = photograph.mask[box]
+        off = np.abs(image - behind).max(-1)
+        light = (image * behind).sum(-1) / np.square(behind).sum(-1).clip(1)
+        is_shaded = (light > _SHADED[0]) & (light < _SHADED[1])
+        off = np.where(is_shaded, np.abs(image - light[..., None] * behind).max(-1), off)
+        outside = off[known & ~mask]
+        noise = max(1.4826 * float(np.median(outside)), _NOISE) if len(outside) else np.inf
+        away = ndimage.uniform_filter(off, 3) / (_DEVIATIONS / 2 * noise)
+        seen = (away**2 / 2 - 2).clip(*_FROM_BACKGROUND)
+        colors = self.odds[tuple(np.moveaxis(image // (256 // _BINS), -1, 0))]
+        evidence = np.where(known, seen + colors / 2, colors)
+        return evidence + np.where(mask, _FROM_MASK, -_FROM_MASK)
 
-def _mended(
-    image: np.ndarray, matte: np.ndarray, behind: np.ndarray, known: np.ndarray, reach: int
-) -> np.ndarray | None:
-    """Correct the matte of a photograph in front of a background.
+    def _costs(self, photograph: Photograph, box: tuple[slice, slice]) -> list[np.ndarray]:
+        """Costs of pairs of neighbours, less where the photograph has an edge that the background lacks."""
+        image, behind, known = photograph.image[box], self.image[box], self.known[box]
+        costs = []
+        for step in NEIGHBOURS:
+            first, second = neighbour_pairs(image.astype(np.float32), step)
+            contrast = np.abs(first - second).max(-1)
+            first, second = neighbour_pairs(behind, step)
+            are_known = np.logical_and(*neighbour_pairs(known, step))
+            contrast = (contrast - np.abs(first - second).max(-1) * are_known).clip(0)
+            alike = np.exp(-np.square(contrast / _CONTRAST) / 2)
+            costs.append(_TOGETHER * (_AT_EDGE + (1 - _AT_EDGE) * alike) / np.hypot(*step))
+        return costs
 
-    Args:
-        image: the photograph [h, w, 3] uint8.
-        matte: its matte [h, w] uint8; above 127 is the subject.
-        behind: the background [h, w, 3] float32, levels from 0 to 255.
-        known: where the background is known [h, w] bool.
-        reach: pixels by which outlines of masks may be wrong.
+    def _changed(
+        self, photograph: Photograph, cut: np.ndarray, box: tuple[slice, slice], hull: np.ndarray | None
+    ) -> np.ndarray | None:
+        """Take over large parts of a new mask.
 
-    Returns:
-        The corrected matte [h, w] uint8; None: it stays as it is.
-    """
-    mask = matte > 127
-    off = ndimage.uniform_filter(np.abs(image - behind).max(-1) * known, 3)
-    outside = off[known & ~mask]
-    least = max(_DEVIATIONS * 1.4826 * float(np.median(outside)), _DIFFERENT) if len(outside) else np.inf
-    same = known & (ndimage.uniform_filter(off, 7) < 0.7 * least)
-    gone = _parts(_large(mask & same, mask, reach), lambda part: _is_alike(image[part], behind[part]))
-    gone = ndimage.binary_dilation(gone, iterations=reach, mask=mask & (off < 2 * least))
-    come = _large(known & (off > 2 * least) & ~mask, mask, reach)
-    come = _parts(come, lambda part: not _is_shaded(image[part], behind[part]))
-    if not gone.any() and not come.any():
-        return None
-    matte = np.where(come, np.uint8(255), np.where(gone, np.uint8(0), matte))
-    if come.any():  # fills the rim, which differs less clearly
-        matte = np.maximum(matte, ndimage.binary_closing(matte > 127, iterations=3) * np.uint8(255))
+        Args:
+            photograph: with the mask so far.
+            cut: the new mask of a box [h, w].
+            box: rows and columns of it.
+            hull: pixels by which each lies inside the hull of the others; None: not known.
+
+        Returns:
+            The box's matte [h, w] uint8; None: no large part changes.
+        """
+        image, behind, known = photograph.image[box], self.image[box], self.known[box]
+        matte = photograph.matte[box]
+        mask = matte > 127
+        reach = reach_of(self.known.shape)
+        far = np.zeros_like(mask) if hull is None else hull < -reach
+
+        def is_background(part: np.ndarray) -> bool:
+            shows_it = known[part].mean() > 0.5 and _is_alike(image[part], behind[part])
+            return shows_it or far[part].mean() > 0.5
+
+        gone = _parts(_large(mask & ~cut, mask, reach), is_background)
+        come = _large(cut & ~mask, mask, reach)
+        if not gone.any() and not come.any():
+            return None
+        # Rims of parts that change belong to them.
+        gone = ndimage.binary_dilation(gone, iterations=reach, mask=mask & ~cut)
+        come = ndimage.binary_dilation(come, iterations=reach, mask=cut & ~mask)
+        matte = np.where(come, np.uint8(255), np.where(gone, np.uint8(0), matte))
+        if come.any():  # closes the seam between parts
+            closed = ndimage.binary_closing(np.pad(matte > 127, 3), iterations=3)[3:-3, 3:-3]
+            matte = np.maximum(matte, (closed & cut) * np.uint8(255))
+        return _without_specks(matte)
+
+
+def _without_specks(matte: np.ndarray) -> np.ndarray:
+    """A matte [h, w] uint8 without parts that are much smaller than the largest."""
     labels, count = ndimage.label(matte > 127)
     areas = np.bincount(labels.ravel(), minlength=count + 1)
     areas[0] = areas[1:].max(initial=0)
     return np.where((areas < _SPECK * areas[0])[labels], np.uint8(0), matte)
 
 
-def _is_shaded(image: np.ndarray, behind: np.ndarray) -> bool:
-    """Whether a shadow on the background explains most pixels [n, 3]."""
-    light = (image * behind).sum(-1) / np.square(behind).sum(-1).clip(1)
-    missed = np.abs(image - light[:, None] * behind).max(-1)
-    return ((light > _DARK) & (light < 1) & (missed < _DIFFERENT)).mean() > 0.5
+def _log_histogram(colors: np.ndarray) -> np.ndarray:
+    """Log of the share of colours [n, 3] in each bin, smoothed so that none is 0."""
+    bins = (colors.clip(0, 255) // (256 // _BINS)).astype(int)
+    counts = np.bincount(np.ravel_multi_index(bins.T, (_BINS,) * 3), minlength=_BINS**3)
+    smooth = ndimage.gaussian_filter(counts.reshape((_BINS,) * 3).astype(np.float64), 0.7)
+    return np.log(smooth / max(smooth.sum(), 1) + 1e-3 / _BINS**3)
 
 
 def _is_alike(image: np.ndarray, behind: np.ndarray) -> bool:
@@ -140,11 +224,6 @@ def _parts(parts: np.ndarray, keep: Callable[[np.ndarray], bool]) -> np.ndarray:
     return np.isin(labels, [number for number in range(1, count + 1) if keep(labels == number)])
 
 
-def _reach(size: tuple[int, int]) -> int:
-    """Pixels by which outlines of masks may be wrong."""
-    return max(max(size) // 200, 2)
-
-
 def _large(parts: np.ndarray, mask: np.ndarray, reach: int) -> np.ndarray:
     """The parts that are thick and have ``_LARGE`` of the mask's area."""
     labels, count = ndimage.label(ndimage.binary_opening(parts, iterations=reach))
@@ -158,6 +237,8 @@ class Backgrounds:
     """The backgrounds of a rig that stands still, by camera."""
 
     cameras: Mapping[str, _Background]
+    #: Pixels of photographs along a side of one of the backgrounds
+    factors: Mapping[str, int] = field(default_factory=dict)
 
     @classmethod
     def of(cls, captures: Sequence[Capture]) -> "Backgrounds":
@@ -169,30 +250,91 @@ class Backgrounds:
         Returns:
             The backgrounds of cameras with ``_MIN_BACKGROUND`` photographs or more, all of one size.
         """
-        photographs: dict[str, list[Photograph]] = {}
+        extents: dict[str, list[int]] = {}
         for photograph in (photograph for capture in captures for photograph in capture.photographs):
-            photographs.setdefault(photograph.name, []).append(photograph)
+            longest = max(end - first for first, end in photograph.extents)
+            extents.setdefault(photograph.name, []).append(longest)
+        factors = {name: max(round(max(each) / _SUBJECT), 1) for name, each in extents.items()}
+        backgrounds = cls({}, factors)
+        photographs: dict[str, list[Photograph]] = {}
+        covered: dict[str, list[np.ndarray]] = {}
+        for capture in map(backgrounds._small, captures):
+            for photograph, hidden in zip(capture.photographs, _covered(capture), strict=True):
+                photographs.setdefault(photograph.name, []).append(photograph)
+                covered.setdefault(photograph.name, []).append(hidden)
         cameras = {}
         for name, of_camera in photographs.items():
             shapes = {photograph.mask.shape for photograph in of_camera}
             if len(of_camera) >= _MIN_BACKGROUND and len(shapes) == 1:
-                cameras[name] = _Background.of(of_camera)
-        return cls(cameras)
+                cameras[name] = _Background.of(of_camera, covered[name])
+        return cls(cameras, factors)
 
     def applied(self, capture: Capture) -> Capture:
-        """Correct masks where large parts of them contradict the background.
+        """Mend the masks that fail, where that lets all masks agree better.
 
         Args:
             capture: an instant; cameras without a background of their photograph's size keep their
                 masks.
 
         Returns:
-            The capture with corrected masks.
+            The capture with corrected masks; photographs whose masks are right are those given.
         """
-        with ThreadPoolExecutor(allowed_cores()) as pool:
-            return replace(capture, photographs=tuple(pool.map(self._mended, capture.photographs)))
+        if not self.cameras:
+            return capture
+        given = small = self._small(capture)
+        agreement = Agreement.of(small)
+        for _ in range(_ROUNDS if agreement else 1):
+            mended = self._mended(small, agreement)
+            if all(a is b for a, b in zip(mended.photographs, small.photographs, strict=True)):
+                break
+            after = Agreement.of(mended)
+            if agreement and sum(after.misses) >= sum(agreement.misses):
+                break
+            small, agreement = mended, after
+        photographs = map(self._taken_over, capture.photographs, given.photographs, small.photographs)
+        return replace(capture, photographs=tuple(photographs))
 
-    def _mended(self, photograph: Photograph) -> Photograph:
-        background = self.cameras.get(photograph.name)
-        fits = background is not None and background.known.shape == photograph.mask.shape
-        return background.mended(photograph) if fits else photograph
+    def _small(self, capture: Capture) -> Capture:
+        photographs = (shrunk(photo, self.factors.get(photo.name, 1)) for photo in capture.photographs)
+        return replace(capture, photographs=tuple(photographs))
+
+    def _mended(self, capture: Capture, agreement: Agreement | None) -> Capture:
+        """One round over the masks of an instant that fail."""
+
+        def mended(view: int) -> Photograph:
+            photograph = capture.photographs[view]
+            background = self.cameras.get(photograph.name)
+            fits = background is not None and background.known.shape == photograph.mask.shape
+            if not fits or (agreement and not agreement.failed[view]):
+                return photograph
+            if agreement is None:
+                return background.mended(photograph)
+            hulls = (agreement.depth_in_others(view, spare=spare) for spare in (0, 1))
+            return background.mended(photograph, *hulls)
+
+        with ThreadPoolExecutor(allowed_cores()) as pool:
+            return replace(capture, photographs=tuple(pool.map(mended, range(len(capture.photographs)))))
+
+    def _taken_over(self, photograph: Photograph, given: Photograph, mended: Photograph) -> Photograph:
+        """A photograph with what changed in its smaller one; itself where nothing did."""
+        if mended is given:
+            return photograph
+        factor = self.factors[photograph.name]
+        changed = mended.matte != given.matte
+        changed, small = (each.repeat(factor, 0).repeat(factor, 1) for each in (changed, mended.matte))
+        matte = photograph.matte.copy()
+        whole = tuple(map(slice, changed.shape))
+        matte[whole] = np.where(changed, small, matte[whole])
+        return replace(photograph, matte=_without_specks(matte))
+
+
+def _covered(capture: Capture) -> list[np.ndarray]:
+    """Where each photograph of an instant may show the subject [h, w], also where its mask lacks a part."""
+    agreement = Agreement.of(capture)
+    covered = []
+    for view, photograph in enumerate(capture.photographs):
+        reach = reach_of(photograph.mask.shape)
+        covered.append(ndimage.binary_dilation(photograph.mask, iterations=reach))
+        if agreement is not None and agreement.takes[view] > MISSED:
+            covered[-1] |= agreement.depth_in_others(view) > -reach
+    return covered

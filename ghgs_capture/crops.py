@@ -73,6 +73,27 @@ def crop_to_subject(photograph: Photograph, size: tuple[int, int], refine_masks:
     )
 
 
+def shrunk(photograph: Photograph, factor: int) -> Photograph:
+    """A photograph of fewer pixels, each the mean of some.
+
+    Args:
+        photograph: of ``factor`` pixels a side or more.
+        factor: pixels of the photograph along a side of each new one; what is left over at its right and its
+            bottom is cut off.
+
+    Returns:
+        The smaller photograph with its camera.
+    """
+    if factor == 1:
+        return photograph
+    rows, columns = (side // factor for side in photograph.matte.shape)
+    whole = slice(rows * factor), slice(columns * factor)
+    image = area_image(photograph.image[whole], rows, columns)
+    matte = area_image(photograph.matte[whole], rows, columns)
+    intrinsics = photograph.intrinsics / np.array([[factor], [factor], [1.0]])
+    return replace(photograph, image=image, matte=matte, intrinsics=intrinsics)
+
+
 def _refined(
     name: str, image: np.ndarray, matte: np.ndarray, size: tuple[int, int], pixels: int
 ) -> tuple[np.ndarray, np.ndarray]:

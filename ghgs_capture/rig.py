@@ -7,7 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -28,6 +28,20 @@ from ghgs_lit.types import Batch, Cameras
 INSTANTS = 8  #: Instants, spread over a sequence, for correcting its cameras
 #: Median deviation of log gains above which exposures change between instants.
 _CHANGING = 0.05
+
+
+def spread(values: Sequence[Any], count: int) -> list[Any]:
+    """Some of a sequence's instants, evenly spread from the first to the last.
+
+    Args:
+        values: one for each instant.
+        count: how many at most, 2 or more.
+
+    Returns:
+        The values of these instants, in their order.
+    """
+    places = [round((len(values) - 1) * i / (count - 1)) for i in range(count)]
+    return [values[place] for place in dict.fromkeys(places)] if len(values) else []
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,12 @@ import torch
 from omegaconf import DictConfig
 
 from ghgs_capture import export
-from ghgs_capture.backgrounds import Backgrounds
+from ghgs_capture.backgrounds import BACKGROUND_INSTANTS, Backgrounds
 from ghgs_capture.capture import Capture
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.formats.json_and_toml import json_text
 from ghgs_capture.prediction import TimedPrediction, crop_size, in_frame, predict, predict_batch
-from ghgs_capture.rig import INSTANTS, Rig, corrected_rig
+from ghgs_capture.rig import INSTANTS, Rig, corrected_rig, spread
 from ghgs_capture.temporal import Temporal
 from ghgs_capture.tones import without_tones
 from ghgs_capture.verbs.advice import advice_of, moved_line, rig_advice
@@ -228,15 +228,16 @@ def shared_by(
     rounds = refining["refine_cameras"]
     masks = refining["refine_masks"]
     tones = refining["tones"]
-    spread = [round((len(names) - 1) * i / (INSTANTS - 1)) for i in range(INSTANTS)]
     is_needed = bool(rounds or masks or tones)
-    for place in dict.fromkeys(spread) if is_needed else ():
+    count = BACKGROUND_INSTANTS if masks else INSTANTS
+    for name in spread(names, count) if is_needed else ():
         with contextlib.suppress(InputError):  # this instant is left out
-            captures.append(Capture(names[place], folder.photographs(names[place])))
+            captures.append(Capture(name, folder.photographs(name)))
     if tones == "auto":
         plain = {"refine_cameras": 0, "refine_masks": 0, "renderer": renderer}
         tones = predict(captures[0], model, size, **plain).tones if captures else {}
     backgrounds = Backgrounds.of(captures if masks else [])
+    captures = spread(captures, INSTANTS)
     mended = [without_tones(backgrounds.applied(capture), tones) for capture in captures]
     rig = corrected_rig(mended, model, size, rounds, masks, renderer) if captures and rounds else None
     if rig is None:
