@@ -138,14 +138,17 @@ def test_names_of_the_package_exist():
 
 
 def test_options_and_keys_exist():
-    """Every ``group=option`` must be a file of ``conf``, and every ``key=value`` a key of some verb."""
+    """Every ``group=option`` must be a file of ``conf`` or ``--config-dir``, and every ``key=value`` a key of some verb."""
     wrong = []
     for span in (span for document in DOCUMENTS for span in code(document)):
         # values of Python, in calls, are none of a configuration
         for name, value in re.findall(r"(?<![\w.$<{+/-])([a-z][\w./]*)=([^\s'`]*)", span):
             if name in groups():
                 options = re.findall(r"[a-z]\w*", value) if re.match(r"[a-z]", value) else []
-                wrong += [f"{name}={option}" for option in options if option not in groups()[name] | {"null"}]
+                known = groups()[name] | {"null"}
+                for folder in re.findall(r"--config-dir (\S+)", span):
+                    known |= {file.stem for file in (REPOSITORY / folder / name).glob("*.yaml")}
+                wrong += [f"{name}={option}" for option in options if option not in known]
             elif not re.match(r"True|False|\(", value) and not name.startswith("hydra.") and not is_key(name):
                 wrong.append(f"{name}={value}")
         dotted = re.fullmatch(r"([a-z_]+)(?:\.[a-z_]+)+", span)
