@@ -69,7 +69,10 @@ class Rows:
         groups, of_group = wanted.shape
         size = min(size_class(max(max(counts, default=0), 1)), of_group)
         number = torch.arange(of_group, device=wanted.device)
-        ranks = wanted.cumsum(1)
+        # One long sum: a GPU sums rows of a table with a block of threads each.
+        ranks = wanted.flatten().cumsum(0).view_as(wanted)
+        if groups > 1:
+            ranks = ranks - (ranks[:, :1] - wanted[:, :1].long())
         # The n-th row that counts goes to place n from 1 on, and 0 for all others to place 0.
         places = number.new_zeros(groups, size + 1).scatter_(1, ranks * wanted, number * wanted)
         total = ranks[:, -1:]
