@@ -138,7 +138,7 @@ def test_names_of_the_package_exist():
 
 
 def test_options_and_keys_exist():
-    """Every ``group=option`` must be a file of ``conf`` or ``--config-dir``, and every ``key=value`` a key of some verb."""
+    """Each ``group=option`` must be a file of ``conf`` or ``--config-dir``, ``key=value`` a key of a verb."""
     wrong = []
     for span in (span for document in DOCUMENTS for span in code(document)):
         # values of Python, in calls, are none of a configuration

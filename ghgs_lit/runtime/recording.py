@@ -9,7 +9,7 @@ import threading
 import traceback
 import warnings
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -282,7 +282,7 @@ def _played(recording: _Recording, tensors: list[Tensor]) -> Any:
         recording: of the class of the inputs.
         tensors: of the inputs, in the order of :func:`described`.
     """
-    torch._foreach_copy_(recording.inputs, tensors)
+    _copy_all(recording.inputs, tensors)
     recording.play()
     results: dict[int, Tensor] = {}
 
@@ -292,9 +292,26 @@ def _played(recording: _Recording, tensors: list[Tensor]) -> Any:
 
     _replaced(recording.result, noted)
     copies = {key: torch.empty_like(tensor) for key, tensor in results.items()}
-    if copies:
-        torch._foreach_copy_(list(copies.values()), list(results.values()))
+    _copy_all(list(copies.values()), list(results.values()))
     return _replaced(recording.result, lambda tensor: copies[id(tensor)])
+
+
+def _copy_all(places: Sequence[Tensor], sources: Sequence[Tensor]) -> None:
+    """Copy tensors to others of their sizes, with a launch for each type.
+
+    Args:
+        places: written.
+        sources: of the same types.
+    """
+    groups: dict[tuple, tuple[list[Tensor], list[Tensor]]] = {}
+    for place, source in zip(places, sources, strict=True):
+        # One pair of another type, or that lies in memory otherwise, makes PyTorch copy all one by one.
+        kind = (source.dtype, place.stride() == source.stride())
+        group = groups.setdefault(kind, ([], []))
+        group[0].append(place)
+        group[1].append(source)
+    for group in groups.values():
+        torch._foreach_copy_(*group)
 
 
 class _Guard(TorchDispatchMode):
