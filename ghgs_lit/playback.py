@@ -1,10 +1,8 @@
 """Predictions whose work is recorded on a GPU for each class of scenes, and played back.
 
 What follows a plan (:mod:`ghgs_lit.plan`) depends on sizes alone, and on a GPU these are size classes. So
-pieces of a prediction are the same work for every batch of a class: what precedes the plan, the bounds, and
-all that comes after the encoder. Recorded once as CUDA graphs (:mod:`ghgs_lit.runtime.recording`), each
-starts at once instead of by thousands of calls. The encoder stays eager: it has few and large kernels, and
-its semantic branch works on as many patches as a scene shows."""
+what precedes the plan, and the stages after it, are the same work for every batch of a class. Recorded once
+as CUDA graphs (:mod:`ghgs_lit.runtime.recording`), each starts at once instead of by thousands of calls."""
 
 import dataclasses
 from collections.abc import Callable, Hashable, Sequence
@@ -16,48 +14,27 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from ghgs_lit.extents import Extent
-from ghgs_lit.plan import Plan
+from ghgs_lit.plan import Plan, Sizes
 from ghgs_lit.plan.patches import KeptPatches
-from ghgs_lit.rendering.capacity import Rooms, deferred, settled
+from ghgs_lit.rendering.capacity import Rooms, deferred
 from ghgs_lit.rounds import CoarseDepths
 from ghgs_lit.runtime.recording import Recorder, described
 from ghgs_lit.runtime.watching import is_watched
 from ghgs_lit.surroundings import Finding, Surrounding
-from ghgs_lit.types import Batch, DecodedPixels, DepthBounds, Prediction, Tokens
+from ghgs_lit.types import Batch, DecodedPixels, Prediction
 
 #: Layers around the stages, the batch inside of them, and what is expected of its values.
 _Entered = tuple[Sequence[Surrounding], Batch, list[Finding]]
 
 
-class Pieces(Protocol):
-    """A prediction in pieces, as :class:`ghgs_lit.model.GHGS` has them."""
+class Stages(Protocol):
+    """The stages of a prediction, as :class:`ghgs_lit.model.GHGS` has them."""
 
-    def bounded(self, batch: Batch) -> DepthBounds | None:
-        """Bounds of all pixels."""
-
-    def encoded(self, batch: Batch, bounds: DepthBounds | None, plan: Plan) -> Tokens:
-        """Tokens of the patches that the plan keeps.
+    def predict(self, batch: Batch, plan: Plan, coarse: CoarseDepths | None = None) -> Prediction:
+        """What all stages make of a batch.
 
         Args:
             batch: as the stages see it.
-            bounds: of all pixels; None for stages without bounds.
-            plan: of the batch.
-        """
-
-    def decoded(
-        self,
-        batch: Batch,
-        bounds: DepthBounds | None,
-        tokens: Tokens,
-        plan: Plan,
-        coarse: CoarseDepths | None,
-    ) -> Prediction:
-        """All that comes after the encoder.
-
-        Args:
-            batch: as the stages see it.
-            bounds: of all pixels; None for stages without bounds.
-            tokens: of the encoder.
             plan: of the batch.
             coarse: depths from smaller copies of the photographs; None: there are none.
         """
@@ -65,30 +42,37 @@ class Pieces(Protocol):
 
 @dataclass(frozen=True)
 class Scene:
-    """What the pieces read of a batch and its plan, as inputs of a recording: tensors, and numbers of the
+    """What the stages read of a batch and its plan, as inputs of a recording: tensors, and numbers of the
     class."""
 
     batch: Batch
     shown: Bool[Tensor, "B V h w"]
+    kept: Bool[Tensor, "B V h w"] | None
     extents: tuple[Extent, ...]
     shown_extents: tuple[Extent, ...]
     patch_size: int
     pixels: DecodedPixels
     tokens: DecodedPixels
+    sizes: Sizes
 
     @classmethod
     def of(cls, batch: Batch, plan: Plan) -> "Scene":
-        """The inputs that the pieces read; what only losses read is left out."""
+        """The inputs that the stages read; what only losses read is left out."""
         bare = dataclasses.replace(batch, targets=None, body_vertices=None, subjects=(), views=())
-        facts = (plan.patch_size, plan.pixels, plan.tokens)
-        return cls(bare, plan.shown, *plan.extents_of_class(), *facts)
+        kept = None if plan.kept.is_whole else plan.kept.mask
+        facts = (plan.patch_size, plan.pixels, plan.tokens, plan.sizes)
+        return cls(bare, plan.shown, kept, *plan.extents_of_class(), *facts)
 
     def read(self) -> tuple[Batch, Plan]:
         """A batch and its plan, for which no value of a tensor is needed."""
         batch = dataclasses.replace(self.batch, cameras=dataclasses.replace(self.batch.cameras))
         facts = (self.extents, self.shown_extents, self.patch_size, self.pixels, self.tokens, True)
-        kept = KeptPatches.whole(self.shown.shape, self.shown.device)
-        plan = Plan(batch.masks, self.shown, kept, *facts)
+        device = self.shown.device
+        if self.kept is None:
+            kept = KeptPatches.whole(self.shown.shape, device)
+        else:
+            kept = KeptPatches(self.kept, device, size=self.sizes.kept)
+        plan = Plan(batch.masks, self.shown, kept, *facts, least=self.sizes)
         batch.note(plan.extents, plan.subject.index)
         vars(batch.cameras)["has_skew"] = False
         return batch, plan
@@ -98,7 +82,7 @@ class Playback:
     """Predictions of a model, played back where they can be.
 
     Args:
-        recorder: makes and keeps recordings, three for each class of scenes; None: one that keeps 16.
+        recorder: makes and keeps recordings, two for each class of scenes; None: one that keeps 16.
         steps: the same of training steps (:mod:`ghgs_lit.training.captured`), one for each class.
     """
 
@@ -149,12 +133,12 @@ class Playback:
     def repeats(self, batch: Batch, plan: Plan) -> bool:
         """:meth:`fits`, with or without a gradient."""
         here = batch.masks.device.type == self.recorder.tape.device
-        sized = type(batch) is Batch and plan.is_of_class and plan.kept.is_whole
+        sized = type(batch) is Batch and plan.is_of_class and plan.kept.is_even
         return here and sized and not is_watched()
 
     def __call__(
         self,
-        pieces: Pieces,
+        stages: Stages,
         batch: Batch,
         plan: Plan,
         coarse: CoarseDepths | None,
@@ -163,7 +147,7 @@ class Playback:
         """The prediction for a batch that :meth:`fits`.
 
         Args:
-            pieces: the model.
+            stages: of the model.
             batch: as the stages see it.
             plan: of the batch.
             coarse: depths from smaller copies, if there are any.
@@ -172,22 +156,15 @@ class Playback:
         Returns:
             The prediction; its Gaussians fill their size class.
         """
-        scene = Scene.of(batch, plan)
-        bounds = self.recorder(lambda inputs: pieces.bounded(inputs.read()[0]), scene, ("bounds", key))
-        tokens = pieces.encoded(batch, bounds, plan)
 
-        def decode(inputs: _Decoded) -> tuple[Prediction, Rooms]:
-            scene, bounds, tokens, coarse = inputs
-            batch, plan = scene.read()
+        def predict(inputs: tuple[Scene, CoarseDepths | None]) -> tuple[Prediction, Rooms]:
+            scene, coarse = inputs
             with deferred() as rooms:
-                return pieces.decoded(batch, bounds, tokens, plan, coarse), rooms
+                return stages.predict(*scene.read(), coarse), rooms
 
-        inputs = (scene, bounds, tokens, coarse)
-        prediction, rooms = self.recorder(decode, inputs, ("decoded", key))
-        if rooms.suffice():
-            return prediction
-        self.recorder.forget(inputs, ("decoded", key))
-        return settled(lambda: pieces.decoded(batch, bounds, tokens, plan, coarse))
-
-
-_Decoded = tuple[Scene, DepthBounds | None, Tokens, CoarseDepths | None]
+        inputs = (Scene.of(batch, plan), coarse)
+        prediction, rooms = self.recorder(predict, inputs, key)
+        while not rooms.suffice():
+            self.recorder.forget(inputs, key)
+            prediction, rooms = self.recorder(predict, inputs, key)
+        return prediction

@@ -13,6 +13,7 @@ Shapes are written with ``B`` batch, ``V`` input views, ``T`` target views, ``H 
 size (of tokens: rows and columns), ``N`` packed Gaussians or tokens, ``L`` layers."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -224,7 +225,8 @@ class Tokens(_TensorStruct):
     """Tokens of the kept patches of the whole batch, packed. Token ``n`` is the patch at ``row[n]``,
     ``column[n]`` of image ``image[n]`` (``b * V + v``); tokens are ordered by image, row, column. ``grid`` is
     ``(B, V, h, w)``. ``latent``: embeddings E of the encoder's read-out layers. ``semantic``: features F,
-    detached: they weight the attention, which does not train them."""
+    detached: they weight the attention, which does not train them. ``real``: which rows are tokens, where
+    each image has the same number of rows, a size class; None: all."""
 
     latent: tuple[Float[Tensor, "N C"], ...]
     semantic: Float[Tensor, "N S"]
@@ -233,16 +235,17 @@ class Tokens(_TensorStruct):
     column: Int[Tensor, " N"]
     grid: tuple[int, int, int, int]
     patch_size: int
+    real: Bool[Tensor, " N"] | None = None
 
     @property
     def is_dense(self) -> bool:
         """Whether every patch of every image is present."""
-        b, v, h, w = self.grid
-        return self.image.shape[0] == b * v * h * w
+        return self.real is None and self.image.shape[0] == math.prod(self.grid)
 
     def select(self, index: Tensor | slice) -> "Tokens":
         """The tokens at ``index`` (a slice, a mask or indices) of the same grid."""
         parts = {name: getattr(self, name)[index] for name in ("semantic", "image", "row", "column")}
+        parts["real"] = None if self.real is None else self.real[index]
         return dataclasses.replace(self, latent=tuple(layer[index] for layer in self.latent), **parts)
 
     def of_images(self, images: slice) -> "Tokens":
@@ -250,8 +253,9 @@ class Tokens(_TensorStruct):
         b, v, h, w = self.grid
         if images == slice(0, b * v):
             part = self
-        elif self.is_dense:
-            part = self.select(slice(images.start * h * w, images.stop * h * w))
+        elif self.is_dense or self.real is not None:
+            rows = self.image.shape[0] // (b * v)
+            part = self.select(slice(images.start * rows, images.stop * rows))
         else:
             ends = torch.tensor((images.start, images.stop), device=self.image.device)
             part = self.select(slice(*torch.searchsorted(self.image, ends).tolist()))
@@ -270,8 +274,13 @@ class Tokens(_TensorStruct):
         b, v, h, w = self.grid
         values = self.latent[layer]
         if not self.is_dense:
+            count = b * v * h * w
             flat = (self.image * h + self.row) * w + self.column
-            values = values.new_zeros(b * v * h * w, values.shape[1]).index_copy(0, flat, values)
+            spare = 0
+            if self.real is not None:
+                flat = torch.where(self.real, flat, count)
+                spare = 1
+            values = values.new_zeros(count + spare, values.shape[1]).index_copy(0, flat, values)[:count]
         return values.reshape(b * v, h, w, -1).permute(0, 3, 1, 2)
 
 

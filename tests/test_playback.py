@@ -55,17 +55,17 @@ def eager(model, batch):
     return found
 
 
-@pytest.mark.parametrize("kind", ["model=paper", "model=recurrent"])
+@pytest.mark.parametrize("kind", [("model=paper", "skip=fast"), ("model=recurrent",)], ids=str)
 def test_other_scenes_of_a_class_are_predicted_as_eagerly(kind):
     """Other masks and colours; as many Gaussians as each has pixels."""
-    model = recording(kind)
+    model = recording(*kind)
     for holes, color in ((0, 1.0), (1, 0.9), (2, 0.8), (3, 1.0)):
         batch = scene(holes=holes, color=color)
         found, wanted = model(batch), eager(model, batch)
         assert len(found.gaussians) == int(batch.masks.cpu().sum()) == len(wanted.gaussians)
         close(found.gaussians.to("cpu"), wanted.gaussians.to("cpu"))
         torch.testing.assert_close(found.depth.cpu(), wanted.depth.cpu(), rtol=1e-5, atol=1e-5)
-    assert counts(model) == {"eager": 3, "recorded": 3, "played": 6}
+    assert counts(model) == {"eager": 2, "recorded": 2, "played": 4}
 
 
 def test_what_changes_a_prediction_is_another_class():
@@ -78,7 +78,7 @@ def test_what_changes_a_prediction_is_another_class():
     assert len(found.rounds) == 2
     model(scene(views=3))
     model(scene(0.3))
-    assert counts(model) == {"recorded": 3, "eager": 10, "played": 2}  # what precedes the plan
+    assert counts(model) == {"recorded": 2, "eager": 6, "played": 2}  # what precedes the plan
 
 
 def test_what_is_watched_or_has_a_gradient_is_called():
@@ -96,17 +96,15 @@ def test_what_is_watched_or_has_a_gradient_is_called():
     assert counts(model) == before | {"played": 2}  # what precedes the plan
 
 
-def test_too_little_room_is_answered_by_an_eager_call(monkeypatch):
-    """And the recording, which would have as little room again, is forgotten."""
+def test_too_little_room_is_answered_by_another_recording(monkeypatch):
+    """The first, which would have as little room again, is forgotten."""
     model, batch = recording("model=recurrent"), scene()
     for _ in range(3):
         wanted = model(batch)
     suffice = iter([False])
     monkeypatch.setattr(Rooms, "suffice", lambda self: next(suffice, True))
     close(model(batch).gaussians.to("cpu"), wanted.gaussians.to("cpu"))
-    before = counts(model)
-    model(batch)
-    assert counts(model)["recorded"] == before["recorded"] + 1
+    assert counts(model) == {"eager": 3, "recorded": 3, "played": 3}
 
 
 def test_weights_that_move_are_recorded_again():
@@ -116,7 +114,7 @@ def test_weights_that_move_are_recorded_again():
         model(batch)
     twin = copy.deepcopy(model)
     assert not twin.playback.recorder._recordings
-    assert len(model.playback.recorder._recordings) == 2
+    assert len(model.playback.recorder._recordings) == 1
     model.to(DEVICE)
     assert not model.playback.recorder._recordings
     for _ in range(2):
@@ -143,7 +141,7 @@ def test_what_is_played_back_is_not_asked_for(there):
         asked.append((there.launches, there.waits.total()))
     (eager, waits), _, (played, as_many) = asked
     print(eager, played, waits, as_many)
-    assert 3 * played < eager
+    assert 5 * played < eager
     assert as_many <= waits
 
 

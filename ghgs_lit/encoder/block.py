@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 from einops import rearrange
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
@@ -86,14 +86,19 @@ class Attention(nn.Module):
         self.proj = Linear(width, width)
 
     def forward(
-        self, x: Float[Tensor, "t c"], lengths: Sequence[int], rotary: Rotary | None = None
+        self,
+        x: Float[Tensor, "t c"],
+        lengths: Sequence[int],
+        rotary: Rotary | None = None,
+        real: Bool[Tensor, " t"] | None = None,
     ) -> Float[Tensor, "t c"]:
         q, k, v = rearrange(self.qkv(x), "t (s a d) -> s a t d", s=3, a=self.heads)
         q = self._norm_and_rotate(q, self.q_norm, rotary)
         k = self._norm_and_rotate(k, self.k_norm, rotary)
         if len(set(lengths)) == 1:
             each = (rearrange(values, "a (n t) d -> n a t d", n=len(lengths)) for values in (q, k, v))
-            return self.proj(_attend(*each).flatten(0, 1))
+            keys = None if real is None else real.view(len(lengths), 1, 1, -1)
+            return self.proj(_attend(*each, keys).flatten(0, 1))
         # One by one: a block mask would also compute the products between different sequences.
         parts = zip(*(values[None].split(lengths, dim=2) for values in (q, k, v)), strict=True)
         return self.proj(torch.cat([_attend(*part)[0] for part in parts]))
@@ -112,12 +117,23 @@ class Attention(nn.Module):
 
 
 def _attend(
-    q: Float[Tensor, "n a t d"], k: Float[Tensor, "n a t d"], v: Float[Tensor, "n a t d"]
+    q: Float[Tensor, "n a t d"],
+    k: Float[Tensor, "n a t d"],
+    v: Float[Tensor, "n a t d"],
+    keys: Bool[Tensor, "n 1 1 t"] | None = None,
 ) -> Float[Tensor, "n t c"]:
-    """``softmax(q k^T / sqrt(d)) v`` of every head, heads concatenated."""
-    if cpu.is_supported(q, v):
+    """``softmax(q k^T / sqrt(d)) v`` of every head, heads concatenated.
+
+    Args:
+        q: queries.
+        k: keys.
+        v: values.
+        keys: which keys take part; None: all.
+    """
+    if keys is None and cpu.is_supported(q, v):
         return cpu.attend(q, k, v).flatten(2)
-    y = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
+    mask = {} if keys is None else {"attn_mask": keys}  # flash kernels take none
+    y = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v, **mask)
     return rearrange(y, "n a t d -> n t (a d)")
 
 
@@ -186,9 +202,13 @@ class Block(nn.Module):
         self.ls2 = LayerScale(width, layer_scale)
 
     def forward(
-        self, x: Float[Tensor, "t c"], lengths: Sequence[int], rotary: Rotary | None = None
+        self,
+        x: Float[Tensor, "t c"],
+        lengths: Sequence[int],
+        rotary: Rotary | None = None,
+        real: Bool[Tensor, " t"] | None = None,
     ) -> Float[Tensor, "t c"]:
-        x = self.ls1(x, self.attn(self.norm1(x), lengths, rotary))
+        x = self.ls1(x, self.attn(self.norm1(x), lengths, rotary, real))
         if torch.is_grad_enabled():
             return self.ls2(x, self.mlp(self.norm2(x)))
         # x is the fresh result of ls1, so it can be changed in place, a part of the tokens at a time.
@@ -203,6 +223,7 @@ def run_block(
     lengths: Sequence[int],
     checkpointing: bool,
     rotary: Rotary | None = None,
+    real: Bool[Tensor, " t"] | None = None,
 ) -> Float[Tensor, "t c"]:
     """``block(x)``, without recording gradients if neither ``x`` nor the block needs one.
 
@@ -212,6 +233,7 @@ def run_block(
         lengths: tokens of each sequence, inside which attention stays.
         checkpointing: recompute activations in the backward pass.
         rotary: tables of all tokens; None: no rotation.
+        real: tokens that others attend to, where all sequences have one length; None: all.
 
     Returns:
         Tokens [t, c].
@@ -219,5 +241,5 @@ def run_block(
     needs_grad = x.requires_grad or any(p.requires_grad for p in block.parameters())
     with torch.set_grad_enabled(needs_grad and torch.is_grad_enabled()):
         if checkpointing and torch.is_grad_enabled():
-            return checkpoint(block, x, lengths, rotary, use_reentrant=False)
-        return block(x, lengths, rotary)
+            return checkpoint(block, x, lengths, rotary, real, use_reentrant=False)
+        return block(x, lengths, rotary, real)

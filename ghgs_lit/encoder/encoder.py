@@ -187,12 +187,13 @@ class Aggregator(nn.Module):
         rotary = rotary_tables(kept.positions(self.special), self.head_width, x)
         inside = kept.lengths(self.special)
         across = kept.element_lengths(self.special)
+        real = kept.real_tokens(self.special)
 
         pairs = []
         blocks = zip(self.frame_blocks, self.global_blocks, strict=True)
         for i, (frame_block, global_block) in enumerate(blocks):
-            frame = run_block(frame_block, x, inside, self.checkpointing, rotary)
-            x = run_block(global_block, frame, across, self.checkpointing, rotary)
+            frame = run_block(frame_block, x, inside, self.checkpointing, rotary, real)
+            x = run_block(global_block, frame, across, self.checkpointing, rotary, real)
             if i in self.layers:
                 pairs.append((frame, x))
         return pairs, patches
@@ -282,7 +283,7 @@ class VGGTEncoder(nn.Module):
         latent = tuple(_joined(pairs, kept, self.aggregator.special))
         semantic = patches.detach() if self.semantic is None else self.semantic(images, masks, plan)
         places = (kept.image, kept.row, kept.column)
-        return Tokens(latent, semantic, *places, kept.grid, self.patch_size)
+        return Tokens(latent, semantic, *places, kept.grid, self.patch_size, kept.real)
 
     def keeps(self, masks: Bool[Tensor, "b v H W"]) -> Bool[Tensor, "b v h w"]:
         """Patches that ``tokens`` and ``margin`` keep.

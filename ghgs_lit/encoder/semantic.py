@@ -102,7 +102,7 @@ class SemanticBranch(nn.Module):
         x = kept.join(self.token.to(patches.dtype).expand(masks.shape[0] * masks.shape[1], -1, -1), patches)
         rotary = rotary_tables(kept.positions(1), self.head_width, x)
         for block in self.blocks:
-            x = run_block(block, x, kept.lengths(1), False, rotary)
+            x = run_block(block, x, kept.lengths(1), False, rotary, kept.real_tokens(1))
         return at_least_float32(self.head(self.norm(kept.take(x, 1)))).log_softmax(1)
 
     def forward(
@@ -118,6 +118,11 @@ class SemanticBranch(nn.Module):
         Returns:
             Features [N, p]; 0 (cosine 0 with all others) where no subject is shown.
         """
-        features = features_of(self.log_shares(images, masks, plan.shown_patches))
-        places = torch.searchsorted(plan.kept.index, plan.shown_patches.index)
-        return features.new_zeros(len(plan.kept.index), self.parts).index_copy(0, places, features)
+        shown = plan.shown_patches
+        features = features_of(self.log_shares(images, masks, shown))
+        count = len(plan.kept.index)
+        places = torch.searchsorted(plan.kept.index, shown.index)
+        if shown.real is None:
+            return features.new_zeros(count, self.parts).index_copy(0, places, features)
+        places = torch.where(shown.real, places, count)  # behind all others
+        return features.new_zeros(count + 1, self.parts).index_copy(0, places, features)[:count]

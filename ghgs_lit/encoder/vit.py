@@ -181,8 +181,9 @@ class VisionTransformer(nn.Module):
         """
         x = self.embed(images, kept)
         lengths = kept.lengths(self.special)
+        real = kept.real_tokens(self.special)
         for block in self.blocks:
-            x = run_block(block, x, lengths, self.checkpointing)
+            x = run_block(block, x, lengths, self.checkpointing, real=real)
         return self.norm(x)
 
     def forward(self, images: Float[Tensor, "n i H W"], kept: KeptPatches) -> Float[Tensor, "N c"]:

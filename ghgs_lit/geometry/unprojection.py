@@ -35,11 +35,12 @@ class Unprojection(Options):
         points = unproject_maps(depth, cameras, pixels)
         # The maps hold every patch, also those without a token.
         index = (tokens.image, tokens.row, tokens.column)
+        tokens_valid = valid.flatten(0, 1)[index]
         return Points(
             pixels=unproject_maps(depth_maps.depth, cameras),
             valid=depth_maps.valid,
             tokens=points.flatten(0, 1)[index],
-            tokens_valid=valid.flatten(0, 1)[index],
+            tokens_valid=tokens_valid if tokens.real is None else tokens_valid & tokens.real,
             token_image=tokens.image,
         )
 

@@ -15,7 +15,7 @@ size: they take the plan, and decide nothing of the kind themselves.
 Something else that a scene does not need is left out in three steps: a field of the preset says so, the plan
 holds what is left, and the stage works on that."""
 
-from ghgs_lit.plan.plan import Plan, planned
+from ghgs_lit.plan.plan import Plan, Sizes, planned
 from ghgs_lit.plan.presets import SkipOptions
 
-__all__ = ["Plan", "SkipOptions", "planned"]
+__all__ = ["Plan", "Sizes", "SkipOptions", "planned"]

@@ -5,10 +5,12 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghgs_lit.extents import Extent, extents, true_places
+from ghgs_lit.plan.rows import Rows
 
 
 class KeptPatches:
@@ -19,25 +21,39 @@ class KeptPatches:
     Args:
         kept: on any device.
         device: that of the tokens.
-        known: the extent of the kept patches of each image; None: it is read from ``kept``."""
+        known: the extent of the kept patches of each image; None: it is read from ``kept``.
+        size: number of rows of each image, at least that of its kept patches: others repeat its last one (the
+            first of all patches where none is kept); None: those that are kept.
+
+    Attributes:
+        real: which rows are kept patches; None: all."""
 
     def __init__(
         self,
         kept: Bool[Tensor, "b v h w"],
         device: torch.device,
         known: Sequence[Extent] | None = None,
+        size: int | None = None,
     ):
-        _, views, height, width = self.grid = tuple(kept.shape)
+        elements, views, height, width = self.grid = tuple(kept.shape)
+        if size is not None:
+            known = [Extent(size, 0, height, 0, width)] * (elements * views)
         self._extents = extents(kept.flatten(0, 1)) if known is None else known
         counts = [extent.count for extent in self._extents]
         self._counts = [counts[first : first + views] for first in range(0, len(counts), views)]
         self._kept = kept
         self._device = device
-        self.is_whole = sum(counts) == kept.numel()
+        self.size = size
+        self.real = None
+        self.is_whole = size is None and sum(counts) == kept.numel()
         if self.is_whole:
             self.index = torch.arange(kept.numel(), device=device)
-        else:
+        elif size is None:
             self.index = true_places(self.mask, sum(counts))
+        else:
+            self._rows = Rows.filled(self.mask.flatten(0, 1).flatten(1), (size,), 1)
+            self.index = self._rows.index
+            self.real = self._rows.real
         self.image = self.index // (height * width)
         self.row = self.index // width % height
         self.column = self.index % width
@@ -58,6 +74,8 @@ class KeptPatches:
     @cached_property
     def number(self) -> Int[Tensor, " p"]:
         """The number of each kept one of all patches; 0 or more for others, without a meaning."""
+        if self.size is not None:
+            return self._rows.places(self.mask.numel())[1]
         return self.index if self.is_whole else (self.mask.flatten().cumsum(0) - 1).clamp(min=0)
 
     @cached_property
@@ -66,6 +84,21 @@ class KeptPatches:
         if self.is_whole:
             return torch.ones(self.grid, dtype=torch.bool, device=self._device)
         return self._kept.to(self._device)
+
+    @property
+    def is_even(self) -> bool:
+        """Whether all images have the same number of rows, which is known without reading masks."""
+        return self.is_whole or self.size is not None
+
+    def real_tokens(self, special: int) -> Bool[Tensor, " t"] | None:
+        """Which packed tokens are special ones or kept patches; None: all.
+
+        Args:
+            special: number of special tokens in each image.
+        """
+        if self.real is None:
+            return None
+        return F.pad(self.real.unflatten(0, (-1, self.size)), (special, 0), value=True).flatten()
 
     def lengths(self, special: int) -> list[int]:
         """Number of tokens of each image, with ``special`` special ones."""
@@ -104,7 +137,7 @@ class KeptPatches:
         """
         images, count, width = special.shape
         dtype = torch.promote_types(special.dtype, patches.dtype)
-        if self.is_whole:
+        if self.is_even:
             parts = (special.to(dtype), patches.to(dtype).reshape(images, -1, width))
             return torch.cat(parts, dim=1).flatten(0, 1)
         number = torch.arange(images, device=patches.device)
@@ -121,7 +154,7 @@ class KeptPatches:
             packed: tokens of all images.
             special: number of special ones in each image.
         """
-        if self.is_whole:
+        if self.is_even:
             images = self.grid[0] * self.grid[1]
             return packed.unflatten(0, (images, -1))[:, special:].flatten(0, 1)
         return packed[self._places(special)]

@@ -14,13 +14,38 @@ from torch import Tensor
 from ghgs_lit.extents import Extent, extent_numbers, true_places
 from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.plan.patches import KeptPatches
-from ghgs_lit.plan.rows import Rows, rounds_up
+from ghgs_lit.plan.rows import Rows, rounds_up, size_class
 from ghgs_lit.plan.window import Span, Window, subject_windows
 from ghgs_lit.types import Decision, DecodedPixels, Prediction
 
 #: From the numbers of patches [B, V] that each of several presets keeps: each element's decision, and the
 #: number of its preset.
 Choose = Callable[[Sequence[Float[Tensor, "B V"]]], tuple[tuple[Decision, ...], Sequence[int]]]
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What is the same for all scenes of a class.
+
+    Attributes:
+        pixels: rows of the subject's pixels, of each element.
+        peers: rows of the tokens that are recalibrated, of each element.
+        kept: rows of the patches that become tokens, of each image; 0: all patches do.
+        shown: rows of the patches that show the subject, of each image.
+        window: patches in which every subject lies.
+    """
+
+    pixels: int
+    peers: int
+    kept: int
+    shown: int
+    window: Window
+
+    def hull(self, other: "Sizes") -> "Sizes":
+        """The smallest sizes that are enough for both."""
+        names = ("pixels", "peers", "kept", "shown")
+        largest = {name: max(getattr(self, name), getattr(other, name)) for name in names}
+        return Sizes(**largest, window=self.window.hull(other.window))
 
 
 @dataclass(frozen=True)
@@ -38,7 +63,8 @@ class Plan:
         tokens: tokens that are recalibrated; ``all``: with those of the background, which need depths, too.
         classes: numbers of rows, and windows, are size classes (:mod:`ghgs_lit.plan.rows`).
         decisions: what ``skip=auto`` chose for each element.
-        flags: values of further tensors that were read with the masks."""
+        flags: values of further tensors that were read with the masks.
+        least: sizes that no size class falls below; None: those of the scene."""
 
     masks: Bool[Tensor, "B V H W"]
     shown: Bool[Tensor, "B V h w"]
@@ -51,17 +77,28 @@ class Plan:
     classes: bool = False
     decisions: tuple[Decision, ...] = ()
     flags: tuple[bool, ...] = ()
+    least: Sizes | None = None
 
     @cached_property
     def shown_patches(self) -> KeptPatches:
         """The patches ``shown``, each of which has a token."""
-        return KeptPatches(self.shown, self.kept.index.device, self.shown_extents)
+        size = None
+        if self.classes:
+            size = _of_images(self.shown_extents, self.shown, 0 if self.least is None else self.least.shown)
+        return KeptPatches(self.shown, self.kept.index.device, self.shown_extents, size)
+
+    @property
+    def sizes(self) -> Sizes:
+        """The sizes of the scene's class."""
+        rows = (self.subject.counts[0], self.peers.counts[0])
+        return Sizes(*rows, self.kept.size or 0, self.shown_patches.size, self._patches)
 
     @cached_property
     def subject(self) -> Rows:
         """The subject's pixels among those of all images."""
         if self.classes:
-            return Rows.filled(self.masks.flatten(1), self.counts, self.views)
+            least = 0 if self.least is None else self.least.pixels
+            return Rows.filled(self.masks.flatten(1), (*self.counts, least), self.views)
         return Rows.exact(self.masks, [extent.count for extent in self.extents], 1)
 
     @cached_property
@@ -70,6 +107,7 @@ class Plan:
         everyone = self.tokens == "all"
         counts = self.kept.element_lengths(0) if everyone else self._of_elements(self.shown_extents)
         if self.classes:
+            counts = (*counts, 0 if self.least is None else self.least.peers)
             rows = Rows.filled((self.kept.mask if everyone else self.shown).flatten(1), counts, self.views)
             kept = self.kept
             return rows if kept.is_whole else dataclasses.replace(rows, index=kept.number[rows.index])
@@ -157,10 +195,30 @@ class Plan:
         whole_cells = [window and window.coarser(cell).finer(cell, size) for window in each]
         if not self.classes:
             return whole_cells
-        filled = [window for window in whole_cells if window is not None]
-        spans = functools.reduce(Window.hull, filled) if filled else [Span(0, 1, full) for full in size]
-        widened = [span.coarser(cell).widened().finer(cell, span.full) for span in spans]
-        return [Window(*widened)] * len(whole_cells)
+        return [self._patches.finer(cell, size)] * len(whole_cells)
+
+    @cached_property
+    def _patches(self) -> Window:
+        """Patches around all subjects, as many as a size class has."""
+        size = tuple(self.masks.shape[2:])
+        seen = [window.coarser(self.patch_size) for window in subject_windows(self.extents, size) if window]
+        if self.least is not None:
+            seen.append(self.least.window)
+        grid = tuple(self.shown.shape[2:])
+        spans = functools.reduce(Window.hull, seen) if seen else [Span(0, 1, full) for full in grid]
+        return Window(*(span.widened() for span in spans))
+
+
+def _of_images(extents: Sequence[Extent], patches: Tensor, least: int) -> int:
+    """Rows of each image for the largest number of patches of one.
+
+    Args:
+        extents: of the patches that count in each image.
+        patches: of all images, of which [..., h, w] are counted.
+        least: smallest number of rows.
+    """
+    largest = max(1, least, *(extent.count for extent in extents))
+    return min(size_class(largest), patches.shape[-2] * patches.shape[-1])
 
 
 def planned(
@@ -172,6 +230,7 @@ def planned(
     choose: Choose | None = None,
     flags: Sequence[Bool[Tensor, ""]] = (),
     classes: bool | None = None,
+    least: Sizes | None = None,
 ) -> Plan:
     """The plan of a batch. The host waits for a GPU once.
 
@@ -184,6 +243,7 @@ def planned(
         choose: gives each element one of the ``choices``; None: all get the first.
         flags: tensors whose values are to be read with those of the masks.
         classes: whether numbers of rows are size classes; None: as the masks' device needs it.
+        least: as of :class:`Plan`.
     """
     b, v = masks.shape[:2]
     shown = patches_around_subject(masks, patch_size, 0)
@@ -207,10 +267,14 @@ def planned(
         kept = torch.stack([choices[number][element].to(masks.device) for element, number in enumerate(best)])
         each = [of_choices[best[image // v]][image] for image in range(b * v)]
         kept_extents = tuple(each)
-    patches = KeptPatches(kept, masks.device, kept_extents)
     known = tuple(map(bool, values[-1])) if flags else ()
     classes = rounds_up(masks.device) if classes is None else classes
-    facts = (extents, shown_extents, patch_size, pixels, tokens, classes, decisions, known)
+    is_whole = sum(extent.count for extent in kept_extents) == kept.numel()
+    size = None
+    if classes and not is_whole:
+        size = _of_images(kept_extents, kept, 0 if least is None else least.kept)
+    patches = KeptPatches(kept, masks.device, kept_extents, size)
+    facts = (extents, shown_extents, patch_size, pixels, tokens, classes, decisions, known, least)
     return Plan(masks, shown, patches, *facts)
 
 

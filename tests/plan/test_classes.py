@@ -98,7 +98,7 @@ def test_predictions_are_the_same(kind, skip, rounding):
     torch.testing.assert_close(found.depth[batch.masks], expected.depth[batch.masks], rtol=0, atol=2e-6)
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind[0])
+@pytest.mark.parametrize("kind", [*KINDS, ("model=hull", "skip=fast")], ids=str)
 def test_gradients_are_the_same(kind, rounding):
     """A row that is repeated must not be learned from twice."""
     model, batch, found = make_model(*kind).train(), training_batch(2, 56), []
