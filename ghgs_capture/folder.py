@@ -1,6 +1,7 @@
 """A folder of photographs or videos with a calibration: one instant, or many."""
 
 import functools
+import itertools
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -127,7 +128,7 @@ class CaptureFolder:
     @functools.cached_property
     def missing(self) -> dict[str, dict[str, str]]:
         """``{instant: {camera: why}}`` of photographs that are missing, or could not be read so far."""
-        cameras = dict.fromkeys(name for paths in self._listing[0].values() for name in paths)
+        cameras = dict.fromkeys(itertools.chain.from_iterable(self._listing[0].values()))
         missing = {}
         for instant, paths in self.paths.items():
             missing[instant] = {name: "there is no photograph" for name in cameras if name not in paths}
@@ -141,10 +142,11 @@ class CaptureFolder:
     @property
     def input_files(self) -> list[Path]:
         """All files that may be read: photographs and what lies beside them, the calibration, masks."""
-        sources = (path for paths in self.paths.values() for path in paths.values())
-        folders = {path.parent if isinstance(path, Path) else self.images for path in sources}
+        folders = set()
+        for paths in self.paths.values():
+            folders |= {path.parent if isinstance(path, Path) else self.images for path in paths.values()}
         given = [path for path in (self.cameras, self.masks, self.backgrounds) if isinstance(path, Path)]
-        files = [path for folder in folders for path in folder.iterdir()]
+        files = list(itertools.chain.from_iterable(folder.iterdir() for folder in folders))
         for path in given:
             files += path.rglob("*") if path.is_dir() else [path]
         return files

@@ -1,5 +1,6 @@
 """Live captures: instants of a folder that is being written, videos at their own rate, or cameras."""
 
+import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -281,7 +282,8 @@ def _arriving(
             continue
         done = counted(newest)
         last = clock()
-        files = [path for place in places if (place / newest).is_dir() for path in (place / newest).iterdir()]
+        folders = [place / newest for place in places if (place / newest).is_dir()]
+        files = itertools.chain.from_iterable(folder.iterdir() for folder in folders)
         age = max(time.time() - max(path.stat().st_ctime for path in files), 0.0)
         yield Arrived(capture, sum(counted(name) < done for name in sizes), last - age)
 

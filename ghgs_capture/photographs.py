@@ -195,7 +195,7 @@ def find_instants(
     below = {name: images_in(path) for name, path in places.items()}
     for name, paths in below.items():
         is_camera = camera_named(name, cameras, names) in cameras
-        instants = {instant for others in below.values() for instant in others}
+        instants = set().union(*below.values())
         require_all_read(places[name], paths, instants if is_camera else known)
     folders = {name: paths for name, paths in below.items() if paths}
     require(bool(folders), str(folder), f"photographs ({', '.join(SUFFIXES)})", "none")
@@ -225,7 +225,7 @@ def _by_instant(folder: Path, by_camera: Mapping[str, dict[str, Path]]) -> dict[
         expected = f"photographs named as those of {first}"
         examples = ", ".join(list(by_camera[other])[:3])
         require(bool(shared), f"{folder}: {other}", expected, f"others: {examples}")
-    instants = sorted({instant for paths in by_camera.values() for instant in paths}, key=counted)
+    instants = sorted(set().union(*by_camera.values()), key=counted)
     by_instant = {}
     for instant in instants:
         of_cameras = {camera: paths[instant] for camera, paths in by_camera.items() if instant in paths}

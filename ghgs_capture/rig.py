@@ -3,6 +3,7 @@
 One instant shows one pose, often with a mask that is wrong somewhere; several say more about the cameras, and
 cameras that are the same in all instants do not flicker."""
 
+import itertools
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -88,7 +89,8 @@ class Rig:
             By camera, its calibration and the (height, width) of its photographs in pixels.
         """
         corrected_cameras = {}
-        for name, photograph in {p.name: p for c in captures for p in c.photographs}.items():
+        photographs = itertools.chain.from_iterable(capture.photographs for capture in captures)
+        for name, photograph in {photograph.name: photograph for photograph in photographs}.items():
             stored = folder.file.cameras[name]
             size = stored.size or photograph.mask.shape
             given = calibrate(stored, folder.convention, size)

@@ -129,7 +129,9 @@ def output_files(options: OutputOptions, views: Sequence[str]) -> list[str]:
     Returns:
         Names of the files, except the report.
     """
-    names = [name for format in options.formats for name in FORMATS[format].names(views, options.frames)]
+    names = []
+    for format in options.formats:
+        names += FORMATS[format].names(views, options.frames)
     return [*names, SHEET]
 
 

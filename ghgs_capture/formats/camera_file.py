@@ -44,7 +44,7 @@ class CameraFile:
         Raises:
             InputError: two different cameras have one name.
         """
-        if unread := sorted({*unread, *(key for camera in cameras for key in camera.unread)}):
+        if unread := sorted(set(unread).union(*(camera.unread for camera in cameras))):
             warnings.warn(f"cameras: entries that are not read: {', '.join(unread)}", stacklevel=3)
         for part in (-1, -2, 0):
             named: dict[str, StoredCamera] = {}

@@ -177,7 +177,7 @@ class Entries:
             what: as for :meth:`keys`.
             shapes: lengths of the axes; None is any length.
         """
-        return any(_fits(self.fields[key], shape) for key in self.keys(what) for shape in shapes)
+        return any(_fits(self.fields[key], shapes) for key in self.keys(what))
 
     def array(self, what: str, *shapes: tuple[int | None, ...]) -> np.ndarray | None:
         """An array of one of several shapes.
@@ -196,7 +196,7 @@ class Entries:
             InputError: an entry has another shape or no finite numbers, or two differ.
         """
         keys = self.keys(what)
-        fitting = [key for key in keys if any(_fits(self.fields[key], shape) for shape in shapes)]
+        fitting = [key for key in keys if _fits(self.fields[key], shapes)]
         values = {}
         for key in fitting or keys[:1]:
             value = self.fields[key]
@@ -350,12 +350,17 @@ def _bends(key: str, value: Any) -> bool:
     return bool(_LENS.search(key)) and bool(np.any(np.asarray(value, object)))
 
 
-def _fits(value: Any, shape: tuple[int | None, ...]) -> bool:
+def _fits(value: Any, shapes: tuple[tuple[int | None, ...], ...]) -> bool:
+    """Whether nested lists have one of several shapes; None is any length."""
     try:
         sizes = np.shape(value)
     except ValueError:  # lists of different lengths
         return False
-    return len(sizes) == len(shape) and all(side in (None, n) for side, n in zip(shape, sizes, strict=True))
+    for shape in shapes:
+        same_rank = len(sizes) == len(shape)
+        if same_rank and all(side in (None, n) for side, n in zip(shape, sizes, strict=True)):
+            return True
+    return False
 
 
 def _has_flags(value: Any) -> bool:

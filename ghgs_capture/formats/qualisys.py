@@ -43,11 +43,9 @@ def read_qualisys(path: Path) -> CameraFile:
 def _camera(path: Path, camera: ElementTree.Element) -> StoredCamera:
     """One camera; :func:`read_qualisys` names errors in it."""
     name = camera.attrib["serial"]
-    numbers = {
-        key: float(value)
-        for part in ("fov_video", "transform", "intrinsic")
-        for key, value in camera.find(part).attrib.items()
-    }
+    numbers = {}
+    for part in ("fov_video", "transform", "intrinsic"):
+        numbers |= {key: float(value) for key, value in camera.find(part).attrib.items()}
     fx = numbers["focalLengthU"] / _SUBPIXELS
     fy = numbers["focalLengthV"] / _SUBPIXELS
     cx = numbers["centerPointU"] / _SUBPIXELS
@@ -58,7 +56,8 @@ def _camera(path: Path, camera: ElementTree.Element) -> StoredCamera:
     others = {key: value for key, value in numbers.items() if key not in keys.values()}
     Entries(f"{path}: {name}", others).unread(())  # refuses distortion of other names
     pose = np.eye(4)
-    pose[:3, :3] = [[numbers[f"r{row}{column}"] for column in (1, 2, 3)] for row in (1, 2, 3)]
+    for row in range(3):
+        pose[row, :3] = [numbers[f"r{row + 1}{column}"] for column in (1, 2, 3)]
     pose[:3, 3] = -pose[:3, :3] @ [numbers[axis] for axis in "xyz"]
     size = int(numbers["bottom"] - numbers["top"]) + 1, int(numbers["right"] - numbers["left"]) + 1
     distortion = coefficients(lens, _ORDER)

@@ -146,5 +146,5 @@ def _presets(
         "rows": rows,
         "broken": report.broken_budgets(rows),
         "decisions": decisions,
-        "subjects": [row for record in records for row in record.metrics],
+        "subjects": list(itertools.chain.from_iterable(record.metrics for record in records)),
     }

@@ -40,7 +40,10 @@ def defaults_of(verb: str) -> dict[str, str | None]:
 
 def _files(group: str, folders: Sequence[Path]) -> list[Path]:
     """Files of a group's options: those of ``conf``, then those of ``folders``, each sorted by name."""
-    return [path for folder in (conf_dir(), *folders) for path in sorted((folder / group).glob("*.yaml"))]
+    paths = []
+    for folder in (conf_dir(), *folders):
+        paths += sorted((folder / group).glob("*.yaml"))
+    return paths
 
 
 def print_verb(verb: str, folders: Sequence[Path] = ()) -> None:

@@ -1,5 +1,6 @@
 """Batches from sample specifications; an item of the torch datasets here is a whole :class:`Batch`."""
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -94,7 +95,7 @@ def _images(views: list[list[View]]) -> Tensor:
 
 def _stacked(views: list[list[View]], name: str) -> Tensor | None:
     """One array of all views [B, V, ...]; None where a view lacks it."""
-    arrays = [getattr(view, name) for row in views for view in row]
+    arrays = [getattr(view, name) for view in itertools.chain.from_iterable(views)]
     if any(array is None for array in arrays):
         return None
     return torch.from_numpy(np.stack(arrays)).unflatten(0, (len(views), -1))

@@ -212,8 +212,11 @@ def _read(
     reader = photographs.reader
     # Views that the protocol may ask for are read even if no file of theirs exists.
     needed = {RING_VIEW} | targets.view_numbers
-    places = [(name, position) for name, positions in reader.subjects.items() for position in positions]
-    listed = [(*place, view) for place in places for view in sorted(needed | set(reader.views_at(*place)))]
+    listed = []
+    for name, positions in reader.subjects.items():
+        for position in positions:
+            views = sorted(needed | set(reader.views_at(name, position)))
+            listed += [(name, position, view) for view in views]
     if not listed:
         return []
     items = _Readings(photographs, listed, _pictured(reader), min_iou)

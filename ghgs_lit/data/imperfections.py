@@ -4,6 +4,7 @@ The number of random numbers that a function draws does not depend on its limits
 """
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -220,9 +221,13 @@ def miscalibrated(
 def _corners(masks: Bool[Tensor, "V H W"]) -> Float[Tensor, "V 4 2"]:
     """Corners of the boxes around masks, in pixels; those of the photograph for an empty mask."""
     masks = torch.where(masks.any((1, 2), keepdim=True), masks, True)
-    lines = [mask.any(axis).nonzero()[:, 0] for mask in masks for axis in (0, 1)]
-    ends = torch.stack([torch.stack((line[0], line[-1] + 1)) for line in lines]).reshape(len(masks), 2, 2)
-    return torch.stack([ends[:, [0, 1], [i, j]] for i in (0, 1) for j in (0, 1)], 1).double()
+    ends = []
+    for mask, axis in itertools.product(masks, (0, 1)):
+        line = mask.any(axis).nonzero()[:, 0]
+        ends.append(torch.stack((line[0], line[-1] + 1)))
+    ends = torch.stack(ends).reshape(len(masks), 2, 2)
+    corners = itertools.product((0, 1), (0, 1))
+    return torch.stack([ends[:, [0, 1], corner] for corner in corners], 1).double()
 
 
 def _of_each(matrices: Float[Tensor, "V n m"]) -> Float[Tensor, "V 4 n m"]:

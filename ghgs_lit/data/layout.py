@@ -16,6 +16,7 @@ and ``done/<phase>/<subject>`` (an empty file for each complete subject, written
 ``rendering/`` was made elsewhere and counts as complete.
 """
 
+import itertools
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -245,7 +246,7 @@ class Layout(Reader):
     def files(self, name: str) -> Iterator[Path]:
         positions = self.subjects[name]
         views = {position: self.views_at(name, position) for position in positions}
-        counts = Counter(view for position in positions for view in views[position])
+        counts = Counter(itertools.chain.from_iterable(views.values()))
         usual = {view for view, count in counts.items() if 2 * count > len(positions)}
         for position in sorted(self._usual_positions.union(positions)):
             for view in sorted(usual.union(views.get(position, ()))):
@@ -257,7 +258,7 @@ class Layout(Reader):
     @cached_property
     def _usual_positions(self) -> set[int]:
         """Positions that half of the subjects have, or more."""
-        counts = Counter(position for positions in self.subjects.values() for position in positions)
+        counts = Counter(itertools.chain.from_iterable(self.subjects.values()))
         return {position for position, count in counts.items() if 2 * count >= len(self.subjects)}
 
     def body_place(self, name: str) -> Path:

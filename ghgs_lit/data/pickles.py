@@ -42,7 +42,8 @@ _ADMITTED: dict[tuple[str, str], Any] = {
     **{(f"numpy.{core}.multiarray", "_reconstruct"): _ARRAY for core in ("core", "_core")},
     **{(f"numpy.{core}.multiarray", "scalar"): _SCALAR for core in ("core", "_core")},
     **{(f"numpy.{core}.numeric", "_frombuffer"): _BUFFER for core in ("core", "_core")},
-    **{(module, kind.__name__): kind for kind in _BUILTINS for module in ("builtins", "__builtin__")},
+    **{("builtins", kind.__name__): kind for kind in _BUILTINS},
+    **{("__builtin__", kind.__name__): kind for kind in _BUILTINS},
 }
 
 

@@ -6,6 +6,7 @@ drawn as for photographs that are read; pixels agree with theirs up to the round
 
 import copy
 import functools
+import itertools
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -282,7 +283,8 @@ def resident_batches(batches: TrainingBatches, device: torch.device) -> DrawnBat
         area = builder.inputs.resampling == "area"
         require(area, "data.resident", "off with data.resampling=release and sizes that vary", "device")
         drawn = [*(augmentation.sizes or (builder.inputs.size,)), builder.targets.size]
-        fits = all(side <= most for size in drawn for side, most in zip(size, inputs.size, strict=True))
+        heights, widths = zip(*drawn, strict=True)
+        fits = max(heights) <= inputs.size[0] and max(widths) <= inputs.size[1]
         require(fits, "data.resident", f"off, or sizes of at most {inputs.size} as stored", drawn)
         return DrawnBatches(batches, inputs, inputs)
     if builder.targets is builder.inputs:
@@ -337,8 +339,9 @@ def _centered_depth(inverse: Int[Tensor, "*batch H W"], size: Size) -> Int[Tenso
     pairs = [_neighbors(*pair, inverse.device) for pair in zip(inverse.shape[-2:], size, strict=True)]
     (rows, down), (columns, across) = pairs
     known = inverse.float()
-    corners = torch.stack([known[..., rows[i], :][..., columns[j]] for i in (0, 1) for j in (0, 1)])
-    weights = torch.stack([down[i][:, None] * across[j] for i in (0, 1) for j in (0, 1)])
+    places = list(itertools.product((0, 1), (0, 1)))
+    corners = torch.stack([known[..., rows[i], :][..., columns[j]] for i, j in places])
+    weights = torch.stack([down[i][:, None] * across[j] for i, j in places])
     weights = weights.reshape(4, *(1,) * (inverse.dim() - 2), *size)
     front = torch.where(weights > 0, corners, 0).amax(0)
     least = ((1 - SAME_SURFACE) * front).clamp(min=0.5)  # 0 is unknown

@@ -172,7 +172,7 @@ class TargetProtocol(Options):
             InputError: there are fewer.
         """
         taken = ring_photos(inputs)
-        everything = [(position, view) for position in available for view in self.training_views]
+        everything = itertools.product(available, self.training_views)
         pool = [photo for photo in everything if photo not in taken]
         if len(pool) < count:
             raise InputError(
@@ -327,6 +327,8 @@ def evaluation_samples(
                 f"found no position {lacking[0]}"
             )
         each = [p.evaluation(available, inputs, ring, subject_rng(seed, name)) for p in protocols]
-        names = tuple(p.name for p, photos in zip(protocols, each, strict=True) for _ in photos)
-        specs.append(SampleSpec(name, ring_photos(inputs), tuple(itertools.chain(*each)), names))
+        names = []
+        for protocol, photos in zip(protocols, each, strict=True):
+            names += [protocol.name] * len(photos)
+        specs.append(SampleSpec(name, ring_photos(inputs), tuple(itertools.chain(*each)), tuple(names)))
     return specs

@@ -63,7 +63,9 @@ def read_split(split: Split, names: Sequence[str]) -> dict[str, list[str]]:
             require(split.get(phase) is not None, place, f"a list {phase!r}", split.get(phase))
         chosen = {}
         for phase in PHASES:
-            chosen[phase] = [name for entry in split[phase] for name in _expand(entry, names)]
+            chosen[phase] = []
+            for entry in split[phase]:
+                chosen[phase] += _expand(entry, names)
     else:
         place = Path(split).expanduser()
         require_folder(place, "a folder with split_train.txt and split_val.txt")

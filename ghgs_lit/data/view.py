@@ -4,6 +4,7 @@ Resizing keeps the middle of the image. ``release`` functions reproduce what the
 nearest neighbour takes pixel floor(i * scale), which moves masks by half an old pixel less half a new one.
 """
 
+import itertools
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -75,8 +76,9 @@ def centered_depth(inverse: np.ndarray, height: int, width: int) -> np.ndarray:
     rows, down = neighbors(inverse.shape[0], height)
     columns, across = neighbors(inverse.shape[1], width)
     known = inverse.astype(np.float32)
-    corners = [known[rows[i][:, None], columns[j]] for i in (0, 1) for j in (0, 1)]
-    weights = [down[i][:, None] * across[j] for i in (0, 1) for j in (0, 1)]
+    places = list(itertools.product((0, 1), (0, 1)))
+    corners = [known[rows[i][:, None], columns[j]] for i, j in places]
+    weights = [down[i][:, None] * across[j] for i, j in places]
     front = np.maximum.reduce([np.where(w > 0, c, 0) for c, w in zip(corners, weights, strict=True)])
     least = np.maximum((1 - SAME_SURFACE) * front, 0.5)  # 0 is unknown
     total = np.zeros_like(front)

@@ -271,5 +271,6 @@ def measure_all(
         for name, method in methods.items():
             batches = track(loader, f"measuring {name}, {count} views")
             measured += measure(method, name, batches, metrics, device, pictures, picture_count)
-        rows += [row for kind in targets for row in measured if row["targets"] == kind]
+        for kind in targets:
+            rows += [row for row in measured if row["targets"] == kind]
     return rows

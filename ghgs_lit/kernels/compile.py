@@ -62,7 +62,7 @@ def _digest(folder: Path) -> str:
     package, of ``folder`` and of its parent. Kernels read no constants of other files."""
     digest = hashlib.sha256()
     rooms = (Path(__file__).parent, folder, folder.parent)
-    for path in sorted({path for room in rooms for path in room.glob("*.py")}):
+    for path in sorted(set().union(*(room.glob("*.py") for room in rooms))):
         digest.update(path.name.encode() + path.read_bytes())
     return digest.hexdigest()
 

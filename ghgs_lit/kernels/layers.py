@@ -140,8 +140,11 @@ def parameters(layers: Sequence[nn.Module]) -> list[nn.Parameter]:
     Args:
         layers: such as those of an ``nn.Sequential``; others than linear ones are left out.
     """
-    linears = (layer for layer in layers if isinstance(layer, nn.Linear))
-    return [x for layer in linears for x in (layer.weight, layer.bias)]
+    numbers = []
+    for layer in layers:
+        if isinstance(layer, nn.Linear):
+            numbers += [layer.weight, layer.bias]
+    return numbers
 
 
 def packed(numbers: Sequence[Tensor], transposed: bool = False) -> np.ndarray:
@@ -200,7 +203,10 @@ class Sums:
             part.reshape(block).swapaxes(1, 2).reshape(-1, block[1])[: shape[0], : shape[1] + 1]
             for part, block, shape in zip(sums, self._blocks, self._shapes, strict=True)
         ]
-        return [x for each in both for x in (torch.tensor(each[:, :-1]), torch.tensor(each[:, -1]))]
+        gradients = []
+        for each in both:
+            gradients += [torch.tensor(each[:, :-1]), torch.tensor(each[:, -1])]
+        return gradients
 
 
 #: :func:`room` inside kernels.

@@ -4,6 +4,7 @@ P. Andersson, J. Nilsson, T. Akenine-Möller, M. Oskarsson, K. Åström, M. D. F
 Evaluator for Alternating Images", HPG 2020. Section numbers below are that paper's. Images are sRGB in
 [0, 1]; the result lies in [0, 1], 0 for equal images."""
 
+import itertools
 import math
 
 import torch
@@ -81,7 +82,7 @@ def _filter(maps: Tensor, along_y: Tensor, along_x: Tensor) -> Tensor:
 
 def _filter_sensitivity(ycc: Tensor, ppd: float) -> Tensor:
     """Blur each channel of YCxCz [n, 3, h, w] as the eye does at ``ppd`` pixels a degree (section 4.1.1)."""
-    widest = max(b for terms in _SENSITIVITY.values() for _, b in terms)
+    widest = max(b for _, b in itertools.chain.from_iterable(_SENSITIVITY.values()))
     radius = math.ceil(3 * math.sqrt(widest / (2 * math.pi**2)) * ppd)
     x = torch.arange(-radius, radius + 1, dtype=ycc.dtype, device=ycc.device) / ppd
     filtered = []

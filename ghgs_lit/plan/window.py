@@ -1,5 +1,6 @@
 """Windows of maps, and the windows that the layers of a dense head need for a window of its result."""
 
+import itertools
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
@@ -211,5 +212,5 @@ def subject_windows(extents: Sequence[Extent], size: tuple[int, int]) -> list[Wi
 
 def reach(*modules: nn.Module) -> int:
     """Number of cells on each side that the result of these consecutive layers depends on."""
-    layers = (layer for module in modules for layer in module.modules())
+    layers = itertools.chain.from_iterable(module.modules() for module in modules)
     return sum(layer.kernel_size[0] // 2 for layer in layers if isinstance(layer, nn.Conv2d))

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import itertools
 import json
 import math
 import reprlib
@@ -47,7 +48,8 @@ def metric_names(rows: Sequence[Row]) -> list[str]:
     Returns:
         Names in order of appearance.
     """
-    return list(dict.fromkeys(name for row in rows for name in row if name not in KEYS))
+    names = dict.fromkeys(itertools.chain.from_iterable(rows))
+    return [name for name in names if name not in KEYS]
 
 
 def by_protocol(rows: Sequence[Row]) -> dict[tuple, dict[str, list[Row]]]:

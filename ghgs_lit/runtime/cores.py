@@ -33,7 +33,8 @@ def spin_if_alone(arguments: Sequence[str], running: Path = Path("/proc/loadavg"
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except (OSError, IndexError):
         return
-    if alone and not any(word in argument for argument in arguments for word in _SEVERAL):
+    command = " ".join(arguments)
+    if alone and not any(word in command for word in _SEVERAL):
         _spins.append(handle)
         os.environ["GOMP_SPINCOUNT"] = _TURNS
 

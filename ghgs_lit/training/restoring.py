@@ -4,6 +4,7 @@ Lightning loads loops, callbacks, optimizers and schedules as they come: a damag
 in the middle of its start, or counts on from a wrong step.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -65,8 +66,8 @@ def check_optimizer_state(
     for group in state["param_groups"]:
         rate = group.get("lr")
         require(_is_number(rate) and rate >= 0, f"{place}.param_groups.lr", "a number of 0 or more", rate)
-    parameters = [parameter for group in groups for parameter in group["params"]]
-    by_number = dict(zip((number for numbers in lists for number in numbers), parameters, strict=True))
+    parameters = list(itertools.chain.from_iterable(group["params"] for group in groups))
+    by_number = dict(zip(itertools.chain.from_iterable(lists), parameters, strict=True))
     kept = state.get("state")
     require(isinstance(kept, Mapping), f"{place}.state", "a mapping of parameters", type(kept).__name__)
     for number, values in kept.items():

@@ -77,7 +77,9 @@ class ZJUMoCapReader(FrameReader):
         self.data = data
         folder = data.folder
         chosen = getattr(data.split, phase)
-        wanted = [(f"CoreView_{s}", some.frames) for some in chosen for s in some.sequences]
+        wanted = []
+        for some in chosen:
+            wanted += [(f"CoreView_{s}", some.frames) for s in some.sequences]
         there = self.existing(folder, [name for name, _ in wanted], wanted[0][0])
         for name, frames in wanted:
             if name in there:

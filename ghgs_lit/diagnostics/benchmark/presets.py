@@ -123,7 +123,7 @@ def cases_of(
     Raises:
         InputError: the model refuses a preset or knob, or the weights do not fit it.
     """
-    choices = [(name, change) for name in presets for change in combinations(knobs)]
+    choices = list(itertools.product(presets, combinations(knobs)))
     if YARDSTICK in presets:
         choices = [(YARDSTICK, {}), *(choice for choice in choices if choice != (YARDSTICK, {}))]
     state: dict[str, Tensor] = {}

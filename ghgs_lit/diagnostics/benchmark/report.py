@@ -118,7 +118,10 @@ def broken_budgets(rows: Sequence[Row]) -> list[str]:
     Args:
         rows: as of :func:`rows_of`.
     """
-    return [f"{row['preset']}: {line}" for row in totals(rows) for line in _broken(row)]
+    lines = []
+    for row in totals(rows):
+        lines += [f"{row['preset']}: {line}" for line in _broken(row)]
+    return lines
 
 
 def _broken(row: Row) -> list[str]:

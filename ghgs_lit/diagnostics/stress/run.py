@@ -1,5 +1,6 @@
 """Run of a stress test: its cells, by stage and family, in several processes."""
 
+import itertools
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -61,13 +62,14 @@ def run_tasks(tasks: Sequence[Task], workers: int) -> list[Row]:
         workers: number of processes; 0: this one.
     """
     if workers == 0:
-        return [row for task in track(tasks, "stages and families") for row in task.run()]
+        rows = map(Task.run, track(tasks, "stages and families"))
+        return list(itertools.chain.from_iterable(rows))
     # Spawned: a forked child would inherit locks of threads that it does not have.
     pool = ProcessPoolExecutor(
         workers, get_context("spawn"), initializer=torch.set_num_threads, initargs=(1,)
     )
     try:
         done = zip(track(tasks, "stages and families"), pool.map(Task.run, tasks), strict=True)
-        return [row for _, rows in done for row in rows]
+        return list(itertools.chain.from_iterable(rows for _, rows in done))
     finally:
         pool.shutdown(cancel_futures=True)

@@ -1,5 +1,6 @@
 """Attention for CPUs with AVX2 or AVX-512, in one pass without the matrix of all scores in memory."""
 
+import itertools
 from functools import partial
 from itertools import pairwise
 
@@ -61,7 +62,7 @@ def attend(
     out = torch.empty(q.transpose(1, 2).shape)
     arrays = [_rows(x.float()).numpy() for x in (q, k, v, out.transpose(1, 2))]
     n, a, t, d = q.shape
-    heads = [(i, j) for i in range(n) for j in range(a)]
+    heads = list(itertools.product(range(n), range(a)))
     # Every task packs keys and values again, so a head is split only if there are few heads.
     parts = max(1, min(-(-2 * torch.get_num_threads() // len(heads)), t // QUERIES))
     edges = [t * p // (parts * QUERIES) * QUERIES for p in range(parts)] + [t]

@@ -1,5 +1,6 @@
 """Assembly of tables from measurements: their rows, columns and cells."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -131,7 +132,8 @@ def _groups(rows: pd.DataFrame, planned: list[Planned], options: TableOptions) -
     names += [*rows["data"], *(p.data for p in planned)]
     titles = dict.fromkeys(map(data_title, names))
     text = "{}, {}-view" if len(views) > 1 else "{}"
-    return [Group(text.format(name, n), n, name) for name in titles for n in views]
+    pairs = itertools.product(titles, views)
+    return [Group(text.format(name, n), n, name) for name, n in pairs]
 
 
 def _reported(layout: Layout, reported: str, groups: list[Group]) -> tuple[list[Line], list[dict]]:

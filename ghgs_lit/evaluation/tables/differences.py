@@ -1,5 +1,6 @@
 """What the configurations of runs differ in."""
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -23,7 +24,7 @@ def differing(
         Dotted keys with their values as text, ``ABSENT`` among them.
     """
     flat = [flatten(config) for config in configs]
-    keys = dict.fromkeys(key for values in flat for key in values)
+    keys = dict.fromkeys(itertools.chain.from_iterable(flat))
     known = [key for key in keys if not is_below(key, expected)]
     texts = {}
     for key in known:

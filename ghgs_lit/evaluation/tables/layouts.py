@@ -1,5 +1,6 @@
 """Layouts of tables (the paper's four, the ablation at several numbers of views) and their parts."""
 
+import itertools
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -303,4 +304,4 @@ def reported_data(name: str) -> list[str]:
     Returns:
         Data sets or numbers of views.
     """
-    return list(dict.fromkeys(group for row in reported_table(name)[1].values() for group in row))
+    return list(dict.fromkeys(itertools.chain.from_iterable(reported_table(name)[1].values())))

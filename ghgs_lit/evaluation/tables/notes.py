@@ -212,10 +212,14 @@ def _about_runs(table: Table) -> list[str]:
     for source, variant, data in ours.values:
         row = (variant.model, variant.encoder, variant.ablation, data)
         groups.setdefault(() if table.layout.rows == "ablation" else row, []).append(table.configs[source])
-    keys = {key: values for group in groups.values() for key, values in differing(group).items()}
-    by_rows = [key for line in table.ours for key, _ in line.variant.extra]
-    for shown in ("checkpoint", *by_rows, *(key for sets in own_ablations(table).values() for key in sets)):
-        keys.pop(shown, None)
+    keys = {}
+    for group in groups.values():
+        keys |= differing(group)
+    shown = {"checkpoint"}
+    for line in table.ours:
+        shown |= {key for key, _ in line.variant.extra}
+    for key in shown.union(*own_ablations(table).values()):
+        keys.pop(key, None)
     if keys:
         notes.append(f"Runs side by side differ also in {differing_text(keys)}.")
     states = sorted(table.rows["git"].dropna().unique()) if "git" in table.rows else []

@@ -3,6 +3,7 @@
 A run is identified by its configuration, never by the name of its directory.
 """
 
+import itertools
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -355,7 +356,7 @@ def files_below(folders: Sequence[Path], name: str) -> list[Path]:
     for folder in folders:
         if not folder.is_dir():
             raise FileNotFoundError(f"{folder}: expected a directory of runs; found none")
-    paths = [path for folder in folders for path in sorted(folder.rglob(name))]
+    paths = itertools.chain.from_iterable(sorted(folder.rglob(name)) for folder in folders)
     return [path for path in paths if path.parent.name != ".hydra"]
 
 
@@ -382,7 +383,7 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
         begun = f"{len(trainings)} runs without one" if trainings else "none"
         raise InputError(f"{names}: expected runs with a metrics.json below it; found {begun}")
     models = {source: config for source, (rows, config) in runs.items() if METHOD in set(rows["method"])}
-    known = {key for _, config in runs.values() for key in flatten(config)}
+    known = set().union(*(flatten(config) for _, config in runs.values()))
     for key in by:
         require(any(is_below(k, [key]) for k in known), "by", "keys of the runs' configurations", key)
     by = list(dict.fromkeys([*by, *keys_of_rows([*models.values(), *trainings.values()])]))

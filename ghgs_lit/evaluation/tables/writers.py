@@ -3,6 +3,7 @@ r"""Writers of tables: Markdown, terminal, CSV, and LaTeX in the paper's layout.
 LaTeX needs ``\usepackage{booktabs,multirow,adjustbox,pifont}``.
 """
 
+import itertools
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
@@ -110,7 +111,7 @@ def to_terminal(table: Table) -> str:
     """
     numbers = texts(table, lambda number, tail, best: _bold(number + tail, best))
     rows = []
-    for line in (line for block in table.blocks for line in block):
+    for line in itertools.chain.from_iterable(table.blocks):
         first, *more = table.lines[line].stub
         mark = "† " if table.lines[line].is_reported else ""
         for number, group in enumerate(table.groups):
@@ -130,8 +131,9 @@ def to_csv(tables: Sequence[Table]) -> str:
     Returns:
         CSV with the columns ``COLUMNS``.
     """
-    pairs = [(n, table, cell) for n, table in enumerate(tables, 1) for cell in table.cells.itertuples()]
-    lines = [_line(*each) for each in pairs]
+    lines = []
+    for number, table in enumerate(tables, 1):
+        lines += [_line(number, table, cell) for cell in table.cells.itertuples()]
     frame = pd.DataFrame(lines, columns=COLUMNS)
     frame = frame.astype(dict.fromkeys(("subjects", "test_seeds", "test_subjects"), "Int64"))
     return frame.to_csv(index=False, lineterminator="\n")

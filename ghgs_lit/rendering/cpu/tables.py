@@ -243,7 +243,9 @@ def _interleave(builder, columns: list):
         lines = builder.shuffle_vector(
             lines, column, indices([*lanes, *range(len(lanes), len(lanes) + DOUBLES)])
         )
-    order = [k * DOUBLES + lane for lane in range(DOUBLES) for k in range(len(columns))]
+    order = []
+    for lane in range(DOUBLES):
+        order += range(lane, len(columns) * DOUBLES, DOUBLES)
     return builder.shuffle_vector(lines, lines, indices(order))
 
 

@@ -2,8 +2,6 @@
 
 from ghgs_lit.diagnostics.stress.stages import geometry, heads, photographs, recalibration, rendering, whole
 
-STAGES = {
-    stage.name: stage
-    for room in (geometry, heads, recalibration, rendering, photographs, whole)
-    for stage in room.STAGES
-}
+STAGES = {}
+for _room in (geometry, heads, recalibration, rendering, photographs, whole):
+    STAGES |= {stage.name: stage for stage in _room.STAGES}
