@@ -148,7 +148,7 @@ def read_json(path: Path, expected: str = "JSON") -> Any:
         expected: what it would hold, in words.
 
     Raises:
-        InputError: as for :func:`read_text`; no JSON; more than 64 levels.
+        InputError: as for :func:`read_text`; no JSON; more than :data:`DEEPEST` levels.
     """
     return read_parsed(path, expected, json.loads)
 
@@ -224,7 +224,7 @@ def check_yaml(text: str, aliases: bool = True) -> None:
         aliases: whether aliases (``*name``) are allowed.
 
     Raises:
-        ValueError: more than 64 levels, a forbidden alias, or aliases that expand to more than a
+        ValueError: more than :data:`DEEPEST` levels, a forbidden alias, or aliases that expand to more than a
             million values.
         yaml.YAMLError: no YAML.
     """
@@ -264,7 +264,7 @@ def read_parsed(path: Path, expected: str, parse: Callable[[str], Any]) -> Any:
         parse: turns the text into plain data.
 
     Raises:
-        InputError: as for :func:`read_text`; ``parse`` fails; more than 64 levels.
+        InputError: as for :func:`read_text`; ``parse`` fails; more than :data:`DEEPEST` levels.
     """
     try:
         value = parse(read_text(path, expected))
