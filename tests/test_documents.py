@@ -37,6 +37,7 @@ VERBS = (
 MADE = ("conf/data/my_people.yaml", "conf/sweep/<name>.yaml")
 OPTIONS = {
     "ablation": {"one_neighbor"},
+    "sweep": {"controls"},
     "data": {"my_people"},
     "hydra/launcher": {"joblib", "ray", "submitit_local"},
     "hydra/sweeper": {"optuna"},

@@ -14,6 +14,7 @@ from ghgs_lit.cli.inputs import build_data, build_renderer, check_size
 from ghgs_lit.cli.train import build_trainer, quiet
 from ghgs_lit.config import build
 from ghgs_lit.config.keys import WITHOUT_INFLUENCE, flatten, is_below, lookup
+from ghgs_lit.config.registry import read_node
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.protocols import check_evaluation
 from ghgs_lit.model import GHGS
@@ -126,6 +127,11 @@ class _Rehearsed:
         self.attempt(check_evaluation, self.config, data)
         if batch is not None and batch.body_vertices is None:
             self._lacks_body(data, batch.subjects[0])
+        if model is not None and "feature_cache" in self.config:
+            cache = read_node(self.config["feature_cache"], "feature_cache")
+            needed = self.attempt(cache.needs, model, data)
+            if needed is not None:
+                self.notes[needed] = None
         if len(self.reasons) == before:  # what was read is there: now the files of everybody
             for phase in dict.fromkeys(("train", split)):
                 self.attempt(self._check_files, data, phase)

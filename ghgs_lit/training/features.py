@@ -28,6 +28,9 @@ class NoFeatureCache(Options):
 
     group = "feature_cache"
 
+    def needs(self, model: nn.Module, data: PhotographsDataModule) -> None:
+        """Nothing."""
+
     def attach(self, model: nn.Module, data: PhotographsDataModule) -> None:
         """Change nothing."""
 
@@ -42,6 +45,27 @@ class DiskFeatureCache(Options):
     dtype: Literal["float16", "bfloat16"] = "float16"
     """In which tokens are kept and used: float16 rounds to 11 bits, bfloat16 to 8"""
 
+    @property
+    def _root(self) -> Path:
+        shared = Path(os.environ.get("GHGS_CACHE") or "~/.cache/ghgs_lit")
+        return Path(self.folder or shared / "features").expanduser()
+
+    def needs(self, model: nn.Module, data: PhotographsDataModule) -> str:
+        """How much a training will write, in words.
+
+        Args:
+            model: as of :meth:`attach`; its weights are not read.
+            data: as of :meth:`attach`.
+
+        Raises:
+            InputError: the encoder has no frozen ViT.
+        """
+        vit = _frozen_vit(model)
+        if data.augmentation.changes_photographs:
+            return "feature_cache: off, since augmentation makes a new photograph in each step"
+        count, size = _amount(vit, data)
+        return f"feature_cache: {self._root}: tokens of {count} photographs of training, {size / 1e9:.3g} GB"
+
     def attach(self, model: nn.Module, data: PhotographsDataModule) -> None:
         """Let a model's encoder keep tokens in training, and say how much room they need.
 
@@ -52,40 +76,38 @@ class DiskFeatureCache(Options):
         Raises:
             InputError: the encoder has no frozen ViT, or the disk has no room.
         """
-        vit = getattr(getattr(model.encoder, "aggregator", None), "patch_embed", None)
-        fits = isinstance(vit, VisionTransformer) and not any(p.requires_grad for p in vit.parameters())
-        expected = "none where encoder.vit is no dinov2 or learns (encoder.trainable)"
-        require(fits, "feature_cache", expected, "disk")
+        text = self.needs(model, data)
+        vit = _frozen_vit(model)
         if data.augmentation.changes_photographs:
-            _say("feature_cache: off, since augmentation makes a new photograph in each step")
-            return
-        folder = Path(self.folder or Path(os.environ.get("GHGS_CACHE") or "~/.cache/ghgs_lit") / "features")
+            return _say(text)
         heads = vit.blocks[0].attn.heads
         network = digest_of({**vit.state_dict(), f"heads {heads}": torch.zeros(0)})[:16]
-        cache = FeatureCache(folder.expanduser(), network, _DTYPES[self.dtype])
-        count = sum(map(len, data.subjects("train").values()))
-        size = count * _bytes_of(vit, data.dataset.size)
-        there = sum(path.stat().st_size for path in cache.folder.glob(f"{network}-*-{self.dtype}/*/*.npy"))
-        sizes = f"{size / 1e9:.3g} GB, of which {there / 1e9:.3g} GB are there"
-        _say(f"feature_cache: {cache.folder}: tokens of {count} photographs of training, {sizes}")
-        cache.folder.mkdir(parents=True, exist_ok=True)
-        free = shutil.disk_usage(cache.folder).free
-        if free < size - there:
-            expected = f"{(size - there) / 1e9:.3g} GB of room for tokens"
-            raise InputError(
-                f"feature_cache.folder: {cache.folder}: expected {expected}; found {free / 1e9:.3g}"
-            )
-        vit.cache = cache
+        files = self._root.glob(f"{network}-*-{self.dtype}/*/*.npy")
+        there = sum(path.stat().st_size for path in files)
+        _say(f"{text}, of which {there / 1e9:.3g} GB are there")
+        self._root.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(self._root).free
+        lacking = _amount(vit, data)[1] - there
+        if free < lacking:
+            room = f"expected {lacking / 1e9:.3g} GB of room for tokens; found {free / 1e9:.3g}"
+            raise InputError(f"feature_cache.folder: {self._root}: {room}")
+        vit.cache = FeatureCache(self._root, network, _DTYPES[self.dtype])
 
 
-def _bytes_of(vit: VisionTransformer, size: tuple[int, int]) -> int:
-    """Bytes of the tokens of a photograph.
+def _frozen_vit(model: nn.Module) -> VisionTransformer:
+    """The ViT of a model's encoder; InputError: there is none, or it learns."""
+    vit = getattr(getattr(model.encoder, "aggregator", None), "patch_embed", None)
+    fits = isinstance(vit, VisionTransformer) and not any(p.requires_grad for p in vit.parameters())
+    expected = "none where encoder.vit is no dinov2 or learns (encoder.trainable)"
+    require(fits, "feature_cache", expected, "disk")
+    return vit
 
-    Args:
-        vit: has patches and channels.
-        size: (height, width) in pixels; padded to whole patches.
-    """
-    return 2 * vit.pos_embed.shape[-1] * math.prod(-(-side // vit.patch_size) for side in size)
+
+def _amount(vit: VisionTransformer, data: PhotographsDataModule) -> tuple[int, int]:
+    """Number of photographs of training, and bytes of their tokens; the last patches may be padded."""
+    count = sum(map(len, data.subjects("train").values()))
+    patches = math.prod(-(-side // vit.patch_size) for side in data.dataset.size)
+    return count, count * patches * 2 * vit.pos_embed.shape[-1]
 
 
 @rank_zero_only
