@@ -108,14 +108,11 @@ class Playback:
         described(batch, tensors)
         if not here or is_watched() or any(tensor.requires_grad for tensor in tensors):
             return enter(batch)
-        targets = batch.targets and dataclasses.replace(batch.targets, names=(), protocols=())
-        bare = dataclasses.replace(batch, targets=targets, subjects=(), views=())
+        bare = dataclasses.replace(batch, targets=None, subjects=(), views=())
         with torch.no_grad():
             around, inside, findings = self.recorder(enter, bare, ("entered", key))
-        # Names take no part; what was computed of the batch stays with it.
-        vars(inside).update(subjects=batch.subjects, views=batch.views)
-        if targets is not None:
-            vars(inside.targets).update(names=batch.targets.names, protocols=batch.targets.protocols)
+        # Targets and names take no part; what was computed of the batch stays with it.
+        vars(inside).update(targets=batch.targets, subjects=batch.subjects, views=batch.views)
         return around, inside, findings
 
     def fits(self, batch: Batch, plan: Plan) -> bool:
