@@ -90,28 +90,40 @@ class _Pass(nn.Module):
             return left(around, self.model.predict(batch, plan))
 
 
-def is_recordable(model: nn.Module, renderer: Callable, losses: Callable, batch: Batch) -> bool:
-    """Whether training steps can be recorded at all.
+def may_be_recorded(model: nn.Module, renderer: Callable, losses: Callable, device: str) -> bool:
+    """Whether steps of a training are of a kind that is recorded.
 
     Args:
         model: of the training.
         renderer: of the training; others than this package's may do what depends on values.
         losses: likewise.
+        device: its type.
+    """
+    known = isinstance(model, GHGS) and isinstance(renderer, Renderer) and isinstance(losses, Losses)
+    return known and model.options.capture == "auto" and device == model.playback.steps.tape.device
+
+
+def is_recordable(model: nn.Module, renderer: Callable, losses: Callable, batch: Batch) -> bool:
+    """Whether a training step can be recorded.
+
+    Args:
+        model: as of :func:`may_be_recorded`.
+        renderer: as of :func:`may_be_recorded`.
+        losses: as of :func:`may_be_recorded`.
         batch: of a step.
 
     Returns:
         True on a device that records, with ``model.capture=auto``, where the gradient needs no scaling and
         no tokens are read from disk.
     """
-    known = isinstance(model, GHGS) and isinstance(renderer, Renderer) and isinstance(losses, Losses)
-    if not known or model.options.capture == "off" or is_watched():
+    device = batch.masks.device.type
+    if not may_be_recorded(model, renderer, losses, device) or is_watched():
         return False
     if getattr(model.encoder, "keeps_features", False):  # a plug-in's may not say
         return False
-    device = batch.masks.device.type
     if torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device) == torch.float16:
         return False  # gradients would underflow before they are scaled
-    return model.training and device == model.playback.steps.tape.device
+    return model.training
 
 
 def played(model: GHGS, renderer: Renderer, losses: Losses, batch: Batch) -> Outcome | None:

@@ -12,6 +12,7 @@ from ghgs_lit.config.options import Options
 from ghgs_lit.model import STAGES
 from ghgs_lit.runtime.allocation import forget_peak, resident_bytes
 from ghgs_lit.runtime.watching import Inputs, Stopwatch, Watcher, watched
+from ghgs_lit.training.captured import may_be_recorded
 
 #: Parts of a step in their order.
 PARTS = ("data", *STAGES, "rounds", "render", "loss", "backward", "optimizer")
@@ -28,15 +29,21 @@ class CostsOptions(Options):
 class Costs(Callback, Watcher):
     """Logs milliseconds of a step and of its parts, means since the last log, and memory in MiB, on CUDA the
     peak of all tensors since the last log. ``time_ms/01_data`` is the wait for data. Validation, other
-    callbacks and writing of checkpoints and logs do not count."""
+    callbacks and writing of checkpoints and logs do not count. Steps that are played back as one CUDA graph
+    (:mod:`ghgs_lit.training.captured`) have no stages: ``time_ms/forward`` is loss and gradients."""
 
     def __init__(self):
         self._stack = ExitStack()
         self._inside = False  # a step, not a validation
+        self._has_stages = True
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Watch all stages."""
+        """Watch all stages, unless this would keep steps from being played back."""
         self._begin_interval(pl_module)
+        parts = [getattr(pl_module, name, None) for name in ("model", "renderer", "losses")]
+        self._has_stages = not may_be_recorded(*parts, pl_module.device.type)
+        if not self._has_stages:
+            return
         places = {name: f"model.{name}" for name in (*STAGES, "rounds")}
         places |= {"render": "renderer", "loss": "losses"}
         self._stack.enter_context(watched(pl_module, places, self))
@@ -70,9 +77,13 @@ class Costs(Callback, Watcher):
         for stage in ("step", "data"):
             self._watch.begin(stage, since=pl_module.ready)
         self.end("data")
+        if not self._has_stages:
+            self.begin("forward")
 
     def on_before_backward(self, *args: Any) -> None:
         """The backward pass begins."""
+        if not self._has_stages:
+            self.end("forward")
         self.begin("backward")
 
     def on_after_backward(self, *args: Any) -> None:

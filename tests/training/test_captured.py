@@ -1,6 +1,7 @@
 """Training steps that are played back, on the pretend device with a stand-in for CUDA graphs."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,7 +12,9 @@ from ghgs_lit.playback import Playback
 from ghgs_lit.rendering import capacity
 from ghgs_lit.rendering.api import Renderer
 from ghgs_lit.runtime.recording import Recorder
+from ghgs_lit.runtime.watching import is_watched
 from ghgs_lit.training.captured import is_recordable, played
+from ghgs_lit.training.cost import Costs
 from tests.helpers.losses import losses_of
 from tests.helpers.models import make_model
 from tests.helpers.pretend_device import DEVICE, pretend_device
@@ -132,3 +135,20 @@ def test_what_cannot_be_recorded_is_called():
     assert not is_recordable(model.eval(), Renderer(), LOSSES, batch)
     model.train().options = model.options.model_copy(update={"capture": "off"})
     assert not is_recordable(model, Renderer(), LOSSES, batch)
+
+
+def test_times_of_a_step_do_not_keep_it_from_being_played_back():
+    """The callback that every training has watches stages only where they are called."""
+    model = recording("model=paper")
+    for capture, is_free in (("auto", True), ("off", False)):
+        model.options = model.options.model_copy(update={"capture": capture})
+        module = SimpleNamespace(model=model, renderer=Renderer(), losses=LOSSES, device=DEVICE, ready=None)
+        costs = Costs()
+        costs.on_train_start(None, module)
+        assert is_watched() != is_free
+        for mark in (costs.on_train_batch_start, costs.on_before_backward, costs.on_after_backward):
+            mark(None, module)
+        costs.end("optimizer")
+        costs.end("step")
+        assert ("forward" in costs._watch.seconds()) == is_free
+        costs.teardown(None, module, "fit")
