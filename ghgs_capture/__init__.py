@@ -1,17 +1,19 @@
 """A user's own photographs and calibration become files, pages and weights for one's rig.
 
-A plug-in of :mod:`ghgs_lit` by the door that a user's own has: it offers the verbs for photographs.
+A plug-in of :mod:`ghgs_lit` by the door that a user's own has: it offers the verbs for photographs, and the
+instants of a sequence as a data set.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from ghgs_lit.config.registry import offer_verbs
+from ghgs_lit.config.registry import offer, offer_verbs
 
 if TYPE_CHECKING:
     from ghgs_capture.capture import Capture
     from ghgs_capture.prediction import predict
 
+offer("data", instants="ghgs_capture.learning.Instants")
 offer_verbs(
     predict="ghgs_capture.verbs.Predict",
     view="ghgs_capture.verbs.View",

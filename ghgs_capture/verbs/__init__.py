@@ -141,6 +141,10 @@ class Adapt(OfPhotographs, Training):
 
     checkpoint: PathText = "shipped"
     """The weights to start from."""
+    learn: Literal["auto", "people", "instants", "both"] = "auto"
+    """From what: people who are built in and stand in the rig; instants of images, of whose cameras each in
+    turn is the target of the others; both; auto: instants where images has several of three cameras or more,
+    else people."""
     minutes: float = Field(3, gt=0, le=1440)
     """Minutes of training."""
     out: PathText | None = None

@@ -1,7 +1,10 @@
-"""``ghgs adapt``: weights for the cameras of one rig, from built-in people who stand in it."""
+"""``ghgs adapt``: weights for the cameras of one rig, from built-in people who stand in it, or for one
+capture, from its own instants."""
 
+import contextlib
+import json
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,9 +12,15 @@ import numpy as np
 from omegaconf import DictConfig
 
 from ghgs_capture.calibration import calibrate
+from ghgs_capture.capture import Capture
 from ghgs_capture.export.maps import camera_entry
+from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.formats import read_cameras
+from ghgs_capture.learning import LISTING, agrees, splits_of, write_instant
+from ghgs_capture.rig import spread
+from ghgs_capture.tones import without_tones
 from ghgs_capture.verbs.photographs import capture_folder
+from ghgs_capture.verbs.predict import mended_by, shared_by
 from ghgs_lit.cli.inputs import (
     build_data,
     build_renderer,
@@ -24,9 +33,12 @@ from ghgs_lit.cli.inputs import (
 from ghgs_lit.cli.runtime import announce, files_to_write, output_dir
 from ghgs_lit.cli.train import run_job, train
 from ghgs_lit.config import compose, resolve
-from ghgs_lit.errors import require
+from ghgs_lit.config.compose import read_option
+from ghgs_lit.config.options import image_size
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.report import measure_and_write
+from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.weights.exporting import write_inference
@@ -40,6 +52,12 @@ if TYPE_CHECKING:
 _SPREAD = 0.1
 # Minutes for which the training people of conf/adapt.yaml suffice; ten passes over them learn them by heart.
 _MINUTES = 3
+_INSTANTS = 60  #: Instants, spread over a sequence, that are read to learn from
+#: Weights of the loss's terms for instants, of which depth and body are not known.
+_WEIGHTS = {"chamfer": 0.0, "depth": 0.0, "silhouette": 0.2}
+#: Keys that data sets share, which the instants take from the people's.
+_SHARED = ("size", "batch_size", "cache_images_mb", "packed_gb", "resident", "resampling", "workers")
+_LEARN_PEOPLE = "(learn=people needs no further ones)"
 
 
 def run(options: "Adapt", cfg: DictConfig) -> float | str | None:
@@ -50,12 +68,94 @@ def run(options: "Adapt", cfg: DictConfig) -> float | str | None:
         cfg: the whole configuration.
 
     Returns:
-        Mean PSNR in dB of validation people in the rig, also of a run that is done; ``BUSY``
-        (:mod:`ghgs_lit.runs.job`): in a sweep, another process works on it.
+        Mean PSNR in dB of validation people in the rig or of instants that were not learned from, also
+        of a run that is done; ``BUSY`` (:mod:`ghgs_lit.runs.job`): in a sweep, another process works on it.
     """
     config = resolve(cfg) | model_of(options.checkpoint, cfg)
     files_to_write(options, ["out"])
-    return run_job(with_rig(config), RunDirectory(output_dir()), adapt)
+    directory = RunDirectory(output_dir())
+    return run_job(with_instants(with_rig(config), directory.path), directory, adapt)
+
+
+def with_instants(config: dict[str, Any], directory: Path) -> dict[str, Any]:
+    """Learn from the instants of ``images`` where ``learn`` says so, in place of or beside people.
+
+    Args:
+        config: of :func:`with_rig`.
+        directory: of the run, where instants are kept.
+
+    Returns:
+        The configuration: of all cameras but one, the inputs, that one is the target.
+
+    Raises:
+        InputError: there is one instant, or fewer than three cameras.
+    """
+    learn = config["learn"]
+    count = len(config["data"]["cameras"])
+    instants = [] if config["images"] is None or learn == "people" else capture_folder(config).instants
+    if learn == "people" or (learn == "auto" and (len(instants) < 2 or count < 3)):
+        return config
+    expected = f"folders of two instants or more {_LEARN_PEOPLE}"
+    require(len(instants) > 1, "images", expected, config["images"] and len(instants))
+    require(count > 2, "cameras", f"three cameras or more: one is the target {_LEARN_PEOPLE}", count)
+    people = config["data"]
+    data = {name: people[name] for name in people if name in _SHARED}
+    data |= {"kind": "instants", "name": "instants", "root": str(directory / "instants")}
+    data |= {"cameras": list(people["cameras"]), "beside": people if learn == "both" else None}
+    weights = {**config["loss"]["weights"], **_WEIGHTS}
+    if learn == "both":
+        weights["depth"] = config["loss"]["weights"]["depth"]
+    return {
+        **config,
+        "data": data,
+        "targets": {**read_option("targets", "cameras"), "per_step": 1},
+        "views": {**config["views"], "training_counts": [count - 1], "evaluation_count": count - 1},
+        "evaluation": {**config["evaluation"], "views": [count - 1], "targets": ["cameras"]},
+        "loss": {**config["loss"], "weights": weights},
+    }
+
+
+def prepare_instants(config: dict[str, Any]) -> None:
+    """Write the instants that are learned from, with the masks, cameras and gains of a prediction.
+
+    Those that an interrupted run has written are kept.
+
+    Args:
+        config: of :func:`with_instants`.
+
+    Raises:
+        InputError: fewer than two instants have masks that agree.
+    """
+    root = Path(config["data"]["root"])
+    if (root / LISTING).exists():
+        return
+    root.mkdir(parents=True, exist_ok=True)
+    folder = capture_folder(config)
+    device = pick_device("cpu" if config["trainer"]["accelerator"] == "cpu" else "auto")
+    model = load_model({**config, "precision": "inherit"}, device)
+    size = image_size("data.size", config["data"]["size"])
+    refining = dict.fromkeys(("refine_cameras", "refine_masks", "tones"), "auto")
+    tones, backgrounds, rig, _ = shared_by(folder, model, size, refining, build_renderer(config, device))
+    names = spread(folder.instants, _INSTANTS)
+    used = []
+    for given in _whole(folder, names, config["data"]["cameras"]):
+        capture = without_tones(mended_by(backgrounds, given), tones)
+        if agrees(capture):
+            write_instant(rig.applied(capture) if rig else capture, root, size)
+            used.append(given.name)
+    print(f"{len(used)} of {len(names)} instants have masks that agree, and are learned from", flush=True)
+    write_text_atomically(root / LISTING, json.dumps(splits_of(used)))
+
+
+def _whole(folder: CaptureFolder, names: Sequence[str], cameras: Sequence[str]) -> Iterator[Capture]:
+    """Captures of instants with a photograph of every camera; a line for each of the others."""
+    for name in names:
+        with contextlib.suppress(InputError):
+            capture = Capture(name, folder.photographs(name))
+            if {photograph.name for photograph in capture.photographs} == set(cameras):
+                yield capture
+                continue
+        print(f"instant {name} is not learned from: a photograph or mask is missing", flush=True)
 
 
 def with_rig(config: dict[str, Any]) -> dict[str, Any]:
@@ -159,6 +259,9 @@ def adapt(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
         Mean PSNR in dB of validation people after training; None: it was interrupted.
     """
     begin = time.perf_counter()
+    learns_instants = config["data"]["kind"] == "instants"
+    if learns_instants:
+        prepare_instants(config)
     data = build_data(config)
     data.prepare_data()
     rendered = time.perf_counter() - begin
@@ -177,10 +280,13 @@ def adapt(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
         return None
     out = Path(config["out"] or directory / "adapted.ckpt").expanduser()
     write_inference(directory / "checkpoints" / "last.ckpt", out, "float16")
-    people = config["data"]["people"]["val"] + config["data"]["active"]["val"]
+    count = len(data.subjects("val"))
+    measured = f"{count} people that were not trained on, half-way between the cameras"
+    if learns_instants:
+        measured = f"{count} photographs of instants that were not learned from, each from the other cameras"
     print(
-        f"{people} people that were not trained on, half-way between the cameras: {before:.2f} dB before,"
-        f" {after:.2f} dB after ({rendered:.0f} s of rendering, {stats['seconds']:.0f} s of training)",
+        f"{measured}: {before:.2f} dB before, {after:.2f} dB after"
+        f" ({rendered:.0f} s of preparing, {stats['seconds']:.0f} s of training)",
         flush=True,
     )
     if after <= before:

@@ -22,6 +22,9 @@ class LossWeights(Options):
     depth: Amount = 0.0
     """|z - true z| in metres, the sum over rounds (not in the paper); the data must have depth maps."""
 
+    silhouette: Amount = 0.0
+    """Mean |alpha - mask| of the target views (not in the paper)."""
+
     @property
     def used(self) -> dict[str, float]:
         """The weights above 0 by name."""

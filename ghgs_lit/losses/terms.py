@@ -106,3 +106,16 @@ def depth(prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
     rounds = prediction.rounds or (prediction.depth_maps,)
     errors = [(torch.where(used, at_least_float32(maps.depth), truth) - truth).abs() for maps in rounds]
     return sum(error.sum() for error in errors) / used.sum().clamp(min=1)
+
+
+def silhouette(prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
+    """Mean |alpha - mask| over the target images.
+
+    Args:
+        prediction: not used.
+        rendering: alpha [B, T, 1, h, w].
+        batch: with masks of the targets [B, T, h, w].
+
+    Returns:
+        The mean over all pixels, from 0 to 1."""
+    return (at_least_float32(rendering.alpha)[:, :, 0] - batch.targets.masks.float()).abs().mean()

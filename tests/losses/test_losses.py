@@ -160,6 +160,21 @@ def test_the_total_is_the_weighted_sum_of_reference_terms():
     assert total.item() == pytest.approx(sum(weights[k] * expected[k] for k in weights), rel=1e-4)
 
 
+def test_silhouettes_are_compared_with_the_masks_of_targets():
+    prediction, rendering, batch = _example()
+    masks = batch.targets.masks.clone()
+    masks[0], masks[1] = True, False
+    batch = dataclasses.replace(batch, targets=dataclasses.replace(batch.targets, masks=masks))
+    missing = (1 - rendering.alpha[0].double()).mean()
+    too_much = rendering.alpha[1].double().mean()
+    total, values = losses_of(weights={"render_l1": 0, "render_ssim": 0, "chamfer": 0, "silhouette": 0.5})(
+        prediction, rendering, batch
+    )
+    assert values.keys() == {"silhouette"}
+    assert values["silhouette"].item() == pytest.approx((missing + too_much).item() / 2, rel=1e-6)
+    assert total.item() == pytest.approx(values["silhouette"].item() / 2, rel=1e-6)
+
+
 @pytest.mark.parametrize("part", [(0, 1, 0, 1), (30, 41, 39, 40), (5, 25, 12, 30), (0, 0, 0, 0)])
 def test_ssim_of_images_that_differ_in_a_part(part):
     """Value and gradient are those of the whole map."""

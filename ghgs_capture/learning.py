@@ -1,0 +1,184 @@
+"""The instants of a sequence as data to learn from: of its cameras all but one are inputs, one is the target.
+
+Each camera is the target in turn. Masks and cameras are those that a prediction of the sequence would have;
+instants with a mask that still fails are left out."""
+
+import functools
+from collections import ChainMap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from ghgs_capture.agreement import Agreement
+from ghgs_capture.capture import Capture
+from ghgs_capture.doubts import CORRECTION, doubt_of_masks
+from ghgs_lit.config.options import PathText, Text, Words
+from ghgs_lit.config.registry import read_node
+from ghgs_lit.data.dataset import DataOptions
+from ghgs_lit.data.reader import PHASES, Reader
+from ghgs_lit.data.view import View
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import write_atomically
+from ghgs_lit.geometry.frame import Frame
+from ghgs_lit.parsing import read_json
+
+LISTING = "instants.json"  #: Names of the instants of each phase; written last
+#: One instant in so many, three at most, is only measured.
+_EVERY = 5
+_MOST_MEASURED = 3
+
+
+def splits_of(names: Sequence[str]) -> dict[str, list[str]]:
+    """Which instants are learned from, and which are only measured.
+
+    Args:
+        names: of two instants or more, in their order.
+
+    Returns:
+        Names by phase, ``train`` and ``val``.
+
+    Raises:
+        InputError: there are fewer.
+    """
+    require(len(names) > 1, "images", "two instants or more to learn from, whose masks agree", len(names))
+    count = min(max(len(names) // _EVERY, 1), _MOST_MEASURED)
+    measured = {names[round((i + 0.5) * len(names) / count - 0.5)] for i in range(count)}
+    return {"train": [n for n in names if n not in measured], "val": [n for n in names if n in measured]}
+
+
+def agrees(capture: Capture) -> bool:
+    """Whether an instant can be learned from: none of its masks fails where its view is left out.
+
+    Args:
+        capture: of an instant.
+    """
+    agreement = Agreement.of(capture)
+    return agreement is None or not agreement.failed.any()
+
+
+def write_instant(capture: Capture, folder: Path, size: tuple[int, int]) -> None:
+    """Write the crops of an instant as they are learned from.
+
+    Args:
+        capture: with corrected masks and cameras, and gains where they are known.
+        folder: of all instants; gets ``<name>.npz``.
+        size: (height, width) of the crops in pixels.
+    """
+    batch = capture.batch(size, CORRECTION if doubt_of_masks(capture, size) else 0)
+    batch = Frame.of(batch).enter(batch)
+    images = (255 * batch.images[0]).round().byte().movedim(1, -1)
+    mattes = (255 * batch.alpha[0]).round().byte()
+    cameras = batch.cameras[0]
+    arrays = (images, mattes, cameras.intrinsics.float(), cameras.extrinsics.float())
+    names = ("images", "mattes", "intrinsics", "extrinsics")
+    stored = {name: each.numpy() for name, each in zip(names, arrays, strict=True)}
+    write_atomically(folder / f"{capture.name}.npz", lambda path: _save(path, stored))
+
+
+def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    with path.open("wb") as file:
+        np.savez(file, **arrays)
+
+
+class InstantReader(Reader):
+    """Instants, and training people beside them.
+
+    In validation each camera of an instant is the target once: a subject ``<instant>/<camera>`` has it at its
+    last position.
+
+    Args:
+        folder: of the instants.
+        names: of those of the phase.
+        cameras: names of the cameras, in the order of the crops.
+        phase: ``train`` or ``val``.
+        beside: reader of people; None: there are none.
+    """
+
+    def __init__(
+        self, folder: Path, names: Sequence[str], cameras: Sequence[str], phase: str, beside: Reader | None
+    ) -> None:
+        super().__init__()
+        self._folder = folder
+        self._beside = beside
+        self._first: dict[str, tuple[str, int]] = {}
+        for name in names:
+            if phase == "train":
+                self._first[name] = name, 0
+                continue
+            for target, camera in enumerate(cameras):
+                self._first[f"{name}/{camera}"] = name, target + 1
+        own = dict.fromkeys(self._first, tuple(range(len(cameras))))
+        # A view of the people's, which grow while they are rendered.
+        self.subjects = own if beside is None else ChainMap(own, beside.subjects)
+
+    def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
+        """See :meth:`Reader.read_view`.
+
+        Args:
+            name: of the subject.
+            position: number of the camera, from that of the subject on.
+            view: 0, but of people.
+            depth: also read the depth map; those of instants are not known, and 0 beside people.
+        """
+        if name not in self._first:
+            return self._beside.read_view(name, position, view, depth)
+        instant, first = self._first[name]
+        stored = _stored(self._folder / f"{instant}.npz")
+        camera = (first + position) % len(stored["images"])
+        matte = stored["mattes"][camera]
+        unknown = np.zeros(matte.shape, np.uint16) if depth and self._beside is not None else None
+        matrices = (stored[key][camera] for key in ("intrinsics", "extrinsics"))
+        return View(stored["images"][camera], matte > 127, unknown, *matrices, matte)
+
+    def read_body(self, name: str) -> np.ndarray | None:
+        return None if name in self._first else self._beside.read_body(name)
+
+    def views_at(self, name: str, position: int) -> list[int]:
+        return [0] if name in self._first else self._beside.views_at(name, position)
+
+
+@functools.lru_cache(maxsize=64)
+def _stored(path: Path) -> dict[str, np.ndarray]:
+    """The crops of an instant, kept for further photographs of it."""
+    with np.load(path) as stored:
+        return dict(stored)
+
+
+class Instants(DataOptions):
+    """The instants of a capture that ``ghgs adapt`` learns from, each camera in turn the others' target."""
+
+    static_cameras: ClassVar[bool] = True
+    name: Text = "instants"
+    root: PathText | None = None
+    """Folder of the instants, which the verb writes."""
+    cameras: tuple[Text, ...] = ()
+    """Names of the cameras, in their order."""
+    beside: Annotated[dict, Words("options of a data set")] | None = Field(None)
+    """People in the same rig that training also shows; null: none."""
+
+    @property
+    def ring(self) -> int:
+        return len(self.cameras)
+
+    @functools.cached_property
+    def _people(self) -> Any:
+        return None if self.beside is None else read_node(self.beside, "data.beside")
+
+    def prepare(self, splits: Sequence[str] = PHASES) -> None:
+        """Render the people beside the instants, where training will show them.
+
+        Args:
+            splits: names of splits.
+        """
+        if self._people is not None and "train" in splits:
+            self._people.prepare(["train"])
+
+    def reader(self, phase: str, strict: bool = True) -> InstantReader:
+        listing = self.folder / LISTING
+        if not listing.exists():
+            raise InputError(f"{listing}: expected the instants that ghgs adapt has written; found none")
+        beside = self._people.reader(phase, strict) if self._people is not None and phase == "train" else None
+        return InstantReader(self.folder, read_json(listing)[phase], self.cameras, phase, beside)
