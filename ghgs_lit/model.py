@@ -16,7 +16,7 @@ from ghgs_lit.config.registry import build, read_node
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.padding import bounds_of
 from ghgs_lit.heads.dpt import LEVELS, DPTHead
-from ghgs_lit.plan import Plan, SkipOptions, planned
+from ghgs_lit.plan import Plan, Sizes, SkipOptions, planned
 from ghgs_lit.playback import Playback
 from ghgs_lit.rendering.capacity import settled
 from ghgs_lit.rounds import CoarseDepths, Rounds, State, coarse_depths, coarse_sizes, prediction_of, replaced
@@ -100,11 +100,12 @@ class GHGS(nn.Module):
         """
         return self.finished(*self.prepared(batch))
 
-    def prepared(self, batch: Batch) -> tuple[Sequence[Surrounding], Batch, Plan]:
+    def prepared(self, batch: Batch, least: Sizes | None = None) -> tuple[Sequence[Surrounding], Batch, Plan]:
         """What precedes the stages.
 
         Args:
             batch: as of :meth:`forward`.
+            least: sizes that the plan keeps as long as they are enough; None: those of the scene.
 
         Returns:
             The layers around the stages, the batch inside of them, and its plan.
@@ -118,7 +119,7 @@ class GHGS(nn.Module):
             around, inside, findings = self.playback.entered(enter, batch, repr(asked))
         else:
             around, inside, findings = enter(batch)
-        return around, inside, self.plan(inside, findings)
+        return around, inside, self.plan(inside, findings, least)
 
     def finished(self, around: Sequence[Surrounding], batch: Batch, plan: Plan) -> Prediction:
         """The prediction for what is prepared.
@@ -146,12 +147,13 @@ class GHGS(nn.Module):
         height = None if self.rounds is None else self.rounds.options.height
         return height is not None and any(coarse_sizes(batch, height, self.encoder.patch_size))
 
-    def plan(self, batch: Batch, findings: Sequence[Finding] = ()) -> Plan:
+    def plan(self, batch: Batch, findings: Sequence[Finding] = (), least: Sizes | None = None) -> Plan:
         """What the stages work on; a GPU is waited for once.
 
         Args:
             batch: as the stages see it, with whole patches.
             findings: of its checks, which are read, too.
+            least: sizes that are kept as long as they are enough; None: those of the scene.
 
         Raises:
             InputError: the batch violates one of the checks.
@@ -168,6 +170,7 @@ class GHGS(nn.Module):
             self.recalibration.tokens,
             None if auto is None else functools.partial(auto.choose, encoder),
             [*(each.any_skew for each in cameras), *([any_bad(findings)] if findings else [])],
+            least=least,
         )
         *skews, is_bad = plan.flags if findings else (*plan.flags, False)
         if is_bad:

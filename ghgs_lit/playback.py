@@ -72,7 +72,7 @@ class Scene:
             kept = KeptPatches.whole(self.shown.shape, device)
         else:
             kept = KeptPatches(self.kept, device, size=self.sizes.kept)
-        plan = Plan(batch.masks, self.shown, kept, *facts, least=self.sizes)
+        plan = Plan(batch.masks, self.shown, kept, *facts, least=self.sizes, is_least=True)
         batch.note(plan.extents, plan.subject.index)
         vars(batch.cameras)["has_skew"] = False
         return batch, plan
@@ -84,11 +84,15 @@ class Playback:
     Args:
         recorder: makes and keeps recordings, two for each class of scenes; None: one that keeps 16.
         steps: the same of training steps (:mod:`ghgs_lit.training.captured`), one for each class.
+
+    Attributes:
+        sizes: those of training steps so far, by the shape of their photographs and what their encoder sees.
     """
 
     def __init__(self, recorder: Recorder | None = None, steps: Recorder | None = None):
         self.recorder = recorder or Recorder(limit=16)
         self.steps = steps or Recorder(limit=32)
+        self.sizes: dict[Hashable, Sizes] = {}
 
     def clear(self) -> None:
         """Forget all recordings: after weights have moved."""

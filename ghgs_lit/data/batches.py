@@ -132,7 +132,8 @@ class TrainingBatches(Dataset):
         """(height, width) of the inputs and of the targets at a step."""
         inputs = self.builder.inputs.size
         targets = self.builder.targets.size
-        return self.augmentation.draw_sizes(inputs, targets, self.sampler.seed, step)
+        step_of_class = step // self.sampler.class_steps
+        return self.augmentation.draw_sizes(inputs, targets, self.sampler.seed, step_of_class)
 
     def __getitem__(self, step: int) -> Batch:
         batch = self.builder.batch(self.sampler.batch(step, self.rank, self.world), *self.sizes(step))

@@ -149,10 +149,10 @@ class PhotographsDataModule(LightningDataModule):
         Args:
             targets: choice of the targets; None: this module's.
         """
-        targets = self._possible(targets or self.targets)
-        return TrainingSampler(
-            self.subjects("train"), self.views, targets, self.dataset.ring, self.dataset.batch_size, self.seed
-        )
+        data = self.dataset
+        protocols = (self.views, self._possible(targets or self.targets))
+        numbers = (data.ring, data.batch_size, self.seed, data.class_steps)
+        return TrainingSampler(self.subjects("train"), *protocols, *numbers)
 
     def training_batch(self, step: int) -> Batch:
         """The batch of a single process at ``step``."""

@@ -39,6 +39,9 @@ class LoadingOptions(Options):
     (photographs by Pillow's bicubic filter, masks by OpenCV's nearest neighbour)."""
     batch_size: int = Field(1, ge=1, le=1024)
     """Samples of one step in each process, all in memory at once: at most 1024."""
+    class_steps: Count = 1
+    """Training batches in a row with equal sizes of photographs and targets, number of views, entry of
+    token_budgets and number of rounds: a GPU plays back what it has recorded of the first two of them."""
     steps_per_epoch: Count | None = None
     """Training steps of an epoch; null: one pass over the subjects."""
     cache_images_mb: Amount = 512

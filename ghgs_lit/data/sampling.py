@@ -231,6 +231,7 @@ class TrainingSampler:
         ring: number of positions of a full ring.
         batch_size: samples of each step and process.
         seed: of the run.
+        class_steps: steps in a row with equal numbers of inputs.
 
     Raises:
         InputError: a subject has too few positions.
@@ -242,6 +243,7 @@ class TrainingSampler:
     ring: int
     batch_size: int
     seed: int
+    class_steps: int = 1
 
     def __post_init__(self) -> None:
         most = max(self.views.training_counts)
@@ -263,7 +265,8 @@ class TrainingSampler:
             rank: number of the process.
             world: number of processes.
         """
-        count = int(np.random.default_rng([self.seed, _COUNT, step]).choice(self.views.training_counts))
+        numbers = [self.seed, _COUNT, step // self.class_steps]
+        count = int(np.random.default_rng(numbers).choice(self.views.training_counts))
         return [self._sample(step, index, count) for index in self.indices(step, rank, world)]
 
     def indices(self, step: int, rank: int = 0, world: int = 1) -> range:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -32,7 +33,7 @@ class Sizes:
         peers: rows of the tokens that are recalibrated, of each element.
         kept: rows of the patches that become tokens, of each image; 0: all patches do.
         shown: rows of the patches that show the subject, of each image.
-        window: patches in which every subject lies.
+        window: patches in which every subject lies; None: it is not known yet.
     """
 
     pixels: int
@@ -41,11 +42,21 @@ class Sizes:
     shown: int
     window: Window
 
-    def hull(self, other: "Sizes") -> "Sizes":
-        """The smallest sizes that are enough for both."""
-        names = ("pixels", "peers", "kept", "shown")
-        largest = {name: max(getattr(self, name), getattr(other, name)) for name in names}
-        return Sizes(**largest, window=self.window.hull(other.window))
+    def held(self, name: str, needed: int) -> int:
+        """A size as long as it is enough, then what is needed with room to spare.
+
+        Args:
+            name: of the size.
+            needed: rows.
+        """
+        own = getattr(self, name)
+        return own if own >= needed else math.ceil(_SPARE * needed) if own else needed
+
+
+#: Room that sizes get where those before were too small.
+_SPARE = 1.15
+#: Nothing is held.
+_NOTHING = Sizes(0, 0, 0, 0, None)
 
 
 @dataclass(frozen=True)
@@ -64,7 +75,8 @@ class Plan:
         classes: numbers of rows, and windows, are size classes (:mod:`ghgs_lit.plan.rows`).
         decisions: what ``skip=auto`` chose for each element.
         flags: values of further tensors that were read with the masks.
-        least: sizes that no size class falls below; None: those of the scene."""
+        least: sizes that are kept as long as they are enough.
+        is_least: sizes are these, whatever the scene."""
 
     masks: Bool[Tensor, "B V H W"]
     shown: Bool[Tensor, "B V h w"]
@@ -77,28 +89,36 @@ class Plan:
     classes: bool = False
     decisions: tuple[Decision, ...] = ()
     flags: tuple[bool, ...] = ()
-    least: Sizes | None = None
+    least: Sizes = _NOTHING
+    is_least: bool = False
+
+    def _held(self, name: str, counts: Sequence[int]) -> int:
+        """Number of rows for groups of some counts."""
+        if self.is_least:
+            return getattr(self.least, name)
+        return self.least.held(name, max(1, *counts))
 
     @cached_property
     def shown_patches(self) -> KeptPatches:
         """The patches ``shown``, each of which has a token."""
-        size = None
-        if self.classes:
-            size = _of_images(self.shown_extents, self.shown, 0 if self.least is None else self.least.shown)
+        size = self._shown_size if self.classes else None
         return KeptPatches(self.shown, self.kept.index.device, self.shown_extents, size)
 
     @property
     def sizes(self) -> Sizes:
         """The sizes of the scene's class."""
         rows = (self.subject.counts[0], self.peers.counts[0])
-        return Sizes(*rows, self.kept.size or 0, self.shown_patches.size, self._patches)
+        return Sizes(*rows, self.kept.size or 0, self._shown_size, self._patches)
+
+    @property
+    def _shown_size(self) -> int:
+        return _of_image(self._held("shown", [extent.count for extent in self.shown_extents]), self.shown)
 
     @cached_property
     def subject(self) -> Rows:
         """The subject's pixels among those of all images."""
         if self.classes:
-            least = 0 if self.least is None else self.least.pixels
-            return Rows.filled(self.masks.flatten(1), (*self.counts, least), self.views)
+            return Rows.filled(self.masks.flatten(1), [self._held("pixels", self.counts)], self.views)
         return Rows.exact(self.masks, [extent.count for extent in self.extents], 1)
 
     @cached_property
@@ -107,8 +127,8 @@ class Plan:
         everyone = self.tokens == "all"
         counts = self.kept.element_lengths(0) if everyone else self._of_elements(self.shown_extents)
         if self.classes:
-            counts = (*counts, 0 if self.least is None else self.least.peers)
-            rows = Rows.filled((self.kept.mask if everyone else self.shown).flatten(1), counts, self.views)
+            wanted = self.kept.mask if everyone else self.shown
+            rows = Rows.filled(wanted.flatten(1), [self._held("peers", counts)], self.views)
             kept = self.kept
             return rows if kept.is_whole else dataclasses.replace(rows, index=kept.number[rows.index])
         every = torch.ones_like(self.kept.index, dtype=torch.bool)
@@ -202,23 +222,17 @@ class Plan:
         """Patches around all subjects, as many as a size class has."""
         size = tuple(self.masks.shape[2:])
         seen = [window.coarser(self.patch_size) for window in subject_windows(self.extents, size) if window]
-        if self.least is not None:
-            seen.append(self.least.window)
         grid = tuple(self.shown.shape[2:])
-        spans = functools.reduce(Window.hull, seen) if seen else [Span(0, 1, full) for full in grid]
+        spans = functools.reduce(Window.hull, seen) if seen else Window(*(Span(0, 1, full) for full in grid))
+        if self.least.window is not None:
+            both = self.least.window.hull(spans)
+            spans = both if both == self.least.window else both.grown(1)
         return Window(*(span.widened() for span in spans))
 
 
-def _of_images(extents: Sequence[Extent], patches: Tensor, least: int) -> int:
-    """Rows of each image for the largest number of patches of one.
-
-    Args:
-        extents: of the patches that count in each image.
-        patches: of all images, of which [..., h, w] are counted.
-        least: smallest number of rows.
-    """
-    largest = max(1, least, *(extent.count for extent in extents))
-    return min(size_class(largest), patches.shape[-2] * patches.shape[-1])
+def _of_image(rows: int, patches: Bool[Tensor, "B V h w"]) -> int:
+    """The size class of rows of an image, which needs no more than it has patches."""
+    return min(size_class(rows), patches.shape[-2] * patches.shape[-1])
 
 
 def planned(
@@ -243,8 +257,9 @@ def planned(
         choose: gives each element one of the ``choices``; None: all get the first.
         flags: tensors whose values are to be read with those of the masks.
         classes: whether numbers of rows are size classes; None: as the masks' device needs it.
-        least: as of :class:`Plan`.
+        least: as of :class:`Plan`; None: nothing is held.
     """
+    least = least or _NOTHING
     b, v = masks.shape[:2]
     shown = patches_around_subject(masks, patch_size, 0)
     asked = [masks, *choices]
@@ -272,7 +287,7 @@ def planned(
     is_whole = sum(extent.count for extent in kept_extents) == kept.numel()
     size = None
     if classes and not is_whole:
-        size = _of_images(kept_extents, kept, 0 if least is None else least.kept)
+        size = _of_image(least.held("kept", max(1, *(extent.count for extent in kept_extents))), kept)
     patches = KeptPatches(kept, masks.device, kept_extents, size)
     facts = (extents, shown_extents, patch_size, pixels, tokens, classes, decisions, known, least)
     return Plan(masks, shown, patches, *facts)

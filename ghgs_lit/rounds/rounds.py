@@ -303,13 +303,18 @@ class Rounds(nn.Module):
         return tuple(states)
 
     @contextmanager
-    def drawn(self) -> Iterator[None]:
-        """Draw the number of rounds of a training step now, for all that is called inside."""
-        self._known_count = self._drawn()
+    def drawn(self, count: int | None = None) -> Iterator[None]:
+        """Fix the number of rounds of a training step for all that is called inside.
+
+        Args:
+            count: the number; None: the one that is fixed already, or one that is drawn now.
+        """
+        before = self._known_count
+        self._known_count = count or before or self._drawn()
         try:
             yield
         finally:
-            self._known_count = None
+            self._known_count = before
 
     def _drawn(self) -> int:
         """The number of rounds of a training step."""

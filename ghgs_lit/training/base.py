@@ -94,6 +94,13 @@ class BudgetedModule(L.LightningModule):
         part = batch_idx % self.trainer.accumulate_grad_batches
         return [self.config.get("seed", 0), self.global_step, part]
 
+    def class_numbers(self, batch_idx: int) -> list[int] | None:
+        """The same for what consecutive batches share, as ``data.class_steps`` says; None: they share
+        nothing."""
+        steps = (self.config.get("data") or {}).get("class_steps", 1)
+        seed, step, part = self.step_numbers(batch_idx)
+        return None if steps == 1 else [seed, (step * self.trainer.accumulate_grad_batches + part) // steps]
+
     def progress(self) -> float:
         """Used share of the budget.
 

@@ -139,13 +139,35 @@ def played(model: GHGS, renderer: Renderer, losses: Losses, batch: Batch) -> Out
         The loss; None where this batch must be called: its subjects are tall, or its sizes are no class.
     """
     with nullcontext() if model.rounds is None else model.rounds.drawn():
-        around, inside, plan = model.prepared(batch)
+        around, inside, plan = _prepared(model, batch)
         if not model.playback.repeats(inside, plan) or model.needs_copies(inside):
             return None
         targets = dataclasses.replace(batch.targets, names=(), protocols=())
         bodies = batch.body_vertices if losses.weights.chamfer else None
         seen = dataclasses.replace(batch, targets=targets, body_vertices=bodies, subjects=(), views=())
         return _recorded(_Pass(model, renderer, losses), around, Scene.of(inside, plan), seen, plan)
+
+
+def _prepared(model: GHGS, batch: Batch) -> tuple[Sequence[Surrounding], Batch, Plan]:
+    """What precedes the stages, with a plan of sizes that rarely change.
+
+    Subjects of other batches are of other sizes, and each class would have to be recorded. So sizes are kept
+    as long as they are enough for the subjects of a batch.
+
+    Args:
+        model: of the training.
+        batch: of a step.
+    """
+    sizes = model.playback.sizes
+    shape = tuple(batch.masks.shape)
+    view = (shape, model.encoder.tokens, model.encoder.margin)
+    least = sizes.get(shape)
+    if least is not None:
+        least = dataclasses.replace(least, kept=sizes[view].kept if view in sizes else 0)
+    around, inside, plan = model.prepared(batch, least)
+    if plan.is_of_class:
+        sizes[shape] = sizes[view] = plan.sizes
+    return around, inside, plan
 
 
 def _recorded(

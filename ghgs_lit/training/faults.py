@@ -30,13 +30,15 @@ class Step:
         budget: which patches the encoder sees (:func:`~ghgs_lit.training.module.drawn_budget`); None: as
             configured.
         autocast: type of products in mixed precision; None: float32.
-        scale: factor of the loss (``16-mixed``)."""
+        scale: factor of the loss (``16-mixed``).
+        rounds: number of rounds; None: drawn by the seed."""
 
     batch: Batch
     seed: int
     budget: str | int | None = None
     autocast: torch.dtype | None = None
     scale: float = 1.0
+    rounds: int | None = None
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -26,11 +26,12 @@ from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch, Cameras, DepthMaps, Gaussians, Prediction, Rendering, Targets
 from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint
 
+Choice = TypeVar("Choice")
 #: Metrics of validations, as the run's protocol defines them; LPIPS where it has one.
 VALIDATED = ("psnr", "psnr_box", "ssim", "lpips", *FURTHER, "psnr_edge")
 
 
-def drawn_budget(budgets: Sequence[str | int], numbers: Sequence[int]) -> str | int:
+def drawn_budget(budgets: Sequence[Choice], numbers: Sequence[int], stream: int = 1) -> Choice:
     """Draw which patches the encoder sees in a training step.
 
     Args:
@@ -38,11 +39,12 @@ def drawn_budget(budgets: Sequence[str | int], numbers: Sequence[int]) -> str | 
             that holds the subject (``balanced``); a number: the subject's patches and those at most this many
             patches away (``fast``). Budgets that are listed twice are drawn twice as often.
         numbers: seed; equal numbers give the same budget.
+        stream: another one draws something else with the same numbers.
 
     Returns:
         One of the budgets."""
     # A separate key: the same numbers seed the other draws of the step.
-    generator = np.random.default_rng(np.random.SeedSequence(numbers, spawn_key=(1,)))
+    generator = np.random.default_rng(np.random.SeedSequence(numbers, spawn_key=(stream,)))
     return budgets[int(generator.integers(len(budgets)))]
 
 
@@ -56,6 +58,18 @@ def token_budget(model: GHGS, budget: str | int | None) -> AbstractContextManage
     Returns:
         The context."""
     return nullcontext() if budget is None else seeing(model.encoder, KeptTokens.of_budget(budget))
+
+
+def number_of_rounds(model: GHGS, count: int | None) -> AbstractContextManager[None]:
+    """Set the number of rounds of a training step while the context lasts.
+
+    Args:
+        model: that predicts in the context.
+        count: the number; None: each prediction draws one.
+
+    Returns:
+        The context."""
+    return nullcontext() if count is None else model.rounds.drawn(count)
 
 
 def _depth_error(batch: Batch, maps: DepthMaps) -> Tensor:
@@ -156,7 +170,7 @@ class GHGSModule(BudgetedModule):
         Returns:
             The prediction, its loss without dimensions, and the loss's unweighted terms by name."""
         torch.manual_seed(step.seed)
-        with token_budget(self.model, step.budget):
+        with token_budget(self.model, step.budget), number_of_rounds(self.model, step.rounds):
             prediction, rendering = self(step.batch)
         total, values = self.losses(prediction, rendering, step.batch)
         return prediction, total, values
@@ -172,17 +186,20 @@ class GHGSModule(BudgetedModule):
         if not is_recordable(*parts):
             return None
         torch.manual_seed(step.seed)
-        with token_budget(self.model, step.budget):
+        with token_budget(self.model, step.budget), number_of_rounds(self.model, step.rounds):
             return played(*parts)
 
     def _step(self, batch: Batch, batch_idx: int) -> Step:
         """All inputs of a training step."""
         device = self.device.type
         autocast = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else None
-        budget = None
+        budget = count = None
+        shared = self.class_numbers(batch_idx)
         if self.token_budgets is not None:  # the same in all processes, so that none waits for another
-            budget = drawn_budget(self.token_budgets, self.step_numbers(batch_idx))
-        return Step(batch, self.step_seed(batch_idx), budget, autocast)
+            budget = drawn_budget(self.token_budgets, shared or self.step_numbers(batch_idx))
+        if shared and getattr(self.model, "rounds", None) is not None:
+            count = drawn_budget(self.model.rounds.options.training_counts, shared, stream=2)
+        return Step(batch, self.step_seed(batch_idx), budget, autocast, rounds=count)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Run a step and log its loss, without a wait for the device.

@@ -37,6 +37,17 @@ def test_training_samples_depend_on_seed_step_and_index_only():
     assert forward[7] == sampler().batch(7)
 
 
+def test_batches_of_a_class_have_one_number_of_inputs():
+    """Their subjects and cameras differ, and every number is drawn."""
+    batches = [sampler(class_steps=8).batch(step) for step in range(160)]
+    counts = [len(batch[0].inputs) for batch in batches]
+    assert all(len(set(counts[first : first + 8])) == 1 for first in range(0, 160, 8))
+    assert set(counts) == {3, 4, 5}
+    assert len({batch[0].inputs for batch in batches[:8]}) == 8
+    once = [len(sampler().batch(step)[0].inputs) for step in range(20)]
+    assert counts[::8] == once
+
+
 def test_training_samples_are_fair():
     """Every subject once in each round, all counts, positions and views, no target among the inputs."""
     batches = [sampler().batch(step) for step in range(300)]

@@ -122,6 +122,23 @@ def test_too_little_room_is_answered_by_another_recording(monkeypatch):
     assert model.playback.steps.counts["recorded"] == 2
 
 
+def test_sizes_are_kept_while_they_are_enough():
+    """Smaller subjects are played back; one that is larger leaves room for others; nothing else changes."""
+    model = recording("model=hull", "skip=fast")
+    for share in (0.1, 0.1, 0.07, 0.16, 0.17, 0.05):
+        batch = dataclasses.replace(ellipsoid_batch(share, 3, 56, 1), subjects=("a",)).to(DEVICE)
+        batch = dataclasses.replace(batch, depths=2.0 * batch.masks)
+        total, _, gaussians = called(model, batch)
+        wanted = slopes(model, total)
+        found = played(model, Renderer(), LOSSES, batch)
+        assert found.gaussians == gaussians
+        torch.testing.assert_close(found.total.detach().cpu(), total.detach().cpu(), rtol=1e-5, atol=0)
+        slope = slopes(model, found.total)
+        for name in wanted:
+            assert (slope[name] - wanted[name]).norm() <= 1e-4 * wanted[name].norm() + 1e-9, name
+    assert dict(model.playback.steps.counts) == {"eager": 2, "recorded": 2, "played": 2}
+
+
 def test_what_cannot_be_recorded_is_called():
     """Other devices, renderers and losses, predictions, ``model.capture=off``."""
     model, batch = recording("model=paper"), scene()
