@@ -5,6 +5,7 @@ subject. A mask is tested by leaving its view out (:mod:`ghgs_capture.agreement`
 they are. Others are cut anew from what differs from the background, from colours, and from the hull of the
 other masks. Large parts that change are taken over; outlines stay: finding them is the work of mattes."""
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -251,7 +252,7 @@ class Backgrounds:
             The backgrounds of cameras with ``_MIN_BACKGROUND`` photographs or more, all of one size.
         """
         extents: dict[str, list[int]] = {}
-        for photograph in (photograph for capture in captures for photograph in capture.photographs):
+        for photograph in itertools.chain.from_iterable(capture.photographs for capture in captures):
             longest = max(end - first for first, end in photograph.extents)
             extents.setdefault(photograph.name, []).append(longest)
         factors = {name: max(round(max(each) / _SUBJECT), 1) for name, each in extents.items()}

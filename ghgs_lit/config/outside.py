@@ -5,6 +5,7 @@ as all options are; but the node ``hydra`` can set environment variables, call f
 scripts. Of it these files may set :data:`SETTABLE`; the command line may set all of it.
 """
 
+import itertools
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -92,7 +93,7 @@ def check_file(file: Path, name: str, package: str, content: Mapping[str, Any]) 
         for part in reversed(parts[1:]):
             node = {part: node}
         nodes.append(node)
-    for key, value in (item for node in nodes for item in flatten(node).items()):
+    for key, value in itertools.chain.from_iterable(flatten(node).items() for node in nodes):
         if not _may_set(key, value):
             expected = f"keys of {', '.join(SETTABLE[:8])}, and names and numbers of launcher and sweeper"
             raise InputError(f"{file}: hydra: expected {expected}; found hydra.{key}={value!r}")

@@ -178,7 +178,7 @@ class ImageMetrics:
             "shared_neighbors": "share of neighbours that the other recalibration.neighborhood has, too",
             "surface_mm": "mean distance of Gaussians (by opacity) to the surface of the inputs, and back",
         }
-        measured = {metric for region in options.regions for metric in MEASURED[region]}
+        measured = set().union(*(MEASURED[region] for region in options.regions))
         if "ssim" in measured:
             said["ssim"] = f"11x11 Gaussian window, sigma 1.5, padding {options.ssim_padding}"
         if "flip" in measured:

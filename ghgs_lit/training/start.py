@@ -1,5 +1,6 @@
 """Start of training: from nothing, from the weights of another run, or from an interrupted run."""
 
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -72,7 +73,8 @@ def _check_optimizer(
 ) -> None:
     """Refuse to resume with Muon from AdamW's state, the reverse, or with other parameter groups."""
     states = checkpoint["optimizer_states"]
-    by_muon = any("orthogonal" in group for state in states for group in state["param_groups"])
+    stored = itertools.chain.from_iterable(state["param_groups"] for state in states)
+    by_muon = any("orthogonal" in group for group in stored)
     key = "optimizer.matrix_scale"
     scale = lookup(config, key)
     require(by_muon == (scale is not None), key, f"{'a number' if by_muon else 'null'}, as in {path}", scale)
