@@ -30,22 +30,6 @@ _ROUNDING = 1e-3
 Finding = tuple[str, str, Tensor]
 
 
-def check_batch(batch: Batch, patch_size: int, values: bool = True) -> None:
-    """Refuse a batch that the stages cannot work on; a GPU is waited for once.
-
-    Args:
-        batch: as of :func:`findings_of`.
-        patch_size: as of :func:`findings_of`.
-        values: as of :func:`findings_of`.
-
-    Raises:
-        InputError: a shape, a dtype or a value is wrong.
-    """
-    findings = findings_of(batch, patch_size, values)
-    if bool(any_bad(findings)):
-        refuse(findings)
-
-
 def findings_of(batch: Batch, patch_size: int, values: bool = True) -> list[Finding]:
     """What is expected of a batch's values, and where they violate it, without waiting for a GPU.
 

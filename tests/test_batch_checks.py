@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.surroundings import check_batch
+from ghgs_lit.surroundings import findings_of, refuse
 from ghgs_lit.types import Batch
 from tests.helpers.models import make_model
 from tests.helpers.scenes import make_batch
@@ -94,4 +94,4 @@ def test_checks_of_values_can_be_left_out():
 def test_a_bad_batch_is_refused_by_name(message):
     """Bad input must be refused with the name of the field."""
     with pytest.raises(InputError, match=message):
-        check_batch(bad_batches()[message], 14)
+        refuse(findings_of(bad_batches()[message], 14))
