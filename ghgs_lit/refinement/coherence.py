@@ -14,26 +14,21 @@ from operator import add
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.geometry.frame import HEIGHT, subject_center
 from ghgs_lit.geometry.masks import coverage
-from ghgs_lit.geometry.projection import project, unproject, world_to_camera
 from ghgs_lit.geometry.rotations import after_motions, without_common
 from ghgs_lit.refinement.outlines import QUICK, TO, Outlines
+from ghgs_lit.refinement.rays import Lens, Pose, best_points, gradients_of, rows_of
 from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Cameras
 
-Lens = Float[Tensor, "V 3 3"]  #: Intrinsics of an instant, in pixels
-Pose = Float[Tensor, "V 4 4"]  #: Extrinsics, the same at all instants
 Lenses = Float[Tensor, "K V 3 3"]  #: Intrinsics of ``K`` instants, whose crops differ
 Middles = Float[Tensor, "K 3"]  #: The subject's middle at ``K`` instants
 Which = Bool[Tensor, " V"]  #: A choice of cameras
-Numbers = Int[Tensor, " R"]  #: A silhouette for each ray
-Points = Float[Tensor, "R 3"]  #: A point or vector for each ray
 
-_DEPTHS = 48  #: Depths tried along a ray
 #: Mean distance of rays in pixels below which silhouettes are consistent.
 _COHERENT = 5e-4
 #: Weight of the squared steps, in pixels, relative to the mean squared distance.
@@ -263,7 +258,7 @@ class _Silhouettes:
         for outlines, each, middle in zip(self.outlines, lens, self.middle, strict=True):
             some = outlines.of_views(kept)
             placed = _placed(pose[kept], middle)
-            depth = _best_points(some, each[kept], placed, some.view, some.pixels)[2]
+            depth = best_points(some, each[kept], placed, some.view, some.pixels)[2]
             missed = missed - float(depth.clamp(max=0).sum())
             rays = rays + len(depth)
         return missed / max(rays, 1)
@@ -296,14 +291,14 @@ def _equations(
     near = outlines.depth <= phase.to
     view = outlines.view[near]
     depth_at_home = outlines.depth[near]
-    points, other, depth = _best_points(outlines, lens, pose, view, outlines.pixels[near])
+    points, other, depth = best_points(outlines, lens, pose, view, outlines.pixels[near])
     distances = phase.distances(depth, depth_at_home)
     rays = max(len(distances), 1)
-    gradients = _gradients(outlines, lens, pose, points, other) / pixel
+    gradients = gradients_of(outlines, lens, pose, points, other) / pixel
     jacobian = gradients.new_zeros(len(gradients), count, 7)
     index = torch.arange(len(gradients))
-    jacobian[index, other] = _rows(points, gradients, pose[other], middle)
-    jacobian[index, view] -= _rows(points, gradients, pose[view], middle)
+    jacobian[index, other] = rows_of(points, gradients, pose[other], middle)
+    jacobian[index, view] -= rows_of(points, gradients, pose[view], middle)
     jacobian = jacobian.flatten(1)
     weighted = phase.weights(distances)[:, None] * jacobian
     stay = _STAY * rays * torch.tensor([*[1.0] * 6, _KNOWN]).to(gradients).repeat(count)
@@ -340,83 +335,3 @@ def _stepped(steps: Float[Tensor, "V 7"], lens: Lenses, pose: Pose, are_all: boo
     zoomed = lens.clone()
     zoomed[..., [0, 1], [0, 1]] *= zooms.exp()
     return zoomed, after_motions(pose, motions, pose.new_zeros(3), HEIGHT / 2)
-
-
-def _best_points(
-    outlines: Outlines, lens: Lens, pose: Pose, view: Numbers, pixels: Float[Tensor, "R 2"]
-) -> tuple[Points, Numbers, Float[Tensor, " R"]]:
-    """The point of each ray that is deepest in the other silhouettes.
-
-    Args:
-        outlines: of the silhouettes of one instant.
-        lens: its intrinsics.
-        pose: extrinsics around the subject's middle.
-        view: the silhouette of each ray, ascending.
-        pixels: that the rays pass [R, 2].
-
-    Returns:
-        Points [R, 3]; the other silhouette that each is least deep in [R]; and its signed depth in that in
-        pixels [R].
-    """
-    centers = -(pose[:, :3, :3].mT @ pose[:, :3, 3:])[..., 0]
-    along = torch.linspace(-HEIGHT / 2, HEIGHT / 2, _DEPTHS).to(pixels)
-    views = range(len(pose))
-    points = []
-    for home in views:
-        rays = pixels[view == home]
-        ahead = unproject(rays, torch.ones_like(rays[:, 0]), lens[home], pose[home]) - centers[home]
-        depths = pose[home, 2, 3] + along
-        least = rays.new_full((len(rays), _DEPTHS), torch.inf)
-        for one in views:
-            if one != home:
-                seen = outlines.along(one, lens[one], pose[one], centers[home], ahead, depths)
-                least = torch.minimum(least, seen)
-        points.append(centers[home] + depths[least.argmax(1)][:, None] * ahead)
-    points = torch.cat(points)
-    shown = []
-    for one in views:
-        depth = outlines.at(torch.full_like(view, one), project(points, lens[one], pose[one])[0])
-        shown.append(torch.where(view == one, torch.inf, depth))
-    depth, other = torch.stack(shown).min(0)
-    return points, other, depth
-
-
-def _gradients(outlines: Outlines, lens: Lens, pose: Pose, points: Points, other: Numbers) -> Points:
-    """Derivatives of the distances with respect to the points.
-
-    Args:
-        outlines: of the silhouettes of one instant.
-        lens: its intrinsics.
-        pose: extrinsics.
-        points: one for each ray.
-        other: the silhouette that each distance is in.
-
-    Returns:
-        Vectors [R, 3] in the world's axes, in pixels per unit of the frame.
-    """
-    seen, depth = project(points, lens[other], pose[other])
-    slopes = outlines.slopes(other, seen) * lens[other][:, [0, 1], [0, 1]]
-    inside = world_to_camera(points, pose[other])
-    ahead = -(slopes * inside[:, :2]).sum(-1) / depth**2
-    in_camera = torch.cat((slopes / depth[:, None], ahead[:, None]), -1)
-    return (pose[other, :3, :3].mT @ in_camera[..., None])[..., 0]
-
-
-def _rows(
-    points: Points, gradients: Points, pose: Float[Tensor, "R 4 4"], middle: Float[Tensor, " 3"]
-) -> Float[Tensor, "R 7"]:
-    """Derivatives of the distances with respect to a camera's motion and zoom.
-
-    Args:
-        points: one for each ray, around the subject's middle.
-        gradients: derivatives with respect to these.
-        pose: extrinsics of the camera of each ray [R, 4, 4].
-        middle: the subject's middle [3] in the frame.
-
-    Returns:
-        [R, 7]: by the rotation vector about the frame's origin, the shift in half heights, and the logarithm
-        of the focal length, which moves points away from the optical axis.
-    """
-    across = world_to_camera(points, pose)[:, :2]
-    zoom = ((pose[:, :3, :3] @ gradients[..., None])[:, :2, 0] * across).sum(-1, keepdim=True)
-    return torch.cat((torch.linalg.cross(points + middle, gradients), HEIGHT / 2 * gradients, zoom), -1)

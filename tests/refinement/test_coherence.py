@@ -9,7 +9,7 @@ import torch
 from ghgs_lit.geometry.frame import HEIGHT, Frame
 from ghgs_lit.geometry.projection import project, unproject_maps
 from ghgs_lit.geometry.rotations import after_motions, rigid, without_common
-from ghgs_lit.refinement import coherence
+from ghgs_lit.refinement import coherence, rays
 from ghgs_lit.refinement.coherence import coherent_cameras, contradiction, culprit
 from ghgs_lit.refinement.outlines import Outlines
 from ghgs_lit.types import Batch
@@ -169,9 +169,9 @@ def test_gradients_are_those_of_finite_differences():
     outlines = Outlines(ramps[:, None], None, None, None, (126, 126))
     points = 0.3 * torch.randn(40, 3, generator=torch.Generator().manual_seed(2))
     other = torch.arange(40) % 4
-    gradients = coherence._gradients(outlines, lens, pose, points, other)
+    gradients = rays.gradients_of(outlines, lens, pose, points, other)
     middle = torch.tensor([0.2, -0.1, 0.3])  # a turn is about the frame's origin, not about the subject
-    rows = coherence._rows(points, gradients, pose[other], middle)
+    rows = rays.rows_of(points, gradients, pose[other], middle)
 
     def distances(step):
         rotation, shift = rigid(step[:6], HEIGHT / 2)
@@ -275,7 +275,7 @@ def test_a_ray_is_looked_up_in_the_other_silhouettes():
     outlines = Outlines.of(truth.alpha[0])
     lens, pose = truth.cameras.intrinsics[0], truth.cameras.extrinsics[0]
     view, pixels = outlines.view[::23], outlines.pixels[::23]
-    points, other, depth = coherence._best_points(outlines, lens, pose, view, pixels)
+    points, other, depth = rays.best_points(outlines, lens, pose, view, pixels)
     assert (other != view).all()
     index = torch.arange(4).expand(len(view), 4)
     seen = project(points[:, None].expand(-1, 4, 3), lens[index], pose[index])[0]
