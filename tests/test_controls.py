@@ -133,7 +133,9 @@ def test_attention_knows_the_true_parts(controls, monkeypatch):
     shares = torch.rand(2 * 3 * 4 * 4, len(PARTS), generator=torch.Generator().manual_seed(1))
     for similarity in ("product", "none"):
         model = model_of(similarity=similarity)
-        results = [calls_of(model, batch)[2].latent[3]]
+        tokens, points, result = calls_of(model, batch)
+        assert torch.equal(tokens.semantic, points.shares.sqrt())  # as pictures of attention see them
+        results = [result.latent[3]]
         with monkeypatch.context() as patched:
             patched.setattr(controls, "part_shares", lambda batch, patch_size: shares)
             results.append(calls_of(model, batch)[2].latent[3])

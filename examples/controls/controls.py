@@ -92,20 +92,27 @@ class Control(Recalibration):
     def __init__(self, options: ControlOptions, dim_latent: int):
         super().__init__(options, dim_latent)
         self.control = options.control
+        self.register_forward_pre_hook(_with_parts)  # a hook: pictures of attention see these features, too
 
     def forward(self, tokens: Tokens, points: KnownPoints, plan) -> Tokens:
         """Recalibrated tokens, changed as ``control`` says.
 
         Args:
-            tokens: of the encoder.
+            tokens: of the encoder, with features that know parts.
             points: of :class:`KnownUnprojection`.
             plan: as of :class:`Recalibration`.
         """
-        expected = "kind: known, which tells this recalibration what is true"
-        require(isinstance(points, KnownPoints), "unprojection", expected, type(points).__name__)
-        tokens = super().forward(dataclasses.replace(tokens, semantic=points.shares.sqrt()), points, plan)
+        tokens = super().forward(tokens, points, plan)
         change = {"none": _unchanged, "shuffled": _shuffled, "residual": _with_residual}[self.control]
         return change(tokens, points, self.takes_part(points))
+
+
+def _with_parts(stage: Control, inputs: tuple) -> tuple:
+    """Inputs of the stage with features that know parts."""
+    tokens, points, plan = inputs
+    expected = "kind: known, which tells this recalibration what is true"
+    require(isinstance(points, KnownPoints), "unprojection", expected, type(points).__name__)
+    return dataclasses.replace(tokens, semantic=points.shares.sqrt()), points, plan
 
 
 def _unchanged(tokens: Tokens, points: KnownPoints, is_subject: Bool[Tensor, " N"]) -> Tokens:
