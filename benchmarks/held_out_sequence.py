@@ -52,11 +52,9 @@ from ghgs_lit.weights.checkpoint import read_config
 #: Which masks, cameras and colour gains, whose weights, and of how many instants one is predicted anew.
 WAYS = {
     "as given": ("given", "given", "each", "shipped", 1),
-    "cameras once": ("given", "once", "each", "shipped", 1),
     "auto": ("mended", "once", "once", "shipped", 1),
     "auto, temporal": ("mended", "once", "once", "shipped", 8),
     "adapted to the capture": ("mended", "once", "once", "adapted", 1),
-    "adapted, temporal": ("mended", "once", "once", "adapted", 8),
 }
 COLUMNS = ("whole", "box", "box_40", "photograph", "flicker", "flicker_photograph", "anew", "seconds")
 

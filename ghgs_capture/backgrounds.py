@@ -36,6 +36,7 @@ _SHADED = (0.4, 1.0)  #: Share of the light that a shadow leaves
 _BINS = 16  #: Levels of a channel that a histogram of colours counts together
 #: Correlation of brightness above which a part shows the background: a grey shirt is no grey wall.
 _ALIKE = 0.9
+_UNLIKE = -1.0  #: Mean odds of colours below which a part is not the subject's
 # Energies of a pixel, in those of a pixel of the background: what the background says at least and at most;
 # what colours do where it is not known; the given mask; a place inside and outside of the others' hull, and
 # outside of two of them.
@@ -62,7 +63,9 @@ class _Background:
     odds: np.ndarray  #: [bins, bins, bins] log of how much likelier a colour is the subject's
 
     @classmethod
-    def of(cls, photographs: Sequence[Photograph], covered: Sequence[np.ndarray]) -> "_Background":
+    def of(
+        cls, photographs: Sequence[Photograph], covered: Sequence[np.ndarray], trusted: Sequence[Photograph]
+    ) -> "_Background":
         """The background that photographs of one camera share.
 
         At each pixel it is the mean of a quarter of them (at least three), those that agree best.
@@ -70,6 +73,7 @@ class _Background:
         Args:
             photographs: three or more of one camera, of one size.
             covered: where each may show the subject [h, w].
+            trusted: photographs of the camera whose masks tell the subject's colours.
 
         Returns:
             The background; known where enough photographs show it without the subject and differ by
@@ -89,7 +93,7 @@ class _Background:
         images = np.take_along_axis(images, chosen[..., None], 0)
         known = (np.ptp(images, axis=0).max(-1) < _STEADY) & np.isfinite(width.min(0))
         image = images.mean(0, dtype=np.float32)
-        subject = [photograph.image[photograph.mask] for photograph in photographs]
+        subject = [photograph.image[photograph.mask] for photograph in trusted]
         odds = _log_histogram(np.concatenate(subject)) - _log_histogram(image[known])
         return cls(image, known, odds.clip(-_FROM_COLORS, _FROM_COLORS))
 
@@ -140,9 +144,13 @@ class _Background:
         noise = max(1.4826 * float(np.median(outside)), _NOISE) if len(outside) else np.inf
         away = ndimage.uniform_filter(off, 3) / (_DEVIATIONS / 2 * noise)
         seen = (away**2 / 2 - 2).clip(*_FROM_BACKGROUND)
-        colors = self.odds[tuple(np.moveaxis(image // (256 // _BINS), -1, 0))]
+        colors = self._odds_of(image)
         evidence = np.where(known, seen + colors / 2, colors)
         return evidence + np.where(mask, _FROM_MASK, -_FROM_MASK)
+
+    def _odds_of(self, image: np.ndarray) -> np.ndarray:
+        """:attr:`odds` of the colours of pixels [..., 3] uint8."""
+        return self.odds[tuple(np.moveaxis(image // (256 // _BINS), -1, 0))]
 
     def _costs(self, photograph: Photograph, box: tuple[slice, slice]) -> list[np.ndarray]:
         """Costs of pairs of neighbours, less where the photograph has an edge that the background lacks."""
@@ -179,8 +187,8 @@ class _Background:
         far = np.zeros_like(mask) if hull is None else hull < -reach
 
         def is_background(part: np.ndarray) -> bool:
-            shows_it = known[part].mean() > 0.5 and _is_alike(image[part], behind[part])
-            return shows_it or far[part].mean() > 0.5
+            shows_it = _is_alike(image[part], behind[part]) or self._odds_of(image[part]).mean() < _UNLIKE
+            return far[part].mean() > 0.5 or (known[part].mean() > 0.5 and shows_it)
 
         gone = _parts(_large(mask & ~cut, mask, reach), is_background)
         come = _large(cut & ~mask, mask, reach)
@@ -258,16 +266,20 @@ class Backgrounds:
         factors = {name: max(round(max(each) / _SUBJECT), 1) for name, each in extents.items()}
         backgrounds = cls({}, factors)
         photographs: dict[str, list[Photograph]] = {}
+        trusted: dict[str, list[Photograph]] = {}
         covered: dict[str, list[np.ndarray]] = {}
         for capture in map(backgrounds._small, captures):
-            for photograph, hidden in zip(capture.photographs, _covered(capture), strict=True):
+            agreement = Agreement.of(capture)
+            for view, photograph in enumerate(capture.photographs):
                 photographs.setdefault(photograph.name, []).append(photograph)
-                covered.setdefault(photograph.name, []).append(hidden)
+                covered.setdefault(photograph.name, []).append(_covered(photograph, view, agreement))
+                if agreement is None or not agreement.failed[view]:
+                    trusted.setdefault(photograph.name, []).append(photograph)
         cameras = {}
         for name, of_camera in photographs.items():
             shapes = {photograph.mask.shape for photograph in of_camera}
             if len(of_camera) >= _MIN_BACKGROUND and len(shapes) == 1:
-                cameras[name] = _Background.of(of_camera, covered[name])
+                cameras[name] = _Background.of(of_camera, covered[name], trusted.get(name, of_camera))
         return cls(cameras, factors)
 
     def applied(self, capture: Capture) -> Capture:
@@ -329,13 +341,10 @@ class Backgrounds:
         return replace(photograph, matte=_without_specks(matte))
 
 
-def _covered(capture: Capture) -> list[np.ndarray]:
-    """Where each photograph of an instant may show the subject [h, w], also where its mask lacks a part."""
-    agreement = Agreement.of(capture)
-    covered = []
-    for view, photograph in enumerate(capture.photographs):
-        reach = reach_of(photograph.mask.shape)
-        covered.append(ndimage.binary_dilation(photograph.mask, iterations=reach))
-        if agreement is not None and agreement.takes[view] > MISSED:
-            covered[-1] |= agreement.depth_in_others(view) > -reach
+def _covered(photograph: Photograph, view: int, agreement: Agreement | None) -> np.ndarray:
+    """Where a photograph may show the subject [h, w], also where its mask lacks a part."""
+    reach = reach_of(photograph.mask.shape)
+    covered = ndimage.binary_dilation(photograph.mask, iterations=reach)
+    if agreement is not None and agreement.takes[view] > MISSED:
+        covered |= agreement.depth_in_others(view) > -reach
     return covered
