@@ -43,7 +43,8 @@ from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.data.view import area_image
-from ghgs_lit.metrics.functional import box_of, decibels, flicker_in_place, mean_over, psnr, psnr_box_40
+from ghgs_lit.metrics.flicker import flicker_in_place
+from ghgs_lit.metrics.functional import box_of, decibels, mean_over, psnr, psnr_box_40
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.rounds.gains import divided
 from ghgs_lit.types import Batch, Cameras, Prediction
