@@ -68,6 +68,10 @@ def _protocols(targets: Targets | Sequence[Targets]) -> list[TargetProtocol]:
     return [read_node(protocol, "targets") for protocol in several]
 
 
+#: Steps of an epoch, at least.
+LEAST_STEPS = 100
+
+
 class PhotographsDataModule(LightningDataModule):
     """Loaders of a data set.
 
@@ -228,7 +232,8 @@ class PhotographsDataModule(LightningDataModule):
         world = self.trainer.world_size if self.trainer else 1
         rank = self.trainer.global_rank if self.trainer else 0
         once = math.ceil(len(sampler.subjects) / (self.dataset.batch_size * world))
-        length = self.dataset.steps_per_epoch or once
+        # Loading processes begin anew with each epoch, for which a GPU would wait where subjects are few.
+        length = self.dataset.steps_per_epoch or once * math.ceil(LEAST_STEPS / once)
         planned = planned_batches(self.trainer, length)
         builder = self._packed_builder(planned, rank)
         batches = self._training_batches(sampler, length, rank, world, builder)

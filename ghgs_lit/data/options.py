@@ -43,7 +43,7 @@ class LoadingOptions(Options):
     """Training batches in a row with equal sizes of photographs and targets, number of views, entry of
     token_budgets and number of rounds: a GPU plays back what it has recorded of the first two of them."""
     steps_per_epoch: Count | None = None
-    """Training steps of an epoch; null: one pass over the subjects."""
+    """Training steps of an epoch; null: whole passes over the subjects, 100 steps or more."""
     cache_images_mb: Amount = 512
     """MiB of decoded photographs kept in memory by each process."""
     packed_gb: Amount = 16

@@ -92,13 +92,13 @@ def test_evaluation_has_the_batches_that_are_asked_for(boxes):
 
 @pytest.mark.parametrize("rank", [0, 1])
 def test_each_process_of_several_loads_its_own_samples(boxes, rank):
-    """Its number and how many there are come from the trainer: four subjects, two steps."""
+    """Its number and how many there are come from the trainer; four subjects are passed often in an epoch."""
     data = rendered(boxes, batch_size=1)
     data.trainer = SimpleNamespace(world_size=2, global_rank=rank, max_steps=-1, max_epochs=None)
     data.trainer.num_devices = 2
     data.trainer.strategy = SimpleNamespace(root_device=torch.device("cpu"))
     batches = data.train_dataloader().dataset
-    assert (batches.rank, batches.world, len(batches)) == (rank, 2, 2)
+    assert (batches.rank, batches.world, len(batches)) == (rank, 2, 100)
     drawn = data.training_sampler()
     for step in range(2):
         expected = [sample.subject for sample in drawn.batch(step, rank, 2)]
