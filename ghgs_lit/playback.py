@@ -91,7 +91,7 @@ class Playback:
 
     def __init__(self, recorder: Recorder | None = None, steps: Recorder | None = None):
         self.recorder = recorder or Recorder(limit=16)
-        self.steps = steps or Recorder(limit=32)
+        self.steps = steps or Recorder(limit=32, recent=8)
         self.sizes: dict[Hashable, Sizes] = {}
 
     def clear(self) -> None:

@@ -88,15 +88,18 @@ class Recorder:
         eager: calls of a class before it is recorded: what comes once is not worth it, and caches are
             filled.
         tape: makes recordings; None: CUDA graphs.
+        recent: number of classes that eager calls are remembered of; None: 64 for each recording. A class
+            that comes again only after more than there are recordings would be recorded in vain.
 
     Attributes:
         counts: calls that were ``played``, ``recorded`` (and played), ``eager``, ``refused``.
         reason: why the last recording failed; empty if none did.
     """
 
-    def __init__(self, limit: int = 8, eager: int = 1, tape: Tape | None = None):
+    def __init__(self, limit: int = 8, eager: int = 1, tape: Tape | None = None, recent: int | None = None):
         self.limit = limit
         self.eager = eager
+        self.recent = recent or 64 * limit
         self.tape = tape or CudaTape()
         self.counts: Counter[str] = Counter()
         self.reason = ""
@@ -105,7 +108,7 @@ class Recorder:
 
     def __reduce__(self) -> tuple:
         """Copies of a model record anew."""
-        return type(self), (self.limit, self.eager, type(self.tape)(self.tape.device))
+        return type(self), (self.limit, self.eager, type(self.tape)(self.tape.device), self.recent)
 
     def clear(self) -> None:
         """Forget all recordings: after weights have moved."""
@@ -180,7 +183,7 @@ class Recorder:
 
     def _note(self, kind: Hashable) -> None:
         self._seen[kind] = self._seen.pop(kind, 0) + 1
-        while len(self._seen) > 64 * self.limit:
+        while len(self._seen) > self.recent:
             self._seen.popitem(last=False)
 
     def _refuse(self, kind: Hashable, error: Exception) -> None:

@@ -170,6 +170,13 @@ def _prepared(model: GHGS, batch: Batch) -> tuple[Sequence[Surrounding], Batch, 
     return around, inside, plan
 
 
+def _laid_out(gradient: Tensor | None, weight: Tensor) -> Tensor | None:
+    """A gradient in the layout of its weight: PyTorch would copy others, one by one."""
+    if gradient is None or gradient.stride() == weight.stride():
+        return gradient
+    return torch.empty_like(weight).copy_(gradient)
+
+
 def _recorded(
     one_pass: _Pass, around: Sequence[Surrounding], scene: Scene, seen: Batch, plan: Plan
 ) -> Outcome:
@@ -192,6 +199,7 @@ def _recorded(
             total, values = functional_call(one_pass, twins, (around, *scene.read(), seen))
             with torch.autocast(total.device.type, enabled=False):
                 gradients = torch.autograd.grad(total, list(twins.values()), allow_unused=True)
+        gradients = tuple(map(_laid_out, gradients, weights.values()))
         return total.detach(), {name: value.detach() for name, value in values.items()}, gradients, rooms
 
     recorder = one_pass.model.playback.steps

@@ -1,5 +1,6 @@
 """Recorded calls: what is played back, what is refused, and what makes a class of its own."""
 
+import copy
 import dataclasses
 import warnings
 from contextlib import nullcontext
@@ -305,3 +306,16 @@ def test_graphs_are_made_as_pytorch_documents(monkeypatch):
     once = ["wait", [], "in", "call", "out", "wait"]
     then = [["capture_error_mode", "pool", "stream"], "in", "call", "out", "play"]
     assert log == [*once, "pool", *then, *once, *then]
+
+
+def test_what_comes_again_too_late_is_not_recorded():
+    """Recordings would push each other out before they are played back."""
+    recorder = Recorder(limit=2, tape=OperatorTape("cpu"), recent=2)
+    for _ in range(3):
+        for size in (1, 2, 3):
+            recorder(torch.neg, torch.ones(size))
+    assert dict(recorder.counts) == {"eager": 9}
+    for _ in range(3):
+        recorder(torch.neg, torch.ones(3))
+    assert dict(recorder.counts) == {"eager": 9, "recorded": 1, "played": 2}
+    assert copy.deepcopy(recorder).recent == 2

@@ -3,8 +3,11 @@
 import dataclasses
 from types import SimpleNamespace
 
+import lightning.pytorch as L
 import pytest
 import torch
+from lightning.pytorch.strategies import SingleDeviceStrategy
+from torch.utils.data import DataLoader
 
 from benchmarks.device import drawing_nothing
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
@@ -13,12 +16,14 @@ from ghgs_lit.rendering import capacity
 from ghgs_lit.rendering.api import Renderer
 from ghgs_lit.runtime.recording import Recorder
 from ghgs_lit.runtime.watching import is_watched
+from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.captured import is_recordable, played
 from ghgs_lit.training.cost import Costs
 from tests.helpers.losses import losses_of
 from tests.helpers.models import make_model
 from tests.helpers.pretend_device import DEVICE, pretend_device
 from tests.helpers.tape import OperatorTape
+from tests.test_device import PretendAccelerator
 
 LOSSES = losses_of({"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 0.0, "depth": 0.2})
 
@@ -100,6 +105,30 @@ def test_weights_that_move_are_read_where_they_are():
     assert len(set(totals)) == 4
     model.to(DEVICE)
     assert not model.playback.steps._recordings
+
+
+def trained(folder, capture):
+    """Weights after four steps of two batches each, and how often passes were played back."""
+    model = recording("model=hull")
+    model.options = model.options.model_copy(update={"capture": capture})
+    module = GHGSModule(model, Renderer(), LOSSES, Optimization(lr=1e-2, warmup=0.0))
+    batches = [scene(color=1 - number / 20, holes=number).to("cpu") for number in range(4)]
+    trainer = L.Trainer(
+        strategy=SingleDeviceStrategy(DEVICE, PretendAccelerator()), max_steps=4, accumulate_grad_batches=2,
+        limit_val_batches=0, default_root_dir=folder, logger=False, enable_checkpointing=False,
+        enable_progress_bar=False, enable_model_summary=False,
+    )  # fmt: skip
+    trainer.fit(module, DataLoader(batches, batch_size=None, collate_fn=lambda batch: batch))
+    weights = {name: weight.detach().cpu() for name, weight in model.named_parameters()}
+    return weights, model.playback.steps.counts["played"]
+
+
+def test_a_training_comes_to_the_same_weights(tmp_path):
+    """With Lightning's loop, parts of a step that are summed up, and clipping."""
+    (wanted, none), (found, played_back) = (trained(tmp_path, capture) for capture in ("off", "auto"))
+    assert (none, played_back) == (0, 6)
+    for name in wanted:
+        torch.testing.assert_close(found[name], wanted[name], rtol=1e-4, atol=1e-5, msg=name)
 
 
 def test_rounds_are_drawn_once_and_are_a_class_each():
