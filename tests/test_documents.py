@@ -20,6 +20,7 @@ from tests.helpers.processes import run_block, run_script, run_verb
 REPOSITORY = Path(__file__).resolve().parents[1]
 CONF = REPOSITORY / "conf"
 VERBS = (
+    "adapt",
     "train",
     "pretext",
     "evaluate",
