@@ -3,6 +3,7 @@
 import re
 import shutil
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -79,6 +80,23 @@ def test_one_thing_that_is_missing_is_the_one_that_is_said(
     assert len(found.reasons) == 1
     assert re.search(expected, found.reasons[0]), found.reasons
     assert found.step is None
+
+
+def test_the_room_for_tokens_is_said(rendered):
+    """Before anything is written: three people in 16 positions, 2 x 2 patches, 32 channels of two bytes."""
+    encoder = "encoder={width: 32, heads: 2, depth: 4, layers: [0, 1, 2, 3], image_size: 28}"
+    frozen = ["encoder=vggt_1b", encoder, "encoder.vit={depth: 2, heads: 2}", "allow_random_encoder=true"]
+    found = rehearsed(
+        f"data.root={rendered}",
+        "feature_cache=disk",
+        "feature_cache.folder=features",
+        "data.size=28",
+        *frozen,
+    )
+    assert not found.reasons
+    (note,) = (note for note in found.notes if note.startswith("feature_cache"))
+    assert note == "feature_cache: features: tokens of 48 photographs of training, 1.23e-05 GB"
+    assert not Path("features").exists()
 
 
 @pytest.mark.parametrize(
