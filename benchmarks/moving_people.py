@@ -104,6 +104,7 @@ class MovingPerson(Reader):
         for i in range(instants):
             name, parts = f"{person}_t{i:03d}", moving.parts[i * count : (i + 1) * count]
             studio = Studio(replace(moving, parts=parts), lights, settings.samples)
+            lights = studio.lights  # the exposure of the first instant
             shot = {(p, n): view for p, n, view in photographs(studio, drawn, settings, yaws, poses)}
             self._views |= {(name, *place): view for place, view in shot.items()}
             self.subjects[name] = tuple(dict.fromkeys(position for position, _ in shot))

@@ -34,7 +34,8 @@ from ghgs_lit.runtime.cores import allowed_cores, use_known_start_method
 from ghgs_people import figures
 from ghgs_people.cpu.kernel import compile_kernels
 from ghgs_people.figures.mesh import Person
-from ghgs_people.photograph import Lights, Studio
+from ghgs_people.lights import Lights
+from ghgs_people.photograph import Studio
 from ghgs_people.progress import Progress
 from ghgs_people.rig import STILL, Poses, Rig
 
@@ -44,7 +45,7 @@ _GUARD = 'if __name__ == "__main__":'
 # Runs of equal bytes (Z_RLE of zlib): half the time of the default, and files are no larger.
 _PNG = {"compress_type": 3}
 # Part of every cache key: to be increased when photographs of the same settings change.
-RENDER_VERSION = 2
+RENDER_VERSION = 3
 # Numbers of threads of the libraries that NumPy and PyTorch compute with.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 #: Lights of all people.

@@ -22,9 +22,16 @@ from ghgs_lit.types import Cameras
 from ghgs_people.cpu import kernel
 from ghgs_people.figures.mesh import Person
 from ghgs_people.figures.meshing import smooth_normals
+from ghgs_people.lights import LightRig
+from ghgs_people.rig import Rig
 
 # Rays traced at once: they fit the processor's cache, which is three times as fast as a whole photograph.
 _CHUNK = 1 << 14
+# Side in pixels of the photographs that the exposure is measured with, and factor on their light.
+_TRIAL = 64
+_DIM = 0.25
+# Brightness above which lit surfaces are compressed below 1, as cameras do.
+_KNEE = 0.8
 
 
 def _embree() -> tuple[ModuleType, ModuleType]:
@@ -37,68 +44,6 @@ def _embree() -> tuple[ModuleType, ModuleType]:
             "rendering of meshes: expected the package embreex, or photographs that are rendered elsewhere"
         )
         raise InputError(f"{message}; found {found}") from None
-
-
-@dataclass(frozen=True)
-class Lights:
-    """White lights around a person, the same for every camera, so that views agree.
-
-    Shading is Lambertian with soft terminators, ``ambient + sum_l w_l max((n.l + s) / (1 + s), 0)``, and
-    multiplies texture values as stored."""
-
-    count: int = 6
-    ambient: float = 0.5  # share of ambient light, 0 to 1
-    softness: float = 0.3  # s of the formula, 0 (Lambertian) to 1
-    exposure: float = 0.6  # approximate mean brightness over all directions of the normal
-    elevation: float = 30.0  # largest elevation of a light in degrees
-    jitter: float = 0.25  # relative variation of the strengths of the lights, 0 to below 1
-
-    def draw(self, rng: np.random.Generator) -> "LightRig":
-        """Draw the lights of one person: evenly spaced in azimuth, with random elevations and strengths.
-
-        Args:
-            rng: draws azimuth, elevations and strengths.
-        """
-        azimuth = 2 * np.pi * (np.arange(self.count) + rng.uniform()) / self.count
-        elevation = np.radians(self.elevation) * rng.uniform(-0.3, 1.0, self.count)
-        strength = 1 + self.jitter * rng.uniform(-1, 1, self.count)
-        directions = np.stack(
-            (np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)), -1
-        )
-        # Mean of max((n.l + s)/(1 + s), 0) over the sphere of normals n is (1 + s) / 4.
-        share = (1 - self.ambient) * strength / strength.sum() * 4 / (1 + self.softness)
-        arrays = directions.astype(np.float32), (self.exposure * share).astype(np.float32)
-        return LightRig(*arrays, self.exposure * self.ambient, self.softness)
-
-
-@dataclass(frozen=True)
-class LightRig:
-    """The lights of one person.
-
-    Args:
-        directions: [l, 3] unit vectors towards the lights.
-        strengths: [l], brightness that each adds to a surface that faces it.
-        ambient: brightness without them.
-        softness: s of the formula of :class:`Lights`, 0 to 1.
-    """
-
-    directions: np.ndarray
-    strengths: np.ndarray
-    ambient: float
-    softness: float
-
-    def shade(self, normals: np.ndarray) -> np.ndarray:
-        """Shade surfaces by the formula of :class:`Lights`.
-
-        Args:
-            normals: [n, 3] unit vectors.
-
-        Returns:
-            Brightness [n], at least 0; texture values are multiplied by it.
-        """
-        cosine = normals @ self.directions.T
-        soft = np.maximum((cosine + self.softness) / (1 + self.softness), 0)
-        return self.ambient + soft @ self.strengths
 
 
 @dataclass(frozen=True)
@@ -139,21 +84,16 @@ class Studio:
         parts = [part for part in person.parts if len(part.faces)]
         if not parts:
             raise InputError(f"{person.name}: expected a mesh with faces; found none")
-        lit = lights or LightRig(np.empty((0, 3)), np.empty(0), 1.0, 0.0)
-        arrays = lit.directions.astype(np.float64), lit.strengths.astype(np.float64)
-        self._lights = (*arrays, float(lit.ambient), float(lit.softness))
+        self.lights = lights
         self.samples = samples
         counts = np.cumsum([0] + [len(part.vertices) for part in parts])
         self._vertices = np.concatenate([part.vertices for part in parts]).astype(np.float32)
         self._faces = np.concatenate([p.faces + n for p, n in zip(parts, counts, strict=False)]).astype(
             np.int32
         )
-        uv = np.concatenate([part.uv for part in parts]).astype(np.float32)
-        normals = np.concatenate([smooth_normals(part.vertices, part.faces) for part in parts])
         corners = self._vertices[self._faces].astype(np.float64)
         flat = trimesh.unitize(trimesh.triangles.cross(corners)).astype(np.float32)
         numbers = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part.faces) for part in parts])
-        self._surface = (np.concatenate((uv, normals), 1)[self._faces], flat, numbers)
         shapes = np.array([part.texture.shape[:2] for part in parts])
         first = np.cumsum([0, *shapes.prod(1)])[:-1, None]
         texels = np.concatenate([part.texture.reshape(-1, 3) for part in parts])
@@ -161,6 +101,37 @@ class Studio:
         scenes, meshes = _embree()
         self._scene = scenes.EmbreeScene(robust=True)
         meshes.TriangleMesh(self._scene, self._vertices, self._faces)
+        uv = np.concatenate([part.uv for part in parts]).astype(np.float32)
+        gains = np.zeros((len(uv), 2), np.float32)
+        self._surface = (np.concatenate((uv, gains), 1)[self._faces], flat, numbers)
+        if lights is not None:
+            normals = np.concatenate([smooth_normals(part.vertices, part.faces) for part in parts])
+            self._light(normals)
+
+    def _light(self, normals: np.ndarray) -> None:
+        """Compute the light of all corners, and expose.
+
+        Args:
+            normals: [n, 3] of the vertices; 0 where those of the faces around them cancel.
+        """
+        corners, flat, _ = self._surface
+        lost = ~normals.any(1)
+        for corner in range(3):
+            at = self._faces[:, corner]
+            normals[at[lost[at]]] = flat[lost[at]]
+        light = self.lights.shade(self._vertices, normals, self._is_blocked)
+        tall = np.ptp(self._vertices, axis=0).max()
+        middle = (self._vertices.min(0) + self._vertices.max(0)) / 2
+        around = Rig(radius=4 * tall, look_at=tuple(middle), pitch=0, focal=3, shift_y=0)
+        cameras = around.cameras(np.arange(8) * 45.0, _TRIAL, _TRIAL)
+        corners[..., 2:] = (_DIM * light - 1)[self._faces]  # dim: no highlight is compressed
+        trial = self.shoot(cameras)
+        self.lights = self.lights.exposed(float(trial.images.mean() / trial.alphas.mean()) / _DIM)
+        corners[..., 2:] = (self.lights.exposure * light - 1)[self._faces]
+
+    def _is_blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Whether rays [n, 3], float32, hit the person."""
+        return self._scene.run(origins, directions, query="OCCLUDED") >= 0
 
     def shoot(self, cameras: Cameras) -> RenderedViews:
         """Photograph the person.
@@ -201,6 +172,7 @@ class Studio:
             depth: [h, w], filled, in metres; 0 before.
         """
         n = self.samples
+        knee = 1.0 if self.lights is None else _KNEE
         covered = np.zeros(alpha.shape, bool)
         kernel.cover()(self._vertices, self._faces, matrix, pose, covered)
         pixels = np.flatnonzero(covered)
@@ -215,4 +187,4 @@ class Studio:
             kernel.aim()(some, alpha.shape[1], n, matrix, pose, rays)
             hits = self._scene.run(origins[: len(rays)], rays, output=True)
             hits = tuple(hits[name] for name in ("primID", "u", "v", "tfar"))
-            kernel.expose()(some, order, rays, hits, self._surface, self._textures, self._lights, *maps)
+            kernel.expose()(some, order, rays, hits, self._surface, self._textures, knee, *maps)

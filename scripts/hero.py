@@ -1,7 +1,7 @@
 """The picture and the turntable of the README: ``python scripts/hero.py docs/hero.png docs/turntable.webp``.
 
 A built-in person who was not trained on, photographed from four sides before white, exposed as photographs of
-a real capture are (built-in people are darker: 0.26 of full brightness, these 0.40), and the prediction from
+a real capture are (0.40 of full brightness), and the prediction from
 directions half-way between the cameras. The model sees crops of the size that it was trained with.
 """
 

@@ -15,8 +15,6 @@ LEVELS = np.arange(256, dtype=np.float32) / np.float32(255)
 MARGIN = 0.0625
 # Depth in metres below which projections have no bounds.
 NEAR = 1e-3
-# Length of a sum of normals that cancel.
-LEAST = 1e-13
 
 
 def _array(kind, dimensions):
@@ -26,7 +24,6 @@ def _array(kind, dimensions):
 _DOUBLES = [_array(types.float64, dimensions) for dimensions in range(4)]
 _INDICES = [_array(types.int32, dimensions) for dimensions in range(3)]
 _PLACES = _array(types.int64, 1)
-_LIGHTS = types.Tuple((_DOUBLES[2], _DOUBLES[1], types.float64, types.float64))
 _SURFACE = types.Tuple((_array(types.float32, 3), FLOATS[2], _INDICES[1]))
 _TEXTURES = types.Tuple((_array(types.uint8, 2), _array(types.int64, 2)))
 _HITS = types.Tuple((_INDICES[1], FLOATS[1], FLOATS[1], FLOATS[1]))
@@ -101,40 +98,22 @@ def _between(a, b, c, d, shares):
 
 
 @helper
-def _brightness(lights, x, y, z):
-    """Light that a surface reflects, by the formula of :class:`ghgs_people.photograph.Lights`.
-
-    Args:
-        lights: directions [l, 3], strengths [l], ambient light and softness.
-        x: first coordinate of the unit normal.
-        y: second coordinate.
-        z: third coordinate.
-    """
-    directions, strengths, ambient, softness = lights
-    total = 0.0
-    for k in range(len(strengths)):
-        cosine = x * directions[k, 0] + y * directions[k, 1] + z * directions[k, 2]
-        total += max(cosine + softness, 0.0) * strengths[k]
-    return ambient + total / (1 + softness)
-
-
-@helper
 def _mixed(corners, face, weights, k):
     """An attribute where a ray hits a face, mixed from those of its corners.
 
     Args:
-        corners: [m, 3, 5], u and v of the texture and the normal of each corner.
+        corners: [m, 3, 4], u and v of the texture, and light before and behind each corner, less 1.
         face: index of the face.
         weights: barycentric coordinates of the hit.
-        k: index of the attribute, 0 to 4.
+        k: index of the attribute, 0 to 3.
     """
     first, second, third = weights
     return first * corners[face, 0, k] + second * corners[face, 1, k] + third * corners[face, 2, k]
 
 
 @helper
-def _facing(surface, face, weights, rays, n):
-    """Unit normal of a hit on the side that the ray comes from.
+def _light(surface, face, weights, rays, n):
+    """Factor on the texture of a hit on the side that the ray comes from.
 
     Args:
         surface: corners as in :func:`_mixed`, unit normals [m, 3] of the faces.
@@ -144,18 +123,14 @@ def _facing(surface, face, weights, rays, n):
         n: index of the ray.
     """
     corners, flat, _ = surface
-    x = _mixed(corners, face, weights, 2)
-    y = _mixed(corners, face, weights, 3)
-    z = _mixed(corners, face, weights, 4)
-    length = math.sqrt(np.float64(x * x) + np.float64(y * y) + np.float64(z * z))
-    inverse = 1 / length if length > LEAST else 1.0
-    normal = (x * inverse, y * inverse, z * inverse)
-    if normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2] < 0.5:  # normals cancel
-        normal = (np.float64(flat[face, 0]), np.float64(flat[face, 1]), np.float64(flat[face, 2]))
-    # The flat normal decides, so that all smooth normals of a face flip together.
     along = flat[face, 0] * rays[n, 0] + flat[face, 1] * rays[n, 1] + flat[face, 2] * rays[n, 2]
-    sign = -1.0 if along > ZERO else 1.0
-    return sign * normal[0], sign * normal[1], sign * normal[2]
+    return ONE + _mixed(corners, face, weights, 3 if along > ZERO else 2)
+
+
+@helper
+def _compressed(value, knee):
+    """A brightness below 1: above the knee its slope falls, from 1."""
+    return value if value <= knee else ONE - (ONE - knee) * (ONE - knee) / (value - (knee + knee - ONE))
 
 
 @helper
@@ -193,8 +168,10 @@ def _color(surface, textures, face, weights):
     )
 
 
-@kernel_for(_PLACES, _PLACES, FLOATS[2], _HITS, _SURFACE, _TEXTURES, _LIGHTS, FLOATS[2], FLOATS[1], FLOATS[1])
-def expose(pixels, order, rays, hits, surface, textures, lights, image, matte, depth):
+@kernel_for(
+    _PLACES, _PLACES, FLOATS[2], _HITS, _SURFACE, _TEXTURES, types.float32, FLOATS[2], FLOATS[1], FLOATS[1]
+)
+def expose(pixels, order, rays, hits, surface, textures, knee, image, matte, depth):
     """Develop pixels from what their rays hit.
 
     Args:
@@ -202,9 +179,9 @@ def expose(pixels, order, rays, hits, surface, textures, lights, image, matte, d
         order: [s], samples of a pixel from its centre outwards.
         rays: [p * s, 3], directions.
         hits: face [p * s] (-1: none), second and third barycentric coordinate, distance.
-        surface: corners, normals and parts of the faces, as in :func:`_facing` and :func:`_color`.
+        surface: corners, normals and parts of the faces, as in :func:`_light` and :func:`_color`.
         textures: as in :func:`_color`.
-        lights: as in :func:`_brightness`.
+        knee: brightness above which highlights are compressed; 1: they are cut off.
         image: [h * w, 3], gets the mean colour of the samples; those that miss are black.
         matte: [h * w], gets the share of samples that hit.
         depth: [h * w], gets the distance of the hit nearest to the pixel's centre.
@@ -220,17 +197,17 @@ def expose(pixels, order, rays, hits, surface, textures, lights, image, matte, d
                 continue
             hit += ONE
             weights = (ONE - us[n] - vs[n], us[n], vs[n])
-            light = _brightness(lights, *_facing(surface, face, weights, rays, n))
+            light = _light(surface, face, weights, rays, n)
             color = _color(surface, textures, face, weights)
-            red += np.float32(color[0] * light)
-            green += np.float32(color[1] * light)
-            blue += np.float32(color[2] * light)
+            red += _compressed(color[0] * light, knee)
+            green += _compressed(color[1] * light, knee)
+            blue += _compressed(color[2] * light, knee)
         if hit == ZERO:
             continue
         place = pixels[p]
-        image[place, 0] = min(red / count, ONE)
-        image[place, 1] = min(green / count, ONE)
-        image[place, 2] = min(blue / count, ONE)
+        image[place, 0] = red / count
+        image[place, 1] = green / count
+        image[place, 2] = blue / count
         matte[place] = hit / count
         for sample in order:
             if faces[p * samples + sample] >= 0:

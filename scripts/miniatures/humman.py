@@ -17,7 +17,8 @@ from PIL import Image, ImageFilter
 from ghgs_lit.types import Cameras
 from ghgs_people import figures
 from ghgs_people.figures.mesh import Person
-from ghgs_people.photograph import LightRig, Lights, Studio
+from ghgs_people.lights import LightRig, Lights
+from ghgs_people.photograph import Studio
 from scripts.miniatures import capture
 from scripts.miniatures.smpl import parameters, write_stand_in
 

@@ -16,7 +16,8 @@ from ghgs_lit.data.layout import position_name
 from ghgs_lit.data.sampling import ViewNumber, subject_rng
 from ghgs_lit.types import Cameras
 from ghgs_people.figures.mesh import Person
-from ghgs_people.photograph import Lights, Studio
+from ghgs_people.lights import Lights
+from ghgs_people.photograph import Studio
 from ghgs_people.rig import Rig
 from scripts.miniatures.capture import save_image
 from scripts.miniatures.scans import names, scan_of

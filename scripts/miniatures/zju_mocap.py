@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from ghgs_people import figures
 from ghgs_people.figures.mesh import Person
-from ghgs_people.photograph import Lights, Studio
+from ghgs_people.lights import Lights
+from ghgs_people.photograph import Studio
 from scripts.miniatures import capture
 from scripts.miniatures.smpl import chosen_vertices
 

@@ -16,7 +16,7 @@ from ghgs_lit.data.view import View, encode_depth
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.types import Cameras
-from ghgs_people.jobs import LIGHTS, write_body, write_view
+from ghgs_people.jobs import write_body, write_view
 from ghgs_people.photograph import Studio
 from tests.helpers.people import RIG, box_person
 
@@ -26,7 +26,7 @@ SIZE = 56
 def write_person(root, name="box", size=SIZE, positions=(0, 4)) -> dict:
     """Photographs of a box, written below ``root/train``; what went in, by position."""
     person = RIG.place(box_person(name), subject_rng(0, name))
-    studio = Studio(person, LIGHTS.draw(subject_rng(1, name)))
+    studio = Studio(person, None)
     written = {}
     for position in positions:
         cameras = RIG.cameras(np.array([22.5 * position]), size, size)

@@ -128,7 +128,7 @@ def test_only_the_split_that_is_measured_is_rendered(tmp_path, monkeypatch, spli
     assert asked[0][split] == bench.names(split)
     with pytest.raises(InputError, match=r"split: expected .*bench"):
         data.prepare_data(["bensch"])
-    assert "version 1" in data.dataset.split_facts(split)[split]
+    assert "version 2" in data.dataset.split_facts(split)[split]
     assert split not in data.dataset.split_facts("val")
 
 

@@ -254,12 +254,17 @@ def test_textures_without_lights_come_back_as_they_are(scans, reference, tmp_pat
 
 
 def test_lit_renders_of_before_go_on(scans, reference, tmp_path):
-    """Their stored settings are those of the lights themselves, as ever."""
+    """Their stored settings are those of the lights themselves; with others they do not go on."""
     root = tmp_path / "out"
     render_boxes(root, scans, 1, 0, settings=SMALL)
-    stored = json.loads((root / "rendering" / "settings.json").read_text())["render"]
-    lights = {"count": 6, "ambient": 0.5, "softness": 0.3, "exposure": 0.6, "elevation": 30.0, "jitter": 0.25}
-    assert stored["lights"] == lights
+    path = root / "rendering" / "settings.json"
+    stored = json.loads(path.read_text())
+    assert stored["render"]["lights"]["brightness"] == jobs.LIGHTS.brightness
+    other = {**stored, "render": {**stored["render"], "lights": {"count": 6, "ambient": 0.5}}}
+    path.write_text(json.dumps(other))
+    with pytest.raises(InputError, match=r"expected render\.lights\.ambient = .*; found 0\.5"):
+        render_boxes(root, scans, 3, 1, settings=SMALL)
+    path.write_text(json.dumps(stored))
     with pytest.raises(
         InputError, match=r"lights=none; found studio \(.*data\.render\.lights=studio goes on"
     ):

@@ -14,7 +14,8 @@ from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.types import Cameras
 from ghgs_people import figures
 from ghgs_people.figures.mesh import Person
-from ghgs_people.photograph import Lights, Studio
+from ghgs_people.lights import Lights
+from ghgs_people.photograph import Studio
 from ghgs_people.rig import Rig
 from ghgs_people.thuman2 import THuman2, THuman2Source, find_fits
 from scripts.miniatures import thuman2 as miniature
