@@ -34,7 +34,9 @@ def check(path, checkpoint):
     check_schedules(path, checkpoint.get("lr_schedulers"), len(groups))
     best = CheckpointOptions(filename="best", monitor="val/psnr").build()
     quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
-    trainer = L.Trainer(accelerator="cpu", max_steps=1, callbacks=[best, TrainingCost()], **quiet)
+    trainer = L.Trainer(
+        accelerator="cpu", max_steps=1, max_time={"hours": 1}, callbacks=[best, TrainingCost()], **quiet
+    )
     trainer.ckpt_path = str(path)
     check_restored(trainer, checkpoint)
 
@@ -57,6 +59,18 @@ def named(content, key):
 
 def test_what_a_run_writes_passes(written):
     check(written, torch.load(written, weights_only=True))
+
+
+def test_a_run_with_a_budget_of_time_goes_on(tmp_path):
+    """Its seconds are no whole numbers."""
+    fit(tmp_path, Cut(), max_time={"hours": 1})
+    path = tmp_path / "checkpoints" / "last.ckpt"
+    checkpoint = torch.load(path, weights_only=True)
+    assert checkpoint["callbacks"]["Timer"]["time_elapsed"]["train"] % 1 > 0
+    check(path, checkpoint)
+    checkpoint["callbacks"]["Timer"]["time_elapsed"]["train"] = "long"
+    with pytest.raises(InputError, match=r"time_elapsed\.train: expected a number; found 'long'"):
+        check(path, checkpoint)
 
 
 PROGRESS = "loops/fit_loop/epoch_loop.batch_progress"
