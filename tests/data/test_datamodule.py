@@ -91,7 +91,7 @@ def test_evaluation_has_the_batches_that_are_asked_for(boxes):
 
 
 @pytest.mark.parametrize("rank", [0, 1])
-def test_each_process_of_several_loads_its_own_samples(boxes, rank):
+def test_each_process_of_several_loads_its_own_samples(boxes, rank, monkeypatch):
     """Its number and how many there are come from the trainer; four subjects are passed often in an epoch."""
     data = rendered(boxes, batch_size=1)
     data.trainer = SimpleNamespace(world_size=2, global_rank=rank, max_steps=-1, max_epochs=None)
@@ -103,3 +103,5 @@ def test_each_process_of_several_loads_its_own_samples(boxes, rank):
     for step in range(2):
         expected = [sample.subject for sample in drawn.batch(step, rank, 2)]
         assert list(batches[step].subjects) == expected
+    monkeypatch.setattr("ghgs_lit.data.datamodule.LEAST_STEPS", 1)
+    assert len(data.train_dataloader().dataset) == 2  # of the four subjects, each process has half
