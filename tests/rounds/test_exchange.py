@@ -8,7 +8,7 @@ import torch
 from scipy.signal import correlate
 
 from ghgs_lit.extents import extents
-from ghgs_lit.rounds.rounds import SIDE, Exchange, Windows
+from ghgs_lit.rounds.exchange import SIDE, Exchange, Windows
 
 HEIGHT, WIDTH, KNOWN, CHANNELS = 13, 17, 6, 3
 
