@@ -272,7 +272,7 @@ def crop_size(size: int | tuple[int, int] | None, config: Mapping[str, Any], mod
     multiple = side_multiple(model.options, patch)
     expected = f"sides divisible by the patch size {multiple}"
     require(height % multiple == width % multiple == 0, "size", expected, (height, width))
-    is_coarse_to_fine = model.rounds is not None and model.rounds.options.height is not None
+    is_coarse_to_fine = model.rounds is not None and model.rounds.height is not None
     if not is_coarse_to_fine and (height > trained[0] or width > trained[1]):
         below = ", ".join(str(n * patch) for n in range(max(trained) // patch, 0, -3)[:3])
         warnings.warn(

@@ -19,7 +19,17 @@ from ghgs_lit.heads.dpt import LEVELS, DPTHead
 from ghgs_lit.plan import Plan, Sizes, SkipOptions, planned
 from ghgs_lit.playback import Playback
 from ghgs_lit.rendering.capacity import settled
-from ghgs_lit.rounds import CoarseDepths, Rounds, State, coarse_depths, coarse_sizes, prediction_of, replaced
+from ghgs_lit.rounds import (
+    Coarse,
+    CoarseDepths,
+    Rounds,
+    State,
+    coarse_of,
+    coarse_sizes,
+    prediction_of,
+    replaced,
+    with_known_height,
+)
 from ghgs_lit.runtime.precision import PRECISIONS, precision_of
 from ghgs_lit.stages import HEADS, OPTIONS, STAGES
 from ghgs_lit.surroundings import Finding, ModelOptions, Surrounding, any_bad, entered, left, refuse
@@ -132,7 +142,7 @@ class GHGS(nn.Module):
         with self.in_precision(batch.masks.device):
             prediction = self._predicted(batch, plan, self._coarse(batch))
         prediction = plan.trimmed(left(around, prediction))
-        return dataclasses.replace(prediction, decisions=plan.decisions)
+        return dataclasses.replace(prediction, decisions=plan.decisions, tokens=None)
 
     def in_precision(self, device: torch.device) -> AbstractContextManager[None]:
         """The precision of the stages' products on a device, while the context lasts."""
@@ -144,7 +154,7 @@ class GHGS(nn.Module):
         Args:
             batch: as the stages see it.
         """
-        height = None if self.rounds is None else self.rounds.options.height
+        height = None if self.rounds is None else self.rounds.height
         return height is not None and any(coarse_sizes(batch, height, self.encoder.patch_size))
 
     def plan(self, batch: Batch, findings: Sequence[Finding] = (), least: Sizes | None = None) -> Plan:
@@ -180,16 +190,25 @@ class GHGS(nn.Module):
         batch.note(plan.extents, plan.subject.index)
         return plan
 
-    def _predicted(self, batch: Batch, plan: Plan, coarse: CoarseDepths | None) -> Prediction:
+    def _predicted(self, batch: Batch, plan: Plan, coarse: Coarse | None) -> Prediction:
         """:meth:`_predict`, played back where it can be; renderings have room enough."""
         if self.options.capture == "auto" and not self.training and self.playback.fits(batch, plan):
             return self.playback(self, batch, plan, coarse, self.settings())
         return settled(lambda: self.predict(batch, plan, coarse))
 
-    def predict(self, batch: Batch, plan: Plan, coarse: CoarseDepths | None = None) -> Prediction:
-        """The stages of Figure 2: bounds, tokens, and what is decoded from them."""
+    def predict(self, batch: Batch, plan: Plan, coarse: Coarse | None = None) -> Prediction:
+        """The stages of Figure 2: bounds, tokens, and what is decoded from them.
+
+        Args:
+            batch: as the stages see it.
+            plan: of the batch.
+            coarse: what was found in smaller copies of the photographs; None: there are none.
+        """
         bounds = self.bounded(batch)
-        return self.decoded(batch, bounds, self.encoded(batch, bounds, plan), plan, coarse)
+        encode = functools.partial(self.encoded, batch, bounds, plan)
+        tokens = encode() if coarse is None else coarse.encoded(plan, encode)
+        depths = None if coarse is None else coarse.depths
+        return dataclasses.replace(self.decoded(batch, bounds, tokens, plan, depths), tokens=tokens)
 
     def bounded(self, batch: Batch) -> DepthBounds | None:
         """Near and far of each pixel's ray; None for stages without bounds."""
@@ -260,16 +279,15 @@ class GHGS(nn.Module):
         maps = self.depth_head(tokens, batch, bounds, plan)
         return maps if coarse is None else coarse.maps(batch, bounds, maps)
 
-    def _coarse(self, batch: Batch) -> CoarseDepths | None:
-        """Depths from smaller copies of photographs with subjects that are taller than the rounds know."""
-        if self.rounds is None or self.rounds.options.height is None:
+    def _coarse(self, batch: Batch) -> Coarse | None:
+        """What is found in smaller copies of photographs with subjects taller than the rounds know."""
+        if self.rounds is None or self.rounds.height is None:
             return None
 
-        def predict(small: Batch) -> DepthMaps:
-            return self._predicted(small, self.plan(small), None).depth_maps
+        def predict(small: Batch) -> Prediction:
+            return self._predicted(small, self.plan(small), None)
 
-        sizes = (self.rounds.options.height, self.encoder.patch_size)
-        return coarse_depths(batch, *sizes, self.options.matte, predict)
+        return coarse_of(batch, self.rounds.height, self.encoder.patch_size, self.options.matte, predict)
 
     def settings(self) -> Hashable:
         """All that may be changed after a model was made and decides what it computes, but its weights."""
@@ -302,6 +320,7 @@ class GHGS(nn.Module):
         """
         for name in STAGES:
             require(name in config, name, "a stage of the model", "nothing")
+        config = with_known_height(config, config)
         skip, options = (read_node(config.get(name) or {}, name) for name in ("skip", "model"))
 
         def stage(name: str, **extra: Any) -> Any:

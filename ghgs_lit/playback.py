@@ -17,7 +17,7 @@ from ghgs_lit.extents import Extent
 from ghgs_lit.plan import Plan, Sizes
 from ghgs_lit.plan.patches import KeptPatches
 from ghgs_lit.rendering.capacity import Rooms, deferred
-from ghgs_lit.rounds import CoarseDepths
+from ghgs_lit.rounds import Coarse
 from ghgs_lit.runtime.recording import Recorder, described
 from ghgs_lit.runtime.watching import is_watched
 from ghgs_lit.surroundings import Finding, Surrounding
@@ -30,13 +30,13 @@ _Entered = tuple[Sequence[Surrounding], Batch, list[Finding]]
 class Stages(Protocol):
     """The stages of a prediction, as :class:`ghgs_lit.model.GHGS` has them."""
 
-    def predict(self, batch: Batch, plan: Plan, coarse: CoarseDepths | None = None) -> Prediction:
+    def predict(self, batch: Batch, plan: Plan, coarse: Coarse | None = None) -> Prediction:
         """What all stages make of a batch.
 
         Args:
             batch: as the stages see it.
             plan: of the batch.
-            coarse: depths from smaller copies of the photographs; None: there are none.
+            coarse: what was found in smaller copies of the photographs; None: there are none.
         """
 
 
@@ -142,7 +142,7 @@ class Playback:
         stages: Stages,
         batch: Batch,
         plan: Plan,
-        coarse: CoarseDepths | None,
+        coarse: Coarse | None,
         key: Hashable,
     ) -> Prediction:
         """The prediction for a batch that :meth:`fits`.
@@ -151,14 +151,14 @@ class Playback:
             stages: of the model.
             batch: as the stages see it.
             plan: of the batch.
-            coarse: depths from smaller copies, if there are any.
+            coarse: what was found in smaller copies, if there are any.
             key: all else that the prediction depends on, but weights that stay where they are.
 
         Returns:
             The prediction; its Gaussians fill their size class.
         """
 
-        def predict(inputs: tuple[Scene, CoarseDepths | None]) -> tuple[Prediction, Rooms]:
+        def predict(inputs: tuple[Scene, Coarse | None]) -> tuple[Prediction, Rooms]:
             scene, coarse = inputs
             with deferred() as rooms:
                 return stages.predict(*scene.read(), coarse), rooms

@@ -390,7 +390,8 @@ class Decision:
 class Prediction(_TensorStruct):
     """The result of ``model(batch)``, in the world and the unit of its cameras. ``depth`` has a meaning where
     ``depth_valid``. ``decisions``: one for each element with ``skip=auto``. ``rounds``: depths before the
-    first round and after each (the last is ``depth_maps``). ``drafts``: Gaussians before each, if kept."""
+    first round and after each (the last is ``depth_maps``). ``drafts``: Gaussians before each, if kept.
+    ``tokens``: of the encoder, inside the model alone."""
 
     gaussians: Gaussians
     depth: Float[Tensor, "B V H W"]
@@ -400,6 +401,7 @@ class Prediction(_TensorStruct):
     decisions: tuple[Decision, ...] = ()
     rounds: tuple[DepthMaps, ...] = ()
     drafts: tuple[Gaussians, ...] = ()
+    tokens: Tokens | None = None
 
 
 @dataclass(frozen=True)

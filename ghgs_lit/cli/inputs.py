@@ -16,6 +16,7 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.model import GHGS
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.rendering.api import resolve_backend
+from ghgs_lit.rounds import with_known_height
 from ghgs_lit.runtime.precision import half_precision, keep_rounded
 from ghgs_lit.stages import OPTIONS, STAGES
 from ghgs_lit.surroundings import side_multiple
@@ -32,8 +33,8 @@ MODEL_NODES = (*STAGES, *OPTIONS, "compat")
 OF_MACHINE = ("cache_dir", "cache_images_mb", "packed_gb", "render_workers", "resident", "workers")
 
 #: Keys that may change in a trained model: they change neither shape nor meaning of any tensor.
-FREE = ("bounds", "encoder.precision", "model.pad", "rounds.count", "skip", "unprojection", "recalibration.k")
-FREE += ("recalibration.neighborhood", "recalibration.similarity", "recalibration.tokens")
+FREE = ("bounds", "encoder.precision", "model.pad", "rounds.count", "rounds.height", "skip", "unprojection")
+FREE += ("recalibration.k", "recalibration.neighborhood", "recalibration.similarity", "recalibration.tokens")
 
 
 def build_data(config: Mapping[str, Any]) -> "PhotographsDataModule":
@@ -172,7 +173,8 @@ def model_of(checkpoint: str, cfg: DictConfig) -> dict[str, Any]:
             OmegaConf.update(after, key, value, merge=False, force_add=True)
         else:
             _require_same(before, key, value)
-    return OmegaConf.to_container(after, resolve=True)
+    # Of the weights' own training, which may have seen smaller photographs than this one.
+    return with_known_height(OmegaConf.to_container(after, resolve=True), trained)
 
 
 def _require_same(trained: Mapping[str, Any], key: str, value: Any) -> None:

@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -136,10 +136,11 @@ class RoundsOptions(Options):
 
     slopes: bool = False
     """Whether a round is shown the gradient of the inputs' error with respect to each Gaussian."""
-    height: Annotated[int, Field(ge=14, le=16384)] | None = 200
-    """Pixels of the subject's height, or of its width if larger, that the weights know (252 x 252 photographs
-    that it fills to four fifths). Where it is taller, depths of smaller copies are refined at full size
-    (:mod:`ghgs_lit.rounds.coarse`); null: never."""
+    height: Literal["auto"] | Annotated[int, Field(ge=14, le=16384)] | None = "auto"
+    """Pixels of the subject's height, or of its width if larger, that the weights know; auto: four fifths of
+    the largest side of the photographs of the training. In larger photographs of taller subjects, stages run
+    on smaller copies, whose depths and tokens start the rounds at full size (:mod:`ghgs_lit.rounds.coarse`);
+    null: never."""
 
     def build(self, channels: int) -> "Rounds":
         """The rounds after a Gaussian head with descriptors of width ``channels``."""
@@ -181,6 +182,12 @@ class Rounds(nn.Module):
         nn.init.zeros_(self.change[-1].weight)
         nn.init.zeros_(self.change[-1].bias)
 
+    @property
+    def height(self) -> int | None:
+        """Pixels of the subject's height that the weights know; None: any, or no training said it."""
+        known = self.options.height
+        return None if known == "auto" else known
+
     def forward(
         self, state: State, activate: Activate, batch: Batch, step: float | Float[Tensor, " B"] = 1.0
     ) -> tuple[State, ...]:
@@ -190,7 +197,8 @@ class Rounds(nn.Module):
             state: the prediction of the stages, with bounds of depths.
             activate: gives Gaussians from their raw attributes.
             batch: photographs, masks and cameras are read.
-            step: size of the first step, in those after a depth head; one for all elements or one for each.
+            step: size of the first step in depth, in those after a depth head; one for all elements or for
+                each. Attributes take whole steps.
 
         Returns:
             As many states as there are rounds, and one more.
@@ -206,7 +214,8 @@ class Rounds(nn.Module):
             step = step[state.raw.image // batch.masks.shape[1]]
         count = (self._known_count or self._drawn()) if self.training else self.count
         for number in range(count):
-            change, memory = self._round(states[-1], batch, rays, memory, windows, step * 0.5**number)
+            share = 0.5**number
+            change, memory = self._round(states[-1], batch, rays, memory, windows, share, step * share)
             shown = activate if number == count - 1 else replaced(activate, self.training)
             states.append(_moved(states[-1], shown, batch, rays, *change))
         return tuple(states)
@@ -237,6 +246,7 @@ class Rounds(nn.Module):
         rays: Rays,
         memory: Float[Tensor, "N h"],
         windows: Windows | None,
+        share: float,
         size: float | Float[Tensor, " N"],
     ) -> tuple[tuple[Tensor, Tensor], Tensor]:
         """What a round changes.
@@ -247,7 +257,8 @@ class Rounds(nn.Module):
             rays: of the Gaussians' pixels.
             memory: of the rounds before.
             windows: places of the Gaussians in maps; None: nothing is exchanged.
-            size: of the step, as a share of the largest one; one for all Gaussians or one for each.
+            share: of the largest change of attributes.
+            size: of the step in depth, as a share of the largest one; one for all Gaussians or one for each.
 
         Returns:
             Changes of depths in metres [N] and of raw attributes [N, c], and the memory for the next round.
@@ -263,8 +274,7 @@ class Rounds(nn.Module):
         memory, change = self._looked(*rows, windows)
         step = bounded_tanh(change[:, 0])
         moved = torch.where(step > 0, search.up, search.down) * step
-        size = size[:, None] if isinstance(size, Tensor) else size
-        return (moved, size * change[:, 1:]), memory
+        return (moved, share * change[:, 1:]), memory
 
     def _looked(
         self,

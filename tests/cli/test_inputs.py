@@ -67,6 +67,23 @@ def test_what_is_said_of_the_model_acts_on_a_checkpoint(composed, checkpoint, ve
 
 
 @pytest.mark.parametrize(
+    ("verb", "said", "height"),
+    [
+        ("predict", [], 34),
+        ("predict", ["+rounds.height=null"], None),
+        ("evaluate", ["+rounds.height=60"], 60),
+        ("adapt", ["data.size=518"], 34),
+    ],
+)
+def test_weights_know_the_height_of_their_own_training(composed, tmp_path, verb, said, height):
+    """Four fifths of its photographs, whatever they are used for or trained further with."""
+    path = str(tmp_path / "recurrent.ckpt")
+    write_checkpoint(path, {}, {**config("model=recurrent"), "data": {"size": 42}})
+    cfg = composed(verb, f"checkpoint={path}", *said)
+    assert inputs.model_of(path, cfg)["rounds"]["height"] == height
+
+
+@pytest.mark.parametrize(
     ("said", "refused"),
     [
         ("encoder=vggt_small", "encoder.width: expected 32, which the checkpoint's weights"),

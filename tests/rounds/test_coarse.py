@@ -5,14 +5,32 @@ import dataclasses
 import pytest
 import torch
 
+from ghgs_lit import GHGS
+from ghgs_lit.cli.inputs import build_data
+from ghgs_lit.config import compose, resolve
+from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.geometry.projection import project, unproject_maps
-from ghgs_lit.rounds.coarse import CoarseDepths, coarse_sizes, enlarged, shrunk
-from ghgs_lit.types import DepthBounds, DepthMaps
+from ghgs_lit.rounds.coarse import (
+    CoarseDepths,
+    coarse_sizes,
+    enlarged,
+    shrunk,
+    spread_tokens,
+    with_known_height,
+)
+from ghgs_lit.types import DepthBounds, DepthMaps, Tokens
 from tests.helpers.models import ATTRIBUTES, close, make_model
 from tests.helpers.scenes import in_dtype, make_batch, with_soft_rims
 
 SIDE = 112  #: of photographs that are too large for weights that know a subject of ``HEIGHT`` pixels
 HEIGHT = 40
+
+
+def lookup_side(trained):
+    """Largest side of the photographs of a training."""
+    size = trained.get("data", {}).get("size")
+    sizes = [size] if isinstance(size, int) else list(size or ())
+    return max([*sizes, *trained.get("augmentation", {}).get("sizes", ())], default=None)
 
 
 def recurrent(height, *overrides):
@@ -98,17 +116,54 @@ def test_coarse_depths_stay_within_bounds():
     assert coarse.step.tolist() == [0.5, 1.0]
 
 
-def test_rounds_start_from_the_depths_of_a_smaller_copy():
-    """The depth head sees the copy alone; the final depths of the copy are those that rounds start from."""
-    batch, seen = make_batch(1, 3, SIDE, SIDE), []
+def test_tokens_of_copies_are_interpolated_where_the_patches_of_photographs_lie():
+    """Values that are linear in the picture stay so, with a border, and beside tokens that are missing."""
+    batch, small, patch = make_batch(1, 2, 98, 108), (56, 70), 14
+    padding = pad_to_patches(batch.masks, patch)
+    padded = padding.pad_batch(batch)
+    rows, columns = (side // patch for side in small)
+
+    def value(x, y):
+        """Of a place in shares of the photograph's sides."""
+        return torch.stack((2 * x - y + 0.5, 3 * y), -1)
+
+    image, row, column = torch.nonzero(torch.ones(2, rows, columns), as_tuple=True)
+    there = (row < 3) | (image == 1)  # the last row of the first view has no tokens
+    image, row, column = (each[there] for each in (image, row, column))
+    own = value((column + 0.5) / columns, (row + 0.5) / rows)
+    tokens = Tokens((own, -own), own[:, :1], image, row, column, (1, 2, rows, columns), patch)
+    found = spread_tokens(tokens, padded, patch)
+    assert found.shape == (1, 2, padding.height // patch, padding.width // patch, 5)
+    v, u = torch.meshgrid(*(torch.arange(n) for n in found.shape[2:4]), indexing="ij")
+    x = ((u + 0.5) * patch + padding.left) / 108
+    y = ((v + 0.5) * patch + padding.top) / 98
+    edge = 0.5 / torch.tensor((columns, rows))
+    expected = value(x.clamp(edge[0], 1 - edge[0]), y.clamp(edge[1], 1 - edge[1]))
+    torch.testing.assert_close(found[0, 1, ..., :2], expected, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(found[..., 2:4], -found[..., :2])
+    inside = y < 2.5 / rows
+    torch.testing.assert_close(found[0, 0, inside, :2], expected[inside], rtol=1e-5, atol=1e-5)
+    nearest = value(x.clamp(edge[0], 1 - edge[0]), torch.full_like(y, 2.5 / rows))
+    beside = (y > 2.5 / rows) & (y < 3.5 / rows)
+    torch.testing.assert_close(found[0, 0, beside, :2], nearest[beside], rtol=1e-5, atol=1e-5)
+
+
+def test_rounds_start_from_what_is_found_in_a_smaller_copy():
+    """Encoder and depth head see the copy alone; rounds start from its final depths and its tokens."""
+    batch, seen, tokens = make_batch(1, 3, SIDE, SIDE), [], []
     model = recurrent(HEIGHT, "model.frame=world")  # one frame for both sizes
     model.depth_head.register_forward_hook(lambda head, inputs, maps: seen.append(inputs[1]))
+    model.encoder.register_forward_hook(lambda encoder, inputs, result: tokens.append(result))
+    model.recalibration.register_forward_hook(lambda stage, inputs, result: tokens.append(inputs[0]))
     with torch.no_grad():
         found = model(batch)
         (copy,) = seen
+        of_copy, _, at_full_size = tokens
         size = coarse_sizes(batch, HEIGHT, model.encoder.patch_size)[0]
         assert tuple(copy.masks.shape[2:]) == size
         alone = model(shrunk(batch, size, None))
+    spread = spread_tokens(of_copy, batch, 14).flatten(0, 3)
+    assert torch.equal(torch.cat((*at_full_size.latent, at_full_size.semantic), -1), spread)
     start, bounds = found.rounds[0].depth, found.rounds[0].bounds
     expected = enlarged(alone.depth_maps, (SIDE, SIDE)).clamp(bounds.near, bounds.far)
     known = batch.masks & (enlarged(alone.depth_maps, (SIDE, SIDE)) > 0)
@@ -116,6 +171,78 @@ def test_rounds_start_from_the_depths_of_a_smaller_copy():
     torch.testing.assert_close(start[known], expected[known], rtol=1e-5, atol=1e-5)
     assert not torch.equal(found.depth[known], start[known])
     assert len(found.rounds) == model.rounds.count + 1
+
+
+@pytest.mark.parametrize(
+    ("trained", "height"),
+    [
+        ({"data": {"size": 252}, "augmentation": {"sizes": [140, 252]}}, 202),
+        ({"data": {"size": [140, 112]}}, 112),
+        ({"data": {"size": 140}, "augmentation": {"sizes": [84, 280]}}, 224),
+        ({"data": {"size": None}}, None),
+        ({}, None),
+    ],
+)
+def test_the_training_says_what_height_the_weights_know(trained, height):
+    nodes = {"rounds": {"kind": "recurrent", "count": 2}, "model": {}}
+    assert with_known_height(nodes, trained) == {"rounds": {**nodes["rounds"], "height": height}, "model": {}}
+    for said in (None, 60):
+        nodes["rounds"]["height"] = said
+        assert with_known_height(nodes, trained) == nodes
+    assert with_known_height({"model": {}}, trained) == {"model": {}}
+    side = lookup_side(trained)
+    if side is not None:  # what fits into a photograph of the training is never predicted from a copy
+        batch = make_batch(1, 2, side, side)
+        filled = dataclasses.replace(batch, masks=torch.ones_like(batch.masks))
+        assert coarse_sizes(filled, height, 14) == [None]
+        larger = make_batch(1, 2, side + 14, side + 14)
+        for rows, is_copied in ((height, False), (height + 1, True)):
+            masks = torch.zeros_like(larger.masks)
+            masks[:, 1, :rows, :3] = True  # the tallest view decides
+            sizes = coarse_sizes(dataclasses.replace(larger, masks=masks), height, 1)
+            assert (sizes != [None]) == is_copied
+
+
+@pytest.fixture(scope="module")
+def shipped():
+    return GHGS.from_checkpoint()
+
+
+def without_copies(model, batch):
+    """The prediction with ``rounds.height=null``."""
+    before = model.rounds.options
+    model.rounds.options = before.replace(height=None)
+    found = model(batch)
+    model.rounds.options = before
+    return found
+
+
+def person(folder, side):
+    """A built-in person in four photographs, with depths; photographs of other sizes are smaller copies."""
+    said = [f"data.size={side}", "data.render={size: 322, positions: [0, 4, 8, 12], views: [0]}"]
+    said += ["data=synthetic", "data.people={train: 1, val: 1}", f"data.cache_dir={folder}"]
+    config = resolve(compose("evaluate", ["checkpoint=shipped", *said]))
+    data = build_data({**config, "targets": None})
+    data.prepare_data()
+    return data.evaluation_batch("p0000000", "train", views=4)
+
+
+def error(prediction, batch):
+    return (prediction.depth - batch.depths)[batch.masks].abs().mean().item()
+
+
+@torch.no_grad()
+def test_a_larger_photograph_is_placed_better_with_the_weights_of_the_package(shipped, tmp_path):
+    """Than at once, and than a photograph of the size of the training, which is predicted as ever."""
+    assert shipped.rounds.height == 202
+    assert shipped.config["rounds"]["height"] == 202
+    small, large = person(tmp_path, 252), person(tmp_path, 322)
+    of_large = error(shipped(large), large)
+    of_small = shipped(small)
+    print(of_large, error(without_copies(shipped, large), large), error(of_small, small))
+    assert of_large < 0.9 * error(without_copies(shipped, large), large)
+    assert of_large < 0.95 * error(of_small, small)
+    close(of_small.gaussians, without_copies(shipped, small).gaussians, 0)
 
 
 def test_photographs_of_the_size_of_the_training_have_no_copy():
