@@ -23,7 +23,7 @@ from ghgs_lit.types import Batch
 from tests.helpers.losses import losses_of
 from tests.helpers.models import make_model
 from tests.helpers.pretend_device import DEVICE, pretend_device
-from tests.helpers.tape import OperatorTape
+from tests.helpers.tape import SilentTape
 
 
 class Asked(NamedTuple):
@@ -85,13 +85,6 @@ def test_a_gpu_is_asked_for_no_more_than_before(kind, size):
     assert not grown
 
 
-class Silent(OperatorTape):
-    """Plays back nothing, as far as the host is concerned."""
-
-    def record(self, call):
-        return call(), lambda: None
-
-
 #: Launches around the graph of a training step of the shipped weights, and waits, by the batch's size.
 AROUND = {1: (216, 2), 8: (226, 2)}
 
@@ -103,7 +96,7 @@ def test_little_is_asked_for_around_a_step_that_is_played_back(size):
     losses = losses_of({"render_l1": 0.8, "depth": 0.2})
     with pretend_device() as log, device.drawing_nothing():
         model = GHGS.from_checkpoint().to(DEVICE).train()
-        model.playback = Playback(*(Recorder(tape=Silent()) for _ in range(2)))
+        model.playback = Playback(*(Recorder(tape=SilentTape()) for _ in range(2)))
         model.rounds._drawn = lambda: 2
         options = Optimization(lr=1e-3, matrix_scale=1.0)
         optimizer = options.optimizer(model)

@@ -15,7 +15,7 @@ from ghgs_lit.runtime.recording import Recorder
 from ghgs_lit.runtime.watching import Watcher, watched
 from tests.helpers.models import close, make_model
 from tests.helpers.pretend_device import DEVICE, pretend_device
-from tests.helpers.tape import OperatorTape
+from tests.helpers.tape import OperatorTape, SilentTape
 
 
 @pytest.fixture(autouse=True)
@@ -124,17 +124,10 @@ def test_weights_that_move_are_recorded_again():
     assert not model.playback.recorder._recordings
 
 
-class Silent(OperatorTape):
-    """Plays back nothing, as far as the host is concerned."""
-
-    def record(self, call):
-        return call(), lambda: None
-
-
 def test_what_is_played_back_is_not_asked_for(there):
     """The encoder, the plan and what surrounds the stages remain, and as many waits as before."""
     model, batch, asked = recording("model=recurrent"), scene(), []
-    model.playback.recorder.tape = Silent()
+    model.playback.recorder.tape = SilentTape()
     for _ in range(3):
         there.clear()
         model(batch)

@@ -1,5 +1,6 @@
 """Sequences of different lengths packed into one tensor: views keep different numbers of patches. Only the
-attention of a block mixes tokens, so views need no padding."""
+attention of a block mixes tokens, so views need no padding. Where shapes must repeat, on a GPU, each view's
+rows are filled up to a size class, and nothing attends to what fills them."""
 
 from collections.abc import Sequence
 from functools import cached_property
