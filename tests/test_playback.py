@@ -68,6 +68,18 @@ def test_other_scenes_of_a_class_are_predicted_as_eagerly(kind):
     assert counts(model) == {"eager": 2, "recorded": 2, "played": 4}
 
 
+def test_photographs_with_smaller_copies_are_predicted_as_eagerly():
+    """Both the copies and full size, which starts from their depths and tokens, are played back."""
+    model = recording("model=recurrent", "rounds.height=14")
+    for color in (1.0, 0.9, 0.8, 0.7):
+        batch = scene(0.3, color)
+        assert model.needs_copies(batch)
+        found, wanted = model(batch), eager(model, batch)
+        close(found.gaussians.to("cpu"), wanted.gaussians.to("cpu"))
+    # What precedes the plan, the stages for copies, and those at full size.
+    assert counts(model) == {"eager": 3, "recorded": 3, "played": 6}
+
+
 def test_what_changes_a_prediction_is_another_class():
     """Sizes, the number of rounds, what the encoder sees."""
     model = recording("model=recurrent", "encoder.semantic=null")
