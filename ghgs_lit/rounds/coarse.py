@@ -16,6 +16,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
+from omegaconf import OmegaConf
 from torch import Tensor
 
 from ghgs_lit.config.keys import lookup
@@ -48,6 +49,7 @@ def with_known_height(nodes: Mapping[str, Any], trained: Mapping[str, Any]) -> d
         The nodes; without known sizes ``rounds.height`` is null.
     """
     rounds = nodes.get("rounds")
+    rounds = OmegaConf.to_container(rounds, resolve=True) if OmegaConf.is_config(rounds) else rounds
     is_known = isinstance(rounds, Mapping) and rounds.get("kind") == "recurrent"  # not a user's own kind
     if not is_known or rounds.get("height", "auto") != "auto":
         return dict(nodes)
