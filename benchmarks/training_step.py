@@ -21,10 +21,7 @@ CHILD = """
 import json, logging, sys, tempfile
 import lightning.pytorch as L
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
-
-from ghgs_lit.config import build, conf_dir
+from ghgs_lit.config import build, compose, resolve
 from ghgs_lit.model import GHGS
 from ghgs_lit.training import GHGSModule
 try:
@@ -40,8 +37,7 @@ try:  # as the command line of the version does
 except ImportError:
     pass
 logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
-with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-    config = OmegaConf.to_container(compose("train", overrides), resolve=True)
+config = resolve(compose("train", overrides))
 L.seed_everything(config["seed"], workers=True, verbose=False)
 data = build(config["data"], "data", views=config["views"], targets=config["targets"], seed=config["seed"])
 parts = [build(config[name], name) for name in ("renderer", "loss", "optimizer")]

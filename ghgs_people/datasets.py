@@ -100,7 +100,7 @@ class _Generated(_Renderable):
     limit: ClassVar[Limit] = Limit()
     pixel_centers: ClassVar[str] = "half"
 
-    size: Size = (140, 140)
+    size: Size = 140
     render: RenderOptions = RenderOptions(size=140)
     people: People = People()
     """Number of people."""
@@ -186,6 +186,9 @@ class PeopleInRig(_Generated):
     waits for the first people only (for all with ``render_workers=0``); the others are rendered meanwhile."""
 
     name: Text = "people_in_rig"
+    size: Size = 252
+    people: People = People(train=32, val=6)
+    active: ActivePeople = ActivePeople(train=8, val=2)
     cameras: Annotated[dict, Words("a mapping of cameras")] = Field({})
     """The cameras of the rig: intrinsics, extrinsics, width and height of each by name."""
     fill: tuple[Fill, Fill] = (0.5, 0.95)
@@ -238,7 +241,7 @@ class Scans(DataSet, _OnRing):
     """Scans rendered to ``root``; :meth:`render_missing` renders them from ``source``."""
 
     name: Text = "scans"
-    size: Size = (140, 140)
+    size: Size = 140
     render: RenderOptions = RenderOptions(lights="none")
     source: options.PathText | None = None
     """Folder of textured meshes, <id>/<id>.obj or .glb; only for rendering."""

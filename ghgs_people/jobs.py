@@ -102,7 +102,7 @@ class RenderOptions(Options):
 
     group = "data.render"
 
-    size: Size = (512, 512)
+    size: Size = 512
     """Side or [height, width] of the photographs in pixels."""
     samples: int = Field(3, ge=1, le=16)
     """Each pixel is the mean of samples x samples rays."""

@@ -159,7 +159,7 @@ class THuman2(Scans):
     published: ClassVar[Mapping[str, int]] = {"train": 426, "val": 100}
 
     name: Text = "thuman2"
-    size: Size = (512, 512)
+    size: Size = 512
     render: RenderOptions = RenderOptions(
         size=1024, samples=2, views=(0, 1, 2, 3, 4), quality=95, lights="none"
     )

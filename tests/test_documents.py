@@ -10,10 +10,9 @@ from itertools import zip_longest
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from ghgs_lit.config import VERSION_BASE
+from ghgs_lit.config import compose
 from ghgs_lit.runs.results import read_results
 from tests.helpers.processes import run_block, run_script, run_verb
 
@@ -88,17 +87,16 @@ def keys() -> frozenset[str]:
             found.add(f"{prefix}{name}")
             collect(value, f"{prefix}{name}.")
 
-    with initialize_config_dir(str(CONF), **VERSION_BASE):
-        shipped = [
-            [f"{group}={option}" for option in sorted(options - OPTIONS.get(group, set()))]
-            for group, options in groups().items()
-            if "/" not in group and group not in ("experiment", "sweep", "calibration")
-        ]
-        # One option of each group at a time: composing takes a third of a second.
-        runs = [(verb, []) for verb in VERBS]
-        runs += [("train", [*filter(None, chosen)]) for chosen in zip_longest(*shipped)]
-        for verb, overrides in runs:
-            collect(OmegaConf.to_container(compose(verb, overrides=overrides), resolve=False))
+    shipped = [
+        [f"{group}={option}" for option in sorted(options - OPTIONS.get(group, set()))]
+        for group, options in groups().items()
+        if "/" not in group and group not in ("experiment", "sweep", "calibration")
+    ]
+    # One option of each group at a time: composing takes a third of a second.
+    runs = [(verb, []) for verb in VERBS]
+    runs += [("train", [*filter(None, chosen)]) for chosen in zip_longest(*shipped)]
+    for verb, overrides in runs:
+        collect(OmegaConf.to_container(compose(verb, overrides), resolve=False))
     return frozenset(found)
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ghgs_capture.folder import CaptureFolder
+from ghgs_lit.config.nodes import Calibration
 from ghgs_lit.errors import InputError, require
 
 _BEGUN: list[CaptureFolder] = []  #: The folder whose photographs are being decoded, if any
@@ -26,7 +27,9 @@ def sources_of(config: Mapping[str, Any]) -> dict[str, Any]:
     """
     for name, example in (("images", "images=<folder of photographs>"), ("cameras", "cameras=<calibration>")):
         require(config[name] is not None, name, example, None)
-    return {name: config[name] for name in _SOURCES if name in config}
+    # Whether defaults are filled in makes no other folder.
+    calibration = Calibration.read(config.get("calibration", {}), "calibration")
+    return {name: config[name] for name in _SOURCES if name in config} | {"calibration": calibration}
 
 
 def capture_folder(config: Mapping[str, Any]) -> CaptureFolder:

@@ -1,10 +1,12 @@
 """Run each verb as a Hydra application of ``conf/<verb>.yaml``."""
 
+import json
 import os
 import re
 import signal
 import sys
 import time
+from argparse import Namespace
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,10 +16,12 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.cli import messages
-from ghgs_lit.config import VERSION_BASE, conf_dir
+from ghgs_lit.config import VERSION_BASE, compose, conf_dir, resolve
 from ghgs_lit.config.compose import check_ablation, plain, read_verb, store_defaults
+from ghgs_lit.config.options import UnknownKey
 from ghgs_lit.config.outside import check_outside_files
 from ghgs_lit.config.registry import check, verb_class
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import require_no_links, write_text_atomically
 from ghgs_lit.runs.job import register_resolvers
 from ghgs_lit.runs.run import RunDirectory
@@ -97,10 +101,11 @@ class Verb:
             config = plain(cfg)
             verb = read_verb(self.name, config)
             if verb.begins_run:
-                RunDirectory(directory).start(config)
+                run = RunDirectory(directory)
+                run.start(config if run.marker is None else resolve(cfg))  # it compares whole configurations
             write_hydra_files(cfg, directory)
             verb.require_files(config)
-            check(config)  # before the verb imports what takes longer
+            resolve(cfg)  # with all defaults, before the verb imports what takes longer
             collect_garbage_again()
             children_sleep()
             return verb.run(cfg)
@@ -156,6 +161,38 @@ def _help(verb: str, words: list[str], folder: str | None) -> int:
     return 0
 
 
+def _print_configuration(name: str, overrides: list[str], values: Namespace) -> None:
+    """Do what ``--cfg job`` of Hydra does, with the defaults that no file says.
+
+    Args:
+        name: of the verb, or what ``--config-name`` says.
+        overrides: of the command line.
+        values: of the flags ``--config-dir``, ``--package`` and ``--resolve``.
+
+    Raises:
+        InputError: the package is not there, or a node has an unknown key.
+    """
+    if values.config_dir is not None:
+        searched = json.dumps([f"file://{Path(values.config_dir).resolve()}"], ensure_ascii=False)
+        overrides = [*overrides, f"hydra.searchpath={searched}"]
+    cfg = compose(name, overrides, with_hydra=True)
+    HydraConfig.instance().set_config(cfg)
+    cfg = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+    try:
+        check(OmegaConf.to_container(cfg, resolve=True))
+    except UnknownKey:
+        raise
+    except InputError:  # a wrong value is what somebody may look for
+        pass
+    if values.resolve:
+        OmegaConf.resolve(cfg)
+    if values.package not in (None, "_global_"):
+        require(OmegaConf.select(cfg, values.package) is not None, "--package", "a key", values.package)
+        cfg = OmegaConf.select(cfg, values.package)
+        print(f"# @package {values.package}")
+    print(OmegaConf.to_yaml(cfg) if OmegaConf.is_config(cfg) else cfg, end="")
+
+
 def run(verb: str, argv: list[str]) -> int:
     """Run a verb as a Hydra application; errors and interruptions are printed in one line.
 
@@ -175,9 +212,12 @@ def run(verb: str, argv: list[str]) -> int:
         flags, overrides, values = messages.parsed(argv[2:])
         if values.help:
             return _help(verb, overrides, values.config_dir)
-        sys.argv = [argv[0], *flags, messages.NO_FILES_OF_HYDRA, *_for_hydra(verb, overrides)]
         messages.check_deletions(overrides)
         store_defaults(verb)
+        if values.cfg == "job":
+            _print_configuration(values.config_name or verb, _for_hydra(verb, overrides), values)
+            return 0
+        sys.argv = [argv[0], *flags, messages.NO_FILES_OF_HYDRA, *_for_hydra(verb, overrides)]
         with interruptible():
             hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=verb)(task)()
         sys.stdout.flush()

@@ -18,7 +18,7 @@ from yaml import YAMLError
 
 from ghgs_lit.config import compose, conf_dir, resolve
 from ghgs_lit.config.keys import flatten, is_below
-from ghgs_lit.config.options import did_you_mean
+from ghgs_lit.config.options import UnknownKey, did_you_mean
 from ghgs_lit.config.registry import verb_class, verbs
 from ghgs_lit.errors import InputError
 
@@ -53,6 +53,8 @@ def one_line(error: Exception, verb: str) -> str:
         text = f"{error.full_key}: expected a value that can be resolved; found {error.msg}"
     elif isinstance(error, YAMLError):
         text = _yaml(error)
+    elif isinstance(error, UnknownKey) and any(word.startswith(f"{error.key}=") for word in sys.argv[1:]):
+        text = _unknown_key(error.key, verb)
     elif isinstance(error, InputError):
         text = str(error)
     else:  # an error of Hydra that does not name the override
@@ -106,7 +108,11 @@ def _composition(error: HydraException, verb: str) -> str:
     named = re.match(r"Could not override '([^']+)'", str(error))
     if named is None:
         return f"{_command_line()}: expected overrides that fit; found {error} {error.__cause__ or ''}"
-    return f"{named[1]}: expected a key or group of this verb; found none of that name{_hint(verb, named[1])}"
+    return _unknown_key(named[1], verb)
+
+
+def _unknown_key(key: str, verb: str) -> str:
+    return f"{key}: expected a key or group of this verb; found none of that name{_hint(verb, key)}"
 
 
 def _hint(verb: str, key: str) -> str:
@@ -142,7 +148,7 @@ def _keys(verb: str, overrides: Sequence[str] = ()) -> list[str]:
     """All dotted keys of a verb with some overrides; none where it cannot be composed so."""
     try:
         return list(flatten(OmegaConf.to_container(compose(verb, overrides), resolve=False)))
-    except (HydraException, OmegaConfBaseException):
+    except (HydraException, OmegaConfBaseException, InputError):
         return []
 
 

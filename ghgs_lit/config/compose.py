@@ -2,43 +2,25 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import MISSING, DictConfig, OmegaConf
-from pydantic import BaseModel
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import InterpolationResolutionError
 
+from ghgs_lit.config.defaults import fill, of_verb
+from ghgs_lit.config.folder import VERSION_BASE, conf_dir
 from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.config.options import did_you_mean
+from ghgs_lit.config.outside import files_are_read
 from ghgs_lit.config.registry import KINDS, check, verb_class, verbs
 from ghgs_lit.errors import InputError, require
 
 if TYPE_CHECKING:
     from ghgs_lit.cli.verb import Verb
-
-#: Hydra 1.3 asks for the version to be compatible with; later versions do not.
-VERSION_BASE: dict[str, Any] = {"version_base": "1.3"} if hydra.__version__.startswith("1.3") else {}
-
-
-def conf_dir() -> Path:
-    """Absolute path of ``conf``: inside the package in a wheel, beside it in a checkout.
-
-    Raises:
-        InputError: neither is there.
-    """
-    package = Path(__file__).resolve().parents[1]
-    candidates = (package / "conf", package.parent / "conf")
-    for candidate in candidates:
-        if (candidate / "train.yaml").is_file():
-            return candidate
-    raise InputError(
-        f"configuration: expected train.yaml in one of {', '.join(map(str, candidates))}; found none"
-    )
-
 
 #: First line of the configuration that a run saves; a file without it belongs to another program.
 HEADER = "# The configuration of this run, by ghgs."
@@ -50,7 +32,7 @@ def _application() -> Iterator[None]:
     running = GlobalHydra.instance().hydra
     GlobalHydra.instance().hydra = None
     try:
-        with hydra.initialize_config_dir(str(conf_dir()), **VERSION_BASE):
+        with files_are_read(), hydra.initialize_config_dir(str(conf_dir()), **VERSION_BASE):
             yield
     finally:
         GlobalHydra.instance().hydra = running
@@ -74,20 +56,12 @@ def store_defaults(verb: str) -> None:
     """
     if (conf_dir() / f"{verb}.yaml").is_file():
         return
-    node: dict[str, Any] = {"defaults": ["_self_", {"override hydra/output": "ghgs"}]}
-    for name, field in verb_class(verb).model_fields.items():
-        default = field.get_default(call_default_factory=True)
-        if field.is_required():
-            default = MISSING
-        elif isinstance(default, BaseModel):
-            default = default.model_dump(mode="json")
-        node[name] = list(default) if isinstance(default, tuple) else default
-    node["hydra"] = {"job": {"name": verb}}
-    ConfigStore.instance().store(name=verb, node=node)
+    node = {"defaults": ["_self_", {"override hydra/output": "ghgs"}], "hydra": {"job": {"name": verb}}}
+    ConfigStore.instance().store(name=verb, node=of_verb(verb, node))
 
 
 def compose(verb: str, overrides: Sequence[str] = (), with_hydra: bool = False) -> DictConfig:
-    """The configuration of ``ghgs <verb> <overrides>``.
+    """The configuration of ``ghgs <verb> <overrides>``, with all defaults.
 
     Args:
         verb: name of a verb, or of another file in ``conf``.
@@ -96,11 +70,12 @@ def compose(verb: str, overrides: Sequence[str] = (), with_hydra: bool = False) 
 
     Raises:
         HydraException: an override does not fit.
+        InputError: a node names a kind that there is not.
     """
     if verb in verbs():
         store_defaults(verb)
     with _application():
-        return hydra.compose(verb, overrides=list(overrides), return_hydra_config=with_hydra)
+        return fill(hydra.compose(verb, overrides=list(overrides), return_hydra_config=with_hydra))
 
 
 def saved_text(config: dict[str, Any]) -> str:
@@ -112,13 +87,13 @@ def resolve(cfg: DictConfig, verb: str | None = None) -> dict[str, Any]:
     """A composed configuration as plain data, whose groups are checked.
 
     Args:
-        cfg: the configuration; nodes without a kind are checked when they are built.
+        cfg: the configuration, which gets all defaults; nodes without a kind are checked when they are built.
         verb: whose own keys are checked, too; None: none are.
 
     Raises:
         InputError: a value is missing or has a wrong type or range.
     """
-    data = plain(cfg)
+    data = plain(fill(cfg))
     if verb is not None:
         read_verb(verb, data)
     check(data)
@@ -131,7 +106,10 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
     Raises:
         InputError: a value is missing.
     """
-    missing = sorted(OmegaConf.missing_keys(cfg))
+    try:
+        missing = sorted(OmegaConf.missing_keys(cfg))
+    except InterpolationResolutionError:  # perhaps of a key that no file says
+        missing = sorted(OmegaConf.missing_keys(fill(cfg)))
     if missing:
         raise InputError(f"{missing[0]}: expected a value ({missing[0]}=...); found none")
     return OmegaConf.to_container(cfg, resolve=True)
@@ -244,7 +222,7 @@ def read_option(group: str, name: str, key: str | None = None) -> dict[str, Any]
     with nullcontext() if _is_own() else _application():
         known = sorted(GlobalHydra.instance().config_loader().get_group_options(group))
         if name in known:
-            node = OmegaConf.select(hydra.compose(f"{group}/{name}"), group.replace("/", "."))
+            node = OmegaConf.select(fill(hydra.compose(f"{group}/{name}")), group.replace("/", "."))
             return OmegaConf.to_container(node, resolve=True)
     hint = did_you_mean(name, known)
     raise InputError(f"{key or group}: expected one of {', '.join(known)}; found {name!r}{hint}")

@@ -143,6 +143,18 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     return f" (did you mean {close[0]}?)" if close else ""
 
 
+class UnknownKey(InputError):
+    """Options have no such field.
+
+    Attributes:
+        key: dotted key that was given.
+    """
+
+    def __init__(self, message: str, key: str):
+        super().__init__(message)
+        self.key = key
+
+
 class _Checked(type(BaseModel)):
     """Metaclass that raises :class:`InputError` for options that are made in Python, too."""
 
@@ -175,8 +187,16 @@ class Options(BaseModel, metaclass=_Checked):
 
     @model_validator(mode="before")
     @classmethod
-    def _lists_become_tuples(cls, values: Any) -> Any:
-        return _immutable(values) if isinstance(values, dict) else values
+    def _given(cls, values: Any) -> Any:
+        """Lists become tuples; a mapping for options changes those that are the default of their field."""
+        if not isinstance(values, dict):
+            return values
+        given = _immutable(values)
+        for name, value in given.items():
+            default = cls.model_fields[name].default if name in cls.model_fields else None
+            if isinstance(value, dict) and isinstance(default, Options):
+                given[name] = {**dict(default), **value}
+        return given
 
     @classmethod
     def read(cls: type[_T], values: Any, key: str) -> _T:
@@ -280,7 +300,7 @@ def _input_error(cls: type[Options], key: str, values: Mapping, error: Validatio
         name = first["loc"][-1]
         known = list(cls.model_fields)
         text = f"expected one of {', '.join(sorted(known))}; found {name!r}{did_you_mean(name, known)}"
-        return InputError(f"{dotted} key: {text}" if dotted else f"{name}: {text}")
+        return UnknownKey(f"{dotted} key: {text}" if dotted else f"{name}: {text}", ".".join([*path, name]))
     if first["type"] == "missing" and first["loc"][-1] in cls.model_fields:
         return InputError(f"{dotted}: expected a value; found none")
     wanted = str(cause) if cause is not None else expected(field) if field is not None else first["msg"]

@@ -8,17 +8,21 @@ scripts. Of it these files may set :data:`SETTABLE`; the command line may set al
 import itertools
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import yaml
 from hydra._internal.core_plugins import file_config_source
 from hydra._internal.sources_registry import SourcesRegistry
+from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult
 from omegaconf import OmegaConf
 
-from ghgs_lit.config.compose import conf_dir
+from ghgs_lit.config.defaults import of_verb, open_nodes
+from ghgs_lit.config.folder import conf_dir
 from ghgs_lit.config.keys import flatten, is_below, require_plain
+from ghgs_lit.config.registry import verbs
 from ghgs_lit.errors import InputError
 
 #: Of launchers: names and numbers for the queue and the processes, no commands.
@@ -58,15 +62,35 @@ class FileConfigSource(file_config_source.FileConfigSource):
             with file.open(encoding="utf-8") as stream:  # references are not written out yet
                 require_plain(yaml.load(stream, yaml.BaseLoader), str(file))
         result = super().load_config(config_path)
-        if is_outside and OmegaConf.is_dict(result.config):
-            package = result.header.get("package") or ""
-            check_file(file, config_path, package, OmegaConf.to_container(result.config))
+        if not OmegaConf.is_dict(result.config):
+            return result
+        package = result.header.get("package") or ""
+        content = OmegaConf.to_container(result.config)
+        if is_outside:
+            check_file(file, config_path, package, content)
+        name = config_path.removesuffix(".yaml")
+        if name in verbs():
+            result.config = OmegaConf.create(of_verb(name, content))
+        open_nodes(name, package, result.config)
         return result
 
 
 def check_outside_files() -> None:
-    """Let all later applications of this process check the files outside of the package."""
+    """Let all later applications of this process read files as :class:`FileConfigSource` does."""
     SourcesRegistry.instance().types["file"] = FileConfigSource
+
+
+@contextmanager
+def files_are_read() -> Iterator[None]:
+    """Let applications of the block read files so; those of another program do not."""
+    Plugins.instance()  # registers Hydra's own
+    types = SourcesRegistry.instance().types
+    before = types["file"]
+    check_outside_files()
+    try:
+        yield
+    finally:
+        types["file"] = before
 
 
 def check_file(file: Path, name: str, package: str, content: Mapping[str, Any]) -> None:

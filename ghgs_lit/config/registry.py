@@ -16,7 +16,7 @@ import marshal
 import os
 import pkgutil
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -301,6 +301,20 @@ def class_of(group: str, kind: Any, key: str) -> type[Options]:
     return _imported(known[kind])
 
 
+def class_of_node(node: Mapping[str, Any], key: str) -> type[Options]:
+    """The options class of a node.
+
+    Args:
+        node: with ``kind`` where its group has kinds.
+        key: its dotted key.
+
+    Raises:
+        InputError: as for :func:`class_of`.
+    """
+    group = key.split(".")[0]
+    return class_of(group, None if None in KINDS[group] else node.get("kind"), key)
+
+
 #: Options of the nodes that were read, by class, key and values.
 _READ: dict[tuple[type[Options], str, bytes], Options] = {}
 
@@ -317,12 +331,12 @@ def read_node(node: Any, key: str) -> Options:
     """
     if isinstance(node, Options):
         return node
-    group = key.split(".")[0]
     if not isinstance(node, Mapping):
         raise InputError(f"{key}: expected a mapping of its keys; found {shown(node)}")
     values = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else dict(node)
-    kind = None if None in KINDS[group] else values.pop("kind", None)
-    cls = class_of(group, kind, key)
+    cls = class_of_node(values, key)
+    if None not in KINDS[key.split(".")[0]]:
+        values.pop("kind", None)
     # Options do not change: a node is read once in a process, whoever asks for it. Types and order count.
     try:
         known = (
@@ -351,6 +365,33 @@ def build(node: Any, key: str, **extra: Any) -> Any:
     return read_node(node, key).build(**extra)
 
 
+def nodes_of(config: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """The nodes of all groups of a configuration, with their dotted keys.
+
+    Args:
+        config: the whole configuration, or a part of it. A node is a mapping unless it is wrong.
+    """
+    for group in (name for name in config if name in KINDS):
+        node = config[group]
+        # A verb that takes its data from a checkpoint may have neither data nor targets.
+        if node is None and group in ("data", "targets"):
+            continue
+        if group in NAMED and isinstance(node, Mapping):
+            yield from ((f"{group}.{name}", part) for name, part in node.items())
+        else:
+            yield group, node
+
+
+def says_its_class(key: str, node: Mapping[str, Any]) -> bool:
+    """Whether a node describes an object: keys that change a checkpoint's data have no kind, for example.
+
+    Args:
+        key: dotted key of the node.
+        node: what its group has under it.
+    """
+    return "kind" in node or None in KINDS[key.split(".")[0]]
+
+
 def check(config: Mapping[str, Any]) -> None:
     """Check the nodes of all groups; those without a kind are checked when they are built.
 
@@ -360,13 +401,7 @@ def check(config: Mapping[str, Any]) -> None:
     Raises:
         InputError: as for :func:`read_node`.
     """
-    for group, node in config.items():
-        # A verb that takes its data from a checkpoint may have neither data nor targets.
-        if group not in KINDS or (node is None and group in ("data", "targets")):
-            continue
-        if group in NAMED and isinstance(node, Mapping):
-            for name, part in node.items():
-                read_node(part, f"{group}.{name}")
-        # Skipped without a kind: keys that change a checkpoint's data, or an optimizer that the verb lacks.
-        elif not isinstance(node, Mapping) or "kind" in node or None in KINDS[group]:
-            read_node(node, group)
+    for key, node in nodes_of(config):
+        # Skipped without a kind: an optimizer that the verb lacks, for example.
+        if key.split(".")[0] in NAMED or not isinstance(node, Mapping) or says_its_class(key, node):
+            read_node(node, key)

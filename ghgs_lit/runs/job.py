@@ -10,6 +10,8 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from ghgs_lit.config.compose import plain
+from ghgs_lit.config.defaults import fill
 from ghgs_lit.config.keys import lookup
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import resolved
@@ -44,7 +46,7 @@ def register_resolvers() -> None:
 
     def hash_of_run(*, _root_: DictConfig) -> str:
         keys = [key for key in _root_ if key != "hydra"]
-        return config_hash(OmegaConf.to_container(OmegaConf.masked_copy(_root_, keys), resolve=True))
+        return config_hash(plain(fill(OmegaConf.masked_copy(_root_, keys))))
 
     def run_of_job(name: str, *, _root_: DictConfig) -> str:
         if not is_queued_again():
@@ -154,7 +156,7 @@ def check_config(config: Mapping[str, Any]) -> None:
     Raises:
         InputError: It has ``skip=auto``, or a frozen encoder without weights.
     """
-    one_preset = not lookup(config, "skip.choices")
+    one_preset = not any((lookup(config, "skip.choices") or {}).values())
     require(one_preset, "skip", "the preset to train with, or one and token_budgets=[...]", "auto")
     _require_weights(config)
 

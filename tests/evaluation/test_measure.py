@@ -160,8 +160,9 @@ def test_each_target_protocol_has_the_values_of_its_own_file():
     assert found["release"] == release
     for name in ("midway", "ghg"):
         own = yaml.safe_load((conf_dir() / "targets" / f"{name}.yaml").read_text())
-        base = yaml.safe_load((conf_dir() / "targets" / "release.yaml").read_text())
-        assert found[name] == base | {key: value for key, value in own.items() if key != "defaults"}
+        said = {key: value for key, value in own.items() if key != "defaults"}
+        assert found[name].items() >= said.items()
+        assert found[name]["training_views"] == {"midway": [0, 2, 3, 4], "ghg": [2, 3, 4]}[name]
     config["evaluation"]["targets"] = ["release", "midwy"]
     said = r"evaluation\.targets: expected one of cameras, ghg, .*; found 'midwy' \(did you mean midway\?\)"
     with pytest.raises(InputError, match=said):

@@ -8,8 +8,8 @@ from typing import Any
 import hydra
 
 from ghgs_lit.cli.runtime import output_dir
-from ghgs_lit.config import VERSION_BASE, conf_dir
-from ghgs_lit.config.compose import plain
+from ghgs_lit.config import VERSION_BASE, conf_dir, resolve
+from ghgs_lit.config.outside import files_are_read
 from ghgs_lit.runs import job as job_module
 from ghgs_lit.runs.grid import run_all
 from ghgs_lit.runs.job import register_resolvers, train_once
@@ -48,9 +48,9 @@ def executed(sweep: Path) -> list[str]:
 
 
 def job(cfg) -> float | str | None:
-    """The job of a launcher: the verb without its training, and without the checks that import PyTorch. With
+    """The job of a launcher: the verb without its training. With
     ``data.workers`` it loads data, as training does."""
-    return train_once(RunDirectory(output_dir()), plain(cfg), load_and_record)
+    return train_once(RunDirectory(output_dir()), resolve(cfg), load_and_record)
 
 
 def load_and_record(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float:
@@ -66,7 +66,8 @@ def hydra_app(monkeypatch, *overrides: str) -> None:
     """Run ``job`` as an application over ``conf/train.yaml``."""
     monkeypatch.setattr("sys.argv", ["ghgs", *overrides])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name="train")(job)()
+    with files_are_read():
+        hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name="train")(job)()
 
 
 def plan_seeds(sweep: Path, count: int) -> list[PlannedRun]:

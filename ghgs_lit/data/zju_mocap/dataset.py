@@ -219,7 +219,7 @@ class ZJUMoCap(DataSet):
     static_cameras: ClassVar[bool] = True
 
     name: Text = "zju_mocap"
-    size: Size = (512, 512)
+    size: Size = 512
     split: FramesByPhase
     """Sequences of each phase, and which of their frames."""
     cameras: Annotated[int, Field(ge=2)] | None = 20
