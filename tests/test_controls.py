@@ -62,7 +62,7 @@ def calls_of(model, batch):
     return tokens, points, result
 
 
-def test_the_rows_are_the_papers_and_three_more():
+def test_the_rows_are_the_papers_and_three_more(controls):
     """One configuration each, which differs from the whole method in what the row's name says."""
     composed = {name: config(f"ablation={name}") for name in (*ABLATIONS.values(), *OWN)}
     rows = composed["full"]["recalibration"]
