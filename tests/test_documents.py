@@ -36,7 +36,7 @@ VERBS = (
 # What a reader makes, and options and names that are not in this repository.
 MADE = ("conf/data/my_people.yaml", "conf/sweep/<name>.yaml")
 OPTIONS = {
-    "ablation": {"one_neighbor"},
+    "ablation": {"one_neighbor", "residual", "shuffled", "relative"},
     "sweep": {"controls"},
     "data": {"my_people"},
     "hydra/launcher": {"joblib", "ray", "submitit_local"},
