@@ -22,7 +22,7 @@ from ghgs_capture.photographs import (
     images_in,
 )
 from ghgs_capture.videos import SUFFIXES
-from ghgs_lit.config.nodes import SequenceOptions
+from ghgs_lit.config.nodes import Calibration, SequenceOptions
 from ghgs_lit.errors import InputError, require
 
 #: Seconds between looks for a frame and for a folder, and of waiting for a camera at the end.
@@ -158,7 +158,7 @@ def live_frames(
     Raises:
         InputError: the calibration, a video, a camera or the folder is missing or wrong.
     """
-    calibration = options.get("calibration", {})
+    calibration = Calibration.read(options.get("calibration", {}), "calibration")
     part = options.get("sequence", {})
     if is_folder := not isinstance(images, Mapping):
         folder = Path(images).expanduser()
@@ -167,7 +167,7 @@ def live_frames(
             return _played(CaptureFolder(folder, cameras, masks, **options), clock, sleep)
     expected = f"all instants of {'a folder that is being written' if is_folder else 'cameras'}"
     require(SequenceOptions.read(part, "sequence") == SequenceOptions(), "sequence", expected, part)
-    stored = read_cameras(cameras, calibration.get("format") or "auto")
+    stored = read_cameras(cameras, calibration.format)
     if not is_folder:
         devices = by_camera(
             Path("images"), {str(n): device for n, device in images.items()}, stored.cameras, {}
@@ -177,7 +177,7 @@ def live_frames(
         require(bool(is_told), "masks", expected, masks)
         least = min(MIN_PHOTOGRAPHS, len(devices))
         return _watched(newest_frames(opened(devices), least, clock, sleep), stored, options)
-    names = composed_names(calibration.get("names"))
+    names = composed_names(calibration.names)
     places = [folder] if masks is None else [folder, Path(masks).expanduser()]
 
     def read(name: str) -> Capture:

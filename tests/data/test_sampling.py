@@ -225,7 +225,7 @@ def test_loading_processes_change_nothing(root):
 def test_an_epoch_and_the_evaluation_have_the_expected_length(root):
     """Lengths follow subjects, batch size, steps_per_epoch and limit; evaluation repeats exactly."""
     data = module(root)
-    assert len(data.train_dataloader()) == 2  # 3 subjects, 2 at a time
+    assert len(data.train_dataloader()) == 100  # 50 passes over 3 subjects, 2 at a time
     assert [len(batch.subjects) for batch in data.val_dataloader()] == [2]
     assert [len(b.subjects) for b in data.evaluation_loader(split="train", batch_size=2)] == [2, 1]
     assert len(module(root, steps_per_epoch=7).train_dataloader()) == 7

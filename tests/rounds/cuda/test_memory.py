@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from ghgs_lit.rounds.memory import _remembered, fits, remembered
-from ghgs_lit.runtime.precision import round_products, rounds_products
+from ghgs_lit.runtime.precision import _float32
 from tests.helpers.kernels import DEVICE, kernels
 
 
@@ -52,10 +52,5 @@ def test_a_value_that_is_not_a_number_stays_in_its_row():
 def test_float32_and_gradients_are_plain_pytorchs(rounding, has_gradient):
     """Where products may not round to TF32, and where a gradient is wanted."""
     inputs = [value.to(DEVICE) for value in rows(3, 2, 11, 48, 24)]
-    before = rounds_products(DEVICE.type)
-    with kernels(), torch.set_grad_enabled(has_gradient):
-        try:
-            round_products(rounding, DEVICE.type)
-            assert fits(*inputs) == (rounding and not has_gradient)
-        finally:
-            round_products(before, DEVICE.type)
+    with kernels(), torch.set_grad_enabled(has_gradient), _float32(DEVICE.type, rounding):
+        assert fits(*inputs) == (rounding and not has_gradient)
