@@ -70,14 +70,10 @@ def intersections(
     centers = centers.reshape(-1, depths.shape[-1], 2)
     radii = radii.reshape(centers.shape)
     _, order = depths.contiguous().view(torch.int32).flatten().sort(stable=True)
-    if gpu.is_supported(centers, radii):
-        boxes = _BOXED(centers, radii, order, rows, columns)
-        ends = boxes[0].cumsum(0)
-        tile, splat = _PLACED(ends, boxes, order, fixed.every, capacity, columns)
-    else:
-        boxes = _boxed(centers, radii, order, rows, columns)
-        ends = boxes[0].cumsum(0)
-        tile, splat = _placed(ends, boxes, order, fixed.every, capacity, columns)
+    box, place = (_BOXED, _PLACED) if gpu.is_supported(centers, radii) else (_boxed, _placed)
+    boxes = box(centers, radii, order, rows, columns)
+    ends = boxes[0].cumsum(0)
+    tile, splat = place(ends, boxes, order, fixed.every, capacity, columns)
     # A radix sort passes once over each byte.
     tile, order = tile.sort(stable=True)
     offsets = torch.searchsorted(tile, fixed.every, out_int32=True).view(fixed.has_pixels.shape)

@@ -34,7 +34,7 @@ def remembered(
     known: Float[Tensor, "N k"],
     memory: Float[Tensor, "N h"],
 ) -> Float[Tensor, "N h"]:
-    """The new memory of each Gaussian, as of :meth:`ghgs_lit.rounds.rounds.Rounds._remembered`.
+    """The new memory of each Gaussian, from what is seen and known; for inputs that :func:`fits` accepts.
 
     Args:
         layers: two of the views, two of the update, and the last one.
@@ -42,16 +42,37 @@ def remembered(
         known: what is known of each Gaussian beside them.
         memory: of the rounds before.
     """
-    weights = [tensor for layer in layers for tensor in (layer.weight, layer.bias)]
-    return _REMEMBER(each, known, memory, weights)
+    return _REMEMBER(each, known, memory, _weights_of(layers))
+
+
+def remembered_plainly(layers: Sequence[nn.Linear], each: Tensor, known: Tensor, memory: Tensor) -> Tensor:
+    """:func:`remembered` in plain PyTorch, with a gradient if one is wanted.
+
+    Args:
+        layers: as of :func:`remembered`, as are the next ones.
+        each: observations.
+        known: beside them.
+        memory: of the rounds before.
+    """
+    return _remembered(each, known, memory, _weights_of(layers))
+
+
+def _weights_of(layers: Sequence[nn.Linear]) -> list[Tensor]:
+    """Weights and biases in turn."""
+    return [tensor for layer in layers for tensor in (layer.weight, layer.bias)]
 
 
 def _remembered(each: Tensor, known: Tensor, memory: Tensor, weights: Sequence[Tensor]) -> Tensor:
-    """:func:`remembered` in plain PyTorch, with the weights and biases of its layers in turn."""
-    seen = F.relu(F.linear(F.relu(F.linear(each, *weights[:2])), *weights[2:4]))
-    inputs = torch.cat((seen[:, 0], seen[:, 1:].mean(1), seen[:, 1:].amax(1), known, memory), -1)
-    updated = F.relu(F.linear(F.relu(F.linear(inputs, *weights[4:6])), *weights[6:8]))
-    return torch.tanh(memory + F.linear(updated, *weights[8:]))
+    """The operator in plain PyTorch, with the weights and biases of its layers in turn."""
+    own, others = _two_layers(each, weights[:4]).split((1, each.shape[1] - 1), 1)
+    inputs = torch.cat((own[:, 0], others.mean(1), others.amax(1), known, memory), -1)
+    return torch.tanh(memory + F.linear(_two_layers(inputs, weights[4:8]), *weights[8:]))
+
+
+def _two_layers(x: Tensor, weights: Sequence[Tensor]) -> Tensor:
+    """Two layers with their weights and biases in turn, each with a rectifier in place."""
+    x = F.relu_(F.linear(x, *weights[:2]))
+    return F.relu_(F.linear(x, *weights[2:]))
 
 
 _REMEMBER = gpu.operator(

@@ -28,7 +28,7 @@ from ghgs_lit.kernels.pool import at_once, even_parts, multiplies
 from ghgs_lit.rounds import cpu
 from ghgs_lit.rounds.exchange import Exchange, Windows
 from ghgs_lit.rounds.gains import equalized
-from ghgs_lit.rounds.memory import fits, remembered
+from ghgs_lit.rounds.memory import fits, remembered, remembered_plainly
 from ghgs_lit.rounds.observation import CHANNELS, SLOPES, observe, slopes
 from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Prediction
@@ -292,8 +292,7 @@ class Rounds(nn.Module):
             windows: places of the Gaussians in maps; None: nothing is exchanged.
         """
         if fits(each, known, memory, self.memory.weight):
-            layers = (self.view[0], self.view[2], self.update[0], self.update[2], self.memory)
-            memory = remembered(layers, each, known, memory)
+            memory = remembered(self._layers, each, known, memory)
         elif multiplies(each, known, memory, self.memory.weight):
             memory = cpu.remembered(self.view, self.update, self.memory, each, known, memory)
         else:
@@ -308,19 +307,14 @@ class Rounds(nn.Module):
         parts = even_parts(count, count if torch.is_grad_enabled() else at_once(device, _AT_ONCE, count))
         return torch.cat([self._remembered(*(row[part] for row in rows)) for part in parts])
 
-    def _remembered(
-        self, each: Float[Tensor, "n V c"], known: Float[Tensor, "n k"], memory: Float[Tensor, "n h"]
-    ) -> Float[Tensor, "n h"]:
-        """The new memory, from what is seen and known.
+    def _remembered(self, *rows: Tensor) -> Float[Tensor, "n h"]:
+        """The new memory from observations, what is known beside them, and the memory before."""
+        return remembered_plainly(self._layers, *rows)
 
-        Args:
-            each: observations of each view, the own one first.
-            known: what is known of each Gaussian beside them.
-            memory: of the rounds before.
-        """
-        own, others = self.view(each).split((1, each.shape[1] - 1), 1)
-        seen = (own[:, 0], others.mean(1), others.amax(1))
-        return torch.tanh(memory + self.memory(self.update(torch.cat((*seen, known, memory), -1))))
+    @property
+    def _layers(self) -> tuple[nn.Linear, ...]:
+        """What :func:`ghgs_lit.rounds.memory.remembered` multiplies with."""
+        return self.view[0], self.view[2], self.update[0], self.update[2], self.memory
 
     @torch.no_grad()
     def _search(self, state: State, batch: Batch, rays: Rays, reach: float | Tensor) -> Search:
