@@ -6,6 +6,7 @@ import shutil
 import pytest
 
 from ghgs_capture.live import live_frames
+from ghgs_lit.config.nodes import Calibration
 from ghgs_lit.errors import InputError
 from tests.helpers.figures import Figure
 from tests.helpers.videos import mask_frames, number_of, numbered_frames, write_video
@@ -126,3 +127,12 @@ def test_a_missing_folder_is_refused_at_once(source):
     with pytest.raises(InputError, match="nowhere: expected a folder"):
         live_frames(source / "nowhere", source / "cameras.json")
     assert list(itertools.islice(arriving(source, Time()), 1)) == []
+
+
+@pytest.mark.parametrize("kind", [dict, Calibration])
+def test_the_format_that_is_said_is_read(source, kind):
+    """As options, or as plain data; the file alone would be taken for the package's own format."""
+    calibration = kind(format="toml")
+    with pytest.raises(InputError, match=r"cameras\.json: expected"):
+        live_frames(source / "images", source / "cameras.json", calibration=calibration)
+    assert live_frames(source / "images", source / "cameras.json", calibration=kind(format="ghgs"))
