@@ -59,11 +59,13 @@ _PIECES = {"mask_hole_chance": 1.0}
 
 @dataclass(frozen=True)
 class Imperfection:
-    """How a capture differs: ``data.rig.variation``, positions of the inputs, and :class:`Augmentation`.
+    """How a capture differs: ``data.rig.variation``, positions of the inputs,
+    and :class:`Augmentation`.
 
-    Photographs have exact mattes, or ``masks`` of 0 and 1, ``grown`` pixels too large. A ``bumped`` camera is
-    the only one whose calibration is wrong; None: all are. The first one is turned by ``turned`` pixels, its
-    focal length ``zoom`` times and its photograph's colours to the power ``gamma`` of the right ones.
+    Photographs have exact mattes, or ``masks`` of 0 and 1, ``grown`` pixels too large. A ``bumped``
+    camera is the only one whose calibration is wrong; None: all are. The first one is turned by
+    ``turned`` pixels, its focal length ``zoom`` times and its photograph's colours to the power
+    ``gamma`` of the right ones.
     """
 
     rig: Mapping[str, Any] = field(default_factory=dict)
@@ -115,7 +117,8 @@ CAPTURES = {
 def data_of(
     capture: Imperfection, people: int, size: list[int], uneven: list[int], rendered: list[int] | None = None
 ) -> PhotographsDataModule:
-    """People in front of the rig of a capture; what is missing is rendered, in the ``rendered`` size."""
+    """People in front of the rig of a capture;
+    what is missing is rendered, in the ``rendered`` size."""
     # Inputs, the targets beside the first one and half-way to the second one.
     positions = sorted({*_EVEN, *uneven, _EVEN[1] // 2})
     overrides = [
@@ -141,7 +144,8 @@ def batches(
     size: tuple[int, int],
     refine_masks: int,
 ) -> Iterator[Batch]:
-    """Crops of ``size`` of the photographs that ``capture`` takes, with the targets of the clean rig."""
+    """Crops of ``size`` of the photographs that ``capture`` takes,
+    with the targets of the clean rig."""
     targets = [read_option("targets", name) for name in _TARGETS]
     for batch in clean.evaluation_loader(_VIEWS, targets, batch_size=1):
         subject = batch.subjects[0]
@@ -160,7 +164,8 @@ def predicted(
     renderer: Renderer,
     refine: int | str,
 ) -> Iterator[Batch]:
-    """The batch that ``predict`` takes for each person from the ``first`` on, with the targets of the rig."""
+    """The batch that ``predict`` takes for each person from the ``first`` on,
+    with the targets of the rig."""
     targets = [read_option("targets", name) for name in _TARGETS]
     clean, own = data
     for subject in list(clean.subjects("val"))[first:]:
@@ -205,7 +210,8 @@ def photographed(capture: Imperfection, batch: Batch) -> Capture:
 
 
 def _knock(lens: np.ndarray, pose: np.ndarray, capture: Imperfection, subject: str) -> None:
-    """Turn and zoom one camera in place, about an axis in its image plane that is the subject's own."""
+    """Turn and zoom one camera in place, about an axis in its image plane that is the
+    subject's own."""
     angle = subject_rng(2, subject).uniform(0, 2 * math.pi)
     turn = math.tan(_LARGER * capture.turned / lens[0, 0] / 2)
     rotation = torch.tensor([1.0, turn * math.cos(angle), turn * math.sin(angle), 0.0], dtype=torch.float64)
@@ -214,7 +220,8 @@ def _knock(lens: np.ndarray, pose: np.ndarray, capture: Imperfection, subject: s
 
 
 def means(rows: list[dict]) -> dict[str, float]:
-    """PSNR by target and region, and the error of depth where the method has one, over the subjects."""
+    """PSNR by target and region, and the error of depth where the method has one,
+    over the subjects."""
     found = {
         f"{target}_{name}": sum(row[name] for row in rows if row["targets"] == target)
         / sum(row["targets"] == target for row in rows)

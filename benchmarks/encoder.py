@@ -76,7 +76,8 @@ def _patch_tokens_first(model: GHGS, record: Recorder) -> Callable:
 
 @torch.no_grad()
 def forward(model: GHGS, batch: Batch, record: Recorder) -> tuple[Tokens, Points]:
-    """``GHGS.forward``, stage by stage; returns the tokens and points that enter the recalibration."""
+    """``GHGS.forward``, stage by stage; returns the tokens and points that enter the
+    recalibration."""
     bounds = model.bounds(batch)
     plan = model.plan(batch)
     tokens = _patch_tokens_first(model, record)(batch, bounds, plan)
@@ -139,7 +140,8 @@ def best_seconds(function: Callable, repeats: int = 3) -> float:
 
 @torch.no_grad()
 def product_rates(tokens: int, width: int, dtype: torch.dtype) -> dict[str, float]:
-    """GFLOP/s of matrix products by ``torch.matmul`` and by ours: squares, and the encoder's shapes."""
+    """GFLOP/s of matrix products by ``torch.matmul`` and by ours: squares,
+    and the encoder's shapes."""
 
     def rate(multiply: Callable, m: int, k: int, n: int) -> float:
         x, weight = torch.randn(m, k, dtype=dtype), torch.randn(n, k, dtype=dtype)
@@ -181,7 +183,8 @@ def literal_stage(model: GHGS, tokens: Tokens, points: Points) -> Stage:
 
 
 def training_stages(config: dict, batch: Batch) -> list[Stage]:
-    """One forward and backward pass of the encoder alone, fully trained, without and with checkpointing.
+    """One forward and backward pass of the encoder alone, fully trained,
+    without and with checkpointing.
 
     Without it a whole ``vggt_1b`` takes tens of GB: choose fewer blocks with ``encoder.depth``.
     """

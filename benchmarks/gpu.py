@@ -6,22 +6,24 @@ r"""All that is worth measuring in the first minutes on a GPU: one prepared scri
     python benchmarks/gpu.py step prediction             # sections by name
     python benchmarks/gpu.py --table runs/gpu            # the tables again, from the files alone
 
-Each section is a process of its own with a time limit. Findings are lines of JSON in ``<out>/<run>.jsonl`` as
-soon as they are known; a section that fails or takes too long is a row with its last lines, and the others go
-on. In the background gsplat is compiled (its kernels for up to 9 channels, for this GPU) and built-in people
-are rendered on all cores; they pause while a section measures what a busy host would spoil. Both lie in
-``--work``, where the next call finds them.
+Each section is a process of its own with a time limit. Findings are lines of JSON in
+``<out>/<run>.jsonl`` as soon as they are known; a section that fails or takes too long is a
+row with its last lines, and the others go on. In the background gsplat is compiled (its
+kernels for up to 9 channels, for this GPU) and built-in people are rendered on all cores; they
+pause while a section measures what a busy host would spoil. Both lie in ``--work``, where the
+next call finds them.
 
-A compiled gsplat can travel along. On a machine with nvcc 13, and with the Python and the PyTorch of the one
-with the GPU (three minutes on two cores for one architecture and kernels for up to 9 channels):
+A compiled gsplat can travel along. On a machine with nvcc 13, and with the Python and the
+PyTorch of the one with the GPU (three minutes on two cores for one architecture and kernels for
+up to 9 channels):
 
     TORCH_CUDA_ARCH_LIST="9.0" pip install --no-build-isolation --no-deps --no-binary gsplat \
         --target gsplat_built gsplat==1.5.3
     python benchmarks/gpu.py --gsplat gsplat_built first
 
-``second`` trains ``experiment=shipped`` with batches of eight; further overrides follow its name. With
-``--beside <run>/csv/metrics.csv`` its table has the scores of another run, such as a CPU's, after as many
-samples (``--beside-samples`` a step).
+``second`` trains ``experiment=shipped`` with batches of eight; further overrides follow its name.
+With ``--beside <run>/csv/metrics.csv`` its table has the scores of another run, such as a CPU's,
+after as many samples (``--beside-samples`` a step).
 """
 
 import argparse
@@ -56,8 +58,8 @@ LAST_LINES = 12  #: of a section that failed
 
 @dataclass(frozen=True)
 class Plan:
-    """When a section runs: its limit in seconds, what it needs, whether the background pauses meanwhile, and
-    how long it waits for more people than the first."""
+    """When a section runs: its limit in seconds, what it needs, whether the background pauses
+    meanwhile, and how long it waits for more people than the first."""
 
     seconds: int
     needs: tuple[str, ...] = ()
@@ -209,7 +211,8 @@ def environment_of(options: argparse.Namespace) -> dict[str, str]:
 
 
 def fewer_channels(package: Path, folder: Path) -> Path:
-    """A copy of gsplat in ``folder`` whose kernels for many channels are left out: a third of the time."""
+    """A copy of gsplat in ``folder`` whose kernels for many channels are left out:
+    a third of the time."""
     if not folder.exists():
         shutil.copytree(package, folder / package.name)
         for file in folder.glob("*/cuda/csrc/*.c*"):
@@ -251,7 +254,8 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def report(found: list[dict[str, Any]], beside: list[dict[str, float]]) -> str:
-    """Tables of all sections, and the kernels that take most of the time of each row that has them."""
+    """Tables of all sections, and the kernels that take most of the time of each row
+    that has them."""
     lines, hidden = [], ("section", "status", "last_lines", "longest", "numbers")
     for name, section in SECTIONS.items():
         own = [row for row in found if row["section"] == name]

@@ -57,7 +57,8 @@ DRY = Sizes(
 
 
 class Rows:
-    """A file of findings, a line of JSON each, which holds whatever was found before a process ended."""
+    """A file of findings, a line of JSON each,
+    which holds whatever was found before a process ended."""
 
     def __init__(self, file: Path):
         self.file = file

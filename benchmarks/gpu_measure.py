@@ -65,8 +65,8 @@ class Gpu:
         return [statistics.median(span) for span in spans]
 
     def work(self, call: Callable[[], Any], repeats: int = 3) -> dict[str, Any]:
-        """Of a call, means: ``busy_ms`` of the GPU, ``launches``, ``waits`` of the host, and ``longest``, the
-        kernels that take most of the time: name, calls, milliseconds."""
+        """Of a call, means: ``busy_ms`` of the GPU, ``launches``, ``waits`` of the host, and
+        ``longest``, the kernels that take most of the time: name, calls, milliseconds."""
         torch.cuda.synchronize()
         with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as found:
             for _ in range(repeats):
@@ -105,7 +105,8 @@ def reason(error: BaseException) -> str:
 
 @contextlib.contextmanager
 def rehearsal() -> Iterator[Gpu]:
-    """The pretend device of the tests as a GPU, with stand-ins for what PyTorch has for CUDA alone."""
+    """The pretend device of the tests as a GPU,
+    with stand-ins for what PyTorch has for CUDA alone."""
     with pretend_device() as log, drawing_nothing(), contextlib.ExitStack() as stack:
         for name, value in _stand_ins(log).items():
             stack.enter_context(mock.patch.object(torch.cuda, name, value))

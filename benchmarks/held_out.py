@@ -2,9 +2,9 @@
 
     python benchmarks/held_out.py photographs cameras.json model.ckpt [model.ckpt ...] --out held_out
 
-Prints PSNR of each held-out photograph, whole and in the subject's box, for the checkpoints, the nearest
-input photograph and the visual hull (splats where rays meet it), and writes pictures.
-The crops and the frame of the world are those of all photographs.
+Prints PSNR of each held-out photograph, whole and in the subject's box, for the checkpoints, the
+nearest input photograph and the visual hull (splats where rays meet it), and writes pictures. The
+crops and the frame of the world are those of all photographs.
 """
 
 import argparse
@@ -32,7 +32,8 @@ from ghgs_lit.weights.checkpoint import read_checkpoint
 
 
 def held_out(batch: Batch, given: Batch) -> Iterator[Batch]:
-    """A batch for each photograph: that of ``given`` is the target, the others of ``batch`` the inputs."""
+    """A batch for each photograph: that of ``given`` is the target,
+    the others of ``batch`` the inputs."""
     count = batch.masks.shape[1]
     for i in range(count):
         others = [j for j in range(count) if j != i]

@@ -50,7 +50,8 @@ from ghgs_lit.rounds.gains import divided
 from ghgs_lit.types import Batch, Cameras, Prediction
 from ghgs_lit.weights.checkpoint import read_config
 
-#: Which masks, cameras and colour gains, whose weights, and of how many instants one is predicted anew.
+#: Which masks, cameras and colour gains, whose weights,
+#: and of how many instants one is predicted anew.
 WAYS = {
     "as given": ("given", "given", "each", "shipped", 1),
     "auto": ("mended", "once", "once", "shipped", 1),
@@ -107,7 +108,8 @@ class Measured:
         return [self.kept(f"batch_{masks}_{cameras}_{name}", partial(batch, name)) for name in self.names]
 
     def truth(self) -> list[list[dict[str, Tensor]]]:
-        """Of each instant and camera: photographs on black and as they are, verified masks, halved."""
+        """Of each instant and camera: photographs on black and as they are, verified masks,
+        halved."""
         backgrounds = self.kept("shared", self.shared)[0]
         found = []
         for name in self.names:
@@ -122,7 +124,8 @@ class Measured:
     def rows(
         self, masks: str, cameras: str, gains: str, weights: str, view: int, everies: tuple[int, ...]
     ) -> list[np.ndarray]:
-        """The columns [n, 8] of a held-out camera, for each of some ``every`` of :class:`Temporal`."""
+        """The columns [n, 8] of a held-out camera,
+        for each of some ``every`` of :class:`Temporal`."""
         known: dict[str, tuple[Prediction, float]] = {}
         rig, spent = self.kept("shared", self.shared)[1], 0.0
 
@@ -187,8 +190,8 @@ class Measured:
 
 
 def with_gains_of(rig: Rig | None, batch: Batch) -> Batch:
-    """Photographs divided by the rig's gains, whose mean over these cameras is 1; as they are where it has
-    none."""
+    """Photographs divided by the rig's gains, whose mean over these cameras is 1; as they are where
+    it has none."""
     if not rig or not rig.gains:
         return batch
     logs = np.log([rig.gains[name] for name in batch.views[0]])
@@ -196,7 +199,8 @@ def with_gains_of(rig: Rig | None, batch: Batch) -> Batch:
 
 
 def compared(image: Tensor, alpha: Tensor, truth: dict[str, Tensor]) -> tuple[list[float], tuple]:
-    """PSNR of four kinds, nan where the mask fails; errors on black and before the background [3, h, w]."""
+    """PSNR of four kinds, nan where the mask fails;
+    errors on black and before the background [3, h, w]."""
     composed = image + (1 - alpha) * truth["behind"]
     off = (composed - truth["photograph"]) * truth["known"]
     box = box_of(truth["mask"][None])

@@ -55,8 +55,8 @@ def data_of(overrides: list[str]) -> PhotographsDataModule:
 
 
 def rate(data: PhotographsDataModule, seconds: float) -> tuple[float, int]:
-    """Samples per second, and how many samples were counted; the first batch, which starts the processes,
-    does not count."""
+    """Samples per second, and how many samples were counted; the first batch, which starts the
+    processes, does not count."""
     batches = iter(data.train_dataloader())
     next(batches)
     started, samples = time.perf_counter(), 0
@@ -66,8 +66,9 @@ def rate(data: PhotographsDataModule, seconds: float) -> tuple[float, int]:
 
 
 def processor_ms(data: PhotographsDataModule, seconds: float) -> float:
-    """Milliseconds of processor time of a sample in this process, the median of some parts of ``seconds``.
-    Each subject was read before, and all of its photographs where they are kept in memory."""
+    """Milliseconds of processor time of a sample in this process, the median of some parts
+    of ``seconds``. Each subject was read before, and all of its photographs where they are
+    kept in memory."""
     batches = data.train_dataloader().dataset
     photographs = batches.builder.inputs
     for name, positions in photographs.reader.subjects.items():

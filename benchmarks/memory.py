@@ -3,8 +3,8 @@
     python benchmarks/memory.py --size 140 encoder=vggt_nano model=hull
     python benchmarks/memory.py --size 518 --device cuda encoder=vggt_1b model=paper renderer=auto
 
-Measured is what tensors take; on a CPU in a fresh process, in which the C library gives freed memory back at
-once.
+Measured is what tensors take; on a CPU in a fresh process, in which the C library gives freed
+memory back at once.
 """
 
 import argparse

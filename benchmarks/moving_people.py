@@ -40,8 +40,8 @@ class Motion:
     second: Figure
 
     def at(self, share: float) -> Figure:
-        """The figure at a share of the way. Each bone turns about a fixed axis of its parent; the foot that
-        is lower in both poses stays in its place, the lowest vertex on the ground."""
+        """The figure at a share of the way. Each bone turns about a fixed axis of its parent; the
+        foot that is lower in both poses stays in its place, the lowest vertex on the ground."""
         body, first = self.body, self.first
         start, end = (self._local(figure.transforms[:, :, :3]) for figure in (first, self.second))
         rotations = (start * Rotation.from_rotvec(share * (start.inv() * end).as_rotvec())).as_matrix()
@@ -69,8 +69,9 @@ class Motion:
 
 
 def generate_moving(seed: int, index: int, instants: int, active: bool = False) -> Person:
-    """Person ``index`` of the family ``seed`` at all instants: parts and bodies of one instant after another.
-    Arguments as of :func:`ghgs_people.figures.generate`; the frame is that of the first instant."""
+    """Person ``index`` of the family ``seed`` at all instants: parts and bodies of one instant
+    after another. Arguments as of :func:`ghgs_people.figures.generate`; the frame is that of the
+    first instant."""
     person = Character(seed, index, active)
     first = person.first
     for _ in range(MAX_POSES):  # until the arms do not cut the trunk on the way
@@ -88,8 +89,8 @@ def generate_moving(seed: int, index: int, instants: int, active: bool = False) 
 
 
 class MovingPerson(Reader):
-    """Photographs of a built-in person at all instants, each a subject ``<person>_t<number>``. ``surfaces``:
-    points [n, 3] of the surface, the same at all instants."""
+    """Photographs of a built-in person at all instants, each a subject ``<person>_t<number>``.
+    ``surfaces``: points [n, 3] of the surface, the same at all instants."""
 
     def __init__(self, person: str, instants: int, rig: Rig, settings: RenderOptions, seed: int = 0) -> None:
         super().__init__()

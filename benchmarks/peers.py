@@ -1,10 +1,10 @@
 """Two other rasterizers for CPUs, with which the project's rasterizer is compared.
 
-``box``: the method of today's CPU tools. Every splat, in depth order, loops over the pixels of its 3-sigma
-box; compiled by Numba with all optimisations, one thread, colours only, forward and hand-written backward.
-``torch``: tiles of 16 x 16 pixels in plain PyTorch, splats in chunks of 64; a tile ends early when all of
-its pixels are opaque; gradients by autograd. Results depend on the sizes of tile and chunk, so these are
-fixed.
+``box``: the method of today's CPU tools. Every splat, in depth order, loops over the pixels of its
+3-sigma box; compiled by Numba with all optimisations, one thread, colours only, forward and
+hand-written backward. ``torch``: tiles of 16 x 16 pixels in plain PyTorch, splats in chunks of 64;
+a tile ends early when all of its pixels are opaque; gradients by autograd. Results depend on the
+sizes of tile and chunk, so these are fixed.
 
 Both use the reference's projection (plain PyTorch, differentiable) in float32.
 """
@@ -24,7 +24,8 @@ TILE, CHUNK = 16, 64
 
 
 def _project(gaussians: Gaussians, camera: Cameras) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Centres [n, 2], inverse covariances (xx, xy, yy), opacities and colours, front to back; radii."""
+    """Centres [n, 2], inverse covariances (xx, xy, yy), opacities and colours, front to back;
+    radii."""
     index = reference.visible(gaussians, camera, _SETTINGS, 0.01, 1e10)
     splats = reference.project(gaussians.select(index, (len(index),)), camera, _SETTINGS)
     xx, xy, yy = splats.covariances.unbind(-1)
@@ -75,7 +76,8 @@ def _box_backward(
     centers, inverse, opacities, colors, radii, transmittance, last, upstream, behind, d_centers, d_inverse,
     d_opacities, d_colors,
 ):  # fmt: skip
-    """Back to front; ``behind`` [h, w] is the gradient times the weighted colours behind a splat."""
+    """Back to front; ``behind`` [h, w] is the gradient times the weighted colours
+    behind a splat."""
     height, width = transmittance.shape
     for n in range(len(centers) - 1, -1, -1):
         u, v, radius, opacity = centers[n, 0], centers[n, 1], radii[n], opacities[n]

@@ -8,11 +8,11 @@ Each line of ``planted_defects.json`` is a defect:
 - ``what`` is wrong;
 - ``at``: the end of the dotted name of a function, method, class or constant, as long as one has it
   (``rig.known_as``), so that files and packages may move;
-- ``change``: one expression or statement of its code and what replaces it, as ``A - B → B - A``. Both are
-  Python; ``A`` to ``D`` stand for any expression. Code is compared as a syntax tree, so that line breaks and
-  formatting do not matter;
-- ``test``: the end of the dotted name of a test (``test_rig.test_gains_are_bounded``, with the id of one case
-  in brackets) or of a file of tests. It must fail with the defect and pass without.
+- ``change``: one expression or statement of its code and what replaces it, as ``A - B → B - A``.
+  Both are Python; ``A`` to ``D`` stand for any expression. Code is compared as a syntax tree, so
+  that line breaks and formatting do not matter;
+- ``test``: the end of the dotted name of a test (``test_rig.test_gains_are_bounded``, with the id
+  of one case in brackets) or of a file of tests. It must fail with the defect and pass without.
 
 Prints what catches each and the score; exit code 1 where a defect is not caught.
 """
@@ -36,7 +36,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LIST = Path(__file__).with_suffix(".json")
-#: Copied. Caches of kernels are, too: they are stamped with their sources, and compiling takes a minute.
+#: Copied. Caches of kernels are, too: they are stamped with their sources,
+#: and compiling takes a minute.
 COPIED = ("ghgs_*", "hydra_plugins", "conf", "tests", "benchmarks", "scripts", "examples", "pyproject.toml")
 #: What tests take seconds to import, and is not ours.
 LOADED = ("pytest", "torch", "lightning.pytorch", "kornia", "hydra", "pandas", "scipy.spatial", "trimesh")
@@ -47,7 +48,8 @@ TESTS = "tests/**/test_*.py"
 
 
 def definitions(body: list[ast.stmt], prefix: str = "") -> Iterator[tuple[str, ast.stmt]]:
-    """Names and nodes of functions, classes, methods and constants of a module's or a class's body."""
+    """Names and nodes of functions, classes,
+    methods and constants of a module's or a class's body."""
     for node in body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             yield prefix + node.name, node
@@ -167,7 +169,8 @@ def defects() -> list[Defect]:
 
 
 class _Failures:
-    """A plugin of pytest that notes the ids of tests that fail, and of files that cannot be read."""
+    """A plugin of pytest that notes the ids of tests that fail,
+    and of files that cannot be read."""
 
     def __init__(self):
         self.ids: list[str] = []
@@ -189,7 +192,8 @@ def _run_tests(copied: Path, tests: list[str], results: Connection) -> None:
 
 
 def failing_tests(copied: Path, tests: list[str]) -> list[str]:
-    """Ids of the tests that fail in a copy, up to the first; a file that cannot be read is one, too.
+    """Ids of the tests that fail in a copy, up to the first;
+    a file that cannot be read is one, too.
 
     A process of its own runs them, forked from one that has loaded the packages that ours needs.
     """

@@ -108,7 +108,8 @@ def _summary(found: list[tuple[float, float]]) -> dict:
 
 
 def repeats(count: int, quick: bool) -> dict[str, int]:
-    """Number of runs of each contender; none of plain PyTorch for 200 000 splats: it takes minutes."""
+    """Number of runs of each contender; none of plain PyTorch for 200 000 splats:
+    it takes minutes."""
     slow = 0 if count > 50_000 else 1 if quick else 3
     return {"ours": 12 if quick else 40, "box": 5 if quick else 12, "torch": slow}
 

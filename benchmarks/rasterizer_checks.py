@@ -37,7 +37,8 @@ print(time.perf_counter() - start)
 
 
 def first_use() -> tuple[float, float]:
-    """Seconds of the first forward and backward pass of a new process: without a cache, and with it."""
+    """Seconds of the first forward and backward pass of a new process: without a cache,
+    and with it."""
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
         command = [sys.executable, "-c", _FIRST_USE]
@@ -46,7 +47,8 @@ def first_use() -> tuple[float, float]:
 
 
 def errors(gaussians: Gaussians, cameras: Cameras) -> dict[str, float]:
-    """Relative L2 errors of the CPU backend against the reference in float64, without ambiguous pixels."""
+    """Relative L2 errors of the CPU backend against the reference in float64,
+    without ambiguous pixels."""
     gaussians = gaussians.detach()
     unsure = ambiguous(gaussians, cameras, RasterSettings())
     generator = torch.Generator().manual_seed(1)
@@ -118,7 +120,8 @@ def _sample(part: TexturedMesh, areas: np.ndarray, count: int, generator) -> tup
 
 @torch.no_grad()
 def pictures(folder: Path, backends: dict[str, Callable[[Gaussians, Cameras], Tensor]]) -> Path:
-    """A person drawn by every backend (images [3, h, w]), and below each its difference from the reference.
+    """A person drawn by every backend (images [3, h, w]),
+    and below each its difference from the reference.
 
     The reference is drawn in float64; differences are magnified ``AMPLIFIED`` times.
     """

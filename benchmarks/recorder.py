@@ -10,7 +10,8 @@ from ghgs_lit.runtime.allocation import forget_peak, resident_bytes, return_free
 
 @dataclass
 class Stage:
-    """Time, memory and work of one stage; GB are in addition to what the process held before all stages."""
+    """Time, memory and work of one stage; GB are in addition to what the process held before
+    all stages."""
 
     name: str
     seconds: float
@@ -31,7 +32,8 @@ def memory_gb(field: str) -> float:
 
 
 class Recorder:
-    """Times stages and reads their peak memory; ``base`` is what the process holds at construction."""
+    """Times stages and reads their peak memory;
+    ``base`` is what the process holds at construction."""
 
     def __init__(self) -> None:
         return_free_memory()

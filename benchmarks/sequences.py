@@ -3,11 +3,11 @@
     python benchmarks/sequences.py [data.size=252] [--every 12] [--people p2000015,a2000001]
 
 Renders eight frozen sequences (minutes), of people that no training reaches; the target is half-way
-between two of four inputs. Prints for each person, and on average, PSNR (whole and in the box), flicker along
-the motion of the surface, on average and between the worst two instants, and at fixed pixels of the box (in
-thousandths of white), tOF (by how many pixels of the box optical flow differs from that of the photographs;
-Chu et al. 2020, TecoGAN; OpenCV's Farneback), and seconds of an instant with its render. A black render has
-the flicker and the flow of the photographs themselves.
+between two of four inputs. Prints for each person, and on average, PSNR (whole and in the box),
+flicker along the motion of the surface, on average and between the worst two instants, and at fixed
+pixels of the box (in thousandths of white), tOF (by how many pixels of the box optical flow differs
+from that of the photographs; Chu et al. 2020, TecoGAN; OpenCV's Farneback), and seconds of an
+instant with its render. A black render has the flicker and the flow of the photographs themselves.
 """
 
 import argparse
@@ -36,7 +36,8 @@ from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs import results
 from ghgs_lit.types import Batch, Cameras, Prediction
 
-#: What is frozen, with the people's own motion, the default rig and lights: people, and instants of each.
+#: What is frozen, with the people's own motion, the default rig and lights: people,
+#: and instants of each.
 PEOPLE = "p2000003,p2000006,p2000012,p2000015,a2000001,a2000006,a2000011,a2000016"
 INSTANTS = 24
 _DATA = (
@@ -118,7 +119,8 @@ def measured(
 def surface(
     reader: MovingPerson, sample: SampleSpec, errors: Tensor, cameras: Cameras
 ) -> tuple[Tensor, Tensor, Tensor, Cameras]:
-    """Errors [t, 3, h, w] of an instant, points of the surface, true depths [t, h, w] and cameras."""
+    """Errors [t, 3, h, w] of an instant, points of the surface,
+    true depths [t, h, w] and cameras."""
     views = (reader.read_view(sample.subject, *photo, depth=True) for photo in sample.targets)
     depths = np.stack([view.depth for view in views])
     return errors, errors.new_tensor(reader.surfaces[sample.subject]), errors.new_tensor(depths), cameras

@@ -2,11 +2,11 @@
 
     python benchmarks/table_power.py [number of tables]
 
-A value is the sum of its row's mean, a chance of its seed and of its subject that rows share, and a chance of
-the row's own with each seed (``deviations``), each subject and both. ``pairs``: each pair of rows alone,
-corrected over three metrics as if all were tested; ``pooled``: as ``ghgs table`` does; ``plain``: the same
-without room for a reference that varies more than others. False stars are counted where seeds decide, which
-is the worst for a pooled variance.
+A value is the sum of its row's mean, a chance of its seed and of its subject that rows share, and a
+chance of the row's own with each seed (``deviations``), each subject and both. ``pairs``: each pair
+of rows alone, corrected over three metrics as if all were tested; ``pooled``: as ``ghgs table``
+does; ``plain``: the same without room for a reference that varies more than others. False stars are
+counted where seeds decide, which is the worst for a pooled variance.
 """
 
 import sys
@@ -51,7 +51,8 @@ def draw(
 
 
 def marked(rows: Sequence[pd.DataFrame], way: str) -> tuple[list[bool], float]:
-    """Whether each row but the first is marked against it, and the mean of the smallest differences."""
+    """Whether each row but the first is marked against it,
+    and the mean of the smallest differences."""
     shared = None if way == "pairs" else pool(rows)
     if way == "plain":
         shared = replace(shared, rows=2)
@@ -71,7 +72,8 @@ def tables(
     people: float = DEVIATION,
     start: int = 0,
 ) -> tuple[np.ndarray, float]:
-    """Marks of ``trials`` tables [trials, rows - 1], and the root mean square of their smallest differences.
+    """Marks of ``trials`` tables [trials, rows - 1],
+    and the root mean square of their smallest differences.
 
     Args:
         means: Of the rows, dB; the first is the reference.
@@ -91,7 +93,8 @@ def tables(
 
 
 def main(trials: int = 100) -> None:
-    """Print tables with a star without a difference, stars by difference, and the smallest difference."""
+    """Print tables with a star without a difference, stars by difference,
+    and the smallest difference."""
     started = time.perf_counter()
     print(f"| tables with a false star | rows | seeds | {' | '.join(WAYS)} |\n|{'---|' * 6}")
     for name, ratios in (("alike", (1,)), ("reference twice", (2, 1)), ("reference and another", (2, 2, 1))):

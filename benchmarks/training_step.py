@@ -3,9 +3,10 @@
     python benchmarks/training_step.py experiment=scans data.root=/data/scans
     python benchmarks/training_step.py --packages ../before . -- experiment=scans data.root=/data/scans
 
-The arguments are overrides of ``ghgs train``. Each round trains ``--steps`` steps with each package in a
-process of its own; as many before them, which compile and fill caches, do not count. The table has the
-medians of the rounds, and the loss of the last step, which versions that compute the same share.
+The arguments are overrides of ``ghgs train``. Each round trains ``--steps`` steps with each
+package in a process of its own; as many before them, which compile and fill caches, do not count.
+The table has the medians of the rounds, and the loss of the last step, which versions that compute
+the same share.
 """
 
 import argparse

@@ -1,7 +1,7 @@
 """A user's own photographs and calibration become files, pages and weights for one's rig.
 
-A plug-in of :mod:`ghgs_lit` by the door that a user's own has: it offers the verbs for photographs, and the
-instants of a sequence as a data set.
+A plug-in of :mod:`ghgs_lit` by the door that a user's own has: it offers the verbs for photographs,
+and the instants of a sequence as a data set.
 """
 
 from importlib import import_module

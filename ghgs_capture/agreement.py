@@ -1,7 +1,8 @@
 """Do the masks of one instant agree? Each is tested by leaving its view out.
 
-A grid of points around the subject is looked up in every mask. A pixel can show the subject only where its
-ray passes a point inside the other masks: the hull of the others (visual hull; Laurentini, PAMI 1994).
+A grid of points around the subject is looked up in every mask. A pixel can show the subject only
+where its ray passes a point inside the other masks: the hull of the others (visual hull;
+Laurentini, PAMI 1994).
 """
 
 from dataclasses import dataclass
@@ -18,7 +19,8 @@ from ghgs_lit.geometry.masks import signed_distance
 _POINTS = 56  #: Points of the grid along each axis
 _LARGER = 1.4  #: Side of the grid, in heights of the subject
 _NOWHERE = -99.0  #: Depth in the others' masks where a ray passes no point
-#: Share of a mask that its hull may lack, and that a mask may take from another's hull, before it fails.
+#: Share of a mask that its hull may lack, and that a mask may take from another's hull,
+#: before it fails.
 MISSED = 0.01
 
 
@@ -36,8 +38,8 @@ class Agreement:
     """How deep points of a grid lie in the masks of an instant."""
 
     photographs: tuple[Photograph, ...]
-    #: [V, n] pixels inside the mask of each view, below 0 outside; beyond a photograph that cuts its subject
-    #: 0, which says nothing
+    #: [V, n] pixels inside the mask of each view, below 0 outside; beyond a photograph that cuts
+    #: its subject 0, which says nothing
     depths: Float[np.ndarray, "V n"]
     #: [V, n] cell of each point in each view, -1 beyond the photograph
     cells: Float[np.ndarray, "V n"]
@@ -124,7 +126,8 @@ class Agreement:
 
     @property
     def failed(self) -> Bool[np.ndarray, " V"]:
-        """Which masks fail: they are outside the others' hull, or take from it what another needs."""
+        """Which masks fail: they are outside the others' hull,
+        or take from it what another needs."""
         return (np.array(self.misses) > MISSED) | (np.array(self.takes) > MISSED)
 
 

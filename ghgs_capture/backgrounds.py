@@ -1,9 +1,10 @@
 """Backgrounds of cameras that stand still, and masks of a sequence that are mended by them.
 
-Such a camera shows the same background in every instant, and at each pixel some instants show it without the
-subject. A mask is tested by leaving its view out (:mod:`ghgs_capture.agreement`); those that pass stay as
-they are. Others are cut anew from what differs from the background, from colours, and from the hull of the
-other masks. Large parts that change are taken over; outlines stay: finding them is the work of mattes."""
+Such a camera shows the same background in every instant, and at each pixel some instants show it
+without the subject. A mask is tested by leaving its view out (:mod:`ghgs_capture.agreement`); those
+that pass stay as they are. Others are cut anew from what differs from the background, from colours,
+and from the hull of the other masks. Large parts that change are taken over; outlines stay: finding
+them is the work of mattes."""
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -37,17 +38,17 @@ _BINS = 16  #: Levels of a channel that a histogram of colours counts together
 #: Correlation of brightness above which a part shows the background: a grey shirt is no grey wall.
 _ALIKE = 0.9
 _UNLIKE = -1.0  #: Mean odds of colours below which a part is not the subject's
-# Energies of a pixel, in those of a pixel of the background: what the background says at least and at most;
-# what colours do where it is not known; the given mask; a place inside and outside of the others' hull, and
-# outside of two of them.
+# Energies of a pixel, in those of a pixel of the background: what the background says at least and
+# at most; what colours do where it is not known; the given mask; a place inside and outside of the
+# others' hull, and outside of two of them.
 _FROM_BACKGROUND = (-4.0, 6.0)
 _FROM_COLORS = 3.0
 _FROM_MASK = 1.0
 _IN_HULL = 1.0
 _OUT_OF_HULL = 2.0
 _OUT_OF_TWO = 4.0
-#: Cost of different labels of neighbours of one colour, and the share of it that remains at an edge of
-#: several times ``_CONTRAST`` levels.
+#: Cost of different labels of neighbours of one colour, and the share of it that remains at an edge
+#: of several times ``_CONTRAST`` levels.
 _TOGETHER = 6.0
 _AT_EDGE = 0.1
 _CONTRAST = 10.0
@@ -104,8 +105,8 @@ class _Background:
 
         Args:
             photograph: of this camera, of the background's size.
-            inside: pixels by which each pixel lies inside the hull of the other masks [h, w]; None: there
-                are no others.
+            inside: pixels by which each pixel lies inside the hull of the other masks [h, w]; None:
+                there are no others.
             most: the same of the others but one.
 
         Returns:
@@ -153,7 +154,8 @@ class _Background:
         return self.odds[tuple(np.moveaxis(image // (256 // _BINS), -1, 0))]
 
     def _costs(self, photograph: Photograph, box: tuple[slice, slice]) -> list[np.ndarray]:
-        """Costs of pairs of neighbours, less where the photograph has an edge that the background lacks."""
+        """Costs of pairs of neighbours, less where the photograph has an edge that the
+        background lacks."""
         image, behind, known = photograph.image[box], self.image[box], self.known[box]
         costs = []
         for step in NEIGHBOURS:
@@ -257,7 +259,8 @@ class Backgrounds:
             captures: the instants, of cameras that stand still.
 
         Returns:
-            The backgrounds of cameras with ``_MIN_BACKGROUND`` photographs or more, all of one size.
+            The backgrounds of cameras with ``_MIN_BACKGROUND`` photographs or more,
+            all of one size.
         """
         extents: dict[str, list[int]] = {}
         for photograph in itertools.chain.from_iterable(capture.photographs for capture in captures):

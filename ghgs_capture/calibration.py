@@ -1,6 +1,7 @@
 """Calibrations as files store them, and their meaning in the conventions of :mod:`ghgs_lit.types`.
 
-Few files say whether poses map the world to the camera, and with which axes: the format tells, or the user.
+Few files say whether poses map the world to the camera, and with which axes: the format tells,
+or the user.
 """
 
 import math
@@ -26,7 +27,8 @@ _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 # Video is coded in blocks of 16 pixels: a sensor's 1088 are 1080 in the pictures of some programs.
 _CODED = 1088
 _SHOWN = 1080
-# Distance from the origin beyond which a rotation's seventh digit moves a centre by more than 0.1 mm.
+# Distance from the origin beyond which a rotation's seventh digit moves a centre by
+# more than 0.1 mm.
 _FAR = 1e3
 # Pixels by which a side may differ from the calibration's ratio of sides: rounding of a resize.
 _ROUNDING = 1.5
@@ -39,9 +41,10 @@ class Convention:
     Attributes:
         extrinsics: what the poses map: ``world_to_camera`` | ``camera_to_world``.
         axes: of the camera: ``opencv`` (y down, z forward) | ``opengl`` (y up, z backward).
-        intrinsics: ``pixels``, or shares of width and height: ``normalized`` (all) | ``normalized_principal``
-            (the principal point alone).
-        pixel_centers: the first pixel's centre lies at 0.5 (``half``) or at 0 (``integer``, as OpenCV's).
+        intrinsics: ``pixels``, or shares of width and height: ``normalized`` (all) |
+            ``normalized_principal`` (the principal point alone).
+        pixel_centers: the first pixel's centre lies at 0.5 (``half``) or at 0
+            (``integer``, as OpenCV's).
         resized: factor of a resize after the calibration, beyond the sizes that the file says.
         unit: metres of one unit of length."""
 
@@ -75,7 +78,8 @@ class Convention:
 
 @dataclass(frozen=True)
 class PartialIntrinsics:
-    """What a file says of intrinsics that depend on the photograph's size, for x and y; None: nothing."""
+    """What a file says of intrinsics that depend on the photograph's size, for x and y;
+    None: nothing."""
 
     focal: tuple[float | None, float | None]  #: in pixels
     middle: tuple[float | None, float | None]  #: principal point in pixels; None: the photograph's middle
@@ -87,7 +91,8 @@ class PartialIntrinsics:
         return self.focal != (None, None) and None not in self.middle
 
     def intrinsics(self, size: tuple[int, int]) -> np.ndarray:
-        """Complete the intrinsics for one photograph; pixels are square where the file has one focal length.
+        """Complete the intrinsics for one photograph;
+        pixels are square where the file has one focal length.
 
         Args:
             size: (height, width) of the photograph in pixels.
@@ -114,11 +119,12 @@ class StoredCamera:
         intrinsics: [3, 3] float64.
         pose: [4, 4] float64, a rotation and a translation.
         size: (height, width) in pixels of the calibrated images, where the file says it.
-        distortion: 0 to 14 numbers: OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty; with ``fisheye`` k1
-            to k4 of Kannala and Brandt's model.
+        distortion: 0 to 14 numbers: OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty; with
+            ``fisheye`` k1 to k4 of Kannala and Brandt's model.
         mask: the photograph's mask, where the file names it.
         gains: [3], of red, green and blue relative to other cameras, where the file says them.
-        lens: in place of ``intrinsics`` where they depend on the photograph's size and the file has none.
+        lens: in place of ``intrinsics`` where they depend on the photograph's size and the
+            file has none.
         unread: keys of the camera in the file that are not read."""
 
     name: str
@@ -246,8 +252,9 @@ def extrinsics_of(pose: np.ndarray, convention: Convention) -> np.ndarray:
 
 
 def _rigid(pose: np.ndarray) -> np.ndarray:
-    """The pose with the nearest rotation and the same camera centre: a rotation of seven digits is not
-    orthogonal enough, and 100 km from the origin the transpose puts the centre a centimetre off."""
+    """The pose with the nearest rotation and the same camera centre: a rotation of seven digits
+    is not orthogonal enough, and 100 km from the origin the transpose puts the centre a
+    centimetre off."""
     u, _, v = np.linalg.svd(pose[:3, :3])
     rigid = pose.copy()
     rigid[:3, :3] = u @ v

@@ -1,5 +1,5 @@
-"""Report on the cameras of a capture: other meanings of their numbers (:class:`Hypothesis`), ranked by how
-well masks and cameras agree (:mod:`ghgs_lit.geometry.silhouettes`)."""
+"""Report on the cameras of a capture: other meanings of their numbers (:class:`Hypothesis`), ranked
+by how well masks and cameras agree (:mod:`ghgs_lit.geometry.silhouettes`)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +18,8 @@ from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, subject_sphere
 #: Least agreement of every view of a right calibration, and by how much a better meaning must win.
 AGREES = 0.9
 BETTER = 0.05
-#: Agreement below which a view is sought that disagrees, and how much of the disagreement it may leave.
+#: Agreement below which a view is sought that disagrees,
+#: and how much of the disagreement it may leave.
 _SOUND = 0.97
 _REST = 1 / 3
 _SAME = 0.01  # Difference of agreement that tells nothing
@@ -149,7 +150,8 @@ def _size_line(size: float) -> str:
 
 
 def _unexplained(folder: CaptureFolder, given: Hypothesis, tried: list[Hypothesis]) -> Diagnosis:
-    """The diagnosis where no meaning fits: the view without which the others agree, if there is one."""
+    """The diagnosis where no meaning fits: the view without which the others agree,
+    if there is one."""
     base = max((h for h in tried if not h.blames), key=lambda h: h.score)
     base = base if base.score > given.score + BETTER else given
     suspects, *lines = _suspected(base, folder)
@@ -160,10 +162,11 @@ def _unexplained(folder: CaptureFolder, given: Hypothesis, tried: list[Hypothesi
 
 
 def _suspected(hypothesis: Hypothesis, folder: CaptureFolder) -> tuple[Any, ...]:
-    """The views that explain by themselves most of the disagreement, and a line about them; () if none does.
+    """The views that explain by themselves most of the disagreement, and a line about them;
+    () if none does.
 
-    A mask that lacks a part lies in the hull of the others, and theirs do not lie in that with it: what is
-    compared are the others with and without it."""
+    A mask that lacks a part lies in the hull of the others, and theirs do not lie in that with it:
+    what is compared are the others with and without it."""
     least = max(AGREES, 1 - (1 - hypothesis.score) * _REST)
     without = {}
     for left_out in hypothesis.views if len(hypothesis.views) > 2 else ():
@@ -187,8 +190,9 @@ def _suspected(hypothesis: Hypothesis, folder: CaptureFolder) -> tuple[Any, ...]
 
 
 def _edges(hypothesis: Hypothesis, names: tuple[str, str], folder: CaptureFolder) -> dict[str, float]:
-    """Contrast of two photographs, of which one's mask has a part that the other's lacks, at that part of the
-    mask's outline, compared with the rest of it: the wrong mask's outline follows no edge there."""
+    """Contrast of two photographs, of which one's mask has a part that the other's lacks, at that
+    part of the mask's outline, compared with the rest of it: the wrong mask's outline follows no
+    edge there."""
     from scipy import ndimage  # here: it takes time to import
 
     photographs = hypothesis.photographs(folder)
@@ -219,7 +223,8 @@ def _edges(hypothesis: Hypothesis, names: tuple[str, str], folder: CaptureFolder
 
 
 def _reading(hypothesis: Hypothesis, name: str) -> str:
-    """What may be wrong with a view, by whether its own mask or those of the others lie outside a hull."""
+    """What may be wrong with a view, by whether its own mask or those of the others lie
+    outside a hull."""
     own = 1 - hypothesis.shares[name]
     others = 1 - min(share for other, share in hypothesis.shares.items() if other != name)
     if own <= _REST * others:

@@ -78,8 +78,8 @@ def shrunk(photograph: Photograph, factor: int) -> Photograph:
 
     Args:
         photograph: of ``factor`` pixels a side or more.
-        factor: pixels of the photograph along a side of each new one; what is left over at its right and its
-            bottom is cut off.
+        factor: pixels of the photograph along a side of each new one; what is left over at its
+            right and its bottom is cut off.
 
     Returns:
         The smaller photograph with its camera.

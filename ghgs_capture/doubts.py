@@ -65,7 +65,8 @@ def doubt_of_cameras(capture: Capture, batch: Batch) -> str:
 
 
 def _outline(photograph: Photograph, size: tuple[int, int]) -> float:
-    """Pixels of the crop inside the mask's outline at which the photograph has the most contrast."""
+    """Pixels of the crop inside the mask's outline at which the photograph has the
+    most contrast."""
     extents = photograph.extents
     steps = [(end - start) / (SHARE * side) for (start, end), side in zip(extents, size, strict=True)]
     step = max(*steps, 1)
@@ -86,7 +87,8 @@ def _outline(photograph: Photograph, size: tuple[int, int]) -> float:
     lines = np.floor(distance[near]).astype(int) + _REACH
     count = np.maximum(np.bincount(lines, minlength=2 * _REACH), 1)
     contrast = np.bincount(lines, np.abs(across).sum(-1), 2 * _REACH) / count
-    # The lines of pixels on either side of an edge, and those beside them, give fractions of a pixel.
+    # The lines of pixels on either side of an edge, and those beside them,
+    # give fractions of a pixel.
     first = int((contrast[1:-2] + contrast[2:-1]).argmax())
     around = contrast[first : first + 4]
     middle = (around * np.arange(4)).sum() / max(around.sum(), 1e-6)

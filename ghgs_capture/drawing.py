@@ -63,7 +63,8 @@ def _smaller(view: Silhouette) -> Silhouette:
 
 
 def _extremes(mask: np.ndarray) -> np.ndarray:
-    """Pixels [5, 2] (column, row): the mask's top, bottom, left and right ones, and one in its middle."""
+    """Pixels [5, 2] (column, row): the mask's top, bottom, left and right ones,
+    and one in its middle."""
     pixels = np.argwhere(mask)[:, ::-1]
     middle = np.abs(pixels - np.median(pixels, 0)).sum(1).argmin()
     ends = [pixels[:, 1].argmin(), pixels[:, 1].argmax(), pixels[:, 0].argmin(), pixels[:, 0].argmax()]

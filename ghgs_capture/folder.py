@@ -98,7 +98,8 @@ class CaptureFolder:
 
     @functools.cached_property
     def _listing(self) -> tuple[dict[str, dict[str, Source]], str]:
-        """``{instant: {camera: path or frame}}`` of all instants, and a line about frames left over."""
+        """``{instant: {camera: path or frame}}`` of all instants,
+        and a line about frames left over."""
         folder = self.images
         cameras = self.file.cameras
         part = self._sequence
@@ -127,7 +128,8 @@ class CaptureFolder:
 
     @functools.cached_property
     def missing(self) -> dict[str, dict[str, str]]:
-        """``{instant: {camera: why}}`` of photographs that are missing, or could not be read so far."""
+        """``{instant: {camera: why}}`` of photographs that are missing,
+        or could not be read so far."""
         cameras = dict.fromkeys(itertools.chain.from_iterable(self._listing[0].values()))
         missing = {}
         for instant, paths in self.paths.items():
@@ -141,7 +143,8 @@ class CaptureFolder:
 
     @property
     def input_files(self) -> list[Path]:
-        """All files that may be read: photographs and what lies beside them, the calibration, masks."""
+        """All files that may be read: photographs and what lies beside them, the calibration,
+        masks."""
         folders = set()
         for paths in self.paths.values():
             folders |= {path.parent if isinstance(path, Path) else self.images for path in paths.values()}
@@ -188,7 +191,8 @@ class CaptureFolder:
         return self._complete(instant, {name: view.result for name, view in self._begun[instant].items()})
 
     def _complete(self, instant: str, views: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
-        """The values of all views; in a sequence, without those that fail where the others are enough."""
+        """The values of all views; in a sequence,
+        without those that fail where the others are enough."""
         values = {}
         for name, view in views.items():
             try:
@@ -325,7 +329,8 @@ _segmenter = functools.cache(segmenter)
 
 @functools.lru_cache(maxsize=16)
 def _grid(intrinsics: tuple, distortion: tuple, fisheye: bool, height: int, width: int) -> "torch.Tensor":
-    """The grid of :func:`ghgs_lit.geometry.undistortion.undistorting_grid`, kept for further instants.
+    """The grid of :func:`ghgs_lit.geometry.undistortion.undistorting_grid`,
+    kept for further instants.
 
     Args:
         intrinsics: the nine numbers of the matrix, in pixels.

@@ -31,7 +31,8 @@ _DIGITS = 6
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A decoded photograph [h, w, 3] uint8 RGB, and its source; ``mask`` as for :class:`VideoFrame`."""
+    """A decoded photograph [h, w, 3] uint8 RGB, and its source;
+    ``mask`` as for :class:`VideoFrame`."""
 
     origin: str
     image: np.ndarray
@@ -47,7 +48,8 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class VideoFrame:
-    """A photograph, or a mask, that is a frame of a video; ``mask``: that of the photograph, where known."""
+    """A photograph, or a mask, that is a frame of a video;
+    ``mask``: that of the photograph, where known."""
 
     video: Reader
     number: int
@@ -180,7 +182,8 @@ def _by_number(videos: Mapping[str, Video], offsets: Mapping[str, Any]) -> dict[
 
 
 def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) -> dict[int, dict[str, int]]:
-    """The frame of each camera nearest to each of the first camera's, within half of its frame time."""
+    """The frame of each camera nearest to each of the first camera's,
+    within half of its frame time."""
     import pandas as pd  # here: it takes time to import
 
     columns = {"camera": str, "frame": int, "seconds": float}

@@ -1,5 +1,5 @@
-"""Other meanings of the numbers of a calibration (:class:`Hypothesis`), and how well masks agree with them
-(:mod:`ghgs_lit.geometry.silhouettes`)."""
+"""Other meanings of the numbers of a calibration (:class:`Hypothesis`), and how well masks agree
+with them (:mod:`ghgs_lit.geometry.silhouettes`)."""
 
 import itertools
 from collections.abc import Iterator
@@ -46,7 +46,8 @@ class Hypothesis:
         return min(self.shares.values())
 
     def photographs(self, folder: CaptureFolder) -> list[Photograph]:
-        """The small photographs without lens distortion, upright, with their cameras in this meaning.
+        """The small photographs without lens distortion, upright,
+        with their cameras in this meaning.
 
         Args:
             folder: where the views come from; it knows how photographs are turned.
@@ -135,7 +136,8 @@ def for_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
 
 
 def _plausible(view: StoredView) -> bool:
-    """Whether the principal point of a view lies in the middle part of its photograph (``_MIDDLE``)."""
+    """Whether the principal point of a view lies in the middle part of its photograph
+    (``_MIDDLE``)."""
     share = view.camera.intrinsics[:2, 2] * view.convention.resized
     if view.convention.intrinsics == "pixels":
         share = share / np.array(view.camera.size)[::-1]

@@ -1,7 +1,8 @@
-"""The instants of a sequence as data to learn from: of its cameras all but one are inputs, one is the target.
+"""The instants of a sequence as data to learn from: of its cameras all but one are inputs,
+one is the target.
 
-Each camera is the target in turn. Masks and cameras are those that a prediction of the sequence would have;
-instants with a mask that still fails are left out."""
+Each camera is the target in turn. Masks and cameras are those that a prediction of the sequence
+would have; instants with a mask that still fails are left out."""
 
 import functools
 from collections import ChainMap
@@ -86,8 +87,8 @@ def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 class InstantReader(Reader):
     """Instants, and training people beside them.
 
-    In validation each camera of an instant is the target once: a subject ``<instant>/<camera>`` has it at its
-    last position.
+    In validation each camera of an instant is the target once: a subject ``<instant>/<camera>`` has
+    it at its last position.
 
     Args:
         folder: of the instants.
@@ -148,7 +149,8 @@ def _stored(path: Path) -> dict[str, np.ndarray]:
 
 
 class Instants(DataOptions):
-    """The instants of a capture that ``ghgs adapt`` learns from, each camera in turn the others' target."""
+    """The instants of a capture that ``ghgs adapt`` learns from,
+    each camera in turn the others' target."""
 
     static_cameras: ClassVar[bool] = True
     name: Text = "instants"

@@ -1,4 +1,5 @@
-"""Live captures: instants of a folder that is being written, videos at their own rate, or cameras."""
+"""Live captures: instants of a folder that is being written, videos at their own rate,
+or cameras."""
 
 import itertools
 import threading
@@ -122,7 +123,8 @@ def newest_frames(
 
 
 class Arrived(NamedTuple):
-    """A capture, how many were dropped since the one before, and its time of arrival by the clock."""
+    """A capture, how many were dropped since the one before,
+    and its time of arrival by the clock."""
 
     capture: Capture
     dropped: int
@@ -138,7 +140,8 @@ def live_frames(
     sleep: Callable[[float], None] = time.sleep,
     **options: Any,
 ) -> Iterator[Arrived]:
-    """The newest capture whenever one is asked for; others, and those that cannot be read, are dropped.
+    """The newest capture whenever one is asked for;
+    others, and those that cannot be read, are dropped.
 
     Args:
         images: a folder of videos, played at their own rate; or of instants, each a folder that

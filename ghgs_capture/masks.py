@@ -1,6 +1,8 @@
-"""The subject's matte in a photograph: from a file, alpha, a photograph of the background, or rembg.
+"""The subject's matte in a photograph: from a file, alpha, a photograph of the background,
+or rembg.
 
-A matte [h, w] uint8 is 255 times the share of each pixel that shows the subject; a mask has only 0 and 255.
+A matte [h, w] uint8 is 255 times the share of each pixel that shows the subject;
+a mask has only 0 and 255.
 """
 
 import os

@@ -33,7 +33,8 @@ def minimum_cut(
 ) -> Bool[np.ndarray, "h w"]:
     """Choose the pixels whose sum of evidence, less the costs of pairs that are cut, is greatest.
 
-    A pixel whose evidence exceeds what all of its pairs cost is decided by it, and is no node of the graph.
+    A pixel whose evidence exceeds what all of its pairs cost is decided by it,
+    and is no node of the graph.
 
     Args:
         evidence: for each pixel, above 0 for the subject; without unit.

@@ -1,5 +1,5 @@
-"""What the places of cameras tell about a capture before anything is predicted: numbers that are too coarse,
-photographs from one direction, sides that none shows, and copies of a photograph."""
+"""What the places of cameras tell about a capture before anything is predicted: numbers that are
+too coarse, photographs from one direction, sides that none shows, and copies of a photograph."""
 
 import itertools
 from collections.abc import Sequence
@@ -14,11 +14,11 @@ _SIDE = 500  #: Longer side of photographs whose pixels are told
 _COARSE = 0.25
 #: Degrees between the two most different views below which depth is a guess.
 _NARROW = 10.0
-#: Degrees around the subject between neighbouring cameras above which a side of it is seen by none; four
-#: cameras evenly around have 90.
+#: Degrees around the subject between neighbouring cameras above which a side of it is seen by none;
+#: four cameras evenly around have 90.
 _GAP = 100.0
-# Two copies of a photograph, stored with losses: least common share of their masks, and mean difference of
-# levels of 255 within them.
+# Two copies of a photograph, stored with losses: least common share of their masks, and mean
+# difference of levels of 255 within them.
 _SAME = 0.98
 _ALIKE = 2.0
 

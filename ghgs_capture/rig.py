@@ -1,7 +1,7 @@
 """Cameras of a rig that stands still, corrected once over several instants, and their colour gains.
 
-One instant shows one pose, often with a mask that is wrong somewhere; several say more about the cameras, and
-cameras that are the same in all instants do not flicker."""
+One instant shows one pose, often with a mask that is wrong somewhere; several say more about the
+cameras, and cameras that are the same in all instants do not flicker."""
 
 import itertools
 import math

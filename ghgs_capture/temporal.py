@@ -1,10 +1,10 @@
 """Prediction of a sequence: Gaussians follow the photographs and are predicted anew now and then.
 
-The Gaussians of the last instant follow the scene flow (:mod:`ghgs_lit.geometry.scene_flow`). A few gradient
-steps on the inputs' renders, with one optimiser over the instants, correct its errors and follow changes of
-light (as in Luiten et al., 3DV 2024). Every few instants Gaussians are predicted anew, and take the place of
-the last ones over some instants, so that nothing pops. Where renders no longer fit photographs or masks, they
-do so at once."""
+The Gaussians of the last instant follow the scene flow (:mod:`ghgs_lit.geometry.scene_flow`). A few
+gradient steps on the inputs' renders, with one optimiser over the instants, correct its errors and
+follow changes of light (as in Luiten et al., 3DV 2024). Every few instants Gaussians are predicted
+anew, and take the place of the last ones over some instants, so that nothing pops. Where renders no
+longer fit photographs or masks, they do so at once."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -32,7 +32,8 @@ _WORSE = 1.5  #: Times the misfit after a new prediction above which Gaussians d
 
 @dataclass(frozen=True)
 class _Last:
-    """The last instant, its photographs for the flow, and depth [1, V, 1, H, W] of the inputs' renders."""
+    """The last instant, its photographs for the flow,
+    and depth [1, V, 1, H, W] of the inputs' renders."""
 
     batch: Batch
     prediction: Prediction
@@ -42,9 +43,9 @@ class _Last:
 
 @dataclass(frozen=True)
 class _Crossing:
-    """A new prediction on its way: the ``coming`` first Gaussians of a descent are its own, the others those
-    before it; ``opacities`` [N] of all by themselves. Shares are of -log(1 - opacity), so that both together
-    let as much light through as either."""
+    """A new prediction on its way: the ``coming`` first Gaussians of a descent are its own, the
+    others those before it; ``opacities`` [N] of all by themselves. Shares are of -log(1 - opacity),
+    so that both together let as much light through as either."""
 
     coming: int
     opacities: Tensor
@@ -82,8 +83,8 @@ class _Crossing:
 class Temporal:
     """``temporal(batch)``: the prediction of each instant of a sequence in turn.
 
-    An instant that equals the last one has the same prediction, bit for bit. Where one prediction takes the
-    place of another there are Gaussians of both.
+    An instant that equals the last one has the same prediction, bit for bit. Where one prediction
+    takes the place of another there are Gaussians of both.
 
     Args:
         predict: gives the prediction of a batch of one subject, as a model does.
@@ -147,7 +148,8 @@ class Temporal:
         self._descent = Descent(self._crossing.shared(both, 0), batch, changes)
 
     def _follow(self, last: _Last, batch: Batch, levels: list[Tensor]) -> None:
-        """Move the Gaussians to the instant of ``batch``, and those of a new prediction on their way."""
+        """Move the Gaussians to the instant of ``batch``,
+        and those of a new prediction on their way."""
         crossing = self._crossing
         start = _moved(self._descent.start, last, batch, levels)
         if crossing is not None and self._age >= crossing.instants:

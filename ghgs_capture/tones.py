@@ -1,4 +1,5 @@
-"""Tone curves of single cameras (another profile, contrast or picture style): found, said and undone."""
+"""Tone curves of single cameras (another profile, contrast or picture style): found,
+said and undone."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -11,8 +12,9 @@ from ghgs_capture.crops import Photograph
 from ghgs_lit.rounds.gains import log_gammas
 from ghgs_lit.types import Batch, Gaussians
 
-#: Log gamma of all channels, beside the median camera's, above which a camera has a tone curve of its own,
-#: and how many times as large in one as in another: what light and wrong depths do differs between them.
+#: Log gamma of all channels, beside the median camera's, above which a camera has a tone curve of
+#: its own, and how many times as large in one as in another: what light and wrong depths do
+#: differs between them.
 _OWN = 0.1
 _UNLIKE = 2.0
 

@@ -131,7 +131,8 @@ class Reader:
         self.step = step
         self._lock = threading.Lock()
         self._process = None
-        # The numbers of the frame at hand and of the one before: no frame between them could be decoded.
+        # The numbers of the frame at hand and of the one before:
+        # no frame between them could be decoded.
         self._at = self._before = -1
         self._frame = np.zeros(0, np.uint8)
 

@@ -40,7 +40,8 @@ def require(condition: bool, key: str, expected: str, found: object) -> None:
 
 
 def shown(value: object) -> str:
-    """A value in a message: as Python writes it, if it can (numbers of more than 4300 digits it cannot)."""
+    """A value in a message: as Python writes it,
+    if it can (numbers of more than 4300 digits it cannot)."""
     try:
         return repr(value)
     except ValueError:

@@ -8,7 +8,8 @@ from torch import Tensor
 
 
 class Extent(NamedTuple):
-    """Number of pixels of a mask, and its bounding box (ends excluded; no meaning for an empty mask)."""
+    """Number of pixels of a mask, and its bounding box (ends excluded; no meaning for an
+    empty mask)."""
 
     count: int
     top: int

@@ -1,4 +1,5 @@
-"""Files that several processes share: atomic writes, and locks that are freed when their process ends."""
+"""Files that several processes share: atomic writes,
+and locks that are freed when their process ends."""
 
 import contextlib
 import errno
@@ -13,7 +14,8 @@ from typing import Any
 
 from ghgs_lit.errors import InputError, require
 
-# Lock files that this process holds; they are not opened again: closing a second handle would free the lock.
+# Lock files that this process holds; they are not opened again:
+# closing a second handle would free the lock.
 _HELD: set[Path] = set()
 _OWNER = b"process "  #: How the text of a lock file begins
 
@@ -116,7 +118,8 @@ def naming(folder: Path) -> Iterator[None]:
 
 
 def _refusal(path: Path) -> OSError | None:
-    """The error that the system gives when more is written to the file ``path``; None: it can be written."""
+    """The error that the system gives when more is written to the file ``path``;
+    None: it can be written."""
     try:
         with path.open("ab") as file:
             file.write(bytes(1 << 20))

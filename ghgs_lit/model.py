@@ -39,7 +39,8 @@ from ghgs_lit.weights.reading import SHIPPED
 
 
 class GHGS(nn.Module):
-    """The whole method, ``model(batch) -> Prediction``: the stages of Figure 2 of the paper, and rounds.
+    """The whole method, ``model(batch) -> Prediction``: the stages of Figure 2 of the paper,
+    and rounds.
 
     Args:
         bounds: near and far of each pixel's ray.
@@ -50,7 +51,8 @@ class GHGS(nn.Module):
         gaussian_head: tokens and points to Gaussians.
         rounds: correct the Gaussians of the Gaussian head, and need bounds; None: no rounds.
         skip: work to leave out; None: ``skip=exact``.
-        options: preparation of photographs around the stages; None: as in a configuration that says nothing.
+        options: preparation of photographs around the stages;
+            None: as in a configuration that says nothing.
 
     Raises:
         InputError: a stage needs bounds that there are none of, or the reverse.
@@ -103,7 +105,8 @@ class GHGS(nn.Module):
             batch: photographs, masks and cameras are read, and mattes and gains if there are any.
 
         Returns:
-            The prediction in the pixels of the photographs, in the unit and the axes of the cameras' world.
+            The prediction in the pixels of the photographs,
+            in the unit and the axes of the cameras' world.
 
         Raises:
             InputError: the batch does not fit the stages.
@@ -280,7 +283,8 @@ class GHGS(nn.Module):
         return maps if coarse is None else coarse.maps(batch, bounds, maps)
 
     def _coarse(self, batch: Batch) -> Coarse | None:
-        """What is found in smaller copies of photographs with subjects taller than the rounds know."""
+        """What is found in smaller copies of photographs with subjects taller than the
+        rounds know."""
         if self.rounds is None or self.rounds.height is None:
             return None
 
@@ -290,7 +294,8 @@ class GHGS(nn.Module):
         return coarse_of(batch, self.rounds.height, self.encoder.patch_size, self.options.matte, predict)
 
     def settings(self) -> Hashable:
-        """All that may be changed after a model was made and decides what it computes, but its weights."""
+        """All that may be changed after a model was made and decides what it computes,
+        but its weights."""
         settings: list[Hashable] = [self.skip.pixels, self.keeps_drafts]
         for name in (*STAGES, "rounds"):
             of_stage = getattr(getattr(self, name), "__dict__", {}).items()
@@ -310,13 +315,14 @@ class GHGS(nn.Module):
         """The model of a configuration.
 
         Args:
-            config: nodes by their names: all of :data:`ghgs_lit.stages.STAGES`, and of ``OPTIONS`` there any.
-            empty: on the meta device, to be given weights: a strange configuration then takes no memory
-                before they are compared with it.
+            config: nodes by their names: all of :data:`ghgs_lit.stages.STAGES`,
+                and of ``OPTIONS`` there any.
+            empty: on the meta device, to be given weights: a strange configuration then takes no
+                memory before they are compared with it.
 
         Raises:
-            InputError: a stage is missing, an option is unknown or out of range, or stages do not fit
-                each other.
+            InputError: a stage is missing, an option is unknown or out of range, or stages do not
+                fit each other.
         """
         for name in STAGES:
             require(name in config, name, "a stage of the model", "nothing")
@@ -349,11 +355,13 @@ class GHGS(nn.Module):
         Args:
             path: of a checkpoint of this package; by default the weights that come with it.
             map_location: the device that the model is moved to.
-            dtype: precision of the encoder; None: as in the file, where the device has it. Heads are float32.
+            dtype: precision of the encoder; None: as in the file, where the device has it.
+                Heads are float32.
 
         Raises:
             FileNotFoundError: there is no such file.
-            InputError: it is not a checkpoint of this package, or its weights are not finite or do not fit.
+            InputError: it is not a checkpoint of this package,
+                or its weights are not finite or do not fit.
         """
         model = cls.from_config(read_config(path), empty=True)
         load_weights(model, path, dtype, map_location)

@@ -1,4 +1,5 @@
-"""Readers of text files, of limited size and depth, and of arrays; every defect is an :class:`InputError`."""
+"""Readers of text files, of limited size and depth, and of arrays;
+every defect is an :class:`InputError`."""
 
 import csv
 import functools
@@ -64,12 +65,14 @@ def composed(name: str) -> str:
 
 
 def parts_of(name: str) -> list[str]:
-    """Folders and file of a path as any system writes it: with slashes or backslashes, composed or not."""
+    """Folders and file of a path as any system writes it: with slashes or backslashes,
+    composed or not."""
     return composed(name).replace("\\", "/").split("/")
 
 
 def find_path(folder: Path, name: str, suffixes: Sequence[str] = ("",)) -> Path | None:
-    """The file or folder that ``name`` means, as a file, a program or a user of any system spells it.
+    """The file or folder that ``name`` means, as a file,
+    a program or a user of any system spells it.
 
     A path that exists as it is written counts; otherwise its parts may have backslashes, letters
     composed of two characters, and upper or lower case where that leaves one path.
@@ -98,7 +101,8 @@ def find_path(folder: Path, name: str, suffixes: Sequence[str] = ("",)) -> Path 
 
 
 def _alike(folder: Path, name: str) -> Path | None:
-    """The only entry of a folder that is spelled as ``name``, or else differs by upper and lower case."""
+    """The only entry of a folder that is spelled as ``name``,
+    or else differs by upper and lower case."""
     if not folder.is_dir():
         return None
     paths = _listed(folder, folder.stat().st_mtime_ns).get(name.casefold(), [])
@@ -174,7 +178,8 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 
 
 def read_lines_of_json(path: Path) -> Iterator[dict[str, Any]]:
-    """The mappings of a JSON Lines file; lines that are no mapping, such as unfinished ones, are skipped.
+    """The mappings of a JSON Lines file; lines that are no mapping, such as unfinished ones,
+    are skipped.
 
     Raises:
         InputError: there is no such file.
@@ -224,8 +229,8 @@ def check_yaml(text: str, aliases: bool = True) -> None:
         aliases: whether aliases (``*name``) are allowed.
 
     Raises:
-        ValueError: more than :data:`DEEPEST` levels, a forbidden alias, or aliases that expand to more than a
-            million values.
+        ValueError: more than :data:`DEEPEST` levels, a forbidden alias, or aliases that expand to
+            more than a million values.
         yaml.YAMLError: no YAML.
     """
     sizes: dict[str | None, int] = {}

@@ -1,8 +1,9 @@
 """Predictions whose work is recorded on a GPU for each class of scenes, and played back.
 
-What follows a plan (:mod:`ghgs_lit.plan`) depends on sizes alone, and on a GPU these are size classes. So
-what precedes the plan, and the stages after it, are the same work for every batch of a class. Recorded once
-as CUDA graphs (:mod:`ghgs_lit.runtime.recording`), each starts at once instead of by thousands of calls."""
+What follows a plan (:mod:`ghgs_lit.plan`) depends on sizes alone, and on a GPU these are size
+classes. So what precedes the plan, and the stages after it, are the same work for every batch of a
+class. Recorded once as CUDA graphs (:mod:`ghgs_lit.runtime.recording`), each starts at once instead
+of by thousands of calls."""
 
 import dataclasses
 from collections.abc import Callable, Hashable, Sequence
@@ -42,8 +43,8 @@ class Stages(Protocol):
 
 @dataclass(frozen=True)
 class Scene:
-    """What the stages read of a batch and its plan, as inputs of a recording: tensors, and numbers of the
-    class."""
+    """What the stages read of a batch and its plan, as inputs of a recording: tensors, and numbers
+    of the class."""
 
     batch: Batch
     shown: Bool[Tensor, "B V h w"]
@@ -86,7 +87,8 @@ class Playback:
         steps: the same of training steps (:mod:`ghgs_lit.training.captured`), one for each class.
 
     Attributes:
-        sizes: those of training steps so far, by the shape of their photographs and what their encoder sees.
+        sizes: those of training steps so far,
+            by the shape of their photographs and what their encoder sees.
     """
 
     def __init__(self, recorder: Recorder | None = None, steps: Recorder | None = None):
@@ -100,7 +102,8 @@ class Playback:
         self.steps.clear()
 
     def entered(self, enter: Callable[[Batch], _Entered], batch: Batch, key: Hashable) -> _Entered:
-        """What precedes the plan, played back where no gradient is wanted; its work depends on sizes alone.
+        """What precedes the plan, played back where no gradient is wanted;
+        its work depends on sizes alone.
 
         Args:
             enter: gives layers around the stages, the batch inside of them, and findings.
@@ -127,7 +130,8 @@ class Playback:
             plan: of the batch.
 
         Returns:
-            True where its sizes are those of a class, on a device that records, and no gradient is wanted.
+            True where its sizes are those of a class, on a device that records,
+            and no gradient is wanted.
         """
         return self.repeats(batch, plan) and not torch.is_grad_enabled()
 

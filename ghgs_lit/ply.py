@@ -1,8 +1,8 @@
 """Gaussians as the PLY file that viewers of 3D Gaussian Splatting read.
 
-Positions in metres in the world frame, opacity as logit, standard deviations as logarithm, unit quaternions
-``(w, x, y, z)``, colour as the constant term of spherical harmonics. A comment in the header has the image
-constants that the Gaussians were made for; other programs ignore it."""
+Positions in metres in the world frame, opacity as logit, standard deviations as logarithm, unit
+quaternions ``(w, x, y, z)``, colour as the constant term of spherical harmonics. A comment in the
+header has the image constants that the Gaussians were made for; other programs ignore it."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -51,7 +51,8 @@ def write_ply(gaussians: Gaussians, path: str | Path) -> None:
 def ply_bytes(gaussians: Gaussians) -> bytes:
     """The content of the file that :func:`write_ply` writes.
 
-    The format is that of 3D Gaussian Splatting (Kerbl et al., SIGGRAPH 2023), whose viewers read it.
+    The format is that of 3D Gaussian Splatting (Kerbl et al., SIGGRAPH 2023),
+    whose viewers read it.
 
     Args:
         gaussians: of one subject, with RGB colours.
@@ -126,8 +127,8 @@ def _read(path: Path) -> PlyData:
 def read_ply(path: Path) -> Gaussians:
     """Read a 3DGS PLY as the Gaussians of one subject, without view-dependent colours.
 
-    A file without this package's comment is taken to be made for 3D Gaussian Splatting's own renderer: a
-    low-pass of 0.3 px^2, not antialiased.
+    A file without this package's comment is taken to be made for 3D Gaussian Splatting's own
+    renderer: a low-pass of 0.3 px^2, not antialiased.
 
     Args:
         path: of the file.

@@ -1,7 +1,7 @@
 """Interfaces of the stages of the method (paper, Figure 2), which a replacement must offer.
 
-To replace a stage, register the options of a class under a new kind (:func:`ghgs_lit.config.register`).
-Stages with weights are modules (``torch.nn.Module``)."""
+To replace a stage, register the options of a class under a new kind
+(:func:`ghgs_lit.config.register`). Stages with weights are modules (``torch.nn.Module``)."""
 
 from typing import Any, Protocol
 
@@ -54,13 +54,15 @@ class Bounds(Protocol):
 
 
 class Encoder(Protocol):
-    """Photographs to tokens; options: ``build(tokens, margin)``, which choose the patches (``conf/skip``).
+    """Photographs to tokens; options: ``build(tokens, margin)``,
+    which choose the patches (``conf/skip``).
 
     Attributes:
         dim_latent: width of a layer of the tokens.
         patch_size: side of a patch in pixels.
         bounds_input: whether bounds are read.
-        tokens: which patches have tokens; can be set later, as can ``margin``, and changes :meth:`keeps`.
+        tokens: which patches have tokens; can be set later, as can ``margin``,
+            and changes :meth:`keeps`.
         margin: patches around these that have some, too.
     """
 
@@ -113,7 +115,8 @@ class DepthHead(Protocol):
             plan: where depths are needed.
 
         Returns:
-            Depths [B, V, H, W] in metres, between the bounds if there are any, and which pixels are valid.
+            Depths [B, V, H, W] in metres, between the bounds if there are any,
+            and which pixels are valid.
         """
 
 
@@ -152,7 +155,8 @@ class Recalibration(Protocol):
 class GaussianHead(Protocol):
     """Tokens to Gaussians in two steps; options: ``build(dim_latent)``.
 
-    The first step may give any type, but rounds need :class:`ghgs_lit.heads.attributes.RawGaussians`.
+    The first step may give any type, but rounds need
+    :class:`ghgs_lit.heads.attributes.RawGaussians`.
 
     Attributes:
         channels: width of the descriptors of these.

@@ -1,11 +1,13 @@
-"""What surrounds the stages: layers that a batch enters before them and its prediction leaves after them.
+"""What surrounds the stages: layers that a batch enters before them and its prediction
+leaves after them.
 
-:func:`surroundings` gives the layers of a batch, the outermost first: photographs are checked and masks
-follow mattes (:class:`CheckedPhotographs`); the world becomes metres around the subject
-(:class:`SubjectFrame`); photographs get a black border up to whole patches (:class:`Border`). The prediction
-goes through them in reverse: the border is cut off, and Gaussians, depths and points are brought back to the
-cameras' world. :class:`ModelOptions` (``conf/model``) choose the layers. Checks of values are findings,
-which :meth:`ghgs_lit.model.GHGS.plan` reads together with all else that a GPU must be waited for."""
+:func:`surroundings` gives the layers of a batch, the outermost first: photographs are checked and
+masks follow mattes (:class:`CheckedPhotographs`); the world becomes metres around the subject
+(:class:`SubjectFrame`); photographs get a black border up to whole patches (:class:`Border`). The
+prediction goes through them in reverse: the border is cut off, and Gaussians, depths and points are
+brought back to the cameras' world. :class:`ModelOptions` (``conf/model``) choose the layers. Checks
+of values are findings, which :meth:`ghgs_lit.model.GHGS.plan` reads together with all else that a
+GPU must be waited for."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -120,7 +122,8 @@ def _findings_of_values(batch: Batch) -> list[Finding]:
 
 
 def _beyond(values: Tensor, highest: float) -> Tensor:
-    """Views of ``values`` [B, V, ...] with a NaN or a value outside 0 to ``highest``, up to rounding."""
+    """Views of ``values`` [B, V, ...] with a NaN or a value outside 0 to ``highest``,
+    up to rounding."""
     low, high = values.flatten(2).aminmax(dim=-1)
     # Negated, because comparisons with NaN are false.
     return ~((low >= -_ROUNDING) & (high <= highest + _ROUNDING))
@@ -133,17 +136,17 @@ class ModelOptions(Options):
     name: Text = "paper"
     """Name of the combination of stages, for tables."""
     pad: Literal["none", "multiple"] = "none"
-    """multiple: photographs get a black border up to the next multiple of the patch size, which is cut off
-    again; none: their sides must be multiples."""
+    """multiple: photographs get a black border up to the next multiple of the patch size, which is
+    cut off again; none: their sides must be multiples."""
     frame: Literal["subject", "world"] = "subject"
-    """subject: the stages work in metres around the subject, whatever the world's unit, origin and axes;
-    world: in coordinates as they are given."""
+    """subject: the stages work in metres around the subject, whatever the world's unit, origin and
+    axes; world: in coordinates as they are given."""
     matte: float | None = Field(None, ge=0, le=0.5)
-    """Pixels that show a larger share of the subject become Gaussians, whose colours and opacities know that
-    share; null: masks decide, mattes are ignored."""
+    """Pixels that show a larger share of the subject become Gaussians, whose colours and opacities
+    know that share; null: masks decide, mattes are ignored."""
     capture: Literal["auto", "off"] = "auto"
-    """auto: on CUDA, predictions and training steps of scenes of one size class are recorded as CUDA graphs
-    and played back; off: every operator is called each time."""
+    """auto: on CUDA, predictions and training steps of scenes of one size class are recorded as
+    CUDA graphs and played back; off: every operator is called each time."""
 
 
 class Surrounding:
@@ -209,7 +212,8 @@ class CheckedPhotographs(Surrounding):
     Args:
         side_multiple: number of pixels that must divide height and width.
         checks_values: check every value, too.
-        least_matte: pixels that show a larger share of the subject are its mask, 0 to 0.5; None: masks stay.
+        least_matte: pixels that show a larger share of the subject are its mask, 0 to 0.5;
+            None: masks stay.
     """
 
     side_multiple: int
@@ -223,7 +227,8 @@ class CheckedPhotographs(Surrounding):
 
 @dataclass
 class SubjectFrame(Surrounding):
-    """Metres around the subject inside, the cameras' world outside (:mod:`ghgs_lit.geometry.frame`).
+    """Metres around the subject inside, the cameras' world outside
+    (:mod:`ghgs_lit.geometry.frame`).
 
     Attributes:
         frame: of the batch that entered.

@@ -9,8 +9,9 @@ Conventions of the whole package:
 * quaternions are ``(w, x, y, z)``; lengths are metres; depth is z in the camera;
 * images are float in ``[0, 1]``, RGB, on a black background outside the mask.
 
-Shapes are written with ``B`` batch, ``V`` input views, ``T`` target views, ``H W`` input size, ``h w`` target
-size (of tokens: rows and columns), ``N`` packed Gaussians or tokens, ``L`` layers."""
+Shapes are written with ``B`` batch, ``V`` input views, ``T`` target views, ``H W`` input
+size, ``h w`` target size (of tokens: rows and columns), ``N`` packed Gaussians or tokens,
+``L`` layers."""
 
 import dataclasses
 import math
@@ -32,7 +33,8 @@ DecodedPixels = Literal["all", "subject"]
 
 
 def map_tensors(value: _T, fn: Callable[[Tensor], Tensor]) -> _T:
-    """Apply a function to every tensor inside nested dataclasses, tuples, named ones too, lists and dicts.
+    """Apply a function to every tensor inside nested dataclasses, tuples, named ones too,
+    lists and dicts.
 
     Args:
         value: a tensor, such a container, or anything else, which stays.
@@ -93,7 +95,8 @@ class Cameras(_TensorStruct):
 
     @cached_property
     def has_skew(self) -> bool:
-        """Whether any ``K[0, 1]`` is not 0; the host waits for a GPU at the first use, if none read it."""
+        """Whether any ``K[0, 1]`` is not 0; the host waits for a GPU at the first use,
+        if none read it."""
         return bool(self.any_skew)
 
     @property
@@ -131,9 +134,9 @@ class Cameras(_TensorStruct):
 
 @dataclass(frozen=True)
 class Targets(_TensorStruct):
-    """Photographs to predict, from cameras other than the input cameras. ``names``: the photographs of each
-    subject. ``protocols``: the target protocol of each of the ``T`` targets, the same for all subjects.
-    ``depths``: true z-depths in metres, 0 where unknown; None: unknown."""
+    """Photographs to predict, from cameras other than the input cameras. ``names``: the photographs
+    of each subject. ``protocols``: the target protocol of each of the ``T`` targets, the same for
+    all subjects. ``depths``: true z-depths in metres, 0 where unknown; None: unknown."""
 
     images: Float[Tensor, "B T 3 h w"]
     masks: Bool[Tensor, "B T h w"]
@@ -157,10 +160,11 @@ class Targets(_TensorStruct):
 class Batch(_TensorStruct):
     """Input photographs of ``B`` subjects, with everything that is known about them.
 
-    ``body_vertices``: points of the body's surface in metres. ``depths``: true z-depths in metres, 0 where
-    unknown. ``alpha``: soft mattes, the share of each pixel that shows the subject, by which its colour is
-    multiplied. ``log_gains``: logarithms of the cameras' gains, by which photographs are already divided.
-    ``views``: names of the photographs of each subject. None: unknown."""
+    ``body_vertices``: points of the body's surface in metres. ``depths``: true z-depths in
+    metres, 0 where unknown. ``alpha``: soft mattes, the share of each pixel that shows the
+    subject, by which its colour is multiplied. ``log_gains``: logarithms of the cameras' gains,
+    by which photographs are already divided. ``views``: names of the photographs of each subject.
+    None: unknown."""
 
     images: Float[Tensor, "B V 3 H W"]
     masks: Bool[Tensor, "B V H W"]
@@ -174,7 +178,8 @@ class Batch(_TensorStruct):
     views: tuple[tuple[str, ...], ...] = ()
 
     def of_views(self, views: Sequence[int]) -> "Batch":
-        """The batch with only the photographs of these numbers, in their order, and the same targets."""
+        """The batch with only the photographs of these numbers, in their order,
+        and the same targets."""
         views = list(views)
         names = ("images", "masks", "cameras", "depths", "alpha", "log_gains")
         parts = {name: value[:, views] for name in names if (value := getattr(self, name)) is not None}
@@ -191,19 +196,22 @@ class Batch(_TensorStruct):
         return changed
 
     def once(self, function: Callable[["Batch"], _T]) -> _T:
-        """``function`` of this batch, computed once and kept for other stages that pass the same function."""
+        """``function`` of this batch, computed once and kept for other stages that pass the
+        same function."""
         known = self.__dict__.setdefault("_known", {})
         if function not in known:
             known[function] = function(self)
         return known[function]
 
     def note(self, extents: Sequence[Extent], pixels: Int[Tensor, " n"]) -> None:
-        """Keep what a plan read of the masks: :attr:`extents`, and :attr:`pixels` in ascending order."""
+        """Keep what a plan read of the masks: :attr:`extents`,
+        and :attr:`pixels` in ascending order."""
         self.__dict__.update(extents=list(extents), pixels=pixels)
 
     @cached_property
     def extents(self) -> list[Extent]:
-        """Extent of the subject in each image ``b * V + v``; the host may wait for a GPU at the first use."""
+        """Extent of the subject in each image ``b * V + v``;
+        the host may wait for a GPU at the first use."""
         return extents(self.masks.flatten(0, 1))
 
     @cached_property
@@ -214,7 +222,8 @@ class Batch(_TensorStruct):
 
 @dataclass(frozen=True)
 class DepthBounds(_TensorStruct):
-    """The nearest and the farthest z-depth, in metres, at which each pixel's ray can meet the subject."""
+    """The nearest and the farthest z-depth, in metres,
+    at which each pixel's ray can meet the subject."""
 
     near: Float[Tensor, "B V H W"]
     far: Float[Tensor, "B V H W"]
@@ -222,11 +231,12 @@ class DepthBounds(_TensorStruct):
 
 @dataclass(frozen=True)
 class Tokens(_TensorStruct):
-    """Tokens of the kept patches of the whole batch, packed. Token ``n`` is the patch at ``row[n]``,
-    ``column[n]`` of image ``image[n]`` (``b * V + v``); tokens are ordered by image, row, column. ``grid`` is
-    ``(B, V, h, w)``. ``latent``: embeddings E of the encoder's read-out layers. ``semantic``: features F,
-    detached: they weight the attention, which does not train them. ``real``: which rows are tokens, where
-    each image has the same number of rows, a size class; None: all."""
+    """Tokens of the kept patches of the whole batch, packed. Token ``n`` is the patch at
+    ``row[n]``, ``column[n]`` of image ``image[n]`` (``b * V + v``); tokens are ordered by image,
+    row, column. ``grid`` is ``(B, V, h, w)``. ``latent``: embeddings E of the encoder's read-out
+    layers. ``semantic``: features F, detached: they weight the attention, which does not train
+    them. ``real``: which rows are tokens, where each image has the same number of rows, a size
+    class; None: all."""
 
     latent: tuple[Float[Tensor, "N C"], ...]
     semantic: Float[Tensor, "N S"]
@@ -249,7 +259,8 @@ class Tokens(_TensorStruct):
         return dataclasses.replace(self, latent=tuple(layer[index] for layer in self.latent), **parts)
 
     def of_images(self, images: slice) -> "Tokens":
-        """The tokens of consecutive images ``b * V + v``, as one element; the host may wait for a GPU."""
+        """The tokens of consecutive images ``b * V + v``, as one element;
+        the host may wait for a GPU."""
         b, v, h, w = self.grid
         if images == slice(0, b * v):
             part = self
@@ -310,11 +321,12 @@ class Points(_TensorStruct):
 class Gaussians(_TensorStruct):
     """3D Gaussians of a batch, packed; ``splits[b]`` of them belong to element ``b``.
 
-    ``quaternions`` need not have unit norm; ``scales`` are standard deviations in metres; ``colors`` may have
-    any number of channels. ``image`` (``b * V + v``) and ``pixel`` (row-major index): the input pixel that a
-    Gaussian belongs to, if any. ``low_pass`` (px^2) and ``antialiased``: the settings of the renderer
-    (:class:`ghgs_lit.rendering.RasterSettings`) that they were made for. ``metre``: the length of a metre in
-    the unit of each element's world (:mod:`ghgs_lit.geometry.frame`); None: 1."""
+    ``quaternions`` need not have unit norm; ``scales`` are standard deviations in metres;
+    ``colors`` may have any number of channels. ``image`` (``b * V + v``) and ``pixel`` (row-major
+    index): the input pixel that a Gaussian belongs to, if any. ``low_pass`` (px^2) and
+    ``antialiased``: the settings of the renderer (:class:`ghgs_lit.rendering.RasterSettings`) that
+    they were made for. ``metre``: the length of a metre in the unit of each element's world
+    (:mod:`ghgs_lit.geometry.frame`); None: 1."""
 
     means: Float[Tensor, "N 3"]
     quaternions: Float[Tensor, "N 4"]
@@ -338,7 +350,8 @@ class Gaussians(_TensorStruct):
         return torch.stack([field.isfinite().all(1) for field in fields]).all(0)
 
     def select(self, index: Tensor | slice, splits: tuple[int, ...]) -> "Gaussians":
-        """The Gaussians at ``index`` (slice, mask or indices). ``splits``: their number in each element."""
+        """The Gaussians at ``index`` (slice, mask or indices).
+        ``splits``: their number in each element."""
         changes = {
             f.name: getattr(self, f.name)[index]
             for f in dataclasses.fields(self)
@@ -379,8 +392,8 @@ class Gaussians(_TensorStruct):
 
 @dataclass(frozen=True)
 class Decision:
-    """The preset that ``skip=auto`` gave a subject, and the FLOPs of the encoder's blocks as a share of those
-    of the most accurate preset."""
+    """The preset that ``skip=auto`` gave a subject, and the FLOPs of the encoder's blocks as a
+    share of those of the most accurate preset."""
 
     preset: str
     products: float
@@ -388,10 +401,11 @@ class Decision:
 
 @dataclass(frozen=True)
 class Prediction(_TensorStruct):
-    """The result of ``model(batch)``, in the world and the unit of its cameras. ``depth`` has a meaning where
-    ``depth_valid``. ``decisions``: one for each element with ``skip=auto``. ``rounds``: depths before the
-    first round and after each (the last is ``depth_maps``). ``drafts``: Gaussians before each, if kept.
-    ``tokens``: of the encoder, inside the model alone."""
+    """The result of ``model(batch)``, in the world and the unit of its cameras. ``depth``
+    has a meaning where ``depth_valid``. ``decisions``: one for each element with
+    ``skip=auto``. ``rounds``: depths before the first round and after each (the last is
+    ``depth_maps``). ``drafts``: Gaussians before each, if kept. ``tokens``: of the encoder,
+    inside the model alone."""
 
     gaussians: Gaussians
     depth: Float[Tensor, "B V H W"]
@@ -406,7 +420,8 @@ class Prediction(_TensorStruct):
 
 @dataclass(frozen=True)
 class Rendering(_TensorStruct):
-    """Rendered Gaussians. ``depth`` is the expected z in metres, ``sum(w z) / max(sum(w), 1e-10)``."""
+    """Rendered Gaussians. ``depth`` is the expected z in metres,
+    ``sum(w z) / max(sum(w), 1e-10)``."""
 
     image: Float[Tensor, "B T C h w"]
     alpha: Float[Tensor, "B T 1 h w"]

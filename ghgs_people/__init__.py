@@ -1,7 +1,7 @@
 """Making of data: people, rigs of cameras, photographs, scans.
 
-A plug-in of :mod:`ghgs_lit` by the door that a user's own has: it offers data sets that are rendered, and the
-parts of its bodies.
+A plug-in of :mod:`ghgs_lit` by the door that a user's own has: it offers data sets that are
+rendered, and the parts of its bodies.
 """
 
 from ghgs_lit.config.registry import PARTS, offer

@@ -16,10 +16,12 @@ _running: dict[Path, multiprocessing.process.BaseProcess] = {}
 
 
 class Joining(dict[str, tuple[int, ...]]):
-    """``subjects`` of a training layout; iterating adds those of ``names`` that have become complete.
+    """``subjects`` of a training layout; iterating adds those of ``names`` that have
+    become complete.
 
     Args:
-        layout: of the training people that are complete so far; its ``subjects`` become this mapping.
+        layout: of the training people that are complete so far;
+            its ``subjects`` become this mapping.
         names: all training people, complete or not.
     """
 

@@ -1,6 +1,7 @@
-"""A user's own cameras as a rig around built-in people, photographed in crops like those of captures.
-Positions are the cameras in the order of their azimuth about the subject. Views at a position are numbered as
-in :mod:`ghgs_people.rig`; those between two cameras turn about the subject from one to the next."""
+"""A user's own cameras as a rig around built-in people, photographed in crops like those of
+captures. Positions are the cameras in the order of their azimuth about the subject. Views at a
+position are numbered as in :mod:`ghgs_people.rig`; those between two cameras turn about the subject
+from one to the next."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -51,8 +52,8 @@ class CaptureRig:
         intrinsics: [3, 3] of each camera, in pixels.
         extrinsics: [4, 4] of each camera, world to camera, in any unit.
         heights: of each camera's photographs, pixels.
-        fill: [least, greatest] share of the photograph's height that a subject takes in the camera that
-            sees it tallest, 0 to 1; decides how far the cameras stand.
+        fill: [least, greatest] share of the photograph's height that a subject takes in the camera
+            that sees it tallest, 0 to 1; decides how far the cameras stand.
     """
 
     intrinsics: tuple
@@ -71,8 +72,8 @@ class CaptureRig:
             fill: [least, greatest] share of the photograph's height that a subject takes, 0 to 1.
 
         Raises:
-            InputError: there are fewer cameras, they look in one direction, or the point that they look at is
-                behind one of them.
+            InputError: there are fewer cameras, they look in one direction, or the point that they
+                look at is behind one of them.
         """
         require(len(cameras) > 1, "data.cameras", "two or more cameras", len(cameras))
         rig = cls(
@@ -121,7 +122,8 @@ class CaptureRig:
     @cached_property
     def _upright(self) -> np.ndarray:
         """Rotation [3, 3] from the world to one whose y points up. Cameras are assumed level: up is
-        orthogonal to all image rows. If all rows are parallel, it is the mean up direction of the images."""
+        orthogonal to all image rows. If all rows are parallel, it is the mean up direction of
+        the images."""
         rows = self._poses[:, 0, :3]
         mean = -self._poses[:, 1, :3].mean(0)
         _, strengths, axes = np.linalg.svd(rows)
@@ -133,7 +135,8 @@ class CaptureRig:
 
     @cached_property
     def _around(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rotations [n, 3, 3] and translations [n, 3] for a world with origin :attr:`_middle` and y up."""
+        """Rotations [n, 3, 3] and translations [n, 3] for a world with origin
+        :attr:`_middle` and y up."""
         shifts = self._poses[:, :3, :3] @ self._middle + self._poses[:, :3, 3]
         return self._poses[:, :3, :3] @ self._upright.T, shifts
 
@@ -176,8 +179,8 @@ class CaptureRig:
             person: the subject, in metres, y up.
             yaws: places [positions, 5] of all views (:meth:`yaws`).
             aspect: width / height of the images; not used, as crops fit their subject.
-            rng: draws the subject's share of the image's height, and how far it stands from the point that
-                the cameras look at.
+            rng: draws the subject's share of the image's height, and how far it stands from the
+                point that the cameras look at.
 
         Returns:
             The placed cameras, and their deviations, which are 0.

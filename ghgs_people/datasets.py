@@ -39,7 +39,8 @@ from ghgs_people.scans import ScanSource
 _PEOPLE_SEED = 0
 # Seed of heights, yaws, lights and of the split by fraction of scans.
 _SEED = 0
-# People in a rig that are rendered before training begins: a first run of ``ghgs adapt`` takes minutes.
+# People in a rig that are rendered before training begins:
+# a first run of ``ghgs adapt`` takes minutes.
 _FIRST_TRAIN = 8
 
 
@@ -95,7 +96,8 @@ class ActivePeople(Options):
 
 
 class _Generated(_Renderable):
-    """Generated people, rendered on first use and kept in a cache folder named after all their settings."""
+    """Generated people, rendered on first use and kept in a cache folder named after all
+    their settings."""
 
     limit: ClassVar[Limit] = Limit()
     pixel_centers: ClassVar[str] = "half"
@@ -182,8 +184,9 @@ class Synthetic(_Generated, _OnRing):
 
 
 class PeopleInRig(_Generated):
-    """Generated people in the rig of a capture, as crops around them: what ``ghgs adapt`` trains on. Training
-    waits for the first people only (for all with ``render_workers=0``); the others are rendered meanwhile."""
+    """Generated people in the rig of a capture, as crops around them: what ``ghgs adapt`` trains
+    on. Training waits for the first people only (for all with ``render_workers=0``); the others are
+    rendered meanwhile."""
 
     name: Text = "people_in_rig"
     size: Size = 252
@@ -192,8 +195,8 @@ class PeopleInRig(_Generated):
     cameras: Annotated[dict, Words("a mapping of cameras")] = Field({})
     """The cameras of the rig: intrinsics, extrinsics, width and height of each by name."""
     fill: tuple[Fill, Fill] = (0.5, 0.95)
-    """[least, greatest] share of its photograph's height that a subject takes in the camera that sees it
-    tallest."""
+    """[least, greatest] share of its photograph's height that a subject takes in the camera that
+    sees it tallest."""
 
     @property
     def ring(self) -> int:
@@ -247,13 +250,13 @@ class Scans(DataSet, _OnRing):
     """Folder of textured meshes, <id>/<id>.obj or .glb; only for rendering."""
     split: options.PathText | dict[str, tuple[Text | Index, ...] | None] | None = None
     """Which subjects are train and val: a folder with split_train.txt and split_val.txt, or
-    {train: [0000-0425], val: [0426-0525]}. Null: the folders train and val of root; when rendering, the split
-    files in source, else a fraction."""
+    {train: [0000-0425], val: [0426-0525]}. Null: the folders train and val of root; when rendering,
+    the split files in source, else a fraction."""
     val_fraction: Share = 0.1
     """Fraction of the scans that is val where no split decides, at least one of them."""
     pixel_centers: Literal["half", "integer", "auto"] = "half"
-    """Pixel centres of the files. half: rendered by this package; integer: by the published scripts; auto:
-    whichever it was."""
+    """Pixel centres of the files. half: rendered by this package; integer: by the published
+    scripts; auto: whichever it was."""
 
     def subject_names(self, phase: str) -> list[str] | None:
         if self.split is None:
@@ -288,7 +291,8 @@ class Scans(DataSet, _OnRing):
             Number of scans rendered now.
 
         Raises:
-            InputError: ``source`` or ``root`` is null, a scan is bad, or ``root`` holds something else.
+            InputError: ``source`` or ``root`` is null, a scan is bad,
+                or ``root`` holds something else.
         """
         source = self.scans()
         root = required_folder("data.root", "a folder", self.root)

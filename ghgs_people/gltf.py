@@ -1,4 +1,5 @@
-"""glTF and GLB files with the vertices where skins and morph targets put them: trimesh reads neither."""
+"""glTF and GLB files with the vertices where skins and morph targets put them:
+trimesh reads neither."""
 
 import base64
 import copy
@@ -18,15 +19,16 @@ _COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 # Kinds of a GLB's chunks.
 _JSON = 0x4E4F534A
 _BIN = 0x004E4942
-# Extensions without which a reader would see another mesh or texture, though a file may require them.
+# Extensions without which a reader would see another mesh or texture,
+# though a file may require them.
 _READ = ("EXT_texture_webp", "KHR_lights_punctual", "KHR_materials_")
 
 
 def posed(path: Path) -> dict[str, Any] | None:
     """Read a file with all vertices where its skins, joints and weights of morph targets put them.
 
-    Section 3.7.3 of the specification of glTF 2.0: a vertex of a skinned mesh is the mean, by its weights,
-    of where its joints put it, in the world of the scene.
+    Section 3.7.3 of the specification of glTF 2.0: a vertex of a skinned mesh is the mean, by its
+    weights, of where its joints put it, in the world of the scene.
 
     Args:
         path: of a ``.gltf`` or ``.glb`` file.
@@ -187,7 +189,8 @@ def _skinned(
     skin: dict[str, Any],
     worlds: dict[int, np.ndarray],
 ) -> np.ndarray:
-    """Put vertices where joints put them in the world (section 3.7.3 of the specification of glTF 2.0).
+    """Put vertices where joints put them in the world (section 3.7.3 of the
+    specification of glTF 2.0).
 
     Args:
         tree: content of the file.

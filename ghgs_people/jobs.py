@@ -1,7 +1,7 @@
-"""Rendering of many people in several processes: resumable, with the same files for the same seed. Workers
-are spawned (a fork of a process that runs threads may hang): each imports the script that called
-:func:`render_people`, which therefore needs ``if __name__ == "__main__":``. Workers write to workspaces; the
-process that holds the lock moves finished subjects to their place."""
+"""Rendering of many people in several processes: resumable, with the same files for the same seed.
+Workers are spawned (a fork of a process that runs threads may hang): each imports the script that
+called :func:`render_people`, which therefore needs ``if __name__ == "__main__":``. Workers write to
+workspaces; the process that holds the lock moves finished subjects to their place."""
 
 import contextlib
 import logging
@@ -114,8 +114,8 @@ class RenderOptions(Options):
     quality: int = Field(98, ge=1, le=100)
     """Of the JPEG files."""
     lights: Literal["studio", "none"] = "studio"
-    """studio: white lights around each person, for textures without light; none: textures as they are, for
-    scans, whose textures are photographs with the light of their day."""
+    """studio: white lights around each person, for textures without light; none: textures as they
+    are, for scans, whose textures are photographs with the light of their day."""
 
 
 @dataclass(frozen=True)
@@ -258,8 +258,8 @@ def render_people(
         Number of people rendered now.
 
     Raises:
-        InputError: ``root`` holds something else, a position is not on the rig, the script has no main
-            guard, or people are bad: the others are rendered, then these are named.
+        InputError: ``root`` holds something else, a position is not on the rig, the script has no
+            main guard, or people are bad: the others are rendered, then these are named.
         RuntimeError: a rendering process died.
     """
     _check_main_guard()
@@ -337,7 +337,8 @@ def _run(jobs: list[_Job], workers: int | None) -> Iterator[tuple[_Job, str]]:
 
 @contextlib.contextmanager
 def one_thread_each() -> Iterator[None]:
-    """Processes that start meanwhile compute with one thread: those of NumPy's products wait by spinning."""
+    """Processes that start meanwhile compute with one thread:
+    those of NumPy's products wait by spinning."""
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     try:
@@ -350,7 +351,8 @@ def one_thread_each() -> Iterator[None]:
 
 
 def _check_main_guard() -> None:
-    """Refuse to run in a worker that imports the calling script, which would wait for its parent forever."""
+    """Refuse to run in a worker that imports the calling script,
+    which would wait for its parent forever."""
     # Set by multiprocessing while a spawned process imports the main module of its parent.
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         raise InputError(
@@ -375,8 +377,8 @@ def _end_with_parent() -> None:
 def write_view(phase: Path, folder: str, number: int, view: View, quality: int = 98) -> None:
     """Write one view of a subject, in the layout of :mod:`ghgs_lit.data.layout`.
 
-    The JPEG keeps the full resolution of colours. The mask has three equal channels, as the authors'
-    loader reads channel 0.
+    The JPEG keeps the full resolution of colours. The mask has three equal channels, as the
+    authors' loader reads channel 0.
 
     Args:
         phase: folder of the phase, or a workspace.

@@ -1,13 +1,14 @@
-"""Lights around a person as photographs of real people have them: several of some size, whose shadows are
-soft, and light from all around, brighter from above. They are white and the same for every camera, so that
-views agree.
+"""Lights around a person as photographs of real people have them: several of some size, whose
+shadows are soft, and light from all around, brighter from above. They are white and the same for
+every camera, so that views agree.
 
-The light of each vertex of the mesh is computed once, for either side of the surface, and interpolated:
+The light of each vertex of the mesh is computed once, for either side of the surface,
+and interpolated:
 
     (ambient (1 + sky n_y) + sum_l w_l mean_s visible(l, s) max(n . d_ls, 0)) ^ (1 / 2.2)
 
-over samples s of each light l. The power makes it a factor on texture values as stored. The exposure is
-that of a camera that measures the subject from all around."""
+over samples s of each light l. The power makes it a factor on texture values as stored. The
+exposure is that of a camera that measures the subject from all around."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -100,8 +101,9 @@ class LightRig:
     exposure: float | None = None
 
     def exposed(self, brightness: float) -> "LightRig":
-        """Set the exposure, where it is not set: half of what a subject in dark or white clothes differs from
-        a typical one is taken back, as by a camera that measures subject and surroundings.
+        """Set the exposure, where it is not set: half of what a subject in dark or white
+        clothes differs from a typical one is taken back, as by a camera that measures subject
+        and surroundings.
 
         Args:
             brightness: mean of the subject at an exposure of 1.

@@ -1,13 +1,14 @@
 """Photographs of textured meshes: image, matte, mask and metric depth from pinhole cameras.
 
-Embree casts ``samples`` x ``samples`` rays on a regular grid through each pixel of the subject's window.
+Embree casts ``samples`` x ``samples`` rays on a regular grid through each pixel of the
+subject's window.
 
-* image: the mean colour of the samples; samples that miss are black, so silhouettes are antialiased and
-  premultiplied by their coverage (like an alpha-blended splat on black);
+* image: the mean colour of the samples; samples that miss are black, so silhouettes are antialiased
+  and premultiplied by their coverage (like an alpha-blended splat on black);
 * matte: the share of a pixel's samples that hit the subject;
 * mask: true where the matte is at least 0.5;
-* depth: z of the hit nearest to the pixel's centre (at the centre itself when ``samples`` is odd), 0 where
-  there is none. It is no mean of samples, so that no depth lies between two surfaces."""
+* depth: z of the hit nearest to the pixel's centre (at the centre itself when ``samples`` is odd),
+  0 where there is none. It is no mean of samples, so that no depth lies between two surfaces."""
 
 import importlib
 import platform
@@ -25,7 +26,8 @@ from ghgs_people.figures.meshing import smooth_normals
 from ghgs_people.lights import LightRig
 from ghgs_people.rig import Rig
 
-# Rays traced at once: they fit the processor's cache, which is three times as fast as a whole photograph.
+# Rays traced at once: they fit the processor's cache,
+# which is three times as fast as a whole photograph.
 _CHUNK = 1 << 14
 # Side in pixels of the photographs that the exposure is measured with, and factor on their light.
 _TRIAL = 64

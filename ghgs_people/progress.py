@@ -1,6 +1,6 @@
-"""Progress of rendering on disk, so that a killed run can resume; :mod:`ghgs_lit.data.layout` reads it.
-Besides the files described there, ``<root>/rendering/`` has ``settings.json`` (the settings of the files),
-``lock`` and ``tmp/`` (workspaces)."""
+"""Progress of rendering on disk, so that a killed run can resume; :mod:`ghgs_lit.data.layout` reads
+it. Besides the files described there, ``<root>/rendering/`` has ``settings.json`` (the settings of
+the files), ``lock`` and ``tmp/`` (workspaces)."""
 
 import contextlib
 import json

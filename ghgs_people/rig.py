@@ -1,9 +1,9 @@
 """The ring of cameras that THuman2.0 is rendered with, and the placement of a subject in it.
 
-``positions`` cameras stand evenly around the subject. The views at each position are numbered: 0 is the ring
-camera itself, 1 the next ring camera, 3 the exact middle between the two, 2 and 4 are random in the first and
-the second half of the step. Yaw 0 sees the front of a subject that faces +z. A :class:`Variation` gives each
-subject its own ring and moves single cameras."""
+``positions`` cameras stand evenly around the subject. The views at each position are numbered: 0 is
+the ring camera itself, 1 the next ring camera, 3 the exact middle between the two, 2 and 4 are
+random in the first and the second half of the step. Yaw 0 sees the front of a subject that faces
++z. A :class:`Variation` gives each subject its own ring and moves single cameras."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,17 +27,20 @@ Fill = Annotated[float, Field(gt=0, lt=1)]
 
 
 class Variation(Options):
-    """Differences of rigs between subjects, and of single cameras from their ring; null and 0: none."""
+    """Differences of rigs between subjects, and of single cameras from their ring;
+    null and 0: none."""
 
     group = "data.rig.variation"
 
     radius: tuple[Positive, Positive] | None = None
     """[least, greatest] radius of a subject's ring, metres."""
     pitch: tuple[Pitch, Pitch] | None = None
-    """[least, greatest] pitch of a subject's ring, degrees; a ring that looks down stands higher."""
+    """[least, greatest] pitch of a subject's ring, degrees;
+    a ring that looks down stands higher."""
     fill: tuple[Fill, Fill] | None = None
-    """[least, greatest] share of the image's height that a subject takes up in the camera that sees it
-    tallest: decides the focal length. Less where it would not fit into every image of the ring."""
+    """[least, greatest] share of the image's height that a subject takes up in the camera
+    that sees it tallest: decides the focal length. Less where it would not fit into every
+    image of the ring."""
     camera_pitch: Tilt = 0.0
     """Degrees: greatest deviation of single cameras."""
     camera_roll: float = Field(0.0, ge=0, le=180)
@@ -45,8 +48,8 @@ class Variation(Options):
     camera_look_at: Amount = 0.0
     """Metres: greatest shift of single cameras and of what they look at, along each axis."""
     between_pitch: Tilt = 0.0
-    """Degrees: greatest deviation of the views between ring cameras (2, 3 and 4), which only targets take:
-    subjects are also seen from higher and from lower than by any input."""
+    """Degrees: greatest deviation of the views between ring cameras (2, 3 and 4), which only
+    targets take: subjects are also seen from higher and from lower than by any input."""
 
     @model_validator(mode="after")
     def _check(self) -> "Variation":
@@ -76,7 +79,8 @@ class RigOptions(Options):
 
 @dataclass(frozen=True)
 class Poses:
-    """Deviations of cameras [...] from their ring: degrees of pitch and roll, metres of shift [..., 3]."""
+    """Deviations of cameras [...] from their ring: degrees of pitch and roll,
+    metres of shift [..., 3]."""
 
     pitch: np.ndarray | float = 0.0
     roll: np.ndarray | float = 0.0
@@ -106,7 +110,8 @@ class Rig:
         """Draw the yaws of all views of one subject.
 
         Args:
-            rng: draws the turn of the ring, and where the views 2 and 4 stand between two ring cameras.
+            rng: draws the turn of the ring, and where the views 2 and 4 stand between
+                two ring cameras.
 
         Returns:
             Yaws [positions, 5] in degrees of views 0 to 4.

@@ -1,4 +1,5 @@
-"""Scans: textured meshes, as ``.obj`` like those of THuman2.0, or as ``.glb`` with several parts."""
+"""Scans: textured meshes, as ``.obj`` like those of THuman2.0,
+or as ``.glb`` with several parts."""
 
 import io
 import json
@@ -26,7 +27,8 @@ _IMAGE_SUFFIXES = (".jpeg", ".jpg", ".png")
 
 @dataclass(frozen=True)
 class ScanSource:
-    """A folder ``<folder>/<id>/<id>.obj`` (with its ``material0.jpeg``) or ``<folder>/<id>/<id>.glb``.
+    """A folder ``<folder>/<id>/<id>.obj`` (with its ``material0.jpeg``) or
+    ``<folder>/<id>/<id>.glb``.
 
     Args:
         folder: of the scans.
@@ -104,7 +106,8 @@ class _Beside(trimesh.resolvers.FilePathResolver):
         """
         name = str(key).strip().strip('"')
         folder = Path(self.parent)
-        # Escapes of a URI, folders of another machine, and options of map_Kd, which stand before the name.
+        # Escapes of a URI, folders of another machine, and options of map_Kd,
+        # which stand before the name.
         for spelling in (name, unquote(name), parts_of(name)[-1], *name.split()[-1:]):
             path = find_path(folder, spelling) if spelling else None
             if path is not None and path.is_file():
@@ -113,13 +116,15 @@ class _Beside(trimesh.resolvers.FilePathResolver):
 
 
 def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
-    """Read all textured meshes of a file in its world frame, where joints and morph targets put them.
+    """Read all textured meshes of a file in its world frame,
+    where joints and morph targets put them.
 
     Args:
         path: of an ``.obj``, ``.glb`` or ``.gltf`` file.
 
     Raises:
-        InputError: the file cannot be read, has no triangles, or a mesh lacks texture or coordinates.
+        InputError: the file cannot be read, has no triangles,
+            or a mesh lacks texture or coordinates.
     """
     kind = path.suffix.lower()[1:]
     tree = None if kind == "obj" else posed(path)

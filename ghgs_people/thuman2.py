@@ -5,8 +5,8 @@
     <source>/<id>/<id>.obj, material0.jpeg, material0.mtl     526 scans 0000 ... 0525, y up, no metric units
     <fits>/<id>/smplx_param.pkl, mesh_smplx.obj               the fit, in the frame of its scan
 
-Renders have the layout of :mod:`ghgs_lit.data.layout`; those of GPS-Gaussian, GHG, RoGSplat and the authors'
-release can be read unchanged."""
+Renders have the layout of :mod:`ghgs_lit.data.layout`; those of GPS-Gaussian, GHG, RoGSplat and the
+authors' release can be read unchanged."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -96,8 +96,8 @@ class THuman2Source(ScanSource):
             name: id of the scan.
 
         Returns:
-            Degrees by which the first camera is turned about y to face the person, -180 to 180; 0 without a
-            fit.
+            Degrees by which the first camera is turned about y to face the person, -180 to 180; 0
+            without a fit.
 
         Raises:
             InputError: the fit is missing or bad.
@@ -137,8 +137,8 @@ def _check_body(folder: Path, scan: Person, body: np.ndarray) -> None:
         body: vertices [n, 3] of the fit.
 
     Raises:
-        InputError: the body leaves the scan's box by more than 0.1 of its height, or is not 0.7 to 1.2
-            times as tall.
+        InputError: the body leaves the scan's box by more than 0.1 of its height, or is not 0.7 to
+            1.2 times as tall.
     """
     points = np.concatenate([part.vertices for part in scan.parts])
     low = points.min(0)
@@ -166,7 +166,8 @@ class THuman2(Scans):
     val_fraction: Share = 0.19
     pixel_centers: Literal["half", "integer", "auto"] = "auto"
     fits: options.PathText | None = None
-    """Folder with <id>/smplx_param.pkl, mesh_smplx.obj; null: by its usual names in or beside source."""
+    """Folder with <id>/smplx_param.pkl, mesh_smplx.obj;
+    null: by its usual names in or beside source."""
 
     def scans(self) -> THuman2Source:
         return THuman2Source(self.source_folder, find_fits(self.source_folder, self.fits))

@@ -1,4 +1,5 @@
-"""The sweeper's class, which Hydra finds only in ``hydra_plugins``; ``ghgs_lit.runs.grid`` does the work."""
+"""The sweeper's class, which Hydra finds only in ``hydra_plugins``;
+``ghgs_lit.runs.grid`` does the work."""
 
 from typing import Any
 

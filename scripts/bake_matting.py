@@ -30,9 +30,11 @@ from ghgs_lit.files import write_atomically
 _CROP = 160
 #: Height or width of the subject in pixels; how much photographs are enlarged for it at most.
 _SUBJECT, _LARGEST = (170, 330), 1.4
-#: Shares of samples: their matte is exact; it is a mask, but otherwise exact; a wrong mask is blurred.
+#: Shares of samples: their matte is exact; it is a mask, but otherwise exact;
+#: a wrong mask is blurred.
 _EXACT, _SHARP, _BLURRED = 0.2, 0.1, 0.2
-#: Masks grow or shrink by up to this many pixels, bumps are up to this high and as many times wider than 6.
+#: Masks grow or shrink by up to this many pixels,
+#: bumps are up to this high and as many times wider than 6.
 _OFFSET, _RAGGED, _WIDER = 4.0, 5.0, (1, 1, 2, 3)
 _HOLE, _HOLE_CHANCE = 0.12, 0.35
 _RATE = 2e-3
@@ -99,7 +101,8 @@ def _around_an_outline(alpha: np.ndarray, rng: np.random.Generator) -> tuple[sli
 
 
 def _background(image: np.ndarray, alpha: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Clouds, pieces of a room, a slow change or a texture; every fourth has a colour of the subject."""
+    """Clouds, pieces of a room, a slow change or a texture;
+    every fourth has a colour of the subject."""
     kind = rng.integers(4)
     if kind == 0:
         found = backgrounds(1, _CROP, _CROP, rng)[0]
@@ -136,7 +139,8 @@ def _room(rng: np.random.Generator) -> np.ndarray:
 
 
 class Samples(IterableDataset):
-    """Batches of training, each a function of its step: one sample of each photograph of a person."""
+    """Batches of training, each a function of its step:
+    one sample of each photograph of a person."""
 
     def __init__(self, data: PhotographsDataModule, first: int) -> None:
         self.data, self.first = data, first
@@ -178,7 +182,8 @@ class Training(LightningModule):
 
 
 def train(data: PhotographsDataModule, steps: int, out: Path, weights: Path) -> None:
-    """Train to ``steps`` in all, from the last checkpoint in ``out`` if there is one; write the weights."""
+    """Train to ``steps`` in all, from the last checkpoint in ``out`` if there is one;
+    write the weights."""
     training = Training(data, steps)
     last = ModelCheckpoint(out, "last", every_n_train_steps=_KEPT, enable_version_counter=False)
     trainer = Trainer(

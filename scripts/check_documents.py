@@ -293,7 +293,8 @@ def _in_blocks(document: str, text: str) -> Iterator[Command]:
 
 
 def _in_prose(document: str, text: str) -> Iterator[Command]:
-    """Code spans that begin like a command and have an argument; names of verbs alone are not run."""
+    """Code spans that begin like a command and have an argument;
+    names of verbs alone are not run."""
     prose = re.sub(r"^```.*?^```", lambda block: "\n" * block[0].count("\n"), text, flags=re.M | re.S)
     program = r"(?:ghgs --help|ghgs\s\w+\s\S*(?:=|--help)|python \w+/|make \w|pip install|tensorboard )"
     for span in re.finditer(rf"(?<!`)`((?:\w+=\S+ )?{program}[^`]*)`(?!`)", prose):

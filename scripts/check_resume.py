@@ -18,7 +18,8 @@ import torch
 
 
 def command(directory: Path, arguments: argparse.Namespace, *more: str) -> list[str]:
-    """``ghgs train`` with frequent checkpoints; schedules count steps, as time is not repeatable."""
+    """``ghgs train`` with frequent checkpoints;
+    schedules count steps, as time is not repeatable."""
     return [
         *(sys.executable, "-m", "ghgs_lit.cli.main", "train"),
         *(f"trainer.max_steps={arguments.steps}", "trainer.max_time=null"),
@@ -34,7 +35,8 @@ def read(directory: Path) -> dict | None:
 
 
 def train_and_kill(directory: Path, arguments: argparse.Namespace) -> int:
-    """Kill the run and its processes soon after step ``kill_at``; returns the step of its last checkpoint."""
+    """Kill the run and its processes soon after step ``kill_at``;
+    returns the step of its last checkpoint."""
     with open(directory.with_suffix(".log"), "w") as log:
         process = subprocess.Popen(
             command(directory, arguments), stdout=log, stderr=log, start_new_session=True

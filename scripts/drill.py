@@ -62,7 +62,8 @@ class Drill:
         return self.ghgs("train", "-m", *SETTINGS, *grid, cache, *self.overrides, where, **environment)
 
     def start_two(self) -> None:
-        """Start processes until two run; those that have ended by themselves must have succeeded."""
+        """Start processes until two run; those that have ended by themselves must have
+        succeeded."""
         while len(self.processes) < 2:
             self.processes.append(self.train(self.sweep))
 
@@ -181,7 +182,8 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=60, help="of each run; fewer on a slow machine")
     parser.add_argument("--random", type=int, default=0, help="seed of what is killed and when")
     arguments, overrides = parser.parse_known_args()
-    # A shell starts what it puts into the background with Ctrl-C ignored, and children inherit that.
+    # A shell starts what it puts into the background with Ctrl-C ignored,
+    # and children inherit that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if arguments.out.exists():
         raise SystemExit(f"{arguments.out}: expected a new directory; found one")

@@ -27,7 +27,8 @@ from ghgs_lit.visualization.turntable import orbit, subject_points
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
 SIDE, WIDTH, BRIGHTER, FRAMES = 512, 320, 1.55, 36
-#: Where the picture looks from, degrees from the first photograph, which is 90 degrees from the second.
+#: Where the picture looks from, degrees from the first photograph,
+#: which is 90 degrees from the second.
 BETWEEN = (45, 135, 225, 315)
 
 

@@ -27,10 +27,10 @@ from scripts.miniatures.scans import mark
 
 
 def make_miniature(dataset: DataSet, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
-    """Write a small data set that the reader of ``dataset`` reads; returns the folders that were written.
-    ``people``: number of people of each phase. ``size``: longer side of the photographs in pixels.
-    InputError: no layout is published for the data set, it has no folder, or the folder holds anything but a
-    miniature."""
+    """Write a small data set that the reader of ``dataset`` reads; returns the folders that were
+    written. ``people``: number of people of each phase. ``size``: longer side of the photographs in
+    pixels. InputError: no layout is published for the data set, it has no folder, or the folder
+    holds anything but a miniature."""
     for kind, make in _MAKERS.items():
         if isinstance(dataset, kind):
             return make(dataset, people, size, seed)
@@ -57,7 +57,8 @@ def _humman(dataset: HuMMan, people: Mapping[str, int], size: int, seed: int) ->
 
 
 def _thuman2(dataset: THuman2, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
-    """Renders as the published scripts make them; with ``data.source`` raw scans with their fits."""
+    """Renders as the published scripts make them;
+    with ``data.source`` raw scans with their fits."""
     if dataset.source is not None:
         source = dataset.source_folder
         mark(source, scans.fit_folder(source))

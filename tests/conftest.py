@@ -7,20 +7,20 @@ import sys
 import threading
 from pathlib import Path
 
-# Where Python keeps no bytecode, as in many containers, each process that a test starts compiles PyTorch and
-# Lightning anew, which takes longer than most tests.
+# Where Python keeps no bytecode, as in many containers, each process that a test starts compiles
+# PyTorch and Lightning anew, which takes longer than most tests.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 from tests.helpers.shapes import begin_test, check_shapes  # noqa: E402
 
-# Modules and tests are no garbage, and looking through what is left takes a tenth of the suite: it is done
-# between tests, now and then, also where a verb turns the collector on again.
+# Modules and tests are no garbage, and looking through what is left takes a tenth of the suite: it
+# is done between tests, now and then, also where a verb turns the collector on again.
 gc.set_threshold(0)
 _TESTS_BETWEEN = 64
 
-# Test processes and their children share the cores; more threads than cores slow each other down, and those
-# that spin while they wait do so most.
+# Test processes and their children share the cores; more threads than cores slow each other down,
+# and those that spin while they wait do so most.
 _THREADS = max(1, (os.cpu_count() or 2) // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))
 os.environ |= {"OMP_NUM_THREADS": str(_THREADS), "OMP_WAIT_POLICY": "PASSIVE"}
 

@@ -71,7 +71,8 @@ def spoiled(name, index, value):
     ],
 )  # fmt: skip
 def test_broken_values_are_refused_where_they_are(changes, message):
-    """One NaN in the background left no Gaussian, in silence; photographs as uint8 gave colours of 254."""
+    """One NaN in the background left no Gaussian, in silence;
+    photographs as uint8 gave colours of 254."""
     batch = make_batch(1, 2)
     for name, value in changes.items():
         object.__setattr__(batch, name, value)  # the types' own checks run in tests only

@@ -1,4 +1,5 @@
-"""The experiment with controls in ``examples/controls``: rows that must lose and win do what they say."""
+"""The experiment with controls in ``examples/controls``:
+rows that must lose and win do what they say."""
 
 import dataclasses
 import sys

@@ -1,4 +1,5 @@
-"""The whole package on a device that refuses to mix with the CPU: what a GPU would refuse fails here."""
+"""The whole package on a device that refuses to mix with the CPU:
+what a GPU would refuse fails here."""
 
 import dataclasses
 
@@ -136,8 +137,8 @@ def train(folder, **place):
 
 
 def test_training_there_changes_the_weights_alike_and_its_checkpoint_loads_anywhere(tmp_path, monkeypatch):
-    """Steps with clipping, a validation, callbacks; the checkpoint goes to the CPU and back. What a step logs
-    is there already: Lightning would copy a number, for which the host waits."""
+    """Steps with clipping, a validation, callbacks; the checkpoint goes to the CPU and back. What a
+    step logs is there already: Lightning would copy a number, for which the host waits."""
     log_dict, logged = GHGSModule.log_dict, {}
 
     def noted(self, values, **options):
@@ -176,7 +177,8 @@ def test_batches_are_copied_there_without_a_wait():
 
 
 def test_everything_is_measured_there(tmp_path, monkeypatch):
-    """The model, refined too, and all baselines, with all metrics and pictures: rows are those of the CPU."""
+    """The model, refined too, and all baselines, with all metrics and pictures:
+    rows are those of the CPU."""
     monkeypatch.setattr("ghgs_lit.refinement.cameras._STEPS", 3)
     metrics = MetricsOptions(regions=("image", "box", "subject", "edge"), lpips="off").build()
 
@@ -229,7 +231,8 @@ def test_predict_runs_there(tmp_path, monkeypatch):
     ids=" ".join,
 )
 def test_the_host_waits_once(overrides):
-    """For the plan: the check of the batch, the subject's extent, the numbers of tokens and Gaussians."""
+    """For the plan: the check of the batch, the subject's extent,
+    the numbers of tokens and Gaussians."""
     waits = []
     for size in (1, 2):
         with torch.no_grad(), pretend_device(True) as log:

@@ -1,4 +1,5 @@
-"""Paths, config groups, keys and names in the documents exist, and their commands of some seconds run."""
+"""Paths, config groups, keys and names in the documents exist,
+and their commands of some seconds run."""
 
 import importlib.util
 import pydoc
@@ -138,7 +139,8 @@ def test_names_of_the_package_exist():
 
 
 def test_options_and_keys_exist():
-    """Each ``group=option`` must be a file of ``conf`` or ``--config-dir``, ``key=value`` a key of a verb."""
+    """Each ``group=option`` must be a file of ``conf`` or ``--config-dir``,
+    ``key=value`` a key of a verb."""
     wrong = []
     for span in (span for document in DOCUMENTS for span in code(document)):
         # values of Python, in calls, are none of a configuration
@@ -159,7 +161,8 @@ def test_options_and_keys_exist():
 
 
 def test_promised_pythons_agree():
-    """README, package, linter and the script that tests them must promise the same versions of Python."""
+    """README, package, linter and the script that tests them must promise the same
+    versions of Python."""
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
     oldest, last = re.fullmatch(r">=3\.(\d+),<3\.(\d+)", project["project"]["requires-python"]).groups()
     versions = [f"3.{minor}" for minor in range(int(oldest), int(last))]
@@ -173,7 +176,8 @@ def test_promised_pythons_agree():
 
 
 def test_commands_are_read_whole(tmp_path, monkeypatch):
-    """Continuation lines, comments, Python blocks and commands in running text must all be found."""
+    """Continuation lines, comments, Python blocks and commands in running text must
+    all be found."""
     text = "`ghgs table\nruns=x` `ghgs table`\n```bash\n# no\nghgs train a=1 \\\n    'b=#2'  # yes\n```\n"
     (tmp_path / "a.md").write_text(f"{text}```python\nx = 1\ny = 2\n```\n")
     monkeypatch.setattr(check_documents, "ROOT", tmp_path)
@@ -186,7 +190,8 @@ def test_commands_are_read_whole(tmp_path, monkeypatch):
 
 
 def test_commands_for_a_gpu_are_run_on_a_cpu():
-    """A wrong or missing key is found without one; README's is among those that every test run runs."""
+    """A wrong or missing key is found without one;
+    README's is among those that every test run runs."""
     found = [
         c for document in DOCUMENTS for c in check_documents.commands(document) if "trainer=gpu" in c.text
     ]
@@ -209,7 +214,8 @@ def test_a_command_that_fails_is_reported(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.parametrize("document", check_documents.FAST)
 def test_fast_commands_run(document, tmp_path, monkeypatch):
-    """Commands of the documents that take seconds must run as printed (all of them: `make documents`)."""
+    """Commands of the documents that take seconds must run as printed (all of them:
+    `make documents`)."""
     run = check_documents.Reader.run
 
     def prepared(reader, text, is_python=False):
@@ -226,7 +232,8 @@ def test_fast_commands_run(document, tmp_path, monkeypatch):
     assert check_documents.main(["--fast", document, "--folder", str(tmp_path)]) == 0
 
 
-#: Decibels by which a figure may differ on another processor: two in the last digit that is printed.
+#: Decibels by which a figure may differ on another processor:
+#: two in the last digit that is printed.
 ROUNDING = 0.02
 
 
@@ -241,8 +248,8 @@ def figures(document: str) -> dict[tuple[str, str], list[tuple[float, float]]]:
 
 
 def test_figures_of_the_first_day_are_those_of_a_run(tmp_path):
-    """Of what is not trained, measured again on the people that the page holds out; its model's are the same
-    in both tables, and lie as far below a perfect depth as the page says."""
+    """Of what is not trained, measured again on the people that the page holds out; its model's are
+    the same in both tables, and lie as far below a perfect depth as the page says."""
     page = (REPOSITORY / "docs" / "first_day.md").read_text()
     printed, reader = figures(page), check_documents.Reader(tmp_path, "docs/first_day.md")
     for command in (

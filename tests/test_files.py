@@ -34,7 +34,8 @@ def names(folder) -> list[str]:
 
 
 def test_a_failing_writer_leaves_the_old_file_or_none(tmp_path):
-    """A run that dies in a write must neither lose the last checkpoint nor leave half of a new one."""
+    """A run that dies in a write must neither lose the last checkpoint nor leave half
+    of a new one."""
 
     def fail(temporary):
         temporary.write_text("half")
@@ -52,7 +53,8 @@ def test_a_failing_writer_leaves_the_old_file_or_none(tmp_path):
 
 
 def test_leftovers_of_dead_processes_are_removed_and_no_others(tmp_path):
-    """Killed runs must not fill the disk; a process that is still writing must not lose its file."""
+    """Killed runs must not fill the disk; a process that is still writing must not
+    lose its file."""
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
     host = socket.gethostname()
@@ -113,7 +115,8 @@ def test_a_lock_is_held_by_one_process_and_freed_by_its_death(tmp_path):
 
 
 def limited_write(kind, path, answers):
-    """In a process of its own: write 4 MB where files may have half of one, as on a disk that is full."""
+    """In a process of its own: write 4 MB where files may have half of one,
+    as on a disk that is full."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 19, 1 << 19))
     content = {"weights": torch.from_numpy(np.zeros(1 << 20, np.float32))}  # no threads after a fork
     write = {

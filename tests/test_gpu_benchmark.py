@@ -46,7 +46,8 @@ def test_a_section_runs_in_a_rehearsal(section, tmp_path, one_thread):
 
 
 def test_a_section_that_fails_or_hangs_stops_no_other(tmp_path, monkeypatch, capsys):
-    """Its last lines are reported, what it has found stays, and the tables come from the files alone."""
+    """Its last lines are reported, what it has found stays,
+    and the tables come from the files alone."""
     file = tmp_path / "first.jsonl"
     line = '{"section": "step", "row": "batch of 8", "ms": 12.5}'
     codes = {
@@ -74,7 +75,8 @@ def test_a_section_that_fails_or_hangs_stops_no_other(tmp_path, monkeypatch, cap
 
 
 def test_a_section_whose_needs_failed_is_not_run(tmp_path, monkeypatch):
-    """gsplat that does not compile is said once for each section, with the compiler's last lines."""
+    """gsplat that does not compile is said once for each section,
+    with the compiler's last lines."""
     code = "import sys; sys.exit('nvcc: not found')"
     monkeypatch.setattr(gpu.Session, "command", lambda _, name: [sys.executable, "-c", code])
     options = argparse.Namespace(dry=False, gsplat=tmp_path, work=tmp_path, overrides=[])

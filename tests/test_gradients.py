@@ -1,8 +1,9 @@
 """Gradients of every differentiable function of the package against finite differences, in float64.
 
-Those of unit vectors, chamfer, SSIM, a dense head and the reference renderer are tested beside their values
-(``grep -rl gradcheck tests``), the compiled renderer against the reference. Nothing else has a gradient:
-bounds, photo-consistency, relative depths and lenses are constants of a training step, as one test checks.
+Those of unit vectors, chamfer, SSIM, a dense head and the reference renderer are tested beside
+their values (``grep -rl gradcheck tests``), the compiled renderer against the reference. Nothing
+else has a gradient: bounds, photo-consistency, relative depths and lenses are constants of a
+training step, as one test checks.
 """
 
 from dataclasses import replace
@@ -138,7 +139,8 @@ def test_the_gradient_of_a_loss_is_that_of_finite_differences(name):
 
 
 def test_what_is_constant_in_a_training_step_has_no_gradient():
-    """Bounds, agreement of photographs, relative depths and lenses are inputs of networks, not results."""
+    """Bounds, agreement of photographs, relative depths and lenses are inputs of networks,
+    not results."""
     batch = make_batch(views=3, height=28, width=28)
     batch = replace(batch, images=batch.images.clone().requires_grad_())
     near = batch.depths.clone().requires_grad_()

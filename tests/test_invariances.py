@@ -1,4 +1,5 @@
-"""What must not change a result beyond rounding: the number of threads, and the precision of products."""
+"""What must not change a result beyond rounding: the number of threads,
+and the precision of products."""
 
 import pytest
 import torch
@@ -97,8 +98,9 @@ HALF = pytest.mark.skipif("avx512bf16" not in processor_features(), reason="no p
 
 @pytest.mark.parametrize("case", [pytest.param(attention, marks=HALF), recalibration, sweep, similarity])
 def test_mixed_precision_costs_at_most_twice_what_it_costs_pytorch(case):
-    """``|out - ref|`` of the same function in plain PyTorch at that dtype, and 1e-5 of ``|ref|``; root mean
-    squares, since the largest rounding is the luck of a processor's order of summation."""
+    """``|out - ref|`` of the same function in plain PyTorch at that dtype, and 1e-5 of
+    ``|ref|``; root mean squares, since the largest rounding is the luck of a processor's order
+    of summation."""
     ours, plain = case(torch.Generator().manual_seed(0))
     expected = plain(torch.float32)
     allowed = 2 * (plain(torch.bfloat16).float() - expected).norm() + 1e-5 * expected.norm()

@@ -1,9 +1,10 @@
-"""What a GPU is asked for may not grow: launches, and waits of the host, counted on the pretend device.
+"""What a GPU is asked for may not grow: launches, and waits of the host,
+counted on the pretend device.
 
-Operators of the package (:mod:`ghgs_lit.kernels.gpu`) are one launch, as on CUDA. Counts are exact and the
-same on every machine; each limit is the count of today. Whoever needs fewer lowers it: a failing test prints
-the line to write. Other versions of PyTorch may divide an operator otherwise, so that they are held to waits
-alone."""
+Operators of the package (:mod:`ghgs_lit.kernels.gpu`) are one launch, as on CUDA. Counts are exact
+and the same on every machine; each limit is the count of today. Whoever needs fewer lowers it: a
+failing test prints the line to write. Other versions of PyTorch may divide an operator otherwise,
+so that they are held to waits alone."""
 
 import dataclasses
 from typing import NamedTuple
@@ -59,7 +60,8 @@ def one_thread():
 
 
 def asked(kind: str, size: int) -> Asked:
-    """Counts for four views of 28 x 28 pixels, or 56 x 56 with the weights that come with the package."""
+    """Counts for four views of 28 x 28 pixels,
+    or 56 x 56 with the weights that come with the package."""
     model = GHGS.from_checkpoint() if kind == "shipped" else make_model(kind)
     batch = ellipsoid_batch(0.15, 4, 28, size)
     batch = Batch(batch.images, batch.masks, batch.cameras, batch.targets, depths=2.0 * batch.masks)
@@ -77,7 +79,8 @@ def asked(kind: str, size: int) -> Asked:
 
 @pytest.mark.parametrize(("kind", "size"), LIMITS)
 def test_a_gpu_is_asked_for_no_more_than_before(kind, size):
-    """Each launch costs the host some 15 microseconds, each wait the time until the GPU has caught up."""
+    """Each launch costs the host some 15 microseconds,
+    each wait the time until the GPU has caught up."""
     found, limit = asked(kind, size), LIMITS[kind, size]
     counted = Asked._fields if torch.__version__.startswith(_VERSION) else ("waits", "step_waits")
     grown = [name for name in counted if getattr(found, name) > getattr(limit, name)]
@@ -85,7 +88,8 @@ def test_a_gpu_is_asked_for_no_more_than_before(kind, size):
     assert not grown
 
 
-#: Launches around the graph of a training step of the shipped weights, and waits, by the batch's size.
+#: Launches around the graph of a training step of the shipped weights, and waits,
+#: by the batch's size.
 AROUND = {1: (216, 2), 8: (226, 2)}
 
 

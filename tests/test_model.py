@@ -76,7 +76,8 @@ def test_the_pipeline_matches_the_release(dtype):
     extrinsics = torch.eye(4, dtype=dtype).repeat(1, 3, 1, 1)
     extrinsics[..., :3, :] = inputs["extr"]
     masks = inputs["mask"][:, :, 0] != 0
-    # The photographs are 64 x 64; the release pads them to 70 x 70 before, the model does so itself.
+    # The photographs are 64 x 64; the release pads them to 70 x 70 before,
+    # the model does so itself.
     batch = Batch(inputs["image"][..., 3:-3, 3:-3], masks, Cameras(inputs["intr"], extrinsics, 64, 64))
     model = release_model(inputs, dtype)
     prediction = model(batch)
@@ -108,8 +109,9 @@ def test_the_pipeline_matches_the_release(dtype):
     [
         ("model=paper", "exact", torch.float32, 1e-5),
         *(("model=hull", skip, torch.float32, 1e-5) for skip in PRESETS),
-        # Its depth is 1/d of a d that crosses 0 where the subject fills a view: |depth| goes from 2 to 1000,
-        # and rounding grows as much (3e-5 in float32 on some processors). In float64 it is below 1e-12.
+        # Its depth is 1/d of a d that crosses 0 where the subject fills a view: |depth| goes from
+        # 2 to 1000, and rounding grows as much (3e-5 in float32 on some processors). In float64 it
+        # is below 1e-12.
         ("compat=release", "none", torch.float64, 1e-9),
     ],
     ids=lambda value: str(value).removeprefix("torch."),
@@ -140,7 +142,8 @@ def test_a_batch_equals_its_elements_one_by_one(kind, skip, dtype, limit):
 @pytest.mark.parametrize("skip", PRESETS)
 @pytest.mark.parametrize("name", list(hard_subjects()))
 def test_extreme_masks_give_one_finite_gaussian_for_each_pixel(name, skip):
-    """Empty, full and single-pixel masks, two people, a subject at the border: nothing is lost or NaN."""
+    """Empty, full and single-pixel masks, two people, a subject at the border:
+    nothing is lost or NaN."""
     batch = hard_subjects()[name]
     with torch.no_grad():
         prediction = make_model(f"skip={skip}")(batch)
@@ -231,7 +234,8 @@ def test_named_models_choose_their_parts_and_the_command_line_wins():
 
 @pytest.mark.parametrize(("skip", "ablation"), [*((skip, "full") for skip in PRESETS), ("exact", "neither")])
 def test_order_of_later_views_does_not_matter(skip, ablation):
-    """The order of the later views must not change the Gaussians (the encoder treats the first apart)."""
+    """The order of the later views must not change the Gaussians (the encoder treats the
+    first apart)."""
     batch = make_batch(1, 4, zoom=0.6)
     order = torch.tensor([0, 3, 1, 2])
     swapped = Batch(batch.images[:, order], batch.masks[:, order], batch.cameras[:, order])

@@ -20,7 +20,8 @@ PADS = ["model.pad=multiple"]
 @pytest.mark.parametrize("skip", ["none", "exact", "balanced", "fast"])
 @pytest.mark.parametrize(("size", "name"), [((50, 64), "hull"), ((45, 71), "paper")])
 def test_photographs_of_any_size_are_padded_and_come_back(size, name, skip):
-    """What the stages see is a batch with a black border; what comes back is in the photograph's pixels."""
+    """What the stages see is a batch with a black border;
+    what comes back is in the photograph's pixels."""
     batch = make_batch(2, 3, *size)
     overrides = [f"model={name}", f"skip={skip}"]
     with pytest.raises(InputError, match=r"model\.pad=multiple"):

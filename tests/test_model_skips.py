@@ -30,7 +30,8 @@ def test_skip_fast_gives_the_gaussians_of_skip_exact_where_nothing_is_background
 @pytest.mark.parametrize("margin", [0, 1])
 @torch.no_grad()
 def test_skip_fast_with_few_pixels_and_with_mates(margin):
-    """An empty view, a single pixel, two people and a batch mate: the same pixels, each element as alone."""
+    """An empty view, a single pixel, two people and a batch mate: the same pixels,
+    each element as alone."""
     batch = make_batch(2, 4, zoom=0.4)
     batch.masks[0, 0] = False
     batch.masks[0, 1] = False
@@ -68,7 +69,8 @@ def test_only_windows_around_the_subject_are_decoded():
 @pytest.mark.parametrize("overrides", [["model=hull"], ["unprojection=release"]], ids=operator.itemgetter(0))
 @pytest.mark.parametrize("size", [(70, 70), (154, 98)])
 def test_skip_exact_gives_the_gaussians_of_skip_none(size, overrides):
-    """skip=exact promises the same Gaussians, also where windows are smaller than the photographs."""
+    """skip=exact promises the same Gaussians,
+    also where windows are smaller than the photographs."""
     batch = make_batch(2, 3, *size, zoom=0.3)
     batch.masks[0, 1] = False
     batch.masks[1, 2, :5, -9:] = True

@@ -1,4 +1,5 @@
-"""Names of files as other systems spell them, by the one reader that captures, data sets and scans share."""
+"""Names of files as other systems spell them, by the one reader that captures,
+data sets and scans share."""
 
 import pytest
 
@@ -29,7 +30,8 @@ def test_a_file_is_found_under_every_spelling(tmp_path, stored, said, suffixes):
 
 
 def test_the_nearest_spelling_counts(tmp_path):
-    """The exact one first, the preferred ending before others, and never one of several by case alone."""
+    """The exact one first, the preferred ending before others,
+    and never one of several by case alone."""
     for name in ("a.PNG", "A.png", "b.png", "b.jpg", "C.png", "c.PNG", "D.png", "d.pNG", "d.PNG"):
         (tmp_path / name).touch()
     assert find_path(tmp_path, "a", (".png",)).name == "a.PNG"

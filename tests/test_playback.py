@@ -36,7 +36,8 @@ def recording(*overrides):
 
 
 def scene(share=0.15, color=1.0, views=2, holes=0):
-    """Photographs of an ellipsoid that covers a ``share`` of them, with holes in the middle of a mask."""
+    """Photographs of an ellipsoid that covers a ``share`` of them,
+    with holes in the middle of a mask."""
     batch = ellipsoid_batch(share, views, 28, 1)
     batch.masks[0, 0, 14, 14 : 14 + holes] = False
     return dataclasses.replace(batch, images=color * batch.images).to(DEVICE)
@@ -151,7 +152,8 @@ def test_what_is_played_back_is_not_asked_for(there):
 
 
 def test_what_precedes_the_plan_keeps_names_and_gradients():
-    """Batches that differ in names alone are one class; photographs that are learned get their gradient."""
+    """Batches that differ in names alone are one class;
+    photographs that are learned get their gradient."""
     model = recording("model=paper")
     for name in ("a", "b", "c"):
         batch = dataclasses.replace(scene(), subjects=(name,), views=(("0", "1"),))

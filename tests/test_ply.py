@@ -26,7 +26,8 @@ def gaussians(n=50, seed=0) -> Gaussians:
 
 
 def test_a_ply_renders_as_what_was_written(tmp_path):
-    """Opacities, scales, colours and the world frame survive the file: both render to the same image."""
+    """Opacities, scales, colours and the world frame survive the file:
+    both render to the same image."""
     written = gaussians()
     write_ply(written, tmp_path / "a.ply")
     read = read_ply(tmp_path / "a.ply")
@@ -59,7 +60,8 @@ def test_a_header_that_promises_terabytes(tmp_path, kind, count, rows):
 
 
 def test_a_ply_has_the_names_and_units_of_3dgs(tmp_path):
-    """Viewers of 3D Gaussian Splatting read the columns by name; empty and bad files are handled."""
+    """Viewers of 3D Gaussian Splatting read the columns by name;
+    empty and bad files are handled."""
     plyfile = pytest.importorskip("plyfile")
     one = Gaussians(
         torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([[2.0, 0, 0, 0]]), torch.tensor([[0.1, 1.0, 0.0]]),

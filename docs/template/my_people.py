@@ -1,8 +1,9 @@
 """A data set of your own: a reader that finds photographs on disk, and its options.
 
 Copy this file and ``conf/data/my_people.yaml``, then change what is marked. As it stands it reads
-``<root>/<train|val>/<person>/<camera>.png`` (RGBA, alpha is the mask) with ``cameras.npz`` beside them:
-``intrinsics`` [n, 3, 3] in pixels and ``extrinsics`` [n, 3 or 4, 4], world to camera, in metres, OpenCV axes.
+``<root>/<train|val>/<person>/<camera>.png`` (RGBA, alpha is the mask) with ``cameras.npz`` beside
+them: ``intrinsics`` [n, 3, 3] in pixels and ``extrinsics`` [n, 3 or 4, 4], world to camera, in
+metres, OpenCV axes.
 """
 
 from pathlib import Path
@@ -33,8 +34,8 @@ class MyReader(Reader):
             raise InputError(f"{folder}: expected a folder for each person; found none")
 
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
-        # CHANGE: one photograph as it is stored. Resizing and caching are done for you; `view` is 0 with
-        # static cameras.
+        # CHANGE: one photograph as it is stored. Resizing and caching are done for you; `view` is 0
+        # with static cameras.
         path = self.folder / name / f"{position}.png"
         image = read_image(path)
         require(image.mode == "RGBA", str(path), "an image with an alpha channel", image.mode)
@@ -46,8 +47,8 @@ class MyReader(Reader):
         with np.load(cameras) as stored:
             intrinsics = check_intrinsics(cameras, stored["intrinsics"][position])
             extrinsics = check_extrinsics(cameras, stored["extrinsics"][position])
-        # CHANGE: pixel centres lie at +0.5 here. A calibration made with OpenCV puts them at integers:
-        # intrinsics[:2, 2] += 0.5
+        # CHANGE: pixel centres lie at +0.5 here. A calibration made with OpenCV puts them at
+        # integers: intrinsics[:2, 2] += 0.5
         return View(
             image=pixels[..., :3] * mask[..., None],  # on black
             mask=mask,
@@ -57,7 +58,8 @@ class MyReader(Reader):
         )
 
     def read_body(self, name: str) -> np.ndarray | None:
-        # CHANGE: vertices [n, 3] of any body model in the world, for the Chamfer loss; None without one.
+        # CHANGE: vertices [n, 3] of any body model in the world, for the Chamfer loss;
+        # None without one.
         path = self.folder / name / "body.npy"
         return read_array(path, [(None, 3)]).astype(np.float32) if path.exists() else None
 
@@ -67,7 +69,8 @@ class MyReader(Reader):
 
 @register("data", "my_people")
 class MyPeople(DataSet):
-    """The options. `root`, `limit`, `size` and so on are there already; CHANGE: add fields of your own."""
+    """The options. `root`, `limit`, `size` and so on are there already;
+    CHANGE: add fields of your own."""
 
     static_cameras: ClassVar[bool] = True  # CHANGE: False if there are views between the cameras
     ring: ClassVar[int] = 8  # CHANGE: number of cameras; inputs are evenly spaced among them

@@ -1,11 +1,12 @@
-"""Recalibration with controls: can this experiment see what 3D neighbours and semantic consistency do?
+"""Recalibration with controls: can this experiment see what 3D neighbours and semantic
+consistency do?
 
     export GHGS_PLUGINS=examples/controls/controls.py
     ghgs train --config-dir examples/controls/conf sweep=controls
 
-Rows of the ablation can be told apart only where a row that must lose loses, and one that must win wins. Both
-read what a prediction cannot know (true depths and bodies of built-in people), so they are a plug-in and no
-options of the package: nobody meets them by accident.
+Rows of the ablation can be told apart only where a row that must lose loses, and one that must win
+wins. Both read what a prediction cannot know (true depths and bodies of built-in people), so they
+are a plug-in and no options of the package: nobody meets them by accident.
 """
 
 import dataclasses
@@ -23,7 +24,8 @@ from ghgs_lit.recalibration import Recalibration, RecalibrationOptions
 from ghgs_lit.training.pretext.labels import part_shares
 from ghgs_lit.types import Batch, DepthMaps, Points, Tokens
 
-#: A residual of this length, in metres, is a value of 1 in the tokens, whose channels are of that order.
+#: A residual of this length, in metres, is a value of 1 in the tokens,
+#: whose channels are of that order.
 RESIDUAL_UNIT = 0.05
 #: Channels of a token that hold the residual: its three coordinates, eight times.
 COPIES = 8
@@ -34,7 +36,8 @@ class KnownPoints(Points):
     """Points with what is true of their tokens.
 
     Attributes:
-        residual: from the point of a token to where the photographed surface is, in metres; 0 if unknown.
+        residual: from the point of a token to where the photographed surface is, in metres;
+            0 if unknown.
         shares: of the parts of the body in the patch of a token.
     """
 
@@ -72,10 +75,12 @@ class KnownUnprojection(Unprojection):
 
 @register("recalibration", "control")
 class ControlOptions(RecalibrationOptions):
-    """The recalibration of the package on features that know parts, and what must lose or win after it."""
+    """The recalibration of the package on features that know parts,
+    and what must lose or win after it."""
 
     control: Literal["none", "shuffled", "residual"] = "none"
-    """What is done to recalibrated tokens: none | shuffled: the tokens of a subject change places (must lose)
+    """What is done to recalibrated tokens: none | shuffled: the tokens of a subject change
+    places (must lose)
     | residual: some channels say how far the token's point is from the true surface (must win)"""
 
     def build(self, dim_latent: int) -> "Control":
@@ -85,8 +90,8 @@ class ControlOptions(RecalibrationOptions):
 class Control(Recalibration):
     """:class:`Recalibration` whose semantic features are roots of true shares of parts.
 
-    Their cosine is the overlap of two distributions, as that of a trained branch: the most similar patch of
-    another view shows the same part in 80 % of the cases.
+    Their cosine is the overlap of two distributions, as that of a trained branch: the most similar
+    patch of another view shows the same part in 80 % of the cases.
     """
 
     def __init__(self, options: ControlOptions, dim_latent: int):

@@ -1,4 +1,5 @@
-"""Gaussians in the compact formats of 3DGS viewers; ``docs/evidence/outputs.md`` has sizes and losses."""
+"""Gaussians in the compact formats of 3DGS viewers;
+``docs/evidence/outputs.md`` has sizes and losses."""
 
 from collections.abc import Mapping
 
@@ -11,11 +12,12 @@ from ghgs_lit.ply import ply_bytes, stored_values
 from ghgs_lit.types import Gaussians
 
 CONVERTED = {"compressed_ply": "compressed.ply", "spz": "spz", "sog": "sog"}
-"""Formats that the package gaussforge makes from a PLY; what it, and the suffix of files, calls each."""
+"""Formats that the package gaussforge makes from a PLY;
+what it, and the suffix of files, calls each."""
 
 RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
-"""One Gaussian of ``.splat``, which has no header: position and standard deviations, colour and opacity, and
-the rotation (w, x, y, z), of which 128 is zero."""
+"""One Gaussian of ``.splat``, which has no header: position and standard deviations, colour and
+opacity, and the rotation (w, x, y, z), of which 128 is zero."""
 
 
 def converted(name: str, gaussians: Gaussians) -> bytes:

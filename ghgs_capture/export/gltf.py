@@ -1,7 +1,7 @@
 """Gaussians as binary glTF with the Khronos extension ``KHR_gaussian_splatting``.
 
-The vertices are in the world of the other files; a node turns it so that +y is up, as in glTF. Programs
-without the extension show coloured points."""
+The vertices are in the world of the other files; a node turns it so that +y is up, as in glTF.
+Programs without the extension show coloured points."""
 
 import numpy as np
 import torch

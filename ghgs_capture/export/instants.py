@@ -117,7 +117,8 @@ class Instants:
         return end_files(directory, names, report)
 
     def _path(self) -> np.ndarray:
-        """Shift of page and video at each instant [instants, 3]: the smoothed path of the subject's mean."""
+        """Shift of page and video at each instant [instants, 3]: the smoothed path of the
+        subject's mean."""
         reach = self.options.fps // 2
         # Odd reflection at the ends: a steady walk stays steady.
         padded = np.pad(np.stack(self._means), ((reach, reach), (0, 0)), "reflect", reflect_type="odd")
@@ -132,7 +133,8 @@ class Instants:
         return page(self._first, name, self._packed, path, self.options.fps).encode()
 
     def _video(self) -> bytes:
-        """The content of the video: the camera swings by ``_SWING`` to each side, once over all instants."""
+        """The content of the video: the camera swings by ``_SWING`` to each side,
+        once over all instants."""
         first = self._first
         cameras = self._first.cameras
         path = self._path()

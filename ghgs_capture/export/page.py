@@ -17,8 +17,8 @@ from ghgs_capture.export.subject import ExportedSubject
 from ghgs_lit.ply import stored_values
 from ghgs_lit.types import Gaussians
 
-#: Quantisation steps in a pixel of a photograph (centre), a factor of e (standard deviation) and 1 (opacity;
-#: rotation, to each side of 0): ``FINE`` for one instant, ``COARSE`` for each of several.
+#: Quantisation steps in a pixel of a photograph (centre), a factor of e (standard deviation) and 1
+#: (opacity; rotation, to each side of 0): ``FINE`` for one instant, ``COARSE`` for each of several.
 FINE = {"center": 64, "scale": 24, "opacity": 255, "rotation": 127}
 COARSE = {"center": 12, "scale": 12, "opacity": 127, "rotation": 31}
 #: A Gaussian's numbers of four bytes (its centre) and of one (the others).

@@ -37,7 +37,8 @@ SHEET = "sheet.png"  #: The picture to look at
 
 @dataclass(frozen=True)
 class Format:
-    """One format. ``contents`` gives a function for each file, in order; threads call it for the content."""
+    """One format. ``contents`` gives a function for each file, in order;
+    threads call it for the content."""
 
     files: tuple[str, ...]  #: names; one for each ``{view}``, or ``{frame}`` of the turntable
     contents: Callable[[ExportedSubject], Iterable[Callable[[], bytes]]]
@@ -67,7 +68,8 @@ def _one(content: Callable[[ExportedSubject], bytes]) -> Callable[[ExportedSubje
 
 
 def _of_viewers(content: Callable[[Gaussians], bytes]) -> Callable[[ExportedSubject], list]:
-    """Contents of one file from the Gaussians for other viewers, which are made before threads begin."""
+    """Contents of one file from the Gaussians for other viewers,
+    which are made before threads begin."""
     return lambda subject: [partial(content, subject.for_other_renderers)]
 
 
@@ -189,7 +191,8 @@ def write_prediction(
 
 
 def _report(subject: ExportedSubject) -> dict[str, Any]:
-    """Plain data about a prediction: counts, lengths in the unit of the cameras, PSNR of the inputs."""
+    """Plain data about a prediction: counts, lengths in the unit of the cameras,
+    PSNR of the inputs."""
     gaussians = subject.gaussians
     valid = subject.depth_valid
     lost = subject.masks & ~valid

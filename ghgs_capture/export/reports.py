@@ -37,7 +37,8 @@ def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] =
 
 
 def begin_files(directory: Path, names: Sequence[str]) -> list[str]:
-    """List files in the report before they are written, so that an interrupted run's are known, too.
+    """List files in the report before they are written, so that an interrupted run's are known,
+    too.
 
     Args:
         directory: where files will be written.

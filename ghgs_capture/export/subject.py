@@ -1,4 +1,5 @@
-"""One subject as its files hold it: prediction, photographs and cameras, in the frame of the files."""
+"""One subject as its files hold it: prediction, photographs and cameras,
+in the frame of the files."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -70,8 +71,8 @@ def rotate_world(
 #: Low-pass, in px^2, of other viewers' renderers, which are not antialiased.
 VIEWER_LOW_PASS = 0.3
 _SMALLEST = 1e-3  #: Least standard deviation in pixels
-#: The fit of Gaussians for other viewers: changes, steps, cameras around the subject (beside the inputs), and
-#: views in each step.
+#: The fit of Gaussians for other viewers: changes, steps, cameras around the subject (beside the
+#: inputs), and views in each step.
 _FIT = {"scales": Change(3.0, 0.15), "opacities": Change(5.0, 0.3), "colors": Change(0.1, 0.006)}
 _FIT_STEPS = 32
 _AROUND = 8
@@ -167,9 +168,9 @@ def fitted(theirs: Gaussians, ours: Gaussians, cameras: Sequence[Cameras], rende
 class ExportedSubject:
     """One subject. Lengths are in the unit of the cameras; ``up`` is the upward unit vector.
 
-    ``images`` are premultiplied by ``mattes`` (the masks, where there are none). ``points`` are the subject's
-    unprojected pixels with their ``colors``; ``dropped`` counts Gaussians that are not finite, which no
-    renderer draws and no file holds."""
+    ``images`` are premultiplied by ``mattes`` (the masks, where there are none). ``points`` are the
+    subject's unprojected pixels with their ``colors``; ``dropped`` counts Gaussians that are not
+    finite, which no renderer draws and no file holds."""
 
     name: str
     views: tuple[str, ...]
@@ -195,12 +196,14 @@ class ExportedSubject:
     @cached_property
     def stored(self) -> Gaussians:
         """The Gaussians of the PLY, which stores their image constants; with ``smooth`` they are
-        :func:`smoothed` (as in Mip-Splatting, Yu et al. 2024), so that a larger screen shows no gaps."""
+        :func:`smoothed` (as in Mip-Splatting, Yu et al. 2024), so that a larger screen
+        shows no gaps."""
         return smoothed(self.gaussians, self.pixel) if self.options.smooth else self.gaussians
 
     @cached_property
     def for_other_renderers(self) -> Gaussians:
-        """The Gaussians of files without image constants, fitted to our renders of inputs and all around."""
+        """The Gaussians of files without image constants,
+        fitted to our renders of inputs and all around."""
         if self.options.smooth:
             return self.stored
         converted = for_other_renderers(self.gaussians, self.pixel)

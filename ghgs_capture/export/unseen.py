@@ -15,8 +15,8 @@ _BEHIND = 0.03
 #: Parts of the subject's height, and share of Gaussians beyond either end of it (floaters).
 _PARTS = 4
 _OUTSIDE = 1e-3
-#: Share of ``seen_once`` above which a part is reported: three even views of whole people have a half, two
-#: opposite ones all.
+#: Share of ``seen_once`` above which a part is reported: three even views of whole people have a
+#: half, two opposite ones all.
 GUESSED = 0.75
 
 

@@ -48,7 +48,8 @@ def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
 
 
 def _format_of(path: Path) -> str:
-    """The format of a path, by names of files and keys of JSON. InputError: it is none that is known."""
+    """The format of a path, by names of files and keys of JSON.
+    InputError: it is none that is known."""
     suffix = path.suffix.lower()
     folder = path if path.is_dir() else path.parent
     if path.name.lower() in EASYMOCAP or (path.is_dir() and find_path(path, EASYMOCAP[0]) is not None):

@@ -16,7 +16,8 @@ from ghgs_lit.parsing import composed, parts_of, read_parsed
 
 @dataclass(frozen=True)
 class CameraFile:
-    """The cameras of a file by name, the meaning of their numbers by its format, and the format's name."""
+    """The cameras of a file by name, the meaning of their numbers by its format,
+    and the format's name."""
 
     cameras: dict[str, StoredCamera]
     convention: Convention

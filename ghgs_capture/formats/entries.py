@@ -27,7 +27,8 @@ NAMES = {
 #: Coefficients with an entry each: of OpenCV's model, and of a fisheye's.
 PERSPECTIVE = "k1 k2 p1 p2 k3 k4 k5 k6"
 FISHEYE = "k1 k2 k3 k4"
-# Camera models that are read: those of a pinhole, with OpenCV's distortion, and of OpenCV's fisheye.
+# Camera models that are read: those of a pinhole, with OpenCV's distortion,
+# and of OpenCV's fisheye.
 _PINHOLES = ("pinhole", "perspective", "simplepinhole", "none")
 _BROWN = ("opencv", "radial", "simpleradial", "fullopencv", "brown", "brownconrady", "radtan", "standard")
 _BROWN += ("plumbbob", "rationalpolynomial", "radialtangential")
@@ -73,8 +74,8 @@ def finite(place: str, value: Any) -> float:
 
 
 class Entries:
-    """The entries of a camera. A null counts as missing. Methods give None where an entry is missing, and
-    refuse (InputError) one of a wrong type, and two that mean the same and differ.
+    """The entries of a camera. A null counts as missing. Methods give None where an entry is
+    missing, and refuse (InputError) one of a wrong type, and two that mean the same and differ.
 
     Attributes:
         origin: file and camera, for messages.
@@ -341,8 +342,9 @@ def coefficients(numbers: Mapping[str, float], names: str) -> np.ndarray:
 
 
 def _bends(key: str, value: Any) -> bool:
-    """Whether an entry says something of the lens: numbers other than 0, or a model of another kind, which
-    may be the value of any key, such as ``type``. ``key``: spelled as :func:`plain` does."""
+    """Whether an entry says something of the lens: numbers other than 0, or a model of another
+    kind, which may be the value of any key, such as ``type``. ``key``: spelled as
+    :func:`plain` does."""
     if isinstance(value, str):
         model = plain(value)
         is_model = bool(_MODELS.match(model)) and len(value.split()) == 1

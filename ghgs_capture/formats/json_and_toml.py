@@ -1,4 +1,5 @@
-"""This package's JSON, OpenCV's matrices as JSON, and the TOML of Pose2Sim, Anipose and Caliscope."""
+"""This package's JSON, OpenCV's matrices as JSON, and the TOML of Pose2Sim,
+Anipose and Caliscope."""
 
 import json
 import tomllib
@@ -65,7 +66,8 @@ def read_json(path: Path) -> CameraFile:
 
 
 def _cameras_of(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
-    """Cameras by name: those of the entry ``cameras``, a mapping or a list, or all entries without one."""
+    """Cameras by name: those of the entry ``cameras``, a mapping or a list,
+    or all entries without one."""
     named = content.get("cameras", content)
     if isinstance(named, list) and all(isinstance(camera, Mapping) for camera in named):
         named = {str(camera.get("name", i)): camera for i, camera in enumerate(named)}
@@ -99,7 +101,8 @@ def _others(
 
 
 def read_toml(path: Path) -> CameraFile:
-    """Pose2Sim's, Anipose's and Caliscope's TOML: a table for each camera, named by its key ``name``.
+    """Pose2Sim's, Anipose's and Caliscope's TOML: a table for each camera,
+    named by its key ``name``.
 
     Args:
         path: of the file.

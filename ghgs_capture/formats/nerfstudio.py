@@ -1,4 +1,5 @@
-"""``transforms.json`` of nerfstudio and Instant NGP: camera-to-world matrices with OpenGL's axes."""
+"""``transforms.json`` of nerfstudio and Instant NGP:
+camera-to-world matrices with OpenGL's axes."""
 
 import math
 from collections.abc import Mapping

@@ -1,8 +1,8 @@
 """OpenCV's matrices under the names that programs give them, and the YAML that has them.
 
-YAML of ``cv2.FileStorage`` is a file for each camera, all cameras in one, or EasyMocap's pair. Files differ
-in spelling: ``camera_matrix`` or ``K``, ``distortion_coefficients`` or ``dist``, ``rvec`` or ``R``. Poses map
-the world to the camera; pixel centres are at integers."""
+YAML of ``cv2.FileStorage`` is a file for each camera, all cameras in one, or EasyMocap's pair.
+Files differ in spelling: ``camera_matrix`` or ``K``, ``distortion_coefficients`` or ``dist``,
+``rvec`` or ``R``. Poses map the world to the camera; pixel centres are at integers."""
 
 import re
 from collections.abc import Mapping
@@ -39,7 +39,8 @@ class _Loader(yaml.SafeLoader):
 
 
 def _matrix(loader: _Loader, node: yaml.Node) -> np.ndarray:
-    """The node ``{rows, cols, dt, data}``, or ``{sizes, dt, data}`` as OpenCV 5 writes arrays of one axis."""
+    """The node ``{rows, cols, dt, data}``, or ``{sizes, dt, data}`` as OpenCV 5 writes arrays
+    of one axis."""
     fields = loader.construct_mapping(node, deep=True)
     sizes = fields["sizes"] if "sizes" in fields else (fields["rows"], fields["cols"])
     return np.array(fields["data"], np.float64).reshape(tuple(map(int, sizes)))
@@ -125,8 +126,8 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 
 def _by_name(fields: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
-    """Cameras whose keys carry their names: K_01, dist_01, R_01 (vector), Rot_01 (matrix), T_01; and the
-    other entries."""
+    """Cameras whose keys carry their names: K_01, dist_01, R_01 (vector), Rot_01 (matrix), T_01;
+    and the other entries."""
     cameras: dict[str, dict[str, Any]] = {key[2:]: {} for key in fields if key.startswith("K_")}
     others: dict[str, Any] = {}
     for key, value in fields.items():

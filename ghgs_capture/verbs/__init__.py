@@ -1,4 +1,5 @@
-"""The verbs that work on a user's photographs: what each is for, its keys, and where its work begins.
+"""The verbs that work on a user's photographs: what each is for, its keys,
+and where its work begins.
 
 The module that does the work is imported when the verb runs: ``ghgs --help`` waits for no library.
 """
@@ -20,11 +21,14 @@ class OfPhotographs(Verb):
     """The user's photographs and their cameras."""
 
     images: PathText | None = None
-    """Folder of photographs or videos named after their cameras; of such folders: one for each instant."""
+    """Folder of photographs or videos named after their cameras;
+    of such folders: one for each instant."""
     cameras: PathText | None = None
-    """Their calibration: JSON, transforms.json, COLMAP, YAML of OpenCV or EasyMocap, TOML of Pose2Sim."""
+    """Their calibration: JSON, transforms.json, COLMAP, YAML of OpenCV or EasyMocap,
+    TOML of Pose2Sim."""
     masks: PathText | None = None
-    """Folder of masks; null: backgrounds, segment, <name>_mask.png, those of the calibration, or alpha."""
+    """Folder of masks; null: backgrounds, segment, <name>_mask.png, those of the calibration,
+    or alpha."""
     backgrounds: PathText | None = None
     """Folder of photographs without the subject."""
     segment: Text | None = None
@@ -35,7 +39,8 @@ class OfPhotographs(Verb):
         return False
 
     def require_files(self, config: Mapping[str, Any]) -> None:
-        """As of every verb; photographs that are read at once are then decoded beside the imports."""
+        """As of every verb; photographs that are read at once are then decoded beside
+        the imports."""
         super().require_files(config)
         if self.reads_at_once() and self.images is not None and self.cameras is not None:
             from ghgs_capture.verbs.photographs import begin_to_read
@@ -56,16 +61,17 @@ class Predict(OfPhotographs, Measured):
     check_cameras: bool = True
     """Refuse cameras that the masks contradict (``ghgs doctor task=cameras`` says more)."""
     size: CropSize | None = None
-    """Side or [height, width] of what the model sees, in pixels; null: as it was trained. At most 2072, four
-    times the published 518: memory grows with its square."""
+    """Side or [height, width] of what the model sees, in pixels; null: as it was trained. At most
+    2072, four times the published 518: memory grows with its square."""
     refine_masks: Literal["auto"] | Annotated[int, Field(ge=0, le=64)] = "auto"
-    """Pixels of size that masks may be off by: photographs say where outlines are; 0: none; auto: 4 where
-    photographs contradict the masks (of images alone, not of a data set)."""
+    """Pixels of size that masks may be off by: photographs say where outlines are; 0: none; auto: 4
+    where photographs contradict the masks (of images alone, not of a data set)."""
     refine_cameras: Literal["auto"] | Annotated[int, Field(ge=0, le=100)] = "auto"
     """Rounds, at most, that correct the cameras until the photographs agree; 0: none; auto: 4 where
     silhouettes contradict the cameras (of images alone, not of a data set)."""
     refine_tones: Literal["auto", 0] = "auto"
-    """auto: undo the tone curve that a single camera has beside the others (of images alone); 0: leave it."""
+    """auto: undo the tone curve that a single camera has beside the others (of images alone);
+    0: leave it."""
     refine: int = Field(0, ge=0, le=10000)
     """Steps of optimisation towards the photographs after the prediction, such as 15; 0: none."""
     out: PathText | None = None
@@ -103,12 +109,14 @@ class View(Predict):
     reads_data = False
 
     images: PathText | Annotated[dict, Words("a folder or a mapping of cameras to devices")] | None = None
-    """As for ``ghgs predict``; with live also {camera: number of a device, or address of a stream}, which
-    OpenCV opens."""
+    """As for ``ghgs predict``; with live also {camera: number of a device, or address of a stream},
+    which OpenCV opens."""
     path: PathText | None = None
-    """A directory of ``ghgs predict`` (its formats ply and inputs), or a PLY; null: predict first."""
+    """A directory of ``ghgs predict`` (its formats ply and inputs), or a PLY;
+    null: predict first."""
     checkpoint: PathText | None = None
-    """Without path: a checkpoint, as for ``ghgs predict``; null: the one that comes with the package."""
+    """Without path: a checkpoint, as for ``ghgs predict``;
+    null: the one that comes with the package."""
     formats: Texts = ("ply", "inputs")
     """What is written, as for ``ghgs predict``."""
     host: Text = "127.0.0.1"
@@ -118,11 +126,12 @@ class View(Predict):
     seconds: Positive | None = None
     """The page is closed after so long; null: never."""
     live: bool = False
-    """Show the newest instant of images again and again: of a folder that is being written, of videos at
-    their rate, or of cameras. Their calibration is not checked, auto refines nothing, and out gets
-    sequence/0000.ply and so on."""
+    """Show the newest instant of images again and again: of a folder that is being written, of
+    videos at their rate, or of cameras. Their calibration is not checked, auto refines nothing, and
+    out gets sequence/0000.ply and so on."""
     delay: Positive | None = None
-    """Of live: seconds between an instant and its picture after which it is dropped; null: none is."""
+    """Of live: seconds between an instant and its picture after which it is dropped;
+    null: none is."""
 
     def reads_at_once(self) -> bool:
         return False
@@ -142,9 +151,9 @@ class Adapt(OfPhotographs, Training):
     checkpoint: PathText = "shipped"
     """The weights to start from."""
     learn: Literal["auto", "people", "instants", "both"] = "auto"
-    """From what: people who are built in and stand in the rig; instants of images, of whose cameras each in
-    turn is the target of the others; both; auto: instants where images has several of three cameras or more,
-    else people."""
+    """From what: people who are built in and stand in the rig; instants of images, of whose cameras
+    each in turn is the target of the others; both; auto: instants where images has several of three
+    cameras or more, else people."""
     minutes: float = Field(3, gt=0, le=1440)
     """Minutes of training."""
     out: PathText | None = None
@@ -162,9 +171,9 @@ class Doctor(OfPhotographs):
     example = "ghgs doctor task=cameras images=photographs cameras=cameras.json masks=masks"
 
     task: Literal["cameras", "machine", "selfcheck"] = "cameras"
-    """cameras: whether photographs, masks and calibration fit together, and what would fit. machine: what
-    there is, and what is missing for which feature. selfcheck: whether ``device`` computes as the CPU does in
-    float64: a table for a bug report."""
+    """cameras: whether photographs, masks and calibration fit together, and what would fit.
+    machine: what there is, and what is missing for which feature. selfcheck: whether ``device``
+    computes as the CPU does in float64: a table for a bug report."""
     device: Device = "auto"
     """Of task=machine and selfcheck."""
     seed: Seed = 1

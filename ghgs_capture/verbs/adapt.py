@@ -1,5 +1,5 @@
-"""``ghgs adapt``: weights for the cameras of one rig, from built-in people who stand in it, or for one
-capture, from its own instants."""
+"""``ghgs adapt``: weights for the cameras of one rig, from built-in people who stand in it, or for
+one capture, from its own instants."""
 
 import contextlib
 import json
@@ -50,7 +50,8 @@ if TYPE_CHECKING:
 
 # Training people are as tall in a photograph as the user's subject, give or take this share.
 _SPREAD = 0.1
-# Minutes for which the training people of conf/adapt.yaml suffice; ten passes over them learn them by heart.
+# Minutes for which the training people of conf/adapt.yaml suffice;
+# ten passes over them learn them by heart.
 _MINUTES = 3
 _INSTANTS = 60  #: Instants, spread over a sequence, that are read to learn from
 #: Weights of the loss's terms for instants, of which depth and body are not known.
@@ -68,8 +69,9 @@ def run(options: "Adapt", cfg: DictConfig) -> float | str | None:
         cfg: the whole configuration.
 
     Returns:
-        Mean PSNR in dB of validation people in the rig or of instants that were not learned from, also
-        of a run that is done; ``BUSY`` (:mod:`ghgs_lit.runs.job`): in a sweep, another process works on it.
+        Mean PSNR in dB of validation people in the rig or of instants that were not learned from,
+        also of a run that is done; ``BUSY`` (:mod:`ghgs_lit.runs.job`): in a sweep, another
+        process works on it.
     """
     config = resolve(cfg) | model_of(options.checkpoint, cfg)
     files_to_write(options, ["out"])

@@ -1,4 +1,5 @@
-"""Folder of photographs that a configuration names, and the check of its cameras before a verb runs."""
+"""Folder of photographs that a configuration names,
+and the check of its cameras before a verb runs."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -188,7 +188,8 @@ def _free_places(
         moves_cameras: several instants also share a file of corrected cameras.
 
     Returns:
-        The directory of each instant by name, and what several of them share; None for a single one.
+        The directory of each instant by name, and what several of them share;
+        None for a single one.
 
     Raises:
         InputError: a file would be written over that is read.

@@ -30,7 +30,8 @@ _HULL_POINTS = 50_000
 
 @dataclass(frozen=True)
 class Content:
-    """Gaussians of one subject; ``batch`` has its photographs, masks and cameras where they are known."""
+    """Gaussians of one subject; ``batch`` has its photographs,
+    masks and cameras where they are known."""
 
     gaussians: Gaussians
     up: Float[Tensor, "3"]
@@ -90,7 +91,8 @@ class Content:
 
 
 def read_content(path: str | Path, up: str | None) -> Content:
-    """Read what ``ghgs predict`` wrote into a directory (its formats ``ply`` and ``inputs``), or a PLY.
+    """Read what ``ghgs predict`` wrote into a directory (its formats ``ply`` and ``inputs``),
+    or a PLY.
 
     Args:
         path: the directory or the PLY.
@@ -117,7 +119,8 @@ def read_content(path: str | Path, up: str | None) -> Content:
 
 
 def _read_inputs(directory: Path) -> Batch:
-    """Photographs, masks and cameras of the format ``inputs``. InputError: one is missing or wrong."""
+    """Photographs, masks and cameras of the format ``inputs``.
+    InputError: one is missing or wrong."""
     stored = read_json(directory / "cameras.json")
     pictures = []
     cameras = []

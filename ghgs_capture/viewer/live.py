@@ -57,7 +57,8 @@ class Recording:
 
 
 class Pause:
-    """``pause(seconds)`` waits; CancelledError once ``stopped`` is set. ``seconds``: length of all pauses."""
+    """``pause(seconds)`` waits; CancelledError once ``stopped`` is set.
+    ``seconds``: length of all pauses."""
 
     def __init__(self):
         self.stopped = threading.Event()

@@ -41,7 +41,8 @@ def _refuse_other_addresses(connection: Any, request: Any, response: Any) -> Any
 
 @contextlib.contextmanager
 def _own_pages_only(host: str) -> Iterator[None]:
-    """Make servers that start in this context refuse pages of other sites; viser accepts any origin."""
+    """Make servers that start in this context refuse pages of other sites;
+    viser accepts any origin."""
     from websockets.asyncio import server
 
     serve = server.serve
@@ -168,7 +169,8 @@ class Viewer:
             node.visible = box.value
 
     def _show_frustums(self) -> None:
-        """Show the cameras; that of the visitors hides its photograph unless ``picture`` chooses it."""
+        """Show the cameras; that of the visitors hides its photograph unless ``picture``
+        chooses it."""
         for view, frustum in enumerate(self._frustums):
             is_clear = view != self._at or self._shown == "photograph"
             frustum.visible = self.cameras.value and is_clear
@@ -206,7 +208,8 @@ class Viewer:
         self._at: int | None = None  # the camera that visitors were put at
 
     def _place_visitors(self) -> None:
-        """Start visitors behind and beside the first camera: its photograph would hide the subject."""
+        """Start visitors behind and beside the first camera:
+        its photograph would hide the subject."""
         cameras = self.content.cameras
         target = self.content.center.numpy()
         up = self.content.up.numpy().astype(np.float64)

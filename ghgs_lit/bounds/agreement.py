@@ -1,6 +1,6 @@
-"""Agreement of the masks: a view whose mask contradicts all others does not vote. In silhouettes of one
-subject, each ray has a point that all the other silhouettes cover (silhouette coherence; Hernandez et al.,
-PAMI 2007). Nothing here has a gradient."""
+"""Agreement of the masks: a view whose mask contradicts all others does not vote. In silhouettes of
+one subject, each ray has a point that all the other silhouettes cover (silhouette coherence;
+Hernandez et al., PAMI 2007). Nothing here has a gradient."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -29,11 +29,13 @@ _SHARE = 0.95
 def trusted_views(
     coarse: Silhouettes, center: Float[Tensor, "B 3"], reach: Float[Tensor, " B"], tolerance: int
 ) -> Bool[Tensor, "B V"]:
-    """Views that vote about the hull: those that show the subject, except one that contradicts the others.
+    """Views that vote about the hull: those that show the subject,
+    except one that contradicts the others.
 
-    A mask that is cut leaves rays of the other views unexplained; a mask that is too large has unexplained
-    rays itself. If the masks do not agree (:data:`_SHARE`), the view without which less than half of the
-    unexplained share is left does not vote. With two views both vote: either could be wrong.
+    A mask that is cut leaves rays of the other views unexplained; a mask that is too large has
+    unexplained rays itself. If the masks do not agree (:data:`_SHARE`), the view without which
+    less than half of the unexplained share is left does not vote. With two views both vote: either
+    could be wrong.
 
     Args:
         coarse: masks of at most :data:`RESOLUTION` cells along the longer side, and their cameras.
@@ -71,7 +73,8 @@ def _votes(coarse: Silhouettes, voting: Tensor, center: Tensor, reach: Tensor) -
         reach: [B], half of their range, in metres.
 
     Returns:
-        Votes [B, v, o, h, w, S]: 1 where view ``o`` sees a point on a ray of view ``v`` outside its mask.
+        Votes [B, v, o, h, w, S]: 1 where view ``o`` sees a point on a ray of view ``v``
+        outside its mask.
     """
     masks = coarse.masks
     cameras = coarse.cameras

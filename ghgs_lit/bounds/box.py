@@ -1,5 +1,6 @@
-"""Near and far of each pixel from an axis-aligned box around the subject. The box is found by carving a
-coarse grid with the masks, dilated because real masks are noisy. Nothing here has a gradient."""
+"""Near and far of each pixel from an axis-aligned box around the subject. The box is found
+by carving a coarse grid with the masks, dilated because real masks are noisy. Nothing here
+has a gradient."""
 
 from typing import ClassVar
 
@@ -29,7 +30,8 @@ from ghgs_lit.kernels import gpu
 from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 
-#: Cells along the longer side of the masks that are searched, and along each side of the grid that is carved.
+#: Cells along the longer side of the masks that are searched,
+#: and along each side of the grid that is carved.
 RESOLUTION = 160
 CELLS = 32
 
@@ -43,9 +45,10 @@ _FARTHEST = 1e6
 
 
 class SubjectBox(Options):
-    """``bounds(batch) -> DepthBounds``: where each ray enters and leaves the subject's box. A ray that misses
-    the box gets the range of depths of the whole box. Views with an empty mask do not vote, nor does one
-    whose mask contradicts all others (:func:`ghgs_lit.bounds.agreement.trusted_views`)."""
+    """``bounds(batch) -> DepthBounds``: where each ray enters and leaves the subject's box. A ray
+    that misses the box gets the range of depths of the whole box. Views with an empty mask do not
+    vote, nor does one whose mask contradicts all others
+    (:func:`ghgs_lit.bounds.agreement.trusted_views`)."""
 
     group = "bounds"
     dilation: float = Field(0.01, ge=0, lt=0.5)
@@ -112,8 +115,8 @@ def subject_box(
 ) -> tuple[Float[Tensor, "B 3"], Float[Tensor, "B 3"]]:
     """The axis-aligned box of the visual hull.
 
-    Carved twice: the second grid fills the box of the first. If nothing is left (contradicting masks), the
-    box before that pass stays.
+    Carved twice: the second grid fills the box of the first. If nothing is left (contradicting
+    masks), the box before that pass stays.
 
     Args:
         masks: a view with an empty mask does not vote.
@@ -133,7 +136,8 @@ def subject_box(
         lower, upper = corners
         cell = (upper - lower) / CELLS
         depth = in_cameras((lower + upper) / 2, cameras.extrinsics)[..., 2]
-        # Half a cell's diagonal in pixels, for points as near as 0.6 times the depth of the box's middle.
+        # Half a cell's diagonal in pixels, for points as near as 0.6 times the depth of
+        # the box's middle.
         pixels = focal * cell.norm(dim=-1, keepdim=True) / 2 / (0.6 * depth).clamp(min=NEAREST)
         grow = pixels.nan_to_num(nan=0.0).amax(1).clamp(max=max(masks.shape[-2:])).ceil().int()
         grown = dilate(masks, radius, grow)

@@ -1,6 +1,6 @@
-"""Near and far of each pixel from the visual hull of the other views. The rays of the subject's pixels are
-marched through the subject's box; depths that the masks of the *other* views allow are kept: the image-based
-visual hull (Matusik et al. 2000). Nothing here has a gradient."""
+"""Near and far of each pixel from the visual hull of the other views. The rays of the subject's
+pixels are marched through the subject's box; depths that the masks of the *other* views allow are
+kept: the image-based visual hull (Matusik et al. 2000). Nothing here has a gradient."""
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -29,8 +29,8 @@ _DEPTHS = 1 << 18, 1 << 23
 
 
 class VisualHull(SubjectBox):
-    """``bounds(batch) -> DepthBounds``: where each ray of the subject enters and leaves the visual hull.
-    Other pixels, and rays that miss the hull, have the bounds of the box."""
+    """``bounds(batch) -> DepthBounds``: where each ray of the subject enters and leaves the visual
+    hull. Other pixels, and rays that miss the hull, have the bounds of the box."""
 
     samples: int = Field(48, ge=2, le=4096)
     """Depths that are tried along each ray"""
@@ -84,7 +84,8 @@ def hull_bounds(
         samples: depths that are tried along each ray.
         rays: indices of the masks' pixels, if known.
         voting: views that may say "outside"; None: those whose mask is not empty.
-        count: the masks have no more pixels than this, so that a GPU need not be asked; None: unknown.
+        count: the masks have no more pixels than this, so that a GPU need not be asked;
+            None: unknown.
 
     Returns:
         Bounds [B, V, h, w] in metres, half a step outside the depths that were tried.
@@ -119,8 +120,8 @@ def _march(
     steps: Float[Tensor, " s"],
     tolerance: int,
 ) -> None:
-    """Replace the bounds of some pixels by the first and the last depth that the other views allow; unchanged
-    where there is none.
+    """Replace the bounds of some pixels by the first and the last depth that the other views allow;
+    unchanged where there is none.
 
     Args:
         rays: indices of pixels; one may be listed more than once, so that ``start`` is read.
@@ -201,6 +202,7 @@ _marching = gpu.operator(
 
 
 def _enlarge(values: Tensor, stride: int, size: tuple[int, int]) -> Tensor:
-    """Values of cells for their ``stride`` x ``stride`` pixels each, cropped to ``size`` (height, width)."""
+    """Values of cells for their ``stride`` x ``stride`` pixels each,
+    cropped to ``size`` (height, width)."""
     values = values.repeat_interleave(stride, -2).repeat_interleave(stride, -1)
     return values[..., : size[0], : size[1]]

@@ -1,5 +1,5 @@
-"""Rays of pixels, and masks as silhouettes: dilated, and looked up at projected points. A ray is a function
-of z-depth: ``point(z) = center + z * direction``."""
+"""Rays of pixels, and masks as silhouettes: dilated, and looked up at projected points. A ray is a
+function of z-depth: ``point(z) = center + z * direction``."""
 
 from dataclasses import dataclass
 from itertools import product
@@ -37,7 +37,8 @@ def projection_matrices(cameras: Cameras) -> Float[Tensor, "*batch 3 4"]:
 
 
 def pixel_axes(cameras: Cameras) -> tuple[Float[Tensor, " w"], Float[Tensor, " h"]]:
-    """Coordinates of the pixel centres along a row (columns + 0.5) and along a column (rows + 0.5)."""
+    """Coordinates of the pixel centres along a row (columns + 0.5) and along a column
+    (rows + 0.5)."""
     centers = pixel_centers(cameras.height, cameras.width, at_least_float32(cameras.intrinsics))
     return centers[0, :, 0], centers[:, 0, 1]
 
@@ -53,8 +54,8 @@ def depths_in_box(cameras: Cameras, lower: Float[Tensor, "B 3"], upper: Float[Te
         upper: that with the largest.
 
     Returns:
-        Bounds [B, V, h, w] in metres, perhaps behind the camera; for a ray that misses the box, the range of
-        depths of the whole box.
+        Bounds [B, V, h, w] in metres, perhaps behind the camera; for a ray that misses the box, the
+        range of depths of the whole box.
     """
     directions = ray_directions(cameras)
     centers = cameras.centers[:, :, None, None]
@@ -77,13 +78,15 @@ def depths_in_box(cameras: Cameras, lower: Float[Tensor, "B 3"], upper: Float[Te
 #: Which faces meet in each corner of a box.
 _CORNERS = tuple(product((False, True), repeat=3))
 
-#: The smallest depth in metres at which masks are looked up; points behind the camera are moved there.
+#: The smallest depth in metres at which masks are looked up;
+#: points behind the camera are moved there.
 NEAREST = 1e-4
 
 
 @dataclass(frozen=True)
 class Silhouettes:
-    """Masks of cells of ``stride`` x ``stride`` pixels, the cameras of the cells, and a dilation in cells."""
+    """Masks of cells of ``stride`` x ``stride`` pixels, the cameras of the cells,
+    and a dilation in cells."""
 
     masks: Bool[Tensor, "B V h w"]
     cameras: Cameras
@@ -167,8 +170,9 @@ def look_up(
 ) -> Tensor:
     """Entries of tables at homogeneous pixels.
 
-    Points outside the frame take the entry of the nearest border pixel: a mask that does not touch the border
-    has the whole subject in its frame. Points behind the camera land far outside the frame.
+    Points outside the frame take the entry of the nearest border pixel: a mask that does not
+    touch the border has the whole subject in its frame. Points behind the camera land far
+    outside the frame.
 
     Args:
         tables: of votes or other values.

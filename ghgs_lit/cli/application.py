@@ -93,7 +93,8 @@ class Verb:
         Raises:
             SystemExit: bad input, outside of a sweep; its message is printed.
         """
-        # Lightning runs sys.argv again for the other processes of a DDP job; it must contain the verb.
+        # Lightning runs sys.argv again for the other processes of a DDP job;
+        # it must contain the verb.
         sys.argv = list(self.argv)
         try:
             directory = Path(HydraConfig.get().runtime.output_dir)

@@ -1,4 +1,5 @@
-"""``ghgs <verb> --help [group]``: keys with meaning, default and range, read from the options classes."""
+"""``ghgs <verb> --help [group]``: keys with meaning, default and range,
+read from the options classes."""
 
 import textwrap
 from collections.abc import Iterator, Sequence
@@ -39,7 +40,8 @@ def defaults_of(verb: str) -> dict[str, str | None]:
 
 
 def _files(group: str, folders: Sequence[Path]) -> list[Path]:
-    """Files of a group's options: those of ``conf``, then those of ``folders``, each sorted by name."""
+    """Files of a group's options: those of ``conf``, then those of ``folders``,
+    each sorted by name."""
     paths = []
     for folder in (conf_dir(), *folders):
         paths += sorted((folder / group).glob("*.yaml"))

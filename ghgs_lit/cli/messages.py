@@ -27,7 +27,8 @@ BAD_INPUT = (InputError, OSError, HydraException, OmegaConfBaseException)
 
 _EXTRAS = {"joblib": "cluster", "submitit": "cluster", "ray": "ray", "optuna": "optuna"}
 
-#: Hydra would write .hydra through links; :func:`ghgs_lit.cli.application.write_hydra_files` does not.
+#: Hydra would write .hydra through links;
+#: :func:`ghgs_lit.cli.application.write_hydra_files` does not.
 NO_FILES_OF_HYDRA = "hydra.output_subdir=null"
 
 #: Nodes of Lightning's classes, whose keys have defaults and so may be deleted.
@@ -159,7 +160,8 @@ def _can_add(verb: str, chosen: Sequence[str], key: str, override: str) -> bool:
         verb: name of the verb.
         chosen: overrides that choose options of groups.
         key: the dotted key.
-        override: adds the key, such as ``+data.rig.x=3``; empty: the key was not on the command line.
+        override: adds the key, such as ``+data.rig.x=3``;
+            empty: the key was not on the command line.
     """
     if not override or (key.count(".") < 2 and not key.startswith("hydra.")):
         return False
@@ -171,7 +173,8 @@ def _can_add(verb: str, chosen: Sequence[str], key: str, override: str) -> bool:
 
 
 def _system(error: OSError) -> str:
-    """Message for a file that cannot be read or written; the run's directory if the error names none."""
+    """Message for a file that cannot be read or written;
+    the run's directory if the error names none."""
     if error.errno is None:  # raised by this package, with a message of its own
         return str(error)
     path = error.filename2 or error.filename

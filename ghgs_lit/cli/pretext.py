@@ -48,7 +48,8 @@ def pretrain(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> 
         Part accuracy on validation people, 0 to 1.
 
     Raises:
-        InputError: the encoder has no branch, or the size of photographs is no multiple of its patch.
+        InputError: the encoder has no branch,
+            or the size of photographs is no multiple of its patch.
     """
     # Tables of models that start from this checkpoint show this origin.
     config = {**config, "encoder": {**config["encoder"], "weights": "pretext"}}

@@ -1,4 +1,5 @@
-"""What ``dry_run`` tries of the runs of a sweep: everything that they need, and the time of one step."""
+"""What ``dry_run`` tries of the runs of a sweep: everything that they need,
+and the time of one step."""
 
 import json
 import tempfile
@@ -114,7 +115,8 @@ class _Rehearsed:
             model: whose patches photographs must fit; None: it was refused.
 
         Returns:
-            Whether a step can be trained on it now: nothing is missing, and nothing must be rendered.
+            Whether a step can be trained on it now: nothing is missing,
+            and nothing must be rendered.
         """
         if model is not None:
             self.attempt(check_size, data, model)
@@ -146,7 +148,8 @@ class _Rehearsed:
             self.reasons[f"{place}: expected {expected}; found none"] = None
 
     def _check_files(self, data: "PhotographsDataModule", phase: str) -> None:
-        """Note the first file of a phase that is not there, and the first body that the loss lacks."""
+        """Note the first file of a phase that is not there,
+        and the first body that the loss lacks."""
         key = json.dumps([self.config["data"], phase], sort_keys=True, default=str)
         if key in self.listed:
             return

@@ -64,8 +64,8 @@ def files_to_write(options: Verb, keys: Sequence[str], read: Sequence[str | Path
         read: files that the verb reads.
 
     Raises:
-        InputError: a file exists and ``overwrite`` is false, it is one of ``read``, or two keys name
-            one.
+        InputError: a file exists and ``overwrite`` is false, it is one of ``read``, or two
+            keys name one.
     """
     named = {key: getattr(options, key) for key in keys}
     paths = {key: Path(path).expanduser() for key, path in named.items() if path is not None}

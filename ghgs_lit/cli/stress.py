@@ -1,4 +1,5 @@
-"""``ghgs stress``: compare stages with float64 on adversarial inputs, or repeat a saved training step."""
+"""``ghgs stress``: compare stages with float64 on adversarial inputs,
+or repeat a saved training step."""
 
 import sys
 from typing import TYPE_CHECKING

@@ -43,7 +43,8 @@ if TYPE_CHECKING:
 
 
 def quiet() -> None:
-    """Silence Lightning's log lines, which Hydra would print twice, and warnings that do not apply here."""
+    """Silence Lightning's log lines, which Hydra would print twice,
+    and warnings that do not apply here."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
     messages = ("LeafSpec", "smaller than the logging interval", "num_workers", "dataloader is not resumable")
@@ -156,8 +157,8 @@ def run(options: "Train", cfg: DictConfig) -> float | str | None:
         cfg: the whole configuration that Hydra composed.
 
     Returns:
-        Mean PSNR of the first protocol in dB; in a sweep ``job.BUSY`` where another process works on
-        the run.
+        Mean PSNR of the first protocol in dB; in a sweep ``job.BUSY`` where another process
+        works on the run.
 
     Raises:
         InputError: the configuration, a checkpoint or the data is wrong.
@@ -272,7 +273,8 @@ def fit(
         data: of the training.
         config: the whole configuration as plain data; ``resume`` is read.
         step: where ``resume`` stands; None: a new run.
-        stats: receives ``steps``, those taken here, and ``seconds``, even if training is interrupted.
+        stats: receives ``steps``, those taken here, and ``seconds``,
+            even if training is interrupted.
 
     Raises:
         InputError: options of the Trainer do not fit the data.

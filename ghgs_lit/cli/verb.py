@@ -1,7 +1,7 @@
 """A verb of ``ghgs`` is one class: its summary, an example, its keys, and what it does.
 
-The fields of a verb are the keys that ``conf/<verb>.yaml`` sets beside its groups. All come in by the door of
-:mod:`ghgs_lit.config.registry`, those of this distribution as those of a plug-in.
+The fields of a verb are the keys that ``conf/<verb>.yaml`` sets beside its groups. All come in by
+the door of :mod:`ghgs_lit.config.registry`, those of this distribution as those of a plug-in.
 """
 
 from collections.abc import Mapping
@@ -21,7 +21,8 @@ Budgets = Annotated[tuple[Budget, ...], Field(min_length=1)]
 
 
 class Verb(Options):
-    """Base of all verbs; the first line of the docstring is the summary that ``ghgs --help`` prints."""
+    """Base of all verbs; the first line of the docstring is the summary that
+    ``ghgs --help`` prints."""
 
     example: ClassVar[str] = ""
     """A command, for ``ghgs --help``."""
@@ -32,7 +33,8 @@ class Verb(Options):
     has_trained_data: ClassVar[bool] = False
     """Whether the data comes from the checkpoint where no ``data=<option>`` is chosen."""
     begins_run: ClassVar[bool] = False
-    """Whether its directory becomes that of a run at once, before a run of others gets files of this one."""
+    """Whether its directory becomes that of a run at once,
+    before a run of others gets files of this one."""
 
     @classmethod
     def summary(cls) -> str:
@@ -46,7 +48,8 @@ class Verb(Options):
             config: the whole configuration, groups included, as plain data.
 
         Raises:
-            FileNotFoundError, InputError: a file or folder is missing or wrong; the message is its reader's.
+            FileNotFoundError, InputError: a file or folder is missing or wrong;
+                the message is its reader's.
         """
         from ghgs_lit.parsing import require_folder  # here: --help needs no NumPy
         from ghgs_lit.weights.reading import require_weights
@@ -88,6 +91,7 @@ class Training(Verb):
     seed: Seed = 1
     """Of weights, of samples and of their order."""
     resume: Literal["auto"] | PathText | None = "auto"
-    """A checkpoint to go on from; auto: where the run in the directory stands; null: begins anew."""
+    """A checkpoint to go on from; auto: where the run in the directory stands;
+    null: begins anew."""
     overwrite: bool = False
     """Delete the run that is in the directory already."""

@@ -22,12 +22,14 @@ class Train(Training):
     reads_data = True
 
     token_budgets: Budgets | None = None
-    """What the encoder sees in a training step, drawn from this list: all, window (around the subject), or a
-    number (patches around the subject that stay). One checkpoint then serves all presets of skip."""
+    """What the encoder sees in a training step, drawn from this list: all, window (around the
+    subject), or a number (patches around the subject that stay). One checkpoint then serves all
+    presets of skip."""
     init_from: PathText | None = None
     """A checkpoint whose weights to start from."""
     init_strict: bool = False
-    """Whether all weights of init_from must fit, and be all that the model has (or all of its encoder)."""
+    """Whether all weights of init_from must fit,
+    and be all that the model has (or all of its encoder)."""
     allow_random_encoder: bool = False
     """Whether an encoder that does not learn may be random, to try things out."""
     dry_run: bool = False
@@ -67,7 +69,8 @@ class Evaluate(Measured):
     refine: int = Field(0, ge=0, le=10000)
     """Steps of optimisation towards the inputs after each prediction; 0: none."""
     baselines: Texts = ()
-    """Of black, nearest_view, body_depth, hull, photo_depth, true_depth, per_scene, untrained; or all."""
+    """Of black, nearest_view, body_depth, hull, photo_depth, true_depth, per_scene, untrained;
+    or all."""
     per_scene: PerScene = PerScene()
     """3D Gaussian splatting on each subject's inputs."""
 
@@ -85,7 +88,8 @@ class Benchmark(Measured):
     checkpoint: PathText | None = None
     """null: random weights, of which only run times and differences mean something."""
     presets: Annotated[tuple[Text, ...], Field(min_length=1)] = ("none", "exact", "balanced", "fast")
-    """Names of files of conf/skip; none, which the others are compared with, is always measured, too."""
+    """Names of files of conf/skip; none, which the others are compared with, is always measured,
+    too."""
     knobs: Annotated[dict | None, Words("a mapping of lists or null")] = None
     """Lists of values by key, such as {recalibration.k: [4, 8]}: each preset is measured with every
     combination."""
@@ -116,7 +120,8 @@ class Stress(Verb):
     families: tuple[Text, ...] | None = None
     """Names of families of inputs, as stress.md lists them; null: all."""
     dump: PathText | None = None
-    """A training step that was not finite, <run>/faults/step_<n>.pt: run it again, and nothing else."""
+    """A training step that was not finite, <run>/faults/step_<n>.pt: run it again,
+    and nothing else."""
     workers: Workers | None = None
     """Processes; null: one for each processor, 0: this one."""
 
@@ -136,10 +141,11 @@ class Table(Verb):
     ]
     """The directory of a sweep, or a list of directories."""
     layout: Literal["ablation", "table1", "table2", "table3", "table4"] = "ablation"
-    """ablation: four rows, 3 to 5 views | table1: data sets | table2: 3 to 5 views | table3: NeRF methods |
-    table4: the paper's ablation."""
+    """ablation: four rows, 3 to 5 views | table1: data sets | table2: 3 to 5 views | table3: NeRF
+    methods | table4: the paper's ablation."""
     columns: Texts | None = None
-    """Metrics, such as [psnr_box, ssim_box]; null: psnr, ssim, lpips (flip where a run has no lpips)."""
+    """Metrics, such as [psnr_box, ssim_box];
+    null: psnr, ssim, lpips (flip where a run has no lpips)."""
     by: Texts = ()
     """Configuration keys whose values get rows of their own, such as [optimizer.lr]."""
     others: Texts = ()
@@ -161,8 +167,8 @@ class Prepare(Verb):
     example = "ghgs prepare task=render data=scans data.source=scans data.root=rendered"
 
     task: Literal["render", "check"] = "render"
-    """render: render what is missing. check: read every photograph and camera once, with tables and a
-    contact sheet."""
+    """render: render what is missing. check: read every photograph and camera once, with tables and
+    a contact sheet."""
     check: Check = Check()
     """What task=check expects of data."""
     seed: Seed = 0
@@ -182,7 +188,8 @@ class Import(Verb):
     vggt: PathText | None = None
     """facebook/VGGT-1B, or its file (.safetensors or .pt)."""
     release: PathText | None = None
-    """The authors' checkpoint; null: the file holds the encoder alone, for init_from of a training."""
+    """The authors' checkpoint; null: the file holds the encoder alone,
+    for init_from of a training."""
     out: PathText
     """File of the checkpoint."""
     dtype: Literal["float32", "bfloat16", "float16"] = "float32"
@@ -209,7 +216,8 @@ class Export(Verb):
     release: PathText | None = None
     """File for all other stages, .pth; null: not written."""
     inference: PathText | None = None
-    """File with weights and configuration alone, a checkpoint for ``ghgs predict``; null: not written."""
+    """File with weights and configuration alone, a checkpoint for ``ghgs predict``;
+    null: not written."""
     dtype: Literal["float16", "bfloat16", "float32"] = "float16"
     """Of the weights in it."""
     overwrite: bool = False

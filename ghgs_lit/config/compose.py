@@ -39,7 +39,8 @@ def _application() -> Iterator[None]:
 
 
 def _is_own() -> bool:
-    """Whether the Hydra application that runs, if any, searches ``conf``: another program's does not."""
+    """Whether the Hydra application that runs, if any, searches ``conf``:
+    another program's does not."""
     if not GlobalHydra.instance().is_initialized():
         return False
     searched = GlobalHydra.instance().config_loader().get_search_path().get_path()
@@ -87,7 +88,8 @@ def resolve(cfg: DictConfig, verb: str | None = None) -> dict[str, Any]:
     """A composed configuration as plain data, whose groups are checked.
 
     Args:
-        cfg: the configuration, which gets all defaults; nodes without a kind are checked when they are built.
+        cfg: the configuration, which gets all defaults;
+            nodes without a kind are checked when they are built.
         verb: whose own keys are checked, too; None: none are.
 
     Raises:
@@ -133,7 +135,8 @@ _GLOBAL = ("experiment", "sweep", "ablation")
 
 
 def check_ablation(cfg: DictConfig, hydra_node: DictConfig) -> None:
-    """Check that each key that the chosen ablation sets has its value, unless the command line sets it.
+    """Check that each key that the chosen ablation sets has its value,
+    unless the command line sets it.
 
     Args:
         cfg: the composed configuration.
@@ -179,8 +182,8 @@ def chosen_options(config: Mapping[str, Any], hydra_node: DictConfig) -> dict[st
         hydra_node: The node ``hydra`` of the application that composed it.
 
     Returns:
-        ``model``, ``encoder`` and ``ablation``: names of the chosen options, None without one; ``sets``:
-        dotted keys that the ablation sets, with their values in ``config``.
+        ``model``, ``encoder`` and ``ablation``: names of the chosen options, None without one;
+        ``sets``: dotted keys that the ablation sets, with their values in ``config``.
     """
     choices = hydra_node.runtime.choices
     names = {group: choices.get(group) for group in ("model", "encoder", "ablation")}

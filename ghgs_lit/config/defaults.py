@@ -1,9 +1,9 @@
 """Defaults of options, which YAML does not repeat.
 
-A key that no file sets has the default of its class. Hydra refuses overrides of keys that are not there, so
-nodes of options are opened when their file is read. Classes are imported later, because libraries come with
-them: then unknown keys are refused and defaults are filled in. Those of verbs, which need no library, are
-filled in at once.
+A key that no file sets has the default of its class. Hydra refuses overrides of keys that are not
+there, so nodes of options are opened when their file is read. Classes are imported later, because
+libraries come with them: then unknown keys are refused and defaults are filled in. Those of verbs,
+which need no library, are filled in at once.
 """
 
 from collections.abc import Mapping

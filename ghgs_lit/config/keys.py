@@ -1,4 +1,5 @@
-"""Dotted keys of configurations, lists of keys that do not influence results, and names of ablations."""
+"""Dotted keys of configurations, lists of keys that do not influence results,
+and names of ablations."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -14,13 +15,14 @@ WITHOUT_INFLUENCE = (
     "evaluation.pictures", "trainer.log_every_n_steps", "trainer.profiler",
 )  # fmt: skip
 
-#: Keys that may change when a run is resumed without being reported: those without influence, the length of
-#: training (``trainer.max_*``) and what is measured after it.
+#: Keys that may change when a run is resumed without being reported: those without influence, the
+#: length of training (``trainer.max_*``) and what is measured after it.
 MAY_CHANGE_ON_RESUME = (
     *WITHOUT_INFLUENCE, "evaluation", "metrics", "sweep", "trainer.max_steps", "trainer.max_time",
 )  # fmt: skip
 
-#: Keys that loggers do not list as hyperparameters: those without influence, the sweep, and the evaluation.
+#: Keys that loggers do not list as hyperparameters: those without influence, the sweep,
+#: and the evaluation.
 NOT_HYPERPARAMETERS = (*WITHOUT_INFLUENCE, "evaluation", "sweep")
 
 #: Keys of views and targets by which models are trained differently.
@@ -28,12 +30,13 @@ OF_TRAINING = ("views.training_counts", "views.training", "targets.training_view
 #: Keys by which a protocol of one name has other targets.
 OF_TARGETS = ("targets.kind", "targets.view", "targets.positions", "targets.per_subject")
 
-#: Keys that may differ between the runs of a row of a table: those without influence, the seed, and views,
-#: targets and metrics, which tables keep apart themselves.
+#: Keys that may differ between the runs of a row of a table: those without influence, the seed, and
+#: views, targets and metrics, which tables keep apart themselves.
 OF_A_RUN = (*WITHOUT_INFLUENCE, "evaluation", "metrics.kind", "seed", "targets", "views")
 #: Keys that name files and machines: the same run elsewhere has others.
 OF_A_PLACE = ("checkpoint", "data.root", "data.source", "init_from", "trainer.accelerator")
-#: Keys that may differ between the runs of a table: those of a run, and the switches of the ablation.
+#: Keys that may differ between the runs of a table: those of a run,
+#: and the switches of the ablation.
 EXPECTED_TO_DIFFER = (*OF_A_RUN, "recalibration.neighborhood", "recalibration.similarity")
 
 
@@ -119,7 +122,8 @@ def is_below(key: str, parents: Iterable[str]) -> bool:
     return any(key == parent or key.startswith(f"{parent}.") for parent in parents)
 
 
-#: Name of the ablation by its switches (3D unprojection, semantic consistency), in the order of tables.
+#: Name of the ablation by its switches (3D unprojection, semantic consistency),
+#: in the order of tables.
 ABLATIONS = {
     (False, False): "neither",
     (False, True): "no_unprojection",
@@ -146,12 +150,12 @@ def ablation_of(config: Mapping[str, Any]) -> str:
     """Name of a model's row in the ablation table.
 
     Args:
-        config: Resolved configuration of a training. Its ``chosen.ablation``, where it has one, is the option
-            of the group ``ablation`` that was chosen.
+        config: Resolved configuration of a training. Its ``chosen.ablation``, where it has one, is
+            the option of the group ``ablation`` that was chosen.
 
     Returns:
-        The option where it is a user's own; else the name that :data:`ABLATIONS` gives to the model's
-        switches, which the command line may have set one by one.
+        The option where it is a user's own; else the name that :data:`ABLATIONS` gives to the
+        model's switches, which the command line may have set one by one.
     """
     name = lookup(config, "chosen.ablation")
     return name if is_own_ablation(name) else ABLATIONS[switches_of(config)]

@@ -13,7 +13,8 @@ Views = Annotated[int, Field(ge=2)]
 
 
 class Calibration(Options):
-    """Corrections of what the file of cameras omits or says wrongly; null: as its format defines it."""
+    """Corrections of what the file of cameras omits or says wrongly;
+    null: as its format defines it."""
 
     group = "calibration"
     format: Literal["auto", "ghgs", "colmap", "nerfstudio", "opencv", "easymocap", "toml", "qualisys"] = (
@@ -49,8 +50,8 @@ class SequenceOptions(Options):
     step: Count = 1
     """Every so many of them."""
     sync: PathText | Annotated[dict, Words("a mapping of cameras to frames")] | None = None
-    """Of videos. null: their frames are numbered alike. {camera: frames} by which it began before the others.
-    A CSV (camera,frame,seconds): the frames nearest to those of the first camera."""
+    """Of videos. null: their frames are numbered alike. {camera: frames} by which it began before
+    the others. A CSV (camera,frame,seconds): the frames nearest to those of the first camera."""
 
 
 class Turntable(Options):
@@ -73,7 +74,8 @@ class Timing(Options):
     """How run times are measured."""
 
     repeats: int = Field(9, ge=1, le=1000)
-    """Rounds that count, enough of them at 1000; each runs all presets, and each begins with another one."""
+    """Rounds that count, enough of them at 1000;
+    each runs all presets, and each begins with another one."""
 
 
 class Check(Options):
@@ -96,18 +98,21 @@ class PairedTest(Options):
     metrics: Texts | None = None
     """Columns that are tested, all together corrected; null: the first. Others are printed only."""
     unit: Text | None = None
-    """Where subjects are frames of people: a regular expression whose group is the person's name."""
+    """Where subjects are frames of people: a regular expression whose group is the
+    person's name."""
 
 
 class EvaluationOptions(Options):
-    """What is measured after training and by ``ghgs evaluate``: every number of views with every protocol."""
+    """What is measured after training and by ``ghgs evaluate``:
+    every number of views with every protocol."""
 
     group = "evaluation"
     views: Views | tuple[Views, ...] | None = None
     """Numbers of input views (the paper's: 3, 4 and 5); of tables, null: those of the layout."""
     targets: Texts | None = ("release", "midway")
-    """Names of files in conf/targets, each with its own values (the paper's: release). The one that targets=
-    selects has the values of this configuration. Of tables, null: all that were measured."""
+    """Names of files in conf/targets, each with its own values (the paper's: release). The
+    one that targets= selects has the values of this configuration. Of tables, null: all that
+    were measured."""
     split: Text = "val"
     """val: unseen in training | train | bench, sealed: frozen people of data=synthetic."""
     pictures: Index = 4

@@ -1,7 +1,8 @@
 """Options: classes of typed fields that configure a stage, defined once beside it.
 
-A field has a type with a range, a default and, in the text below it, a unit and meaning. Values are checked
-wherever they come from (YAML, command line, checkpoint, Python); ``ghgs <verb> --help <group>`` prints them.
+A field has a type with a range, a default and, in the text below it, a unit and meaning. Values are
+checked wherever they come from (YAML, command line, checkpoint, Python);
+``ghgs <verb> --help <group>`` prints them.
 """
 
 import ast
@@ -188,7 +189,8 @@ class Options(BaseModel, metaclass=_Checked):
     @model_validator(mode="before")
     @classmethod
     def _given(cls, values: Any) -> Any:
-        """Lists become tuples; a mapping for options changes those that are the default of their field."""
+        """Lists become tuples; a mapping for options changes those that are the default of
+        their field."""
         if not isinstance(values, dict):
             return values
         given = _immutable(values)
@@ -207,7 +209,8 @@ class Options(BaseModel, metaclass=_Checked):
             key: dotted key of the mapping; empty: the whole configuration.
 
         Raises:
-            InputError: names the first wrong key below ``key``, what was expected and what was found.
+            InputError: names the first wrong key below ``key``,
+                what was expected and what was found.
         """
         if isinstance(values, cls):
             return values
@@ -263,7 +266,8 @@ def _plain(value: Any) -> Any:
 
 
 def _input_error(cls: type[Options], key: str, values: Mapping, error: ValidationError) -> InputError:
-    """The first of pydantic's errors, unknown keys first: a misspelt key may leave another one missing.
+    """The first of pydantic's errors, unknown keys first:
+    a misspelt key may leave another one missing.
 
     Args:
         cls: the class of options that refused its values.

@@ -1,8 +1,8 @@
 """Files of ``--config-dir`` and ``hydra.searchpath``, and what they may say to Hydra.
 
-Such files can come from somebody else. What they say of the package's groups are options, which are checked
-as all options are; but the node ``hydra`` can set environment variables, call functions and write shell
-scripts. Of it these files may set :data:`SETTABLE`; the command line may set all of it.
+Such files can come from somebody else. What they say of the package's groups are options, which are
+checked as all options are; but the node ``hydra`` can set environment variables, call functions and
+write shell scripts. Of it these files may set :data:`SETTABLE`; the command line may set all of it.
 """
 
 import itertools
@@ -147,7 +147,8 @@ def _may_set(key: str, value: Any) -> bool:
 
 
 def _is_plain(value: Any, key: str) -> bool:
-    """Whether a value is one, in one line; of what Hydra instantiates not a reference to another node.
+    """Whether a value is one, in one line; of what Hydra instantiates not a reference
+    to another node.
 
     Args:
         value: without lists and mappings.

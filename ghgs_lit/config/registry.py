@@ -1,11 +1,13 @@
-"""Registry of what a configuration may build: kinds of options by group, never a path of Python code.
+"""Registry of what a configuration may build: kinds of options by group,
+never a path of Python code.
 
-A configuration can come from somebody else's checkpoint, so a node such as ``depth_head: {kind: dpt, ...}``
-can only name a kind listed below or a registered one. Kinds and verbs are registered by the files of the
-group's subpackage, such as ``ghgs_lit/heads``, and by plug-ins: modules in the environment variable
-``GHGS_PLUGINS`` (Python files or module names, separated as in ``PATH``) or entry points in the group
-``ghgs_lit.plugins``. The other packages of this distribution, ``ghgs_people`` and ``ghgs_capture``, are such
-entry points; they offer import paths, so that nothing is imported before it is chosen.
+A configuration can come from somebody else's checkpoint, so a node such as
+``depth_head: {kind: dpt, ...}`` can only name a kind listed below or a registered one. Kinds and
+verbs are registered by the files of the group's subpackage, such as ``ghgs_lit/heads``, and by
+plug-ins: modules in the environment variable ``GHGS_PLUGINS`` (Python files or module names,
+separated as in ``PATH``) or entry points in the group ``ghgs_lit.plugins``. The other packages of
+this distribution, ``ghgs_people`` and ``ghgs_capture``, are such entry points; they offer import
+paths, so that nothing is imported before it is chosen.
 """
 
 import gc
@@ -28,7 +30,8 @@ from ghgs_lit.errors import InputError, shown
 
 VARIABLE = "GHGS_PLUGINS"
 GROUP = "ghgs_lit.plugins"
-#: Groups of what plug-ins register that no configuration names: verbs, and body models whose parts are known.
+#: Groups of what plug-ins register that no configuration names: verbs,
+#: and body models whose parts are known.
 _VERBS = "verb"
 PARTS = "parts"
 
@@ -227,7 +230,8 @@ def _keep(group: str, kind: str, what: type[Options] | str) -> None:
 
 
 def _path_of(what: type[Options] | str) -> str:
-    """Import path without the module, which a file that is loaded twice may have under two names."""
+    """Import path without the module, which a file that is loaded twice may have under two
+    names."""
     return what if isinstance(what, str) else what.__qualname__
 
 
@@ -337,7 +341,8 @@ def read_node(node: Any, key: str) -> Options:
     cls = class_of_node(values, key)
     if None not in KINDS[key.split(".")[0]]:
         values.pop("kind", None)
-    # Options do not change: a node is read once in a process, whoever asks for it. Types and order count.
+    # Options do not change: a node is read once in a process, whoever asks for it.
+    # Types and order count.
     try:
         known = (
             cls,
@@ -383,7 +388,8 @@ def nodes_of(config: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def says_its_class(key: str, node: Mapping[str, Any]) -> bool:
-    """Whether a node describes an object: keys that change a checkpoint's data have no kind, for example.
+    """Whether a node describes an object: keys that change a checkpoint's data have no kind,
+    for example.
 
     Args:
         key: dotted key of the node.

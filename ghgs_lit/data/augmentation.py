@@ -42,18 +42,19 @@ Pixels = Annotated[float, Field(ge=0, le=64)]
 
 
 class Augmentation(Options):
-    """Variation of training batches; null and 0: none. Pixels are those of the inputs at their drawn size.
-    Targets keep their colours and cameras, except that principal points move with cut subjects. Depth maps
-    keep the z-depths in the true cameras: the depth loss asks for the distance of the surface, not for one
-    that compensates the error of a camera."""
+    """Variation of training batches; null and 0: none. Pixels are those of the inputs at their
+    drawn size. Targets keep their colours and cameras, except that principal points move with cut
+    subjects. Depth maps keep the z-depths in the true cameras: the depth loss asks for the distance
+    of the surface, not for one that compensates the error of a camera."""
 
     group = "augmentation"
 
     sizes: tuple[options.Size, ...] | None = None
-    """Sides or [height, width] of the inputs; one is drawn for each step, the same in all processes."""
+    """Sides or [height, width] of the inputs;
+    one is drawn for each step, the same in all processes."""
     target_scale: tuple[Positive, Positive] | None = None
-    """[least, greatest] size of the targets over that of the inputs, drawn likewise; never larger than
-    data.target_size, as photographs that are enlarged teach blur."""
+    """[least, greatest] size of the targets over that of the inputs, drawn likewise; never larger
+    than data.target_size, as photographs that are enlarged teach blur."""
     chance: Share = 1.0
     """Share of the steps whose inputs are imperfect in the ways below."""
     exact_from: Count | None = None
@@ -63,18 +64,21 @@ class Augmentation(Options):
     white_balance: Stops = 0.0
     """Stops: greatest deviation of red and of blue of single cameras."""
     gamma: Share = 0.0
-    """Greatest natural logarithm of the power to which single cameras raise colours: their tone curves."""
+    """Greatest natural logarithm of the power to which single cameras raise colours:
+    their tone curves."""
     cut: Share = 0.0
-    """Share of the samples whose feet or legs are outside the frame: in all photographs, or in some."""
+    """Share of the samples whose feet or legs are outside the frame: in all photographs,
+    or in some."""
     mask_offset: Pixels = 0.0
     """Pixels that masks grow or shrink by at most; inputs are then black outside them."""
     mask_ragged: Pixels = 0.0
     """Pixels: greatest height of bumps of the outlines of masks."""
     mask_hole_chance: Share = 0.0
-    """How often a piece of a mask is missing, of a diameter of up to 0.12 of the subject's height."""
+    """How often a piece of a mask is missing,
+    of a diameter of up to 0.12 of the subject's height."""
     background: Share = 0.0
-    """Share of samples with wrong masks that were taken before a background, which a mask that is too large
-    shows; behind the others it is black."""
+    """Share of samples with wrong masks that were taken before a background, which a mask that is
+    too large shows; behind the others it is black."""
     refined: Share = 0.0
     """Share of the samples before a background whose masks were refined, as by refine_masks."""
     calibration: Amount = 0.0
@@ -103,7 +107,8 @@ class Augmentation(Options):
 
         Args:
             size: (height, width) of the inputs in pixels without variation.
-            target: (height, width) of the targets in pixels without variation, which drawn ones never exceed.
+            target: (height, width) of the targets in pixels without variation,
+                which drawn ones never exceed.
             seed: of the run.
             step: of training, the same number in all processes.
 
@@ -138,7 +143,8 @@ class Augmentation(Options):
         return is_perfect or np.random.default_rng([seed, _CHANCE, step]).uniform() >= self.chance
 
     def imperfect(self, batch: Batch, seed: int, step: int, indices: Sequence[int]) -> Batch:
-        """The batch of a step with the imperfections of captures, in a share ``chance`` of the steps.
+        """The batch of a step with the imperfections of captures,
+        in a share ``chance`` of the steps.
 
         Args:
             batch: samples as they are read.
@@ -156,7 +162,8 @@ class Augmentation(Options):
         )
 
     def imperfections(self, batch: Batch, rngs: Sequence[np.random.Generator]) -> Batch:
-        """The batch with the imperfections of captures; images stay in [0, 1], and no mask becomes empty.
+        """The batch with the imperfections of captures;
+        images stay in [0, 1], and no mask becomes empty.
 
         Args:
             batch: of at least two views.

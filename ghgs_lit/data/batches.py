@@ -1,4 +1,5 @@
-"""Batches from sample specifications; an item of the torch datasets here is a whole :class:`Batch`."""
+"""Batches from sample specifications; an item of the torch datasets here is a whole
+:class:`Batch`."""
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
@@ -167,8 +168,8 @@ class EvaluationBatches(Dataset):
 class StepSampler(DistributedSampler):
     """Steps of one epoch, counted from the beginning of the run.
 
-    A ``DistributedSampler``, because with several processes Lightning replaces any other sampler by its
-    own; the datasets divide samples among processes themselves.
+    A ``DistributedSampler``, because with several processes Lightning replaces any other sampler by
+    its own; the datasets divide samples among processes themselves.
 
     Args:
         dataset: its length is that of the epoch.

@@ -157,10 +157,10 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
 
     Args:
         data: the data module.
-        min_iou: least IoU of a body's silhouette and a mask, in [0, 1]; clothed people reach 0.75 to
-            0.95, wrong cameras 0 to 0.4.
-        min_agreement: without a body, least share of a mask that the subject's other masks allow, in [0,
-            1]; right cameras reach 0.98 to 1.
+        min_iou: least IoU of a body's silhouette and a mask, in [0, 1]; clothed people reach 0.75
+            to 0.95, wrong cameras 0 to 0.4.
+        min_agreement: without a body, least share of a mask that the subject's other masks allow,
+            in [0, 1]; right cameras reach 0.98 to 1.
     """
     report = Report()
     dataset = data.dataset

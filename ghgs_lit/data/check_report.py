@@ -1,4 +1,5 @@
-"""The report on a checked data set: printed as tables, and written as ``check.json`` and a contact sheet."""
+"""The report on a checked data set: printed as tables,
+and written as ``check.json`` and a contact sheet."""
 
 import json
 import re

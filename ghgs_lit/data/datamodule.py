@@ -39,7 +39,8 @@ def trained_batches(trainer: Trainer | None, length: int) -> int:
 
     Args:
         trainer: Lightning's; None: 0 batches.
-        length: batches of an epoch, whose last step may have fewer than ``accumulate_grad_batches``.
+        length: batches of an epoch, whose last step may have fewer than
+            ``accumulate_grad_batches``.
     """
     if trainer is None:
         return 0
@@ -101,7 +102,8 @@ class PhotographsDataModule(LightningDataModule):
         self.augmentation = read_node(augmentation or {}, "augmentation")
         dataset.check_targets(self.targets)
         self.seed = seed
-        #: Whether training reads depth maps; evaluation reads them all the same, for its depth error.
+        #: Whether training reads depth maps;
+        #: evaluation reads them all the same, for its depth error.
         self.trains_on_depths = True
         self._builders: dict[str, BatchBuilder] = {}
         self._resident: DrawnBatches | None = None
@@ -204,8 +206,8 @@ class PhotographsDataModule(LightningDataModule):
         Args:
             photographs: as they are read from their own files.
             depths: whether depth maps are read, too.
-            reads: number of photographs that the run will read; files that are missing are written only where
-                this is more than there are photographs.
+            reads: number of photographs that the run will read; files that are missing are written
+                only where this is more than there are photographs.
             rank: number of this process; the first one says where packed files are.
 
         Returns:
@@ -232,7 +234,8 @@ class PhotographsDataModule(LightningDataModule):
         world = self.trainer.world_size if self.trainer else 1
         rank = self.trainer.global_rank if self.trainer else 0
         once = math.ceil(len(sampler.subjects) / (self.dataset.batch_size * world))
-        # Loading processes begin anew with each epoch, for which a GPU would wait where subjects are few.
+        # Loading processes begin anew with each epoch,
+        # for which a GPU would wait where subjects are few.
         length = self.dataset.steps_per_epoch or once * math.ceil(LEAST_STEPS / once)
         planned = planned_batches(self.trainer, length)
         builder = self._packed_builder(planned, rank)
@@ -268,8 +271,8 @@ class PhotographsDataModule(LightningDataModule):
 
         Args:
             views: number of inputs; None: the view protocol's.
-            targets: a protocol or its mapping, or several, whose targets follow one another in each sample;
-                None: this module's.
+            targets: a protocol or its mapping, or several, whose targets follow one another in each
+                sample; None: this module's.
             split: name of the subjects' split.
             batch_size: samples of a batch; None: the data set's.
 
@@ -327,7 +330,8 @@ class PhotographsDataModule(LightningDataModule):
         return targets
 
     def workers(self, batches: float) -> int:
-        """Number of loading processes, by :func:`automatic_workers` where ``data.workers`` does not say it.
+        """Number of loading processes, by :func:`automatic_workers` where ``data.workers``
+        does not say it.
 
         Args:
             batches: number of batches that are loaded; infinite where it is not known.

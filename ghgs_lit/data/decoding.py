@@ -1,4 +1,5 @@
-"""Decoding and checking of files of data sets; an :class:`InputError` names the file of a defect."""
+"""Decoding and checking of files of data sets;
+an :class:`InputError` names the file of a defect."""
 
 import re
 from collections.abc import Sequence

@@ -1,4 +1,5 @@
-"""Opening of images: which formats, the colours that their profile means, and how they are turned."""
+"""Opening of images: which formats, the colours that their profile means,
+and how they are turned."""
 
 import contextlib
 import functools
@@ -17,19 +18,21 @@ from ghgs_lit.parsing import require_file
 if TYPE_CHECKING:  # most photographs have no profile
     from PIL import ImageCms
 
-#: Formats that are opened, by content: each is decoded in this process. Pillow knows others, and starts a
-#: program of the system for some of them (EPS: Ghostscript).
+#: Formats that are opened, by content: each is decoded in this process. Pillow knows others, and
+#: starts a program of the system for some of them (EPS: Ghostscript).
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "AVIF", "GIF", "JPEG2000", "PPM", "TGA")
 #: Modes that convert to RGB without loss of range.
 EIGHT_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr")
 UPRIGHT = 1  #: The EXIF orientation of images that are stored as they are shown
-# Colour spaces of profiles: the mode that they describe, and modes that convert to it. Palettes are of RGB.
+# Colour spaces of profiles: the mode that they describe, and modes that convert to it.
+# Palettes are of RGB.
 _SPACES = {
     "RGB": ("RGB", ("RGB", "RGBA", "RGBX", "P", "PA", "YCbCr", "1", "L", "LA")),
     "GRAY": ("L", ("1", "L", "LA")),
     "CMYK": ("CMYK", ("CMYK",)),
 }
-# Levels by which a profile of sRGB may differ from LittleCMS's: each of two conversions rounds once.
+# Levels by which a profile of sRGB may differ from LittleCMS's:
+# each of two conversions rounds once.
 _ROUNDING = 2
 
 
@@ -66,8 +69,8 @@ def listed_formats() -> Iterator[None]:
 def orientation_of(image: Image.Image, path: Path) -> int:
     """The EXIF orientation, 1 to 8 (CIPA DC-008).
 
-    Any other value, such as 0, says that it is not known: viewers show such images as they are stored. A
-    warning where EXIF data is damaged.
+    Any other value, such as 0, says that it is not known: viewers show such images as they are
+    stored. A warning where EXIF data is damaged.
 
     Args:
         image: as opened.
@@ -84,8 +87,8 @@ def orientation_of(image: Image.Image, path: Path) -> int:
 def rgb_of(image: Image.Image, path: Path) -> np.ndarray:
     """Colours in sRGB of a photograph, alpha ignored.
 
-    An embedded profile, such as Display P3 or a linear one, is applied by LittleCMS. A warning where it
-    cannot be read or is of other pixels: colours are taken as sRGB.
+    An embedded profile, such as Display P3 or a linear one, is applied by LittleCMS. A warning
+    where it cannot be read or is of other pixels: colours are taken as sRGB.
 
     Args:
         image: as opened.
@@ -113,7 +116,8 @@ def rgb_of(image: Image.Image, path: Path) -> np.ndarray:
 
 @functools.lru_cache(maxsize=64)
 def _to_srgb(profile: bytes, mode: str) -> "tuple[str, ImageCms.ImageCmsTransform | None]":
-    """The mode that a profile describes and the transform from it to sRGB, None where it changes nothing.
+    """The mode that a profile describes and the transform from it to sRGB,
+    None where it changes nothing.
 
     Args:
         profile: ICC profile as it is embedded.

@@ -1,4 +1,5 @@
-"""Imperfections of captures: exposure and colour of single cameras, masks, calibration, cut subjects.
+"""Imperfections of captures: exposure and colour of single cameras, masks, calibration,
+cut subjects.
 
 The number of random numbers that a function draws does not depend on its limits.
 """
@@ -32,7 +33,8 @@ _NOISE = 0.02
 def color_gains(
     views: int, exposure: float, white_balance: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "V 3"]:
-    """Random factors of stored colours, geometric mean 1 over cameras: photographs show only differences.
+    """Random factors of stored colours, geometric mean 1 over cameras:
+    photographs show only differences.
 
     Args:
         views: number of cameras V.
@@ -149,7 +151,8 @@ def backgrounds(
 
 
 def _stretched(patches: Float[Tensor, "*batch m n"], height: int, width: int) -> Float[Tensor, "*batch h w"]:
-    """Patches interpolated linearly, the middles of the outer ones at the middles of the outer pixels."""
+    """Patches interpolated linearly, the middles of the outer ones at the middles of the
+    outer pixels."""
     channels = patches.reshape(1, -1, *patches.shape[-2:])
     pixels = F.interpolate(channels, (height, width), mode="bilinear", align_corners=True)
     return pixels.reshape(*patches.shape[:-2], height, width)
@@ -160,9 +163,9 @@ def miscalibrated(
 ) -> Cameras:
     """Cameras with errors: each is rotated, moved across its axis, and has another focal length.
 
-    A camera's error, drawn up to ``pixels``, is the motion of the corners of its mask's box (the photograph's
-    for an empty mask) at the subject's distance, root mean square. The common error of all cameras is
-    removed, because photographs show only differences between cameras.
+    A camera's error, drawn up to ``pixels``, is the motion of the corners of its mask's box (the
+    photograph's for an empty mask) at the subject's distance, root mean square. The common error of
+    all cameras is removed, because photographs show only differences between cameras.
 
     Args:
         cameras: true cameras [V].
@@ -202,7 +205,8 @@ def miscalibrated(
     points = unproject(corners, distances[:, None].expand(-1, 4), _of_each(lenses), _of_each(poses))
 
     def seen(lens: Tensor, pose: Tensor) -> Tensor:
-        """Pixels of the corners, which far from the world's origin differ from ``corners`` by rounding."""
+        """Pixels of the corners, which far from the world's origin differ from ``corners``
+        by rounding."""
         return project(points, _of_each(lens), _of_each(pose))[0]
 
     def size(lens: Tensor, pose: Tensor) -> Tensor:
@@ -261,9 +265,9 @@ _SHOWN = 0.45, 0.95
 def cut(batch: Batch, chance: float, rngs: list[np.random.Generator]) -> Batch:
     """Cut a share of the subjects by the frame's lower edge.
 
-    Half of them are cut in all inputs and targets at about the same height, so that no legs are asked for
-    that no photograph shows; the others in some inputs, at different heights. Photographs are moved down
-    in their frames, and principal points with them.
+    Half of them are cut in all inputs and targets at about the same height, so that no legs are
+    asked for that no photograph shows; the others in some inputs, at different heights. Photographs
+    are moved down in their frames, and principal points with them.
 
     Args:
         batch: of at least two views.

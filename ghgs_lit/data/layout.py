@@ -11,9 +11,9 @@
     parm/<id>_<position:03d>/<view>_extrinsic.npy  3 x 4 or 4 x 4, world to camera, metres, OpenCV axes
     smpl/<id>/vertices.npy                         optional (or smplx/): vertices of the body [n, 3]
 
-This package's renderer writes ``<root>/rendering/`` with ``plan.json`` (the requested subjects of each phase)
-and ``done/<phase>/<subject>`` (an empty file for each complete subject, written last). Data without
-``rendering/`` was made elsewhere and counts as complete.
+This package's renderer writes ``<root>/rendering/`` with ``plan.json`` (the requested subjects of
+each phase) and ``done/<phase>/<subject>`` (an empty file for each complete subject, written last).
+Data without ``rendering/`` was made elsewhere and counts as complete.
 """
 
 import itertools
@@ -62,7 +62,8 @@ class Completeness:
 
     @property
     def lights(self) -> str | None:
-        """``data.render.lights`` of the renders: ``studio`` or ``none``; None: they were made elsewhere."""
+        """``data.render.lights`` of the renders: ``studio`` or ``none``;
+        None: they were made elsewhere."""
         path = self.folder / "settings.json"
         settings = read_json(path) if path.exists() else {}
         render = settings.get("render") if isinstance(settings, dict) else None
@@ -89,7 +90,8 @@ class Completeness:
         return self.folder / "done" / phase / name
 
     def missing(self, phase: str, names: Sequence[str]) -> list[str]:
-        """Those of several subjects that are not completely rendered; none of data that was made elsewhere.
+        """Those of several subjects that are not completely rendered;
+        none of data that was made elsewhere.
 
         Args:
             phase: ``train`` or ``val``.
@@ -157,15 +159,16 @@ class Layout(Reader):
     Args:
         root: folder of the data set.
         phase: ``train`` or ``val``.
-        names: subjects to read; those that the phase's folder lacks are read from the other one, because the
-            split may have changed; None: all.
+        names: subjects to read; those that the phase's folder lacks are read from the other one,
+            because the split may have changed; None: all.
         limit: number of subjects, the first ones; None: all.
-        pixel_centers: of the renderer: ``half`` (+0.5, as this package), ``integer`` (as the published
-            scripts) or ``auto`` (integer unless rendered here).
+        pixel_centers: of the renderer: ``half`` (+0.5, as this package), ``integer`` (as the
+            published scripts) or ``auto`` (integer unless rendered here).
         strict: raise the first problem, or collect all.
 
     Raises:
-        InputError: the root or phase is missing, empty, not completely rendered, or lacks one of ``names``.
+        InputError: the root or phase is missing, empty, not completely rendered,
+            or lacks one of ``names``.
     """
 
     def __init__(

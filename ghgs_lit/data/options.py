@@ -35,26 +35,30 @@ class LoadingOptions(Options):
     target_size: Size | None = None
     """Side or [height, width] of the targets in pixels; null: as size."""
     resampling: Literal["area", "release"] = "area"
-    """area: means over exact areas, everything stays at its place. release: as the authors' code reads
-    (photographs by Pillow's bicubic filter, masks by OpenCV's nearest neighbour)."""
+    """area: means over exact areas, everything stays at its place. release: as the authors' code
+    reads (photographs by Pillow's bicubic filter, masks by OpenCV's nearest neighbour)."""
     batch_size: int = Field(1, ge=1, le=1024)
     """Samples of one step in each process, all in memory at once: at most 1024."""
     class_steps: Count = 1
-    """Training batches in a row with equal sizes of photographs and targets, number of views, entry of
-    token_budgets and number of rounds: a GPU plays back what it has recorded of the first two of them."""
+    """Training batches in a row with equal sizes of photographs and targets, number of views,
+    entry of token_budgets and number of rounds: a GPU plays back what it has recorded of the first
+    two of them."""
     steps_per_epoch: Count | None = None
     """Training steps of an epoch; null: whole passes over the subjects, 100 steps or more."""
     cache_images_mb: Amount = 512
     """MiB of decoded photographs kept in memory by each process."""
     packed_gb: Amount = 16
-    """Largest size in GB (10^9 bytes) of the decoded photographs of training that are kept on the disk, in
-    the data's folder or the user's cache, and mapped into memory; 0: none are."""
+    """Largest size in GB (10^9 bytes) of the decoded photographs of training that are kept on the
+    disk, in the data's folder or the user's cache, and mapped into memory; 0: none are."""
     resident: Literal["device", "off"] = "off"
-    """device: photographs of training stay in the GPU's memory, where they fit, and are resized there."""
+    """device: photographs of training stay in the GPU's memory, where they fit,
+    and are resized there."""
     evaluation_positions: tuple[tuple[Index, ...], ...] = ()
-    """Lists of input positions, such as [[0, 6, 11]] for 3 views; other numbers of views: evenly spaced."""
+    """Lists of input positions, such as [[0, 6, 11]] for 3 views;
+    other numbers of views: evenly spaced."""
     workers: Workers | Literal["auto"] = "auto"
-    """Loading processes of each process that trains; 0: none; auto: by cores, devices and batches."""
+    """Loading processes of each process that trains; 0: none;
+    auto: by cores, devices and batches."""
 
     @abstractmethod
     def reader(self, phase: str, strict: bool = True) -> Reader:

@@ -1,4 +1,5 @@
-"""Overlap of projected bodies and masks, which reveals wrong units, axes and centres, and pictures of it."""
+"""Overlap of projected bodies and masks, which reveals wrong units, axes and centres,
+and pictures of it."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -32,8 +33,8 @@ def project(vertices: np.ndarray, view: View) -> np.ndarray:
 def overlap(vertices: np.ndarray, view: View) -> float | None:
     """IoU of the silhouette of a body and a mask.
 
-    The silhouette is taken on a grid so coarse that vertices can be joined without faces. Parts outside
-    the photograph do not count.
+    The silhouette is taken on a grid so coarse that vertices can be joined without faces. Parts
+    outside the photograph do not count.
 
     Args:
         vertices: [n, 3] in the world, metres.

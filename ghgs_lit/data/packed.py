@@ -1,11 +1,12 @@
-"""Decoded photographs of each subject in one file, from which training reads at the speed of memory.
+"""Decoded photographs of each subject in one file,
+from which training reads at the speed of memory.
 
-A file holds the photographs of a subject that training may draw: of each the part that is not black, with the
-mask, the matte and the depth map of that part, and its camera. It is mapped into memory, so that processes
-share its pages. Its name has a digest of all that its values depend on (names, sizes and times of the files
-that were read, options, the version of this format): changed data is never read from an old file. Files are
-written at a subject's first use, atomically: what is interrupted is written again, and where two processes
-write the same file, either is right.
+A file holds the photographs of a subject that training may draw: of each the part that is not
+black, with the mask, the matte and the depth map of that part, and its camera. It is mapped into
+memory, so that processes share its pages. Its name has a digest of all that its values depend on
+(names, sizes and times of the files that were read, options, the version of this format): changed
+data is never read from an old file. Files are written at a subject's first use, atomically: what is
+interrupted is written again, and where two processes write the same file, either is right.
 """
 
 import contextlib
@@ -31,13 +32,15 @@ from ghgs_lit.files import write_atomically
 
 log = logging.getLogger(__name__)
 
-#: Changes with the format of the files and with every change of how photographs are decoded or resized.
+#: Changes with the format of the files and with every change of how photographs are
+#: decoded or resized.
 _VERSION = 1
 #: Files that a process keeps open.
 _OPEN_FILES = 128
 #: Largest share of the free disk that packed photographs may take.
 _SHARE_OF_DISK = 0.5
-#: Numbers of each photograph in a file: where it begins, its size, the part of it that is kept, its maps.
+#: Numbers of each photograph in a file: where it begins, its size, the part of it that is kept,
+#: its maps.
 _COLUMNS = ("position", "view", "start", "height", "width", "top", "bottom", "left", "right", "maps")
 _MATTE = 1
 _DEPTH = 2
@@ -71,8 +74,8 @@ class Packing:
 
 
 class PackedReader(Reader):
-    """A reader whose photographs come from packed files, at their size, and from the other reader's files
-    where a subject cannot be packed.
+    """A reader whose photographs come from packed files, at their size, and from the other reader's
+    files where a subject cannot be packed.
 
     Args:
         reader: reads what is packed; its ``sources`` say what a subject's file depends on.
@@ -245,7 +248,8 @@ class Pack:
 
 
 def _packed(view: View) -> tuple[tuple[int, ...], np.ndarray]:
-    """Size, kept part and maps of a photograph, and its bytes: depths first, where they are aligned."""
+    """Size, kept part and maps of a photograph, and its bytes: depths first,
+    where they are aligned."""
     named = [(_DEPTH, view.inverse_depth), (0, view.image), (0, view.mask), (_MATTE, view.matte)]
     there = [(flag, array) for flag, array in named if array is not None]
     shown = view.image.any(-1)

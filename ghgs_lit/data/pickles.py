@@ -1,8 +1,9 @@
 """Safe reading of pickles of data sets.
 
-The writer of a pickle chooses what is called while it is read. Only arrays and plain containers are admitted;
-every other name is refused before anything is called. Names of NumPy 1 (``numpy.core``) and 2
-(``numpy._core``) and of Python 2 (``__builtin__``) are known; trimesh's array subclass is read as an array.
+The writer of a pickle chooses what is called while it is read. Only arrays and plain containers are
+admitted; every other name is refused before anything is called. Names of NumPy 1 (``numpy.core``)
+and 2 (``numpy._core``) and of Python 2 (``__builtin__``) are known; trimesh's array subclass is
+read as an array.
 """
 
 import codecs

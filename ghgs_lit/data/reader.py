@@ -26,8 +26,8 @@ PHASES = ("train", "val")
 class Reader(ABC):
     """Stored photographs of one phase (``train`` or ``val``).
 
-    A photograph is identified by (position, view); ``view`` is 0 except on rings that were rendered with
-    further views between cameras.
+    A photograph is identified by (position, view); ``view`` is 0 except on rings that were rendered
+    with further views between cameras.
 
     Args:
         strict: raise the first problem of the data set, or collect all in ``problems``.
@@ -85,8 +85,9 @@ class Reader(ABC):
         return f"{name}, camera {position}, view {view}"
 
     def sources(self, name: str) -> Iterable[Path | str]:
-        """All that a subject's photographs and body depend on: paths of files, and texts that say the options
-        of their decoding. None: not known, and the subject is never packed (:mod:`ghgs_lit.data.packed`)."""
+        """All that a subject's photographs and body depend on: paths of files, and texts that say
+        the options of their decoding. None: not known, and the subject is never packed
+        (:mod:`ghgs_lit.data.packed`)."""
         return ()
 
     def files(self, name: str) -> Iterable[Path]:
@@ -94,7 +95,8 @@ class Reader(ABC):
         return [source for source in self.sources(name) if isinstance(source, Path)]
 
     def body_place(self, name: str) -> Path | str:
-        """File of a subject's body, whether it is there or not; a text where an option has to name it."""
+        """File of a subject's body, whether it is there or not;
+        a text where an option has to name it."""
         return f"the body of {name}"
 
     def checked_view(self, name: str, position: int, view: int, depth: bool) -> View:
@@ -107,7 +109,8 @@ class Reader(ABC):
             depth: also read the depth map, if there is any.
 
         Raises:
-            InputError: a file is missing or bad, the reader gives a wrong view, or the mask is empty.
+            InputError: a file is missing or bad, the reader gives a wrong view,
+                or the mask is empty.
         """
         stored = self.read_view(name, position, view, depth)
         place = self.place(name, position, view)
@@ -140,7 +143,8 @@ class Reader(ABC):
 
 
 class FrameReader(Reader):
-    """Reader whose subjects are frames of sequences; ``frames[subject].folder`` is the sequence's folder."""
+    """Reader whose subjects are frames of sequences;
+    ``frames[subject].folder`` is the sequence's folder."""
 
     def __init__(self, strict: bool = True) -> None:
         super().__init__(strict)
@@ -177,8 +181,8 @@ class PhotographCache:
     Args:
         reader: finds and decodes them.
         size: (height, width) in pixels; None: as stored.
-        cache_mb: MiB of decoded views and bodies kept in each process, at least 0; the least recently used go
-            first.
+        cache_mb: MiB of decoded views and bodies kept in each process, at least 0; the least
+            recently used go first.
         resampling: as for :func:`ghgs_lit.data.view.resize_view`.
     """
 
@@ -210,7 +214,8 @@ class PhotographCache:
             size: (height, width) in pixels; None: ``self.size``.
 
         Raises:
-            InputError: a file is missing or bad, the reader gives a wrong view, or the mask is empty.
+            InputError: a file is missing or bad, the reader gives a wrong view,
+                or the mask is empty.
         """
         size = size or self.size
 

@@ -1,7 +1,8 @@
 """Training photographs that stay on the device: batches are gathered and resized there.
 
-A loader then sends numbers of photographs (:class:`Drawn`) instead of pixels. Samples, sizes and cameras are
-drawn as for photographs that are read; pixels agree with theirs up to the rounding of means over areas.
+A loader then sends numbers of photographs (:class:`Drawn`) instead of pixels. Samples, sizes and
+cameras are drawn as for photographs that are read; pixels agree with theirs up to the rounding of
+means over areas.
 """
 
 import copy
@@ -76,7 +77,8 @@ class ResidentPhotographs:
         size: (height, width) in pixels.
 
     Raises:
-        InputError: they do not fit into the device's memory, or differ in size or in which maps they have.
+        InputError: they do not fit into the device's memory,
+            or differ in size or in which maps they have.
     """
 
     def __init__(
@@ -152,7 +154,8 @@ class ResidentPhotographs:
         return [self.numbers[subject, *photo] for photo in photos]
 
     def cameras(self, rows: Int[Tensor, "B V"], size: Size) -> Cameras:
-        """Cameras of photographs at a size, on the CPU, as of :func:`ghgs_lit.data.view.resize_view`.
+        """Cameras of photographs at a size, on the CPU,
+        as of :func:`ghgs_lit.data.view.resize_view`.
 
         Args:
             rows: numbers of photographs, on the CPU.
@@ -175,8 +178,8 @@ class ResidentPhotographs:
             depth: whether depths are asked for.
 
         Returns:
-            Images [B, V, 3, h, w] in [0, 1], and masks, depths in metres and mattes in [0, 1] [B, V, h,
-            w]; None for depths and mattes that there are none of.
+            Images [B, V, 3, h, w] in [0, 1], and masks, depths in metres and mattes in [0, 1]
+            [B, V, h, w]; None for depths and mattes that there are none of.
         """
         mattes = None if self.mattes is None else self.mattes[rows]
         inverse = self.inverse[rows] if depth and self.inverse is not None else None
@@ -229,8 +232,9 @@ class ResidentPhotographs:
 
 @dataclass(frozen=True)
 class DrawnBatches(Dataset):
-    """Item ``step`` has the numbers of the photographs of that step; where a step is imperfect, or has a
-    photograph that is not on the device, it is the batch itself, which the loading process makes.
+    """Item ``step`` has the numbers of the photographs of that step; where a step is imperfect,
+    or has a photograph that is not on the device, it is the batch itself, which the loading
+    process makes.
 
     Args:
         batches: makes batches from photographs that are read.
@@ -297,7 +301,8 @@ def _size(cameras: Cameras) -> Size:
 
 
 def _bytes_of(view: View) -> dict[str, Tensor]:
-    """The maps of a photograph, by name; PyTorch has few functions of unsigned integers of 16 bits."""
+    """The maps of a photograph, by name; PyTorch has few functions of unsigned integers
+    of 16 bits."""
     inverse = None if view.inverse_depth is None else view.inverse_depth.view(np.int16)
     maps = {"images": view.image, "masks": view.mask, "mattes": view.matte, "inverse": inverse}
     return {name: torch.tensor(map_) for name, map_ in maps.items() if map_ is not None}

@@ -1,9 +1,9 @@
 """Sampling of input views and targets, in training and evaluation.
 
-A photograph is identified by its ring position and the number of the view there: 0 is the ring camera, 1
-repeats the next ring camera, 3 is the exact middle between the two, 2 and 4 are random in the first and
-second half. Inputs are ring cameras (view 0). A sample depends on (seed, step, index) alone, so that a run
-resumes exactly, whatever the number of workers.
+A photograph is identified by its ring position and the number of the view there: 0 is the ring
+camera, 1 repeats the next ring camera, 3 is the exact middle between the two, 2 and 4 are random in
+the first and second half. Inputs are ring cameras (view 0). A sample depends on (seed, step, index)
+alone, so that a run resumes exactly, whatever the number of workers.
 """
 
 import hashlib
@@ -72,8 +72,8 @@ class ViewProtocol(Options):
     evaluation_count: Several = 4
     """Number of input views in evaluation."""
     training: Literal["any", "even", "uneven"] = "any"
-    """any: ring cameras in random order. even: evenly spaced from a random start. uneven: evenly spaced, then
-    each moved by up to one position, as captures are."""
+    """any: ring cameras in random order. even: evenly spaced from a random start. uneven: evenly
+    spaced, then each moved by up to one position, as captures are."""
 
     def draw(self, available: Sequence[int], count: int, ring: int, rng: np.random.Generator) -> list[int]:
         """Positions of the inputs of a training sample.
@@ -121,18 +121,20 @@ class TargetProtocol(Options):
     group = "targets"
 
     kind: Literal["release", "midway", "random", "cameras"]
-    """Targets of evaluation. release: view ``view`` at an input's position. midway: half-way between an input
-    and the next. random: any of training_views at any position, fixed by the seed. cameras: view ``view`` at
-    those of ``positions`` that are not inputs. Null: the value of ``name``."""
+    """Targets of evaluation. release: view ``view`` at an input's position. midway: half-way
+    between an input and the next. random: any of training_views at any position, fixed by the
+    seed. cameras: view ``view`` at those of ``positions`` that are not inputs. Null: the value
+    of ``name``."""
     name: Text
     """Name of the protocol in results."""
     view: ViewNumber = MIDDLE_VIEW
-    """View that release and cameras take at a position: 0 the ring camera, 3 the middle to the next (release:
-    11.25 degrees from the input)."""
+    """View that release and cameras take at a position: 0 the ring camera, 3 the middle to the next
+    (release: 11.25 degrees from the input)."""
     positions: tuple[Index, ...] | None = None
     """Positions that cameras takes; null: all."""
     per_subject: Count | Literal["all"] = 1
-    """Targets of each subject in evaluation, the first ones; all: one beside every input, or every camera."""
+    """Targets of each subject in evaluation, the first ones;
+    all: one beside every input, or every camera."""
     training_views: tuple[ViewNumber, ...] = Field((0, 2, 3, 4), min_length=1)
     """Numbers of the views that training draws from, at any position."""
     per_step: Count = 1

@@ -21,7 +21,8 @@ def split_names(
         source: folder of the scans.
         names: ids of all scans.
         split: as for :func:`read_split`; None: the split files in ``source``, if there are any.
-        val_fraction: share of ``names`` for ``val`` without a split, in [0, 1]; at least one scan if above 0.
+        val_fraction: share of ``names`` for ``val`` without a split, in [0, 1];
+            at least one scan if above 0.
         seed: of the draw without a split.
 
     Returns:
@@ -50,8 +51,8 @@ def read_split(split: Split, names: Sequence[str]) -> dict[str, list[str]]:
     """Ids of ``train`` and ``val``.
 
     Args:
-        split: a folder with ``split_train.txt`` and ``split_val.txt`` (one id a line), or a mapping to
-            ids and ranges of ``names`` such as ``0000-0425``.
+        split: a folder with ``split_train.txt`` and ``split_val.txt`` (one id a line), or a mapping
+            to ids and ranges of ``names`` such as ``0000-0425``.
         names: ids of all scans.
 
     Raises:

@@ -1,7 +1,8 @@
 """A photograph with its mask, depth and camera, and their resizing.
 
-Resizing keeps the middle of the image. ``release`` functions reproduce what the authors' code reads: OpenCV's
-nearest neighbour takes pixel floor(i * scale), which moves masks by half an old pixel less half a new one.
+Resizing keeps the middle of the image. ``release`` functions reproduce what the authors' code
+reads: OpenCV's nearest neighbour takes pixel floor(i * scale), which moves masks by half an old
+pixel less half a new one.
 """
 
 import itertools
@@ -60,8 +61,8 @@ def area_mask(mask: np.ndarray, height: int, width: int) -> np.ndarray:
 def centered_depth(inverse: np.ndarray, height: int, width: int) -> np.ndarray:
     """Inverse depth at the centres of new pixels.
 
-    It is interpolated linearly (exact for planes) among those of the four old pixels that are known and
-    on the nearest surface.
+    It is interpolated linearly (exact for planes) among those of the four old pixels that are known
+    and on the nearest surface.
 
     Args:
         inverse: [h, w] uint16, 2^15 / metres; 0 where unknown.
@@ -251,15 +252,15 @@ def opencv_view(image: np.ndarray, mask: np.ndarray, intrinsics: np.ndarray, ext
 def resize_view(view: View, height: int, width: int, resampling: str = "area") -> View:
     """Resize a photograph with its mask and depth map, and scale its intrinsics.
 
-    Mattes are resized like photographs, and the mask is then where they are at least half. Depth is taken at
-    the centres of new pixels.
+    Mattes are resized like photographs, and the mask is then where they are at least half. Depth is
+    taken at the centres of new pixels.
 
     Args:
         view: the photograph.
         height: new height in pixels.
         width: new width in pixels.
-        resampling: ``area`` keeps everything in place; ``release``, as the authors' code, resizes photographs
-            by Pillow's bicubic filter and masks by OpenCV's nearest neighbour.
+        resampling: ``area`` keeps everything in place; ``release``, as the authors' code, resizes
+            photographs by Pillow's bicubic filter and masks by OpenCV's nearest neighbour.
     """
     h, w = view.mask.shape
     if (h, w) == (height, width):

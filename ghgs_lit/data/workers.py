@@ -10,7 +10,8 @@ from torch.utils.data import DataLoader, Dataset
 
 from ghgs_lit.runtime.cores import allowed_cores, use_known_start_method
 
-#: Batches below which processes take longer to start than they save: forked ones, and those that import.
+#: Batches below which processes take longer to start than they save: forked ones,
+#: and those that import.
 _FEW_FORKED = 32
 _FEW_STARTED = 256
 #: More processes than this wait for the disk.
@@ -20,9 +21,9 @@ _MOST = 8
 def automatic_workers(batches: float, processes: int, on_gpu: bool, cores: int | None = None) -> int:
     """The number of loading processes of ``data.workers=auto``.
 
-    None for a few batches, and none on a CPU: the model needs the cores itself, and a batch takes longer to
-    come from another process than to be read from packed files. Beside a GPU as many as there are cores for
-    each process, less its own, at least 1 and at most 8.
+    None for a few batches, and none on a CPU: the model needs the cores itself, and a batch takes
+    longer to come from another process than to be read from packed files. Beside a GPU as many as
+    there are cores for each process, less its own, at least 1 and at most 8.
 
     Args:
         batches: number of batches that are loaded; infinite where it is not known.

@@ -1,7 +1,8 @@
-"""Pre-norm transformer block with LayerScale, for the ViT and, with normalised and rotated q and k, for the
-aggregator. The rotary position embedding (RoPE) has two dimensions: half of a head turns with the row, half
-with the column. Angles are float32 or wider for tokens of any precision: rounding an angle to bfloat16 would
-change its cosine by up to 6e-2, rounding the cosine itself only by 2e-3."""
+"""Pre-norm transformer block with LayerScale, for the ViT and, with normalised and rotated q and
+k, for the aggregator. The rotary position embedding (RoPE) has two dimensions: half of a head
+turns with the row, half with the column. Angles are float32 or wider for tokens of any precision:
+rounding an angle to bfloat16 would change its cosine by up to 6e-2, rounding the cosine itself
+only by 2e-3."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -146,7 +147,8 @@ _GPU_HIDDEN = 1 << 28
 
 
 def draw_normal_(values: Tensor, std: float) -> Tensor:
-    """Draw normal ``values`` in place, but not on the meta device, where PyTorch would import its compiler.
+    """Draw normal ``values`` in place, but not on the meta device,
+    where PyTorch would import its compiler.
 
     Args:
         values: any tensor.
@@ -211,7 +213,8 @@ class Block(nn.Module):
         x = self.ls1(x, self.attn(self.norm1(x), lengths, rotary, real))
         if torch.is_grad_enabled():
             return self.ls2(x, self.mlp(self.norm2(x)))
-        # x is the fresh result of ls1, so it can be changed in place, a part of the tokens at a time.
+        # x is the fresh result of ls1, so it can be changed in place,
+        # a part of the tokens at a time.
         for rows in even_parts(len(x), at_once(x.device, _HIDDEN, _GPU_HIDDEN) // (4 * x.shape[-1])):
             x[rows].addcmul_(self.mlp(self.norm2(x[rows])), self.ls2.gamma)
         return x

@@ -1,4 +1,5 @@
-"""The encode stage: photographs and masks to tokens, by alternating attention inside and across views."""
+"""The encode stage: photographs and masks to tokens,
+by alternating attention inside and across views."""
 
 import re
 from collections.abc import Iterator
@@ -36,9 +37,11 @@ class PatchOptions(Options):
 
     group = "encoder.vit"
     kind: Literal["conv", "stem", "dinov2"]
-    """conv, one convolution per patch | stem, a small convolutional stem | dinov2, a ViT with registers"""
+    """conv, one convolution per patch | stem, a small convolutional stem | dinov2,
+    a ViT with registers"""
     channels: Width | None = None
-    """Of kind=stem: channels after the first convolution; doubled at each halving, up to the width"""
+    """Of kind=stem: channels after the first convolution;
+    doubled at each halving, up to the width"""
     depth: Count | None = Field(None, le=1024)
     """Of kind=dinov2: number of blocks"""
     heads: Width | None = None
@@ -71,14 +74,15 @@ class VGGTOptions(Options):
     patch_size: int = Field(14, ge=1, le=1024)
     """Side of a patch, pixels"""
     image_size: Side = 518
-    """Side of the square image whose patch positions a DINOv2 ViT stores, pixels; a multiple of patch_size"""
+    """Side of the square image whose patch positions a DINOv2 ViT stores, pixels;
+    a multiple of patch_size"""
     mask_input: bool = False
     """true: the mask is a further input channel"""
     bounds_input: bool = False
     """true: near and far are two further input channels (not with bounds=none)"""
     semantic: SemanticOptions | None = None
-    """null: the patch tokens are the semantic features | those of a branch of blocks over single views,
-    which `ghgs pretext` trains and which does not learn afterwards"""
+    """null: the patch tokens are the semantic features | those of a branch of blocks over single
+    views, which `ghgs pretext` trains and which does not learn afterwards"""
     layer_scale: float = 0.01
     """Initial LayerScale of the aggregator; 0.01 as published"""
     trainable: Text = "all"
@@ -86,8 +90,9 @@ class VGGTOptions(Options):
     checkpointing: bool = False
     """true: recompute activations in the backward pass, to save memory"""
     precision: Literal["inherit", "bfloat16"] = "inherit"
-    """Of products of the encoder alone: inherit, that of the whole model (the paper's tables: float32) |
-    bfloat16, where the device has it: half the time on a GPU (the authors ran theirs in float16)"""
+    """Of products of the encoder alone: inherit, that of the whole model (the paper's tables:
+    float32) | bfloat16, where the device has it: half the time on a GPU (the authors ran theirs
+    in float16)"""
     weights: Text | None = None
     """Name of the published weights that the semantic features learned from, or pretext; written by
     ghgs import and ghgs pretext, a note for tables only"""
@@ -133,9 +138,9 @@ Pair = tuple[Float[Tensor, "t c"], Float[Tensor, "t c"]]
 class Aggregator(nn.Module):
     """Pairs of a frame block and a global block on patch tokens (VGGT, Wang et al., CVPR 2025).
 
-    Each view's sequence is [camera, registers, kept patches]. The first view has its own camera and register
-    tokens, so it defines the frame of reference: another first view changes the result; any other permutation
-    of the views only permutes it.
+    Each view's sequence is [camera, registers, kept patches]. The first view has its own camera and
+    register tokens, so it defines the frame of reference: another first view changes the result;
+    any other permutation of the views only permutes it.
 
     Args:
         patch_embed: images [n, i, H, W] and :class:`KeptPatches` to tokens [N, width].
@@ -174,8 +179,8 @@ class Aggregator(nn.Module):
             kept: the patches that take part; all others are as if they did not exist.
 
         Returns:
-            Packed tokens [t, c], special ones included, after the frame block and after the global block of
-            each layer in ``layers``; and the patch tokens [N, c] before the first block.
+            Packed tokens [t, c], special ones included, after the frame block and after the global
+            block of each layer in ``layers``; and the patch tokens [N, c] before the first block.
         """
         b, v = images.shape[:2]
         patches = self.patch_embed(images.flatten(0, 1), kept)
@@ -211,9 +216,10 @@ class VGGTEncoder(nn.Module):
 
     Args:
         options: of the encoder.
-        tokens: ``all``; ``window``: patches of the smallest rectangle that holds the subject; ``subject``:
-            patches with a pixel of the subject. Others leave before the first block. Kept patches keep their
-            positions; a view with an empty mask has its special tokens only.
+        tokens: ``all``; ``window``: patches of the smallest rectangle that holds the subject;
+            ``subject``: patches with a pixel of the subject. Others leave before the first
+            block. Kept patches keep their positions; a view with an empty mask has its
+            special tokens only.
         margin: patches around these that are kept, too.
     """
 
@@ -249,7 +255,8 @@ class VGGTEncoder(nn.Module):
 
     @property
     def keeps_features(self) -> bool:
-        """Whether tokens are read from disk in training, which no recording of a GPU's work can hold."""
+        """Whether tokens are read from disk in training,
+        which no recording of a GPU's work can hold."""
         return getattr(self.aggregator.patch_embed, "cache", None) is not None
 
     def forward(
@@ -263,8 +270,8 @@ class VGGTEncoder(nn.Module):
 
         Args:
             images: photographs [b, v, 3, H, W] in [0, 1], with sides divisible by the patch size.
-            masks: [b, v, H, W]; read with ``mask_input``, ``bounds_input`` or ``semantic``, or without a
-                plan.
+            masks: [b, v, H, W]; read with ``mask_input``, ``bounds_input`` or ``semantic``, or
+                without a plan.
             bounds: in metres; read with ``bounds_input``.
             plan: None: one for the patches of :meth:`keeps`.
 

@@ -1,7 +1,7 @@
 """Tokens of a frozen ViT on disk: of a photograph that is seen again they are read, not computed.
 
-A file for each photograph, written whole, in a folder for each network and precision: several processes may
-share it, and one that was interrupted goes on with what is there."""
+A file for each photograph, written whole, in a folder for each network and precision: several
+processes may share it, and one that was interrupted goes on with what is there."""
 
 import hashlib
 from collections.abc import Callable
@@ -24,8 +24,8 @@ class FeatureCache:
     Args:
         folder: of all networks.
         network: name of one, which depends on all of its weights.
-        dtype: float16 or bfloat16, in which tokens are kept. A photograph's are rounded to it when they are
-            computed, too, so that a training does not depend on which it found.
+        dtype: float16 or bfloat16, in which tokens are kept. A photograph's are rounded to it when
+            they are computed, too, so that a training does not depend on which it found.
     """
 
     def __init__(self, folder: Path, network: str, dtype: torch.dtype) -> None:

@@ -1,4 +1,5 @@
-"""Semantic features F of encoders without published weights: the parts of the body that a patch shows."""
+"""Semantic features F of encoders without published weights:
+the parts of the body that a patch shows."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,7 +15,8 @@ from ghgs_lit.plan import Plan
 from ghgs_lit.plan.patches import KeptPatches
 
 NORM_EPS = 1e-5
-#: Body parts that ``ghgs pretext`` distinguishes (``training.pretext.labels``): channels of a feature.
+#: Body parts that ``ghgs pretext`` distinguishes (``training.pretext.labels``):
+#: channels of a feature.
 PARTS = 16
 
 
@@ -43,7 +45,8 @@ class SemanticOptions(Options):
 
 
 def features_of(log_shares: Float[Tensor, "N p"]) -> Float[Tensor, "N p"]:
-    """Square roots of shares; their cosine is the overlap of two distributions (Bhattacharyya's coefficient).
+    """Square roots of shares; their cosine is the overlap of two distributions
+    (Bhattacharyya's coefficient).
 
     Args:
         log_shares: logarithms of the shares of the parts in a patch [N, p].
@@ -57,12 +60,13 @@ def features_of(log_shares: Float[Tensor, "N p"]) -> Float[Tensor, "N p"]:
 class SemanticBranch(nn.Module):
     """A stem and a few blocks over the subject's patches of one view; ``ghgs pretext`` trains it.
 
-    Features are square roots of the predicted shares of the parts in a patch. Their cosine, the semantic
-    consistency (Eq. 4), is then the overlap of two distributions (Bhattacharyya's coefficient): 1 where they
-    are equal, 0 where no part is shared.
+    Features are square roots of the predicted shares of the parts in a patch. Their cosine, the
+    semantic consistency (Eq. 4), is then the overlap of two distributions (Bhattacharyya's
+    coefficient): 1 where they are equal, 0 where no part is shared.
 
-    Attention is inside a view, among a learned token and the patches with a pixel of the subject. Every
-    choice of ``skip.tokens`` keeps these, so features depend on one photograph and its mask alone."""
+    Attention is inside a view, among a learned token and the patches with a pixel of the
+    subject. Every choice of ``skip.tokens`` keeps these, so features depend on one photograph
+    and its mask alone."""
 
     def __init__(self, options: SemanticOptions, patch_size: int):
         super().__init__()

@@ -1,5 +1,5 @@
-"""Images to patch tokens: a projection of each patch, a convolutional stem, or DINOv2 with registers, whose
-tokens are the semantic features F of the paper."""
+"""Images to patch tokens: a projection of each patch, a convolutional stem, or DINOv2 with
+registers, whose tokens are the semantic features F of the paper."""
 
 import math
 
@@ -36,15 +36,17 @@ class ChannelNorm(nn.LayerNorm):
         return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
-#: Patches around a kept one that it depends on: the next one is mixed in, which sees a part of its neighbour.
+#: Patches around a kept one that it depends on: the next one is mixed in,
+#: which sees a part of its neighbour.
 _REACH = 2
 
 
 class ConvStem(nn.Module):
-    """Overlapping convolutions, with which a small encoder learns edges and the silhouette much sooner.
+    """Overlapping convolutions, with which a small encoder learns edges and the
+    silhouette much sooner.
 
-    The image is halved while the patch size is even; a strided convolution does the rest; a last one mixes
-    neighbouring patches.
+    The image is halved while the patch size is even; a strided convolution does the rest; a last
+    one mixes neighbouring patches.
 
     Args:
         in_channels: of the images.
@@ -92,8 +94,8 @@ class VisionTransformer(nn.Module):
         depth: number of blocks.
         heads: attention heads of each block, which divide ``width``.
         patch_size: side of a patch in pixels.
-        image_size: side in pixels of the square image whose position embedding is stored, a multiple of
-            ``patch_size``; it is resampled for other sizes.
+        image_size: side in pixels of the square image whose position embedding is stored, a
+            multiple of ``patch_size``; it is resampled for other sizes.
         checkpointing: recompute activations in the backward pass.
     """
 

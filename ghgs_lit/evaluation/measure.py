@@ -115,7 +115,8 @@ def _depth_error(batch: Batch, estimate: Estimate, element: int) -> float | None
 
 
 def _surface_errors(batch: Batch, gaussians: Gaussians) -> list[float | None]:
-    """Error of each element's Gaussians against the true surface that the inputs show; None: unknown."""
+    """Error of each element's Gaussians against the true surface that the inputs show;
+    None: unknown."""
     if batch.depths is None:
         return [None] * len(batch.images)
     splats = [gaussians[element] for element in range(len(batch.images))]
@@ -210,8 +211,8 @@ def measure(
         picture_count: Number of subjects that are drawn, the first ones.
 
     Returns:
-        Rows with what they are about, metrics, and ``seconds``: those of prediction and all renders of a
-        batch, divided by its subjects.
+        Rows with what they are about, metrics, and ``seconds``: those of prediction and all renders
+        of a batch, divided by its subjects.
 
     Raises:
         InputError: A batch has no targets.

@@ -39,8 +39,8 @@ def check_evaluation(config: Mapping[str, Any], data: PhotographsDataModule) -> 
         data: The data that is measured.
 
     Raises:
-        InputError: A value is impossible, a metric cannot be computed, the split has no subjects, or a
-            subject lacks an input or a target.
+        InputError: A value is impossible, a metric cannot be computed, the split has no subjects,
+            or a subject lacks an input or a target.
     """
     evaluation = config["evaluation"]
     for key in ("views", "targets"):

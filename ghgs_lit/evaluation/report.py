@@ -36,8 +36,8 @@ def measure_and_write(
     device: torch.device,
     **facts: Any,
 ) -> Path:
-    """Measure methods as configured, print the means and write ``metrics.json``, ``metrics.csv`` and
-    ``pictures/``. Call :func:`check_evaluation` before.
+    """Measure methods as configured, print the means and write ``metrics.json``, ``metrics.csv``
+    and ``pictures/``. Call :func:`check_evaluation` before.
 
     Args:
         methods: Methods by name; the trained model is called ``METHOD``.

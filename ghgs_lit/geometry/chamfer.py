@@ -1,5 +1,5 @@
-"""Chamfer distance between two point sets (the paper's geometric loss L_geom). Nearest neighbours are exact
-and carry no gradient; the gradient runs through the matched pairs only."""
+"""Chamfer distance between two point sets (the paper's geometric loss L_geom). Nearest neighbours
+are exact and carry no gradient; the gradient runs through the matched pairs only."""
 
 import torch
 from jaxtyping import Float, Int
@@ -37,11 +37,12 @@ def nearest(queries: Float[Tensor, "n 3"], references: Float[Tensor, "m 3"]) -> 
 
 
 def nearest_by_products(queries: Float[Tensor, "n 3"], references: Float[Tensor, "m 3"]) -> Int[Tensor, " n"]:
-    """:func:`nearest` by matrix products: ``|r|^2 - 2 q r`` finds a few candidates, differences decide.
+    """:func:`nearest` by matrix products: ``|r|^2 - 2 q r`` finds a few candidates,
+    differences decide.
 
-    In float32 the products are off by some 1e-7 of a squared metre around the middle of the references.
-    Differences to all references (``torch.cdist`` without products) took 4 s on a GPU for 160 000 Gaussians
-    and 10 475 vertices.
+    In float32 the products are off by some 1e-7 of a squared metre around the middle of the
+    references. Differences to all references (``torch.cdist`` without products) took 4 s on a GPU
+    for 160 000 Gaussians and 10 475 vertices.
 
     Args:
         queries: points [n, 3]; finite.
@@ -85,17 +86,18 @@ def subsample(points: Float[Tensor, "n 3"], limit: int | None) -> Float[Tensor, 
 def chamfer(
     points: Float[Tensor, "n 3"], references: Float[Tensor, "m 3"], limit: int | None = None
 ) -> Float[Tensor, ""]:
-    """Mean squared distance from each point to its nearest reference, plus the mean the other way round.
+    """Mean squared distance from each point to its nearest reference,
+    plus the mean the other way round.
 
     Args:
         points: the prediction [n, 3], in metres.
         references: the surface [m, 3], in metres.
-        limit: largest number of points of each set that are matched (to all of the other set, so that the
-            mean stays unbiased); None: all.
+        limit: largest number of points of each set that are matched (to all of the other set, so
+            that the mean stays unbiased); None: all.
 
     Returns:
-        The distance in square metres; 0 if either set is empty (with a gradient of 0), nan if a coordinate
-        is not finite.
+        The distance in square metres; 0 if either set is empty (with a gradient of 0), nan if a
+        coordinate is not finite.
     """
     points = at_least_float32(points)
     references = at_least_float32(references)

@@ -1,4 +1,5 @@
-"""Tensors that depend on sizes alone, made once for each device: each takes a GPU at least one launch."""
+"""Tensors that depend on sizes alone, made once for each device:
+each takes a GPU at least one launch."""
 
 from collections.abc import Callable
 from functools import cache, lru_cache
@@ -10,7 +11,8 @@ from torch import Tensor
 def constant(
     make: Callable[..., Tensor], *sizes: object, like: Tensor, dtype: torch.dtype | None = None
 ) -> Tensor:
-    """``make(*sizes, dtype=, device=)``, computed once for the device of ``like``; never to be changed.
+    """``make(*sizes, dtype=, device=)``, computed once for the device of ``like``;
+    never to be changed.
 
     Args:
         make: a function of PyTorch, such as ``torch.arange``, or one with the same two keywords.
@@ -43,7 +45,8 @@ def _made(make: Callable[..., Tensor], sizes: tuple, dtype: torch.dtype, device:
     return make(*sizes, dtype=dtype, device="cpu").to(device, non_blocking=True)
 
 
-#: Without a limit: recorded CUDA graphs read the memory of constants as long as they are played back.
+#: Without a limit: recorded CUDA graphs read the memory of constants as long as they
+#: are played back.
 _kept = cache(_made.__wrapped__)
 
 

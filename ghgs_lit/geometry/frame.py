@@ -1,9 +1,9 @@
 """Coordinate frame of the subject: the stages see each scene in metres, upright, around the origin.
 
-Photographs come with any unit and any origin. In float32 a world 1 km away costs 0.1 mm, limits in metres
-mean nothing in millimetres, and an axis-aligned box depends on the world's axes. So the cameras of a batch
-are moved, turned and scaled, and its prediction is moved back, both by a frame in float64. :meth:`Frame.of`
-and :meth:`Frame.enter` have no gradient."""
+Photographs come with any unit and any origin. In float32 a world 1 km away costs 0.1 mm, limits in
+metres mean nothing in millimetres, and an axis-aligned box depends on the world's axes. So the
+cameras of a batch are moved, turned and scaled, and its prediction is moved back, both by a frame
+in float64. :meth:`Frame.of` and :meth:`Frame.enter` have no gradient."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -31,9 +31,9 @@ HEIGHT = 1.8
 
 @dataclass(frozen=True)
 class Frame:
-    """``world = origin + metre * axes^T point`` for the points of each element, in float64. Axes: right, up
-    (the mean of all cameras) and back of the first camera. Origin: the subject's middle. ``metre``: length of
-    a metre of the frame in the world's unit."""
+    """``world = origin + metre * axes^T point`` for the points of each element, in float64. Axes:
+    right, up (the mean of all cameras) and back of the first camera. Origin: the subject's middle.
+    ``metre``: length of a metre of the frame in the world's unit."""
 
     origin: Float[Tensor, "B 3"]
     axes: Float[Tensor, "B 3 3"]
@@ -56,7 +56,8 @@ class Frame:
 
     @torch.no_grad()
     def enter(self, batch: Batch) -> Batch:
-        """The batch with its input cameras in the frame; targets, true depths and bodies stay in the world.
+        """The batch with its input cameras in the frame;
+        targets, true depths and bodies stay in the world.
 
         Args:
             batch: with cameras in the world, of any unit.
@@ -102,7 +103,8 @@ class Frame:
 
         Args:
             prediction: in the frame.
-            dtype: of points in the world (that of its cameras), which may need more digits than in the frame.
+            dtype: of points in the world (that of its cameras),
+                which may need more digits than in the frame.
 
         Returns:
             The prediction in the unit and the axes of the world.
@@ -176,8 +178,9 @@ def to_world(
 def subject_center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Tensor, "B 3"]:
     """The point nearest to the rays through the masks' centroids, by least squares.
 
-    Optical axes have a small weight, so that one mask or none is enough, and the cameras a smaller one, for
-    parallel rays. To be called where products are exact (:func:`ghgs_lit.runtime.precision.exact`).
+    Optical axes have a small weight, so that one mask or none is enough, and the cameras a smaller
+    one, for parallel rays. To be called where products are exact
+    (:func:`ghgs_lit.runtime.precision.exact`).
 
     Args:
         masks: of the subject [B, V, h, w].
@@ -225,8 +228,8 @@ def in_cameras(points: Float[Tensor, "B 3"], extrinsics: Float[Tensor, "B V 4 4"
 def _size(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Tensor) -> Float[Tensor, " B"]:
     """Height or width of the subject, whichever is larger.
 
-    The median of the views, so that one wrong mask does not matter; of two the larger, since masks are more
-    often too small.
+    The median of the views, so that one wrong mask does not matter; of two the larger, since masks
+    are more often too small.
 
     Args:
         masks: of the subject [B, V, h, w].

@@ -1,6 +1,7 @@
-"""Masks and soft mattes: extents, patches, distances to outlines, colours, relative depths. A matte holds the
-share of a pixel's area that shows the subject. Photographs on black are premultiplied by it, as renders of
-Gaussians are (Porter and Duff, SIGGRAPH 1984); a Gaussian needs the colour of the surface."""
+"""Masks and soft mattes: extents, patches, distances to outlines, colours, relative depths. A
+matte holds the share of a pixel's area that shows the subject. Photographs on black are
+premultiplied by it, as renders of Gaussians are (Porter and Duff, SIGGRAPH 1984); a Gaussian needs
+the colour of the surface."""
 
 import dataclasses
 
@@ -137,7 +138,8 @@ def with_matte(batch: Batch, least: float | None) -> Batch:
 
     Args:
         batch: with or without mattes.
-        least: share of a pixel above which it is in the mask, in [0, 1); None: the matte is dropped.
+        least: share of a pixel above which it is in the mask, in [0,
+            1); None: the matte is dropped.
 
     Returns:
         The batch; unchanged without a matte.
@@ -210,8 +212,8 @@ def relative_bounds(bounds: DepthBounds, masks: Bool[Tensor, "B V H W"]) -> Floa
         masks: of the subject [B, V, H, W].
 
     Returns:
-        ``near`` minus the mean middle of the view's bounds, and ``far - near``, [B, V, 2, H, W] in units of
-        :data:`UNIT`; 0 outside the subject.
+        ``near`` minus the mean middle of the view's bounds, and ``far - near``, [B, V, 2, H, W] in
+        units of :data:`UNIT`; 0 outside the subject.
     """
     middle = subject_mean((bounds.near + bounds.far) / 2, masks)
     maps = torch.stack((bounds.near - middle, bounds.far - bounds.near), dim=2) / UNIT

@@ -1,5 +1,5 @@
-"""A black border around photographs whose sides are not multiples of the patch size. Predictions are cropped
-again, so that results are in the photograph's own pixels."""
+"""A black border around photographs whose sides are not multiples of the patch size. Predictions
+are cropped again, so that results are in the photograph's own pixels."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -15,8 +15,8 @@ from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Prediction,
 
 @dataclass(frozen=True)
 class Padding:
-    """Images of ``height`` x ``width`` with photographs of size ``full`` (height, width) inside. Their first
-    pixel is pixel (``top``, ``left``) of the photograph: 0 or negative."""
+    """Images of ``height`` x ``width`` with photographs of size ``full`` (height, width) inside.
+    Their first pixel is pixel (``top``, ``left``) of the photograph: 0 or negative."""
 
     top: int
     left: int
@@ -118,7 +118,8 @@ class PaddedBatch(Batch):
 
 
 def bounds_of(stage: Callable[[Batch], DepthBounds | None], batch: Batch) -> DepthBounds | None:
-    """Bounds of all pixels, from the photographs without their border, which would look like background.
+    """Bounds of all pixels, from the photographs without their border,
+    which would look like background.
 
     Args:
         stage: gives the bounds of a batch, or None.
@@ -134,7 +135,8 @@ def bounds_of(stage: Callable[[Batch], DepthBounds | None], batch: Batch) -> Dep
 
 
 def pad_to_patches(masks: Bool[Tensor, "B V H W"], multiple: int) -> Padding | None:
-    """The smallest border that makes both sides multiples; an odd pixel goes to the bottom and the right.
+    """The smallest border that makes both sides multiples;
+    an odd pixel goes to the bottom and the right.
 
     512 becomes 518 with 3 pixels on each side, as in the authors' release.
 

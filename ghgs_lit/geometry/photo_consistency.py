@@ -1,5 +1,6 @@
-"""Photo-consistency: how well the photographs agree at several depths of each pixel. A plane sweep (Collins,
-CVPR 1996) within each pixel's own bounds: a point on the surface has the same colour in all views."""
+"""Photo-consistency: how well the photographs agree at several depths of each pixel. A plane
+sweep (Collins, CVPR 1996) within each pixel's own bounds: a point on the surface has the same
+colour in all views."""
 
 import torch
 import torch.nn.functional as F
@@ -21,8 +22,8 @@ _SAMPLES = 1 << 22
 #: Mean absolute difference of two colours at which the consistency is 1 / e.
 TOLERANCE = 0.1
 
-#: Smallest cosine between the axes of two views that are compared (127 degrees): beyond it they hardly share
-#: any surface.
+#: Smallest cosine between the axes of two views that are compared (127 degrees): beyond it they
+#: hardly share any surface.
 WIDEST = -0.6
 
 
@@ -36,7 +37,8 @@ def photo_consistency(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Te
         steps: S, the number of depths: the middles of S equal parts from near to far.
 
     Returns:
-        [B, V, S, H, W] in [0, 1]; 0 outside the subject, and where no other view has the point in its mask.
+        [B, V, S, H, W] in [0, 1]; 0 outside the subject,
+        and where no other view has the point in its mask.
     """
     near, far = (bound.flatten()[batch.pixels] for bound in (bounds.near, bounds.far))
     agreement = consistency_of(batch, batch.pixels, near, far, steps)
@@ -235,7 +237,8 @@ def _relations(
         extrinsics: world to camera [B, V, 4, 4].
 
     Returns:
-        ``turn`` [B, j, k, 3, 3], ``shift`` [B, j, k, 3], and the cosines between the axes of views [B, j, k].
+        ``turn`` [B, j, k, 3, 3], ``shift`` [B, j, k, 3],
+        and the cosines between the axes of views [B, j, k].
     """
     rotation = extrinsics[..., :3, :3]
     translation = extrinsics[..., :3, 3:]

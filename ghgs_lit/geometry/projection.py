@@ -1,5 +1,5 @@
-"""Projection, unprojection and bilinear sampling. Conventions: see :mod:`ghgs_lit.types`. Every function
-takes any leading dimensions and computes in float32 or wider under any autocast."""
+"""Projection, unprojection and bilinear sampling. Conventions: see :mod:`ghgs_lit.types`. Every
+function takes any leading dimensions and computes in float32 or wider under any autocast."""
 
 from functools import reduce
 
@@ -92,8 +92,8 @@ def unproject(
     x = x * depth - shift[..., 0]
     y = y * depth - shift[..., 1]
     z = depth - shift[..., 2]
-    # The product with R^T is written out: matmul would run in half precision under autocast, and this way
-    # there is no temporary of nine numbers for each pixel.
+    # The product with R^T is written out: matmul would run in half precision under autocast, and
+    # this way there is no temporary of nine numbers for each pixel.
     rows = extrinsics[..., :3, :3].unbind(-2)
     return torch.stack(
         [x * rows[0][..., k] + y * rows[1][..., k] + z * rows[2][..., k] for k in range(3)], -1
@@ -161,7 +161,8 @@ def world_to_camera(
 
 
 def _camera_axes(points: Tensor, extrinsics: Tensor) -> Tensor:
-    """Coordinates [3, ...] of :func:`world_to_camera`; no product of matrices, as in :func:`unproject`."""
+    """Coordinates [3, ...] of :func:`world_to_camera`;
+    no product of matrices, as in :func:`unproject`."""
     points = at_least_float32(points)
     matrices = at_least_float32(extrinsics)[..., :3, :]
     columns = _columns(matrices, points.dim() + 1)
@@ -210,7 +211,8 @@ def look_at_point(cameras: Cameras) -> Tensor:
         cameras: V cameras.
 
     Returns:
-        Point [3], float64; for parallel axes, the solution nearest to the mean position of the cameras.
+        Point [3], float64; for parallel axes,
+        the solution nearest to the mean position of the cameras.
     """
     forward = cameras.extrinsics[:, 2, :3].double()
     centers = cameras.centers.double()
@@ -226,8 +228,8 @@ def sample(
     """Bilinear values of maps at pixels of any of them.
 
     Args:
-        maps: m maps of one size [m, c, H, W]; all must be finite: by rounding, the next map may enter with a
-            tiny weight.
+        maps: m maps of one size [m, c, H, W]; all must be finite: by rounding, the next map may
+            enter with a tiny weight.
         image: number of the map of each pixel [...].
         pixels: ``(u, v)`` [..., 2].
 
@@ -236,8 +238,8 @@ def sample(
     """
     count, _, height, width = maps.shape
     u, v = pixels.unbind(-1)
-    # The maps are the layers of a volume, and pixels lie in the middle of a layer. Pixels far outside are
-    # clamped: large numbers are not exact.
+    # The maps are the layers of a volume, and pixels lie in the middle of a layer. Pixels far
+    # outside are clamped: large numbers are not exact.
     layer = (2 * image.to(pixels) + 1) / count - 1
     grid = torch.stack(((2 / width * u - 1).clamp(-3, 3), (2 / height * v - 1).clamp(-3, 3), layer), -1)
     grid = grid.reshape(1, 1, 1, -1, 3)

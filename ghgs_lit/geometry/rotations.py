@@ -1,6 +1,6 @@
-"""Directions, quaternions ``(w, x, y, z)``, rotation matrices, and small motions of cameras. Photographs show
-neither where a rig as a whole is nor how far its cameras are from a subject of unknown size: they only
-determine motions of the cameras relative to one another."""
+"""Directions, quaternions ``(w, x, y, z)``, rotation matrices, and small motions of cameras.
+Photographs show neither where a rig as a whole is nor how far its cameras are from a subject of
+unknown size: they only determine motions of the cameras relative to one another."""
 
 import torch
 import torch.nn.functional as F
@@ -38,8 +38,8 @@ def quaternion_to_matrix(quaternions: Float[Tensor, "*batch 4"]) -> Float[Tensor
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
-#: The 16 values of Shepperd's table as sums of at most four numbers with signs. 0 is the number 1; entries of
-#: the matrix are numbered from 1, by row.
+#: The 16 values of Shepperd's table as sums of at most four numbers with signs. 0 is the number 1;
+#: entries of the matrix are numbered from 1, by row.
 _OWN = (0, 1, 5, 9)
 _X = (8, 6, 0, 0)
 _Y = (3, 7, 0, 0)
@@ -95,8 +95,8 @@ def rotate(
     return vectors + quaternions[..., :1] * twice + torch.linalg.cross(axis, twice)
 
 
-#: Components of the second quaternion by which those of the first are multiplied, and signs of the products:
-#: for z, y, x and w of the result, in whose order gradients are summed.
+#: Components of the second quaternion by which those of the first are multiplied, and signs of the
+#: products: for z, y, x and w of the result, in whose order gradients are summed.
 _FACTORS = ((3, 2, 1, 0), (2, 3, 0, 1), (1, 0, 3, 2), (0, 1, 2, 3))
 _FACTOR_SIGNS = ((1, 1, -1, 1), (1, -1, 1, 1), (1, 1, 1, -1), (1, -1, -1, -1))
 
@@ -119,12 +119,13 @@ def multiply_quaternions(
 def unit(x: Float[Tensor, "*n c"], least: float = 0.0) -> Float[Tensor, "*n c"]:
     """Vectors divided by their length; 0 stays 0, with a zero gradient.
 
-    Vectors are first scaled by their largest component: squares of 1e-20 vanish in float32, those of 1e20
-    overflow.
+    Vectors are first scaled by their largest component: squares of 1e-20 vanish in float32, those
+    of 1e20 overflow.
 
     Args:
         x: vectors [..., c].
-        least: the gradient, which grows as 1 / length, stays constant for vectors shorter than this.
+        least: the gradient, which grows as 1 / length,
+            stays constant for vectors shorter than this.
 
     Returns:
         Vectors [..., c], float32 or wider.
@@ -145,7 +146,8 @@ def unit(x: Float[Tensor, "*n c"], least: float = 0.0) -> Float[Tensor, "*n c"]:
     return direction.detach() + share * (direction - direction.detach())
 
 
-#: Relative weight of a shift along an optical axis: it is hardly visible, much like another focal length.
+#: Relative weight of a shift along an optical axis: it is hardly visible,
+#: much like another focal length.
 _ALONG = 0.01
 
 
@@ -157,7 +159,8 @@ def without_common(
     The mean of the shifts leaves the least shifts across the optical axes (least squares).
 
     Args:
-        motions: rotation vectors of points, in radians, and shifts [..., V, 6], in the world's axes.
+        motions: rotation vectors of points, in radians, and shifts [..., V, 6],
+            in the world's axes.
         axes: optical axes of the cameras [..., V, 3], unit vectors of the world.
 
     Returns:
@@ -183,8 +186,8 @@ def rigid(
         length: in the unit of the world.
 
     Returns:
-        Rotation matrices [..., 3, 3], exact to second order in the angles, and shifts [..., 3] in the unit of
-        the world.
+        Rotation matrices [..., 3, 3], exact to second order in the angles, and shifts [..., 3] in
+        the unit of the world.
     """
     turn, shift = motions.split(3, -1)
     return quaternion_to_matrix(torch.cat((torch.ones_like(turn[..., :1]), turn / 2), -1)), length * shift
@@ -193,7 +196,8 @@ def rigid(
 def motions_between(
     before: Float[Tensor, "V 4 4"], after: Float[Tensor, "V 4 4"], middle: Float[Tensor, "3"]
 ) -> Float[Tensor, "V 6"]:
-    """Small motions about ``middle`` after which ``before`` sees points as ``after`` sees them unmoved.
+    """Small motions about ``middle`` after which ``before`` sees points as ``after``
+    sees them unmoved.
 
     Args:
         before: extrinsics [V, 4, 4].

@@ -1,9 +1,9 @@
 """Scene flow: how surface points move between two instants, from the photographs of all cameras.
 
-A point keeps its colour in each view that shows it. Its motion follows from image gradients (Lucas and
-Kanade, IJCAI 1981), in space and for all views at once (Vedula et al., ICCV 1999), from coarse to fine
-images. The equations of a single point may leave directions open, so those of all points are summed at the
-nodes of a grid and smoothed over the nodes around, further for coarser images."""
+A point keeps its colour in each view that shows it. Its motion follows from image gradients (Lucas
+and Kanade, IJCAI 1981), in space and for all views at once (Vedula et al., ICCV 1999), from coarse
+to fine images. The equations of a single point may leave directions open, so those of all points
+are summed at the nodes of a grid and smoothed over the nodes around, further for coarser images."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,7 +34,8 @@ _STIFF = 0.01
 
 
 class _Level(NamedTuple):
-    """A level: how much smaller images are, how often equations spread to the next nodes, number of steps."""
+    """A level: how much smaller images are, how often equations spread to the next nodes,
+    number of steps."""
 
     smaller: int
     spread: int
@@ -53,7 +54,8 @@ class Instant(NamedTuple):
 
 @dataclass(frozen=True)
 class _Grid:
-    """Nodes around points. ``low``: position of the first. ``shape``: their number along z, y and x."""
+    """Nodes around points. ``low``: position of the first.
+    ``shape``: their number along z, y and x."""
 
     low: Float[Tensor, " 3"]
     shape: tuple[int, int, int]
@@ -96,7 +98,8 @@ class _Grid:
 
 
 def _spread(nodes: Float[Tensor, "c z y x"], times: int) -> Float[Tensor, "c z y x"]:
-    """Smooth the nodes ``times`` times: along each axis a quarter of a value goes to either side."""
+    """Smooth the nodes ``times`` times: along each axis a quarter of a value goes to
+    either side."""
     for _ in range(times):
         for axis in (1, 2, 3):
             size = nodes.shape[axis]
@@ -148,8 +151,8 @@ def scene_flow(
         points: on the surface in the first instant [N, 3], in metres.
         shown: the views that show them there [N, V].
         before: photographs and cameras of the first instant.
-        after: those of the second, with the same views in order; a camera stands still, but its crop may
-            change.
+        after: those of the second, with the same views in order; a camera stands still, but its
+            crop may change.
 
     Returns:
         Motions [N, 3] in metres, and rotation vectors [N, 3] in radians.

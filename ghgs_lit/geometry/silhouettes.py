@@ -1,6 +1,7 @@
-"""Silhouette coherence: how much of each mask lies in the visual hull of the others. With correct cameras and
-masks, the ray of every mask pixel passes a point that all other masks cover (Boyer 2006; Hernandez, Schmitt
-and Cipolla 2007). For silhouettes of any sizes, unlike :mod:`ghgs_lit.bounds.agreement`."""
+"""Silhouette coherence: how much of each mask lies in the visual hull of the others. With correct
+cameras and masks, the ray of every mask pixel passes a point that all other masks cover (Boyer
+2006; Hernandez, Schmitt and Cipolla 2007). For silhouettes of any sizes, unlike
+:mod:`ghgs_lit.bounds.agreement`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -129,7 +130,8 @@ class HullSearch:
 
         Args:
             one: the silhouette whose rays these are.
-            cells: its cells that the rays pass [n, 2] (column, row); the centre of the first is (0.5, 0.5).
+            cells: its cells that the rays pass [n, 2] (column, row);
+                the centre of the first is (0.5, 0.5).
             others: the silhouettes of the hull; a share of :attr:`wrong` need not cover a point.
             focus: the subject's middle [3] (:func:`subject_sphere`).
             radius: of the subject, in the unit of the world.

@@ -1,4 +1,5 @@
-"""Undistortion of photographs, as OpenCV's ``undistort`` and ``fisheye`` do, with kornia's models."""
+"""Undistortion of photographs, as OpenCV's ``undistort`` and ``fisheye`` do,
+with kornia's models."""
 
 import numpy as np
 import torch
@@ -13,7 +14,8 @@ def undistorting_grid(
 ) -> torch.Tensor:
     """Where the pixels of the undistorted image are in the photograph.
 
-    The formulas are those of OpenCV's camera model and of its fisheye model (Kannala and Brandt, PAMI 2006).
+    The formulas are those of OpenCV's camera model and of its fisheye model (Kannala and
+    Brandt, PAMI 2006).
 
     Args:
         intrinsics: K [3, 3] in pixels, also of the undistorted image.

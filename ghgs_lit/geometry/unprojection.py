@@ -16,17 +16,20 @@ RELEASE_BORDER = 3
 
 
 class Unprojection(Options):
-    """``unprojection(depth_maps, tokens, batch) -> Points``, without parameters, in float32 or wider.
+    """``unprojection(depth_maps, tokens, batch) -> Points``, without parameters,
+    in float32 or wider.
 
-    With ``tokens="subject"`` the mean pixel and the mean depth keep a token's point on the surface: at a
-    silhouette the patch's centre may lie beside the subject. A patch without a valid pixel lies at its centre
-    and mean depth, and is not valid. With ``"release"`` inverse depths are sampled bilinearly (2 x 2) and
-    pixels are the centres of a grid over the image without its border; the same tokens are valid."""
+    With ``tokens="subject"`` the mean pixel and the mean depth keep a token's point on the surface:
+    at a silhouette the patch's centre may lie beside the subject. A patch without a valid pixel
+    lies at its centre and mean depth, and is not valid. With ``"release"`` inverse depths are
+    sampled bilinearly (2 x 2) and pixels are the centres of a grid over the image without its
+    border; the same tokens are valid."""
 
     group = "unprojection"
     tokens: Literal["subject", "release"] = "subject"
-    """Where a token lies: subject, at the mean pixel and mean depth of the subject's pixels in its patch |
-    release, as in the authors' code, which scales intrinsics by 37 / 512 as if there were no border"""
+    """Where a token lies: subject, at the mean pixel and mean depth of the subject's pixels in
+    its patch | release, as in the authors' code, which scales intrinsics by 37 / 512 as if there
+    were no border"""
 
     def __call__(self, depth_maps: DepthMaps, tokens: Tokens, batch: Batch) -> Points:
         locate = subject_tokens if self.tokens == "subject" else _release_tokens
@@ -65,8 +68,8 @@ def subject_tokens(
         patch_size: side of a patch in pixels.
 
     Returns:
-        Mean pixels ``(u, v)`` [B, V, h, w, 2], mean depths [B, V, h, w], and whether a patch has valid pixels
-        [B, V, h, w]; without any, means are those of all its pixels.
+        Mean pixels ``(u, v)`` [B, V, h, w, 2], mean depths [B, V, h, w], and whether a patch has
+        valid pixels [B, V, h, w]; without any, means are those of all its pixels.
     """
     depth = at_least_float32(depth_maps.depth)
     valid = depth_maps.valid

@@ -56,21 +56,24 @@ EXP_LIMIT = 80.0
 
 
 def bounded_sigmoid(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """The sigmoid of ``x`` clamped to +-10; beyond, only gradients that lead back into the limits remain.
+    """The sigmoid of ``x`` clamped to +-10; beyond,
+    only gradients that lead back into the limits remain.
 
-    In float32 a plain sigmoid is exactly 1 from 17 on, without a gradient: one step that is too large ends
-    the training of a head.
+    In float32 a plain sigmoid is exactly 1 from 17 on, without a gradient: one step that is too
+    large ends the training of a head.
     """
     return _Saturate.apply(x, SIGMOID_LIMIT, False)
 
 
 def bounded_tanh(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """The hyperbolic tangent of ``x`` clamped to +-5, with gradients as of :func:`bounded_sigmoid`."""
+    """The hyperbolic tangent of ``x`` clamped to +-5,
+    with gradients as of :func:`bounded_sigmoid`."""
     return _Saturate.apply(x, TANH_LIMIT, True)
 
 
 def confidence_of(raw: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """A confidence of at least 1, as in published heads (VGGT), finite for any raw value but NaN."""
+    """A confidence of at least 1, as in published heads (VGGT),
+    finite for any raw value but NaN."""
     return 1 + raw.clamp(max=EXP_LIMIT).exp()
 
 
@@ -81,7 +84,8 @@ Attributes = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 class Constants(NamedTuple):
-    """Numbers of :func:`footprint_attributes`. Lengths are in footprints, except those of offsets."""
+    """Numbers of :func:`footprint_attributes`.
+    Lengths are in footprints, except those of offsets."""
 
     offset_limit: float
     """Largest offset along each axis in metres; 0: none."""
@@ -165,7 +169,8 @@ def activated(
         on_surface: ``raw`` is in axes of the surface.
 
     Returns:
-        Means in metres [N, 3], quaternions [N, 4], scales in metres [N, 3], opacities [N] and colours [N, 3].
+        Means in metres [N, 3], quaternions [N, 4], scales in metres [N, 3],
+        opacities [N] and colours [N, 3].
     """
     *numbers, color = raw
     focal = focal_lengths(cameras).prod(-1).sqrt().flatten()[image]

@@ -1,4 +1,5 @@
-"""Raw attributes of Gaussians, and what they mean: in footprints of pixels, or as in the authors' release."""
+"""Raw attributes of Gaussians, and what they mean: in footprints of pixels,
+or as in the authors' release."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -17,8 +18,8 @@ from ghgs_lit.heads.activations import (
     footprint_attributes,
 )
 
-#: Offset of a Gaussian from its pixel's point along each axis, in metres, for a raw value of 1 where there is
-#: no limit; and the limit where none is said.
+#: Offset of a Gaussian from its pixel's point along each axis, in metres, for a raw value of 1
+#: where there is no limit; and the limit where none is said.
 OFFSET_UNIT = 0.05
 #: The largest scale in footprints: a splat as large as a limb would hide errors beneath it.
 SCALE_CAP = 4.0
@@ -67,7 +68,8 @@ class RawGaussians:
         """The raw attributes plus a change, without a change of descriptors.
 
         Args:
-            change: values of offset, scale, rotation, opacity and color, :data:`RAW_VALUES` together.
+            change: values of offset, scale, rotation, opacity and color,
+                :data:`RAW_VALUES` together.
         """
         offset, scale, rotation, opacity, color = change.split(_WIDTHS, -1)
         return dataclasses.replace(
@@ -81,18 +83,20 @@ class RawGaussians:
 
 
 class FootprintAttributes(Options):
-    """Raw values to attributes in units of a pixel's footprint, ``z / f`` metres; zeros give a splat on the
-    surface. The paper gives no values."""
+    """Raw values to attributes in units of a pixel's footprint, ``z / f`` metres; zeros give a
+    splat on the surface. The paper gives no values."""
 
     scale_floor: Positive = 0.15
-    """Least scale in footprints; it leaves no holes when splats are rendered at a higher resolution."""
+    """Least scale in footprints; it leaves no holes when splats are rendered at a higher
+    resolution."""
     scale_start: Positive = 0.25
     """Scale at which training starts, in footprints."""
     thickness_start: Positive | None = None
     """Scale of the third axis at which training starts, in footprints; null: as the others."""
     inward: Amount = 0.0
-    """Distance along the third axis to which training starts moving the splats, in footprints: with axes of
-    the surface, away from the camera. What a splat covers beside its pixel then ends at the silhouette."""
+    """Distance along the third axis to which training starts moving the splats, in footprints: with
+    axes of the surface, away from the camera. What a splat covers beside its pixel then ends at the
+    silhouette."""
     opacity_floor: Share = 0.1
     """Least opacity: below 1/255 a splat has no gradient left."""
 
@@ -113,7 +117,8 @@ class FootprintAttributes(Options):
 
     @property
     def scale_biases(self) -> tuple[float, float]:
-        """Biases of raw scales of the first two axes and of the third, so that 0 gives the start."""
+        """Biases of raw scales of the first two axes and of the third,
+        so that 0 gives the start."""
         thickness = self.scale_start if self.thickness_start is None else self.thickness_start
         starts = (self.scale_start, thickness)
         return tuple(_logit(log(start / self.scale_floor) / self.scale_range) for start in starts)

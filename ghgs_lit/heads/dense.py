@@ -39,15 +39,15 @@ def decode(
 ) -> Iterator[Part]:
     """Maps of the images in their windows, in the order of the images.
 
-    Images with small maps share a window. Without a gradient, larger maps are computed one after another,
-    each in its own window, to save memory and work.
+    Images with small maps share a window. Without a gradient, larger maps are computed one after
+    another, each in its own window, to save memory and work.
 
     Args:
         dpt: the head.
         tokens: of all images.
         guide: maps of whole images, if the head has one.
-        windows: one for each image; None: whole images. An image without a window is left out; if all are,
-            one pixel is decoded, so that gradients of 0 flow.
+        windows: one for each image; None: whole images. An image without a window is left out; if
+            all are, one pixel is decoded, so that gradients of 0 flow.
         together: number of consecutive images that are decoded at once at least.
 
     Yields:

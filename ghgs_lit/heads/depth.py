@@ -22,7 +22,8 @@ from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Tokens
 
 
 def _bounded_inverse(fraction: Tensor, near: Tensor, far: Tensor) -> Tensor:
-    """Depth linear in ``1 / z``: equal steps of the fraction are equal steps in the image of another view."""
+    """Depth linear in ``1 / z``: equal steps of the fraction are equal steps in the image of
+    another view."""
     return near * far / (far * (1 - fraction) + near * fraction)
 
 
@@ -54,8 +55,8 @@ def bounded_depth(
 def inverse_linear(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """``1 / (x + 1e-8)`` as in the authors' release: of either sign and without bound.
 
-    Infinite at -1e-8, where the gradient is 0. The argument is replaced, too, or the gradient would be 0
-    times infinity.
+    Infinite at -1e-8, where the gradient is 0. The argument is replaced, too, or the gradient would
+    be 0 times infinity.
     """
     shifted = x + 1e-8
     is_pole = shifted == 0
@@ -67,14 +68,16 @@ class DepthHeadOptions(Options):
 
     group = "depth_head"
     rectified_skip: bool = True
-    """Residual units add what they rectified, as published weights expect; in training it can die."""
+    """Residual units add what they rectified, as published weights expect;
+    in training it can die."""
     guide: bool = False
-    """The dense head also sees photographs, masks and bounds at full resolution; the paper: false."""
+    """The dense head also sees photographs, masks and bounds at full resolution;
+    the paper: false."""
     consistency_depths: int = Field(0, ge=0, le=4096)
     """Depths between near and far at which the guide shows photo-consistency; the paper: 0."""
     parameterization: Literal["bounded_inverse", "linear", "inverse_linear"] = "bounded_inverse"
-    """bounded_inverse, linear: in 1 / z or in z between the near and far of each pixel; inverse_linear:
-    without bounds, for the authors' weights only."""
+    """bounded_inverse, linear: in 1 / z or in z between the near and far of each pixel;
+    inverse_linear: without bounds, for the authors' weights only."""
     start: float = Field(0.5, gt=0, lt=1)
     """Depth at which training starts, as a share of the way from near to far."""
 

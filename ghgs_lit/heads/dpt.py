@@ -1,4 +1,5 @@
-"""Dense prediction head (DPT): fuses four layers of tokens from coarse to fine into one map per image."""
+"""Dense prediction head (DPT): fuses four layers of tokens from coarse to fine into one
+map per image."""
 
 import dataclasses
 import functools
@@ -53,8 +54,8 @@ def add_positions_(
 
     Waves of the column in the first half of the channels, of the row in the second.
 
-    The unit is half the diagonal of the image; samples are cell centres. The waves of each axis are cached (a
-    few kilobytes); the embedding is never built as a map.
+    The unit is half the diagonal of the image; samples are cell centres. The waves of each axis are
+    cached (a few kilobytes); the embedding is never built as a map.
 
     Args:
         x: maps, whose channels are a multiple of 4; changed.
@@ -78,14 +79,15 @@ def add_positions_(
 
 
 LEVELS = 4
-#: Cells per patch along an axis in the three finer levels; the coarsest has one cell for two patches.
+#: Cells per patch along an axis in the three finer levels;
+#: the coarsest has one cell for two patches.
 CELLS = (4, 2, 1)
 NORM_EPS = 1e-5
 #: Channels before the last convolution, as published.
 HIDDEN = 32
 
-#: Without a gradient: values of a map at full resolution in memory at once, on a CPU and on a GPU, and the
-#: smallest number of rows.
+#: Without a gradient: values of a map at full resolution in memory at once, on a CPU and on a GPU,
+#: and the smallest number of rows.
 _LARGEST = 1 << 21
 _GPU_LARGEST = 1 << 28
 _ROWS = 8
@@ -95,7 +97,8 @@ Widths = tuple[int, tuple[int, int, int, int]]
 
 
 def published_widths(dim_latent: int) -> Widths:
-    """Channels of the fused maps, and of the four levels from fine to coarse, in the published proportions.
+    """Channels of the fused maps, and of the four levels from fine to coarse,
+    in the published proportions.
 
     1/8 of the tokens' width (a multiple of 8), and 1/8, 1/4, 1/2, 1/2 (multiples of 4).
 
@@ -115,7 +118,8 @@ def _conv3(inputs: int, outputs: int, bias: bool = True) -> nn.Conv2d:
 
 
 def _pointwise(conv: nn.Conv2d, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n o h w"]:
-    """A 1x1 convolution as a linear layer on pixels, without a copy, since channels are innermost."""
+    """A 1x1 convolution as a linear layer on pixels, without a copy,
+    since channels are innermost."""
     return linear(x.permute(0, 2, 3, 1), conv.weight.flatten(1), conv.bias).permute(0, 3, 1, 2)
 
 
@@ -125,15 +129,16 @@ class _Halving(nn.Conv2d):
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h2 w2"]:
         if x.device.type != "cpu" or x.shape[-1] > 1:
             return super().forward(x)
-        # For maps one cell wide in bfloat16, PyTorch 2.13 leaves parts of the weight's gradient unset.
+        # For maps one cell wide in bfloat16,
+        # PyTorch 2.13 leaves parts of the weight's gradient unset.
         with exact("cpu"):
             return super().forward(at_least_float32(x))
 
 
 class ResidualUnit(nn.Module):
-    """``s + conv2(relu(conv1(relu(x))))`` with ``s = relu(x)``, or ``s = x`` without a rectified skip.
-    Published weights expect a rectified skip. In training it can die: where all channels of a sum of levels
-    are negative, tokens no longer affect the result and get no gradient."""
+    """``s + conv2(relu(conv1(relu(x))))`` with ``s = relu(x)``, or ``s = x`` without a rectified
+    skip. Published weights expect a rectified skip. In training it can die: where all channels of a
+    sum of levels are negative, tokens no longer affect the result and get no gradient."""
 
     def __init__(self, features: int, rectified_skip: bool = True):
         super().__init__()
@@ -148,7 +153,8 @@ class ResidualUnit(nn.Module):
 
 
 class Fusion(nn.Module):
-    """Add a finer level to the coarser result and refine it; the coarsest block only refines its level."""
+    """Add a finer level to the coarser result and refine it;
+    the coarsest block only refines its level."""
 
     def __init__(self, features: int, joins: bool, rectified_skip: bool):
         super().__init__()
@@ -163,7 +169,8 @@ class Fusion(nn.Module):
         """The refined sum of the coarser result and a level in the window ``place.joined``.
 
         Args:
-            x: the coarser result in this window, which may be overwritten; None for the coarsest level.
+            x: the coarser result in this window, which may be overwritten;
+                None for the coarsest level.
             level: in the window ``place.level``.
             place: windows of the level.
         """
@@ -210,8 +217,9 @@ class LevelWindows:
 
 @dataclass(frozen=True)
 class Windows:
-    """Windows that a head computes for the window ``result`` of its result. Zero padding spoils the border of
-    a window, so each is larger than needed by the reach of its layers, as far as the map goes."""
+    """Windows that a head computes for the window ``result`` of its result. Zero padding spoils
+    the border of a window, so each is larger than needed by the reach of its layers, as far as
+    the map goes."""
 
     result: Window
     full: Window
@@ -226,8 +234,8 @@ class DPTHead(nn.Module):
         dim_latent: width of a token of ``Tokens.latent``.
         output_dim: channels of the result.
         rectified_skip: as of :class:`ResidualUnit`.
-        guide_channels: channels of a guide at full resolution (:mod:`ghgs_lit.heads.guide`), which keeps a
-            small head sharp; 0: none, as published.
+        guide_channels: channels of a guide at full resolution (:mod:`ghgs_lit.heads.guide`), which
+            keeps a small head sharp; 0: none, as published.
         widths: channels inside; None: :func:`published_widths`.
     """
 
@@ -269,7 +277,8 @@ class DPTHead(nn.Module):
             return self._maps(tokens, guide, window)
 
     def _maps(self, tokens: Tokens, guide: Guide | None, window: Window | None) -> Tensor:
-        """:meth:`forward` in the precision that is left; levels are computed from coarse to fine."""
+        """:meth:`forward` in the precision that is left;
+        levels are computed from coarse to fine."""
         rows, columns = tokens.grid[2:]
         size = (tokens.patch_size * rows, tokens.patch_size * columns)
         windows = self.windows(window or Window.whole(size), (rows, columns))
@@ -319,13 +328,15 @@ class DPTHead(nn.Module):
         if guide is not None:
             x = x + windows.full.cut(guide, seen)
         x = layers[:-1](x)
-        # In float32 also under autocast: depths and offsets of millimetres depend on this projection.
+        # In float32 also under autocast: depths and offsets of millimetres depend on
+        # this projection.
         last = layers[-1]
         with exact(x.device.type):
             return seen.cut(_pointwise(last, x.to(last.weight.dtype)), result)
 
     def _parts(self, x: Float[Tensor, "n c h w"], window: Window) -> list[Window]:
-        """Parts of a window along its rows; without a gradient these largest maps are computed in turn."""
+        """Parts of a window along its rows; without a gradient these largest maps are
+        computed in turn."""
         if torch.is_grad_enabled():
             return [window]
         rows, columns = window
@@ -375,7 +386,8 @@ class DPTHead(nn.Module):
         return getattr(self.scratch, f"layer{i + 1}_rn")(level)
 
     def _project(self, i: int, x: Float[Tensor, "*n c"]) -> Float[Tensor, "*n o"]:
-        """Normalised and projected tokens; the published 1x1 convolution is a linear layer on tokens."""
+        """Normalised and projected tokens; the published 1x1 convolution is a linear
+        layer on tokens."""
         project = self.projects[i]
         if not torch.is_autocast_enabled(x.device.type):
             x = x.to(project.weight.dtype)  # tokens of an encoder under float16 autocast

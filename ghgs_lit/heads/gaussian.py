@@ -49,7 +49,8 @@ def _mlp(sizes: Sequence[int], activation: type[nn.Module]) -> nn.Sequential:
 
 
 def float32_last(mlp: nn.Sequential, x: Tensor) -> Tensor:
-    """``mlp(x)`` with its last projection in float32 under autocast: offsets of millimetres depend on it.
+    """``mlp(x)`` with its last projection in float32 under autocast:
+    offsets of millimetres depend on it.
 
     Under float16 autocast all of it is in float32.
 
@@ -69,18 +70,20 @@ class GaussianHeadOptions(Options):
 
     group = "gaussian_head"
     rectified_skip: bool = True
-    """Residual units add what they rectified, as published weights expect; in training it can die."""
+    """Residual units add what they rectified, as published weights expect;
+    in training it can die."""
     guide: bool = False
-    """The dense head also sees photographs, masks and depths at full resolution; the paper: false."""
+    """The dense head also sees photographs, masks and depths at full resolution;
+    the paper: false."""
     photo_consistency: bool = False
     """The guide shows photo-consistency at the predicted depth: a splat off the surface can become
     transparent; the paper: false."""
     color_limit: Share = 0.0
-    """Largest change of a colour from its pixel's, in each channel, which makes up for the blur of splats and
-    for dark rims; 0: none (the paper)."""
+    """Largest change of a colour from its pixel's, in each channel, which makes up for the blur of
+    splats and for dark rims; 0: none (the paper)."""
     offset_limit: Positive | None = OFFSET_UNIT
-    """Largest offset of a Gaussian from its pixel's point along each axis, in metres; null: none, as
-    published. With parameterization=footprint; release has none."""
+    """Largest offset of a Gaussian from its pixel's point along each axis, in metres; null: none,
+    as published. With parameterization=footprint; release has none."""
     low_pass: Amount = 0.3
     """px^2 that splats are made to be widened by when they are drawn; gsplat's default."""
     antialiased: bool = False
@@ -90,11 +93,11 @@ class GaussianHeadOptions(Options):
     hidden: tuple[Width, Width] = (128, 32)
     """Widths inside the networks of the attributes (as published)."""
     parameterization: Literal["footprint", "release"] = "footprint"
-    """footprint: attributes in units of a pixel's footprint, raw values start at 0; release: offsets and
-    scales in metres, without bound, PyTorch's initialisation."""
+    """footprint: attributes in units of a pixel's footprint, raw values start at 0; release:
+    offsets and scales in metres, without bound, PyTorch's initialisation."""
     axes: Literal["world", "surface"] = "world"
-    """Axes of offsets, scales and rotations: the world's, or normal and tangents of the predicted depth,
-    which look alike from every camera (not the paper's)."""
+    """Axes of offsets, scales and rotations: the world's, or normal and tangents of the predicted
+    depth, which look alike from every camera (not the paper's)."""
     attributes: FootprintAttributes = FootprintAttributes()
     """With parameterization=footprint."""
 
@@ -110,9 +113,9 @@ class GaussianHeadOptions(Options):
 
 
 class GaussianHead(nn.Module):
-    """A dense head over the recalibrated tokens, then small networks for each pixel of the subject. Colours
-    are those of the input pixels, unless ``color_limit`` lets them change. The names of the networks and
-    their linear layers 0, 2 and 4 are the published ones."""
+    """A dense head over the recalibrated tokens, then small networks for each pixel of the subject.
+    Colours are those of the input pixels, unless ``color_limit`` lets them change. The names of the
+    networks and their linear layers 0, 2 and 4 are the published ones."""
 
     def __init__(self, options: GaussianHeadOptions, dim_latent: int):
         super().__init__()
@@ -160,9 +163,8 @@ class GaussianHead(nn.Module):
             batch: photographs, masks and cameras are read.
             points: which pixels have a valid point.
             depth_maps: in metres, read by a guide.
-            plan: its ``windows`` and the subject's pixels are computed; with ``pixels="all"`` every pixel, to
-                select
-                afterwards: the result is the same.
+            plan: its ``windows`` and the subject's pixels are computed; with ``pixels="all"`` every
+                pixel, to select afterwards: the result is the same.
         """
         views, height, width = points.valid.shape[1:]
         rows = plan.subject.only(points.valid)
@@ -266,7 +268,8 @@ class GaussianHead(nn.Module):
 def _in_part(
     part: Part, pixel: Int[Tensor, " N"], rows: Rows
 ) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"], slice]:
-    """Rows and columns in a part's maps of the pixels that lie in it, and the slice of these pixels."""
+    """Rows and columns in a part's maps of the pixels that lie in it,
+    and the slice of these pixels."""
     within = rows.within(part.images)
     (top, _, _), (left, _, width) = part.window
     return pixel[within] // width - top, pixel[within] % width - left, within

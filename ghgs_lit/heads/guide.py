@@ -1,5 +1,6 @@
-"""Guides: further input of a dense head at full resolution, of photographs, masks and depths. A patch is one
-token, so a head that sees only tokens draws soft edges. Published weights use no guide."""
+"""Guides: further input of a dense head at full resolution, of photographs, masks and
+depths. A patch is one token, so a head that sees only tokens draws soft edges. Published
+weights use no guide."""
 
 import functools
 
@@ -33,7 +34,8 @@ def photo_guide(batch: Batch, *maps: Float[Tensor, "B V _ H W"]) -> Guide:
 
 
 class GuidePyramid(nn.Module):
-    """Three convolutions of a guide, at full, half and quarter resolution, added to maps of a dense head.
+    """Three convolutions of a guide, at full, half and quarter resolution,
+    added to maps of a dense head.
 
     Args:
         channels: of the guide.

@@ -24,8 +24,8 @@ def seen_attributes(head: nn.Module | None) -> Iterator[list[RawGaussians]]:
         head: The stage; of one's own, or of a model without it, nothing is collected.
 
     Yields:
-        Raw attributes in the order of calls. The last ones are those of the prediction: rounds change them,
-        and smaller copies of photographs go through the stages first.
+        Raw attributes in the order of calls. The last ones are those of the prediction: rounds
+        change them, and smaller copies of photographs go through the stages first.
     """
     seen: list[RawGaussians] = []
     if not isinstance(head, GaussianHead):
@@ -52,9 +52,9 @@ def offsets_at_limit(raw: RawGaussians) -> Float[Tensor, ""]:
         raw: Attributes of N Gaussians of a head with ``gaussian_head.offset_limit``.
 
     Returns:
-        Share, in [0, 1], of the Gaussians that are moved along an axis by more than ``NEAR_LIMIT`` of the
-        limit; 0 without Gaussians. Such offsets have lost nine tenths of their gradient, and the surface that
-        they look for may lie beyond the limit.
+        Share, in [0, 1], of the Gaussians that are moved along an axis by more than ``NEAR_LIMIT``
+        of the limit; 0 without Gaussians. Such offsets have lost nine tenths of their gradient, and
+        the surface that they look for may lie beyond the limit.
     """
     at_limit = (bounded_tanh(raw.offset).abs() > NEAR_LIMIT).any(-1)
     return at_limit.sum() / max(len(at_limit), 1)

@@ -1,10 +1,12 @@
-"""Depth by recurrent stereo between neighbouring views, for comparison; not part of the paper's method.
+"""Depth by recurrent stereo between neighbouring views, for comparison;
+not part of the paper's method.
 
-After the published description of GPS-Gaussian (Zheng et al., CVPR 2024): one small network computes features
-of all views; they are correlated along epipolar lines; a GRU updates the estimate a few times from the
-correlations around it (RAFT-Stereo, Lipson et al., 3DV 2021); upsampling is convex (RAFT, Teed and Deng, ECCV
-2020). Unlike there, photographs are not rectified: equal steps of inverse depth are the equal steps of
-disparity of a rectified pair. The two pairs of a view give one depth, and the loss sees the last update only.
+After the published description of GPS-Gaussian (Zheng et al., CVPR 2024): one small network
+computes features of all views; they are correlated along epipolar lines; a GRU updates the estimate
+a few times from the correlations around it (RAFT-Stereo, Lipson et al., 3DV 2021); upsampling is
+convex (RAFT, Teed and Deng, ECCV 2020). Unlike there, photographs are not rectified: equal steps of
+inverse depth are the equal steps of disparity of a rectified pair. The two pairs of a view give one
+depth, and the loss sees the last update only.
 """
 
 import torch
@@ -29,7 +31,8 @@ CELL = 4
 CHANNELS = 32
 #: Number of neighbouring views that each view is paired with.
 PAIRS = 2
-#: Resolutions of the correlations along depth, each half of the one before, and steps to either side.
+#: Resolutions of the correlations along depth, each half of the one before,
+#: and steps to either side.
 LEVELS = 3
 RADIUS = 4
 
@@ -43,7 +46,8 @@ class StereoHeadOptions(Options):
     consistency_depths: int = Field(48, gt=0, le=4096, multiple_of=2 ** (LEVELS - 1))
     """Inverse depths from near to far at which neighbouring views are correlated."""
     updates: int = Field(3, ge=1, le=64)
-    """Updates of the inverse depth by the GRU; 3 as published, and no stereo method takes more than 64."""
+    """Updates of the inverse depth by the GRU;
+    3 as published, and no stereo method takes more than 64."""
 
     def build(self, dim_latent: int) -> "StereoHead":
         """The stage; it reads no tokens."""
@@ -118,7 +122,8 @@ def _two_layers(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class Update(nn.Module):
-    """One update: correlations around the estimate, a convolutional GRU, a change of the estimate."""
+    """One update: correlations around the estimate, a convolutional GRU,
+    a change of the estimate."""
 
     def __init__(self, channels: int):
         super().__init__()
@@ -159,7 +164,8 @@ class Update(nn.Module):
 def subject_range(
     bounds: DepthBounds, batch: Batch
 ) -> tuple[Float[Tensor, "B V 1 1"], Float[Tensor, "B V 1 1"]]:
-    """The nearest and the farthest bound of the subject's pixels in each view; of all pixels if none.
+    """The nearest and the farthest bound of the subject's pixels in each view;
+    of all pixels if none.
 
     Args:
         bounds: of all pixels, in metres.
@@ -176,13 +182,15 @@ def subject_range(
 
 
 def neighboring_views(cameras: Cameras) -> Int[Tensor, "n p"]:
-    """For each image ``b * V + v``, the images whose optical axes have the smallest angles to its own.
+    """For each image ``b * V + v``, the images whose optical axes have the smallest
+    angles to its own.
 
     Args:
         cameras: [B, V].
 
     Returns:
-        Their numbers, also ``b * V + v``: of :data:`PAIRS` images, or of all others if these are fewer.
+        Their numbers, also ``b * V + v``: of :data:`PAIRS` images,
+        or of all others if these are fewer.
     """
     count, views = cameras.shape
     forward = at_least_float32(cameras.extrinsics)[..., 2, :3]
@@ -200,10 +208,11 @@ def correlations(
     far: Float[Tensor, "B V 1 1"],
     steps: int,
 ) -> Float[Tensor, "N S"]:
-    """Products of the features of cells with those of neighbouring views at S depths, over ``sqrt(c)``.
+    """Products of the features of cells with those of neighbouring views at S depths,
+    over ``sqrt(c)``.
 
-    The larger one of the two neighbours, as a surface is often hidden from one; 0 if the point lies behind
-    both or outside their images.
+    The larger one of the two neighbours, as a surface is often hidden from one; 0 if the point lies
+    behind both or outside their images.
 
     Args:
         features: of cells, float32 or wider.
@@ -251,8 +260,8 @@ def look_up(level: Float[Tensor, "n s h w"], fraction: Float[Tensor, "n 1 h w"])
 def upsampled(maps: Float[Tensor, "n 1 h w"], weights: Float[Tensor, "n _ h w"]) -> Float[Tensor, "n h2 w2"]:
     """Maps at :data:`CELL` times the resolution.
 
-    Each pixel is a convex combination of the 3 x 3 cells around its own; cells beyond the border repeat it
-    (RAFT, Teed and Deng, ECCV 2020).
+    Each pixel is a convex combination of the 3 x 3 cells around its own; cells beyond the border
+    repeat it (RAFT, Teed and Deng, ECCV 2020).
 
     Args:
         maps: of cells.

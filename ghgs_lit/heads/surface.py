@@ -11,8 +11,8 @@ from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.rotations import matrix_to_quaternion, multiply_quaternions, unit
 from ghgs_lit.types import Cameras, DepthMaps
 
-#: A neighbour counts fully if its depth differs by less than the first number of pixel footprints, and not at
-#: all (another surface) from the second on.
+#: A neighbour counts fully if its depth differs by less than the first number of pixel footprints,
+#: and not at all (another surface) from the second on.
 SAME = 4.0
 OTHER = 8.0
 
@@ -23,9 +23,10 @@ def surface_axes(
 ) -> Float[Tensor, "N 4"]:
     """Unit quaternions from axes of the surface to the world, without a gradient.
 
-    The third axis is the normal away from the camera; the others are the camera's right and down, turned by
-    the smallest rotation from its forward axis to the normal. Normals come from depth differences to
-    neighbouring valid pixels on the same surface; without any along an axis of the image, its slope is 0.
+    The third axis is the normal away from the camera; the others are the camera's right and down,
+    turned by the smallest rotation from its forward axis to the normal. Normals come from depth
+    differences to neighbouring valid pixels on the same surface; without any along an axis of the
+    image, its slope is 0.
 
     Args:
         maps: depths in metres, and which of them are valid.
@@ -43,7 +44,8 @@ def surface_axes(
     # Invalid pixels and those beyond the border are infinitely far away.
     around = F.pad(depth.masked_fill(~maps.valid, inf), (1, 1, 1, 1), value=inf).flatten()
     place = (image * (height + 2) + row + 1) * (width + 2) + column + 1
-    # Of the neighbours to the right, below, to the left and above: how much deeper, and a weight from 0 to 1.
+    # Of the neighbours to the right, below, to the left and above: how much deeper,
+    # and a weight from 0 to 1.
     deeper = around[torch.stack([place + step for step in (1, width + 2, -1, -width - 2)])] - own
     near = ((OTHER - deeper.abs() / (own / fx)) / (OTHER - SAME)).clamp(0, 1)
     after, before = (near * torch.where(near > 0, deeper, 0)).split(2)

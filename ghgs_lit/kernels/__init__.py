@@ -1,1 +1,2 @@
-"""Shared parts of the CPU kernels: compilation with a disk cache, vectors, memory access, threads."""
+"""Shared parts of the CPU kernels: compilation with a disk cache, vectors, memory access,
+threads."""

@@ -12,9 +12,11 @@ import numba
 from numba.core import event, types
 from numba.core.caching import FunctionCache
 
-# Kernels are only called from Python and helpers only from kernels: no other entry points are needed.
+# Kernels are only called from Python and helpers only from kernels:
+# no other entry points are needed.
 _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-#: Arguments of kernels: contiguous arrays of float32 by their number of dimensions, and whole numbers.
+#: Arguments of kernels: contiguous arrays of float32 by their number of dimensions,
+#: and whole numbers.
 FLOATS = [types.Array(types.float32, dimensions, "C") for dimensions in range(6)]
 NUMBER = types.int64
 
@@ -58,8 +60,8 @@ event.register("numba:compile", FirstCompilation())
 
 @cache
 def _digest(folder: Path) -> str:
-    """Digest of the sources that the machine code of a kernel in ``folder`` depends on: those of this
-    package, of ``folder`` and of its parent. Kernels read no constants of other files."""
+    """Digest of the sources that the machine code of a kernel in ``folder`` depends on: those of
+    this package, of ``folder`` and of its parent. Kernels read no constants of other files."""
     digest = hashlib.sha256()
     rooms = (Path(__file__).parent, folder, folder.parent)
     for path in sorted(set().union(*(room.glob("*.py") for room in rooms))):
@@ -70,9 +72,10 @@ def _digest(folder: Path) -> str:
 def kernel(function):
     """Compile ``function`` on first use; it runs without the interpreter lock.
 
-    Numba's cache notices a changed file, but not changed globals or other modules whose code was inlined,
-    and installers may keep a file's time stamp. So cached code is stamped with the digest of all sources
-    that it can depend on. Without a writable folder for the cache, each process compiles again.
+    Numba's cache notices a changed file, but not changed globals or other modules whose code was
+    inlined, and installers may keep a file's time stamp. So cached code is stamped with the digest
+    of all sources that it can depend on. Without a writable folder for the cache, each process
+    compiles again.
 
     Args:
         function: called from Python only, with numbers and contiguous arrays.
@@ -95,7 +98,8 @@ def kernel_for(*argument_types):
         argument_types: Numba types of the arguments, such as ``FLOATS[2]`` and :data:`NUMBER`.
 
     Returns:
-        A decorator that replaces a function by one without arguments, which returns its :func:`kernel`.
+        A decorator that replaces a function by one without arguments,
+        which returns its :func:`kernel`.
     """
 
     def decorate(function):
@@ -119,8 +123,9 @@ def helper(function):
 def processor_features() -> set[str]:
     """LLVM's names of the processor features that kernels may use, such as ``avx512bf16``.
 
-    Features of this processor, changed by Numba's setting ``NUMBA_CPU_FEATURES``: ``-avx512f`` gives the
-    kernels for AVX2. If ``NUMBA_CPU_NAME`` is set, too, only the features in that setting.
+    Features of this processor, changed by Numba's setting ``NUMBA_CPU_FEATURES``:
+    ``-avx512f`` gives the kernels for AVX2. If ``NUMBA_CPU_NAME`` is set, too, only the
+    features in that setting.
     """
     changes = numba.config.CPU_FEATURES
     is_own = numba.config.CPU_NAME is None or changes is None

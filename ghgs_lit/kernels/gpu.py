@@ -1,5 +1,6 @@
-"""Chains of small operators as one kernel of a GPU. Kernels are written in Triton, which comes with PyTorch
-for CUDA; they lie in folders ``cuda`` of the rooms and are imported at their first call on a GPU."""
+"""Chains of small operators as one kernel of a GPU. Kernels are written in Triton, which comes
+with PyTorch for CUDA; they lie in folders ``cuda`` of the rooms and are imported at their first
+call on a GPU."""
 
 import warnings
 from collections.abc import Callable
@@ -22,7 +23,8 @@ PLAIN: dict[str, Callable[..., Any]] = {}
 
 
 def is_supported(*tensors: Tensor | None) -> bool:
-    """Whether kernels compute with these: float32 and whole numbers, on a GPU on which Triton works.
+    """Whether kernels compute with these: float32 and whole numbers,
+    on a GPU on which Triton works.
 
     Args:
         tensors: inputs of an operator, at least one; None: an input that is left out.
@@ -61,7 +63,8 @@ def operator(schema: str, plain: Callable[..., Any], room: str) -> Callable[...,
     Args:
         schema: name, arguments and results in PyTorch's notation.
         plain: the same in plain PyTorch.
-        room: the package whose module ``kernel`` has a function of this name, which launches the kernel.
+        room: the package whose module ``kernel`` has a function of this name,
+            which launches the kernel.
 
     Returns:
         The operator, without a gradient.

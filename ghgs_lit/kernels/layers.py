@@ -1,15 +1,15 @@
 """Small networks inside kernels, ``PANEL`` rows at a time, and their gradients.
 
-Matrix products stay in registers: a tile of the result is ``ROWS`` x ``PANEL``; its right factor is a panel,
-``PANEL`` numbers for every step of the sum.
+Matrix products stay in registers: a tile of the result is ``ROWS`` x ``PANEL``; its right factor is
+a panel, ``PANEL`` numbers for every step of the sum.
 
-Values are stored by channel: a channel is a line of ``PANEL`` floats, one lane for each row. So the result of
-a layer is the input of the next without another layout. The gradient of a layer's input is a product with the
-transposed weights; that of its weights and biases is a sum over lanes, for which the input has a line of ones
-below its channels.
+Values are stored by channel: a channel is a line of ``PANEL`` floats, one lane for each row. So the
+result of a layer is the input of the next without another layout. The gradient of a layer's input
+is a product with the transposed weights; that of its weights and biases is a sum over lanes, for
+which the input has a line of ones below its channels.
 
-``emit(context, builder, sig, args)`` writes the LLVM instructions of a function with ``@intrinsic``, which
-kernels call without its first parameter, Numba's ``typing_context``.
+``emit(context, builder, sig, args)`` writes the LLVM instructions of a function with
+``@intrinsic``, which kernels call without its first parameter, Numba's ``typing_context``.
 """
 
 from collections.abc import Sequence
@@ -26,8 +26,8 @@ from ghgs_lit.kernels.compile import helper, processor_features
 from ghgs_lit.kernels.memory import pointer_to
 from ghgs_lit.kernels.simd import I64, LANES, call, constant, everywhere, floats
 
-#: Rows and columns of a tile: 24 of the 32 registers of AVX-512, or 12 of the 16 of AVX2. They divide
-#: ``QUERIES`` and ``WIDTH`` of ``encoder.cpu``.
+#: Rows and columns of a tile: 24 of the 32 registers of AVX-512, or 12 of the 16 of AVX2. They
+#: divide ``QUERIES`` and ``WIDTH`` of ``encoder.cpu``.
 ROWS, PANEL = (12, 32) if "avx512f" in processor_features() else (6, 16)
 
 
@@ -61,12 +61,13 @@ def make_product(strides: tuple[int, int], adds: bool):
     """A function that multiplies ``ROWS`` rows with a panel.
 
     Args:
-        strides: distances in numbers from row to row and from step to step, constants for the compiler,
-            which keep all registers free for the tile.
+        strides: distances in numbers from row to row and from step to step, constants for the
+            compiler, which keep all registers free for the tile.
         adds: add the product to ``out`` instead of overwriting it.
 
     Returns:
-        An intrinsic of Numba: ``product(x, x_at, panels, panel_at, steps, out, out_at, out_stride)``.
+        An intrinsic of Numba:
+        ``product(x, x_at, panels, panel_at, steps, out, out_at, out_stride)``.
     """
 
     @intrinsic
@@ -125,7 +126,8 @@ product = make_product((1, ROWS), adds=False)
 ZERO = np.float32(0)
 ONE = np.float32(1)
 
-#: ``out += x y^T``, summed over the lanes of the lines ``x`` and of ``y`` as :func:`_turn` stores it.
+#: ``out += x y^T``, summed over the lanes of the lines ``x`` and of ``y`` as
+#: :func:`_turn` stores it.
 _lane_product = make_product((PANEL, 1), adds=True)
 
 
@@ -155,8 +157,8 @@ def packed(numbers: Sequence[Tensor], transposed: bool = False) -> np.ndarray:
         transposed: pack transposed weights, with biases of 0.
 
     Returns:
-        For each layer the weights in tiles of ``ROWS`` outputs, each [inputs, ROWS], then the biases;
-        float32.
+        For each layer the weights in tiles of ``ROWS`` outputs, each [inputs, ROWS], then the
+        biases; float32.
     """
     parts = []
     for weight, bias in _pairs(numbers):
@@ -183,7 +185,8 @@ class Sums:
         tasks: number of tasks that run at once.
 
     Attributes:
-        places: where packed weights, transposed weights and sums of each layer begin, [layers + 1, 3].
+        places: where packed weights, transposed weights and sums of each layer begin,
+            [layers + 1, 3].
         of_task: sums of each task, from :func:`learn`, [tasks, numbers].
     """
 

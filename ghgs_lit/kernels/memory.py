@@ -68,7 +68,8 @@ def _make_access(alignment_of):
     return load, store
 
 
-# ``load`` and ``store`` need vectors of floats to start on a cache line; the others take any address.
+# ``load`` and ``store`` need vectors of floats to start on a cache line;
+# the others take any address.
 load, store = _make_access(lambda kind: 64 if kind is floats else 8)
 _, store_anywhere = _make_access(lambda kind: 4 if kind is floats else 8)
 

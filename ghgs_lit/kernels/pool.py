@@ -1,4 +1,5 @@
-"""Division of work into parts, and a thread pool for kernels, which run without the interpreter lock."""
+"""Division of work into parts, and a thread pool for kernels,
+which run without the interpreter lock."""
 
 import os
 import threading
@@ -45,7 +46,8 @@ _owner: tuple[int, int] | None = None
 
 
 def _reset_lock() -> None:
-    """Replace the lock: a forked child may inherit it held by a thread that exists only in its parent."""
+    """Replace the lock: a forked child may inherit it held by a thread that exists only in
+    its parent."""
     global _lock
     _lock = threading.Lock()
 
@@ -76,7 +78,8 @@ def have_values(*tensors: Tensor) -> bool:
 
 @cache
 def features() -> set[str]:
-    """Processor features that kernels may use; see :func:`ghgs_lit.kernels.compile.processor_features`."""
+    """Processor features that kernels may use;
+    see :func:`ghgs_lit.kernels.compile.processor_features`."""
     from ghgs_lit.kernels.compile import processor_features  # here: it loads a compiler
 
     return processor_features()

@@ -1,9 +1,9 @@
 """Explicit vectors inside Numba kernels, compiled directly to LLVM vector instructions.
 
-LLVM cannot vectorise the masked inner loop of a rasterizer. A vector is 64 bytes, 16 floats or 8 doubles:
-one AVX-512 register; on AVX2 and NEON LLVM splits each operation into two or four. A mask is one bit per
-lane. No fast-math flag is set: NaN and infinity behave as IEEE 754 says. A number combined with a vector
-is put into every lane. ``memory`` loads and stores vectors.
+LLVM cannot vectorise the masked inner loop of a rasterizer. A vector is 64 bytes, 16 floats or 8
+doubles: one AVX-512 register; on AVX2 and NEON LLVM splits each operation into two or four. A mask
+is one bit per lane. No fast-math flag is set: NaN and infinity behave as IEEE 754 says. A number
+combined with a vector is put into every lane. ``memory`` loads and stores vectors.
 
 Functions with ``@intrinsic`` are called in kernels without their first parameter, Numba's
 ``typing_context``; ``emit(context, builder, sig, args)`` writes their LLVM instructions.
@@ -251,7 +251,8 @@ def mask(typing_context, bits):
 
 @intrinsic
 def lane_sum(typing_context, x):
-    """Sum of all lanes of floats, by adding the upper half to the lower half until one lane is left."""
+    """Sum of all lanes of floats, by adding the upper half to the lower half until one
+    lane is left."""
 
     def emit(context, builder, sig, args):
         total = args[0]
@@ -325,7 +326,8 @@ def tanh(x):
     return select(x < _ZERO, _ZERO - size, size)
 
 
-# log2(m) = 2 / ln 2 (s + s^3 / 3 + s^5 / 5 + ...), s = (m - 1) / (m + 1): 1e-14 for m in [1/sqrt 2, sqrt 2).
+# log2(m) = 2 / ln 2 (s + s^3 / 3 + s^5 / 5 + ...), s = (m - 1) / (m + 1): 1e-14 for m in [1/sqrt 2,
+# sqrt 2).
 _LOG2 = [2 / math.log(2) / k for k in range(1, 19, 2)]
 # Subtracted from the bits of x, so that the remaining mantissa lies in [1/sqrt 2, sqrt 2).
 _ROOT_HALF = int(np.float64(math.sqrt(0.5)).view(np.int64))

@@ -1,5 +1,5 @@
-"""What kernels in Triton share: functions of tiles, which hold one number for each row. Only kernels import
-it, since no other PyTorch than CUDA's comes with Triton."""
+"""What kernels in Triton share: functions of tiles, which hold one number for each row. Only
+kernels import it, since no other PyTorch than CUDA's comes with Triton."""
 
 from typing import Any
 
@@ -156,8 +156,8 @@ def cells(place, size):
         size: cells along the axis.
 
     Returns:
-        Indices of both cells, clamped to the map, and their weights: 0 beyond its border. NaN, and places
-        far away, are beyond it.
+        Indices of both cells, clamped to the map, and their weights: 0 beyond its border. NaN, and
+        places far away, are beyond it.
     """
     place = tl.where(place > -2, tl.where(place < size + 2, place, size + 2), -2) - 0.5
     first = tl.floor(place)

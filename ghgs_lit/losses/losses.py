@@ -20,7 +20,8 @@ class LossWeights(Options):
     chamfer: Amount = 1.0
     """Unprojected pixels to body vertices, m^2 (paper: 1.0); the data must have body vertices."""
     depth: Amount = 0.0
-    """|z - true z| in metres, the sum over rounds (not in the paper); the data must have depth maps."""
+    """|z - true z| in metres, the sum over rounds (not in the paper);
+    the data must have depth maps."""
 
     silhouette: Amount = 0.0
     """Mean |alpha - mask| of the target views (not in the paper)."""
@@ -38,7 +39,8 @@ class Losses(Options):
     weights: LossWeights = LossWeights()
     """Weights of the terms."""
     chamfer_points: Count | None = None
-    """Points of each set that the Chamfer term matches in a step, chosen at random; null: all (paper)."""
+    """Points of each set that the Chamfer term matches in a step, chosen at random;
+    null: all (paper)."""
 
     @model_validator(mode="after")
     def _has_a_term(self) -> "Losses":

@@ -1,7 +1,7 @@
 """The terms of the training loss.
 
-Every term takes a prediction, its Gaussians rendered from the batch's target cameras, and the batch, and
-returns a scalar without dimensions, in float32 or wider."""
+Every term takes a prediction, its Gaussians rendered from the batch's target cameras, and the
+batch, and returns a scalar without dimensions, in float32 or wider."""
 
 import torch
 from jaxtyping import Float
@@ -33,7 +33,8 @@ def render_l1(prediction: Prediction, rendering: Rendering, batch: Batch) -> Sca
 
 
 def render_ssim(prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
-    """1 - SSIM over the whole image, without padding, as the authors train (second term of L_render).
+    """1 - SSIM over the whole image, without padding,
+    as the authors train (second term of L_render).
 
     On a CPU only windows in which the images differ are computed; in all others the term is 0.
 
@@ -86,8 +87,8 @@ def chamfer(prediction: Prediction, rendering: Rendering, batch: Batch, points: 
 def depth(prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
     """Mean |z - true z| over the subject's pixels with a true depth.
 
-    With rounds, the sum over the depths before the first round and after each, as RAFT's sequence loss (Teed
-    and Deng, ECCV 2020) without its weights.
+    With rounds, the sum over the depths before the first round and after each, as RAFT's sequence
+    loss (Teed and Deng, ECCV 2020) without its weights.
 
     Args:
         prediction: depths of each round [B, V, H, W] in metres.

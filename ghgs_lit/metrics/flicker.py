@@ -1,9 +1,9 @@
 """Flicker: the change of a render's error from one instant to the next.
 
-The literature measures how frames change along an estimated optical flow (warping error: Lai et al. 2018,
-Learning Blind Video Temporal Consistency) or unlike the true video (tOF, tLP: Chu et al. 2020, TecoGAN). Here
-the motion of the surface is known and the true image subtracted: an error that moves with the surface does
-not flicker. A black render has the flicker of the photographs."""
+The literature measures how frames change along an estimated optical flow (warping error: Lai et al.
+2018, Learning Blind Video Temporal Consistency) or unlike the true video (tOF, tLP: Chu et al.
+2020, TecoGAN). Here the motion of the surface is known and the true image subtracted: an error that
+moves with the surface does not flicker. A black render has the flicker of the photographs."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -35,7 +35,8 @@ def flicker(
         A value for each camera, in units of the images; nan if no point is visible."""
     pixels, z = project(points[:, None], cameras.intrinsics[:, :, None], cameras.extrinsics[:, :, None])
     image = torch.arange(2 * z.shape[1], device=z.device).view(2, -1, 1).expand(z.shape)
-    # Beside the silhouette the 0 of the background makes the depth too small: such points are left out.
+    # Beside the silhouette the 0 of the background makes the depth too small:
+    # such points are left out.
     off = sample(depths.flatten(0, 1)[:, None], image, pixels)[..., 0] - z
     seen = ((z > 0) & (off.abs() < VISIBLE)).all(0)
     before, after = sample(errors.flatten(0, 1), image, pixels)

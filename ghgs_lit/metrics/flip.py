@@ -1,8 +1,8 @@
 """FLIP: a perceptual image difference that needs no trained weights.
 
-P. Andersson, J. Nilsson, T. Akenine-Möller, M. Oskarsson, K. Åström, M. D. Fairchild, "FLIP: A Difference
-Evaluator for Alternating Images", HPG 2020. Section numbers below are that paper's. Images are sRGB in
-[0, 1]; the result lies in [0, 1], 0 for equal images."""
+P. Andersson, J. Nilsson, T. Akenine-Möller, M. Oskarsson, K. Åström, M. D. Fairchild, "FLIP: A
+Difference Evaluator for Alternating Images", HPG 2020. Section numbers below are that paper's.
+Images are sRGB in [0, 1]; the result lies in [0, 1], 0 for equal images."""
 
 import itertools
 import math
@@ -17,9 +17,11 @@ from ghgs_lit.metrics.functional import correlate
 from ghgs_lit.runtime.precision import exact
 
 PIXELS_PER_DEGREE = 67.0206
-"""Resolution in the eye of the paper's viewer: 0.7 m away from a screen 0.7 m wide with 3840 pixels."""
+"""Resolution in the eye of the paper's viewer:
+0.7 m away from a screen 0.7 m wide with 3840 pixels."""
 
-# Contrast sensitivity as sums of Gaussians (table 1): amplitude and width for each opponent channel.
+# Contrast sensitivity as sums of Gaussians (table 1):
+# amplitude and width for each opponent channel.
 _SENSITIVITY = {"Y": ((1.0, 0.0047),), "Cx": ((1.0, 0.0053),), "Cz": ((34.1, 0.04), (13.5, 0.025))}
 _COLOR_EXPONENT, _FEATURE_EXPONENT = 0.7, 0.5
 _KNEE, _KNEE_VALUE = 0.4, 0.95  # p_c and p_t of section 4.1.4
@@ -60,7 +62,8 @@ def _from_opponent(ycc: Tensor) -> Tensor:
 
 
 def _hunt_lab(xyz: Tensor) -> Tensor:
-    """XYZ relative to white to CIELab with chroma scaled by lightness (Hunt effect, section 4.1.3)."""
+    """XYZ relative to white to CIELab with chroma scaled by lightness (Hunt effect,
+    section 4.1.3)."""
     delta = 6 / 29
     root = torch.where(xyz > delta**3, xyz.clamp(min=delta**3) ** (1 / 3), xyz / (3 * delta**2) + 4 / 29)
     x, y, z = root.split(1, dim=1)
@@ -81,7 +84,8 @@ def _filter(maps: Tensor, along_y: Tensor, along_x: Tensor) -> Tensor:
 
 
 def _filter_sensitivity(ycc: Tensor, ppd: float) -> Tensor:
-    """Blur each channel of YCxCz [n, 3, h, w] as the eye does at ``ppd`` pixels a degree (section 4.1.1)."""
+    """Blur each channel of YCxCz [n, 3, h, w] as the eye does at ``ppd`` pixels a degree
+    (section 4.1.1)."""
     widest = max(b for _, b in itertools.chain.from_iterable(_SENSITIVITY.values()))
     radius = math.ceil(3 * math.sqrt(widest / (2 * math.pi**2)) * ppd)
     x = torch.arange(-radius, radius + 1, dtype=ycc.dtype, device=ycc.device) / ppd
@@ -148,7 +152,8 @@ def flip_map(image: Float[Tensor, "n 3 h w"], target: Float[Tensor, "n 3 h w"]) 
 
     Returns:
         Maps in [0, 1], 0 where the images are equal."""
-    # Images one by one: rounding can depend on the position in memory, and equal images must give 0.
+    # Images one by one: rounding can depend on the position in memory,
+    # and equal images must give 0.
     with exact(image.device.type):
         image = at_least_float32(image).clamp(0, 1)
         target = at_least_float32(target).clamp(0, 1)

@@ -1,6 +1,7 @@
 """Image metrics as pure functions: one value for each RGB image in [0, 1] (data range 1).
 
-A ``region`` selects the pixels that count. Where it is empty the value is nan, and averages leave it out."""
+A ``region`` selects the pixels that count. Where it is empty the value is nan,
+and averages leave it out."""
 
 import torch
 import torch.nn.functional as F
@@ -16,17 +17,20 @@ from ghgs_lit.runtime.precision import exact
 REGIONS = ("image", "box", "subject", "crop", "edge")
 PADDINGS = ("valid", "reflect", "zeros")
 PSNR_CAP = 100.0
-"""PSNR in dB of equal images, and the largest value reported: float32 resolves no smaller errors."""
+"""PSNR in dB of equal images, and the largest value reported:
+float32 resolves no smaller errors."""
 CROP = (1000 / 1024, 500 / 1024)
-"""Height and width of the region ``crop`` as shares of the image's: 1000 x 500 of 1024 x 1024, as published
-scripts of GHG and LIFe-GoM crop."""
+"""Height and width of the region ``crop`` as shares of the image's: 1000 x 500 of 1024 x 1024, as
+published scripts of GHG and LIFe-GoM crop."""
 EDGE, BESIDE, INNER = 2, 3, 4
 """Pixels from the subject's outline, in rows and columns: of the region ``edge`` at most, of what
 :func:`spill` and :func:`sharpness` count more than and at least."""
 DEPTH_STEP = 0.02
-"""Least relative difference of the depths of neighbouring pixels at an edge of depth: 5 cm at 2.5 m."""
+"""Least relative difference of the depths of neighbouring pixels at an edge of depth:
+5 cm at 2.5 m."""
 BRIGHTNESS = 0.40
-"""Mean of the subject in the images that :func:`psnr_box_40` compares: that of well lit photographs."""
+"""Mean of the subject in the images that :func:`psnr_box_40` compares:
+that of well lit photographs."""
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 """Side and standard deviation, in pixels, of SSIM's Gaussian window."""
 
@@ -105,7 +109,8 @@ def grown(mask: Bool[Tensor, "n h w"], pixels: int) -> Bool[Tensor, "n h w"]:
 
 
 def depth_edges(depth: Float[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
-    """Pixels on both sides of an edge of depth: beside a neighbour :data:`DEPTH_STEP` nearer or farther.
+    """Pixels on both sides of an edge of depth:
+    beside a neighbour :data:`DEPTH_STEP` nearer or farther.
 
     Args:
         depth: z in metres; 0 is unknown, and no edge.
@@ -195,10 +200,11 @@ def psnr(
 def psnr_box_40(
     image: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"], mask: Bool[Tensor, "n h w"]
 ) -> Float[Tensor, " n"]:
-    """PSNR in the subject's box of images that are scaled so that the subject's mean is :data:`BRIGHTNESS`.
+    """PSNR in the subject's box of images that are scaled so that the subject's mean is
+    :data:`BRIGHTNESS`.
 
-    Errors grow with light: the same prediction of a person lit twice as brightly has 6 dB less. Scaled, dark
-    and bright people can be compared. Values above 1 stay.
+    Errors grow with light: the same prediction of a person lit twice as brightly has 6 dB less.
+    Scaled, dark and bright people can be compared. Values above 1 stay.
 
     Args:
         image: renders.
@@ -232,7 +238,8 @@ def correlate(
     Returns:
         Maps smaller by the kernels' lengths minus 1."""
     n, c, h, w = maps.shape
-    # All maps are channels of one depthwise convolution: ten times faster on a CPU than a batch of maps.
+    # All maps are channels of one depthwise convolution:
+    # ten times faster on a CPU than a batch of maps.
     flat = maps.reshape(1, n * c, h, w)
     flat = F.conv2d(flat, along_y.expand(n * c, 1, -1)[..., None].contiguous(), groups=n * c)
     flat = F.conv2d(flat, along_x.expand(n * c, 1, 1, -1).contiguous(), groups=n * c)
@@ -247,9 +254,9 @@ def ssim_map(
     Args:
         image: renders.
         target: photographs in [0, 1].
-        padding: ``valid`` gives only the pixels whose window lies inside the image (scikit-image averages
-            these); the others keep the image's size: ``reflect`` mirrors the image at its border
-            (torchmetrics), ``zeros`` surrounds it with black (the authors' evaluation).
+        padding: ``valid`` gives only the pixels whose window lies inside the image (scikit-image
+            averages these); the others keep the image's size: ``reflect`` mirrors the image at its
+            border (torchmetrics), ``zeros`` surrounds it with black (the authors' evaluation).
 
     Returns:
         The similarity of each window in [-1, 1].
@@ -328,8 +335,8 @@ def sharpness(
         mask: of the subject.
 
     Returns:
-        The energy over the target's: 1 is right, less is blurred, more is ragged; nan where the target has
-        none."""
+        The energy over the target's: 1 is right, less is blurred, more is ragged; nan where the
+        target has none."""
     inner = (mask & ~grown(~mask, INNER))[:, 1:-1, 1:-1]
     with exact(image.device.type):
         energies = []
@@ -369,15 +376,16 @@ _OPAQUE = 0.5
 def surface_error_mm(
     means: Float[Tensor, "n 3"], opacities: Float[Tensor, " n"], surface: Float[Tensor, "m 3"]
 ) -> Float[Tensor, ""]:
-    """Distance of Gaussians to the surface, and of the surface to the nearest Gaussian; the mean of both.
+    """Distance of Gaussians to the surface, and of the surface to the nearest Gaussian;
+    the mean of both.
 
-    It sees where Gaussians end, after all offsets, where :func:`depth_error_mm` ends before them; points of
-    the surface are about a pixel apart, and so is the least value.
+    It sees where Gaussians end, after all offsets, where :func:`depth_error_mm` ends before them;
+    points of the surface are about a pixel apart, and so is the least value.
 
     Args:
         means: of Gaussians, in metres; those that are not finite are left out.
-        opacities: in [0, 1], by which distances to the surface are weighted; those to a Gaussian are to one
-            of opacity 0.5 or more.
+        opacities: in [0, 1], by which distances to the surface are weighted; those to a Gaussian
+            are to one of opacity 0.5 or more.
         surface: points, in metres.
 
     Returns:

@@ -31,7 +31,8 @@ from ghgs_lit.metrics.functional import (
 NETWORK = "vgg"
 
 _ALL = ("psnr", "ssim", "flip")
-#: Metrics of each region; SSIM and FLIP look at windows, which single pixels of a region do not fill.
+#: Metrics of each region; SSIM and FLIP look at windows,
+#: which single pixels of a region do not fill.
 MEASURED = {"image": _ALL, "box": _ALL, "crop": _ALL, "subject": ("psnr", "ssim"), "edge": ("psnr",)}
 #: Further metrics, and the region that each comes with.
 FURTHER = {"psnr_box_40": ("box", psnr_box_40), "spill": ("edge", spill), "sharpness": ("edge", sharpness)}
@@ -41,7 +42,8 @@ class LPIPS:
     """LPIPS of whole images, by torchmetrics.
 
     Args:
-        signed: map [0, 1] to [-1, 1], for which the network was calibrated; the authors' evaluation does not.
+        signed: map [0, 1] to [-1, 1], for which the network was calibrated;
+            the authors' evaluation does not.
 
     Raises:
         InputError: torchvision or the weights are not available."""
@@ -82,21 +84,22 @@ class MetricsOptions(Options):
 
     group = "metrics"
     protocol: Literal["correct", "release", "files"] = "correct"
-    """correct: renders clamped to [0, 1], SSIM as in torchmetrics, LPIPS on [-1, 1], for which it was
-    calibrated. release: no clamp, SSIM padded with zeros, LPIPS on [0, 1]. files: as correct, of renders and
-    targets rounded to 8 bits, SSIM without padding. Reported with every number."""
+    """correct: renders clamped to [0, 1], SSIM as in torchmetrics, LPIPS on [-1, 1], for which it
+    was calibrated. release: no clamp, SSIM padded with zeros, LPIPS on [0, 1]. files: as correct,
+    of renders and targets rounded to 8 bits, SSIM without padding. Reported with every number."""
     regions: tuple[Literal["image", "box", "subject", "crop", "edge"], ...] = (
         "image",
         "box",
         "subject",
         "edge",
     )
-    """Where PSNR, SSIM and FLIP are measured: all pixels, the box of the mask (with PSNR at one brightness),
-    its pixels (without FLIP), the window around the box that GHG and LIFe-GoM crop (1000 x 500 of
-    1024 x 1024), its outline and edges of true depth (PSNR alone, with light beside the subject and sharpness
-    inside it)."""
+    """Where PSNR, SSIM and FLIP are measured: all pixels, the box of the mask (with PSNR at one
+    brightness), its pixels (without FLIP), the window around the box that GHG and LIFe-GoM crop
+    (1000 x 500 of 1024 x 1024), its outline and edges of true depth (PSNR alone, with light beside
+    the subject and sharpness inside it)."""
     lpips: Literal["auto", "require", "off"] = "auto"
-    """auto: left out, with a message, where torchvision or its weights are missing; require: an error."""
+    """auto: left out, with a message, where torchvision or its weights are missing;
+    require: an error."""
 
     @property
     def is_release(self) -> bool:
@@ -117,8 +120,8 @@ class ImageMetrics:
     """All metrics of a protocol.
 
     Their names are ``psnr``, ``ssim``, ``flip`` and ``lpips`` for the whole image, with ``_box``,
-    ``_subject``, ``_crop`` or ``_edge`` added for the other regions (those of :data:`MEASURED`; LPIPS for the
-    whole image only), and those of :data:`FURTHER`.
+    ``_subject``, ``_crop`` or ``_edge`` added for the other regions (those of :data:`MEASURED`;
+    LPIPS for the whole image only), and those of :data:`FURTHER`.
 
     Args:
         options: the protocol.

@@ -1,6 +1,6 @@
-"""Sequences of different lengths packed into one tensor: views keep different numbers of patches. Only the
-attention of a block mixes tokens, so views need no padding. Where shapes must repeat, on a GPU, each view's
-rows are filled up to a size class, and nothing attends to what fills them."""
+"""Sequences of different lengths packed into one tensor: views keep different numbers of patches.
+Only the attention of a block mixes tokens, so views need no padding. Where shapes must repeat, on a
+GPU, each view's rows are filled up to a size class, and nothing attends to what fills them."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -15,16 +15,16 @@ from ghgs_lit.plan.rows import Rows
 
 
 class KeptPatches:
-    """The kept patches of a batch, and their places among packed tokens. Packed tokens [T, C] are the
-    sequences of all images, one after another: the special tokens of an image (class, camera or registers),
-    then its kept patches, row by row.
+    """The kept patches of a batch, and their places among packed tokens. Packed tokens [T, C] are
+    the sequences of all images, one after another: the special tokens of an image (class, camera or
+    registers), then its kept patches, row by row.
 
     Args:
         kept: on any device.
         device: that of the tokens.
         known: the extent of the kept patches of each image; None: it is read from ``kept``.
-        size: number of rows of each image, at least that of its kept patches: others repeat its last one (the
-            first of all patches where none is kept); None: those that are kept.
+        size: number of rows of each image, at least that of its kept patches: others repeat its
+            last one (the first of all patches where none is kept); None: those that are kept.
 
     Attributes:
         real: which rows are kept patches; None: all."""
@@ -110,7 +110,8 @@ class KeptPatches:
         return [sum(element) + len(element) * special for element in self._counts]
 
     def box(self, margin: int) -> tuple[slice, slice]:
-        """Rows and columns of the patches that are kept in any image, with a margin; at least one patch.
+        """Rows and columns of the patches that are kept in any image, with a margin;
+        at least one patch.
 
         Args:
             margin: patches on each side, as far as the grid goes.
@@ -161,7 +162,8 @@ class KeptPatches:
         return packed[self._places(special)]
 
     def positions(self, special: int) -> Int[Tensor, "t 2"]:
-        """``(row, column)`` of packed tokens in the image: (0, 0) for special ones, from (1, 1) for patches.
+        """``(row, column)`` of packed tokens in the image: (0, 0) for special ones,
+        from (1, 1) for patches.
 
         Args:
             special: number of special tokens in each image.
@@ -171,7 +173,8 @@ class KeptPatches:
         return self.join(at_patches.new_zeros(b * v, special, 2), at_patches)
 
     def _places(self, special: int) -> Int[Tensor, " N"]:
-        """Places of the patch tokens among packed ones, found once for each number of special tokens."""
+        """Places of the patch tokens among packed ones,
+        found once for each number of special tokens."""
         if special not in self._packed:
             numbers = torch.arange(len(self.index), device=self.index.device)
             self._packed[special] = numbers + (self.image + 1) * special

@@ -1,4 +1,5 @@
-"""The plan of a batch, and the one place where a prediction reads from a GPU what its masks hold."""
+"""The plan of a batch, and the one place where a prediction reads from a GPU what its
+masks hold."""
 
 import dataclasses
 import functools
@@ -19,8 +20,8 @@ from ghgs_lit.plan.rows import Rows, rounds_up, size_class
 from ghgs_lit.plan.window import Span, Window, subject_windows
 from ghgs_lit.types import Decision, DecodedPixels, Prediction
 
-#: From the numbers of patches [B, V] that each of several presets keeps: each element's decision, and the
-#: number of its preset.
+#: From the numbers of patches [B, V] that each of several presets keeps: each element's decision,
+#: and the number of its preset.
 Choose = Callable[[Sequence[Float[Tensor, "B V"]]], tuple[tuple[Decision, ...], Sequence[int]]]
 
 
@@ -71,7 +72,8 @@ class Plan:
         shown_extents: of the patches ``shown``, in patches.
         patch_size: in pixels.
         pixels: pixels that dense heads decode; ``all``: whole views.
-        tokens: tokens that are recalibrated; ``all``: with those of the background, which need depths, too.
+        tokens: tokens that are recalibrated;
+            ``all``: with those of the background, which need depths, too.
         classes: numbers of rows, and windows, are size classes (:mod:`ghgs_lit.plan.rows`).
         decisions: what ``skip=auto`` chose for each element.
         flags: values of further tensors that were read with the masks.
@@ -209,7 +211,8 @@ class Plan:
         return None if self.pixels == "all" else self._windows(self.patch_size if self.classes else 1)
 
     def _windows(self, cell: int) -> list[Window | None]:
-        """Windows of whole cells around the subject, None without one; of ``classes`` the same for all."""
+        """Windows of whole cells around the subject, None without one;
+        of ``classes`` the same for all."""
         size = tuple(self.masks.shape[2:])
         each = subject_windows(self.extents, size)
         whole_cells = [window and window.coarser(cell).finer(cell, size) for window in each]

@@ -1,4 +1,5 @@
-"""Presets that leave out patches and pixels, and ``skip=auto``: the cheapest preset within a budget."""
+"""Presets that leave out patches and pixels, and ``skip=auto``:
+the cheapest preset within a budget."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -26,7 +27,8 @@ class KeptTokens(NamedTuple):
         """The view for one choice of ``token_budgets``.
 
         Args:
-            budget: number of patches around the subject that stay; or a value of ``tokens``, such as ``all``.
+            budget: number of patches around the subject that stay;
+                or a value of ``tokens``, such as ``all``.
         """
         return cls("subject", budget) if isinstance(budget, int) else cls(budget)
 
@@ -57,22 +59,23 @@ class Preset(Options):
     name: Text = "exact"
     """Name of the preset, for reports."""
     tokens: Literal["all", "window", "subject"] = "all"
-    """Patches that the encoder works on: all, those of the smallest rectangle around the subject (window), or
-    the subject's."""
+    """Patches that the encoder works on: all, those of the smallest rectangle around the subject
+    (window), or the subject's."""
     margin: Patches = 1
     """Patches around the window or the subject that stay."""
     pixels: DecodedPixels = "subject"
-    """Pixels that the dense heads decode: whole views, or windows around the subject. The depth head decodes
-    all where recalibration.tokens=all: all tokens need a depth."""
+    """Pixels that the dense heads decode: whole views, or windows around the subject. The depth
+    head decodes all where recalibration.tokens=all: all tokens need a depth."""
     every: Count = 1
-    """Of so many instants of a sequence the first is predicted anew, the others move its Gaussians; 1: each
-    is predicted by itself."""
+    """Of so many instants of a sequence the first is predicted anew, the others move its Gaussians;
+    1: each is predicted by itself."""
     budget_db: float | None = EXACT_LOSS
-    """PSNR that may be lost against skip=none, in dB (`ghgs benchmark` checks it); null: no promise."""
+    """PSNR that may be lost against skip=none, in dB (`ghgs benchmark` checks it);
+    null: no promise."""
     max_rel_diff: Amount | None = 1e-5
-    """Largest difference of 99 of 100 values of an attribute or a render from skip=none, as a share of the
-    largest value, times what the model amplifies one rounding of the photographs by; `ghgs benchmark` checks
-    it. null: nothing is promised."""
+    """Largest difference of 99 of 100 values of an attribute or a render from skip=none, as a share
+    of the largest value, times what the model amplifies one rounding of the photographs by;
+    `ghgs benchmark` checks it. null: nothing is promised."""
 
     @property
     def view(self) -> KeptTokens:
@@ -112,7 +115,8 @@ class SkipOptions(Preset):
 
     @property
     def presets(self) -> dict[str, Preset]:
-        """The presets to choose from by name, equal to the files in conf/skip; empty without ``choices``."""
+        """The presets to choose from by name, equal to the files in conf/skip;
+        empty without ``choices``."""
         exact = Preset(pixels=self.pixels, budget_db=EXACT_LOSS)
         seen = {"balanced": ("window", 0), "fast": ("subject", self.margin)}
         others = {}
@@ -136,8 +140,8 @@ class SkipOptions(Preset):
 class AutoSkip:
     """Gives each subject the preset of the budget in which the encoder has the fewest FLOPs.
 
-    Only the encoder counts: the heads compute windows around the subject in every preset. The choice does not
-    depend on the machine; half precision is chosen separately (``precision=auto``).
+    Only the encoder counts: the heads compute windows around the subject in every preset. The
+    choice does not depend on the machine; half precision is chosen separately (``precision=auto``).
 
     Attributes:
         presets: those within the budget, the most accurate first.
@@ -217,9 +221,10 @@ class AutoSkip:
 def encoder_products(encoder: Any, kept: Int[Tensor, "B V"]) -> Float[Tensor, " B"]:
     """FLOPs of a frame block and a global block for each element.
 
-    The linear layers of a block take 24 n C^2 for n tokens of width C (6 for queries, keys and values, 2 for
-    the projection of the attention's output, 16 for the MLP of four times the width), attention among m
-    tokens 4 m^2 C: within a view in the frame block, among all views in the global block.
+    The linear layers of a block take 24 n C^2 for n tokens of width C (6 for queries, keys and
+    values, 2 for the projection of the attention's output, 16 for the MLP of four times the
+    width), attention among m tokens 4 m^2 C: within a view in the frame block, among all views in
+    the global block.
 
     Args:
         encoder: a :class:`ghgs_lit.encoder.VGGTEncoder`.

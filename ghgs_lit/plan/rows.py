@@ -1,4 +1,5 @@
-"""Rows that count: the pixels or tokens of a batch that a stage works on, as indices of known number."""
+"""Rows that count: the pixels or tokens of a batch that a stage works on,
+as indices of known number."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -15,14 +16,16 @@ _STEPS = 8
 
 
 def rounds_up(device: torch.device) -> bool:
-    """Whether numbers of rows are size classes: a GPU repeats shapes, a CPU computes what counts."""
+    """Whether numbers of rows are size classes: a GPU repeats shapes,
+    a CPU computes what counts."""
     return device.type != "cpu"
 
 
 def size_class(count: int) -> int:
     """The smallest size class that holds ``count`` rows.
 
-    1 to 16, then eight of equal steps in each octave (18, 20, ..., 32, 36, ...): at most an eighth is added.
+    1 to 16, then eight of equal steps in each octave (18, 20, ..., 32, 36, ...): at most an
+    eighth is added.
     """
     step = max((1 << max(count - 1, 0).bit_length()) // (2 * _STEPS), 1)
     return -(-count // step) * step
@@ -32,8 +35,9 @@ def size_class(count: int) -> int:
 class Rows:
     """Rows of each group (an image, or an element of the batch), one group after another.
 
-    Exact rows (``real`` is None) are those that count. Filled ones have the same number in each group, a size
-    class: what counts comes first, then its last row is repeated, or the group's first row if none counts.
+    Exact rows (``real`` is None) are those that count. Filled ones have the same number in each
+    group, a size class: what counts comes first, then its last row is repeated, or the group's
+    first row if none counts.
 
     Attributes:
         index: places of the rows among all pixels or tokens, ascending within a group.

@@ -1,4 +1,5 @@
-"""Windows of maps, and the windows that the layers of a dense head need for a window of its result."""
+"""Windows of maps, and the windows that the layers of a dense head need for a window of
+its result."""
 
 import itertools
 from collections.abc import Sequence
@@ -185,8 +186,9 @@ def _of_whole_maps(
         device: of the result.
 
     Returns:
-        For each of the target's cells the first of the two cells around it, as a number that is known without
-        waiting for a GPU; its place; the first and the second cell; and the weight of the second.
+        For each of the target's cells the first of the two cells around it, as a number that is
+        known without waiting for a GPU; its place; the first and the second cell; and the weight
+        of the second.
     """
     # A division and a product, both rounded to the precision of the maps, as in PyTorch.
     step = torch.tensor((source - 1) / max(target - 1, 1), dtype=dtype, device="cpu").item()

@@ -36,18 +36,20 @@ _GATHERED = 1 << 25
 
 
 class SemanticAttention(nn.Module):
-    """``x + o(softmax(q . k / sqrt(d) * s) v)``, then a residual MLP; parameters are named as published.
+    """``x + o(softmax(q . k / sqrt(d) * s) v)``, then a residual MLP;
+    parameters are named as published.
 
     Args:
         dim: width C of the tokens; queries, keys and values have C / 4 channels.
         num_heads: number of heads, each with C / 4 / num_heads channels.
-        similarity: effect of the cosine s of two tokens' semantic features on the logit: ``product``
-            multiplies by s (Eq. 3), ``product_clamped`` by max(s, 0) (the authors' release), ``log`` adds
-            log(max(s, S_MIN)), which lowers the weight of dissimilar neighbours instead of pulling their
-            logit to 0, ``none`` ignores it (s = 1).
-        has_places: whether the value of a neighbour also says where it lies from the query, by a linear map
-            of the difference of their places that starts at 0 (not the paper's). By linearity that is the map
-            of a head's mean place minus the query's: no tensor of all pairs.
+        similarity: effect of the cosine s of two tokens' semantic features on the logit:
+            ``product`` multiplies by s (Eq. 3), ``product_clamped`` by max(s, 0) (the authors'
+            release), ``log`` adds log(max(s, S_MIN)), which lowers the weight of dissimilar
+            neighbours instead of pulling their logit to 0, ``none`` ignores it (s = 1).
+        has_places: whether the value of a neighbour also says where it lies from the query,
+            by a linear map of the difference of their places that starts at 0 (not the
+            paper's). By linearity that is the map of a head's mean place minus the query's:
+            no tensor of all pairs.
 
     Raises:
         InputError: the heads do not divide C / 4."""
@@ -89,8 +91,8 @@ class SemanticAttention(nn.Module):
             x: the tokens of all elements, one after the other.
             neighbors: for each element [n_b, k_b], as indices in it.
             cosines: of the same shapes, if they are used.
-            left_out: of one element, -inf where a neighbour does not count, else 0; one of each token counts
-                at least; None: all.
+            left_out: of one element, -inf where a neighbour does not count, else 0; one of each
+                token counts at least; None: all.
             places: for each element [n_b, 3], in units of the subject; read with ``has_places``.
 
         Returns:
@@ -172,7 +174,8 @@ class SemanticAttention(nn.Module):
         return torch.cat((heads, places[:, None].expand(-1, self.num_heads, -1)), dim=-1).flatten(1)
 
     def _moved(self, y: Float[Tensor, "m j"], places: Float[Tensor, "m 3"]) -> Float[Tensor, "m i"]:
-        """Weighted values of m tokens with what the places of their neighbours add, in float32 or wider.
+        """Weighted values of m tokens with what the places of their neighbours add,
+        in float32 or wider.
 
         Args:
             y: weighted values of :meth:`_with_places`.
@@ -196,7 +199,8 @@ class SemanticAttention(nn.Module):
     ) -> Float[Tensor, "m j"]:
         """Weighted values of the neighbours of ``m`` tokens (Eq. 3), in float32 or wider.
 
-        On a CPU by a product with all tokens: faster than gathering, without a tensor of size m x k x C.
+        On a CPU by a product with all tokens: faster than gathering,
+        without a tensor of size m x k x C.
 
         Args:
             q: queries of these tokens [m, i].
@@ -230,7 +234,8 @@ class SemanticAttention(nn.Module):
         near: Int[Tensor, "m k"],
         changes: Changes,
     ) -> Float[Tensor, "m j"]:
-        """Eq. 3 with gathered keys and values of neighbours; nothing is as large as the square of the tokens.
+        """Eq. 3 with gathered keys and values of neighbours;
+        nothing is as large as the square of the tokens.
 
         If there are several parts, the backward pass computes each again.
 
@@ -239,7 +244,8 @@ class SemanticAttention(nn.Module):
             k: keys of all tokens of the element [n, i].
             v: their values [n, j].
             near: neighbours of the m tokens [m, k].
-            changes: what logits are multiplied by, and what is added, of shapes that broadcast to [m, k].
+            changes: what logits are multiplied by, and what is added,
+                of shapes that broadcast to [m, k].
 
         Returns:
             Values [m, j], heads concatenated.
@@ -329,7 +335,8 @@ class SemanticAttention(nn.Module):
 
 
 def _cast_once(linear: nn.Linear) -> Callable[[Tensor], Tensor]:
-    """``linear`` with its parameters cast to autocast's dtype once, not for every part of the tokens."""
+    """``linear`` with its parameters cast to autocast's dtype once,
+    not for every part of the tokens."""
     kind = linear.weight.device.type
     if not torch.is_autocast_enabled(kind):
         return linear
@@ -340,7 +347,8 @@ def _cast_once(linear: nn.Linear) -> Callable[[Tensor], Tensor]:
 def _in_parts(
     function: Callable[[slice], Tensor], count: int, device: torch.device
 ) -> Float[Tensor, "count _"]:
-    """``function`` of all rows; on a CPU without a gradient a part of them at a time, to save memory.
+    """``function`` of all rows; on a CPU without a gradient a part of them at a time,
+    to save memory.
 
     Args:
         function: rows to values [m, _].

@@ -16,8 +16,8 @@ from ghgs_lit.types import Points, Tokens
 
 @dataclass(frozen=True)
 class TokenAttention:
-    """A token, its neighbours (nearest first), and their weights in every layer and head; ``plain``: the
-    weights for s = 1. ``query`` and ``neighbors`` are indices of packed tokens."""
+    """A token, its neighbours (nearest first), and their weights in every layer and head;
+    ``plain``: the weights for s = 1. ``query`` and ``neighbors`` are indices of packed tokens."""
 
     query: int
     neighbors: Int[Tensor, " k"]
@@ -56,14 +56,15 @@ def attention_of(
 def attention_on_other_parts(
     recalibration: Recalibration, tokens: Tokens, points: Points, part: Int[Tensor, " N"]
 ) -> Float[Tensor, "m L"]:
-    """Share of each token's attention, in each layer, on tokens that show another body part; mean over heads.
+    """Share of each token's attention, in each layer, on tokens that show another body part;
+    mean over heads.
 
     Args:
         recalibration: the stage.
         tokens: inputs of the stage, as is the next.
         points: of these tokens.
-        part: number of the part that a token shows [N]; -1: unknown: such tokens are no queries, and
-            attention to them does not count.
+        part: number of the part that a token shows [N]; -1: unknown: such tokens are no queries,
+            and attention to them does not count.
 
     Returns:
         Shares [m, L] of the m tokens that take part and whose part is known.
@@ -104,10 +105,10 @@ def _near(
 
 @dataclass(frozen=True)
 class Neighborhood:
-    """Whom the tokens of an element attend to. ``tokens``: that take part. ``neighbors``: of each, itself
-    included. ``shared``: share of the neighbours that stay the same in the other setting of
-    ``recalibration.neighborhood``; with nearly all tokens as neighbours that is nearly 1, and the ablation of
-    3D unprojection hardly changes anything."""
+    """Whom the tokens of an element attend to. ``tokens``: that take part. ``neighbors``: of each,
+    itself included. ``shared``: share of the neighbours that stay the same in the other setting of
+    ``recalibration.neighborhood``; with nearly all tokens as neighbours that is nearly 1, and the
+    ablation of 3D unprojection hardly changes anything."""
 
     tokens: int
     neighbors: int

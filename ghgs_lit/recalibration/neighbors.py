@@ -23,16 +23,16 @@ def nearest_neighbors(
 ) -> Int[Tensor, "*b n k"]:
     """The nearest points of each point in any view, itself included.
 
-    Of one element, or of several with the same number of points. Distances are computed from differences in
-    float32 or wider: products would lose digits far from the origin.
+    Of one element, or of several with the same number of points. Distances are computed from
+    differences in float32 or wider: products would lose digits far from the origin.
 
     Args:
         points: positions of the tokens, of any dimension d.
         view: the view of each token; read with ``places``.
         k: number of neighbours, at least 1.
-        places: a number of each token's place, which orders points at equal distances: nearest number first,
-            so that opposite places alternate, and at each place the query's own view, then the next views.
-            None: ties by index.
+        places: a number of each token's place, which orders points at equal distances: nearest
+            number first, so that opposite places alternate, and at each place the query's own view,
+            then the next views. None: ties by index.
         views: number of views of an element; read with ``places``.
 
     Returns:
@@ -41,7 +41,8 @@ def nearest_neighbors(
     points = at_least_float32(points)
     n = points.shape[-2]
     k = min(k, n)
-    # Filled, not concatenated: small results between freed blocks of distances would fragment the memory.
+    # Filled, not concatenated: small results between freed blocks of distances would
+    # fragment the memory.
     index = torch.empty(*points.shape[:-1], k, dtype=torch.int64, device=points.device)
     for rows in even_parts(n, at_once(points.device, _BLOCK, _GPU_BLOCK) // max(points[..., 0].numel(), 1)):
         queries = points[..., rows, :]
@@ -52,7 +53,8 @@ def nearest_neighbors(
 
 
 def _turns(places: Tensor, view: Tensor, views: int, block: slice) -> Int[Tensor, "*b m n"]:
-    """Ranks of tokens at equal distances from some queries; see ``places`` of :func:`nearest_neighbors`.
+    """Ranks of tokens at equal distances from some queries;
+    see ``places`` of :func:`nearest_neighbors`.
 
     Args:
         places: a number of each token's place [..., n].
@@ -73,8 +75,9 @@ def _smallest(
 ) -> Int[Tensor, "*b m k"]:
     """Columns of the smallest values of each row; NaN is largest.
 
-    ``topk`` does not define the order of equal values, so the rank is the lower half of the key; the upper
-    half is the bits of the distance, since those of non-negative floats sort like their values.
+    ``topk`` does not define the order of equal values, so the rank is the lower half of the
+    key; the upper half is the bits of the distance, since those of non-negative floats sort
+    like their values.
 
     Args:
         distance: [..., m, n], 0 or more.

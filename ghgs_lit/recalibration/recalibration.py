@@ -30,21 +30,23 @@ class RecalibrationOptions(Options):
 
     group = "recalibration"
     k: Count | Annotated[float, Field(gt=0, lt=1)] = 64
-    """Neighbours of each token: a number (64 in the authors' release; all tokens where there are fewer), or a
-    share of the subject's tokens that take part, such as 0.1, which means the same at every size."""
+    """Neighbours of each token: a number (64 in the authors' release; all tokens where there are
+    fewer), or a share of the subject's tokens that take part, such as 0.1, which means the same at
+    every size."""
     num_heads: Width = 8
     """Attention heads; they divide a quarter of the token width. 8 in the release."""
     similarity: Similarity = "product"
-    """How the cosine s of semantic features acts on a logit: product (s times it: Eq. 3) | product_clamped
-    (max(s, 0) times it: the release) | log (adds log(max(s, 0.01))) | none (ablation: s = 1)"""
+    """How the cosine s of semantic features acts on a logit: product (s times it: Eq. 3) |
+    product_clamped (max(s, 0) times it: the release) | log (adds log(max(s, 0.01))) | none
+    (ablation: s = 1)"""
     neighborhood: Literal["xyz", "image_plane"] = "xyz"
-    """Where distances are measured: xyz, between 3D points of tokens | image_plane, between centres of
-    tokens in pixels, as if all views were one (ablation: no unprojection)"""
+    """Where distances are measured: xyz, between 3D points of tokens | image_plane, between centres
+    of tokens in pixels, as if all views were one (ablation: no unprojection)"""
     tokens: Literal["subject", "all"] = "subject"
     """Tokens that take part: subject, those with a point on the subject | all (the release)"""
     positions: Literal["none", "relative"] = "none"
-    """What values of attention know of places: none (the paper) | relative: where each neighbour lies from
-    the token, in units of the subject (not the paper's; with neighborhood=xyz)"""
+    """What values of attention know of places: none (the paper) | relative: where each neighbour
+    lies from the token, in units of the subject (not the paper's; with neighborhood=xyz)"""
 
     @model_validator(mode="after")
     def _places_are_3d(self) -> "RecalibrationOptions":
@@ -68,7 +70,8 @@ class RecalibrationOptions(Options):
 
 
 class Recalibration(nn.Module):
-    """One :class:`SemanticAttention` for all layers; neighbours and cosines are computed once per forward."""
+    """One :class:`SemanticAttention` for all layers;
+    neighbours and cosines are computed once per forward."""
 
     def __init__(self, options: RecalibrationOptions, dim_latent: int):
         super().__init__()
@@ -186,7 +189,8 @@ class Recalibration(nn.Module):
         return (torch.stack((tokens.row, tokens.column), dim=-1) + 0.5) * tokens.patch_size
 
     def places(self, tokens: Tokens) -> Int[Tensor, " N"] | None:
-        """``places`` for :func:`nearest_neighbors`; None for 3D points, which have no systematic ties."""
+        """``places`` for :func:`nearest_neighbors`;
+        None for 3D points, which have no systematic ties."""
         if self.neighborhood != "image_plane":
             return None
         # Twice the columns, so that places at equal distances from a query differ in their numbers.
@@ -212,15 +216,16 @@ def places_around(
 ) -> Float[Tensor, "*b n 3"]:
     """Places of tokens around the middle of the subject, in units of its size.
 
-    The middle is the mean of the subject's points, the unit their root mean square distance from it, so that
-    places depend neither on the world's origin nor on its unit.
+    The middle is the mean of the subject's points, the unit their root mean square distance from
+    it, so that places depend neither on the world's origin nor on its unit.
 
     Args:
         points: of the tokens of an element, or of several with the same number.
         is_subject: which points lie on the subject; middle and unit are of these.
 
     Returns:
-        Places, float32 or wider; 0 for points that are not finite, or if all of the subject's coincide.
+        Places, float32 or wider; 0 for points that are not finite,
+        or if all of the subject's coincide.
     """
     points = at_least_float32(points)
     is_finite = points.isfinite().all(-1)

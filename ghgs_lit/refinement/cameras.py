@@ -2,9 +2,9 @@
 
 First, cameras move and zoom until silhouettes are consistent
 (:mod:`ghgs_lit.refinement.coherence`); they stay where a prediction does not confirm the gain, as
-with wrong masks. Then the Gaussians of the other views are rendered with each view's camera, which moves
-until the render fits the photograph (bundle adjustment as in BARF, Lin et al., ICCV 2021). Photographs do not
-tell where the whole rig is: only relative motions of cameras are estimated
+with wrong masks. Then the Gaussians of the other views are rendered with each view's camera, which
+moves until the render fits the photograph (bundle adjustment as in BARF, Lin et al., ICCV 2021).
+Photographs do not tell where the whole rig is: only relative motions of cameras are estimated
 (:mod:`ghgs_lit.geometry.rotations`)."""
 
 from collections.abc import Callable
@@ -34,14 +34,15 @@ _RATE = 0.006  #: Their size at first: radians, and half heights of the subject
 _OUTLINE = 0.5  #: Weight of silhouettes; that of colours is 1
 _SAME = 0.05  #: Largest difference in metres of depths of one surface
 _STAY = 4.0  #: Weight of the squared motion
-#: Relative decrease of the loss for which the cameras of the first round, and cameras that silhouettes
-#: propose, are kept: with exact cameras it is up to 0.01 (0.02 from above), with cameras off by a pixel 0.02
-#: to 0.2.
+#: Relative decrease of the loss for which the cameras of the first round, and cameras that
+#: silhouettes propose, are kept: with exact cameras it is up to 0.01 (0.02 from above), with
+#: cameras off by a pixel 0.02 to 0.2.
 _FIRST = 0.02
 #: The same for the cameras of a later round.
 _LATER = 0.01
-#: With ``_TELLING`` cameras or more (fewer silhouettes tell less), a silhouette distance below ``_EXACT``
-#: pixels means that they are off by half a pixel at most: the first round must gain ``_DOUBTED``.
+#: With ``_TELLING`` cameras or more (fewer silhouettes tell less), a silhouette distance
+#: below ``_EXACT`` pixels means that they are off by half a pixel at most: the first round
+#: must gain ``_DOUBTED``.
 _TELLING = 4
 _EXACT = 1.5e-4
 _DOUBTED = 0.05
@@ -49,8 +50,8 @@ _DOUBTED = 0.05
 
 @dataclass(frozen=True)
 class _Views:
-    """The ``n`` views of a batch with the Gaussians that the element's other views predict; ``owner``: the
-    view that each of these Gaussians is drawn in."""
+    """The ``n`` views of a batch with the Gaussians that the element's other views predict;
+    ``owner``: the view that each of these Gaussians is drawn in."""
 
     gaussians: Gaussians
     owner: Int[Tensor, " N"]
@@ -64,11 +65,12 @@ class CameraRefinement:
     """``refinement(batch)``: the batch with cameras that agree better.
 
     Args:
-        rounds: most rounds of prediction and correction, 1 or more. An element keeps its cameras from the
-            first round on that does not make its photographs agree better.
+        rounds: most rounds of prediction and correction, 1 or more. An element keeps its cameras
+            from the first round on that does not make its photographs agree better.
         predict: gives the prediction of a batch, as a model does.
         renderer: draws Gaussians, with gradients.
-        shared: the elements of a batch are instants of one rig, whose cameras move alike in all of them.
+        shared: the elements of a batch are instants of one rig,
+            whose cameras move alike in all of them.
 
     Raises:
         InputError: ``rounds`` is below 1.
@@ -114,8 +116,9 @@ class CameraRefinement:
             batch: in the subject's frame.
 
         Returns:
-            The batch with these cameras; which elements they improve [B]; which cameras may be wrong [B, V]
-            (all, unless silhouettes and prediction agree on a few); what the first round must gain [B].
+            The batch with these cameras; which elements they improve [B]; which cameras may be
+            wrong [B, V] (all, unless silhouettes and prediction agree on a few); what the first
+            round must gain [B].
         """
         cameras, free, distance = coherent_cameras(batch, self.shared)
         are_right = (distance < _EXACT) & (batch.masks.shape[1] >= _TELLING)
@@ -132,7 +135,8 @@ class CameraRefinement:
         return replace(batch, cameras=cameras), is_better, free, first
 
     def _confirmed(self, batch: Batch, cameras: Cameras) -> Bool[Tensor, " B"]:
-        """Which elements' predictions agree better with other cameras; false where these are the same."""
+        """Which elements' predictions agree better with other cameras;
+        false where these are the same."""
         moved = (cameras.extrinsics != batch.cameras.extrinsics).flatten(1).any(1)
         if not bool(moved.any()):
             return moved
@@ -144,7 +148,8 @@ class CameraRefinement:
         return self._loss(self.renderer(views.gaussians, views.cameras, background=0.0), views, batch)
 
     def _loss(self, drawn: Rendering, views: _Views, batch: Batch) -> Numbers:
-        """L1 of colours and silhouettes per pixel of an element's subject, or with ``shared`` its mean.
+        """L1 of colours and silhouettes per pixel of an element's subject,
+        or with ``shared`` its mean.
 
         Args:
             drawn: renders of the views.
@@ -206,7 +211,8 @@ class CameraRefinement:
 
 
 def _of_free(motions: Float[Tensor, "B V 6"], axes: Float[Tensor, "B V 3"], free: Which) -> Tensor:
-    """Motions of the free cameras: without their common motion if all are free; 0 for fixed cameras.
+    """Motions of the free cameras: without their common motion if all are free;
+    0 for fixed cameras.
 
     Args:
         motions: rotation vectors in radians and shifts in half heights [B, V, 6].

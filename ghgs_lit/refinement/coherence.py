@@ -1,9 +1,9 @@
 """Correction of a capture's cameras by motions and zooms that make its silhouettes consistent.
 
-With right cameras, the ray of every silhouette pixel has a point inside all other silhouettes (silhouette
-coherence: Boyer, ACCV 2006; Hernandez, Schmitt and Cipolla, PAMI 2007). With wrong ones, rays near the
-outlines have none: Gauss-Newton steps minimise how far outside the other silhouettes their best points lie.
-This needs no model and no surface that two photographs share."""
+With right cameras, the ray of every silhouette pixel has a point inside all other silhouettes
+(silhouette coherence: Boyer, ACCV 2006; Hernandez, Schmitt and Cipolla, PAMI 2007). With wrong
+ones, rays near the outlines have none: Gauss-Newton steps minimise how far outside the other
+silhouettes their best points lie. This needs no model and no surface that two photographs share."""
 
 import math
 from collections.abc import Sequence
@@ -35,10 +35,11 @@ _COHERENT = 5e-4
 _STAY = 1e-3
 #: Its factor for zooms: lenses are known better than poses.
 _KNOWN = 5.0
-#: Cameras are wrong by themselves if the others, as given, miss one another by less than ``_CLEARLY`` times
-#: what they do without any other ones (opposite cameras are nearly exchangeable), counted from ``_EXACT``
-#: pixels, which exact cameras reach. They move alone if that leaves less than ``_COHERENT``, ``_AS_WELL``
-#: times the distance that moving all leaves, or ``_REST`` of the given distance, as with rough masks.
+#: Cameras are wrong by themselves if the others, as given, miss one another by less than
+#: ``_CLEARLY`` times what they do without any other ones (opposite cameras are nearly
+#: exchangeable), counted from ``_EXACT`` pixels, which exact cameras reach. They move alone if that
+#: leaves less than ``_COHERENT``, ``_AS_WELL`` times the distance that moving all leaves, or
+#: ``_REST`` of the given distance, as with rough masks.
 _CLEARLY = 0.25
 _EXACT = 5e-5
 _AS_WELL = 1.5
@@ -48,11 +49,13 @@ _BUMPED = 1e-3  #: Given distance from which it is tried: that of one camera off
 
 @dataclass(frozen=True)
 class _Phase:
-    """Gauss-Newton steps with one kind of distance, for rays from pixels up to ``to`` inside their outline.
+    """Gauss-Newton steps with one kind of distance,
+    for rays from pixels up to ``to`` inside their outline.
 
-    First, rays must meet the other silhouettes; the weight of those that miss them by r > ``scale`` pixels
-    falls with 1 / r. Then (``is_exact``) they must lie as deep in the others as in their own, as outlines
-    from the front and from behind do; beyond ``scale`` the weight vanishes (Geman and McClure)."""
+    First, rays must meet the other silhouettes; the weight of those that miss them by r > ``scale``
+    pixels falls with 1 / r. Then (``is_exact``) they must lie as deep in the others as in their
+    own, as outlines from the front and from behind do; beyond ``scale`` the weight vanishes (Geman
+    and McClure)."""
 
     steps: int
     to: float
@@ -96,15 +99,15 @@ class _Alignment:
 def contradiction(batch: Batch) -> tuple[Float[Tensor, " B"], Float[Tensor, "B V"]]:
     """How far rays near outlines miss other silhouettes; a quick check.
 
-    With exact cameras the distance of all views is up to 0.0025, with ones off by 1.5 pixels 0.007 to 0.09;
-    where one is off, the others' is that of exact cameras.
+    With exact cameras the distance of all views is up to 0.0025, with ones off by 1.5 pixels 0.007
+    to 0.09; where one is off, the others' is that of exact cameras.
 
     Args:
         batch: as for :func:`coherent_cameras`.
 
     Returns:
-        Mean distances in pixels: of all views [B], and of the others without each [B, V] (0 for three views
-        or fewer: two nearly always agree).
+        Mean distances in pixels: of all views [B], and of the others without each [B, V] (0 for
+        three views or fewer: two nearly always agree).
     """
     of_all = []
     without = []
@@ -118,7 +121,8 @@ def contradiction(batch: Batch) -> tuple[Float[Tensor, " B"], Float[Tensor, "B V
 
 
 def culprit(without: Sequence[float]) -> int | None:
-    """Which of several views, or sets of them, is wrong by itself: the others agree without it alone.
+    """Which of several views, or sets of them, is wrong by itself:
+    the others agree without it alone.
 
     Args:
         without: mean distances of the others without each, in pixels; two or more.
@@ -140,21 +144,23 @@ def _on_cpu(batch: Batch) -> list[Tensor]:
 def coherent_cameras(
     batch: Batch, shared: bool = False, alone: bool = True
 ) -> tuple[Cameras, Bool[Tensor, "B V"], Float[Tensor, " B"]]:
-    """Cameras with consistent silhouettes; those of an element whose silhouettes are consistent stay.
+    """Cameras with consistent silhouettes; those of an element whose silhouettes are
+    consistent stay.
 
-    Where moving a minority of the cameras is as good as moving all, the others stay. Silhouettes do not tell
-    this from all cameras moving by less, relative to one another.
+    Where moving a minority of the cameras is as good as moving all, the others stay. Silhouettes do
+    not tell this from all cameras moving by less, relative to one another.
 
     Args:
         batch: in the subject's frame (:class:`ghgs_lit.geometry.frame.Frame`).
-        shared: the elements are instants of one rig, in one frame; its cameras move and zoom alike in all.
+        shared: the elements are instants of one rig, in one frame;
+            its cameras move and zoom alike in all.
         alone: a minority of the cameras may move by itself.
 
     Returns:
-        The cameras; which of them were free to move [B, V]; and by how many pixels rays near outlines miss
-        other silhouettes with the given cameras, on average [B]: 0 to 0.00014 with exact cameras and mattes;
-        with four cameras 0.0001 to 0.0004 if off by up to half a pixel, 0.002 by one, 0.04 to 0.08 by three;
-        infinite where no silhouette has an outline.
+        The cameras; which of them were free to move [B, V]; and by how many pixels rays near
+        outlines miss other silhouettes with the given cameras, on average [B]: 0 to 0.00014 with
+        exact cameras and mattes; with four cameras 0.0001 to 0.0004 if off by up to half a pixel,
+        0.002 by one, 0.04 to 0.08 by three; infinite where no silhouette has an outline.
     """
     cameras = batch.cameras
     # On a CPU: many short steps, and distances to outlines are computed there anyway.
@@ -186,7 +192,8 @@ def _coherent(
         alone: a minority of the cameras may move by itself.
 
     Returns:
-        Intrinsics and extrinsics, which were free, and the mean distance in pixels with the given ones.
+        Intrinsics and extrinsics, which were free,
+        and the mean distance in pixels with the given ones.
     """
     silhouettes = _Silhouettes(tuple(Outlines.of(each) for each in mattes), middle)
     every = torch.ones(len(pose), dtype=torch.bool)
@@ -221,7 +228,8 @@ def _minority(silhouettes: "_Silhouettes", lens: Lenses, pose: Pose) -> Which | 
 
 @dataclass(frozen=True)
 class _Equations:
-    """Normal equations of a Gauss-Newton step, and the number and total distance of rays before it."""
+    """Normal equations of a Gauss-Newton step,
+    and the number and total distance of rays before it."""
 
     normal: Float[Tensor, "n n"]
     right: Float[Tensor, " n"]
@@ -251,7 +259,8 @@ class _Silhouettes:
     middle: Middles
 
     def distance(self, lens: Lenses, pose: Pose, views: Sequence[int] = ()) -> float:
-        """Mean distance in pixels by which rays miss other silhouettes, without those of ``views``."""
+        """Mean distance in pixels by which rays miss other silhouettes,
+        without those of ``views``."""
         kept = [view for view in range(len(pose)) if view not in views]
         missed = 0.0
         rays = 0
@@ -284,7 +293,8 @@ def _equations(
         pixel: half the height of the subject, in pixels: what motions and zooms are multiplied by.
 
     Returns:
-        Equations of the motions about the frame's origin and the zooms of all cameras, in about a pixel.
+        Equations of the motions about the frame's origin and the zooms of all cameras,
+        in about a pixel.
     """
     count = len(pose)
     pose = _placed(pose, middle)

@@ -24,8 +24,9 @@ _REACH = 0.75  #: Half the step in pixels of slopes of a distance map
 
 @dataclass(frozen=True)
 class Outlines:
-    """Signed distances in pixels to the outline of each silhouette, above 0 inside, and the rays near it: ray
-    ``r`` passes ``pixels[r]`` of silhouette ``view[r]``, ``depth[r]`` pixels inside the outline."""
+    """Signed distances in pixels to the outline of each silhouette, above 0 inside, and the rays
+    near it: ray ``r`` passes ``pixels[r]`` of silhouette ``view[r]``, ``depth[r]`` pixels inside
+    the outline."""
 
     maps: Float[Tensor, "V 1 h w"]
     view: Int[Tensor, " R"]
@@ -40,8 +41,8 @@ class Outlines:
 
         Args:
             mattes: shares of pixels that show the subject [V, H, W], in [0, 1], on a CPU.
-            look: size of the maps relative to the mattes, greatest depth of rays in pixels, and every how
-                many rays one is used.
+            look: size of the maps relative to the mattes, greatest depth of rays in pixels, and
+                every how many rays one is used.
 
         Returns:
             Distance maps, and the rays in ascending order of silhouettes.
@@ -77,7 +78,8 @@ class Outlines:
         )
 
     def at(self, view: Int[Tensor, "*n"], pixels: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
-        """Distances at pixels; beyond the photograph those at its border, where a subject may go on.
+        """Distances at pixels; beyond the photograph those at its border,
+        where a subject may go on.
 
         Args:
             view: number of the silhouette of each pixel [...].

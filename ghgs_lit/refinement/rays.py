@@ -1,4 +1,5 @@
-"""Rays of silhouette pixels: their deepest points in other silhouettes, and derivatives of these depths."""
+"""Rays of silhouette pixels: their deepest points in other silhouettes,
+and derivatives of these depths."""
 
 import torch
 from jaxtyping import Float, Int
@@ -28,8 +29,8 @@ def best_points(
         pixels: that the rays pass [R, 2].
 
     Returns:
-        Points [R, 3]; the other silhouette that each is least deep in [R]; and its signed depth in that in
-        pixels [R].
+        Points [R, 3]; the other silhouette that each is least deep in [R]; and its signed depth in
+        that in pixels [R].
     """
     centers = -(pose[:, :3, :3].mT @ pose[:, :3, 3:])[..., 0]
     along = torch.linspace(-HEIGHT / 2, HEIGHT / 2, _DEPTHS).to(pixels)
@@ -87,8 +88,8 @@ def rows_of(
         middle: the subject's middle [3] in the frame.
 
     Returns:
-        [R, 7]: by the rotation vector about the frame's origin, the shift in half heights, and the logarithm
-        of the focal length, which moves points away from the optical axis.
+        [R, 7]: by the rotation vector about the frame's origin, the shift in half heights, and the
+        logarithm of the focal length, which moves points away from the optical axis.
     """
     across = world_to_camera(points, pose)[:, :2]
     zoom = ((pose[:, :3, :3] @ gradients[..., None])[:, :2, 0] * across).sum(-1, keepdim=True)

@@ -1,8 +1,8 @@
 """Optimisation of predicted Gaussians towards the input photographs.
 
-A few steps suffice, and every change is bounded, so that what no photograph shows stays as predicted. Inputs
-that are reproduced say nothing about other views (wrong geometry reproduces them, too), so
-:meth:`Refinement.report` holds one out and predicts again from the others."""
+A few steps suffice, and every change is bounded, so that what no photograph shows stays as
+predicted. Inputs that are reproduced say nothing about other views (wrong geometry reproduces them,
+too), so :meth:`Refinement.report` holds one out and predicts again from the others."""
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -44,8 +44,8 @@ WEIGHTS: Weights = (0.8, 0.2, 0.1)
 
 @dataclass(frozen=True)
 class Report:
-    """PSNR in dB in the subject's box before and after: of the inputs, and (of four or more) of one held
-    out."""
+    """PSNR in dB in the subject's box before and after: of the inputs, and (of four or more) of
+    one held out."""
 
     steps: int
     inputs: tuple[float, float]
@@ -126,8 +126,8 @@ class Refinement:
     Args:
         steps: of the optimiser, 1 or more.
         renderer: draws the inputs, with gradients.
-        changes: by field, what may change: means in footprints of their pixels, scales by their logarithm,
-            opacities by their logit, quaternions, colours. Other fields stay.
+        changes: by field, what may change: means in footprints of their pixels, scales by their
+            logarithm, opacities by their logit, quaternions, colours. Other fields stay.
 
     Raises:
         InputError: ``steps`` is below 1.
@@ -179,8 +179,8 @@ class Refinement:
     ) -> Report:
         """The gain of a refinement.
 
-        Of four inputs or more the last is held out (two that remain would show too little of a person), which
-        takes as long as prediction and refinement.
+        Of four inputs or more the last is held out (two that remain would show too little of a
+        person), which takes as long as prediction and refinement.
 
         Args:
             gaussians: before the refinement.

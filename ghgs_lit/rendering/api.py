@@ -39,25 +39,27 @@ def render(
 ) -> Rendering:
     """Render ``B`` sets of Gaussians from cameras [B, T].
 
-    Differentiable in means, quaternions, scales, opacities, colours and background. Any number ``C`` of
-    colour channels, any image size and any number of Gaussians per element, including none. The image is
-    defined by :class:`ghgs_lit.rendering.settings.RasterSettings`, as in 3D Gaussian Splatting (Kerbl et
-    al. 2023).
+    Differentiable in means, quaternions, scales, opacities, colours and background. Any number
+    ``C`` of colour channels, any image size and any number of Gaussians per element, including
+    none. The image is defined by :class:`ghgs_lit.rendering.settings.RasterSettings`, as in 3D
+    Gaussian Splatting (Kerbl et al. 2023).
 
     Args:
         gaussians: N Gaussians of all elements, ``splits`` of them in each; a zero quaternion is the
             identity; a Gaussian with NaN in its geometry or opacity is not drawn.
         cameras: [B, T], without skew; all of one image size (h, w).
-        backend: ``gsplat`` (CUDA), ``cpu`` (float32), ``reference`` (plain PyTorch in the dtype of the
-            means, slow; also differentiable in the cameras) or ``auto``: gsplat on CUDA, else cpu.
+        backend: ``gsplat`` (CUDA), ``cpu`` (float32), ``reference`` (plain PyTorch in the
+            dtype of the means, slow; also differentiable in the cameras) or ``auto``: gsplat
+            on CUDA, else cpu.
         background: one number, one per channel, or a tensor that broadcasts with [B, T, C, h, w].
-        near: metres > 0 (see ``gaussians.metre``); Gaussians whose centre has ``z < near`` are not drawn.
+        near: metres > 0 (see ``gaussians.metre``);
+            Gaussians whose centre has ``z < near`` are not drawn.
         far: metres > ``near``; Gaussians whose centre has ``z > far`` are not drawn.
         settings: constants of the image; None: those that the Gaussians were made for.
 
     Returns:
-        Image [B, T, C, h, w], alpha [B, T, 1, h, w] in [0, 1], and expected depth [B, T, 1, h, w] in the
-        unit of the means, 0 where no Gaussian is seen.
+        Image [B, T, C, h, w], alpha [B, T, 1, h, w] in [0, 1], and expected depth [B, T, 1, h, w]
+        in the unit of the means, 0 where no Gaussian is seen.
 
     Raises:
         InputError: inputs that do not fit together.
@@ -123,7 +125,8 @@ class Renderer(Options):
 
     group = "renderer"
     backend: Literal["auto", "gsplat", "cpu", "reference"] = "auto"
-    """gsplat (CUDA; needs the extra gpu), cpu (float32), reference (plain PyTorch); auto: by the device."""
+    """gsplat (CUDA; needs the extra gpu), cpu (float32), reference (plain PyTorch);
+    auto: by the device."""
     background: float | tuple[float, ...] = 0.0
     """Colour behind the Gaussians: one number or one for each channel."""
     near: Positive = 0.01
@@ -154,7 +157,8 @@ class Renderer(Options):
 
 
 def _check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
-    """Raise InputError where shapes of Gaussians and cameras do not fit together, or a camera has skew."""
+    """Raise InputError where shapes of Gaussians and cameras do not fit together,
+    or a camera has skew."""
     count = len(gaussians)
     shapes = {"means": (count, 3), "quaternions": (count, 4), "scales": (count, 3), "opacities": (count,)}
     for name, shape in shapes.items():
@@ -204,7 +208,8 @@ def _around_cameras(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, 
 
 
 def _in_metres(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
-    """Gaussians and cameras in metres; ``gaussians.metre`` is the length of a metre in each scene."""
+    """Gaussians and cameras in metres; ``gaussians.metre`` is the length of a metre in
+    each scene."""
     if gaussians.metre is None:
         return gaussians, cameras
     lengths = _of_each(gaussians.metre.to(gaussians.means), gaussians)[:, None]

@@ -1,9 +1,10 @@
-"""How many intersections of splats with tiles there is room for, and what happens where there are more.
+"""How many intersections of splats with tiles there is room for,
+and what happens where there are more.
 
-A GPU should not have to tell the host a number before it can go on. So each rendering gets room for what
-similar ones needed, and some more; the number that it really needed is read later: at the end of the
-rendering, while the GPU draws, or of several together (:func:`settled`). Where the room was too small the
-rendering is repeated with enough: an image never lacks splats."""
+A GPU should not have to tell the host a number before it can go on. So each rendering gets room for
+what similar ones needed, and some more; the number that it really needed is read later: at the end
+of the rendering, while the GPU draws, or of several together (:func:`settled`). Where the room was
+too small the rendering is repeated with enough: an image never lacks splats."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -26,7 +27,8 @@ _SPARE = 1.25
 #: Share of a difference by which an expectation falls if less was needed; it rises at once.
 _FALL = 0.1
 
-#: Tiles of an image (rows, columns): what is expected for them depends on nothing else that is known.
+#: Tiles of an image (rows, columns): what is expected for them depends on nothing else
+#: that is known.
 Grid = tuple[int, int]
 _expected: dict[Grid, float] = {}
 
@@ -81,7 +83,8 @@ _rooms: ContextVar[Rooms | None] = ContextVar("rooms", default=None)
 
 @contextmanager
 def deferred() -> Iterator[Rooms]:
-    """Inside, renderings do not check their rooms: who opens this must see whether they ``suffice``."""
+    """Inside, renderings do not check their rooms:
+    who opens this must see whether they ``suffice``."""
     rooms = Rooms()
     token = _rooms.set(rooms)
     try:
@@ -93,12 +96,12 @@ def deferred() -> Iterator[Rooms]:
 def settled(call: Callable[[], T]) -> T:
     """The result of ``call``, repeated where a rendering inside had too little room.
 
-    The host waits once for all renderings inside, and not at all without any. A repeated call has enough
-    room for what was seen.
+    The host waits once for all renderings inside, and not at all without any. A repeated call has
+    enough room for what was seen.
 
     Args:
-        call: anything that renders; it may be called several times. Inside :func:`deferred` it is called
-            once and not checked.
+        call: anything that renders; it may be called several times. Inside :func:`deferred` it is
+            called once and not checked.
     """
     if _rooms.get() is not None:
         return call()
@@ -124,8 +127,8 @@ def with_room(
         draw: draws intersections.
 
     Returns:
-        What ``draw`` returned last. Inside :func:`deferred` it may lack splats: the caller checks the
-        rooms.
+        What ``draw`` returned last. Inside :func:`deferred` it may lack splats: the caller
+        checks the rooms.
     """
     rooms = _rooms.get()
     while True:

@@ -1,7 +1,7 @@
 """The gsplat backend (CUDA), imported on first use; most constants are compiled into gsplat.
 
-Its kernels project and draw. What lies between them, finding the splats of each tile, makes the host wait in
-gsplat, and is done here (:mod:`ghgs_lit.rendering.intersections`)."""
+Its kernels project and draw. What lies between them, finding the splats of each tile, makes the
+host wait in gsplat, and is done here (:mod:`ghgs_lit.rendering.intersections`)."""
 
 import importlib
 import warnings
@@ -19,8 +19,8 @@ from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 #: The limit of alpha that is compiled into gsplat.
 _ALPHA_MAX = RasterSettings().alpha_max
-#: Threads of a warp. In a batch, gsplat 1.5.3 sums the gradients of a warp by the index of a Gaussian in its
-#: element alone, and would mix those of elements with fewer Gaussians than this.
+#: Threads of a warp. In a batch, gsplat 1.5.3 sums the gradients of a warp by the index of a
+#: Gaussian in its element alone, and would mix those of elements with fewer Gaussians than this.
 _WARP = 32
 _FIXED = ("alpha_min", "stop", "extent", "frustum_margin")
 #: Versions whose kernels are known to draw the intersections that are found here.
@@ -64,8 +64,8 @@ def rasterize(
 ) -> Rendering:
     """Render on black in float32; see :func:`ghgs_lit.rendering.render`.
 
-    A limit of alpha below :data:`_ALPHA_MAX` is applied to opacities: for opacities above it, alphas
-    differ by at most ``1 - alpha_max`` from those of other backends.
+    A limit of alpha below :data:`_ALPHA_MAX` is applied to opacities: for opacities above it,
+    alphas differ by at most ``1 - alpha_max`` from those of other backends.
 
     Args:
         gaussians: on a CUDA device, in metres.
@@ -117,7 +117,8 @@ def _drawn(
     fields = _sanitized(*_side_by_side(gaussians))
     means, quaternions, scales, opacities, colors = fields
     if settings.alpha_max < _ALPHA_MAX:
-        # Opacities above the limit keep their gradient, as away from the centre of a splat in other backends.
+        # Opacities above the limit keep their gradient,
+        # as away from the centre of a splat in other backends.
         opacities = opacities - (opacities - settings.alpha_max).clamp(min=0).detach()
     seen = {
         "means": means,
@@ -195,8 +196,9 @@ def _without_wait(
 
 
 def _side_by_side(gaussians: Gaussians) -> tuple[Tensor, ...]:
-    """Means, quaternions, scales, opacities and colors of each element, [B, N, ...], in float32; padded to
-    one number, at least :data:`_WARP` with several elements, by Gaussians with opacity 0."""
+    """Means, quaternions, scales, opacities and colors of each element, [B, N, ...], in
+    float32; padded to one number, at least :data:`_WARP` with several elements, by Gaussians
+    with opacity 0."""
     names = ("means", "quaternions", "scales", "opacities", "colors")
     fields = [getattr(gaussians, name).float() for name in names]
     if len(gaussians.splits) == 1:
@@ -215,8 +217,8 @@ def _sanitized(
     """Gaussians that gsplat draws as the other backends do.
 
     gsplat squares quaternions in float32 and does not expect NaN or infinity. So quaternions are
-    normalised, the zero quaternion becomes the identity, and a Gaussian whose geometry or opacity is not
-    finite becomes invisible.
+    normalised, the zero quaternion becomes the identity, and a Gaussian whose geometry or opacity
+    is not finite becomes invisible.
 
     Args:
         means: [B, N, 3].

@@ -1,8 +1,8 @@
 """Which splats each tile of an image draws, in order of depth, without a wait of the host.
 
-gsplat's own function asks the device for the number of intersections, and the GPU idles until the host has
-read it and has launched what follows. Here arrays have a fixed capacity instead, and the number needed is a
-tensor that can be read later (:mod:`ghgs_lit.rendering.capacity`)."""
+gsplat's own function asks the device for the number of intersections, and the GPU idles until the
+host has read it and has launched what follows. Here arrays have a fixed capacity instead, and the
+number needed is a tensor that can be read later (:mod:`ghgs_lit.rendering.capacity`)."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -21,15 +21,18 @@ TILE = 16
 class Intersections(NamedTuple):
     """Splats of all tiles, one tile after another.
 
-    Each image has a row of tiles below its own. No pixel lies in it, and the very last tile holds the places
-    that are not used: in gsplat's kernels a tile ends where the next one begins, the last at the capacity.
+    Each image has a row of tiles below its own. No pixel lies in it, and the very last tile holds
+    the places that are not used: in gsplat's kernels a tile ends where the next one begins, the
+    last at the capacity.
 
     Attributes:
-        splats: index among all images' splats, in the order of gsplat's sorted keys: by image, tile, bits of
-            the depth, index.
+        splats: index among all images' splats, in the order of gsplat's sorted keys: by image,
+            tile, bits of the depth, index.
         offsets: first place of each tile.
-        has_pixels: false in the rows below the images, which gsplat then skips in the backward pass.
-        needed: number of intersections; where it exceeds the capacity, the farthest splats are missing."""
+        has_pixels: false in the rows below the images,
+            which gsplat then skips in the backward pass.
+        needed: number of intersections; where it exceeds the capacity,
+            the farthest splats are missing."""
 
     splats: Int32[Tensor, " capacity"]
     offsets: Int32[Tensor, "*images rows columns"]
@@ -48,9 +51,9 @@ def intersections(
 ) -> Intersections:
     """Intersections of splats with tiles, as gsplat's ``isect_tiles`` and ``isect_offset_encode``.
 
-    Splats are sorted by depth first, and then their places by tile. Both sorts are stable, so that the
-    order is that of gsplat's 64-bit keys, but most bytes are sorted once for a splat instead of once for
-    a tile.
+    Splats are sorted by depth first, and then their places by tile. Both sorts are stable, so that
+    the order is that of gsplat's 64-bit keys, but most bytes are sorted once for a splat instead of
+    once for a tile.
 
     Args:
         centers: in pixels; anything where a radius is 0.

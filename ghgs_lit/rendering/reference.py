@@ -1,5 +1,5 @@
-"""The reference renderer for tests, in plain PyTorch and the dtype of its input. It evaluates every Gaussian
-in every pixel, so it is slow and needs much memory; gradients are by autograd.
+"""The reference renderer for tests, in plain PyTorch and the dtype of its input. It evaluates every
+Gaussian in every pixel, so it is slow and needs much memory; gradients are by autograd.
 :class:`ghgs_lit.rendering.settings.RasterSettings` defines the image."""
 
 import math
@@ -20,7 +20,8 @@ _CHUNK = 1 << 19
 
 @dataclass(frozen=True)
 class Splats:
-    """Gaussians projected into one camera: centres in pixels, covariances as (xx, xy, yy) in px^2."""
+    """Gaussians projected into one camera: centres in pixels,
+    covariances as (xx, xy, yy) in px^2."""
 
     centers: Float[Tensor, "n 2"]
     covariances: Float[Tensor, "n 3"]
@@ -83,8 +84,8 @@ def visible(
 ) -> Int[Tensor, " n"]:
     """Indices of the Gaussians to draw, sorted by float32 depth, ties by index.
 
-    Drawn are Gaussians with a finite centre, a positive, finite determinant and an opacity of at least
-    ``alpha_min``.
+    Drawn are Gaussians with a finite centre, a positive, finite determinant and an opacity of at
+    least ``alpha_min``.
 
     Args:
         gaussians: of one element.
@@ -105,8 +106,9 @@ def visible(
 def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> Splats:
     """All Gaussians as splats of one camera, also those that it does not see.
 
-    The covariance is that of EWA splatting (Zwicker et al. 2001), ``J W Sigma W^T J^T`` plus ``low_pass``
-    on its diagonal, with the Jacobian J at a centre clamped to the frame and ``frustum_margin``.
+    The covariance is that of EWA splatting (Zwicker et al. 2001), ``J W Sigma W^T J^T`` plus
+    ``low_pass`` on its diagonal, with the Jacobian J at a centre clamped to the frame and
+    ``frustum_margin``.
 
     Args:
         gaussians: n of one element.
@@ -174,5 +176,6 @@ def _blend(splats: Splats, pixels: Float[Tensor, "P 2"], settings: RasterSetting
     weights = alpha * torch.exp(step.cumsum(0) - step)
     ones = torch.ones_like(splats.depths)
     values = torch.cat((splats.colors, splats.depths[:, None], ones[:, None]), dim=-1)
-    # Not a matrix product: colours that are not finite must not reach pixels that do not see their splat.
+    # Not a matrix product: colours that are not finite must not reach pixels that do not
+    # see their splat.
     return (weights[..., None] * torch.where(seen[..., None], values[:, None], 0)).sum(0)

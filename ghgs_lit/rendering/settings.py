@@ -8,10 +8,11 @@ from ghgs_lit.config.options import Amount, Options, Positive
 class RasterSettings(Options):
     """Constants of the image, the same in all backends.
 
-    Each pixel composites Gaussians in the order of their float32 depth, ties by index. A Gaussian has
-    ``alpha = min(alpha_max, opacity exp(-sigma))`` with ``sigma`` half its squared Mahalanobis distance
-    from the pixel's centre; it is skipped where ``alpha < alpha_min`` or ``sigma > extent^2 / 2``. A
-    pixel ends before the first Gaussian behind which its transmittance would not exceed ``stop``.
+    Each pixel composites Gaussians in the order of their float32 depth, ties by index. A Gaussian
+    has ``alpha = min(alpha_max, opacity exp(-sigma))`` with ``sigma`` half its squared Mahalanobis
+    distance from the pixel's centre; it is skipped where ``alpha < alpha_min`` or
+    ``sigma > extent^2 / 2``. A pixel ends before the first Gaussian behind which its transmittance
+    would not exceed ``stop``.
     """
 
     group = "renderer.settings"
@@ -26,7 +27,8 @@ class RasterSettings(Options):
     extent: Positive = 3.33
     """Radius, in standard deviations, beyond which a Gaussian of opacity above one is cut off."""
     frustum_margin: Amount = 0.3
-    """Outside the frame the Jacobian is evaluated at most this part of tan(field of view / 2) beyond it."""
+    """Outside the frame the Jacobian is evaluated at most this part of tan(field of view
+    / 2) beyond it."""
     antialiased: bool = False
     """Scale opacity by ``sqrt(max(0, det before low-pass / det after))``."""
 

@@ -1,10 +1,12 @@
-"""Coarse to fine: what is found in smaller copies of the photographs is where the rounds at full size start.
+"""Coarse to fine: what is found in smaller copies of the photographs is where the rounds at
+full size start.
 
-The stages judge a pixel by what they see around it, in pixels. Where a person is taller than in training they
-see less of it and place it worse. So the whole method runs once on copies in which the subject has the height
-that the weights know. Its depths are refined at full size, as in cascades of cost volumes (CasMVSNet, Gu et
-al., CVPR 2020), and its tokens are those of the encoder at full size, which does not run there. What is
-decided here depends on an element's own masks and the size of the photographs alone.
+The stages judge a pixel by what they see around it, in pixels. Where a person is taller than in
+training they see less of it and place it worse. So the whole method runs once on copies in which
+the subject has the height that the weights know. Its depths are refined at full size, as in
+cascades of cost volumes (CasMVSNet, Gu et al., CVPR 2020), and its tokens are those of the encoder
+at full size, which does not run there. What is decided here depends on an element's own masks and
+the size of the photographs alone.
 """
 
 import dataclasses
@@ -27,9 +29,11 @@ from ghgs_lit.geometry.projection import at_least_float32, pixel_centers
 from ghgs_lit.plan import Plan
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Prediction, Tokens, map_tensors
 
-#: Share of a photograph's side that a person fills in training. In photographs of that size nothing changes.
+#: Share of a photograph's side that a person fills in training.
+#: In photographs of that size nothing changes.
 FILLED = 0.8
-#: First step of the rounds in depth, in those of rounds after a depth head: a coarse depth is nearly right.
+#: First step of the rounds in depth, in those of rounds after a depth head:
+#: a coarse depth is nearly right.
 STEP = 0.5
 #: Share of a pixel that a mask without a matte must cover in a smaller copy.
 _COVERED = 0.5
@@ -43,7 +47,8 @@ def with_known_height(nodes: Mapping[str, Any], trained: Mapping[str, Any]) -> d
 
     Args:
         nodes: of the model, by name, with or without rounds.
-        trained: configuration of its training, whose ``data.size`` and ``augmentation.sizes`` are read.
+        trained: configuration of its training,
+            whose ``data.size`` and ``augmentation.sizes`` are read.
 
     Returns:
         The nodes; without known sizes ``rounds.height`` is null.
@@ -118,7 +123,8 @@ class Coarse:
 
     Attributes:
         depths: of the elements that have copies.
-        tokens: of every patch at full size, from the encoder's of the copies; meaningless in other elements.
+        tokens: of every patch at full size, from the encoder's of the copies;
+            meaningless in other elements.
     """
 
     depths: CoarseDepths
@@ -151,14 +157,15 @@ def coarse_of(
     least_matte: float | None,
     predict: Callable[[Batch], Prediction],
 ) -> Coarse | None:
-    """What is found in smaller copies of the photographs; None where no subject is so tall as to need them.
+    """What is found in smaller copies of the photographs;
+    None where no subject is so tall as to need them.
 
     Args:
         batch: as the stages see it, with or without a border around the photographs.
         height: pixels of the subject's height, or of its width if larger, that the weights know.
         patch_size: of the encoder, in pixels; sides of the copies are its multiples.
-        least_matte: share of a pixel above which it belongs to the subject, 0 to 0.5; None: there are
-            none.
+        least_matte: share of a pixel above which it belongs to the subject, 0 to 0.5; None:
+            there are none.
         predict: gives the prediction of a batch, with the tokens of the encoder.
 
     Returns:
@@ -190,8 +197,8 @@ def coarse_of(
 def coarse_sizes(batch: Batch, height: int, patch_size: int) -> list[Size | None]:
     """The size of each element's smaller copy; None for elements that need none.
 
-    Those do whose subject is taller than the weights know, in photographs larger than those of the training,
-    which subjects may fill: the decision of each element depends on no other.
+    Those do whose subject is taller than the weights know, in photographs larger than those of the
+    training, which subjects may fill: the decision of each element depends on no other.
 
     Args:
         batch: photographs of one size, with or without a border.
@@ -288,7 +295,8 @@ def enlarged(maps: DepthMaps, size: Size) -> Float[Tensor, "B V H W"]:
     """
     depth = at_least_float32(maps.depth)
     inverse = torch.where(maps.valid, 1 / torch.where(maps.valid, depth, 1), 0)
-    # One pixel around what is known: a finger may lie within the photograph's mask and outside the copy's.
+    # One pixel around what is known: a finger may lie within the photograph's mask and
+    # outside the copy's.
     weight, around = (F.avg_pool2d(values, 3, 1, 1) for values in (maps.valid.to(depth.dtype), inverse))
     inverse = torch.where(maps.valid, inverse, around / torch.where(weight > 0, weight, 1))
     weight = _resized((weight > 0).to(depth.dtype), size)

@@ -13,7 +13,8 @@ from ghgs_lit.heads.gaussian import RawGaussians
 from ghgs_lit.plan.rows import size_class
 from ghgs_lit.types import Batch
 
-#: Side in pixels of the square around a Gaussian's pixel whose Gaussians it exchanges features with.
+#: Side in pixels of the square around a Gaussian's pixel whose Gaussians it exchanges
+#: features with.
 SIDE = 5
 
 
@@ -32,7 +33,8 @@ class Windows(NamedTuple):
 
     @classmethod
     def of(cls, raw: RawGaussians, batch: Batch) -> "Windows":
-        """Positions in maps of the size of the largest subject, each of which begins at its own subject.
+        """Positions in maps of the size of the largest subject,
+        each of which begins at its own subject.
 
         Args:
             raw: Gaussians of the batch, with the pixels that they belong to.
@@ -64,10 +66,11 @@ def _on_device(numbers: tuple, device: torch.device) -> Tensor:
 
 
 class Exchange(nn.Module):
-    """Adds features of neighbouring pixels' Gaussians to the features of each; untrained, it adds nothing.
+    """Adds features of neighbouring pixels' Gaussians to the features of each;
+    untrained, it adds nothing.
 
-    If several depths explain a colour, neighbours decide, as in recurrent networks of optical flow (RAFT,
-    Teed and Deng, ECCV 2020). Few channels and one convolution keep it cheap.
+    If several depths explain a colour, neighbours decide, as in recurrent networks of optical flow
+    (RAFT, Teed and Deng, ECCV 2020). Few channels and one convolution keep it cheap.
 
     Args:
         width: of the features.

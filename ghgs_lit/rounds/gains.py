@@ -1,6 +1,6 @@
-"""What differs between cameras: gains, of their exposure or white balance, and gammas. A point on the surface
-has the same colour in all views that see it, up to a gain of each camera and channel (as for panoramas: Brown
-and Lowe, IJCV 2007)."""
+"""What differs between cameras: gains, of their exposure or white balance, and gammas. A point on
+the surface has the same colour in all views that see it, up to a gain of each camera and channel
+(as for panoramas: Brown and Lowe, IJCV 2007)."""
 
 import dataclasses
 import itertools
@@ -17,16 +17,18 @@ from ghgs_lit.rounds.observation import looked_up
 from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Gaussians
 
-#: Distance in metres from a view's rendered surface at which a Gaussian's weight in that view is 1 / e.
+#: Distance in metres from a view's rendered surface at which a Gaussian's weight in that
+#: view is 1 / e.
 _NEAR = 0.02
 #: Colours closer than this to black or white have less weight: they say little about a gain.
 _DARK = 0.05
-#: Deviation of log colours from the gains at which a Gaussian has half its weight: wrong depths, shadows.
+#: Deviation of log colours from the gains at which a Gaussian has half its weight: wrong depths,
+#: shadows.
 _OUTLIER = 0.15
 #: Log gains well below this are probably errors of the estimate, and shrunk towards 0.
 _LEAST = 0.02
-#: Weight of the prior, gains of 1, in Gaussians; views that share nothing get these. For gammas it is one
-#: whose brightness is a tenth from the mean.
+#: Weight of the prior, gains of 1, in Gaussians; views that share nothing get these. For gammas it
+#: is one whose brightness is a tenth from the mean.
 _PRIOR = 1.0
 _PRIOR_OF_SLOPES = 0.1**2
 #: One Gaussian in this many is compared: a third is enough and takes a third of the time.
@@ -70,9 +72,9 @@ def divided(batch: Batch, logs: Float[Tensor, "B V 3"]) -> Batch:
 def log_gains(gaussians: Gaussians, batch: Batch, real: Real = None) -> Float[Tensor, "B V 3"]:
     """Natural logarithms of each camera's gains; 0 if views share nothing.
 
-    Their mean is about 0, as photographs do not tell which camera is right. Pairs of views are compared at
-    the Gaussians that both see, with Cauchy weights, so that wrong depths matter little (gain compensation;
-    Brown and Lowe, IJCV 2007).
+    Their mean is about 0, as photographs do not tell which camera is right. Pairs of views are
+    compared at the Gaussians that both see, with Cauchy weights, so that wrong depths matter little
+    (gain compensation; Brown and Lowe, IJCV 2007).
 
     Args:
         gaussians: of the batch, with the pixels that they belong to.
@@ -94,11 +96,12 @@ def log_gains(gaussians: Gaussians, batch: Batch, real: Real = None) -> Float[Te
 
 @torch.no_grad()
 def log_gammas(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
-    """Natural logarithms of cameras' gammas beside the median camera's; about 0 if views share nothing.
+    """Natural logarithms of cameras' gammas beside the median camera's;
+    about 0 if views share nothing.
 
-    A gamma is the exponent of a camera's colours. Where those of two views differ, log ratios of their
-    colours change as much with log brightness, while gains only shift them: lines are fitted to these, with
-    Cauchy weights.
+    A gamma is the exponent of a camera's colours. Where those of two views differ, log ratios of
+    their colours change as much with log brightness, while gains only shift them: lines are fitted
+    to these, with Cauchy weights.
 
     Args:
         gaussians: of the batch, with the pixels that they belong to.
@@ -155,8 +158,8 @@ def _compared(
         real: which rows are Gaussians; None: all.
 
     Returns:
-        Number of the own photograph of each, logs of their colours in each view and in their own, and weights
-        from 0 to 1.
+        Number of the own photograph of each, logs of their colours in each view and in their own,
+        and weights from 0 to 1.
     """
     depth = render(gaussians, batch.cameras).depth
     views = batch.masks.shape[1]

@@ -1,7 +1,8 @@
 """The memory of the rounds on a GPU: its two small networks as one operator, without a gradient.
 
-Each Gaussian is seen by several views, and a network runs for each of them; between its layers hundreds of
-megabytes would be written and read again for eight people. One kernel keeps them in registers."""
+Each Gaussian is seen by several views, and a network runs for each of them; between its layers
+hundreds of megabytes would be written and read again for eight people. One kernel keeps them
+in registers."""
 
 from collections.abc import Sequence
 
@@ -15,7 +16,8 @@ from ghgs_lit.runtime.precision import rounds_products
 
 
 def fits(*rows: Tensor) -> bool:
-    """Whether the kernel computes with these: on a GPU, without a gradient, where products round to TF32.
+    """Whether the kernel computes with these: on a GPU, without a gradient,
+    where products round to TF32.
 
     Args:
         rows: observations, what is known, the memory, and a weight.
@@ -34,7 +36,8 @@ def remembered(
     known: Float[Tensor, "N k"],
     memory: Float[Tensor, "N h"],
 ) -> Float[Tensor, "N h"]:
-    """The new memory of each Gaussian, from what is seen and known; for inputs that :func:`fits` accepts.
+    """The new memory of each Gaussian, from what is seen and known;
+    for inputs that :func:`fits` accepts.
 
     Args:
         layers: two of the views, two of the update, and the last one.

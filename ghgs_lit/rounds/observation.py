@@ -22,10 +22,12 @@ from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering, map_tensors
 #: Scale in metres of a Gaussian's distance behind the rendered surface (tanh of the ratio).
 _BEHIND = 0.05
 
-#: Values of a Gaussian in a view: photograph minus its own colour (3), photograph minus render (3), mask,
-#: alpha, distance behind the rendered surface, whether the view can see it, whether the view is its own.
+#: Values of a Gaussian in a view: photograph minus its own colour (3), photograph minus render
+#: (3), mask, alpha, distance behind the rendered surface, whether the view can see it, whether the
+#: view is its own.
 CHANNELS = 11
-#: Values of :func:`slopes`: of the mean along its ray and its own axes, of scales, opacity and color.
+#: Values of :func:`slopes`: of the mean along its ray and its own axes, of scales,
+#: opacity and color.
 SLOPES = 1 + 3 + 3 + 1 + 3
 # Slopes saturate from about 1/4 on; most are less than a tenth.
 _STEEP = 4.0
@@ -35,10 +37,11 @@ _STEEP = 4.0
 def slopes(
     gaussians: Gaussians, batch: Batch, directions: Float[Tensor, "N 3"], footprints: Float[Tensor, "N 1"]
 ) -> tuple[Rendering, Float[Tensor, "N s"]]:
-    """The rendered inputs, and the bounded gradient of their squared error with respect to each Gaussian.
+    """The rendered inputs, and the bounded gradient of their squared error with respect to
+    each Gaussian.
 
-    The error is of colours and mattes. Units are pixels for means, logarithms for scales, logits for
-    opacities. No gradient flows through the values.
+    The error is of colours and mattes. Units are pixels for means, logarithms for scales, logits
+    for opacities. No gradient flows through the values.
 
     Args:
         gaussians: of the batch.
@@ -47,7 +50,8 @@ def slopes(
         footprints: size of a pixel at each Gaussian's depth, in the unit of depth.
 
     Returns:
-        Renders from the cameras of the batch, and :data:`SLOPES` values of each Gaussian from -1 to 1.
+        Renders from the cameras of the batch,
+        and :data:`SLOPES` values of each Gaussian from -1 to 1.
     """
     # Copies: tensors of inference mode can never have a gradient.
     means, scales, opacities, colors = leaves = [
@@ -79,7 +83,8 @@ def slopes(
 
 @torch.no_grad()
 def observe(gaussians: Gaussians, batch: Batch, rendering: Rendering | None = None) -> Float[Tensor, "N V c"]:
-    """:data:`CHANNELS` values of each Gaussian in each view: its own, then the others in cyclic order.
+    """:data:`CHANNELS` values of each Gaussian in each view: its own,
+    then the others in cyclic order.
 
     Args:
         gaussians: of the batch, with the pixels that they belong to.
@@ -175,7 +180,8 @@ def looked_up(
         maps: of all views.
 
     Returns:
-        Values in each view, z-depths there, and whether the view can see the means: in its frame, in front.
+        Values in each view, z-depths there, and whether the view can see the means: in its frame,
+        in front.
     """
     return _values_at(gaussians.means, gaussians.image, gaussians.splits, cameras, maps)
 

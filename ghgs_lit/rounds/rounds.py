@@ -1,10 +1,10 @@
 """Rounds: render the inputs, compare them with the photographs, correct the Gaussians.
 
-A single forward pass never checks its depths and attributes, although the rasterizer draws the inputs in
-milliseconds. In each round every Gaussian is compared with the photographs at its present position
-(:mod:`ghgs_lit.rounds.observation`), and a small network, the same in all rounds, moves it along its ray and
-changes its raw attributes. Learned optimizers of splats also use the errors of re-rendered inputs (G3R, Chen
-et al., ECCV 2024; ReSplat, Xu et al., 2025)."""
+A single forward pass never checks its depths and attributes, although the rasterizer draws the
+inputs in milliseconds. In each round every Gaussian is compared with the photographs at its present
+position (:mod:`ghgs_lit.rounds.observation`), and a small network, the same in all rounds, moves it
+along its ray and changes its raw attributes. Learned optimizers of splats also use the errors of
+re-rendered inputs (G3R, Chen et al., ECCV 2024; ReSplat, Xu et al., 2025)."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
@@ -35,8 +35,8 @@ from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Prediction
 
 #: Gaussians that go through the network at once on a CPU.
 _AT_ONCE = 2048
-#: Largest distance of the depths that the first round compares from the current one, as a share of the way
-#: from near to far.
+#: Largest distance of the depths that the first round compares from the current one, as a share of
+#: the way from near to far.
 REACH = 0.25
 #: Channels of ``Search.place``: position between near and far (0 to 1), and far - near.
 _PLACE = 2
@@ -47,7 +47,8 @@ class Search:
     """Depths around the current one of each Gaussian.
 
     Attributes:
-        matches: photo-consistency at depths from ``down`` metres in front of it to ``up`` metres behind it.
+        matches: photo-consistency at depths from ``down`` metres in front of it to ``up``
+            metres behind it.
         place: position between near and far (0 to 1), and far - near in metres.
         down: metres.
         up: metres.
@@ -117,7 +118,8 @@ Number = Annotated[int, Field(ge=1, le=32)]
 
 
 class RoundsOptions(Options):
-    """Rounds that render the inputs, compare them with the photographs and correct the Gaussians."""
+    """Rounds that render the inputs, compare them with the photographs and correct the
+    Gaussians."""
 
     group = "rounds"
     count: Number = 2
@@ -127,20 +129,22 @@ class RoundsOptions(Options):
     hidden: Width = 48
     """Width of the network."""
     depths: int = Field(8, ge=1, le=4096)
-    """Number of depths around the current one at which a round compares the photographs; 4096 are finer than
-    their pixels."""
+    """Number of depths around the current one at which a round compares the photographs; 4096 are
+    finer than their pixels."""
     gains: bool = True
-    """Photographs of cameras whose exposure differs are made alike first, where a rig does not know them."""
+    """Photographs of cameras whose exposure differs are made alike first,
+    where a rig does not know them."""
     exchange: Width | None = 16
-    """Channels in which Gaussians of neighbouring pixels tell each other what they know; null: none."""
+    """Channels in which Gaussians of neighbouring pixels tell each other what they know;
+    null: none."""
 
     slopes: bool = False
     """Whether a round is shown the gradient of the inputs' error with respect to each Gaussian."""
     height: Literal["auto"] | Annotated[int, Field(ge=14, le=16384)] | None = "auto"
-    """Pixels of the subject's height, or of its width if larger, that the weights know; auto: four fifths of
-    the largest side of the photographs of the training. In larger photographs of taller subjects, stages run
-    on smaller copies, whose depths and tokens start the rounds at full size (:mod:`ghgs_lit.rounds.coarse`);
-    null: never."""
+    """Pixels of the subject's height, or of its width if larger, that the weights know; auto: four
+    fifths of the largest side of the photographs of the training. In larger photographs of taller
+    subjects, stages run on smaller copies, whose depths and tokens start the rounds at full size
+    (:mod:`ghgs_lit.rounds.coarse`); null: never."""
 
     def build(self, channels: int) -> "Rounds":
         """The rounds after a Gaussian head with descriptors of width ``channels``."""
@@ -156,9 +160,9 @@ def _two_layers(inputs: int, wide: int, outputs: int) -> nn.Sequential:
 class Rounds(nn.Module):
     """Corrects Gaussians several times with the same weights; untrained, it changes nothing.
 
-    Each round can change half as much as the one before, depths stay between near and far, attributes within
-    the bounds of their activations: more rounds than in training do not diverge. The attribute ``count``, the
-    number of rounds outside of training, may be changed at any time.
+    Each round can change half as much as the one before, depths stay between near and far,
+    attributes within the bounds of their activations: more rounds than in training do not diverge.
+    The attribute ``count``, the number of rounds outside of training, may be changed at any time.
 
     Args:
         options: of the rounds.
@@ -184,7 +188,8 @@ class Rounds(nn.Module):
 
     @property
     def height(self) -> int | None:
-        """Pixels of the subject's height that the weights know; None: any, or no training said it."""
+        """Pixels of the subject's height that the weights know;
+        None: any, or no training said it."""
         known = self.options.height
         return None if known == "auto" else known
 
@@ -197,8 +202,8 @@ class Rounds(nn.Module):
             state: the prediction of the stages, with bounds of depths.
             activate: gives Gaussians from their raw attributes.
             batch: photographs, masks and cameras are read.
-            step: size of the first step in depth, in those after a depth head; one for all elements or for
-                each. Attributes take whole steps.
+            step: size of the first step in depth, in those after a depth head; one for all elements
+                or for each. Attributes take whole steps.
 
         Returns:
             As many states as there are rounds, and one more.
@@ -258,10 +263,12 @@ class Rounds(nn.Module):
             memory: of the rounds before.
             windows: places of the Gaussians in maps; None: nothing is exchanged.
             share: of the largest change of attributes.
-            size: of the step in depth, as a share of the largest one; one for all Gaussians or one for each.
+            size: of the step in depth, as a share of the largest one;
+                one for all Gaussians or one for each.
 
         Returns:
-            Changes of depths in metres [N] and of raw attributes [N, c], and the memory for the next round.
+            Changes of depths in metres [N] and of raw attributes [N, c],
+            and the memory for the next round.
         """
         gaussians = state.gaussians.detach()
         drawn = None
@@ -301,7 +308,8 @@ class Rounds(nn.Module):
         return memory, float32_last(self.change, memory)
 
     def _remembered_in_parts(self, *rows: Tensor) -> Float[Tensor, "N h"]:
-        """:meth:`_remembered` in parts that fit a CPU's cache, in half the time; at once with a gradient."""
+        """:meth:`_remembered` in parts that fit a CPU's cache, in half the time;
+        at once with a gradient."""
         count = len(rows[0])
         device = rows[0].device
         parts = even_parts(count, count if torch.is_grad_enabled() else at_once(device, _AT_ONCE, count))

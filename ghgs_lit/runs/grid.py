@@ -1,4 +1,5 @@
-"""Grid sweeper of ``conf/hydra/sweeper/grid.yaml``: launches those runs of a grid that are not done."""
+"""Grid sweeper of ``conf/hydra/sweeper/grid.yaml``:
+launches those runs of a grid that are not done."""
 
 import json
 import logging
@@ -51,8 +52,8 @@ def sweep(sweeper: BasicSweeper, arguments: Sequence[str], rehearse: Rehearse) -
         What the jobs returned, as Hydra asks for it.
 
     Raises:
-        InputError: A configuration, a directory or the launcher is refused; with ``dry_run`` something is
-            missing.
+        InputError: A configuration, a directory or the launcher is refused; with ``dry_run``
+            something is missing.
         Interrupted: Ctrl-C or SIGTERM; no further run is started.
     """
     directory = resolved(str(sweeper.config.hydra.sweep.dir))
@@ -187,7 +188,8 @@ def check_directories(planned: Sequence[PlannedRun]) -> None:
 
 
 def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Path) -> None:
-    """Write each run's configuration, by which tables recognise planned runs, and what sets it apart.
+    """Write each run's configuration, by which tables recognise planned runs,
+    and what sets it apart.
 
     Args:
         planned: All runs of the sweep.
@@ -212,8 +214,8 @@ def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Pat
 def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = None) -> list[JobReturn]:
     """Launch runs until each one has finished, here or elsewhere, or failed.
 
-    A job that returns ``BUSY`` (another process works on its run) is launched again once that process has
-    ended.
+    A job that returns ``BUSY`` (another process works on its run) is launched again once that
+    process has ended.
 
     Args:
         planned: All runs of the sweep; those that are done are not launched.

@@ -35,14 +35,16 @@ def in_sweep() -> bool:
 
 
 def _waits() -> bool:
-    """Whether to wait for a locked run: the grid sweeper returns to it later, others need its result now."""
+    """Whether to wait for a locked run: the grid sweeper returns to it later,
+    others need its result now."""
     return in_sweep() and HydraConfig.get().sweeper.get("_target_") != SWEEPER
 
 
 def register_resolvers() -> None:
     """Register resolvers of configurations: ``${config_hash:}``, the name of a run's directory;
     ``${run_of_job:name}``, the name of a directory that a job of SLURM goes on in, else ``name``;
-    ``${sqlite:path}``, a database's URL; ``${folder:first,second}``, the second if the first is null."""
+    ``${sqlite:path}``, a database's URL; ``${folder:first,second}``, the second if the
+    first is null."""
 
     def hash_of_run(*, _root_: DictConfig) -> str:
         keys = [key for key in _root_ if key != "hydra"]
@@ -89,8 +91,8 @@ def train_once(run: RunDirectory, config: dict[str, Any], train: Train) -> float
         The metric, also of a run that is done; ``BUSY``: in a sweep, another process works on it.
 
     Raises:
-        InputError: Outside of a sweep, another process works on it; its directory holds another run or other
-            files.
+        InputError: Outside of a sweep, another process works on it; its directory holds another run
+            or other files.
     """
     run = run.of(config)
     with run.claim(wait=_waits()) as claimed:

@@ -133,8 +133,8 @@ Rehearse = Callable[[Sequence[Mapping[str, Any]]], Rehearsal]
 
 
 def print_plan(planned: Sequence[PlannedRun], directory: Path, rehearse: Rehearse) -> None:
-    """Print the runs with their states, the training time of the remaining ones, the output paths and what is
-    missing.
+    """Print the runs with their states, the training time of the remaining ones, the output paths
+    and what is missing.
 
     Args:
         planned: All runs of the sweep.

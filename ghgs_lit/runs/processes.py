@@ -1,4 +1,5 @@
-"""The processes of a training: how many there are, which one this is, and the SLURM job that they are in."""
+"""The processes of a training: how many there are, which one this is,
+and the SLURM job that they are in."""
 
 import os
 import signal
@@ -6,7 +7,8 @@ import subprocess
 from collections.abc import Mapping
 from typing import Any
 
-#: Variables that number the processes of a training; shells of jobs and of crashed launchers keep them.
+#: Variables that number the processes of a training;
+#: shells of jobs and of crashed launchers keep them.
 _RANKS = ("RANK", "LOCAL_RANK")
 
 
@@ -38,8 +40,8 @@ def _device_count(accelerator: str) -> int:
 
 
 def settle_rank(trainer: Mapping[str, Any]) -> int:
-    """Rank of this process among those of its training. What the environment says counts only where a
-    launcher has started several processes; elsewhere it is left over, and is forgotten.
+    """Rank of this process among those of its training. What the environment says counts only where
+    a launcher has started several processes; elsewhere it is left over, and is forgotten.
 
     Args:
         trainer: Options of the group ``trainer``.
@@ -65,8 +67,8 @@ def in_srun() -> bool:
 
 
 def launch() -> str | None:
-    """What the processes share that were started together: the job's step or torchrun's name, and how often
-    it was started again; None: no launcher says."""
+    """What the processes share that were started together: the job's step or torchrun's name, and
+    how often it was started again; None: no launcher says."""
     names = {
         "TORCHELASTIC_RUN_ID": ("TORCHELASTIC_RUN_ID", "TORCHELASTIC_RESTART_COUNT"),
         "SLURM_STEP_ID": ("SLURM_JOB_ID", "SLURM_STEP_ID", "SLURM_RESTART_COUNT"),

@@ -69,7 +69,8 @@ def clock(seconds: float) -> str:
 
 
 def track(items: Iterable[T], text: str, every: float = EVERY) -> Iterator[T]:
-    """Yield items with a bar on a terminal, elsewhere with a line now and then that counts those done.
+    """Yield items with a bar on a terminal, elsewhere with a line now and then that
+    counts those done.
 
     Args:
         items: Whatever is worked on.

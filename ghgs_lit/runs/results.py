@@ -1,4 +1,5 @@
-"""``metrics.json`` and ``metrics.csv``: one row for each subject, target and method, with provenance."""
+"""``metrics.json`` and ``metrics.csv``: one row for each subject, target and method,
+with provenance."""
 
 import csv
 import io
@@ -69,8 +70,8 @@ def by_protocol(rows: Sequence[Row]) -> dict[tuple, dict[str, list[Row]]]:
 
 
 def summarize(rows: Sequence[Row]) -> list[Row]:
-    """Means over subjects for each method, number of views and target protocol. A subject's targets are
-    averaged first, so that each subject counts once.
+    """Means over subjects for each method, number of views and target protocol. A subject's targets
+    are averaged first, so that each subject counts once.
 
     Args:
         rows: Of a measurement.
@@ -210,8 +211,8 @@ def read_results(path: Path) -> dict[str, Any]:
         Its content.
 
     Raises:
-        InputError: It is not complete or of another format version, or its configuration does not fit its
-            ``config_hash``.
+        InputError: It is not complete or of another format version, or its configuration does not
+            fit its ``config_hash``.
     """
     content = read_json(path, "a metrics.json")
     found = content.get("format_version") if isinstance(content, dict) else type(content).__name__

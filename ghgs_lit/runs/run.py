@@ -1,9 +1,11 @@
-"""A run on disk: whose configuration it has, how it goes on, the process that works on it, and its sessions.
+"""A run on disk: whose configuration it has, how it goes on, the process that works on it,
+and its sessions.
 
-``run.json`` says that a folder is a run's, and of which configuration; only in such a folder, and only by the
-process that has locked ``.lock``, anything is deleted. A run is done when it has the ``metrics.json`` of its
-configuration, which is written last. ``sessions.jsonl`` has a line for the start of each process and one for
-its end, which a killed process lacks. No file names the folder, so that a run can be moved.
+``run.json`` says that a folder is a run's, and of which configuration; only in such a folder, and
+only by the process that has locked ``.lock``, anything is deleted. A run is done when it has the
+``metrics.json`` of its configuration, which is written last. ``sessions.jsonl`` has a line for the
+start of each process and one for its end, which a killed process lacks. No file names the folder,
+so that a run can be moved.
 """
 
 import contextlib
@@ -106,7 +108,8 @@ class RunDirectory:
 
     @property
     def results(self) -> dict[str, Any] | None:
-        """Content of ``metrics.json``; None if it is missing, unreadable or of another configuration."""
+        """Content of ``metrics.json``; None if it is missing,
+        unreadable or of another configuration."""
         path = self.path / "metrics.json"
         try:
             results = read_results(path) if path.is_file() else None
@@ -158,8 +161,8 @@ class RunDirectory:
 
     @property
     def curves(self) -> Path:
-        """Folder of TensorBoard's files, by which TensorBoard names the run: for a run of a grid beside the
-        runs, called :attr:`title`. ``.run`` in it says whose it is."""
+        """Folder of TensorBoard's files, by which TensorBoard names the run: for a run of a grid
+        beside the runs, called :attr:`title`. ``.run`` in it says whose it is."""
         if not (self.title and (self.path.parent / PLAN).is_file()):
             return self.path / "tensorboard"
         folder = self.path.parent / "tensorboard" / self.title
@@ -228,8 +231,8 @@ class RunDirectory:
         return _given(resume)
 
     def goes_on(self, config: Mapping[str, Any]) -> bool:
-        """Whether the directory has the run that the same command began; only the length of a run that is not
-        complete, and what is measured after it, may differ.
+        """Whether the directory has the run that the same command began; only the length of a run
+        that is not complete, and what is measured after it, may differ.
 
         Args:
             config: Resolved configuration of the command.
@@ -270,8 +273,8 @@ class RunDirectory:
         )
 
     def begin(self, config: Mapping[str, Any]) -> dict[str, Any]:
-        """Make the directory that of a run. Where there is no checkpoint to start from, what was written is
-        trained again, and deleted. Call it where the run is claimed.
+        """Make the directory that of a run. Where there is no checkpoint to start from, what was
+        written is trained again, and deleted. Call it where the run is claimed.
 
         Args:
             config: Resolved configuration of the run.
@@ -314,8 +317,8 @@ class RunDirectory:
             shutil.rmtree(path) if is_folder else path.unlink()
 
     def discard(self, others: Iterable[str], since: float) -> None:
-        """Remove a directory in which nothing was begun: it holds only files of a start, those of a run and
-        ``others``, and no process works in it.
+        """Remove a directory in which nothing was begun: it holds only files of a start, those of a
+        run and ``others``, and no process works in it.
 
         Args:
             others: Names of further files that may be there.
@@ -368,8 +371,8 @@ class RunDirectory:
         self._log({"ended": _now(), "outcome": "done", **stats})
 
     def session_beside(self) -> dict[str, Any] | None:
-        """The present session of the first of the processes that were started together with this one, with
-        the path of the checkpoint that it ``resumed``; None: there is none yet."""
+        """The present session of the first of the processes that were started together with this
+        one, with the path of the checkpoint that it ``resumed``; None: there is none yet."""
         last = (self.sessions() or [{}])[-1]
         if last.get("launch") != launch() or "outcome" in last or not is_locked(self._lock):
             return None

@@ -1,4 +1,5 @@
-"""Handling of Ctrl-C and of the signals of batch systems, which end a process with 128 + their number."""
+"""Handling of Ctrl-C and of the signals of batch systems,
+which end a process with 128 + their number."""
 
 import contextlib
 import os
@@ -16,7 +17,8 @@ STOP = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 class Interrupted(SystemExit):
     """This process was asked to stop by a signal; the exit code is 128 + its number.
 
-    A ``SystemExit``, because Hydra takes any ``Exception`` for one failed job and starts the next one.
+    A ``SystemExit``, because Hydra takes any ``Exception`` for one failed job and
+    starts the next one.
 
     Args:
         number: of the signal.
@@ -32,7 +34,8 @@ class Interrupted(SystemExit):
 
 
 class _Handler:
-    """Signal handler that calls ``act(number)`` only in the process that made it, not in forked workers."""
+    """Signal handler that calls ``act(number)`` only in the process that made it,
+    not in forked workers."""
 
     def __init__(self, act: Callable[[int], Any]) -> None:
         self.act = act
@@ -65,8 +68,8 @@ def handlers() -> dict[int, Any]:
 
 
 def handle(act: Callable[[int], Any], before: Mapping[int, Any]) -> None:
-    """Let a function handle signals, except those that others handle. Handlers of submitit and ``nohup``
-    stay: under submitit SIGTERM does not end a job.
+    """Let a function handle signals, except those that others handle. Handlers of submitit and
+    ``nohup`` stay: under submitit SIGTERM does not end a job.
 
     Args:
         act: Gets the number of the signal.

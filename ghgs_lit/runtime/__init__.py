@@ -1,1 +1,2 @@
-"""The process and its machine: memory, cores, precision of products, changes of parameters, recorded work."""
+"""The process and its machine: memory, cores, precision of products, changes of parameters,
+recorded work."""

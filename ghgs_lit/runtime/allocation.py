@@ -22,8 +22,8 @@ def resident_bytes(field: str = "VmRSS") -> int:
     """Memory of this process in bytes.
 
     Args:
-        field: ``VmRSS`` (now) or ``VmHWM`` (peak since :func:`forget_peak`); except on Linux both are the
-            peak since its start.
+        field: ``VmRSS`` (now) or ``VmHWM`` (peak since :func:`forget_peak`); except on Linux both
+            are the peak since its start.
     """
     if _STATUS.exists():
         line = next(line for line in _STATUS.read_text().splitlines() if line.startswith(field + ":"))
@@ -53,9 +53,9 @@ def return_free_memory() -> None:
 def keep_freed_memory() -> bool:
     """Make glibc keep freed memory for reuse.
 
-    By default glibc returns every large block to the system, which clears its pages at the next use: a
-    small model spends a tenth of its forward pass or more on that. ``malloc_trim`` still returns the
-    memory. Limits set by the user stay.
+    By default glibc returns every large block to the system, which clears its pages at the next
+    use: a small model spends a tenth of its forward pass or more on that. ``malloc_trim`` still
+    returns the memory. Limits set by the user stay.
 
     Returns:
         Whether that succeeded.
@@ -73,8 +73,8 @@ _freeze_once = functools.cache(gc.freeze)
 
 
 def collect_garbage_again() -> None:
-    """Turn the collector on again after ``gc.disable()``, and exclude the imported objects from it. They are
-    frozen once in a process: at a later call there are objects that may become garbage."""
+    """Turn the collector on again after ``gc.disable()``, and exclude the imported objects from it.
+    They are frozen once in a process: at a later call there are objects that may become garbage."""
     if not gc.isenabled():
         _freeze_once()
         gc.enable()

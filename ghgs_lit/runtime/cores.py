@@ -1,4 +1,5 @@
-"""The cores that this process may use, how its threads wait for one another, and how it starts others."""
+"""The cores that this process may use, how its threads wait for one another,
+and how it starts others."""
 
 import fcntl
 import multiprocessing
@@ -17,11 +18,12 @@ _spins: list[IO[str]] = []
 
 
 def spin_if_alone(arguments: Sequence[str], running: Path = Path("/proc/loadavg")) -> None:
-    """Let OpenMP's threads spin before they sleep if no other process runs; call before importing PyTorch.
+    """Let OpenMP's threads spin before they sleep if no other process runs;
+    call before importing PyTorch.
 
-    On an idle virtual machine a sleeping thread wakes late: steps of ``experiment=demo`` take 0.75 s
-    instead of 0.29. Two spinning processes on the same cores take seven times as long, so only one per
-    machine may.
+    On an idle virtual machine a sleeping thread wakes late: steps of ``experiment=demo`` take 0.75
+    s instead of 0.29. Two spinning processes on the same cores take seven times as long, so only
+    one per machine may.
 
     Args:
         arguments: of the command line; threads sleep where one asks for several processes.
@@ -46,8 +48,8 @@ def children_sleep() -> None:
 
 
 def use_known_start_method() -> None:
-    """Let this process start others as a fresh one does. joblib's workers have a start method of their own,
-    by which data loaders cannot start."""
+    """Let this process start others as a fresh one does. joblib's workers have a start method of
+    their own, by which data loaders cannot start."""
     known = multiprocessing.get_all_start_methods()  # the platform's default comes first
     if multiprocessing.get_start_method() not in known:
         multiprocessing.set_start_method(known[0], force=True)

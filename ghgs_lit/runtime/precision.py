@@ -16,7 +16,8 @@ PRECISIONS = ("inherit", "float32", "tf32", "bfloat16", "float16", "auto")
 
 
 def has_bfloat16(device: torch.device) -> bool:
-    """Whether the device has bfloat16 instructions; without them bfloat16 is slower than float32."""
+    """Whether the device has bfloat16 instructions;
+    without them bfloat16 is slower than float32."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     capabilities = torch.cpu.get_capabilities() if device.type == "cpu" else {}
@@ -43,14 +44,15 @@ def precision_of(name: str, device: torch.device) -> AbstractContextManager:
     """The context of a forward pass in a precision.
 
     Args:
-        name: one of :data:`PRECISIONS`. ``inherit``: the caller's, but where convolutions round to TF32,
-            as PyTorch has it on CUDA, products do, too, which is said once; ``float32``: :func:`exact`;
-            ``tf32``: all products and convolutions; ``auto``: bfloat16 if the device has it, else float16
-            on CUDA and float32 on a CPU.
+        name: one of :data:`PRECISIONS`. ``inherit``: the caller's, but where convolutions round to
+            TF32, as PyTorch has it on CUDA, products do, too, which is said once; ``float32``:
+            :func:`exact`; ``tf32``: all products and convolutions; ``auto``: bfloat16 if the device
+            has it, else float16 on CUDA and float32 on a CPU.
         device: where the pass is.
 
     Raises:
-        InputError: an unknown precision, TF32 or float16 on a CPU, or bfloat16 on a device without it.
+        InputError: an unknown precision, TF32 or float16 on a CPU,
+            or bfloat16 on a device without it.
     """
     choice("precision", name, PRECISIONS)
     if name == "inherit":
@@ -86,8 +88,8 @@ def half_precision(name: str, device: torch.device) -> torch.dtype | None:
 def exact(device: str) -> AbstractContextManager[None]:
     """Full float32: no autocast, and no products or convolutions with rounded factors.
 
-    Factors are rounded to TF32 or bfloat16 where ``torch.set_float32_matmul_precision`` allows it, and in
-    convolutions on CUDA by PyTorch's default (TF32 has 11 bits: 1 mm at 2 m).
+    Factors are rounded to TF32 or bfloat16 where ``torch.set_float32_matmul_precision`` allows it,
+    and in convolutions on CUDA by PyTorch's default (TF32 has 11 bits: 1 mm at 2 m).
 
     Args:
         device: its type, ``cpu`` or ``cuda``.
@@ -97,8 +99,8 @@ def exact(device: str) -> AbstractContextManager[None]:
 
 @contextmanager
 def _inherited() -> Iterator[None]:
-    """The caller's precision on CUDA. PyTorch's default rounds factors of convolutions to TF32, but not those
-    of products: slower, and no more accurate as a whole."""
+    """The caller's precision on CUDA. PyTorch's default rounds factors of convolutions to TF32, but
+    not those of products: slower, and no more accurate as a whole."""
     before = _Rounding.now("cuda")
     if not before.is_default:
         yield
@@ -156,12 +158,14 @@ def round_products(rounding: bool, device: str = "cuda", also_older: bool = True
 
 
 def rounds_products(device: str) -> bool:
-    """Whether products or convolutions of float32 numbers round their factors now on a type of device."""
+    """Whether products or convolutions of float32 numbers round their factors now on a
+    type of device."""
     return _Rounding.now(device).is_any
 
 
 def rounding_state(device: str) -> Hashable:
-    """The state of all switches that decide which products and convolutions round on a type of device."""
+    """The state of all switches that decide which products and convolutions round on a
+    type of device."""
     now = _Rounding.now(device)
     return tuple(now.of_modules), now.of_older
 
@@ -172,8 +176,8 @@ class _Rounding:
 
     Attributes:
         of_modules: ``fp32_precision`` of :func:`_modules`.
-        of_older: for products, and for convolutions on CUDA; None where PyTorch refuses to read them,
-            since newer ones were set to what these cannot express.
+        of_older: for products, and for convolutions on CUDA; None where PyTorch refuses to read
+            them, since newer ones were set to what these cannot express.
     """
 
     of_modules: list[str]
@@ -197,7 +201,8 @@ class _Rounding:
 
     @property
     def is_default(self) -> bool:
-        """Whether convolutions on CUDA round and products do not, as PyTorch has it and nobody chooses it."""
+        """Whether convolutions on CUDA round and products do not,
+        as PyTorch has it and nobody chooses it."""
         if self.of_older != ("highest", True):
             return False
         return not self.of_modules or (
@@ -214,7 +219,8 @@ class _Rounding:
 
 @cache
 def _modules(device: str) -> list[Any]:
-    """What decides whether products and convolutions round on a type of device, in PyTorch 2.9 and later."""
+    """What decides whether products and convolutions round on a type of device,
+    in PyTorch 2.9 and later."""
     matmul = torch.backends.cuda.matmul
     cudnn = torch.backends.cudnn
     mkldnn = torch.backends.mkldnn
@@ -227,10 +233,11 @@ def _modules(device: str) -> list[Any]:
 
 
 def keep_rounded(module: nn.Module, dtype: torch.dtype) -> None:
-    """Store weights of linear layers and convolutions in the half precision that autocast rounds them to.
+    """Store weights of linear layers and convolutions in the half precision that autocast
+    rounds them to.
 
-    Autocast does so at every call; these are the same numbers in half the memory, without a kernel for
-    each weight. From then on the module runs under autocast to ``dtype`` alone.
+    Autocast does so at every call; these are the same numbers in half the memory, without a kernel
+    for each weight. From then on the module runs under autocast to ``dtype`` alone.
 
     Args:
         module: changed in place.
@@ -242,6 +249,7 @@ def keep_rounded(module: nn.Module, dtype: torch.dtype) -> None:
 
 
 def without_float16(device: str) -> AbstractContextManager:
-    """Turn off float16 autocast on a type of device: maps and gradients of dense heads overflow in it."""
+    """Turn off float16 autocast on a type of device:
+    maps and gradients of dense heads overflow in it."""
     low = torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device) == torch.float16
     return torch.autocast(device, enabled=False) if low else nullcontext()

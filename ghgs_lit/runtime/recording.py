@@ -1,9 +1,11 @@
-"""Work of a GPU that is recorded once for each class of inputs and then played back as one CUDA graph.
+"""Work of a GPU that is recorded once for each class of inputs and then played back as
+one CUDA graph.
 
-A host that starts thousands of small kernels is slower than the GPU that runs them. A recording starts all of
-them at once. It repeats the very same work: the same sizes, the same addresses, the same numbers of the host.
-So a call is recorded together with all that may differ between calls (:func:`described`), its inputs are
-copied to the places that were recorded, and functions that read a value of the device are refused."""
+A host that starts thousands of small kernels is slower than the GPU that runs them. A recording
+starts all of them at once. It repeats the very same work: the same sizes, the same addresses, the
+same numbers of the host. So a call is recorded together with all that may differ between calls
+(:func:`described`), its inputs are copied to the places that were recorded, and functions that read
+a value of the device are refused."""
 
 import threading
 import traceback
@@ -25,7 +27,8 @@ _PACKAGE = Path(__file__).parents[1]
 
 
 class NotRecordable(RuntimeError):
-    """A function whose work cannot be recorded; the message says why, and which line is to blame."""
+    """A function whose work cannot be recorded;
+    the message says why, and which line is to blame."""
 
 
 class Tape(Protocol):
@@ -38,14 +41,16 @@ class Tape(Protocol):
 
 
 class CudaTape:
-    """CUDA graphs. One pool of memory for all, since none is played while another's results are needed."""
+    """CUDA graphs. One pool of memory for all,
+    since none is played while another's results are needed."""
 
     def __init__(self, device: str = "cuda") -> None:
         self.device = device
         self._pool: Any = None
 
     def record(self, call: Callable[[], Result]) -> tuple[Result, Callable[[], None]]:
-        """See :class:`Tape`. The call is made once before on the stream that records, for workspaces.
+        """See :class:`Tape`. The call is made once before on the stream that records,
+        for workspaces.
 
         Args:
             call: starts work of the GPU alone.
@@ -57,7 +62,8 @@ class CudaTape:
         torch.cuda.current_stream().wait_stream(stream)
         self._pool = self._pool or torch.cuda.graph_pool_handle()
         graph = torch.cuda.CUDAGraph()
-        # Other threads may work meanwhile: that which pins memory of the next batch, that of the gradients.
+        # Other threads may work meanwhile: that which pins memory of the next batch,
+        # that of the gradients.
         with torch.cuda.graph(graph, pool=self._pool, stream=stream, capture_error_mode="thread_local"):
             result = call()
         return result, graph.replay
@@ -71,7 +77,8 @@ class _Recording:
         inputs: where the tensors of inputs are copied to.
         result: where the result comes about.
         play: does the work again.
-        kept: memory that is read and that was there before, such as tables in caches, which may forget them.
+        kept: memory that is read and that was there before, such as tables in caches,
+            which may forget them.
     """
 
     inputs: list[Tensor]
@@ -84,12 +91,14 @@ class Recorder:
     """Calls functions of tensors, and plays them back from the second call of a class on.
 
     Args:
-        limit: largest number of recordings, at least 1; the one that was not used for longest makes room.
-        eager: calls of a class before it is recorded: what comes once is not worth it, and caches are
-            filled.
+        limit: largest number of recordings, at least 1;
+            the one that was not used for longest makes room.
+        eager: calls of a class before it is recorded: what comes once is not worth it, and
+            caches are filled.
         tape: makes recordings; None: CUDA graphs.
-        recent: number of classes that eager calls are remembered of; None: 64 for each recording. A class
-            that comes again only after more than there are recordings would be recorded in vain.
+        recent: number of classes that eager calls are remembered of; None: 64 for each
+            recording. A class that comes again only after more than there are recordings would
+            be recorded in vain.
 
     Attributes:
         counts: calls that were ``played``, ``recorded`` (and played), ``eager``, ``refused``.
@@ -129,9 +138,9 @@ class Recorder:
         """``function(inputs)``, without a gradient.
 
         Args:
-            function: depends on ``inputs``, ``key`` and on tensors that stay where they are, and writes
-                none of its inputs. The first call of a class is eager, and so are all where recording
-                fails, which is said once.
+            function: depends on ``inputs``, ``key`` and on tensors that stay where they are, and
+                writes none of its inputs. The first call of a class is eager, and so are all where
+                recording fails, which is said once.
             inputs: dataclasses, tuples, lists and dicts of tensors on one device, and of anything
                 hashable.
             key: all else that may change what ``function`` does.
@@ -308,7 +317,8 @@ def _copy_all(places: Sequence[Tensor], sources: Sequence[Tensor]) -> None:
     """
     groups: dict[tuple, tuple[list[Tensor], list[Tensor]]] = {}
     for place, source in zip(places, sources, strict=True):
-        # One pair of another type, or that lies in memory otherwise, makes PyTorch copy all one by one.
+        # One pair of another type, or that lies in memory otherwise,
+        # makes PyTorch copy all one by one.
         kind = (source.dtype, place.stride() == source.stride())
         group = groups.setdefault(kind, ([], []))
         group[0].append(place)
@@ -320,8 +330,8 @@ def _copy_all(places: Sequence[Tensor], sources: Sequence[Tensor]) -> None:
 class _Guard(TorchDispatchMode):
     """Refuses what a recording cannot repeat, before it is done.
 
-    That is: reading a value of the device, and copying from the host, whose memory will hold something
-    else.
+    That is: reading a value of the device, and copying from the host, whose memory will hold
+    something else.
 
     Attributes:
         kept: memory that was not made inside, by its address.

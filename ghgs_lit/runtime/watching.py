@@ -1,5 +1,6 @@
-"""Watchers of the stages of a model: when each begins and ends, its inputs and its result. The model has no
-code for this: stages that are modules get hooks, others are wrapped while they are watched."""
+"""Watchers of the stages of a model: when each begins and ends, its inputs and its result. The
+model has no code for this: stages that are modules get hooks, others are wrapped while they
+are watched."""
 
 import time
 from collections import defaultdict
@@ -54,8 +55,8 @@ def watched(model: nn.Module, stages: Mapping[str, str], watcher: Watcher) -> It
 
     Args:
         model: whose stages are watched.
-        stages: from names for the watcher to dotted paths in ``model``; a stage that is None or missing
-            is left out.
+        stages: from names for the watcher to dotted paths in ``model``; a stage that is None or
+            missing is left out.
         watcher: is called.
     """
     with ExitStack() as stack:

@@ -11,8 +11,8 @@ from ghgs_lit.config.options import Options
 
 
 class AveragingOptions(Options):
-    """An exponential average of all weights (EMA), those of a loss included: validations measure it,
-    checkpoints hold it beside the weights that are trained, and it is the result of the run."""
+    """An exponential average of all weights (EMA), those of a loss included: validations measure
+    it, checkpoints hold it beside the weights that are trained, and it is the result of the run."""
 
     group = "callbacks.ema"
     decay: Annotated[float, Field(gt=0, lt=1)] = 0.999

@@ -1,4 +1,5 @@
-"""Base of the LightningModules of this package: a schedule over the run's budget, plain checkpoints."""
+"""Base of the LightningModules of this package: a schedule over the run's budget,
+plain checkpoints."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -26,14 +27,16 @@ class BudgetedModule(L.LightningModule):
     """A module whose learning rate follows the used share of the run's budget.
 
     Args:
-        model: trained. All other parts with weights, such as a loss, are trained, clipped, frozen and saved
-            with it; checkpoints hold the model's tensors under ``model.``, others under the part's name.
+        model: trained. All other parts with weights, such as a loss, are trained, clipped, frozen
+            and saved with it; checkpoints hold the model's tensors under ``model.``, others under
+            the part's name.
         optimization: options of the optimizer and its schedule.
-        config: the run's full configuration as plain data, of which ``seed`` is read; checkpoints contain it
-            together with the model's own. None: only that of the model.
+        config: the run's full configuration as plain data, of which ``seed`` is read; checkpoints
+            contain it together with the model's own. None: only that of the model.
 
     Attributes:
-        ready: time mark of the end of the last step and all that followed, from where a step waits for data.
+        ready: time mark of the end of the last step and all that followed,
+            from where a step waits for data.
         used_budget: used share of the run's budget in [0, 1], as of the last step."""
 
     def __init__(self, model: nn.Module, optimization: Optimization, config: Mapping[str, Any] | None):
@@ -78,8 +81,8 @@ class BudgetedModule(L.LightningModule):
         self.trainer.fit_loop.epoch_loop._batches_that_stepped = self.global_step
 
     def step_seed(self, batch_idx: int) -> int:
-        """Seed of the random numbers of this step: the same after an interruption, and in all processes, so
-        that none waits for one that has drawn more rounds.
+        """Seed of the random numbers of this step: the same after an interruption, and in all
+        processes, so that none waits for one that has drawn more rounds.
 
         Args:
             batch_idx: of Lightning, which tells the parts of an accumulated step apart.
@@ -89,14 +92,14 @@ class BudgetedModule(L.LightningModule):
         return int(np.random.SeedSequence(self.step_numbers(batch_idx)).generate_state(1)[0])
 
     def step_numbers(self, batch_idx: int) -> list[int]:
-        """Seed of the run, step, and part of an accumulated step, of which all that is drawn in a step is a
-        function."""
+        """Seed of the run, step, and part of an accumulated step, of which all that is drawn in a
+        step is a function."""
         part = batch_idx % self.trainer.accumulate_grad_batches
         return [self.config.get("seed", 0), self.global_step, part]
 
     def class_numbers(self, batch_idx: int) -> list[int] | None:
-        """The same for what consecutive batches share, as ``data.class_steps`` says; None: they share
-        nothing."""
+        """The same for what consecutive batches share, as ``data.class_steps`` says; None: they
+        share nothing."""
         steps = (self.config.get("data") or {}).get("class_steps", 1)
         seed, step, part = self.step_numbers(batch_idx)
         return None if steps == 1 else [seed, (step * self.trainer.accumulate_grad_batches + part) // steps]
@@ -176,7 +179,8 @@ class BudgetedModule(L.LightningModule):
         """Add plain data only, so that the file loads with ``torch.load(weights_only=True)``.
 
         Args:
-            checkpoint: of Lightning; gets the configuration and the names of weights that are not trained."""
+            checkpoint: of Lightning; gets the configuration and the names of weights that are
+                not trained."""
         checkpoint["format_version"] = FORMAT_VERSION
         checkpoint["config"] = self.config
         checkpoint["frozen"] = [name for name, p in self.named_parameters() if not p.requires_grad]

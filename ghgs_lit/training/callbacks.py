@@ -24,8 +24,8 @@ class ProgressOptions(Options):
 
 
 class RunProgress(Callback):
-    """Shows how far the run is: a bar on a terminal, elsewhere a line every minute. ``<run>/train.log`` gets
-    the lines in both cases."""
+    """Shows how far the run is: a bar on a terminal, elsewhere a line every minute.
+    ``<run>/train.log`` gets the lines in both cases."""
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Open the log and the bar."""
@@ -78,8 +78,9 @@ def _numbers(trainer: L.Trainer) -> list[str]:
 
 
 class NeighborsAtStart(Callback):
-    """Says in the first step how many tokens take part in the recalibration, how many neighbours they have,
-    and how many of these would be the same in the other setting of ``recalibration.neighborhood``."""
+    """Says in the first step how many tokens take part in the recalibration, how many neighbours
+    they have, and how many of these would be the same in the other setting of
+    ``recalibration.neighborhood``."""
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Watch the recalibration."""

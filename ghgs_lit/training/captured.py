@@ -1,10 +1,10 @@
 """Training steps whose work is recorded on a GPU for each class of batches, and played back.
 
-A step of a small model asks a GPU for thousands of launches, and the host takes longer to ask than the GPU
-to do. What follows a plan depends on sizes alone, in training as in predictions
-(:mod:`ghgs_lit.playback`). So the stages, the rendering, the loss and the gradients of all weights are one
-CUDA graph here. What surrounds it is called as always: the plan before it; hooks of weights, clipping and
-the optimizer after it, which find a loss with a gradient as usual."""
+A step of a small model asks a GPU for thousands of launches, and the host takes longer to ask than
+the GPU to do. What follows a plan depends on sizes alone, in training as in predictions
+(:mod:`ghgs_lit.playback`). So the stages, the rendering, the loss and the gradients of all weights
+are one CUDA graph here. What surrounds it is called as always: the plan before it; hooks of
+weights, clipping and the optimizer after it, which find a loss with a gradient as usual."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -56,7 +56,8 @@ class _Known(torch.autograd.Function):
 
 
 class _Pass(nn.Module):
-    """Stages, rendering and loss, of a batch that is prepared; its weights can be replaced by others.
+    """Stages, rendering and loss, of a batch that is prepared;
+    its weights can be replaced by others.
 
     Args:
         model: of the training.
@@ -113,8 +114,8 @@ def is_recordable(model: nn.Module, renderer: Callable, losses: Callable, batch:
         batch: of a step.
 
     Returns:
-        True on a device that records, with ``model.capture=auto``, where the gradient needs no scaling and
-        no tokens are read from disk.
+        True on a device that records, with ``model.capture=auto``, where the gradient needs no
+        scaling and no tokens are read from disk.
     """
     device = batch.masks.device.type
     if not may_be_recorded(model, renderer, losses, device) or is_watched():
@@ -136,7 +137,8 @@ def played(model: GHGS, renderer: Renderer, losses: Losses, batch: Batch) -> Out
         batch: on the device of the training, with targets; :func:`is_recordable`.
 
     Returns:
-        The loss; None where this batch must be called: its subjects are tall, or its sizes are no class.
+        The loss; None where this batch must be called: its subjects are tall,
+        or its sizes are no class.
     """
     with nullcontext() if model.rounds is None else model.rounds.drawn():
         around, inside, plan = _prepared(model, batch)
@@ -151,8 +153,8 @@ def played(model: GHGS, renderer: Renderer, losses: Losses, batch: Batch) -> Out
 def _prepared(model: GHGS, batch: Batch) -> tuple[Sequence[Surrounding], Batch, Plan]:
     """What precedes the stages, with a plan of sizes that rarely change.
 
-    Subjects of other batches are of other sizes, and each class would have to be recorded. So sizes are kept
-    as long as they are enough for the subjects of a batch.
+    Subjects of other batches are of other sizes, and each class would have to be recorded. So sizes
+    are kept as long as they are enough for the subjects of a batch.
 
     Args:
         model: of the training.
@@ -193,7 +195,8 @@ def _recorded(
 
     def differentiated(inputs: tuple) -> tuple[Tensor, dict[str, Tensor], tuple, Rooms]:
         around, scene, seen = inputs
-        # Gradients of the weights themselves would be summed on the stream that first asked for them.
+        # Gradients of the weights themselves would be summed on the stream that first
+        # asked for them.
         twins = {name: weight.detach().requires_grad_() for name, weight in weights.items()}
         with torch.enable_grad(), deferred() as rooms:
             total, values = functional_call(one_pass, twins, (around, *scene.read(), seen))

@@ -23,10 +23,10 @@ from ghgs_lit.weights.reading import open_file
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes checkpoints by :func:`ghgs_lit.files.write_atomically`. Lightning's own class writes to the
-    system's temporary folder and *moves* the file: between file systems that copies over the previous
-    checkpoint, and a run killed meanwhile has lost both. Weights that are not trained are written once, to
-    another file (:mod:`ghgs_lit.weights.frozen`)."""
+    """Writes checkpoints by :func:`ghgs_lit.files.write_atomically`. Lightning's own class writes
+    to the system's temporary folder and *moves* the file: between file systems that copies over the
+    previous checkpoint, and a run killed meanwhile has lost both. Weights that are not trained are
+    written once, to another file (:mod:`ghgs_lit.weights.frozen`)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -85,12 +85,14 @@ FileName = Annotated[
 
 
 class CheckpointOptions(Options):
-    """A checkpoint in ``<run>/checkpoints`` at intervals of steps or minutes, or of the best validation. List
-    callbacks with a monitor before those without, so that the best checkpoint is chosen first."""
+    """A checkpoint in ``<run>/checkpoints`` at intervals of steps or minutes, or of the best
+    validation. List callbacks with a monitor before those without, so that the best checkpoint is
+    chosen first."""
 
     group = "callbacks.checkpoints"
     filename: FileName
-    """Name of the file, without .ckpt; with {step} in it all are kept, unless there is a monitor."""
+    """Name of the file, without .ckpt; with {step} in it all are kept,
+    unless there is a monitor."""
     monitor: Text | None = None
     """Logged value that is compared at each validation, the higher the better; null: none."""
     every_n_train_steps: Index | None = None
@@ -104,7 +106,8 @@ class CheckpointOptions(Options):
 
 
 class Checkpoints(ModelCheckpoint):
-    """Lightning's ModelCheckpoint in ``<run>/checkpoints``; a file replaces the previous one of its name.
+    """Lightning's ModelCheckpoint in ``<run>/checkpoints``;
+    a file replaces the previous one of its name.
 
     Args:
         options: names and intervals."""
@@ -151,7 +154,8 @@ class Checkpoints(ModelCheckpoint):
             super().on_train_batch_end(trainer, pl_module, None, None, 0)
 
     def state_dict(self) -> dict[str, Any]:
-        """Lightning's state with names of files in place of their paths, so that the folder can be moved."""
+        """Lightning's state with names of files in place of their paths,
+        so that the folder can be moved."""
         return _with_paths(super().state_dict(), lambda path: Path(path).name) | {"dirpath": ""}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -170,15 +174,16 @@ def _with_paths(state: dict[str, Any], change: Callable[[str], str]) -> dict[str
     return {**state, **paths, "best_k_models": scores}
 
 
-#: Seconds within which a second signal counts as the same one: a terminal sends it to all processes, which
-#: forward it.
+#: Seconds within which a second signal counts as the same one: a terminal sends it to all
+#: processes, which forward it.
 _SAME = 1.0
 
 
 class StopAtStep(Checkpoint):
-    """On Ctrl-C or a signal of a batch system: finishes the step and its validation, writes ``last.ckpt`` and
-    stops. The same signal again, or Ctrl-C, stops at once. Several processes stop after the same step. As the
-    last ``Checkpoint``, Lightning calls it after all other callbacks, whose state is saved.
+    """On Ctrl-C or a signal of a batch system: finishes the step and its validation, writes
+    ``last.ckpt`` and stops. The same signal again, or Ctrl-C, stops at once. Several processes stop
+    after the same step. As the last ``Checkpoint``, Lightning calls it after all other callbacks,
+    whose state is saved.
 
     Attributes:
         received: number of the signal; 0: none."""
@@ -197,13 +202,15 @@ class StopAtStep(Checkpoint):
         check_restored(trainer, checkpoint)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Replace Lightning's signal handlers, which save no checkpoint; it restores all at the end."""
+        """Replace Lightning's signal handlers, which save no checkpoint;
+        it restores all at the end."""
         self._step = trainer.global_step
         handle(self._note, self._before)
 
     def _note(self, number: int) -> None:
         """Handle a signal."""
-        # SIGTERM after SIGUSR1 comes from a batch system that waits, not from somebody who does not.
+        # SIGTERM after SIGUSR1 comes from a batch system that waits,
+        # not from somebody who does not.
         insists = number in (self.received, signal.SIGINT)
         if self.received and insists and time.monotonic() - self._since > _SAME:
             raise Interrupted(number)

@@ -19,7 +19,8 @@ PARTS = ("data", *STAGES, "rounds", "render", "loss", "backward", "optimizer")
 
 
 class CostsOptions(Options):
-    """``time_ms/*``: milliseconds of each part of a step; ``memory_mb/*``: of the process and of the GPU."""
+    """``time_ms/*``: milliseconds of each part of a step;
+    ``memory_mb/*``: of the process and of the GPU."""
 
     def build(self) -> "Costs":
         """The callback."""
@@ -27,10 +28,11 @@ class CostsOptions(Options):
 
 
 class Costs(Callback, Watcher):
-    """Logs milliseconds of a step and of its parts, means since the last log, and memory in MiB, on CUDA the
-    peak of all tensors since the last log. ``time_ms/01_data`` is the wait for data. Validation, other
-    callbacks and writing of checkpoints and logs do not count. Steps that are played back as one CUDA graph
-    (:mod:`ghgs_lit.training.captured`) have no stages: ``time_ms/forward`` is loss and gradients."""
+    """Logs milliseconds of a step and of its parts, means since the last log, and memory in MiB, on
+    CUDA the peak of all tensors since the last log. ``time_ms/01_data`` is the wait for data.
+    Validation, other callbacks and writing of checkpoints and logs do not count. Steps that are
+    played back as one CUDA graph (:mod:`ghgs_lit.training.captured`) have no stages:
+    ``time_ms/forward`` is loss and gradients."""
 
     def __init__(self):
         self._stack = ExitStack()
@@ -114,9 +116,10 @@ class Costs(Callback, Watcher):
 
 
 class TrainingCost(Callback):
-    """Seconds and peak memory of the training of the weights. Checkpoints contain both, so that a resumed run
-    continues to count; work after the last checkpoint of a killed process is repeated and counts once.
-    Validation and writing of checkpoints count. List it before callbacks that reset the GPU's peak."""
+    """Seconds and peak memory of the training of the weights. Checkpoints contain both, so that a
+    resumed run continues to count; work after the last checkpoint of a killed process is repeated
+    and counts once. Validation and writing of checkpoints count. List it before callbacks that
+    reset the GPU's peak."""
 
     def __init__(self) -> None:
         self._earlier = 0.0  # seconds of earlier sessions
@@ -149,7 +152,8 @@ class TrainingCost(Callback):
 
     @property
     def peak_bytes(self) -> int:
-        """Peak memory of the first process over all sessions: of tensors on a GPU, else of the process."""
+        """Peak memory of the first process over all sessions: of tensors on a GPU,
+        else of the process."""
         if self._started is None:
             return self._peak
         on_gpu = self._device.type == "cuda"

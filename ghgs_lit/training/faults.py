@@ -1,4 +1,5 @@
-"""The first value of a training step that is not finite: where it is, and which subject causes it."""
+"""The first value of a training step that is not finite: where it is,
+and which subject causes it."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping
@@ -27,8 +28,8 @@ class Step:
     Args:
         batch: of this process.
         seed: of all random numbers that the step draws.
-        budget: which patches the encoder sees (:func:`~ghgs_lit.training.module.drawn_budget`); None: as
-            configured.
+        budget: which patches the encoder sees (:func:`~ghgs_lit.training.module.drawn_budget`);
+            None: as configured.
         autocast: type of products in mixed precision; None: float32.
         scale: factor of the loss (``16-mixed``).
         rounds: number of rounds; None: drawn by the seed."""
@@ -64,7 +65,8 @@ class Fault:
 
 
 class _Faults(list[Fault], Watcher):
-    """Faults in results of stages and in gradients of their inputs, in the order in which they occur."""
+    """Faults in results of stages and in gradients of their inputs,
+    in the order in which they occur."""
 
     def begin(self, stage: str, inputs: Inputs = ((), {})) -> Inputs:
         """Views of the inputs, whose gradients come from this stage alone."""
@@ -118,10 +120,11 @@ def _tensors(value: Any, name: str) -> Iterator[tuple[str, Tensor]]:
 
 
 def first_fault(module: L.LightningModule, step: Step) -> Fault | None:
-    """Run a step again, and find its first fault in weights, batch, results of modules, and gradients.
+    """Run a step again, and find its first fault in weights, batch, results of modules,
+    and gradients.
 
-    A faulty batch is run again subject by subject, to find the first one that is faulty alone. Weights and
-    their gradients are not changed.
+    A faulty batch is run again subject by subject, to find the first one that is faulty alone.
+    Weights and their gradients are not changed.
 
     Args:
         module: with ``model``, ``renderer``, ``losses`` and ``forward_losses``, as
@@ -171,7 +174,8 @@ def _search(module: L.LightningModule, step: Step) -> Fault | None:
 
 
 def _watch(module: L.LightningModule, faults: _Faults, stack: ExitStack) -> None:
-    """Let ``faults`` check results of all modules and gradients of all parameters until ``stack`` closes."""
+    """Let ``faults`` check results of all modules and gradients of all parameters until
+    ``stack`` closes."""
     model = module.model
     for name, part in model.named_modules():
         hook = part.register_forward_hook(

@@ -1,4 +1,5 @@
-"""Which photographs' frozen tokens a training keeps on disk (:mod:`ghgs_lit.encoder.feature_cache`)."""
+"""Which photographs' frozen tokens a training keeps on disk
+(:mod:`ghgs_lit.encoder.feature_cache`)."""
 
 import logging
 import math
@@ -36,7 +37,8 @@ class NoFeatureCache(Options):
 
 
 class DiskFeatureCache(Options):
-    """Tokens of a frozen DINOv2 ViT are computed once for each photograph of training, and kept on disk."""
+    """Tokens of a frozen DINOv2 ViT are computed once for each photograph of training,
+    and kept on disk."""
 
     group = "feature_cache"
 
@@ -104,7 +106,8 @@ def _frozen_vit(model: nn.Module) -> VisionTransformer:
 
 
 def _amount(vit: VisionTransformer, data: PhotographsDataModule) -> tuple[int, int]:
-    """Number of photographs of training, and bytes of their tokens; the last patches may be padded."""
+    """Number of photographs of training, and bytes of their tokens;
+    the last patches may be padded."""
     count = sum(map(len, data.subjects("train").values()))
     patches = math.prod(-(-side // vit.patch_size) for side in data.dataset.size)
     return count, count * patches * 2 * vit.pos_embed.shape[-1]

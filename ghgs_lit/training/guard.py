@@ -18,9 +18,9 @@ class DivergedError(InputError):
 
 
 class Guard:
-    """Checks each step of the optimizer, and runs the step again only if it is not finite. All processes
-    decide alike. A fault is saved to ``<run>/faults/step_<n>.pt`` (once for each stage), which
-    :mod:`ghgs_lit.training.replay` can run again.
+    """Checks each step of the optimizer, and runs the step again only if it is not finite. All
+    processes decide alike. A fault is saved to ``<run>/faults/step_<n>.pt`` (once for each stage),
+    which :mod:`ghgs_lit.training.replay` can run again.
 
     Args:
         limit: steps in a row that are skipped before the run stops.
@@ -51,7 +51,8 @@ class Guard:
             norm: of the gradient, without dimensions.
 
         Returns:
-            Whether all losses since the last step, and whether the norm, are finite in all processes."""
+            Whether all losses since the last step, and whether the norm,
+            are finite in all processes."""
         losses = torch.stack([loss for _, loss in self._steps]) if self._steps else norm.new_zeros(1)
         flags = torch.stack([losses.isfinite().all(), norm.isfinite()]).float()
         if trainer.world_size > 1:
@@ -65,7 +66,8 @@ class Guard:
         self._in_a_row = 0
 
     def refuse(self, module: L.LightningModule, scale: float) -> None:
-        """Explain and save the fault, and drop the gradients, so that the optimizer changes nothing.
+        """Explain and save the fault, and drop the gradients,
+        so that the optimizer changes nothing.
 
         Args:
             module: that of :func:`~ghgs_lit.training.faults.first_fault`.
@@ -92,7 +94,8 @@ class Guard:
             print(f"{said}; the step is skipped", flush=True)
 
     def _explain(self, module: L.LightningModule, scale: float) -> str:
-        """The first fault of this process, "" if none, and, for the first fault of a stage, its file."""
+        """The first fault of this process, "" if none, and, for the first fault of a stage,
+        its file."""
         for step, _ in self._steps:
             step = dataclasses.replace(step, scale=scale)
             if (fault := first_fault(module, step)) is None:

@@ -84,8 +84,9 @@ class TensorBoardLog(_StepsTaken, TensorBoardLogger):
         self.experiment.flush()
 
     def log_results(self, values: Mapping[str, Value], summary: Sequence[Mapping[str, Any]]) -> None:
-        """Describe the run for the tab HParams, which shows its last validation beside its settings, and
-        write the measurement to the tab Text: as scalars, its numbers would be charts of one point.
+        """Describe the run for the tab HParams, which shows its last validation beside its
+        settings, and write the measurement to the tab Text: as scalars, its numbers would be
+        charts of one point.
 
         Args:
             values: of :func:`hyperparameters`.
@@ -127,8 +128,8 @@ class CsvOptions(Options):
 
 
 class TensorBoardOptions(Options):
-    """TensorBoard's files in ``<run>/tensorboard``; of a run of a grid in ``<sweep>/tensorboard/<what sets it
-    apart>``, since TensorBoard names runs by their folders."""
+    """TensorBoard's files in ``<run>/tensorboard``; of a run of a grid in
+    ``<sweep>/tensorboard/<what sets it apart>``, since TensorBoard names runs by their folders."""
 
     def build(self, save_dir: str) -> TensorBoardLog:
         """The logger of the run in ``save_dir``."""
@@ -136,7 +137,8 @@ class TensorBoardOptions(Options):
 
 
 class WandbLog(WandbLogger):
-    """Weights & Biases: one run there for each run here, however often it is interrupted or moved."""
+    """Weights & Biases: one run there for each run here,
+    however often it is interrupted or moved."""
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
@@ -150,7 +152,8 @@ class WandbLog(WandbLogger):
 
 
 class WandbOptions(Options):
-    """Weights & Biases (extra ``wandb``); ``WANDB_PROJECT`` and ``WANDB_MODE`` of the environment count."""
+    """Weights & Biases (extra ``wandb``); ``WANDB_PROJECT`` and ``WANDB_MODE`` of the
+    environment count."""
 
     def build(self, save_dir: str) -> WandbLog:
         """The logger of the run in ``save_dir``; InputError: the extra is not installed."""
@@ -214,7 +217,8 @@ def final_numbers(summary: Sequence[Mapping[str, Any]]) -> dict[str, float]:
         summary: of ``metrics.json``, a row for each protocol.
 
     Returns:
-        ``hparam/psnr`` of the first protocol, ``hparam_v4_midway/psnr`` of others; only defined values."""
+        ``hparam/psnr`` of the first protocol, ``hparam_v4_midway/psnr`` of others;
+        only defined values."""
     numbers = {}
     for number, row in enumerate(summary):
         prefix = f"hparam_v{row['views']}_{row['targets']}" if number else "hparam"
@@ -227,8 +231,8 @@ def final_numbers(summary: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 def hyperparameters(
     config: Mapping[str, Any], choices: Mapping[str, str], overrides: Sequence[str]
 ) -> dict[str, Value]:
-    """Settings by which runs are compared: what ``overrides`` set, seed and views. Keys that do not affect
-    results are left out.
+    """Settings by which runs are compared: what ``overrides`` set, seed and views. Keys that do not
+    affect results are left out.
 
     Args:
         config: the run's.

@@ -35,9 +35,10 @@ def drawn_budget(budgets: Sequence[Choice], numbers: Sequence[int], stream: int 
     """Draw which patches the encoder sees in a training step.
 
     Args:
-        budgets: ``all``: all patches (``skip=none``, ``exact``); ``window``: those of the smallest rectangle
-            that holds the subject (``balanced``); a number: the subject's patches and those at most this many
-            patches away (``fast``). Budgets that are listed twice are drawn twice as often.
+        budgets: ``all``: all patches (``skip=none``, ``exact``); ``window``: those of the smallest
+            rectangle that holds the subject (``balanced``); a number: the subject's patches and
+            those at most this many patches away (``fast``). Budgets that are listed twice are drawn
+            twice as often.
         numbers: seed; equal numbers give the same budget.
         stream: another one draws something else with the same numbers.
 
@@ -93,15 +94,15 @@ class GHGSModule(BudgetedModule):
     Args:
         model: as of :class:`BudgetedModule`.
         renderer: draws Gaussians as seen from cameras.
-        losses: gives the weighted total, and each term by name, of a prediction, its rendering and the batch.
-            Weights of its own are trained with the model's.
+        losses: gives the weighted total, and each term by name, of a prediction, its rendering and
+            the batch. Weights of its own are trained with the model's.
         optimization: as of :class:`BudgetedModule`.
         config: as of :class:`BudgetedModule`.
         token_budgets: budgets for :func:`drawn_budget` in each training step; None: as configured.
 
     Attributes:
-        metrics: the protocol of validations, which measure :data:`VALIDATED`, on the device of the training;
-            at first without LPIPS."""
+        metrics: the protocol of validations, which measure :data:`VALIDATED`, on the device of the
+            training; at first without LPIPS."""
 
     def __init__(
         self,
@@ -130,8 +131,8 @@ class GHGSModule(BudgetedModule):
         Args:
             checkpoint_path: the file.
             map_location: device of the weights; None: the CPU.
-            **parts: ``renderer``, ``losses`` and ``optimization`` in place of those of the configuration. A
-                part with weights gets those of the checkpoint.
+            **parts: ``renderer``, ``losses`` and ``optimization`` in place of those of the
+                configuration. A part with weights gets those of the checkpoint.
 
         Returns:
             The module, in training mode.
@@ -157,7 +158,8 @@ class GHGSModule(BudgetedModule):
             batch: with targets.
 
         Returns:
-            The prediction for the batch, and its Gaussians rendered from the batch's target cameras."""
+            The prediction for the batch, and its Gaussians rendered from the batch's
+            target cameras."""
         prediction = self.model(batch)
         return prediction, self.renderer(prediction.gaussians, batch.targets.cameras)
 
@@ -270,8 +272,9 @@ class GHGSModule(BudgetedModule):
     def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
         """Clip the gradients of all weights to ``optimizer.clip`` and log their norm before.
 
-        Gradients are already unscaled. After an overflow, a scaler of the loss skips the step and halves its
-        factor; the guard handles losses that are not finite, and gradients that overflow without a factor.
+        Gradients are already unscaled. After an overflow, a scaler of the loss skips the step and
+        halves its factor; the guard handles losses that are not finite, and gradients that overflow
+        without a factor.
 
         Args:
             optimizer, gradient_clip_val, gradient_clip_algorithm: of Lightning; not used.

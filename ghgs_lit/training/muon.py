@@ -1,13 +1,14 @@
 """Muon: orthogonal steps for matrices, AdamW for everything else.
 
-Muon's steps for matrices are orthogonal (K. Jordan et al., 2024, github.com/KellerJordan/Muon): they change
-all directions of a matrix equally, not only the few that dominate the gradient. Step lengths are those of J.
-Liu et al., "Muon is Scalable for LLM Training", 2025.
+Muon's steps for matrices are orthogonal (K. Jordan et al., 2024, github.com/KellerJordan/Muon):
+they change all directions of a matrix equally, not only the few that dominate the gradient. Step
+lengths are those of J. Liu et al., "Muon is Scalable for LLM Training", 2025.
 
-``torch.optim.Muon`` takes the same steps, one matrix after the other, in bfloat16, and refuses weights of
-convolutions. Here these are matrices with a row for each output channel, products are float32, and matrices
-of similar size are multiplied together. Of the 134 matrices of the weights that come with the package,
-PyTorch's takes 61, for which it asks a GPU for 1 403 launches; this module asks for 133 for all weights."""
+``torch.optim.Muon`` takes the same steps, one matrix after the other, in bfloat16, and refuses
+weights of convolutions. Here these are matrices with a row for each output channel, products are
+float32, and matrices of similar size are multiplied together. Of the 134 matrices of the weights
+that come with the package, PyTorch's takes 61, for which it asks a GPU for 1 403 launches; this
+module asks for 133 for all weights."""
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
@@ -24,9 +25,11 @@ ITERATIONS = 5
 MOMENTUM = 0.95
 #: Approximate root mean square of AdamW's steps (Liu et al., section 2.2).
 ROOT_MEAN_SQUARE = 0.2
-#: Parameters with fewer rows or columns (tokens, biases, heads of one or two channels) are left to AdamW.
+#: Parameters with fewer rows or columns (tokens, biases, heads of one or two channels) are
+#: left to AdamW.
 SMALLEST_SIDE = 3
-#: Matrices whose smaller side has at most so many rows are padded to powers of two, and share products.
+#: Matrices whose smaller side has at most so many rows are padded to powers of two,
+#: and share products.
 PADDED_SIDE = 128
 #: Smallest side of padded matrices.
 LEAST_PADDED = 16
@@ -49,15 +52,16 @@ def is_matrix(parameter: nn.Parameter) -> bool:
 def orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
     """Replace singular values by values of about 1 (0.7 to 1.2).
 
-    Zeros around a matrix change none of its singular vectors, so that small matrices of many sizes are padded
-    and go through the iterations together. A result differs by rounding with the matrices beside it.
+    Zeros around a matrix change none of its singular vectors, so that small matrices of many sizes
+    are padded and go through the iterations together. A result differs by rounding with the
+    matrices beside it.
 
     Args:
         matrices: of any sizes, float32 or wider, all of one type on one device.
 
     Returns:
-        A matrix of the same size for each. Singular values below 1e-3 of a matrix's largest become less than
-        1; zeros stay 0."""
+        A matrix of the same size for each. Singular values below 1e-3 of a matrix's largest become
+        less than 1; zeros stay 0."""
     results = list(matrices)
     small = []
     by_shape: dict[torch.Size, list[int]] = {}
@@ -93,8 +97,8 @@ class _Packing(NamedTuple):
     """Where values of matrices lie in padded ones.
 
     Args:
-        places: for each size, [n, rows, columns] with the place of each value in all matrices one after the
-            other, and the place behind the last one for zeros.
+        places: for each size, [n, rows, columns] with the place of each value in all matrices one
+            after the other, and the place behind the last one for zeros.
         back: the place of each value in all padded matrices one after the other."""
 
     places: tuple[Tensor, ...]
@@ -165,9 +169,9 @@ class Muon(torch.optim.AdamW):
 
     Args:
         parameters: to be moved.
-        matrix_lr: learning rate of matrices, whose steps are as long as AdamW's with this rate. A number, or,
-            as AdamW's ``lr``, a tensor without dimensions on the parameters' device, so that a recorded step
-            follows the schedule.
+        matrix_lr: learning rate of matrices, whose steps are as long as AdamW's with this rate. A
+            number, or, as AdamW's ``lr``, a tensor without dimensions on the parameters' device, so
+            that a recorded step follows the schedule.
         records: whether a GPU's products are recorded as a CUDA graph.
         **options: of AdamW; weight decay is for both."""
 
@@ -225,7 +229,8 @@ class Muon(torch.optim.AdamW):
         torch._foreach_mul_(steps, [-ROOT_MEAN_SQUARE * max(step.shape) ** 0.5 for step in steps])
         torch._foreach_mul_(steps, group["lr"])
         torch._foreach_mul_(moved, 1 - group["lr"] * group["weight_decay"])
-        # One that lies in memory otherwise than its weight would make PyTorch add one after the other.
+        # One that lies in memory otherwise than its weight would make PyTorch add one
+        # after the other.
         shaped = []
         for step, weight in zip(steps, moved, strict=True):
             shaped.append(step.view_as(weight).contiguous(memory_format=_layout(weight)))

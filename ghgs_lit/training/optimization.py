@@ -25,25 +25,27 @@ def named_weights(module: nn.Module) -> Iterator[tuple[str, nn.Parameter]]:
     """Parameters by the names that configurations and messages use.
 
     Args:
-        module: a model, or a LightningModule, of which parts beside the model (a loss, a renderer) can have
-            weights, too.
+        module: a model, or a LightningModule, of which parts beside the model (a loss, a renderer)
+            can have weights, too.
 
     Returns:
-        Names and parameters: those of the model by their names in it, such as ``gaussian_head.conv.weight``,
-        all others by their names in the LightningModule, such as ``losses.network.weight``."""
+        Names and parameters: those of the model by their names in it, such as
+        ``gaussian_head.conv.weight``, all others by their names in the LightningModule, such as
+        ``losses.network.weight``."""
     for name, parameter in module.named_parameters():
         yield name.removeprefix(STATE_PREFIX), parameter
 
 
 class Optimization(Options):
-    """AdamW or Muon, with a learning rate that rises linearly to ``lr`` and then falls linearly, over the
-    used share of the run's budget of steps or of time, whichever is larger."""
+    """AdamW or Muon, with a learning rate that rises linearly to ``lr`` and then falls linearly,
+    over the used share of the run's budget of steps or of time, whichever is larger."""
 
     group = "optimizer"
     lr: Positive = 1e-4
     """Highest learning rate."""
     matrix_scale: Positive | None = None
-    """Learning rate of matrices, which take Muon's orthogonal steps, in units of lr; null: AdamW for all."""
+    """Learning rate of matrices, which take Muon's orthogonal steps, in units of lr;
+    null: AdamW for all."""
     betas: tuple[BelowOne, BelowOne] = (0.9, 0.999)
     """AdamW's averages of the gradient and of its square."""
     weight_decay: Amount = 1e-5
@@ -57,18 +59,20 @@ class Optimization(Options):
     freeze_until: dict[str, Share] = Field({})
     """Beginning of parameter names: share of the run in which these parameters stay unchanged."""
     skip_nonfinite: Index = 0
-    """Steps in a row that are not finite and are skipped before the run stops; 0: it stops at the first."""
+    """Steps in a row that are not finite and are skipped before the run stops;
+    0: it stops at the first."""
 
     def optimizer(self, module: nn.Module, fused: bool = True, records: bool = True) -> torch.optim.AdamW:
         """The optimizer of all trained parameters.
 
-        On a GPU it counts steps there (``capturable``), so that its step can be recorded as a CUDA graph; the
-        learning rates become tensors by :func:`hold_rates`.
+        On a GPU it counts steps there (``capturable``), so that its step can be recorded as a CUDA
+        graph; the learning rates become tensors by :func:`hold_rates`.
 
         Args:
-            module: a model, or a LightningModule with all that has weights, on the device of the training.
-            fused: PyTorch's fastest AdamW. It undoes the scaling of a loss (``16-mixed``) inside its step,
-                too late for clipping gradients.
+            module: a model, or a LightningModule with all that has weights,
+                on the device of the training.
+            fused: PyTorch's fastest AdamW. It undoes the scaling of a loss (``16-mixed``) inside
+                its step, too late for clipping gradients.
             records: whether Muon's products are recorded as a CUDA graph on a GPU.
 
         Returns:
@@ -89,12 +93,13 @@ class Optimization(Options):
         return Muon(parameters, self.matrix_scale * self.lr, records, **options)
 
     def drop_frozen_gradients(self, module: nn.Module, progress: float) -> None:
-        """Remove gradients of frozen parameters, so that the optimizer leaves them unchanged, also by weight
-        decay.
+        """Remove gradients of frozen parameters, so that the optimizer leaves them unchanged, also
+        by weight decay.
 
         Args:
             module: that of :meth:`optimizer`.
-            progress: used share of the run's budget in [0, 1]; ``freeze_until`` says until which one."""
+            progress: used share of the run's budget in [0, 1];
+                ``freeze_until`` says until which one."""
         frozen = tuple(prefix for prefix, share in self.freeze_until.items() if progress < share)
         if not frozen:
             return
@@ -124,7 +129,8 @@ class Optimization(Options):
 
 
 def hold_rates(optimizer: torch.optim.Optimizer) -> None:
-    """Hold learning rates as tensors on a GPU: a recorded step reads what the schedule writes there.
+    """Hold learning rates as tensors on a GPU:
+    a recorded step reads what the schedule writes there.
 
     Args:
         optimizer: of :meth:`Optimization.optimizer`; unchanged where it is not ``capturable``."""

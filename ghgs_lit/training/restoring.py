@@ -1,7 +1,7 @@
 """Checks of the training state in a checkpoint, before any of it is used.
 
-Lightning loads loops, callbacks, optimizers and schedules as they come: a damaged one fails with a traceback
-in the middle of its start, or counts on from a wrong step.
+Lightning loads loops, callbacks, optimizers and schedules as they come: a damaged one fails with a
+traceback in the middle of its start, or counts on from a wrong step.
 """
 
 import itertools
@@ -48,8 +48,8 @@ def check_training_state(path: str | Path, checkpoint: Mapping[str, Any]) -> Non
 def check_optimizer_state(
     path: str | Path, state: Mapping[str, Any], groups: Sequence[Mapping[str, Any]]
 ) -> None:
-    """Refuse the state of an optimizer with another number of parameters, tensors of other shapes or values
-    that are not finite.
+    """Refuse the state of an optimizer with another number of parameters, tensors of other shapes
+    or values that are not finite.
 
     Args:
         path: of the checkpoint, for messages.
@@ -115,7 +115,8 @@ def check_schedules(path: str | Path, states: Any, count: int) -> None:
 
 
 def check_restored(trainer: L.Trainer, checkpoint: Mapping[str, Any]) -> None:
-    """Refuse states of loops and callbacks whose form differs from what this run's have at the start.
+    """Refuse states of loops and callbacks whose form differs from what this run's
+    have at the start.
 
     Args:
         trainer: of the run, before it has started.

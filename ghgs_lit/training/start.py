@@ -19,8 +19,8 @@ from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpo
 
 
 def check_start(config: Mapping[str, Any], directory: Path) -> None:
-    """Refuse ``init_from`` together with ``resume``, unless the run resumes in its own directory: then its
-    configuration still has the ``init_from`` that it began with.
+    """Refuse ``init_from`` together with ``resume``, unless the run resumes in its own directory:
+    then its configuration still has the ``init_from`` that it began with.
 
     Args:
         config: the run's, as plain data.
@@ -48,8 +48,8 @@ def check_resume(
         The step of the checkpoint, and one line for each setting that ``config`` changes.
 
     Raises:
-        InputError: not a checkpoint of a training run, of another model or loss (names the tensor) or
-            optimizer, or damaged."""
+        InputError: not a checkpoint of a training run, of another model or loss (names the tensor)
+            or optimizer, or damaged."""
     checkpoint = read_checkpoint(path, whole=True)
     for key in ("global_step", "optimizer_states"):
         if key not in checkpoint:
@@ -71,7 +71,8 @@ def check_resume(
 def _check_optimizer(
     path: str | Path, checkpoint: Mapping[str, Any], module: L.LightningModule, config: Mapping[str, Any]
 ) -> None:
-    """Refuse to resume with Muon from AdamW's state, the reverse, or with other parameter groups."""
+    """Refuse to resume with Muon from AdamW's state, the reverse,
+    or with other parameter groups."""
     states = checkpoint["optimizer_states"]
     stored = itertools.chain.from_iterable(state["param_groups"] for state in states)
     by_muon = any("orthogonal" in group for group in stored)
@@ -93,7 +94,8 @@ def initialize(
     Args:
         model: gets the weights.
         path: the checkpoint.
-        strict: every tensor must fit, those of other stages apart where the file has the encoder alone.
+        strict: every tensor must fit, those of other stages apart where the file has the
+            encoder alone.
         random_frozen: parameters that are not trained may stay as initialised.
 
     Returns:
@@ -101,8 +103,9 @@ def initialize(
         initialised) or ``ignored`` (not in the model).
 
     Raises:
-        InputError: not a checkpoint of this project; nothing fits; a parameter that is not trained would stay
-            as initialised; with ``strict``, a tensor that does not fit or is missing (names it)."""
+        InputError: not a checkpoint of this project; nothing fits; a parameter that is not trained
+            would stay as initialised; with ``strict``, a tensor that does not fit or is missing
+            (names it)."""
     checkpoint = read_checkpoint(path, whole=True)
     state = model_state(checkpoint)
     own = model.state_dict()
@@ -143,8 +146,8 @@ def with_origin(config: Mapping[str, Any], model: nn.Module) -> Mapping[str, Any
         model: of the run.
 
     Returns:
-        ``config`` with ``encoder.weights`` from the checkpoint that the run starts from, if it has one and
-        all these weights fit; else ``config``."""
+        ``config`` with ``encoder.weights`` from the checkpoint that the run starts from, if it has
+        one and all these weights fit; else ``config``."""
     path = config["resume"] or config["init_from"]
     if path is None:
         return config

@@ -37,20 +37,23 @@ class TrainerOptions(Options):
     accelerator: Literal["gpu", "cpu", "auto", "cuda"] = "gpu"
     """gpu, cpu or auto."""
     devices: Annotated[int, Field(ge=1, le=64)] | tuple[Index, ...] | Literal[-1, "auto"] = 1
-    """Number of processes, or a list of GPUs (of a CPU: as many processes); several are DDP, in which each
-    has all parameters. At most 64, as each starts at once on a CPU."""
+    """Number of processes, or a list of GPUs (of a CPU: as many processes); several are DDP, in
+    which each has all parameters. At most 64, as each starts at once on a CPU."""
     num_nodes: int = Field(1, ge=1, le=1024)
     """Machines, each with devices processes; SLURM or torchrun starts them."""
     strategy: Literal[
         "auto", "ddp", "ddp_find_unused_parameters_true", "ddp_find_unused_parameters_false"
     ] = "auto"
-    """Of several processes; auto: DDP that allows parameters without a gradient, as ablations have."""
+    """Of several processes; auto: DDP that allows parameters without a gradient,
+    as ablations have."""
     precision: Precision = "32-true"
-    """32-true (the paper's; convolutions too), tf32, bf16-mixed or 16-mixed; geometry is float32 in each."""
+    """32-true (the paper's; convolutions too), tf32, bf16-mixed or 16-mixed;
+    geometry is float32 in each."""
     max_steps: int = Field(200000, ge=-1)
     """Steps of the optimizer (the paper's 200000); -1: no limit."""
     max_time: Duration | None = None
-    """days:hours:minutes:seconds; the learning rate follows the budget that ends first; null: no limit."""
+    """days:hours:minutes:seconds; the learning rate follows the budget that ends first;
+    null: no limit."""
     val_check_interval: Batches = 5000
     """Steps between two validations."""
     limit_val_batches: Index | Share = 8
@@ -66,7 +69,8 @@ class TrainerOptions(Options):
     overfit_batches: Index | Share = 0.0
     """The first so many batches of the training, or their share, again and again; 0: all."""
     fast_dev_run: bool | Count = False
-    """true, or a number of steps: so few, a validation of as many batches, no logs: whether all runs."""
+    """true, or a number of steps: so few, a validation of as many batches, no logs:
+    whether all runs."""
     profiler: Literal["simple", "advanced", "pytorch"] | None = None
     """Times of Lightning's hooks, written to <run>/fit-profile.txt."""
 

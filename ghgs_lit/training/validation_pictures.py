@@ -28,14 +28,15 @@ CLOUD_VIEW = {
 
 
 class PicturesOptions(Options):
-    """Pictures of the first subjects of each validation; of the first one also attention and point clouds."""
+    """Pictures of the first subjects of each validation;
+    of the first one also attention and point clouds."""
 
     group = "callbacks.pictures"
     subjects: Index = 2
     """Number of subjects; 0: none."""
     token: tuple[Index, Index, Index] | None = None
-    """Whose attention is drawn: view, row and column on the grid of tokens of padded photographs; null: the
-    middle of the subject in its first view."""
+    """Whose attention is drawn: view, row and column on the grid of tokens of padded photographs;
+    null: the middle of the subject in its first view."""
 
     def build(self) -> "Pictures":
         """The callback."""
@@ -43,10 +44,10 @@ class PicturesOptions(Options):
 
 
 class Pictures(Callback):
-    """Logs ``view/sheet/<subject>``, ``view/attention/<subject>``, in TensorBoard's tabs of distributions
-    ``values/*`` and in its mesh tab ``<subject>/points``. A sheet has inputs, depths, targets, renders and
-    errors. Attention is of one token of the recalibration. Clouds are the predicted points and the body's
-    vertices.
+    """Logs ``view/sheet/<subject>``, ``view/attention/<subject>``, in TensorBoard's tabs of
+    distributions ``values/*`` and in its mesh tab ``<subject>/points``. A sheet has inputs, depths,
+    targets, renders and errors. Attention is of one token of the recalibration. Clouds are the
+    predicted points and the body's vertices.
 
     Args:
         options: whom to draw."""
@@ -142,8 +143,8 @@ def distributions(prediction: Prediction) -> dict[str, Tensor]:
         prediction: of a model.
 
     Returns:
-        Finite values by name: opacities, standard deviations in millimetres and, where their pixels are
-        known, the distances from these pixels' points, in millimetres."""
+        Finite values by name: opacities, standard deviations in millimetres and, where their pixels
+        are known, the distances from these pixels' points, in millimetres."""
     gaussians = prediction.gaussians
     found = {"opacity": gaussians.opacities, "scale_mm": 1000 * gaussians.scales}
     if gaussians.pixel is not None:
@@ -161,7 +162,8 @@ def _show_distributions(trainer: L.Trainer, prediction: Prediction) -> None:
 
 
 def _publish(trainer: L.Trainer, tag: str, picture: np.ndarray, file: str) -> None:
-    """Write ``<run>/pictures/step_<step>/<file>.png`` and log it as ``tag`` to loggers of pictures."""
+    """Write ``<run>/pictures/step_<step>/<file>.png`` and log it as ``tag`` to loggers
+    of pictures."""
     step = trainer.global_step
     save_png(picture, Path(trainer.default_root_dir) / "pictures" / f"step_{step:06d}" / f"{file}.png")
     for logger in trainer.loggers:

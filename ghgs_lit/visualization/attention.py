@@ -23,7 +23,8 @@ def chosen_token(
         tokens: Packed tokens of a batch.
         points: Their points, of which some are invalid.
         element: Number of the subject in the batch.
-        at: ``(view, row, column)`` on the grid of tokens; None: the middle of the subject in its first view.
+        at: ``(view, row, column)`` on the grid of tokens;
+            None: the middle of the subject in its first view.
 
     Returns:
         Index of the packed token; None where its view has no valid one.
@@ -48,9 +49,9 @@ def chosen_token(
 def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> np.ndarray:
     """Picture of a subject's views with the query token (outlined) and its neighbours.
 
-    The first row shows the neighbours, the nearest brightest; captions count them in each view. Then one row
-    for each layer shows the weights, averaged over heads, the largest brightest, and beside them those with
-    ``s = 1`` where they differ; captions give shares of views.
+    The first row shows the neighbours, the nearest brightest; captions count them in each view.
+    Then one row for each layer shows the weights, averaged over heads, the largest brightest, and
+    beside them those with ``s = 1`` where they differ; captions give shares of views.
 
     Args:
         batch: With photographs of whole patches.

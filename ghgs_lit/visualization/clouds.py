@@ -14,8 +14,9 @@ Cloud = tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]
 def clouds(batch: Batch, prediction: Prediction, element: int, limit: int = 6000) -> dict[str, Cloud]:
     """Point clouds of one subject.
 
-    ``points``: unprojected pixels in their colours; ``body``: body vertices, where the data has them;
-    ``points_and_body``: both, whose distance the Chamfer term measures. Empty clouds are left out.
+    ``points``: unprojected pixels in their colours; ``body``: body vertices, where the data
+    has them; ``points_and_body``: both, whose distance the Chamfer term measures. Empty
+    clouds are left out.
 
     Args:
         batch: Photographs, masks and bodies are read.

@@ -35,7 +35,8 @@ def to_uint8(image: Tensor) -> np.ndarray:
     """A picture of an image.
 
     Args:
-        image: RGB [3, h, w]; values outside [0, 1] are clamped, those that are not finite are black or white.
+        image: RGB [3, h, w]; values outside [0, 1] are clamped,
+            those that are not finite are black or white.
 
     Returns:
         Picture [h, w, 3] uint8.
@@ -158,8 +159,8 @@ def sheet(
 
     Args:
         batch: photographs, masks, and depths and targets where they are known.
-        image: renders of the targets [B, T, 3, h, w]; without targets, renders of the inputs, which then
-            stand below them with their errors; None: no renders.
+        image: renders of the targets [B, T, 3, h, w]; without targets, renders of the inputs, which
+            then stand below them with their errors; None: no renders.
         element: number of the subject in the batch.
         depth: predicted depths [B, V, H, W], metres; None: no row of them.
         depth_valid: where they are defined [B, V, H, W]; None: in the masks.

@@ -63,9 +63,9 @@ def pixel_size(cameras: Cameras, center: Tensor) -> float:
 def up_direction(cameras: Cameras) -> Tensor:
     """The direction that is up in photographs.
 
-    Upright cameras may look up or down, but the rows of their images are level: up is perpendicular to all
-    rows, and nearest to the mean upward column. A world axis within 3 degrees of it is returned instead, so
-    that small tilts of the cameras do not tilt an upright world.
+    Upright cameras may look up or down, but the rows of their images are level: up is perpendicular
+    to all rows, and nearest to the mean upward column. A world axis within 3 degrees of it is
+    returned instead, so that small tilts of the cameras do not tilt an upright world.
 
     Args:
         cameras: V cameras.
@@ -89,9 +89,9 @@ def up_direction(cameras: Cameras) -> Tensor:
 def turntable(cameras: Cameras, frames: int, points: Tensor | None = None) -> Cameras:
     """Cameras on one turn around the subject, at the mean distance and height of the given ones.
 
-    They start at the side of the first camera and have its lens. With points of the subject they turn about
-    the middle of the points' box, look straight at it, and have a wider lens where that of the first camera
-    would cut points off. Without, they turn about where the optical axes meet.
+    They start at the side of the first camera and have its lens. With points of the subject they
+    turn about the middle of the points' box, look straight at it, and have a wider lens where that
+    of the first camera would cut points off. Without, they turn about where the optical axes meet.
 
     Args:
         cameras: V cameras.

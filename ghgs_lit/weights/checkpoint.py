@@ -1,4 +1,5 @@
-"""Checkpoints of this package: plain data with the whole configuration, enough to rebuild the model."""
+"""Checkpoints of this package: plain data with the whole configuration,
+enough to rebuild the model."""
 
 import copy
 import functools
@@ -87,19 +88,22 @@ def _config(path: str, stamp: tuple[int, ...] | None) -> dict[str, Any]:
 
 
 def _check_content(path: str | Path, checkpoint: Mapping[str, Any]) -> None:
-    """Refuse nodes and tensors of impossible types; values of nodes are checked where they are used."""
+    """Refuse nodes and tensors of impossible types;
+    values of nodes are checked where they are used."""
     require_plain(checkpoint["config"], f"{path}: config")
     for name, node in checkpoint["config"].items():
         fits = name not in KINDS or node is None or isinstance(node, Mapping)
         require(fits, f"{path}: config.{name}", "a mapping of its keys", node)
-    # Verbs merge parts of the configuration into their own, where OmegaConf would evaluate resolvers.
+    # Verbs merge parts of the configuration into their own,
+    # where OmegaConf would evaluate resolvers.
     for key, value in flatten(checkpoint["config"]).items():
         require("${" not in repr(value), f"{path}: config.{key}", "a value, no interpolation", value)
     require_dense(checkpoint["state_dict"], path)
 
 
 def _check_sums(path: str | Path, whole: bool) -> None:
-    """Refuse a PyTorch file that does not fit its checksums; tensors are checked only if ``whole``."""
+    """Refuse a PyTorch file that does not fit its checksums;
+    tensors are checked only if ``whole``."""
     if not zipfile.is_zipfile(file := file_of(path)):
         return  # reading it says what is wrong
     try:
@@ -155,7 +159,8 @@ def require_fit(module: nn.Module, state: Mapping[str, Any], source: str | Path)
         source: of the state, for messages.
 
     Raises:
-        InputError: a key is missing, unknown or has another shape; names source, key and both shapes.
+        InputError: a key is missing, unknown or has another shape;
+            names source, key and both shapes.
     """
     tensors = module.state_dict()
     for key in tensors:
@@ -176,7 +181,8 @@ def require_finite(state: Mapping[str, Tensor], source: str | Path) -> None:
         InputError: a number is not finite; names source and key.
     """
     for key, value in state.items():
-        # The sum is not finite if any term is not, and needs no second tensor. Half precision would overflow.
+        # The sum is not finite if any term is not, and needs no second tensor.
+        # Half precision would overflow.
         total = value.sum(dtype=torch.promote_types(value.dtype, torch.float32))
         require(bool(total.isfinite()), f"{source}: {key}", "finite numbers", "NaN or infinity")
 
@@ -241,19 +247,20 @@ def write_checkpoint(
 def load_weights(
     model: nn.Module, path: str | Path, dtype: torch.dtype | None = None, device: Any = "cpu"
 ) -> None:
-    """Give a :class:`ghgs_lit.model.GHGS` the weights of a checkpoint, mapped from the file, not copied.
+    """Give a :class:`ghgs_lit.model.GHGS` the weights of a checkpoint, mapped from the file,
+    not copied.
 
     Args:
         model: its own weights may be on the meta device.
         path: as for :func:`read_checkpoint`.
-        dtype: precision of the encoder (None: as in the file, but float32 on a CPU without that half
-            precision, and for float64); the heads are float32.
+        dtype: precision of the encoder (None: as in the file, but float32 on a CPU without that
+            half precision, and for float64); the heads are float32.
         device: where the weights will be moved to.
 
     Raises:
         FileNotFoundError: there is no such file.
-        InputError: it is not a checkpoint of this package, or its weights are not finite or do not fit the
-            model.
+        InputError: it is not a checkpoint of this package, or its weights are not finite or do not
+            fit the model.
     """
     checkpoint = read_checkpoint(path, whole=True)
     require_fit(model, model_state(checkpoint), path)
@@ -273,8 +280,8 @@ def load_weights(
 def check_preset(model: nn.Module, checkpoint: Mapping[str, Any], path: str | Path) -> None:
     """Compare the model's token preset with those that the checkpoint was trained with.
 
-    ``skip=auto`` drops presets that were not trained; fewer than all tokens with the authors' weights give a
-    warning.
+    ``skip=auto`` drops presets that were not trained; fewer than all tokens with the authors'
+    weights give a warning.
 
     Args:
         model: a :class:`ghgs_lit.model.GHGS`, whose ``auto`` may be replaced.

@@ -1,4 +1,5 @@
-"""Export of checkpoints: tensors under their published names, or a small checkpoint for prediction."""
+"""Export of checkpoints: tensors under their published names,
+or a small checkpoint for prediction."""
 
 from pathlib import Path
 
@@ -81,8 +82,8 @@ def write_inference(checkpoint: str | Path, path: str | Path, dtype: str) -> Non
         dtype: of all weights: ``float16``, ``bfloat16`` or ``float32``.
 
     Raises:
-        InputError: a weight overflows the dtype, both are one file, or the checkpoint holds the encoder
-            alone.
+        InputError: a weight overflows the dtype, both are one file, or the checkpoint holds the
+            encoder alone.
     """
     if resolved(checkpoint) == resolved(path):
         raise InputError(f"inference={path}: expected another file than the checkpoint; found the same")

@@ -54,7 +54,8 @@ class Frozen:
             folder: that the checkpoint will be in; the shared file is written there if it is new.
 
         Returns:
-            The content to write; ``checkpoint`` unchanged if frozen tensors are small (:data:`OWN`).
+            The content to write; ``checkpoint`` unchanged if frozen tensors are small
+            (:data:`OWN`).
         """
         state = checkpoint.get("state_dict", {})
         tensors = {name: state[name] for name in checkpoint.get("frozen", ())}

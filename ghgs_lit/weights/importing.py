@@ -45,8 +45,8 @@ def fetch(repository: str) -> tuple[str, Path, str]:
         Its name, the path of the file and its SHA-256.
 
     Raises:
-        InputError: the package, the network or the repository is missing, or the checksum is not the
-            published one.
+        InputError: the package, the network or the repository is missing, or the checksum is not
+            the published one.
     """
     hub = installed("huggingface_hub", "hub", repository)
     cached = hub.try_to_load_from_cache(repository, FILE)
@@ -125,7 +125,8 @@ class Source:
             model: the model's tensors by name.
 
         Raises:
-            InputError: a name or a shape does not fit the model's tensors, or two names mean one tensor.
+            InputError: a name or a shape does not fit the model's tensors,
+                or two names mean one tensor.
         """
         for name, tensor in self.tensors().items():
             where = f"{self.path}: {name}"
@@ -197,7 +198,8 @@ def import_weights(
     Args:
         state: tensors that the files must fill, on the meta device: those of the model, or without
             ``release`` those of its encoder.
-        config: nodes of the model. Without ``release`` the checkpoint keeps that of the encoder alone.
+        config: nodes of the model. Without ``release`` the checkpoint keeps that of the
+            encoder alone.
         out: the checkpoint.
         vggt: a file of VGGT-1B's weights, or a repository of the Hugging Face hub.
         release: the authors' checkpoint, with all other stages.

@@ -1,6 +1,7 @@
 """Reading of safetensors and PyTorch files, with one-line errors for any other file.
 
-Tensors are mapped from the disk: only the pages that are used take memory, and the system can free them.
+Tensors are mapped from the disk: only the pages that are used take memory,
+and the system can free them.
 """
 
 import pickle
@@ -52,7 +53,8 @@ def open_file(path: str | Path) -> Any:
         path: of the file, or :data:`SHIPPED`.
 
     Returns:
-        What the file holds; tensors are mapped from the disk, except in files of PyTorch before 1.6.
+        What the file holds; tensors are mapped from the disk,
+        except in files of PyTorch before 1.6.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -108,13 +110,15 @@ def require_weights(path: str | Path) -> bytes:
 def require_stored(path: Path) -> None:
     """Refuse a PyTorch file whose records are not stored as they are, as PyTorch writes them.
 
-    Mapped from the disk, compressed ones would be other numbers, and unpacked they may fill the memory.
+    Mapped from the disk, compressed ones would be other numbers,
+    and unpacked they may fill the memory.
 
     Args:
         path: of a file in ZIP format.
 
     Raises:
-        InputError: a record is compressed or encrypted, or records claim more bytes than the file has.
+        InputError: a record is compressed or encrypted,
+            or records claim more bytes than the file has.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -167,8 +171,8 @@ def _open_safetensors(path: Path) -> "dict[str, Tensor]":
 def require_dense(tensors: "Mapping[str, Any]", path: str | Path) -> None:
     """Refuse tensors that weights never are.
 
-    They are sparse, of 8 bits, or of fewer stored numbers than their shape says, which a copy would expand
-    without limit.
+    They are sparse, of 8 bits, or of fewer stored numbers than their shape says, which a copy would
+    expand without limit.
 
     Args:
         tensors: by name; values of other types are not looked at.
@@ -201,8 +205,8 @@ def cast(
 ) -> "dict[str, Tensor]":
     """Tensors of a mapped file in other precisions.
 
-    Pages that were read count as memory, so the file is mapped again after every 256 MB: only the result and
-    one chunk are held.
+    Pages that were read count as memory, so the file is mapped again after every 256 MB: only the
+    result and one chunk are held.
 
     Args:
         open_tensors: maps the file and returns its tensors by name.

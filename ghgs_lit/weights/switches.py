@@ -39,8 +39,8 @@ def differences(config: Mapping[str, Any], other: Mapping[str, Any] | None = Non
 
     Args:
         config: the whole configuration.
-        other: another one; None: the release. Stages that it lacks, as a checkpoint of ``ghgs pretext`` does,
-            are not compared.
+        other: another one; None: the release. Stages that it lacks, as a checkpoint of
+            ``ghgs pretext`` does, are not compared.
 
     Returns:
         A text ``<key>=<value> for <other value>`` for each.

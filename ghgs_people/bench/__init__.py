@@ -1,11 +1,12 @@
 """Frozen people of ``data=synthetic``: the same ones for all measurements, and for no training.
 
-``split=bench`` compares methods during development; ``split=sealed`` is for published figures only, not for
-choices. ``<split>.json`` defines them: numbers of the people, seed, cameras, lights, rays. The code that
-generates people may change, so ``<split>.npz`` has thumbnails: 16 x 16 pixels of two photographs and masks of
-each person. These are compared within a tolerance: processors round rays and JPEG files differently and
-people can be rendered at any size, so a digest of the photographs would not match. After a change of how they
-look, a new version must be baked (``scripts/bake_bench.py``)."""
+``split=bench`` compares methods during development; ``split=sealed`` is for published figures only,
+not for choices. ``<split>.json`` defines them: numbers of the people, seed, cameras, lights, rays.
+The code that generates people may change, so ``<split>.npz`` has thumbnails: 16 x 16 pixels of two
+photographs and masks of each person. These are compared within a tolerance: processors round rays
+and JPEG files differently and people can be rendered at any size, so a digest of the photographs
+would not match. After a change of how they look, a new version must be baked
+(``scripts/bake_bench.py``)."""
 
 import hashlib
 import json
@@ -30,8 +31,8 @@ FOLDER = Path(__file__).parent
 #: Ring positions of the photographs that are compared: front and back.
 POSITIONS = (0, 8)
 SIDE = 16
-#: Largest root mean square difference of two thumbnails, of 255 levels, at the size of the stored ones (it is
-#: 0 on the machine that made them).
+#: Largest root mean square difference of two thumbnails, of 255 levels, at the size of the stored
+#: ones (it is 0 on the machine that made them).
 SAME_SIZE = 0.3
 #: The same at other sizes (it is 6.8 at 56 pixels).
 OTHER_SIZE = 8.0
@@ -89,7 +90,8 @@ def facts(split: str) -> dict[str, str]:
         split: one of ``SPLITS``.
 
     Returns:
-        Version and first 12 digits of the SHA-256 of definition and thumbnails, by the name of the split.
+        Version and first 12 digits of the SHA-256 of definition and thumbnails,
+        by the name of the split.
     """
     defined = json.dumps(definition(split), sort_keys=True).encode()
     digest = hashlib.sha256(defined + thumbnails(split).tobytes()).hexdigest()
@@ -103,7 +105,8 @@ def check_settings(split: str, settings: Mapping[str, Any]) -> None:
 
     Args:
         split: one of ``SPLITS``.
-        settings: of the data set, as nested plain data; ``render.size`` is [height, width] in pixels.
+        settings: of the data set, as nested plain data;
+            ``render.size`` is [height, width] in pixels.
 
     Raises:
         InputError: names the first key that differs; or the longer side is below ``LEAST`` pixels.

@@ -1,6 +1,8 @@
-"""The kernels of photographs on cores: which pixels can show the subject, rays through them, colours of hits.
+"""The kernels of photographs on cores: which pixels can show the subject, rays through them,
+colours of hits.
 
-Sums have the order and the precision of the formulas in NumPy, so that results are bit-equal to them."""
+Sums have the order and the precision of the formulas in NumPy,
+so that results are bit-equal to them."""
 
 import math
 
@@ -67,7 +69,8 @@ def cover(vertices, faces, matrix, pose, covered):
 
 @kernel_for(_PLACES, NUMBER, NUMBER, _DOUBLES[2], _DOUBLES[2], FLOATS[2])
 def aim(pixels, width, samples, matrix, pose, rays):
-    """Rays through pixels. Before the camera's rotation they have z = 1, so that distances are depths.
+    """Rays through pixels. Before the camera's rotation they have z = 1,
+    so that distances are depths.
 
     Args:
         pixels: [p], row * width + column.

@@ -1,9 +1,10 @@
-"""Ambient occlusion: how much of the light from all around reaches a point past the person's own body.
+"""Ambient occlusion: how much of the light from all around reaches a point past the
+person's own body.
 
-The body is approximated by spheres inside trunk and limbs, because the share of light that a sphere blocks
-has a closed form (about cos(angle) (radius / distance)^2). Folds and hollows finer than the spheres are found
-by the distance between the surface and a smoothed copy of it. Both are smooth functions of the points, unlike
-an estimate from random rays.
+The body is approximated by spheres inside trunk and limbs, because the share of light that a sphere
+blocks has a closed form (about cos(angle) (radius / distance)^2). Folds and hollows finer than the
+spheres are found by the distance between the surface and a smoothed copy of it. Both are smooth
+functions of the points, unlike an estimate from random rays.
 """
 
 import numpy as np

@@ -1,8 +1,8 @@
 """The body model: shapes as principal components, a rig, linear blend skinning.
 
-The asset holds MakeHuman data (CC0 1.0, see ``assets/LICENSE``), converted by ``scripts/bake_body.py``.
-Metres, y up, facing +z; the person's left is +x. At rest the feet stand on y = 0 and the arms hang at 45
-degrees from the body.
+The asset holds MakeHuman data (CC0 1.0, see ``assets/LICENSE``), converted by
+``scripts/bake_body.py``. Metres, y up, facing +z; the person's left is +x. At rest the feet stand
+on y = 0 and the arms hang at 45 degrees from the body.
 """
 
 from dataclasses import dataclass

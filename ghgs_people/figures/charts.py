@@ -1,6 +1,7 @@
 """UV charts of the base mesh: the parts of body and garments that share one texture.
 
-Points and texels of a chart know their place on the average body (:mod:`ghgs_people.figures.place`).
+Points and texels of a chart know their place on the average body
+(:mod:`ghgs_people.figures.place`).
 """
 
 from collections.abc import Sequence
@@ -82,8 +83,8 @@ class Chart:
 class _Recipe:
     """How a chart is built.
 
-    `shape` is the height and width of the texture; quads are subdivided `levels` times, points smoothed
-    `smoothing` and skinning weights `blending` times.
+    `shape` is the height and width of the texture; quads are subdivided `levels` times, points
+    smoothed `smoothing` and skinning weights `blending` times.
     """
 
     shape: tuple[int, int]

@@ -38,7 +38,8 @@ class Complexion:
 
 
 def sample_complexion(rng: np.random.Generator, female: bool, age: float) -> Complexion:
-    """Draw the colours of a person: with dark skin hair and eyes are dark, with age hair turns grey.
+    """Draw the colours of a person: with dark skin hair and eyes are dark,
+    with age hair turns grey.
 
     Args:
         rng: draws everything.

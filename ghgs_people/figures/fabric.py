@@ -1,4 +1,5 @@
-"""Colours of cloth: weaves, patterns and prints as functions of metres along and around the body."""
+"""Colours of cloth: weaves, patterns and prints as functions of metres along and
+around the body."""
 
 import colorsys
 from dataclasses import dataclass

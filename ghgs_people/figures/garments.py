@@ -1,4 +1,5 @@
-"""Shapes of garments: where they end (fields on the average body) and how they drape over a posed body."""
+"""Shapes of garments: where they end (fields on the average body) and how they drape over a
+posed body."""
 
 from dataclasses import dataclass
 
@@ -181,7 +182,8 @@ def fold_collar(posed: np.ndarray, top: Top) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _wrinkles(place: Place, noise: Noise, top: Top) -> np.ndarray:
-    """Height [g] of the folds of a top in metres: across the sleeve at the elbow, slanted at the waist."""
+    """Height [g] of the folds of a top in metres: across the sleeve at the elbow,
+    slanted at the waist."""
     loose = 0.5 + 30.0 * top.ease
     around = np.where(place.arm > 0.5, place.arm_angle * 0.05, place.trunk_angle * 0.15)
     bends = noise(around / 0.9 + 0.31, np.where(place.arm > 0.5, place.sleeve, place.y) / 0.42)

@@ -81,7 +81,8 @@ class Character:
 
         Args:
             parts: meshes in one frame; the ``first`` ones are in the first pose and stand on y = 0.
-            bodies: vertices [k, 3] of the body under them, of all poses one after the other, metres.
+            bodies: vertices [k, 3] of the body under them, of all poses one after the other,
+                metres.
             first: number of parts of the first pose.
 
         Returns:
@@ -97,9 +98,9 @@ class Character:
 def generate(seed: int, index: int, active: bool = False) -> Person:
     """Generate a person, the same on every machine, up to rounding.
 
-    An adult of 1.52 to 1.87 m (barefoot and upright), in metres, with feet on y = 0, the bounding box of
-    the body centred over the origin, facing +z up to 30 degrees of yaw. Part 0 is the skin; clothes, hair
-    and a cap follow.
+    An adult of 1.52 to 1.87 m (barefoot and upright), in metres, with feet on y = 0, the bounding
+    box of the body centred over the origin, facing +z up to 30 degrees of yaw. Part 0 is the skin;
+    clothes, hair and a cap follow.
 
     Args:
         seed: of a family of people, at least 0.

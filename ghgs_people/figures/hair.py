@@ -1,4 +1,5 @@
-"""Hair (a shell over the scalp, a curtain that falls from it, a ponytail, a bun) and knitted caps."""
+"""Hair (a shell over the scalp, a curtain that falls from it, a ponytail, a bun) and
+knitted caps."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -225,7 +226,8 @@ def _curtain(figure: Figure, cut: Haircut, look: Complexion) -> TexturedMesh:
 
 
 def _skull(figure: Figure) -> tuple[np.ndarray, float, Callable[[np.ndarray], np.ndarray]]:
-    """Centre [3] of the cranium, its size against the average one, its radius along directions [..., 3]."""
+    """Centre [3] of the cranium, its size against the average one,
+    its radius along directions [..., 3]."""
     piece = chart("head")
     upper = piece.place.y > 1.50
     head = (piece.interpolation @ figure.rest)[upper]

@@ -1,6 +1,7 @@
 """Textured meshes and people made of them: what is photographed.
 
-Metres, y up, feet on y = 0, facing +z up to a yaw about y. Built-in people and scans use the same two types.
+Metres, y up, feet on y = 0, facing +z up to a yaw about y.
+Built-in people and scans use the same two types.
 """
 
 from collections.abc import Callable
@@ -17,8 +18,8 @@ class TexturedMesh:
     """One part of a person: triangles with one texture.
 
     Raises:
-        InputError: an array has another shape or a value that is not finite, or the faces name vertices
-            that do not exist.
+        InputError: an array has another shape or a value that is not finite, or the faces name
+            vertices that do not exist.
     """
 
     vertices: np.ndarray  # [n, 3] float32, metres
@@ -46,7 +47,8 @@ class Person:
     Args:
         name: of the person, for files and messages.
         parts: its meshes, in one frame.
-        body_vertices: [k, 3] float32, the body under the clothes in the frame of the parts; None: unknown.
+        body_vertices: [k, 3] float32, the body under the clothes in the frame of the parts;
+            None: unknown.
     """
 
     name: str

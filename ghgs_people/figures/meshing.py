@@ -1,4 +1,5 @@
-"""Operations on triangle and quad meshes: normals, subdivision, smoothing, clipping, rasterising UV."""
+"""Operations on triangle and quad meshes: normals, subdivision, smoothing, clipping,
+rasterising UV."""
 
 import numpy as np
 import trimesh
@@ -54,7 +55,8 @@ def subdivide(quads: np.ndarray, count: int) -> tuple[sparse.csr_matrix, np.ndar
         count: number of vertices.
 
     Returns:
-        The operator [count + edges + m, count] that gives the new vertices, and the new quads [4 m, 4].
+        The operator [count + edges + m, count] that gives the new vertices,
+        and the new quads [4 m, 4].
     """
     edges = np.sort(np.stack([quads, np.roll(quads, -1, 1)], -1).reshape(-1, 2), 1)
     unique, inverse = np.unique(edges, axis=0, return_inverse=True)
@@ -72,7 +74,8 @@ def subdivide(quads: np.ndarray, count: int) -> tuple[sparse.csr_matrix, np.ndar
 
 
 def neighbour_mean(faces: np.ndarray, count: int) -> sparse.csr_matrix:
-    """One step of Laplacian smoothing: half the way to the mean of the neighbours; the border stays.
+    """One step of Laplacian smoothing: half the way to the mean of the neighbours;
+    the border stays.
 
     Args:
         faces: [m, c] indices of vertices, triangles or quads.
@@ -103,8 +106,8 @@ def clip(faces: np.ndarray, field: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
         field: [n] on the vertices, linear between them.
 
     Returns:
-        Faces [k, 3] of new vertices, and for each of these two old ones `a`, `b` and the share `t` of
-        `b`: an attribute of the new mesh is `(1 - t) * x[a] + t * x[b]`.
+        Faces [k, 3] of new vertices, and for each of these two old ones `a`, `b` and the share `t`
+        of `b`: an attribute of the new mesh is `(1 - t) * x[a] + t * x[b]`.
     """
     count = len(field)
     inside = field[faces] >= 0
@@ -145,8 +148,9 @@ def rasterise(uv: np.ndarray, faces: np.ndarray, height: int, width: int) -> tup
         width: of the texture, texels.
 
     Returns:
-        Flat indices [k] of the covered texels, their face [k] and barycentric coordinates [k, 3], and
-        `nearest` [height * width]: for each texel the position among the k of the nearest covered one.
+        Flat indices [k] of the covered texels, their face [k] and barycentric coordinates
+        [k, 3], and `nearest` [height * width]: for each texel the position among the k of the
+        nearest covered one.
     """
     corners = np.stack([uv[faces][..., 0] * width, (1 - uv[faces][..., 1]) * height], -1) - 0.5
     low = np.maximum(np.ceil(corners.min(1) - 1e-6).astype(np.int64), 0)

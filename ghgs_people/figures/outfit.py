@@ -1,7 +1,7 @@
 """What a person wears, as numbers: `garments` makes shapes of it, `garment_textures` colours.
 
-Heights are those of the average body at rest (metres above the soles; crotch 0.77, waist about 1.0, neck
-1.43); sleeves are measured from the shoulder joint along the arm (elbow 0.25, wrist 0.50).
+Heights are those of the average body at rest (metres above the soles; crotch 0.77, waist about 1.0,
+neck 1.43); sleeves are measured from the shoulder joint along the arm (elbow 0.25, wrist 0.50).
 """
 
 from dataclasses import dataclass
@@ -42,7 +42,8 @@ class Bottom:
     kind: str  # jeans, chinos, joggers, leggings, shorts or skirt
     waist: float  # height in metres
     hem: float  # height in metres
-    # radius of a leg at the hem in metres; of shorts, how much wider than the thigh; of a skirt, its flare
+    # radius of a leg at the hem in metres; of shorts, how much wider than the thigh;
+    # of a skirt, its flare
     width: float
     fabric: Fabric
     belt: np.ndarray | None = None  # colour [3]; None: no belt

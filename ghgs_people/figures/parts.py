@@ -8,7 +8,8 @@ import numpy as np
 from ghgs_lit.training.pretext.labels import PARTS, BodyParts
 from ghgs_people.figures.body import BODY_VERTICES, load_body
 
-# Prefixes of the names of a part's bones. Bones of limbs end with .L or .R, and their sides are two parts.
+# Prefixes of the names of a part's bones. Bones of limbs end with .L or .R,
+# and their sides are two parts.
 _TRUNK = {
     "head": ("head", "neck"),
     "chest": ("spine01", "spine02", "clavicle", "shoulder"),

@@ -1,6 +1,8 @@
-"""Places on the body: coordinates on the average body at rest, in which clothes and faces are described.
+"""Places on the body: coordinates on the average body at rest,
+in which clothes and faces are described.
 
-Patterns, seams, hems and necklines are functions of the place, so they are the same for every shape.
+Patterns, seams, hems and necklines are functions of the place,
+so they are the same for every shape.
 """
 
 from dataclasses import dataclass

@@ -1,9 +1,9 @@
 """Poses on two feet within the limits of human joints: gestures for the arms, stances for the legs.
 
-Arms are posed by forward kinematics: a direction of the upper arm, an elbow angle, and where the forearm
-points. Legs are posed by inverse kinematics: the soles are placed on the ground and the knees follow, so feet
-do not float. Directions are in the person's frame: +x left, +y up, +z forward; for the right side x is
-mirrored.
+Arms are posed by forward kinematics: a direction of the upper arm, an elbow angle, and where the
+forearm points. Legs are posed by inverse kinematics: the soles are placed on the ground and the
+knees follow, so feet do not float. Directions are in the person's frame: +x left, +y up, +z
+forward; for the right side x is mirrored.
 """
 
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ SPINE = ("spine05", "spine04", "spine03", "spine02", "spine01")
 NECK = ("neck01", "neck02", "neck03", "head")
 FINGERS = ("finger2", "finger3", "finger4", "finger5")
 
-# Direction of the upper arm (x outwards), direction in which the elbow bends; then elbow, forearm twist and
-# curl of the fingers as (mean, half range) in degrees. Directions need no unit length.
+# Direction of the upper arm (x outwards), direction in which the elbow bends; then elbow, forearm
+# twist and curl of the fingers as (mean, half range) in degrees. Directions need no unit length.
 GESTURES = {
     "relaxed": ((0.20, -1.0, 0.00), (-0.25, 0.2, 1.0), (18, 9), (-35, 15), (28, 14)),
     "loose": ((0.34, -1.0, 0.10), (-0.35, 0.2, 1.0), (32, 14), (-25, 15), (30, 15)),
@@ -45,7 +45,8 @@ BENT = {"lunge": (0.62, 0.95), "squat": (0.45, 0.85), "cross": (0.98, 1.0), "cro
 
 @dataclass(frozen=True)
 class _Skeleton:
-    """Joints at rest [b, 3] and the rotations [b, 3, 3] of the bones in world axes, which posing fills in."""
+    """Joints at rest [b, 3] and the rotations [b, 3, 3] of the bones in world axes,
+    which posing fills in."""
 
     body: BodyModel
     joints: np.ndarray
@@ -168,7 +169,8 @@ def _compose(parents: np.ndarray, local: np.ndarray) -> np.ndarray:
 
 
 def _frame(along: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Right-handed frame [3, 3] (columns) with its first axis `along`, its third nearest to `across`."""
+    """Right-handed frame [3, 3] (columns) with its first axis `along`,
+    its third nearest to `across`."""
     first = along / np.linalg.norm(along)
     third = across - (across @ first) * first
     third /= np.linalg.norm(third)
@@ -194,8 +196,8 @@ def _pose_arm(
         side: +1: left, -1: right.
         gesture: one of `GESTURES`.
         widen: how far the arm moves away from the body, 0 to 1.
-        swing: how far the upper arm points forward (back where negative) when walking, about -0.5 to
-            0.5.
+        swing: how far the upper arm points forward (back where negative) when walking,
+            about -0.5 to 0.5.
         rng: draws the angles.
     """
     end = ".L" if side > 0 else ".R"
@@ -331,7 +333,8 @@ def _feet(
         rng: draws the deviations.
 
     Returns:
-        For the left and the right foot: ankle across and forward (metres), yaw and heel lift (degrees).
+        For the left and the right foot: ankle across and forward (metres),
+        yaw and heel lift (degrees).
     """
     half, leg, _ = skeleton.rest("upperleg01.L")[0]
     half = half * rng.uniform(0.85, 1.25)

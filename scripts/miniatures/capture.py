@@ -12,7 +12,8 @@ from ghgs_people.figures.mesh import Person
 
 
 def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """World to camera [4, 4] of an upright camera at ``center`` that looks at ``target`` (OpenCV axes)."""
+    """World to camera [4, 4] of an upright camera at ``center`` that looks at ``target``
+    (OpenCV axes)."""
     forward = (target - center) / np.linalg.norm(target - center)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)

@@ -48,7 +48,8 @@ def make(
         frames: their numbers.
 
     Returns:
-        The folders of the sequences, and last that of the stand-in for SMPL, ``<root>_body_models``.
+        The folders of the sequences, and last that of the stand-in for SMPL,
+        ``<root>_body_models``.
     """
     training = [f"p{100001 + 7 * i:06d}_a{48 + 11 * i:06d}" for i in range(people_of["train"])]
     folders = []

@@ -1,9 +1,9 @@
 """Built-in people as a few scans of THuman2.0, with their fits.
 
 Names, types, shapes and units are those of the real files (:mod:`ghgs_people.thuman2`). Bodies
-are MakeHuman's in place of SMPL-X: the parameters in ``smplx_param.pkl`` have the right shapes and place the
-body correctly, but do not pose it. Folders that are written get a mark, so that real data of the same names
-is never overwritten.
+are MakeHuman's in place of SMPL-X: the parameters in ``smplx_param.pkl`` have the right shapes and
+place the body correctly, but do not pose it. Folders that are written get a mark, so that real data
+of the same names is never overwritten.
 """
 
 import pickle
@@ -33,7 +33,8 @@ POSE_SIZES |= {"leye_pose": 3, "reye_pose": 3, "expression": 10}
 
 
 def mark(*folders: Path) -> None:
-    """Mark folders as a miniature's before they are written. InputError: one holds files and has no mark."""
+    """Mark folders as a miniature's before they are written.
+    InputError: one holds files and has no mark."""
     for folder in folders:
         marked = (folder / MARKER).is_file() or not folder.is_dir()
         found = [] if marked else sorted(path.name for path in folder.iterdir())
@@ -61,7 +62,8 @@ def names(people_of: Mapping[str, int]) -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class Scan:
-    """A person as one mesh in a scan's frame, with the fit that maps the body [n, 3] to it; radians."""
+    """A person as one mesh in a scan's frame, with the fit that maps the body [n, 3] to it;
+    radians."""
 
     mesh: TexturedMesh
     body: np.ndarray
@@ -88,7 +90,8 @@ def scan_of(name: str, seed: int) -> Scan:
 
 
 def make_scans(source: Path, people_of: Mapping[str, int], size: int, seed: int) -> Path:
-    """Write scans into ``source``, their fits into a folder beside it, and split files; returns ``source``.
+    """Write scans into ``source``, their fits into a folder beside it, and split files;
+    returns ``source``.
 
     Args:
         people_of: how many, ``{train: n, val: n}``.

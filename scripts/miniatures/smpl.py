@@ -17,7 +17,8 @@ from ghgs_people.figures.generate import pose_figure
 from ghgs_people.figures.mesh import Person
 
 VERTICES, SHAPES = 6890, 10
-# The joints of SMPL in order: the built-in bone that starts at each, and the index of the parent joint.
+# The joints of SMPL in order: the built-in bone that starts at each,
+# and the index of the parent joint.
 JOINTS = (
     ("root", -1), ("upperleg01.L", 0), ("upperleg01.R", 0), ("spine05", 0), ("lowerleg01.L", 1),
     ("lowerleg01.R", 2), ("spine03", 3), ("foot.L", 4), ("foot.R", 5), ("spine01", 6), ("toe2-1.L", 7),
@@ -61,7 +62,8 @@ def write_stand_in(folder: Path) -> Path:
 
 
 def parameters(seed: int, index: int, person: Person, pose: np.ndarray) -> dict[str, np.ndarray]:
-    """SMPL parameters of ``people.generate(seed, index)`` moved by ``pose`` [4, 4], as HuMMan stores them."""
+    """SMPL parameters of ``people.generate(seed, index)`` moved by ``pose`` [4, 4],
+    as HuMMan stores them."""
     body = load_body()
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence([seed, index]).spawn(4)]
     coefficients, _, _ = body.sample_shape(streams[0])
@@ -88,7 +90,8 @@ def parameters(seed: int, index: int, person: Person, pose: np.ndarray) -> dict[
 
 
 def _regressor(body: BodyModel, chosen: np.ndarray, joint: int) -> np.ndarray:
-    """Weights [6890] of the vertices near a joint, summing to 1, whose mean is the joint for every shape."""
+    """Weights [6890] of the vertices near a joint, summing to 1,
+    whose mean is the joint for every shape."""
     distance = np.linalg.norm(body.mean[chosen] - body.mean[joint], axis=-1)
     near = np.argsort(distance)[:_NEAR]
     shapes = np.concatenate((body.mean[None], body.components[:SHAPES]))
@@ -100,7 +103,8 @@ def _regressor(body: BodyModel, chosen: np.ndarray, joint: int) -> np.ndarray:
 
 
 def _weights(body: BodyModel) -> np.ndarray:
-    """Skinning weights [n, 24]: every bone counts for the nearest joint of SMPL above it in the rig."""
+    """Skinning weights [n, 24]: every bone counts for the nearest joint of SMPL above it
+    in the rig."""
     joint_of = {body.bone(name): j for j, (name, _) in enumerate(JOINTS)}
     weights = np.zeros((body.vertex_count, len(JOINTS)))
     for bone in range(len(body.bone_names)):

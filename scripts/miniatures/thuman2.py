@@ -1,7 +1,7 @@
 """A small THuman2.0 of built-in people, rendered as the published scripts do.
 
-Names, types, shapes and units are those of the real files (:mod:`ghgs_lit.data.layout`); people are those of
-:mod:`scripts.miniatures.scans`.
+Names, types, shapes and units are those of the real files (:mod:`ghgs_lit.data.layout`); people are
+those of :mod:`scripts.miniatures.scans`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,10 +33,10 @@ def make(
 ) -> Path:
     """Write renders below ``root`` in the layout that the published scripts make.
 
-    In it pixel centres are at integers, the principal point is 25/1024 of the side below the middle, masks
-    have three channels, inverse depth is truncated (not rounded) to 16 bits, extrinsics are 3 x 4, the views
-    between cameras also have photographs of twice the size (``<view>_hr.jpg``), and bodies lie in ``smpl``
-    with their normals.
+    In it pixel centres are at integers, the principal point is 25/1024 of the side below the
+    middle, masks have three channels, inverse depth is truncated (not rounded) to 16 bits,
+    extrinsics are 3 x 4, the views between cameras also have photographs of twice the size
+    (``<view>_hr.jpg``), and bodies lie in ``smpl`` with their normals.
 
     Args:
         root: folder of the phases.

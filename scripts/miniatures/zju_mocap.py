@@ -1,9 +1,9 @@
 """A small ZJU-MoCap of built-in people: folders, names, dtypes, units and oddities of the real one.
 
-Photographs are taken through distorting lenses in front of a grey wall. ``mask_cihp`` and ``mask`` both have
-holes; their union has none. ``vertices`` fits worse than ``new_vertices``. The parameters of a body model
-(``params``, ``new_params``) have the right keys and shapes and a correct ``Rh`` and ``Th``; poses and shapes
-are zero, because the bodies are not SMPL's.
+Photographs are taken through distorting lenses in front of a grey wall. ``mask_cihp`` and ``mask``
+both have holes; their union has none. ``vertices`` fits worse than ``new_vertices``. The parameters
+of a body model (``params``, ``new_params``) have the right keys and shapes and a correct ``Rh`` and
+``Th``; poses and shapes are zero, because the bodies are not SMPL's.
 """
 
 from collections.abc import Sequence
@@ -102,7 +102,8 @@ def _long_stem(sequence: str, camera: str, frame: int) -> str:
 def _calibration(
     count: int, size: int, stage: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """K [n, 3, 3] with centres at integers, lens coefficients [n, 5], world to camera [n, 4, 4] in metres."""
+    """K [n, 3, 3] with centres at integers, lens coefficients [n, 5],
+    world to camera [n, 4, 4] in metres."""
     matrices, poses = np.zeros((count, 3, 3)), np.zeros((count, 4, 4))
     centers = capture.ring(count, 2.9, 1.2, rng) + stage
     for k in range(count):
@@ -136,7 +137,8 @@ def _write_body(
 
 
 def _distorting_grid(matrix: np.ndarray, lens: np.ndarray, size: int) -> torch.Tensor:
-    """Where ``grid_sample`` reads each distorted pixel in the undistorted photograph [1, h, w, 2]."""
+    """Where ``grid_sample`` reads each distorted pixel in the undistorted photograph
+    [1, h, w, 2]."""
     rows, columns = torch.meshgrid(torch.arange(size), torch.arange(size), indexing="ij")
     pixels = torch.stack((columns, rows), -1).reshape(1, -1, 2).double()
     places = undistort_points(

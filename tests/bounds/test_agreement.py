@@ -66,7 +66,8 @@ def test_of_two_views_none_loses_its_vote(wrong):
 
 
 def test_a_wrong_mask_that_is_outvoted_keeps_its_vote():
-    """With a tolerance its word alone carves nothing; without its vote the others would have to agree."""
+    """With a tolerance its word alone carves nothing;
+    without its vote the others would have to agree."""
     spoiled = spoil(make_batch(1, 5, 112, 112), "half")
     assert voting(spoiled) == [[True] * 4 + [False]]
     assert voting(spoiled, tolerance=1) == [[True] * 5]

@@ -10,7 +10,8 @@ from tests.helpers.scenes import make_batch
 
 
 def by_hand(batch, start, tolerance, samples, v, row, column):
-    """First and last allowed depth of one ray in float64; undilated masks, no ray leaves the frames."""
+    """First and last allowed depth of one ray in float64;
+    undilated masks, no ray leaves the frames."""
     masks = batch.masks[0].numpy()
     intrinsics, extrinsics = (
         x[0].double().numpy() for x in (batch.cameras.intrinsics, batch.cameras.extrinsics)

@@ -20,7 +20,8 @@ def figure(views=4, **options):
 
 
 def capture(of, name="0", seed=None, masks=None, shift=0):
-    """An instant of a figure, moved sideways in each photograph, before a background with a pattern."""
+    """An instant of a figure, moved sideways in each photograph,
+    before a background with a pattern."""
     photographs = []
     for view, camera in enumerate(of.names):
         rng = np.random.default_rng(view)

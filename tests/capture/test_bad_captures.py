@@ -1,4 +1,5 @@
-"""Captures that cannot be read: one line that names the place, what was expected and what was found."""
+"""Captures that cannot be read: one line that names the place,
+what was expected and what was found."""
 
 import json
 import os

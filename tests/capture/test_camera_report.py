@@ -157,8 +157,8 @@ def test_a_mask_that_lacks_a_part_is_named_and_the_complete_ones_are_not(tmp_pat
 
 
 def test_where_two_views_may_be_wrong_both_are_named(tmp_path):
-    """A part that its opposite alone shows beside the trunk: one mask lacks it or the other has too much. The
-    photograph has no edge where the mask ends, and one where the other does."""
+    """A part that its opposite alone shows beside the trunk: one mask lacks it or the other has too
+    much. The photograph has no edge where the mask ends, and one where the other does."""
     figure = Figure(seed=4, jitter=0.02)
     left, right = np.flatnonzero(figure.masks[2].any(0))[[0, -1]]
     figure.masks[2][:, : left + 3 * (right + 1 - left) // 10] = False

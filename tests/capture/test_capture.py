@@ -83,7 +83,8 @@ def test_figurines_and_statues_are_predicted_alike(tmp_path, scale, origin):
 
 
 def test_python_refines_as_the_command_line_does(tmp_path):
-    """All that brings a prediction nearer to the photographs can be asked for, and says what it gained."""
+    """All that brings a prediction nearer to the photographs can be asked for,
+    and says what it gained."""
     capture, model = Capture.read(tmp_path, Figure().write(tmp_path)), make_model("model=hull").eval()
     plain, refined = (predict(capture, model, 28, refine=steps) for steps in (0, 2))
     assert plain.refined is None
@@ -107,7 +108,8 @@ def _center(photograph):
 @pytest.mark.parametrize("orientation", [3, 6, 8])
 @pytest.mark.parametrize("calibrated", ["shown", "stored"])
 def test_exif_turns_do_not_move_the_subject(tmp_path, orientation, calibrated):
-    """A phone stores pixels as its sensor has them; calibrations are of these or of the turned ones."""
+    """A phone stores pixels as its sensor has them;
+    calibrations are of these or of the turned ones."""
     figure = Figure()
     path = figure.write(tmp_path)
     right = Capture.read(tmp_path, path)
@@ -143,7 +145,8 @@ def _stored(camera, turns):
 
 
 def test_photographs_may_differ_in_size(tmp_path):
-    """One camera gives half the size; its intrinsics follow, and the batch is the same but for its grain."""
+    """One camera gives half the size; its intrinsics follow,
+    and the batch is the same but for its grain."""
     figure = Figure()
     path = figure.write(tmp_path)
     before = Capture.read(tmp_path, path).batch((56, 56))
@@ -186,7 +189,8 @@ def test_masks_come_from_many_places(tmp_path, source):
 
 
 def test_soft_masks_are_mattes(tmp_path):
-    """Grey values of a mask are shares; the background has no part in what a model sees of the rim."""
+    """Grey values of a mask are shares; the background has no part in what a model sees
+    of the rim."""
     figure = Figure()
     path = figure.write(tmp_path)
     sharp = Capture.read(tmp_path, path).batch((42, 42))

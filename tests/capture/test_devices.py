@@ -20,7 +20,8 @@ BROKEN = 9
 
 
 class Camera:
-    """In place of ``cv2.VideoCapture``: its frames carry their number, and come when the test says so."""
+    """In place of ``cv2.VideoCapture``: its frames carry their number,
+    and come when the test says so."""
 
     def __init__(self, device):
         self.device, self.taken, self.waits, self.coming = device, -1, 0, threading.Semaphore(0)
@@ -97,7 +98,8 @@ def red_of(photograph):
 
 
 def test_the_newest_frames_of_all_cameras(rig):
-    """Frames that come meanwhile are dropped and counted; colours are right, and masks the background's."""
+    """Frames that come meanwhile are dropped and counted;
+    colours are right, and masks the background's."""
     frames = rig.frames()
     first = rig.following(frames)
     assert (first.capture.name, first.dropped, first.taken) == ("000000", 0, 7.0)
@@ -163,7 +165,8 @@ def test_without_opencv_one_line_says_what_is_missing(rig, monkeypatch):
 
 
 def test_opencv_reads_files(tmp_path):
-    """Its own captures: frames of all files have one number, none comes twice, and all end together."""
+    """Its own captures: frames of all files have one number, none comes twice,
+    and all end together."""
     pytest.importorskip("cv2")
     paths = {name: tmp_path / f"{name}.mp4" for name in FIGURE.names}
     for camera, path in enumerate(paths.values()):

@@ -1,4 +1,5 @@
-"""What a capture contradicts is mended by itself; an exact capture is predicted as it is, to the bit."""
+"""What a capture contradicts is mended by itself;
+an exact capture is predicted as it is, to the bit."""
 
 import dataclasses
 import re
@@ -65,7 +66,8 @@ def test_a_camera_that_is_off_is_doubted(taken, changes):
 
 
 def test_one_camera_that_is_off_by_little_is_doubted_and_named(taken):
-    """By two pixels of the photographs, 0.9 of the crops: the others agree without it or its opposite."""
+    """By two pixels of the photographs, 0.9 of the crops:
+    the others agree without it or its opposite."""
     wrong = with_first_camera(taken, turn=2.0)
     doubt = doubt_of_cameras(wrong, wrong.batch(SIZE))
     missed, without = (float(number) for number in re.findall(r"by (0\.\d+)", doubt))

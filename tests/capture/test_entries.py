@@ -1,4 +1,5 @@
-"""Entries of calibrations: lenses under every name, types, one meaning each, and a note of the others."""
+"""Entries of calibrations: lenses under every name, types, one meaning each,
+and a note of the others."""
 
 import re
 

@@ -124,7 +124,8 @@ def test_colmap(tmp_path, binary):
 
 
 def test_nerfstudio():
-    """Converted from a COLMAP model by nerfstudio's own code, which turns the world and leaves out k3."""
+    """Converted from a COLMAP model by nerfstudio's own code,
+    which turns the world and leaves out k3."""
     path = FIXTURES / "cameras" / "transforms.json"
     turn = np.array(json.loads(path.read_text())["applied_transform"])
     cameras = {name: c | {"D": c["D"][:4]} for name, c in rig().items()}
@@ -132,7 +133,8 @@ def test_nerfstudio():
 
 
 def test_nerfstudio_with_an_angle_of_view(tmp_path):
-    """Instant NGP and Blender say the angle in place of the focal length, and nothing of the middle."""
+    """Instant NGP and Blender say the angle in place of the focal length,
+    and nothing of the middle."""
     frame = {"file_path": "./train/r_0", "transform_matrix": np.eye(4).tolist()}
     content = {"camera_angle_x": 2 * np.arctan(0.4), "w": 800, "h": 600, "frames": [frame]}
     (tmp_path / "transforms_train.json").write_text(json.dumps(content))
@@ -210,7 +212,8 @@ def test_a_unit_is_metres_of_one_unit_of_length(extrinsics):
 
 @pytest.mark.parametrize("extrinsics", ["world_to_camera", "camera_to_world"])
 def test_rotations_of_seven_digits_far_away(extrinsics):
-    """The centre was 9 mm from where the camera projects from, and an image changed by up to 0.02."""
+    """The centre was 9 mm from where the camera projects from,
+    and an image changed by up to 0.02."""
     rotation, center = rig()["cam_01"]["R"].round(7), np.array([1e5, -3e4, 1e4])
     pose, around = np.eye(4), center + POINTS
     pose[:3, :3] = rotation if extrinsics == "world_to_camera" else rotation.T

@@ -55,7 +55,8 @@ def written(tmp_path):
 
 
 def require_crop(batch, crops, name):
-    """Which camera is the target: inputs and target are the crops of an instant, each camera once."""
+    """Which camera is the target: inputs and target are the crops of an instant,
+    each camera once."""
     seen = torch.cat((batch.images, batch.targets.images), 1)[0]
     lenses = torch.cat((batch.cameras.intrinsics, batch.targets.cameras.intrinsics), 1)[0]
     poses = torch.cat((batch.cameras.extrinsics, batch.targets.cameras.extrinsics), 1)[0]

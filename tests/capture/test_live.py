@@ -1,4 +1,5 @@
-"""A live view's captures: of a folder that is being written, and of videos; no test waits for a clock."""
+"""A live view's captures: of a folder that is being written, and of videos;
+no test waits for a clock."""
 
 import itertools
 import shutil
@@ -29,7 +30,8 @@ class Time:
 
 @pytest.fixture
 def source(tmp_path):
-    """An instant whose files can be put elsewhere, the calibration, and an empty folder for instants."""
+    """An instant whose files can be put elsewhere, the calibration,
+    and an empty folder for instants."""
     path = Figure().write(tmp_path / "source")
     shutil.copy(path, tmp_path / "again.json")
     shutil.move(path, tmp_path / "cameras.json")
@@ -82,7 +84,8 @@ def test_an_instant_counts_when_it_is_whole(source):
 
 
 def test_instants_that_come_while_one_is_in_use_are_dropped(source):
-    """The newest that can be read is taken; one that cannot be is dropped, too, when later ones come."""
+    """The newest that can be read is taken; one that cannot be is dropped, too,
+    when later ones come."""
     put(source, "8")()
     frames = arriving(source, Time())
     (source / "cameras.json").unlink()  # it is read once

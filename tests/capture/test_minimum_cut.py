@@ -20,7 +20,8 @@ def value(labels, evidence, costs):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_no_other_labels_have_more(seed):
-    """Against all 2^12 labels of a small grid; some of its pixels are decided by their evidence alone."""
+    """Against all 2^12 labels of a small grid;
+    some of its pixels are decided by their evidence alone."""
     rng = np.random.default_rng(seed)
     shape = 3, 4
     evidence = rng.normal(0, 4, shape)

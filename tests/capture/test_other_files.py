@@ -31,7 +31,8 @@ def test_a_folder_of_each_camera_names_it(tmp_path):
 
 
 def test_an_angle_of_view_alone_is_of_the_photograph(tmp_path):
-    """NeRF's and Blender's files have no size: the photographs have one, before and after a quarter turn."""
+    """NeRF's and Blender's files have no size: the photographs have one,
+    before and after a quarter turn."""
     poses = rig()
     angle, frames = 2 * np.arctan(0.5), []
     for name, camera in poses.items():

@@ -85,7 +85,8 @@ def test_a_capture_with_an_angle_of_view_alone(capture):
 
 
 def test_a_turned_photograph_of_a_calibration_without_size(capture):
-    """As shown, as OpenCV turns photographs: the report took it as stored, and accused the cameras."""
+    """As shown, as OpenCV turns photographs: the report took it as stored,
+    and accused the cameras."""
     own = json.loads((capture / "cameras.json").read_text())["cameras"]
     without = {n: {k: c[k] for k in ("intrinsics", "extrinsics")} for n, c in own.items()}
     write(capture / "cameras.json", {"cameras": without})
@@ -178,7 +179,8 @@ def matte(tmp_path, image):
 
 
 def test_void_is_not_the_subject(tmp_path):
-    """VOC: the person is 15, the rim around it 255; a soft matte has values between, and white is more."""
+    """VOC: the person is 15, the rim around it 255;
+    a soft matte has values between, and white is more."""
     values = np.zeros((40, 30), np.uint8)
     values[10:30, 8:22] = 255
     values[12:28, 10:20] = 15

@@ -1,4 +1,5 @@
-"""Cameras from whose places alone a prediction cannot be good: a line of the doctor, or a refusal."""
+"""Cameras from whose places alone a prediction cannot be good: a line of the doctor,
+or a refusal."""
 
 import json
 

@@ -1,4 +1,5 @@
-"""Cameras and colour gains that several instants share: what is found, and the file that says so."""
+"""Cameras and colour gains that several instants share: what is found,
+and the file that says so."""
 
 import dataclasses
 import json

@@ -169,7 +169,8 @@ def test_a_mask_that_loses_a_part_is_predicted_anew_and_so_is_what_comes_next():
 
 
 def test_a_person_who_leaves_and_comes_back():
-    """Nobody is no Gaussians, once; who comes back elsewhere is predicted anew and followed again."""
+    """Nobody is no Gaussians, once; who comes back elsewhere is predicted anew and
+    followed again."""
     predict, asked = counted()
     temporal = Temporal(predict, 99, RENDERER)
     back = [motion((0.3 + 0.005 * n, 0.0, -0.2)) for n in range(3)]
@@ -187,8 +188,8 @@ def test_a_person_who_leaves_and_comes_back():
 
 
 def test_a_camera_that_is_black_for_three_instants():
-    """Although its masks say nothing of it. They are predicted from what there is, and so is what comes next;
-    nothing of them is handed on."""
+    """Although its masks say nothing of it. They are predicted from what there is, and so is what
+    comes next; nothing of them is handed on."""
     predict, asked = counted()
     temporal = Temporal(predict, 99, RENDERER)
     batches = [instant(moved) for moved in steps(8)]

@@ -1,4 +1,5 @@
-"""A camera with a tone curve of its own is named and its photographs are mended; others stay as they are."""
+"""A camera with a tone curve of its own is named and its photographs are mended;
+others stay as they are."""
 
 import dataclasses
 import json
@@ -82,7 +83,8 @@ def test_what_was_predicted_before_a_look_is_no_instant_of_a_sequence(taken):
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """A folder with two instants of photographs of which cam2 has a gamma of 0.8, and their cameras."""
+    """A folder with two instants of photographs of which cam2 has a gamma of 0.8,
+    and their cameras."""
     monkeypatch.chdir(tmp_path)
     for instant in ("000", "001"):
         figure = Figure()

@@ -29,7 +29,8 @@ from tests.helpers.videos import number_of, write_video
 
 
 def test_videos_are_read_in_order(place):
-    """Every frame with its mask, by instants named by their frames; and the first again after the last."""
+    """Every frame with its mask, by instants named by their frames;
+    and the first again after the last."""
     folder = opened(place)
     assert all_numbers(folder) == {f"{n:06d}": alike(n) for n in range(FRAMES)}
     assert folder.note == ""
@@ -44,7 +45,8 @@ def test_videos_are_read_in_order(place):
 
 @pytest.mark.parametrize("suffix", [".mov", ".mkv", ".avi", ".webm"])
 def test_frames_have_their_numbers_in_every_kind_of_file(tmp_path, suffix):
-    """With frames that are stored in another order than shown, sought from the end to the beginning."""
+    """With frames that are stored in another order than shown,
+    sought from the end to the beginning."""
     options = {"codec": "libvpx"} if suffix == ".webm" else {"codec": "libx264"}
     path = tmp_path / f"a{suffix}"
     write_video(path, frames_of(0), **options)
@@ -57,7 +59,8 @@ def test_frames_have_their_numbers_in_every_kind_of_file(tmp_path, suffix):
 
 
 def test_frames_that_were_cut_off_do_not_count(tmp_path):
-    """A phone that cuts a video leaves the frames before in its file, and says that they are not shown."""
+    """A phone that cuts a video leaves the frames before in its file,
+    and says that they are not shown."""
     write_video(tmp_path / "whole.mp4", frames_of(0), codec="libx264")
     cut = [get_ffmpeg_exe(), "-v", "error", "-ss", "0.15", "-i", tmp_path / "whole.mp4"]
     subprocess.run([*cut, "-c", "copy", tmp_path / "cut.mp4"], check=True)
@@ -89,7 +92,8 @@ def test_a_frame_that_a_camera_dropped_shifts_no_other(place):
 
 
 def test_masks_of_the_frames_that_there_are(place):
-    """Drawn of one after another they know of no dropped frame: masks of other frames are no use."""
+    """Drawn of one after another they know of no dropped frame:
+    masks of other frames are no use."""
     keep = ["-vf", "select=not(eq(n\\,2))", "-fps_mode", "passthrough"]
     write_video(place / "images" / "cam1.mp4", frames_of(1), output_params=keep)
     drawn = [np.roll(mask(1), 2 * number, 0) for number in range(FRAMES)]
@@ -213,7 +217,8 @@ def write_csv(place, rows, header=("camera", "frame", "seconds")):
 
 
 def test_time_stamps(place):
-    """The nearest frame; a frame that is too far is missing, and its instant is predicted without it."""
+    """The nearest frame; a frame that is too far is missing,
+    and its instant is predicted without it."""
     late = {"cam0": 0.0, "cam1": 0.04, "cam2": -0.2, "cam3": 0.0}
     rows = [(c, n, n / FPS + late[c]) for c in FIGURE.names for n in range(FRAMES) if (c, n) != ("cam3", 2)]
     found = all_numbers(opened(place, sequence=write_csv(place, rows)))

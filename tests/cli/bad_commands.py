@@ -1,8 +1,8 @@
 """Commands that cannot work, by what is wrong with them.
 
-A row is a command, its exit code, and parts of its line: the path or key, what was expected, what was found.
-``{tmp}`` is the folder of the test; the files in braces are made by the fixture ``files`` of
-``test_bad_commands``.
+A row is a command, its exit code, and parts of its line: the path or key, what was expected, what
+was found. ``{tmp}`` is the folder of the test; the files in braces are made by the fixture
+``files`` of ``test_bad_commands``.
 """
 
 USAGE = [

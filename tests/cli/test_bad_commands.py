@@ -73,7 +73,8 @@ def call(monkeypatch, capfd, tmp_path, command: str) -> tuple[int, str]:
 def test_a_bad_command_gets_its_exit_code_and_one_line(
     monkeypatch, capfd, tmp_path, files, command, expected, parts
 ):
-    """Users and scripts must learn what was wrong: the path or key, what was expected, what was found."""
+    """Users and scripts must learn what was wrong: the path or key, what was expected,
+    what was found."""
     names = {**files, "tmp": tmp_path}
     code, text = call(monkeypatch, capfd, tmp_path, command.format(**names))
     assert code == expected, text

@@ -50,7 +50,8 @@ def test_a_checkpoint_is_not_changed_by_what_a_verb_composes(composed, checkpoin
 
 @pytest.mark.parametrize("verb", ["evaluate", "predict"])
 def test_what_is_said_of_the_model_acts_on_a_checkpoint(composed, checkpoint, verb):
-    """Options that need no other weights change the model that is measured, with all that follows them."""
+    """Options that need no other weights change the model that is measured,
+    with all that follows them."""
     said = [
         "skip=none",
         "recalibration.k=2",
@@ -145,7 +146,8 @@ def test_data_that_are_not_here_are_named_by_their_key(composed, checkpoint, mon
 
 
 def test_a_strange_size_of_rounds_takes_no_memory(tmp_path):
-    """``rounds.hidden=65536`` of a checkpoint allocated 150 GB before it was compared with the weights."""
+    """``rounds.hidden=65536`` of a checkpoint allocated 150 GB before it was compared with
+    the weights."""
     path, settings = tmp_path / "a.ckpt", config("model=recurrent")
     state = GHGS.from_config(settings).state_dict()
     write_checkpoint(path, state, {**settings, "rounds": {**settings["rounds"], "hidden": 65536}})
@@ -159,7 +161,8 @@ def test_a_strange_size_of_rounds_takes_no_memory(tmp_path):
 
 
 def test_targets_on_the_command_line_are_measured_alone(composed):
-    """``targets=midway`` is the switch that its name says; evaluation.targets is for several protocols."""
+    """``targets=midway`` is the switch that its name says;
+    evaluation.targets is for several protocols."""
     found = inputs.with_chosen_targets(resolve(composed("evaluate", "targets=midway")))
     assert lookup(found, "evaluation.targets") == ["midway"]
     for said in ([], ["targets.per_subject=2"], ["targets=ghg", "evaluation.targets=[release,midway]"]):

@@ -38,7 +38,8 @@ def call(monkeypatch, capsys, *argv: str) -> tuple[int, str, str]:
 
 
 def test_help_shows_an_example_for_every_verb_and_only_built_verbs(monkeypatch, capsys):
-    """A verb in the help without a module or a configuration would fail only when a user calls it."""
+    """A verb in the help without a module or a configuration would fail only when a
+    user calls it."""
     code, out, _ = call(monkeypatch, capsys, "--help")
     assert code == 0
     for verb in verbs():
@@ -186,7 +187,8 @@ def test_a_prediction_does_not_wait_for_what_training_needs():
 
 
 def test_the_verb_is_in_argv_while_the_task_runs(monkeypatch):
-    """Lightning starts the other processes of a DDP job by sys.argv, which must contain the verb."""
+    """Lightning starts the other processes of a DDP job by sys.argv,
+    which must contain the verb."""
     seen = {}
 
     def run(self, cfg):
@@ -202,7 +204,8 @@ def test_the_verb_is_in_argv_while_the_task_runs(monkeypatch):
 
 
 def test_a_verb_prints_the_path_of_its_configuration(monkeypatch, capsys, tmp_path):
-    """A sweep of many runs must not print thousands of lines of configuration; the file has it all."""
+    """A sweep of many runs must not print thousands of lines of configuration;
+    the file has it all."""
     monkeypatch.setattr(HydraConfig.instance(), "cfg", None)
     config = {"optimizer": {"lr": 0.25}}
     write_config(config, tmp_path)
@@ -267,7 +270,8 @@ def test_a_run_with_anything_else_stays(monkeypatch, tmp_path):
 
 
 def test_hydras_files_are_written_and_through_no_link(tmp_path, monkeypatch, capsys):
-    """A run's folder of a stranger may hold links to files of the user, which Hydra itself would empty."""
+    """A run's folder of a stranger may hold links to files of the user,
+    which Hydra itself would empty."""
     run, precious = tmp_path / "run", tmp_path / "precious"
     run.mkdir()
     precious.write_text("precious")

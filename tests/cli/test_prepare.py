@@ -1,4 +1,5 @@
-"""``ghgs prepare`` on data that is incomplete on purpose, and what is refused before anything is made."""
+"""``ghgs prepare`` on data that is incomplete on purpose,
+and what is refused before anything is made."""
 
 import json
 

@@ -83,7 +83,8 @@ def test_one_thing_that_is_missing_is_the_one_that_is_said(
 
 
 def test_the_room_for_tokens_is_said(rendered):
-    """Before anything is written: three people in 16 positions, 2 x 2 patches, 32 channels of two bytes."""
+    """Before anything is written: three people in 16 positions, 2 x 2 patches,
+    32 channels of two bytes."""
     encoder = "encoder={width: 32, heads: 2, depth: 4, layers: [0, 1, 2, 3], image_size: 28}"
     frozen = ["encoder=vggt_1b", encoder, "encoder.vit={depth: 2, heads: 2}", "allow_random_encoder=true"]
     found = rehearsed(

@@ -53,7 +53,8 @@ def parameters_of(stages):
 
 @pytest.mark.parametrize("group", GROUPS)
 def test_every_member_composes_and_its_model_is_built(group):
-    """A shipped option that does not compose, or builds no model, would fail only for its first user."""
+    """A shipped option that does not compose, or builds no model,
+    would fail only for its first user."""
     for path in sorted((CONF / group).glob("*.yaml")):
         # Depths without bounds belong to the release's model alone.
         fitting = ["compat=release"] if (group, path.stem) == ("bounds", "none") else []
@@ -113,7 +114,8 @@ views: {training: uneven}
 
 @pytest.fixture
 def own(monkeypatch, tmp_path):
-    """``own(ablation=text)`` writes the file ``mine`` of a group; returns the flags that show its folder."""
+    """``own(ablation=text)`` writes the file ``mine`` of a group;
+    returns the flags that show its folder."""
 
     rehearse_nothing(monkeypatch)
 
@@ -127,7 +129,8 @@ def own(monkeypatch, tmp_path):
 
 
 def test_what_an_ablation_sets_holds(monkeypatch, capsys, own):
-    """Loss, optimizer and views composed after it, so that its keys had no effect and two rows were one."""
+    """Loss, optimizer and views composed after it,
+    so that its keys had no effect and two rows were one."""
     flags = own(ablation=SETS)
     said = ["experiment=demo", "ablation=mine", "views.training=any"]
     code, out, _ = call(monkeypatch, capsys, "train", "--cfg", "job", *flags, *said)
@@ -199,7 +202,8 @@ def test_a_model_may_set_keys_of_loss_and_optimizer(monkeypatch, capsys, own):
 
 
 def test_options_are_read_inside_another_hydra_application(tmp_path):
-    """Its search path has none of the package's files: ``targets: expected one of ; found 'midway'``."""
+    """Its search path has none of the package's files:
+    ``targets: expected one of ; found 'midway'``."""
     (tmp_path / "theirs.yaml").write_text("lr: 1\n")
     with initialize_config_dir(str(tmp_path), **VERSION_BASE):
         their = hydra.compose("theirs")

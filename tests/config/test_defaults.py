@@ -30,7 +30,8 @@ class Outer(Options):
 
 
 def test_what_is_not_said_is_the_default():
-    """A part of an inner mapping is over the default of its field; other mappings are whole values."""
+    """A part of an inner mapping is over the default of its field;
+    other mappings are whole values."""
     full = with_defaults({"inner": {"sizes": [3]}, "maybe": {}, "shares": {"b": 1.0}, "new": 1}, Outer)
     inner = {"width": 8, "sizes": [3]}
     nested = {"inner": inner, "maybe": {"width": 4, "sizes": [1, 2]}, "shares": {"b": 1.0}}

@@ -126,7 +126,8 @@ def message(verb, config):
 
 
 def test_wrong_values_are_named_with_what_was_expected_and_found():
-    """Wrong types and ranges ended in tracebacks, comparisons of texts with numbers, or ran for ever."""
+    """Wrong types and ranges ended in tracebacks, comparisons of texts with numbers,
+    or ran for ever."""
     wrong = []
     for line in Path(__file__).with_name("wrong_values.txt").read_text().splitlines():
         command, _, words = line.partition(": ")

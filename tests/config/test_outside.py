@@ -1,4 +1,5 @@
-"""Files of ``--config-dir`` say to Hydra only what a list allows; the rest is the command line's."""
+"""Files of ``--config-dir`` say to Hydra only what a list allows;
+the rest is the command line's."""
 
 import os
 

@@ -50,7 +50,8 @@ OUTSIDE = ["os.system", "subprocess.run", "builtins.eval", "torch.load", "lightn
 
 
 def test_no_function_or_class_is_a_kind_by_its_path():
-    """A checkpoint said ``_target_: ghgs_lit.runs.job._run_process`` with a command, and the command ran."""
+    """A checkpoint said ``_target_: ghgs_lit.runs.job._run_process`` with a command,
+    and the command ran."""
     paths = [*everything_callable(), *OUTSIDE]
     assert len(paths) > 1500
     for number, path in enumerate(paths):  # of each group a share, and what is not ours

@@ -1,4 +1,5 @@
-"""A data set of one's own: the documentation's template, found by the command line, trained and measured."""
+"""A data set of one's own: the documentation's template, found by the command line,
+trained and measured."""
 
 import json
 import shutil
@@ -103,7 +104,8 @@ def test_one_file_and_one_yaml_are_trained_and_measured(project, monkeypatch, ca
 
 
 def test_the_template_passes_the_check(project, monkeypatch):
-    """task=check asks for the static cameras alone, whatever the protocol's views, and counts the bodies."""
+    """task=check asks for the static cameras alone, whatever the protocol's views,
+    and counts the bodies."""
     monkeypatch.setenv(registry.VARIABLE, str(project / "my_people.py"))
     release = {"name": "release", "training_views": [2, 3, 4]}
     report = inspect(build(node(project), "data", **KEYS | {"targets": release}))

@@ -1,4 +1,5 @@
-"""Variation of training batches: what each switch changes, and that batches depend on seed and step alone."""
+"""Variation of training batches: what each switch changes,
+and that batches depend on seed and step alone."""
 
 import dataclasses
 
@@ -60,7 +61,8 @@ def test_batches_depend_on_seed_and_step_alone(root):
 
 
 def test_imperfections_and_sizes_differ_between_seeds_steps_and_samples(root):
-    """The same photographs in another step, run or place of the batch are imperfect in another way."""
+    """The same photographs in another step, run or place of the batch are imperfect in
+    another way."""
     clean, varied = module(root).training_batch(0), Augmentation(**EVERYTHING)
 
     def drawn(seed, step, indices=(6, 7)):
@@ -127,7 +129,8 @@ def test_drawn_sizes_keep_the_proportion_of_the_targets(root):
 
 
 def test_targets_are_never_enlarged(root):
-    """Twice the size of the inputs is more than the photographs hold: they stay as large as they are read."""
+    """Twice the size of the inputs is more than the photographs hold:
+    they stay as large as they are read."""
     data = module(root, target_size=42, augmentation={"target_scale": [1.0, 2.0]})
     sides = {data.training_batch(step).targets.images.shape[-1] for step in range(12)}
     assert 28 <= min(sides) < 36
@@ -229,7 +232,8 @@ def test_refined_masks_are_those_of_a_capture(root):
 
 
 def test_tone_curves_raise_the_surface_to_a_power(root):
-    """One power for each camera; powers differ, their geometric mean is 1; black and mattes stay."""
+    """One power for each camera; powers differ, their geometric mean is 1;
+    black and mattes stay."""
     clean, toned = (module(root, augmentation=a).training_batch(1) for a in ({}, {"gamma": 0.3}))
     one, other = (surface_colors(batch).double() for batch in (clean, toned))
     sure = ((clean.alpha > 0.5)[:, :, None] & (one > 0.1) & (one < 0.9)).expand_as(one)
@@ -244,7 +248,8 @@ def test_tone_curves_raise_the_surface_to_a_power(root):
 
 
 def test_a_cut_moves_photographs_and_cameras_together(root):
-    """A point of the world shows what it showed, until it leaves the frame; wholes are whole in some view."""
+    """A point of the world shows what it showed, until it leaves the frame;
+    wholes are whole in some view."""
     clean = module(root).training_batch(1)
     kinds = set()
     for seed in range(12):

@@ -88,7 +88,8 @@ DAMAGES = {
 
 
 def test_sound_data_agrees(root):
-    """Right masks and cameras pass; every subject's body is counted, whether it checks cameras or not."""
+    """Right masks and cameras pass; every subject's body is counted,
+    whether it checks cameras or not."""
     found = report(root)
     assert found.problems == []
     assert found.notes == []
@@ -98,7 +99,8 @@ def test_sound_data_agrees(root):
 
 @pytest.mark.parametrize("kind", DAMAGES)
 def test_damage_is_found_without_bodies(root, kind):
-    """Each defect that silhouettes show is one problem, although no body says where the subject is."""
+    """Each defect that silhouettes show is one problem,
+    although no body says where the subject is."""
     shutil.rmtree(root / "train/smpl")
     damage, line = DAMAGES[kind]
     damage(root)
@@ -122,7 +124,8 @@ def test_other_units_are_named(root):
 
 
 def test_the_same_person_in_both_phases_is_a_problem(root):
-    """Leakage by id stops reading and the check; the same photographs under another id stop the check."""
+    """Leakage by id stops reading and the check;
+    the same photographs under another id stop the check."""
     for folder in sorted(root.glob("train/*/s1*")):
         renamed = folder.name.replace("s1", "other")
         shutil.copytree(folder, root / "val" / folder.parent.name / renamed)

@@ -1,4 +1,5 @@
-"""Options of data sets: one flat mapping, checked, with the keys of the data set and of its batches."""
+"""Options of data sets: one flat mapping, checked,
+with the keys of the data set and of its batches."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,7 +15,8 @@ from tests.helpers.people import TINY, render_boxes, rendered
 
 
 def test_keys_of_the_data_set_and_of_its_batches_lie_side_by_side():
-    """Documented commands set data.root and data.batch_size in one node; a path may be one of Python's."""
+    """Documented commands set data.root and data.batch_size in one node;
+    a path may be one of Python's."""
     data = rendered(Path("x"), batch_size=3, limit={"val": 2}, workers=1).dataset
     assert data == Scans(root="x", size=[28, 28], batch_size=3, limit={"val": 2}, workers=1, render=TINY)
     assert [data.limit.of(phase) for phase in ("train", "val", "bench")] == [None, 2, None]
@@ -92,7 +94,8 @@ def test_evaluation_has_the_batches_that_are_asked_for(boxes):
 
 @pytest.mark.parametrize("rank", [0, 1])
 def test_each_process_of_several_loads_its_own_samples(boxes, rank, monkeypatch):
-    """Its number and how many there are come from the trainer; four subjects are passed often in an epoch."""
+    """Its number and how many there are come from the trainer;
+    four subjects are passed often in an epoch."""
     data = rendered(boxes, batch_size=1)
     data.trainer = SimpleNamespace(world_size=2, global_rank=rank, max_steps=-1, max_epochs=None)
     data.trainer.num_devices = 2

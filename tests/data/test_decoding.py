@@ -1,4 +1,5 @@
-"""Files that look sound and are not: each is refused with its path, before its values reach a batch."""
+"""Files that look sound and are not: each is refused with its path,
+before its values reach a batch."""
 
 import dataclasses
 

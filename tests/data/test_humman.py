@@ -108,7 +108,8 @@ def test_the_background_is_black(root):
 
 @pytest.mark.parametrize("share", [1, 2, 5])
 def test_intrinsics_fit_resized_photographs(root, tmp_path, share):
-    """A spot where OpenCV sees a point is where the view's camera sees it, to a fiftieth of a pixel."""
+    """A spot where OpenCV sees a point is where the view's camera sees it,
+    to a fiftieth of a pixel."""
     shutil.copytree(root / TEST, tmp_path / TEST)
     camera = json.loads((root / TEST / "cameras.json").read_text())["kinect_color_005"]
     matrix, rotation, translation = (np.array(camera[key]) for key in "KRT")

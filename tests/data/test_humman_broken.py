@@ -1,4 +1,5 @@
-"""Broken HuMMan-Recon data: each case gets one line that says where, what was expected and what was found.
+"""Broken HuMMan-Recon data: each case gets one line that says where,
+what was expected and what was found.
 
 The lines are listed in ``docs/evidence/broken_files.md``.
 """

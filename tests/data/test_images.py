@@ -1,4 +1,5 @@
-"""Images as they are meant: formats, colours of profiles, turns by EXIF; for data sets and captures alike."""
+"""Images as they are meant: formats, colours of profiles, turns by EXIF;
+for data sets and captures alike."""
 
 import warnings
 
@@ -104,7 +105,8 @@ def orientation(value):
 @read
 @pytest.mark.parametrize("suffix", ["jpg", "png"])
 def test_an_orientation_that_is_none_is_as_stored(tmp_path, pixels, reader, suffix):
-    """0 is how several programs say "unknown"; viewers and OpenCV show such photographs as stored."""
+    """0 is how several programs say "unknown";
+    viewers and OpenCV show such photographs as stored."""
     for value in (0, 9, 255):
         path = with_exif(tmp_path / f"a.{suffix}", pixels, orientation(value))
         Image.fromarray(pixels).save(tmp_path / f"b.{suffix}")

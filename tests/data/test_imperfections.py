@@ -62,7 +62,8 @@ def test_masks_grow_shrink_and_fray_within_their_pixels():
 
 @pytest.mark.parametrize("size", [(60, 45), (31, 50)])
 def test_backgrounds_are_patches_that_scipy_enlarges(size):
-    """The same random numbers by another interpolation: patterns agree to the rounding of float32."""
+    """The same random numbers by another interpolation:
+    patterns agree to the rounding of float32."""
     found = backgrounds(2, *size, np.random.default_rng(4))
     rng = np.random.default_rng(4)
     expected = 0.5 + rng.uniform(-0.2, 0.2, (2, 3, 1, 1)) + 0.02 * rng.standard_normal((2, 3, *size))
@@ -137,7 +138,8 @@ def test_calibration_errors_move_the_subject_by_their_pixels(limit):
 
 
 def test_calibration_errors_have_nothing_in_common():
-    """Photographs do not tell where a rig is, nor its scale: what all cameras share cannot be undone."""
+    """Photographs do not tell where a rig is, nor its scale:
+    what all cameras share cannot be undone."""
     cameras, masks, _ = ring()
     true = cameras.extrinsics
     middle = torch.tensor([0, 0.9, 0]).double()
@@ -157,7 +159,8 @@ def test_calibration_errors_have_nothing_in_common():
 
 
 def test_calibration_errors_do_not_depend_on_the_worlds_origin():
-    """A world whose origin is a kilometre away has the same errors, up to the rounding of rotations."""
+    """A world whose origin is a kilometre away has the same errors,
+    up to the rounding of rotations."""
     results = []
     for shift in (0.0, 1000.0):
         cameras, masks, points = ring(shift)

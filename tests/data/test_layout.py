@@ -1,4 +1,5 @@
-"""The rendered layout: what is written is read back, others' variants too, and bad files are named."""
+"""The rendered layout: what is written is read back, others' variants too,
+and bad files are named."""
 
 import os
 import shutil
@@ -110,7 +111,8 @@ def test_depth_code_is_inverse_and_keeps_zero():
 
 @pytest.mark.parametrize("size", [(28, 28), (28, 42), (112, 84), (30, 21)])
 def test_resized_views_keep_their_geometry(root, size):
-    """Unprojected depth of a resized view still lies on the mesh: intrinsics follow pixels exactly."""
+    """Unprojected depth of a resized view still lies on the mesh:
+    intrinsics follow pixels exactly."""
     view = photographs(root, size).view("box", 0, 0)
     assert view.image.shape == (*size, 3)
     assert view.mask.shape == view.depth.shape == size
@@ -133,7 +135,8 @@ def test_halving_averages_areas(root):
 
 
 def test_renders_of_others_are_read(root):
-    """PNG photographs, masks of three channels with 0/1, no depth, smplx only, 4 x 4 poses, hr images."""
+    """PNG photographs, masks of three channels with 0/1, no depth, smplx only, 4 x 4 poses,
+    hr images."""
     ours = photographs(root, pixel_centers="half").view("box", 0, 0)
     img, mask, depth, parm = (root / "train" / k / "box_000" for k in ("img", "mask", "depth", "parm"))
     Image.open(img / "0.jpg").save(img / "0.png")
@@ -160,7 +163,8 @@ def test_renders_of_others_are_read(root):
 
 @pytest.mark.parametrize("size", [(28, 28), (30, 21)])
 def test_mattes_are_resized_as_photographs_and_masks_follow(root, size):
-    """The share of the subject stays; masks are where it fills a half, depths where it shows at all."""
+    """The share of the subject stays; masks are where it fills a half,
+    depths where it shows at all."""
     full, small = photographs(root).view("box", 0, 0), photographs(root, size).view("box", 0, 0)
     assert small.alpha.mean() == pytest.approx(full.alpha.mean(), abs=1e-3)
     np.testing.assert_array_equal(small.mask, small.matte >= 128)

@@ -58,7 +58,8 @@ def same(root, **options) -> bool:
     ids=str,
 )
 def test_samples_are_those_of_the_folder(root, options):
-    """Photographs, masks, mattes, depths, bodies and cameras; resized once, in each step, or not at all."""
+    """Photographs, masks, mattes, depths, bodies and cameras;
+    resized once, in each step, or not at all."""
     assert same(root, **options)
     assert files(root)
     assert batches(root, **options)[0].depths is not None
@@ -161,7 +162,8 @@ def test_size_and_place_are_said_once(root, caplog):
 
 
 def test_what_would_not_fit_is_not_packed(root, caplog):
-    """More than packed_gb, or than half of the free disk: the data's own files are read, and that is said."""
+    """More than packed_gb, or than half of the free disk: the data's own files are read,
+    and that is said."""
     with caplog.at_level(logging.INFO):
         assert all(map(equal, batches(root, gb=1e-9), batches(root, gb=0)))
     assert "photographs are not packed: about" in caplog.text

@@ -1,4 +1,5 @@
-"""Pickles of data sets: arrays and plain containers come through, anything else is refused unexecuted."""
+"""Pickles of data sets: arrays and plain containers come through,
+anything else is refused unexecuted."""
 
 import collections
 import os

@@ -49,7 +49,8 @@ def middle(mask: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("size", ["half", "odd"])
 def test_release_resizes_as_opencv_and_pillow(size):
-    """The numbers of the libraries themselves: even pixels of masks, Pillow's bicubic photographs."""
+    """The numbers of the libraries themselves: even pixels of masks,
+    Pillow's bicubic photographs."""
     image, mask = RECORDED[f"photograph_bicubic_{size}"], RECORDED[f"mask_nearest_{size}"][..., 0]
     np.testing.assert_array_equal(release_image(RECORDED["photograph"], *image.shape[:2]), image)
     np.testing.assert_array_equal(release_mask(RECORDED["mask"][..., 0], *mask.shape), mask)
@@ -86,7 +87,8 @@ def test_masks_stay_at_their_place(old, new):
 
 @pytest.mark.parametrize(("old", "new"), SIZES)
 def test_depth_is_that_of_the_new_centres(old, new):
-    """The depth of a slanted plane is exact to the rounding of the file; a step keeps its two depths."""
+    """The depth of a slanted plane is exact to the rounding of the file;
+    a step keeps its two depths."""
     rows, columns = np.mgrid[:old, :old] + 0.5
     inverse = np.round(12000 + 20 * rows - 15 * columns).astype(np.uint16)
     rows, columns = (np.mgrid[:new, :new] + 0.5) * old / new
@@ -110,7 +112,8 @@ def test_a_resized_view_has_depth_in_its_mask_only():
 
 
 def test_the_release_protocol_loads_as_the_release(tmp_path):
-    """experiment=thuman2 and data=thuman2_release read as the release does; everything else by areas."""
+    """experiment=thuman2 and data=thuman2_release read as the release does;
+    everything else by areas."""
     render_boxes(tmp_path / "root", tmp_path / "scans", train=1, val=1)
     for override, resampling, centers in (
         ("experiment=thuman2", "release", "half"),

@@ -47,7 +47,8 @@ def test_samples_of_one_size_are_the_same_to_the_bit(root, options):
 
 
 def test_samples_of_varying_sizes_agree_to_rounding(root):
-    """The same photographs, sizes and cameras; a mean at the middle of two levels may have the other one."""
+    """The same photographs, sizes and cameras;
+    a mean at the middle of two levels may have the other one."""
     pixels = different = 0
     shapes = set()
     for there, read in pairs(root, augmentation=SIZES):

@@ -52,7 +52,8 @@ def test_even_positions_are_the_protocols():
 
 @pytest.mark.parametrize("count", [3, 4, 5])
 def test_uneven_views_stay_around_the_subject(count):
-    """Neighbours are a position or more apart; no camera is further than one from where it is even."""
+    """Neighbours are a position or more apart;
+    no camera is further than one from where it is even."""
     protocol = ViewProtocol(training_counts=(count,), training="uneven")
     draws = [protocol.draw(FULL, count, 16, np.random.default_rng(seed)) for seed in range(80)]
     gaps = {tuple(np.diff([*positions, positions[0]]) % 16) for positions in draws}
@@ -70,7 +71,8 @@ def test_uneven_views_need_room():
 
 @pytest.mark.parametrize("count", [3, 4, 5])
 def test_targets_stand_where_their_protocol_says(root, count):
-    """Angles of the actual cameras: 11.25 degrees beside the first input; equally far from two inputs."""
+    """Angles of the actual cameras: 11.25 degrees beside the first input;
+    equally far from two inputs."""
     data = module(root)
     for batch in data.evaluation_loader(count, TargetProtocol(name="release")):
         first, target = turns(batch.cameras)[:, 0], turns(batch.targets.cameras)[:, 0]
@@ -163,7 +165,8 @@ def test_data_without_depth_or_body_says_none(root, tmp_path):
 
 
 def test_training_reads_depths_where_a_loss_does(root):
-    """Decoding depth maps that nothing reads is wasted; the depth error needs them in validation."""
+    """Decoding depth maps that nothing reads is wasted;
+    the depth error needs them in validation."""
     data = module(root)
     assert next(iter(data.train_dataloader())).depths is not None
     data.trains_on_depths = False
@@ -223,7 +226,8 @@ def test_loading_processes_change_nothing(root):
 
 
 def test_an_epoch_and_the_evaluation_have_the_expected_length(root):
-    """Lengths follow subjects, batch size, steps_per_epoch and limit; evaluation repeats exactly."""
+    """Lengths follow subjects, batch size, steps_per_epoch and limit;
+    evaluation repeats exactly."""
     data = module(root)
     assert len(data.train_dataloader()) == 100  # 50 passes over 3 subjects, 2 at a time
     assert [len(batch.subjects) for batch in data.val_dataloader()] == [2]

@@ -45,7 +45,8 @@ def test_ranges_of_ids():
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
 def test_few_scans_leave_somebody_to_validate(tmp_path, count):
-    """A tenth of four scans is none: training and evaluation failed on a folder that was never written."""
+    """A tenth of four scans is none: training and evaluation failed on a folder that was
+    never written."""
     names = [f"s{i}" for i in range(count)]
     drawn = split_names(tmp_path, names, None, 0.1, 0)
     assert len(drawn["val"]) == 1

@@ -49,7 +49,8 @@ def test_batches_of_a_class_have_one_number_of_inputs():
 
 
 def test_training_samples_are_fair():
-    """Every subject once in each round, all counts, positions and views, no target among the inputs."""
+    """Every subject once in each round, all counts, positions and views,
+    no target among the inputs."""
     batches = [sampler().batch(step) for step in range(300)]
     for batch in batches:
         assert len({len(d.inputs) for d in batch}) == 1
@@ -91,7 +92,8 @@ def test_even_training_views_keep_their_spacing():
 
 
 def test_seeds_choose_photographs_as_well_as_the_order_of_subjects():
-    """Of a single subject, whose order is no choice; numbers of views and targets of evaluation, too."""
+    """Of a single subject, whose order is no choice;
+    numbers of views and targets of evaluation, too."""
     one = {"subjects": {"a": FULL}, "batch_size": 1}
 
     def drawn(seed):

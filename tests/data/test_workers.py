@@ -33,7 +33,8 @@ MANY = float("inf")
     ],
 )
 def test_processes_by_cores_devices_and_batches(monkeypatch, batches, processes, on_gpu, cores, expected):
-    """A GPU leaves the cores to loading, a CPU none; a few batches come sooner than a process starts."""
+    """A GPU leaves the cores to loading, a CPU none;
+    a few batches come sooner than a process starts."""
     monkeypatch.setattr(workers.multiprocessing, "get_start_method", lambda: "fork")
     assert automatic_workers(batches, processes, on_gpu, cores) == expected
 

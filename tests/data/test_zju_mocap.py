@@ -113,7 +113,8 @@ def test_the_background_is_black(root):
 
 
 def test_undistortion_is_that_of_opencv():
-    """The published calibrations are OpenCV's; our undistortion agrees with stored results of it."""
+    """The published calibrations are OpenCV's;
+    our undistortion agrees with stored results of it."""
     height, width = OPENCV["image"].shape[:2]
     grid = undistorting_grid(half_centers(OPENCV["intrinsics"]), OPENCV["distortion"].ravel(), height, width)
     image, mask = undistort(OPENCV["image"], np.full((height, width), 255, np.uint8), grid)
@@ -145,7 +146,8 @@ def test_a_lens_without_distortion_leaves_photographs_alone(root):
 
 @pytest.mark.parametrize("side", [SIZE, SIZE // 2, SIZE // 4])
 def test_intrinsics_fit_resized_photographs(root, tmp_path, side):
-    """A spot where OpenCV sees a point is where the view's camera sees it, to a fiftieth of a pixel."""
+    """A spot where OpenCV sees a point is where the view's camera sees it,
+    to a fiftieth of a pixel."""
     folder = tmp_path / "CoreView_386"
     shutil.copytree(root / "CoreView_386", folder)
     cams = load_npy(folder / "annots.npy")["cams"]
@@ -267,7 +269,8 @@ def test_the_new_fit_is_preferred(root, tmp_path):
 
 
 def test_parameters_place_the_body_about_the_origin(root):
-    """V = R(Rh) X + Th: what (V - Th) R gives stands upright on its own floor, whatever the world."""
+    """V = R(Rh) X + Th: what (V - Th) R gives stands upright on its own floor,
+    whatever the world."""
     for number in (0, 1):
         params = load_npy(root / "CoreView_386" / "new_params" / f"{number}.npy")
         assert params["poses"].shape == (1, 72)
@@ -347,7 +350,8 @@ def test_targets_between_cameras_that_stand_still_are_refused(root):
 
 
 def test_photographs_are_undistorted_about_their_own_pixel_centers(root):
-    """Calibrations count centres from integers; half a pixel would bend the photograph elsewhere."""
+    """Calibrations count centres from integers;
+    half a pixel would bend the photograph elsewhere."""
     annotations = read_annotations(root / "CoreView_386" / "annots.npy")
     bent = photographs(root, undistorted=False).view("CoreView_386_000000", 7)
     path = root / "CoreView_386" / annotations.frames[0][7]
@@ -361,6 +365,7 @@ def test_photographs_are_undistorted_about_their_own_pixel_centers(root):
 
 @pytest.mark.parametrize("sequence", ["386", "313"])
 def test_packed_frames_are_the_same(root, tmp_path, sequence):
-    """Photographs without lens distortion, and with it in another file; names of both generations."""
+    """Photographs without lens distortion, and with it in another file;
+    names of both generations."""
     require_same_packed(photographs(root, sequence).reader, tmp_path, (64, 48))
     require_same_packed(photographs(root, sequence, undistorted=False).reader, tmp_path, (64, 48))

@@ -1,4 +1,5 @@
-"""Broken ZJU-MoCap data: each case gets one line that says where, what was expected and what was found.
+"""Broken ZJU-MoCap data: each case gets one line that says where,
+what was expected and what was found.
 
 The lines are listed in ``docs/evidence/broken_files.md``.
 """

@@ -30,8 +30,9 @@ def error(found, q, k, v):
 
 
 def limit(q, k, v):
-    """A hundred times what rounding the arguments once changes, and one rounding: the budget of a kernel in
-    ``ghgs stress``. How near PyTorch comes is the luck of a processor's order of summation."""
+    """A hundred times what rounding the arguments once changes, and one rounding: the budget
+    of a kernel in ``ghgs stress``. How near PyTorch comes is the luck of a processor's order
+    of summation."""
     g, eps = torch.Generator().manual_seed(1), torch.finfo(torch.float32).eps
     moved = [x.double() * (1 + eps * torch.randn(x.shape, generator=g).sign()) for x in (q, k, v)]
     return 100 * (eps + error(F.scaled_dot_product_attention(*moved).transpose(1, 2), q, k, v))
@@ -77,7 +78,8 @@ def test_fewer_queries_than_keys_and_more(dtype):
 
 
 def test_scores_that_rise_and_fall_by_hundreds():
-    """A running maximum that changes in every block of keys, or only in the first, loses no accuracy."""
+    """A running maximum that changes in every block of keys, or only in the first,
+    loses no accuracy."""
     v = scene(1, 1, 5 * KEYS, 32, torch.float32)[2]
     slope = torch.linspace(-300, 300, 5 * KEYS)[:, None]
     q = torch.ones_like(v)
@@ -125,7 +127,8 @@ def test_the_same_bits_with_any_number_of_threads(dtype, heads, tokens):
 
 
 def test_types_may_differ_and_that_of_the_values_is_taken():
-    """Queries and keys in another dtype than the values are converted, and the result is in theirs."""
+    """Queries and keys in another dtype than the values are converted,
+    and the result is in theirs."""
     q, k, v = scene(1, 2, 50, 32, torch.float32)
     halves = [x.bfloat16() for x in (q, k)]
     found = cpu.attend(*halves, v)
@@ -185,7 +188,8 @@ for n, heads, queries, keys, width in ((1, 1, 1, 1, 32), (2, 3, 7, 7, 64), (1, 2
 
 
 def test_attention_without_512_bit_vectors():
-    """The kernel of a processor with AVX2 alone is as accurate; a wider one is limited by Numba's setting."""
+    """The kernel of a processor with AVX2 alone is as accurate;
+    a wider one is limited by Numba's setting."""
     if not {"avx2", "fma"} <= processor_features():
         pytest.skip("needs AVX2")
     if "avx512f" in processor_features():

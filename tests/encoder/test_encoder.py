@@ -154,7 +154,8 @@ def test_trainable_part(trainable, pairs):
 
 
 def test_low_precision_stays_near_float32():
-    """Angles, norms and the residual stream are wide: bfloat16 loses what its products lose, no more."""
+    """Angles, norms and the residual stream are wide: bfloat16 loses what its products lose,
+    no more."""
     encoder = _encoder(depth=4, layers=(3,))
     images, masks = _views(1, 3, 140, 140)
     with torch.no_grad():

@@ -16,7 +16,8 @@ VITS = [{"kind": "conv"}, {"kind": "stem", "channels": 8}, {"kind": "dinov2", "d
 
 
 def _encoder(vit=VITS[0], **options) -> VGGTEncoder:
-    """A small encoder in float64 whose special tokens and LayerScales are large enough to matter."""
+    """A small encoder in float64 whose special tokens and LayerScales are large enough to
+    matter."""
     torch.manual_seed(0)
     options = {"tokens": "subject", **options}
     encoder = make_encoder(width=32, heads=2, depth=2, layers=(0, 1), vit=vit, image_size=42, **options)
@@ -28,7 +29,8 @@ def _encoder(vit=VITS[0], **options) -> VGGTEncoder:
 
 
 def _people() -> tuple[torch.Tensor, torch.Tensor]:
-    """Images and masks [2, 4, ...]: two people, a single pixel, an empty view, one at the border, ..."""
+    """Images and masks [2, 4, ...]: two people, a single pixel, an empty view, one at the border,
+    ..."""
     masks = torch.zeros(2, 4, PATCH * ROWS, PATCH * COLUMNS, dtype=torch.bool)
     masks[0, 0, 10:20, 3:20] = masks[0, 0, 40:50, 80:90] = True  # two people
     masks[0, 1, 31, 44] = True  # a single pixel; view 2 is empty
@@ -78,7 +80,8 @@ def _masked_block(block, x, keys, rotary=None):
 
 
 def _masked_encoder(encoder, images, kept):
-    """Latents [V, P, 2 C] of each layer and features [V, P, C] of one element, from all its tokens."""
+    """Latents [V, P, 2 C] of each layer and features [V, P, C] of one element,
+    from all its tokens."""
     aggregator = encoder.aggregator
     v, special = len(images), aggregator.special
     keys = torch.cat((torch.ones(v, special, dtype=torch.bool), kept.flatten(1)), dim=1)

@@ -59,7 +59,8 @@ def test_what_learns_behind_the_cache_has_the_same_gradient(tmp_path, batch):
 
 
 def test_photographs_are_recognised_by_their_pixels(tmp_path, batch):
-    """In another order, in another batch, of another step; one changed value is another photograph."""
+    """In another order, in another batch, of another step;
+    one changed value is another photograph."""
     encoder = with_cache(frozen_encoder(), tmp_path)
     cache = encoder.aggregator.patch_embed.cache
     first = encoder(batch.images, batch.masks)

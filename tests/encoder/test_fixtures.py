@@ -1,7 +1,8 @@
 """Encoder and dense head against numbers of the published architecture (random weights, CPU).
 
-``fixtures/<case>.safetensors`` contains ``state/``, ``in/``, ``out/`` (float32) and ``out64/`` (float64, with
-the tables that are float32 here in float32, too); ``encoder_cases.json`` has options and float32 bounds.
+``fixtures/<case>.safetensors`` contains ``state/``, ``in/``, ``out/`` (float32) and ``out64/``
+(float64, with the tables that are float32 here in float32, too); ``encoder_cases.json`` has options
+and float32 bounds.
 """
 
 import gzip
@@ -48,8 +49,8 @@ def _options(name: str) -> dict:
 def _compare(name: str, groups: dict, dtype: torch.dtype, found: dict[str, torch.Tensor]) -> None:
     expected = groups[DTYPES[dtype]]
     assert set(found) == set(expected)
-    # Position tables of another size are interpolated in float32, also for float64: each entry is a sum whose
-    # order is the processor's, as is that of their effect on tokens.
+    # Position tables of another size are interpolated in float32, also for float64: each entry is a
+    # sum whose order is the processor's, as is that of their effect on tokens.
     is_interpolated = "interp" in name or "same_count" in name
     share = 4 * torch.finfo(torch.float32).eps if is_interpolated else 1e-9
     for key, value in found.items():
@@ -84,7 +85,8 @@ def test_vit(name, dtype):
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", _names("agg_"))
 def test_encoder(name, dtype):
-    """The aggregator reproduces the published numbers, and the encoder reads the right tokens out of it."""
+    """The aggregator reproduces the published numbers,
+    and the encoder reads the right tokens out of it."""
     groups = _load(name)
     encoder = make_encoder(**_options(name))
     encoder.aggregator.load_state_dict(groups["state"])

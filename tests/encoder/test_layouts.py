@@ -1,4 +1,5 @@
-"""Attention reaches PyTorch's fused kernels: which of them run on a GPU depends on how they are asked."""
+"""Attention reaches PyTorch's fused kernels:
+which of them run on a GPU depends on how they are asked."""
 
 import pytest
 import torch
@@ -12,7 +13,8 @@ attention = F.scaled_dot_product_attention
 @pytest.mark.parametrize("autocast", [False, True])
 @pytest.mark.parametrize("tokens", ["all", "subject"])
 def test_attention_is_asked_for_what_fused_kernels_take(tokens, autocast, monkeypatch):
-    """One dtype, channels innermost, heads of whole vectors, no mask: what fused kernels of a GPU ask for.
+    """One dtype, channels innermost, heads of whole vectors, no mask:
+    what fused kernels of a GPU ask for.
 
     Views of one length share a call; others have one each, and none is padded.
     """

@@ -42,7 +42,8 @@ def test_no_kept_patch():
 
 
 def test_the_box_holds_the_kept_patches_of_all_images():
-    """With a margin as far as the grid goes; of none it is a patch, through which gradients of 0 flow."""
+    """With a margin as far as the grid goes;
+    of none it is a patch, through which gradients of 0 flow."""
     assert kept((0, 0, 3, 4), (1, 1, 5, 2)).box(1) == (slice(2, 7), slice(1, 6))
     assert kept((0, 1, 0, 10), (1, 0, 8, 9)).box(2) == (slice(0, 9), slice(7, 11))
     assert kept().box(0) == (slice(0, 1), slice(0, 1))

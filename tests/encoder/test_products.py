@@ -33,7 +33,8 @@ def convolutions(monkeypatch):
 
 @pytest.fixture
 def kernels(monkeypatch):
-    """Use the attention kernel for any size, also where the processor lacks features that make it fast."""
+    """Use the attention kernel for any size,
+    also where the processor lacks features that make it fast."""
     features = processor_features() | {"avx2", "fma"}
     for limit in ("_SMALL", "_LARGE"):
         monkeypatch.setattr(f"ghgs_lit.encoder.cpu.{limit}", 0)
@@ -73,7 +74,8 @@ def test_product_without_a_gradient_is_the_linear_layer(convolutions, shape, bia
 
 
 def test_which_products_are_onednns(monkeypatch):
-    """Those of a processor with wide vectors, but for tiny ones, in float32, in training with two threads."""
+    """Those of a processor with wide vectors, but for tiny ones, in float32,
+    in training with two threads."""
     monkeypatch.setattr(ghgs_lit.kernels.linear, "_WIDE_PRODUCTS", True)
     threads, x, weight = torch.get_num_threads(), torch.empty(1000, 512), torch.empty(64, 512)
     prefers = ghgs_lit.kernels.linear.prefers_onednn
@@ -129,7 +131,8 @@ def test_even_parts_cover_all_rows():
 def test_a_block_without_gradient_is_the_same_and_keeps_its_input(
     convolutions, kernels, monkeypatch, qk_norm
 ):
-    """The in-place path without a gradient gives the same result and does not overwrite its input."""
+    """The in-place path without a gradient gives the same result and does not
+    overwrite its input."""
     monkeypatch.setattr("ghgs_lit.encoder.block._HIDDEN", 200)
     torch.manual_seed(0)
     block = Block(64, 2, qk_norm, 1e-5, 0.5)
@@ -148,7 +151,8 @@ def test_a_block_without_gradient_is_the_same_and_keeps_its_input(
 
 @pytest.mark.parametrize("tokens", ["all", "subject"])
 def test_the_whole_encoder_is_the_same_without_a_gradient(convolutions, kernels, tokens):
-    """All fast paths together do not change the encoder's tokens, with views of any number of tokens."""
+    """All fast paths together do not change the encoder's tokens,
+    with views of any number of tokens."""
     torch.manual_seed(0)
     vit = {"kind": "dinov2", "depth": 2, "heads": 2}
     options = {"image_size": 28, "layer_scale": 0.5, "tokens": tokens, "margin": 0}

@@ -88,7 +88,8 @@ def test_where_there_is_no_subject_features_are_zero():
 
 
 def test_the_consistency_of_two_patches_is_the_overlap_of_their_parts():
-    """The cosine that weights the attention (Eq. 4) must be 1 for equal shares and 0 for disjoint ones."""
+    """The cosine that weights the attention (Eq. 4) must be 1 for equal shares and 0 for
+    disjoint ones."""
     encoder, (images, masks) = make(), views()
     with torch.no_grad():
         encoder.semantic.head.weight.mul_(5)

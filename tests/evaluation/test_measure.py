@@ -170,7 +170,8 @@ def test_each_target_protocol_has_the_values_of_its_own_file():
 
 
 def test_protocols_are_measured_side_by_side_on_their_own_targets(boxes, tmp_path):
-    """One evaluation of shipped protocols and one of the user's, none of which is selected by targets=."""
+    """One evaluation of shipped protocols and one of the user's,
+    none of which is selected by targets=."""
     mine = tmp_path / "conf" / "targets" / "mine.yaml"
     mine.parent.mkdir(parents=True)
     mine.write_text("defaults: [rogsplat, _self_]\nname: mine\npositions: [1, 4]\n")
@@ -196,7 +197,8 @@ def test_protocols_are_measured_side_by_side_on_their_own_targets(boxes, tmp_pat
 
 
 def test_all_protocols_are_measured_from_one_prediction_with_equal_numbers(boxes, tmp_path):
-    """A subject is predicted once for each number of views; rows and pictures are those of each protocol."""
+    """A subject is predicted once for each number of views;
+    rows and pictures are those of each protocol."""
     views = {"training_counts": [3], "evaluation_count": 3}
     data = rendered(boxes, views, {"name": "release"}, size=42)
     protocols = {name: {"name": name} for name in ("midway", "release")}
@@ -251,7 +253,8 @@ def test_predict_writes_a_splat_that_renders_and_a_turntable(trained, boxes, tmp
 
 
 def test_predict_reads_the_photographs_of_one_subject(trained, tmp_path, monkeypatch):
-    """A data set of thousands must not be read up to the subject; targets are read where they are asked."""
+    """A data set of thousands must not be read up to the subject;
+    targets are read where they are asked."""
     read = []
     view = PhotographCache.view
 

@@ -128,7 +128,8 @@ def test_seconds_are_those_of_a_subject(monkeypatch):
 
 
 def test_what_is_timed_searches_no_neighbors_of_the_other_setting(monkeypatch):
-    """Seconds of a prediction are its own; the share of neighbours that an ablation keeps comes later."""
+    """Seconds of a prediction are its own; the share of neighbours that an ablation keeps
+    comes later."""
     searched, search = [], inspection.nearest_neighbors
     monkeypatch.setattr(inspection, "nearest_neighbors", lambda *args: searched.append(1) or search(*args))
     batch = make_batch(1, 3)

@@ -1,4 +1,5 @@
-"""The frame of the subject: any unit, origin and direction of the world give one and the same scene."""
+"""The frame of the subject: any unit, origin and direction of the world give one and the
+same scene."""
 
 import dataclasses
 import functools
@@ -17,7 +18,8 @@ from tests.helpers.scenes import CENTER, ellipsoid, make_batch, ring
 
 
 def moved(cameras, scale=1.0, turn=None, shift=(0.0, 0.0, 0.0)):
-    """Cameras of the same photographs in a world that was scaled, turned and shifted, in float64."""
+    """Cameras of the same photographs in a world that was scaled, turned and shifted,
+    in float64."""
     turn = torch.eye(3).double() if turn is None else turn
     extrinsics = cameras.extrinsics.double().clone()
     rotation = extrinsics[..., :3, :3] @ turn.mT
@@ -143,7 +145,8 @@ def test_a_subject_that_is_wider_than_tall_has_the_size_of_its_width():
 
 @pytest.mark.parametrize("change", ["mirrored", "upside down", "looking down", "opposed", "degenerate"])
 def test_axes_are_a_rotation_for_any_cameras(change):
-    """Mirrored extrinsics, rigs upside down and cameras that look straight down have a frame, too."""
+    """Mirrored extrinsics, rigs upside down and cameras that look straight down have a frame,
+    too."""
     batch = make_batch(1, 3, 42, 42)
     cameras = ring(1, 3, 42, 42)
     rotation = cameras.extrinsics[..., :3, :3].clone()
@@ -190,7 +193,8 @@ def test_an_element_has_the_same_frame_alone():
 
 
 def test_each_element_has_its_own_unit():
-    """One in metres and one in millimetres, in one batch: depths, bounds and sizes of each are its own."""
+    """One in metres and one in millimetres, in one batch: depths,
+    bounds and sizes of each are its own."""
     batch = make_batch(2, 3)
     extrinsics = batch.cameras.extrinsics.double().clone()
     extrinsics[1, :, :3, 3] *= 1000
@@ -213,7 +217,8 @@ def test_each_element_has_its_own_unit():
 
 
 def test_units_of_nested_frames_are_multiplied():
-    """Gaussians that know how long a metre is in their frame know it in the world around that frame."""
+    """Gaussians that know how long a metre is in their frame know it in the world around
+    that frame."""
     gaussians = original("hull")[2].gaussians
     inner = dataclasses.replace(gaussians, metre=torch.tensor([4.0]))
     frame = Frame(torch.zeros(1, 3).double(), torch.eye(3).double()[None], torch.tensor([2.5]).double())

@@ -21,7 +21,8 @@ def matted():
 
 
 def test_colors_are_those_before_premultiplication():
-    """Where nothing of the subject shows, the photograph stays; noise of a file gives no colour above 1."""
+    """Where nothing of the subject shows, the photograph stays;
+    noise of a file gives no colour above 1."""
     colors, batch = matted()
     shown = (batch.alpha > 0)[:, :, None]
     found = surface_colors(batch)

@@ -7,7 +7,8 @@ from tests.helpers.scenes import ring
 
 
 def test_what_cameras_share_is_taken_out_and_the_rest_stays():
-    """A turn, a shift, and a way along the optical axes that all have; differences keep their size."""
+    """A turn, a shift, and a way along the optical axes that all have;
+    differences keep their size."""
     g = torch.Generator().manual_seed(0)
     axes = torch.nn.functional.normalize(torch.randn(2, 4, 3, generator=g), dim=-1)
     motions = torch.randn(2, 4, 6, generator=g)
@@ -21,7 +22,8 @@ def test_what_cameras_share_is_taken_out_and_the_rest_stays():
 
 
 def test_what_cameras_share_is_what_photographs_show():
-    """Left and right camera move along their axes, which shows little: the others stay where they are."""
+    """Left and right camera move along their axes, which shows little:
+    the others stay where they are."""
     axes = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
     motions = torch.zeros(4, 6)
     motions[:, 3] = torch.tensor([0.1, 0.0, -0.1, 0.0])
@@ -34,7 +36,8 @@ def test_what_cameras_share_is_what_photographs_show():
 
 
 def test_small_motions_turn_and_shift_points():
-    """A turn by a hundredth moves a point by that share of its distance from the axis; shifts have a unit."""
+    """A turn by a hundredth moves a point by that share of its distance from the axis;
+    shifts have a unit."""
     rotation, shift = rigid(torch.tensor([0.0, 0.0, 0.01, 0.0, 0.0, 0.5]), length=2.0)
     point = rotation @ torch.tensor([1.0, 0.0, 0.0]) + shift
     torch.testing.assert_close(point, torch.tensor([1.0, 0.01, 1.0]), rtol=0, atol=1e-4)

@@ -8,7 +8,8 @@ from ghgs_lit.geometry.masks import signed_distance, soft_signed_distance
 
 
 def test_the_outline_runs_half_way_between_pixels():
-    """Distances are those to the nearest pixel on the other side, found by going through all pairs."""
+    """Distances are those to the nearest pixel on the other side,
+    found by going through all pairs."""
     mask = np.random.default_rng(0).uniform(size=(14, 11)) < 0.5
     places = np.argwhere(np.ones_like(mask))
     apart = cdist(places, places)
@@ -23,7 +24,8 @@ def test_without_an_outline_all_is_infinitely_far(value):
 
 
 def test_soft_outlines_are_found_to_fractions_of_a_pixel():
-    """Of a disc, from the shares of its pixels; where it is cut off straight there is no soft pixel."""
+    """Of a disc, from the shares of its pixels;
+    where it is cut off straight there is no soft pixel."""
     fine = np.hypot(*((np.indices((320, 320)) + 0.5) / 8 - 20.3)) < 12.4
     matte = fine.reshape(40, 8, 40, 8).mean((1, 3))
     expected = 12.4 - np.hypot(*(np.indices((40, 40)) + 0.5 - 20.3))

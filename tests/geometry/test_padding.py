@@ -28,7 +28,8 @@ def boxes(b, v, height, width, seed=0):
     [((512, 512), -3, -3, (518, 518)), ((360, 640), -2, -2, (364, 644)), ((41, 27), 0, 0, (42, 28))],
 )
 def test_padding_is_centred_and_undone(size, top, left, padded):
-    """512 gets 3 pixels on each side as in the authors' release; a single pixel goes below and right."""
+    """512 gets 3 pixels on each side as in the authors' release;
+    a single pixel goes below and right."""
     alpha = torch.rand(1, 2, *size)
     batch = Batch(torch.rand(1, 2, 3, *size), boxes(1, 2, *size), cameras(1, 2, *size), alpha=alpha)
     padding = pad_to_patches(batch.masks, 14)

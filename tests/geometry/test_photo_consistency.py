@@ -1,4 +1,5 @@
-"""How well photographs agree about a depth, against a pixel-by-pixel version on SciPy's interpolation."""
+"""How well photographs agree about a depth, against a pixel-by-pixel version on SciPy's
+interpolation."""
 
 import dataclasses
 
@@ -18,7 +19,8 @@ from tests.helpers.scenes import make_batch, ring
 
 
 def by_hand(batch, bounds, b, v, row, column, steps):
-    """Agreement at one pixel in float64; views face each other less than the limit in these scenes."""
+    """Agreement at one pixel in float64; views face each other less than the limit in
+    these scenes."""
     masks = batch.masks[b].double().numpy()
     images = batch.images[b].double().numpy() * masks[:, None]
     intrinsics, extrinsics = (

@@ -13,7 +13,8 @@ from tests.helpers.scenes import CASES, fixture, make_batch
 
 
 def release_token_points(inverse, cameras, dtype):
-    """Token points of a padded 518 x 518 inverse depth whose cameras belong to the 512 x 512 inside."""
+    """Token points of a padded 518 x 518 inverse depth whose cameras belong to the 512 x
+    512 inside."""
     padded = cameras.cropped(-3, -3, 518, 518)
     depth = inverse_linear(inverse)
     _, views = depth.shape[:2]

@@ -8,7 +8,8 @@ from ghgs_lit.geometry.rotations import unit
 
 @pytest.mark.parametrize("length", [1e-30, 1e-20, 1.0, 1e19, 1e30])
 def test_a_direction_and_its_gradient_do_not_depend_on_the_length(length):
-    """Squares vanished below 5e-14, where the gradient became infinite, and overflowed from 1e19 on."""
+    """Squares vanished below 5e-14, where the gradient became infinite,
+    and overflowed from 1e19 on."""
     vector = torch.tensor([0.48, -0.6, 0.64, 0.0])
     x = (vector * length).requires_grad_()
     y = unit(x)

@@ -20,7 +20,8 @@ def test_inside_the_limit_it_is_the_plain_function(ours, plain):
 @pytest.mark.parametrize("ours", [bounded_sigmoid, bounded_tanh])
 @pytest.mark.parametrize("raw", FAR_OUT)
 def test_a_gradient_leads_back_from_beyond_the_limit(ours, raw):
-    """A plain sigmoid has a gradient of 0 from 17 on: one large step ended the training of a head."""
+    """A plain sigmoid has a gradient of 0 from 17 on:
+    one large step ended the training of a head."""
     for sign in (-1, 1):
         x = torch.tensor(raw, requires_grad=True)
         (gradient,) = torch.autograd.grad(sign * ours(x), x)
@@ -64,7 +65,8 @@ def test_saturated_attributes_keep_a_gradient(raw):
 
 
 def test_the_rotation_near_minus_identity_has_a_bounded_gradient():
-    """Raw values near (-1, 0, 0, 0) make the zero quaternion: there the gradient grows as 1 / |q|."""
+    """Raw values near (-1, 0, 0, 0) make the zero quaternion: there the gradient grows
+    as 1 / |q|."""
     rotation = torch.tensor([[-1.0, 1e-9, 0.0, 0.0]], requires_grad=True)
     zeros = torch.zeros(1, 3)
     quaternions = FootprintAttributes()(zeros, zeros, rotation, torch.zeros(1), torch.ones(1))[2]

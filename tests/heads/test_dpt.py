@@ -80,7 +80,8 @@ def test_residual_unit_rectifies_its_skip(rectified):
 
 @pytest.mark.parametrize("rectified", [True, False])
 def test_what_a_rectified_skip_lets_die_lives_without(rectified):
-    """Where a sum of levels is negative, tokens must still reach the result, and gradients the tokens."""
+    """Where a sum of levels is negative, tokens must still reach the result,
+    and gradients the tokens."""
     head = _head(rectified_skip=rectified)
     for level in (1, 2, 3):
         nn.init.constant_(getattr(head.scratch, f"refinenet{level + 1}").out_conv.bias, -100.0)
@@ -144,7 +145,8 @@ def test_float16_overflows_no_dense_head():
 
 @pytest.mark.parametrize("grid", [(1, 1), (3, 1), (2, 2)])
 def test_gradients_under_autocast_hold_no_memory_that_was_not_written(grid):
-    """PyTorch's stride of 2 leaves parts of a gradient unset for maps one cell wide: NaN of freed memory."""
+    """PyTorch's stride of 2 leaves parts of a gradient unset for maps one cell wide:
+    NaN of freed memory."""
     head, tokens = _head(out_channels=(4, 8, 8, 32)), _tokens(3, 2, *grid)
     parameters = list(head.parameters())
     for _ in range(10):

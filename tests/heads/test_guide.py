@@ -66,7 +66,8 @@ def test_pyramid_halves_twice(size):
 
 
 def test_depth_follows_the_guide():
-    """Two batches with the same tokens and other pixels give other depths, but for an unguided head."""
+    """Two batches with the same tokens and other pixels give other depths,
+    but for an unguided head."""
     batch = make_batch()
     other = dataclasses.replace(batch, images=batch.images.flip(-1))
     tokens = make_encoder()(batch.images, batch.masks)

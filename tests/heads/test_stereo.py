@@ -40,7 +40,8 @@ def peer(name, *overrides):
 
 
 def painted(count=4, size=112, spread=360.0):
-    """Features of cells that a random function of the place on an ellipsoid paints, cameras, true depths."""
+    """Features of cells that a random function of the place on an ellipsoid paints, cameras,
+    true depths."""
     cameras = ring(1, count, size, size, spread=spread)
     masks, depths = ellipsoid(cameras)
     g = torch.Generator().manual_seed(2)
@@ -75,7 +76,8 @@ def test_the_correlation_is_largest_at_the_true_depth():
 
 
 def test_correlations_are_those_of_a_literal_loop():
-    """Matrices of NumPy and SciPy's interpolation, in float64, cell by cell; 5 cameras have 2 neighbours."""
+    """Matrices of NumPy and SciPy's interpolation, in float64, cell by cell;
+    5 cameras have 2 neighbours."""
     features, cameras, whole, depth = painted(5, 56)
     near, far = limits(depth, whole)
     cells = whole.flatten().nonzero()[::7, 0]
@@ -121,7 +123,8 @@ def test_looking_up_is_linear_interpolation():
 
 
 def test_upsampled_maps_are_convex_combinations():
-    """With all weight on the own cell it is repeated; with equal weights it is the mean of 3 x 3."""
+    """With all weight on the own cell it is repeated;
+    with equal weights it is the mean of 3 x 3."""
     maps = torch.rand(2, 1, 3, 5)
     weights = torch.zeros(2, 9, 16, 3, 5)
     weights[:, 4] = 1e4

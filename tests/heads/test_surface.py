@@ -27,7 +27,8 @@ def camera_axes(batch):
 
 
 def test_the_third_axis_is_the_inward_normal_of_an_ellipsoid():
-    """Against the gradient of its equation; the axes are a rotation of the camera's, by the least angle."""
+    """Against the gradient of its equation; the axes are a rotation of the camera's,
+    by the least angle."""
     cameras = ring(2, 3, 140, 112)
     masks, depths = ellipsoid(cameras)
     batch = dataclasses.replace(make_batch(2, 3, 140, 112), masks=masks, depths=depths)
@@ -47,7 +48,8 @@ def test_the_third_axis_is_the_inward_normal_of_an_ellipsoid():
 
 
 def slanted(slope_x, slope_y, dtype=torch.float64):
-    """A plane z = 2 + a x + b y before a camera at the origin that looks along z, with its depths."""
+    """A plane z = 2 + a x + b y before a camera at the origin that looks along z,
+    with its depths."""
     size, fx, fy, skew = 20, 30.0, 36.0, 3.0
     lens = torch.tensor([[fx, skew, size / 2 + 1], [0, fy, size / 2 - 2], [0, 0, 1]], dtype=dtype)
     centers = torch.arange(size, dtype=dtype) + 0.5
@@ -61,7 +63,8 @@ def slanted(slope_x, slope_y, dtype=torch.float64):
 
 @pytest.mark.parametrize(("a", "b"), [(0.0, 0.0), (1.5, 0.0), (-0.4, 1.0)])
 def test_planes_are_exact_up_to_their_border(a, b):
-    """One-sided differences at the border of the image and of the mask are exact on a plane, too."""
+    """One-sided differences at the border of the image and of the mask are exact on a plane,
+    too."""
     depth, cameras = slanted(a, b)
     valid = torch.ones_like(depth, dtype=torch.bool)
     valid[..., 7:9, 3:5] = False

@@ -37,7 +37,7 @@ CONFIDENCES = {"expp1": confidence_of, "expp0": torch.exp, "sigmoid": torch.sigm
 
 
 def split_activated(raw, value, confidence="expp1"):
-    """Activated values [n, h, w, c - 1] and confidence [n, h, w] of raw channels [n, c, h, w], the last one
-    for the confidence."""
+    """Activated values [n, h, w, c - 1] and confidence [n, h, w] of raw channels [n, c, h, w], the
+    last one for the confidence."""
     raw = at_least_float32(raw).permute(0, 2, 3, 1)
     return VALUES[value](raw[..., :-1]), CONFIDENCES[confidence](raw[..., -1])

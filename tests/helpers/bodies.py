@@ -1,4 +1,5 @@
-"""A batch that shows the built-in body at rest: each pixel's depth is that of its nearest vertex."""
+"""A batch that shows the built-in body at rest:
+each pixel's depth is that of its nearest vertex."""
 
 import torch
 

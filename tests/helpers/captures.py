@@ -1,4 +1,5 @@
-"""Shared by the tests of data sets: miniatures made once, broken files, what a view must agree with."""
+"""Shared by the tests of data sets: miniatures made once, broken files,
+what a view must agree with."""
 
 import dataclasses
 import functools
@@ -48,7 +49,8 @@ def stored(data, phase: str, size: tuple[int, int] | None = None) -> PhotographC
 
 
 def require_same_packed(reader: Reader, folder: Path, size: tuple[int, int]) -> None:
-    """Check that photographs and bodies from packed files in ``folder`` are those of a reader, to the bit."""
+    """Check that photographs and bodies from packed files in ``folder`` are those of a reader,
+    to the bit."""
     packed = packed_reader(reader, Packing(folder, size, "area", (0,), False), 1, print)
     for name, positions in reader.subjects.items():
         assert packed.pack(name) is not None
@@ -68,7 +70,8 @@ class Malice:
 
 
 def refused(line: str, read: Callable[[], object]) -> None:
-    """Check that ``read`` is refused with one line that matches, and that no pickle ran in this folder."""
+    """Check that ``read`` is refused with one line that matches,
+    and that no pickle ran in this folder."""
     with pytest.raises(InputError, match=line) as caught:
         read()
     assert "\n" not in str(caught.value)
@@ -87,7 +90,8 @@ def inside(view: View, points: np.ndarray) -> float:
 
 
 def blob(height: int, width: int, x: float, y: float, sigma: float = 3.0) -> np.ndarray:
-    """[h, w, 3] uint8: a spot at ``x``, ``y`` where pixel centres are integers, as OpenCV has them."""
+    """[h, w, 3] uint8: a spot at ``x``, ``y`` where pixel centres are integers,
+    as OpenCV has them."""
     rows, columns = np.mgrid[:height, :width]
     spot = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * sigma**2))
     return np.repeat(np.round(255 * spot)[..., None], 3, -1).astype(np.uint8)

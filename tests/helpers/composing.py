@@ -1,4 +1,5 @@
-"""Where this is imported, Hydra 1.3 reads each file once, merges the same files once and copies quickly.
+"""Where this is imported, Hydra 1.3 reads each file once,
+merges the same files once and copies quickly.
 
 Composing configurations takes a quarter of the suite otherwise.
 """
@@ -23,7 +24,8 @@ _pickled: dict[tuple, bytes] = {}  # what is composed is changed afterwards: eac
 
 
 def _map_where_needed(overrides, defaults, *arguments):
-    """Hydra makes a map for each file, a third of its time, and reads it for interpolations only."""
+    """Hydra makes a map for each file, a third of its time,
+    and reads it for interpolations only."""
     return _map(overrides, defaults, *arguments) if any(d.is_interpolation() for d in defaults) else None
 
 

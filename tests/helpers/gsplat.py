@@ -44,7 +44,8 @@ class Documented:
 
 
 class InParts(Documented):
-    """A replacement whose parts are gsplat's projection in PyTorch, and its kernel that draws, in Python."""
+    """A replacement whose parts are gsplat's projection in PyTorch, and its kernel that draws,
+    in Python."""
 
     __version__ = "1.5.3"
 
@@ -73,8 +74,8 @@ class InParts(Documented):
 
 
 def drawn_by_tiles(centers, conics, colors, opacities, width, height, side, offsets, splats, masks):
-    """gsplat's kernel ``rasterize_to_pixels_3dgs_fwd``: one tile after another ends where the next begins,
-    the last of all at the end of the list. Tiles without a pixel stop at once."""
+    """gsplat's kernel ``rasterize_to_pixels_3dgs_fwd``: one tile after another ends where the next
+    begins, the last of all at the end of the list. Tiles without a pixel stop at once."""
     ends = torch.cat((offsets.flatten()[1:], offsets.new_tensor([len(splats)]))).view_as(offsets)
     centers, conics, colors, opacities = (
         x.flatten(0, 2) for x in (centers, conics, colors, opacities[..., None])

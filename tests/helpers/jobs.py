@@ -1,4 +1,5 @@
-"""Sweeps without training, whose runs only record that they were executed, in this process or others."""
+"""Sweeps without training, whose runs only record that they were executed,
+in this process or others."""
 
 import os
 import time

@@ -1,4 +1,5 @@
-"""Kernels of a GPU on tensors of the CPU, in Triton's interpreter, or on a GPU where there is one."""
+"""Kernels of a GPU on tensors of the CPU, in Triton's interpreter,
+or on a GPU where there is one."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -28,7 +28,8 @@ def _headings(cells: list[str]) -> list[list]:
 
 
 def read_tabular(text: str) -> dict:
-    """The first ``tabular`` of ``text``: ``columns``, ``headings``, ``cmidrules``, ``metrics``, ``rows``.
+    """The first ``tabular`` of ``text``: ``columns``, ``headings``, ``cmidrules``, ``metrics``,
+    ``rows``.
 
     ``rows`` are the rows of numbers, as ``[cells, indices of bold cells]``.
     """
@@ -52,7 +53,8 @@ def read_tabular(text: str) -> dict:
 
 
 def check_balance(text: str) -> None:
-    """Assert that braces and environments are closed in order and special characters are escaped."""
+    """Assert that braces and environments are closed in order and special characters
+    are escaped."""
     assert text.count("{") - text.count("\\{") == text.count("}") - text.count("\\}")
     opened = []
     for kind, name in re.findall(r"\\(begin|end)\{([^}]*)\}", text):

@@ -1,4 +1,5 @@
-"""The recalibration as the paper writes it, one layer per call, without shared neighbours or cosines."""
+"""The recalibration as the paper writes it, one layer per call,
+without shared neighbours or cosines."""
 
 import torch
 import torch.nn.functional as F

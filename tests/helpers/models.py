@@ -44,7 +44,8 @@ def make_model(*overrides, seed=0):
 
 
 def close(a, b, limit=1e-5):
-    """Assert that two sets of Gaussians differ by ``limit`` of an attribute's largest value at most."""
+    """Assert that two sets of Gaussians differ by ``limit`` of an attribute's largest
+    value at most."""
     for name in ATTRIBUTES:
         x, y = getattr(a, name), getattr(b, name)
         assert (x - y).abs().max() <= limit * y.abs().max(), name

@@ -16,7 +16,8 @@ INPUTS, BETWEEN = AROUND[:, ::2], AROUND[:, 1:2]
 
 
 def motion(shift=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0)):
-    """The rigid motion [4, 4] of a subject that is shifted by metres and turned about its centre."""
+    """The rigid motion [4, 4] of a subject that is shifted by metres and turned about
+    its centre."""
     matrix = torch.eye(4)
     matrix[:3, :3] = torch.from_numpy(Rotation.from_rotvec(turn).as_matrix()).float()
     matrix[:3, 3] = CENTER - matrix[:3, :3] @ CENTER + torch.tensor(shift)

@@ -1,14 +1,15 @@
-"""A pretend accelerator: its tensors say ``pretend:0``, hold CPU data and refuse to mix with CPU tensors.
+"""A pretend accelerator: its tensors say ``pretend:0``,
+hold CPU data and refuse to mix with CPU tensors.
 
-What runs on it runs on a GPU as far as devices go, and what a GPU would wait for is counted. It is stricter
-than CUDA in one point: an index on the CPU is refused, since CUDA copies it at every call.
+What runs on it runs on a GPU as far as devices go, and what a GPU would wait for is counted. It is
+stricter than CUDA in one point: an index on the CPU is refused, since CUDA copies it at every call.
 
     with pretend_device() as log:
         model.to(DEVICE)(batch.to(DEVICE))
     print(log.waits)
 
-PyTorch's interface for backends in Python is experimental; all of its use is in this file. A process has one
-accelerator: where CUDA is, tests of this one are skipped.
+PyTorch's interface for backends in Python is experimental; all of its use is in this file. A
+process has one accelerator: where CUDA is, tests of this one are skipped.
 """
 
 import sys
@@ -101,7 +102,8 @@ class Log:
 
 
 def _line() -> str:
-    """The innermost line of the package that is running, ``backward`` where autograd runs by itself."""
+    """The innermost line of the package that is running,
+    ``backward`` where autograd runs by itself."""
     frame = sys._getframe(1)
     while frame is not None:
         file = frame.f_code.co_filename
@@ -195,7 +197,8 @@ class _Mode(TorchDispatchMode):
 
 @contextmanager
 def pretend_device(by_line: bool = False) -> Iterator[Log]:
-    """Inside, ``device="pretend"`` works for every function of PyTorch; gives what is asked of it."""
+    """Inside, ``device="pretend"`` works for every function of PyTorch;
+    gives what is asked of it."""
     if torch.cuda.is_available():
         raise SkipTest("the pretend device needs a process without CUDA (CUDA_VISIBLE_DEVICES=)")
     log = Log(by_line)
@@ -208,7 +211,8 @@ def pretend_device(by_line: bool = False) -> Iterator[Log]:
 
 
 def _call(function, args, kwargs):
-    """Run an operator on the values of its arguments; its result is on the device that CUDA would choose."""
+    """Run an operator on the values of its arguments;
+    its result is on the device that CUDA would choose."""
     name = function.name().split(".")[0]
     tensors = list(_tensors((args, *kwargs.values())))
     is_here = any(isinstance(value, PretendTensor) for value in tensors)
@@ -236,14 +240,16 @@ def _call(function, args, kwargs):
 
 
 def _gradients_of_the_package(function):
-    """Operators of the package are kernels on CUDA; here gradients come from autograd, which is off."""
+    """Operators of the package are kernels on CUDA;
+    here gradients come from autograd, which is off."""
     if function.namespace != "ghgs_lit":
         return nullcontext()
     return torch._C._SetExcludeDispatchKeyGuard(torch._C.DispatchKey.AutogradFunctionality, False)
 
 
 def _tensors(values) -> Iterator[torch.Tensor]:
-    """Tensors among arguments of an operator, which has no other containers than lists and tuples."""
+    """Tensors among arguments of an operator,
+    which has no other containers than lists and tuples."""
     for value in values:
         if isinstance(value, torch.Tensor):
             yield value

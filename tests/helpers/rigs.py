@@ -8,7 +8,8 @@ POINTS = np.random.default_rng(1).uniform([-0.4, 0.0, -0.4], [0.4, 1.8, 0.4], (1
 
 
 def rig() -> dict[str, dict[str, np.ndarray]]:
-    """K, D, R and T of cameras by name; pixel centres at integers. The fixtures hold the same cameras."""
+    """K, D, R and T of cameras by name; pixel centres at integers.
+    The fixtures hold the same cameras."""
     found = {}
     for i in range(4):
         angle = 1.4 * i

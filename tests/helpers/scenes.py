@@ -19,7 +19,8 @@ CENTER, RADII = torch.tensor([0.1, 0.9, 0.0]), torch.tensor([0.25, 0.8, 0.2])
 
 
 def fixture(name, part, dtype=torch.float32):
-    """The tensors of one part (``in``, ``out64``, ``state`` ...) of a fixture, floats in ``dtype``."""
+    """The tensors of one part (``in``, ``out64``, ``state`` ...) of a fixture,
+    floats in ``dtype``."""
     prefix = part + "/"
     tensors = load_file(FIXTURES / f"{name}.safetensors")
     found = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
@@ -83,7 +84,8 @@ def in_dtype(batch, dtype):
 
 
 def with_soft_rims(batch):
-    """The batch with a matte that falls from 1 to 0 over two pixels, which premultiplies its photographs."""
+    """The batch with a matte that falls from 1 to 0 over two pixels,
+    which premultiplies its photographs."""
     alpha = torch.nn.functional.avg_pool2d(batch.masks.float(), 3, 1, 1)
     images = torch.rand(batch.images.shape, generator=torch.Generator().manual_seed(8))
     return replace(batch, images=images * alpha[:, :, None], masks=alpha >= 0.5, alpha=alpha)

@@ -1,7 +1,8 @@
-"""Annotated shapes are checked (jaxtyping with beartype) in the first calls of each function in each test.
+"""Annotated shapes are checked (jaxtyping with beartype) in the first calls of each
+function in each test.
 
-The checks of a tiny model take longer than the model; what a function is called with in one test differs
-little from call to call.
+The checks of a tiny model take longer than the model; what a function is called with in one test
+differs little from call to call.
 """
 
 import functools

@@ -18,7 +18,8 @@ def camera_ring(
 ) -> Cameras:
     """Cameras [batch, views] on a circle around the y axis that look at the origin.
 
-    Focal lengths of x and y differ and the principal point is off-centre, so that mixed-up axes are seen.
+    Focal lengths of x and y differ and the principal point is off-centre,
+    so that mixed-up axes are seen.
 
     Args:
         views, height, width, batch: number and image size of the cameras.
@@ -47,7 +48,8 @@ def cloud(
 
 
 def body(count: int, size: int, seed: int = 0) -> Gaussians:
-    """Gaussians of about a pixel on an ellipsoid that covers a fifth of a ``size`` x ``size`` image."""
+    """Gaussians of about a pixel on an ellipsoid that covers a fifth of a ``size`` x
+    ``size`` image."""
     generator = torch.Generator().manual_seed(seed)
     direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
     pixel = 3.0 / (1.3 * size)
@@ -63,7 +65,8 @@ def body(count: int, size: int, seed: int = 0) -> Gaussians:
 
 
 def few(**fields) -> Gaussians:
-    """One round Gaussian at the origin; ``fields`` replaces values, and more rows make more Gaussians."""
+    """One round Gaussian at the origin; ``fields`` replaces values,
+    and more rows make more Gaussians."""
     values = {
         "means": torch.zeros(1, 3),
         "quaternions": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
@@ -134,7 +137,8 @@ def assert_cpu_matches_reference(
     Args:
         gaussians, views, settings, options: what to render.
         image_budget, gradient_budget: largest relative L2 errors.
-        ambiguous_budget: largest part of the pixels that may be left out because they are ambiguous.
+        ambiguous_budget: largest part of the pixels that may be left out because they
+            are ambiguous.
 
     Returns:
         The CPU backend's rendering.

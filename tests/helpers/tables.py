@@ -38,8 +38,8 @@ def write_run(
     shifts=SHIFTS, data="synthetic", protocol="correct", method="model", git=None, verb="train",
     training=None, measured=None, nodes=None, **changes,
 ):  # fmt: skip
-    """A run whose mean PSNR at n views is ``psnr + n``; each subject differs from it by its shift. ``nodes``
-    of its configuration are those whose names are arguments here, such as ``views``."""
+    """A run whose mean PSNR at n views is ``psnr + n``; each subject differs from it by its shift.
+    ``nodes`` of its configuration are those whose names are arguments here, such as ``views``."""
     config = config_of(row, seed, data, weights, **changes, **(nodes or {}))
     rows = [
         {

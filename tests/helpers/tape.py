@@ -1,4 +1,5 @@
-"""A stand-in for CUDA graphs: it repeats the operators of a call at the places where the first one worked."""
+"""A stand-in for CUDA graphs: it repeats the operators of a call at the places where the first
+one worked."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +13,8 @@ from tests.helpers.pretend_device import DEVICE, PretendTensor
 
 
 class OperatorTape:
-    """As CUDA graphs, for a type of ``device``; ``recorded``: number of operators of each recording."""
+    """As CUDA graphs, for a type of ``device``;
+    ``recorded``: number of operators of each recording."""
 
     def __init__(self, device: str = DEVICE.type):
         self.device = device

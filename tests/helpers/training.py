@@ -122,7 +122,8 @@ class _Steps(Dataset):
 
 
 class StepData(L.LightningDataModule):
-    """Training batches that are functions of the step, in epochs of ``length``; two to validate on."""
+    """Training batches that are functions of the step, in epochs of ``length``;
+    two to validate on."""
 
     def __init__(self, length: int = 5):
         super().__init__()

@@ -19,7 +19,8 @@ def ghgs(*arguments: str) -> int:
         return exit.code
     finally:
         sys.argv = before
-        # The log of the verb is opened at its first line, which another test would write, elsewhere.
+        # The log of the verb is opened at its first line, which another test would write,
+        # elsewhere.
         for handler in list(logging.getLogger().handlers):
             if isinstance(handler, logging.FileHandler):
                 logging.getLogger().removeHandler(handler)

@@ -25,7 +25,8 @@ OTHER_HEADS = {"camera_head.pose.weight": (9, 4), "point_head.norm.bias": (8,), 
 
 
 def config(*overrides, tiny=True):
-    """The nodes of ``ghgs import`` that describe the model, of a tiny one or of the published size."""
+    """The nodes of ``ghgs import`` that describe the model,
+    of a tiny one or of the published size."""
     return json.loads(_composed((*(TINY if tiny else ()), *overrides)))
 
 

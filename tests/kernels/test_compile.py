@@ -85,7 +85,8 @@ def test_the_key_covers_all_that_kernels_read(room, monkeypatch):
 
 
 def test_the_first_compilation_says_so(capsys, monkeypatch):
-    """A first prediction that compiles for a minute must not look as if it hung; workers say nothing."""
+    """A first prediction that compiles for a minute must not look as if it hung;
+    workers say nothing."""
     numba.njit(lambda x: x)(1)  # the listener of this process has spoken
     capsys.readouterr()
     with event.install_listener("numba:compile", FirstCompilation()):

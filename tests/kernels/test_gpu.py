@@ -23,7 +23,8 @@ SCRIPT = Path(__file__).parents[2] / "benchmarks" / "gpu_compile.py"
 
 
 def test_every_kernel_compiles_for_gpus():
-    """For NVIDIA's A100 and H100, down to machine code, with registers for all that a thread holds."""
+    """For NVIDIA's A100 and H100, down to machine code,
+    with registers for all that a thread holds."""
     pytest.importorskip("triton")
     env = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
     command = [sys.executable, str(SCRIPT), "80", "90"]

@@ -111,7 +111,8 @@ def test_chamfer_is_scipys():
 
 
 def test_a_point_that_is_not_finite_is_not_hidden():
-    """The guard of training looks at the loss; an error of one process would leave the others waiting."""
+    """The guard of training looks at the loss;
+    an error of one process would leave the others waiting."""
     points, surface = torch.rand(5, 3), torch.rand(7, 3)
     points[2, 1] = torch.nan
     assert chamfer(points, surface).isnan()

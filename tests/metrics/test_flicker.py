@@ -81,7 +81,8 @@ def test_points_that_are_hidden_at_one_instant_are_left_out(square):
 
 
 def test_nothing_to_compare_is_undefined(square):
-    """No point in sight, no point at all, all of them behind the camera, no subject in the masks."""
+    """No point in sight, no point at all, all of them behind the camera,
+    no subject in the masks."""
     photographs, points, depths, masks = square
     assert flicker(photographs, points, 0 * depths, CAMERAS).isnan()
     assert flicker(photographs, points[:, :0], depths, CAMERAS).isnan()

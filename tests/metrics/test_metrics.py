@@ -218,7 +218,8 @@ def test_ssim_of_a_region_is_the_mean_of_its_windows():
 
 
 def test_flip_is_the_reference_implementation():
-    """FLIP equals maps by the authors' flip-evaluator 1.7 at its default viewing distance (``flip.npz``)."""
+    """FLIP equals maps by the authors' flip-evaluator 1.7 at its default viewing distance
+    (``flip.npz``)."""
     data = np.load(FIXTURES / "flip.npz")
     reference, test = (
         torch.from_numpy(data[k].astype(np.float32) / 255).permute(0, 3, 1, 2) for k in ("reference", "test")

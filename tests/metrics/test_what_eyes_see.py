@@ -1,5 +1,5 @@
-"""Metrics of what eyes see: outlines and edges of depth, light beside the subject, sharpness inside it,
-errors at one brightness, where Gaussians end."""
+"""Metrics of what eyes see: outlines and edges of depth, light beside the subject, sharpness inside
+it, errors at one brightness, where Gaussians end."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,8 @@ SIDE = 48
 
 
 def _people(n=4):
-    """Noise on blobs, renders of it, and depths with a step of 0, 5, 10 and 15 cm through the blobs."""
+    """Noise on blobs, renders of it, and depths with a step of 0, 5,
+    10 and 15 cm through the blobs."""
     rng = np.random.default_rng(3)
     masks = ndimage.gaussian_filter(rng.normal(size=(n, SIDE, SIDE)), (0, 5, 5)) > 0.02
     targets = rng.uniform(size=(n, 3, SIDE, SIDE)) * masks[:, None]
@@ -72,7 +73,8 @@ def test_what_eyes_see_is_what_scipy_computes(person):
 
 
 def test_what_eyes_see_of_nobody_is_absent():
-    """No subject or no light: nan, which means leave out, as of all regions; equal images have the cap."""
+    """No subject or no light: nan, which means leave out, as of all regions;
+    equal images have the cap."""
     images, targets, masks, depths = (torch.from_numpy(each) for each in _people(2))
     nobody = METRICS.measure(images, targets, masks & False, SEEN, 0 * depths)
     assert all(values.isnan().all() for values in nobody.values())
@@ -92,7 +94,8 @@ def test_brightness_changes_the_psnr_of_the_box_but_not_at_one_brightness():
 
 
 def test_light_beside_the_subject_and_sharpness_inside_it():
-    """Light on a ring of known size; a blur of known effect on a grating; the band of the outline."""
+    """Light on a ring of known size; a blur of known effect on a grating;
+    the band of the outline."""
     mask = torch.zeros(1, 40, 40, dtype=torch.bool)
     mask[:, 10:30, 10:30] = True
     target = 0.5 * mask[:, None].expand(-1, 3, -1, -1).float()
@@ -115,7 +118,8 @@ def test_light_beside_the_subject_and_sharpness_inside_it():
 
 
 def test_the_surface_error_sees_where_gaussians_end():
-    """A plane of points: Gaussians 10 mm above it, a transparent one far away, a hole that nothing covers."""
+    """A plane of points: Gaussians 10 mm above it, a transparent one far away,
+    a hole that nothing covers."""
     grid = torch.stack(torch.meshgrid(torch.arange(20.0), torch.arange(20.0), indexing="ij"), -1).flatten(
         0, 1
     )

@@ -1,4 +1,5 @@
-"""People who are rendered beside training: the first are waited for, the others join when they are whole."""
+"""People who are rendered beside training: the first are waited for,
+the others join when they are whole."""
 
 import pytest
 
@@ -40,7 +41,8 @@ def test_others_join_when_they_are_whole(begun):
 
 
 def test_the_rest_is_rendered_in_another_process(begun):
-    """Once only, the same photographs as without it; nothing is started for people who are whole."""
+    """Once only, the same photographs as without it;
+    nothing is started for people who are whole."""
     root, source = begun
     arguments = (root, NAMES, source, RIG, SMALL, 0)
     background.render_beside(*arguments)

@@ -39,7 +39,8 @@ def rendered(tmp_path_factory):
 
 
 def test_the_people_look_as_they_were_published(rendered, tmp_path):
-    """If this fails, the people have changed: results on them need another version of the definition."""
+    """If this fails, the people have changed:
+    results on them need another version of the definition."""
     bench.check_photographs("bench", Layout(rendered, "bench", SOME["bench"]))
     bench.check_photographs("sealed", render(tmp_path, "sealed", bench.definition("sealed")["size"]))
 
@@ -74,7 +75,8 @@ def test_the_people_are_different_ones(split, count):
 
 @pytest.mark.parametrize("name", ["synthetic", "people_in_rig"])
 def test_nobody_trains_on_them(name):
-    """The greatest numbers of people that a configuration allows reach neither set, nor one set the other."""
+    """The greatest numbers of people that a configuration allows reach neither set,
+    nor one set the other."""
     most = datasets.FIRST_VAL - 1
     data = datasets.Synthetic if name == "synthetic" else datasets.PeopleInRig
     data = data.model_construct(

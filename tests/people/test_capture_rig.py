@@ -1,4 +1,5 @@
-"""People in the cameras of a capture: the right places, whatever the calibration's world and unit."""
+"""People in the cameras of a capture: the right places,
+whatever the calibration's world and unit."""
 
 from dataclasses import replace
 
@@ -40,7 +41,8 @@ def placed(cameras, seed=0):
 
 
 def test_the_world_of_the_calibration_does_not_matter():
-    """A turned, shifted world in millimetres gives the same crops; cameras are sorted by azimuth."""
+    """A turned, shifted world in millimetres gives the same crops;
+    cameras are sorted by azimuth."""
     crops, _, _ = placed(ring())
     turn = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()
     others, _, _ = placed([ring(turn=turn, shift=(30.0, -8.0, 100.0), unit=1000.0)[i] for i in (2, 0, 3, 1)])
@@ -71,7 +73,8 @@ def test_cameras_keep_their_places_beside_one_another():
 
 
 def test_views_between_cameras_turn_about_the_subject():
-    """View 3 is half-way in azimuth, at the mean distance and height, and looks at the same place."""
+    """View 3 is half-way in azimuth, at the mean distance and height,
+    and looks at the same place."""
     crops, _, _ = placed(ring())
     for i, crop in enumerate(crops):
         first, then, middle = (crop.extrinsics[n].double().numpy() for n in (0, 1, 3))

@@ -68,7 +68,8 @@ class File:
 def rigged(
     bind: bool = True, morphs: list[float] | None = None, skinned: bool = True
 ) -> tuple[File, np.ndarray]:
-    """A file with a mesh under a node, moved by two joints of a chain; and the vertices that are expected."""
+    """A file with a mesh under a node, moved by two joints of a chain;
+    and the vertices that are expected."""
     file = File()
     attributes = {
         "POSITION": file.add(VERTICES, "VEC3"),

@@ -64,7 +64,8 @@ def reference(scans, tmp_path_factory):
 
 
 def render_and_die(root: Path, scans: Path, moves: int) -> None:
-    """Render until ``moves`` folders or files were moved, then vanish as ``kill -9`` makes one vanish."""
+    """Render until ``moves`` folders or files were moved,
+    then vanish as ``kill -9`` makes one vanish."""
     count, replace_file = [0], os.replace
 
     def dying(*paths):
@@ -178,7 +179,8 @@ render_people(root, {"train": ["s0", "s1"]}, ScanSource(scans), Rig(), RenderOpt
 
 
 def test_a_script_without_a_main_guard_ends_with_a_reason(scans, tmp_path):
-    """Its workers run the script again and would wait for their parent, which waits for them, for ever."""
+    """Its workers run the script again and would wait for their parent, which waits for them,
+    for ever."""
     script, pids = tmp_path / "script.py", tmp_path / "pids"
     script.write_text(UNGUARDED)
     pids.mkdir()
@@ -200,7 +202,8 @@ def test_several_workers_make_the_same_files(scans, reference, tmp_path, monkeyp
 
 
 def test_workers_have_one_thread_each(monkeypatch):
-    """Products of 15 workers with 15 threads each wait for one another; the caller's settings come back."""
+    """Products of 15 workers with 15 threads each wait for one another;
+    the caller's settings come back."""
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     with jobs.one_thread_each():
@@ -210,7 +213,8 @@ def test_workers_have_one_thread_each(monkeypatch):
 
 
 def test_people_are_rendered_inside_a_worker_of_joblib(scans, reference, tmp_path):
-    """A sweep with ``hydra/launcher=joblib`` makes its people in joblib's worker, in further processes."""
+    """A sweep with ``hydra/launcher=joblib`` makes its people in joblib's worker,
+    in further processes."""
     loky = pytest.importorskip("joblib.externals.loky")
     # Not the executor that joblib shares in a process: it would lack what joblib gives its own.
     with loky.ProcessPoolExecutor(max_workers=1) as worker:
@@ -236,7 +240,8 @@ def test_bad_people_are_named_when_the_others_are_rendered(scans, reference, tmp
 
 
 def test_textures_without_lights_come_back_as_they_are(scans, reference, tmp_path):
-    """Light that is in a texture was there twice. Geometry and cameras are those of the lit photographs."""
+    """Light that is in a texture was there twice.
+    Geometry and cameras are those of the lit photographs."""
     root, unlit = tmp_path / "out", SMALL.replace(lights="none")
     render_boxes(root, scans, 1, 0, settings=unlit)
     files = contents(root)
@@ -274,7 +279,8 @@ def test_lit_renders_of_before_go_on(scans, reference, tmp_path):
 
 
 def test_a_full_disk_names_the_folder_of_the_data_set(scans, tmp_path, monkeypatch):
-    """The system names no file, and the command line then named the run's directory, which had space."""
+    """The system names no file, and the command line then named the run's directory,
+    which had space."""
 
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -340,7 +346,8 @@ def test_portrait_photographs(scans, tmp_path):
 
 
 def test_two_seeds_of_rendering_differ_and_one_repeats(scans, reference, tmp_path):
-    """Other heights, directions and lights: no photograph and no camera is that of the other seed."""
+    """Other heights, directions and lights: no photograph and no camera is that of the
+    other seed."""
     for seed in (0, 1):
         render_boxes(tmp_path / str(seed), scans, 3, 1, settings=SMALL, seed=seed)
     assert contents(tmp_path / "0") == reference

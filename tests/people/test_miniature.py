@@ -9,7 +9,8 @@ from scripts import miniature as layouts
 from scripts.miniatures import humman, scans, thuman2, zju_mocap
 from tests.helpers.captures import refused
 
-# For each data set: the key of the folder, a file of the real data in it, and the function that writes.
+# For each data set: the key of the folder, a file of the real data in it,
+# and the function that writes.
 CASES = {
     "zju_mocap": ("root", "CoreView_386/annots.npy", zju_mocap, "make"),
     "humman": ("root", "p000455_a000986/cameras.json", humman, "make"),
@@ -62,7 +63,8 @@ def test_a_miniature_can_be_written_again(case):
 
 
 def test_what_lies_beside_is_not_overwritten(tmp_path):
-    """The body model beside HuMMan and the fits beside raw scans are checked like the data itself."""
+    """The body model beside HuMMan and the fits beside raw scans are checked like the
+    data itself."""
     for name, key, beside in (
         ("humman", "root", "data_body_models/smpl/SMPL_NEUTRAL.pkl"),
         ("thuman2", "source", "THuman2.0_smplx/0000/smplx_param.pkl"),

@@ -49,7 +49,8 @@ def test_asset_is_small_and_comes_with_its_licence():
 
 
 def test_weights_sum_to_one_and_parents_come_first():
-    """Skinning weights that do not sum to 1 would scale the body; posing needs parents before children."""
+    """Skinning weights that do not sum to 1 would scale the body;
+    posing needs parents before children."""
     body = load_body()
     np.testing.assert_allclose(body.weights.sum(1), 1.0, atol=1e-9)
     assert (body.weights >= 0).all()
@@ -233,7 +234,8 @@ def test_arms_stay_out_of_the_trunk(active):
 
 
 def test_people_in_motion_spread_bend_and_cross_their_legs():
-    """What standing people never show: feet a leg's length apart, deep knees, feet on the other's side."""
+    """What standing people never show: feet a leg's length apart, deep knees,
+    feet on the other's side."""
     body = load_body()
     apart, along, across, high = [], [], [], []
     for active in (False, True):
@@ -267,7 +269,8 @@ def test_negative_numbers_are_refused():
 
 
 def test_textured_mesh_refuses_other_shapes():
-    """Arrays that do not fit together are refused when the mesh is made, not when it is rendered."""
+    """Arrays that do not fit together are refused when the mesh is made,
+    not when it is rendered."""
     square = {
         "vertices": np.zeros((4, 3), np.float32),
         "faces": np.array([[0, 1, 2], [0, 2, 3]]),
@@ -289,7 +292,8 @@ def test_textured_mesh_refuses_other_shapes():
 
 
 def test_clip_keeps_the_area_on_its_side():
-    """Garments are cut where their field is zero: both sides make up the area, no face is flipped."""
+    """Garments are cut where their field is zero: both sides make up the area,
+    no face is flipped."""
     rng = np.random.default_rng(0)
     grid = np.stack(np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)), -1).reshape(-1, 2)
     index = np.arange(81).reshape(9, 9)
@@ -338,7 +342,8 @@ def test_rasterise_finds_the_place_of_texels():
 
 
 def test_normals_of_a_sphere():
-    """Clothes are moved along normals: they have unit length, point outwards and weight faces by area."""
+    """Clothes are moved along normals: they have unit length,
+    point outwards and weight faces by area."""
     import trimesh
 
     sphere = trimesh.creation.icosphere(subdivisions=3)

@@ -57,7 +57,8 @@ def shoot(parts, cameras, samples=3, lights=None):
 
 
 def test_sphere_depth_and_coverage_are_analytic():
-    """Depth and coverage are metric: compared with ray-sphere intersection in float64 and dense sampling."""
+    """Depth and coverage are metric: compared with ray-sphere intersection in float64 and
+    dense sampling."""
     radius, size, distance = 0.6, 56, 2.0
     sphere = trimesh.creation.icosphere(subdivisions=5, radius=radius)
     camera = front_camera(size, distance, shift=3.3)
@@ -83,7 +84,8 @@ def test_sphere_depth_and_coverage_are_analytic():
 
 
 def test_square_covers_exactly_the_pixels_it_should():
-    """No shift by half a pixel: edges at pixel boundaries are sharp, others have their exact coverage."""
+    """No shift by half a pixel: edges at pixel boundaries are sharp,
+    others have their exact coverage."""
     size = 32
     image, mask, depth = shoot([quad(half=0.5)], front_camera(size))  # ± 0.5 * 32 / 2 = ± 8 pixels
     expected = np.zeros((size, size))
@@ -115,7 +117,8 @@ def test_depth_never_mixes_two_surfaces():
 
 
 def test_depth_of_pixel_centers_lies_on_a_slanted_plane():
-    """With an odd number of samples depth is exact at pixel centres: unprojected points lie on the plane."""
+    """With an odd number of samples depth is exact at pixel centres:
+    unprojected points lie on the plane."""
     part = quad(half=0.6)
     turned = trimesh.transformations.rotation_matrix(0.7, [0.3, 1, 0.1])[:3, :3].astype(np.float32)
     part = TexturedMesh(part.vertices @ turned.T, part.faces, part.uv, part.texture)
@@ -130,7 +133,8 @@ def test_depth_of_pixel_centers_lies_on_a_slanted_plane():
 
 
 def test_vertices_project_into_the_mask_from_every_side():
-    """Photographs agree with their cameras: vertices project into the mask, depths lie on the surface."""
+    """Photographs agree with their cameras: vertices project into the mask,
+    depths lie on the surface."""
     rng = subject_rng(3, "capsule")
     capsule = trimesh.creation.capsule(height=1.2, radius=0.25, count=[64, 64])
     capsule.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
@@ -175,7 +179,8 @@ def sample_texture(texture, uv):
 
 
 def hits(corners, origins, rays):
-    """Distances [m, ...] and barycentric coordinates [m, ..., 2] of all rays on all triangles, in float64."""
+    """Distances [m, ...] and barycentric coordinates [m, ..., 2] of all rays on all triangles,
+    in float64."""
     a, b, c = (corners[:, i].reshape(-1, *[1] * (rays.ndim - 1), 3) for i in range(3))
     flat = np.cross(b - a, c - a)
     t = ((a - origins) * flat).sum(-1) / (rays * flat).sum(-1)
@@ -215,7 +220,8 @@ def photographed(part, camera, samples, light):
 
 @pytest.mark.parametrize("samples", [1, 3])
 def test_photograph_follows_its_formulas(samples):
-    """Kernels, and the choice of the rays that are cast, against all rays and all faces in float64."""
+    """Kernels, and the choice of the rays that are cast,
+    against all rays and all faces in float64."""
     rng = np.random.default_rng(samples)
     sphere = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
     vertices = np.float32(sphere.vertices * rng.uniform(0.6, 1.4, (len(sphere.vertices), 1)))
@@ -242,7 +248,8 @@ def test_photograph_follows_its_formulas(samples):
 
 
 def test_lights_are_the_same_for_every_view_and_seam_free():
-    """Light follows its formula on a round body, whose normals are known; UV seams are invisible."""
+    """Light follows its formula on a round body, whose normals are known;
+    UV seams are invisible."""
     sphere = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
     exploded = TexturedMesh(  # every face has its own vertices, as along UV seams
         np.asarray(sphere.triangles, np.float32).reshape(-1, 3),
@@ -268,7 +275,8 @@ def test_lights_are_the_same_for_every_view_and_seam_free():
 
 
 def test_shadows_are_soft():
-    """Below a half-plane under a round light: lit, dark, and between them the share of the disc in sight."""
+    """Below a half-plane under a round light: lit, dark,
+    and between them the share of the disc in sight."""
     height = 1.0
     fine = np.linspace(-1, 1, 201)
     across, along = np.meshgrid(fine, [-1.0, 1.0])
@@ -317,7 +325,8 @@ def test_both_sides_are_lit_and_winding_does_not_matter():
 
 
 def test_camera_beside_and_inside_the_subject():
-    """An empty view gives empty maps; vertices behind the camera do not make the window too small."""
+    """An empty view gives empty maps; vertices behind the camera do not make the
+    window too small."""
     away = front_camera(16)
     away.intrinsics[:, 0, 2] += 1000
     _, mask, depth = shoot([quad()], away)
@@ -378,7 +387,8 @@ def test_placing_scales_and_moves_body_and_clothes_alike():
 
 
 def test_without_embree_only_rendering_is_refused(monkeypatch):
-    """Some machines have no wheel of it: what renders no mesh works there: nothing imports it before."""
+    """Some machines have no wheel of it: what renders no mesh works there:
+    nothing imports it before."""
     monkeypatch.setitem(sys.modules, "embreex.rtcore_scene", None)
     with pytest.raises(InputError, match="expected the package embreex, or photographs that are rendered"):
         Studio(Person("p", (quad(),), None), None)

@@ -1,4 +1,5 @@
-"""Rigs that differ between subjects and cameras: limits, framing, nothing changed where nothing varies."""
+"""Rigs that differ between subjects and cameras: limits, framing,
+nothing changed where nothing varies."""
 
 import hashlib
 import json
@@ -33,7 +34,8 @@ def drawn(rig, person, aspect=1.0, seed=0):
 @pytest.mark.parametrize("extents", [(0.5, 1.7, 0.3), (1.9, 1.7, 0.3), (0.4, 1.1, 0.3)])
 @pytest.mark.parametrize("aspect", [1.0, 0.7])
 def test_every_camera_of_a_varied_rig_sees_the_whole_subject(extents, aspect):
-    """Adults, children and outstretched arms are in every image, as large as ``fill`` says where they fit."""
+    """Adults, children and outstretched arms are in every image,
+    as large as ``fill`` says where they fit."""
     fills, radii, pitches = [], [], []
     for seed in range(8):
         person = VARIED.place(box_person(extents=extents), subject_rng(seed, "box"))
@@ -93,7 +95,8 @@ def test_only_views_between_ring_cameras_stand_higher_or_lower():
 
 
 def test_without_variation_nothing_changes():
-    """The ring is the same to the bit, and what this version of the renderer has made keeps its name."""
+    """The ring is the same to the bit, and what this version of the renderer has made
+    keeps its name."""
     person = box_person()
     rig, cameras, yaws = drawn(Rig(), person)
     assert rig == Rig()

@@ -82,7 +82,8 @@ def test_a_lost_texture_of_several_is_not_guessed(tmp_path):
 
 
 def test_glb_scans_keep_parts_and_frames(tmp_path):
-    """Parts keep their transforms; a mesh without texture, or with one that cuts parts away, is refused."""
+    """Parts keep their transforms; a mesh without texture, or with one that cuts parts away,
+    is refused."""
     scene = trimesh.Scene()
     for k, mode in enumerate(("OPAQUE", "OPAQUE", "MASK")):
         mesh = trimesh.creation.box((0.1, 0.2, 0.3))

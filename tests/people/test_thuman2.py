@@ -1,4 +1,5 @@
-"""THuman2.0 on miniatures in its true layout: one test for each quirk that a loader can get wrong."""
+"""THuman2.0 on miniatures in its true layout:
+one test for each quirk that a loader can get wrong."""
 
 import shutil
 
@@ -56,7 +57,8 @@ def seen_by(view, scan=None) -> np.ndarray:
 
 
 def test_published_renders_have_integer_pixel_centres(rendered):
-    """The person seen from the camera that was read covers exactly the mask; half a pixel off it does not."""
+    """The person seen from the camera that was read covers exactly the mask;
+    half a pixel off it does not."""
     view = stored(module(rendered), "train").view("0000", 2, 3)
     np.testing.assert_array_equal(seen_by(view), view.mask)
     ignored = stored(module(rendered, pixel_centers="half"), "train").view("0000", 2, 3)
@@ -110,7 +112,8 @@ def test_every_view_sees_the_body_in_its_mask(rendered):
 
 
 def test_views_between_ring_cameras(rendered):
-    """16 cameras 22.5 degrees apart; view 1 is the next one, 3 the exact middle, 2 and 4 in the halves."""
+    """16 cameras 22.5 degrees apart; view 1 is the next one, 3 the exact middle,
+    2 and 4 in the halves."""
     photographs = stored(module(rendered), "train")
     yaw = {}
     for position in range(16):
@@ -131,7 +134,8 @@ def test_views_between_ring_cameras(rendered):
 
 
 def test_files_are_of_the_published_types(rendered):
-    """Three-channel masks of 0 and 255, 16-bit depth, 3 x 4 cameras; ``_hr`` files are not views."""
+    """Three-channel masks of 0 and 255, 16-bit depth, 3 x 4 cameras;
+    ``_hr`` files are not views."""
     train = rendered / "train"
     mask = np.asarray(Image.open(train / "mask/0000_004/2.png"))
     assert mask.shape == (SIZE, SIZE, 3)
@@ -143,7 +147,8 @@ def test_files_are_of_the_published_types(rendered):
 
 
 def test_the_first_camera_faces_the_person(raw):
-    """global_orient of the fit turns the ring: a person that looks elsewhere is still seen from the front."""
+    """global_orient of the fit turns the ring:
+    a person that looks elsewhere is still seen from the front."""
     source = THuman2Source(raw, find_fits(raw, None))
     for name in ("0000", "0426"):
         scan = scan_of(name, 0)

@@ -1,4 +1,5 @@
-"""What task=check says of broken THuman2.0 data: each defect gets one line, and training does not start."""
+"""What task=check says of broken THuman2.0 data: each defect gets one line,
+and training does not start."""
 
 import json
 import os

@@ -15,7 +15,8 @@ from tests.helpers.scenes import hard_subjects, make_batch, stack
 
 
 def people():
-    """Subjects for which different presets are the cheapest: in front of much and of little background."""
+    """Subjects for which different presets are the cheapest:
+    in front of much and of little background."""
     masks = torch.zeros(3, 3, 84, 84, dtype=torch.bool)
     masks[0] = True  # exact: there is no background
     masks[1, :, 20:78, 20:78] = True  # balanced: the margin of fast is more than the window
@@ -25,7 +26,8 @@ def people():
 
 @pytest.mark.parametrize("skip", ["exact", "balanced", "fast"])
 def test_the_cost_is_what_the_blocks_compute(skip):
-    """A preset must not be chosen for products that it does not save; against PyTorch's own counter."""
+    """A preset must not be chosen for products that it does not save;
+    against PyTorch's own counter."""
     model, batch = make_model(f"skip={skip}").eval(), stack(list(hard_subjects().values()))
     aggregator = model.encoder.aggregator
     with torch.no_grad(), FlopsProbe() as probe:
@@ -55,7 +57,8 @@ def test_each_subject_gets_the_cheapest_preset_and_it_is_what_runs():
     [
         (["skip.choices.balanced=0.2"], ("exact", "exact", "fast")),
         (["skip.budget_db=0.01"], ("exact",) * 3),
-        # Equal cost goes to the more exact preset: here fast keeps the window of the second subject.
+        # Equal cost goes to the more exact preset:
+        # here fast keeps the window of the second subject.
         (["skip.margin=0"], ("exact", "balanced", "fast")),
     ],
 )
@@ -112,7 +115,8 @@ def test_the_presets_to_choose_from_are_those_of_their_files(name):
 
 
 def test_the_authors_weights_have_seen_all_tokens_only(tmp_path):
-    """Their file may be written with any preset; what their training did not show must not be chosen."""
+    """Their file may be written with any preset;
+    what their training did not show must not be chosen."""
     path, model = tmp_path / "release.ckpt", make_model("skip=auto")
     write_checkpoint(path, make_model().state_dict(), config("skip=fast"), imported={"release": "x"})
     load_weights(model, path)

@@ -29,7 +29,8 @@ def head_of(guided, seed):
 @pytest.mark.parametrize("grid", [(14, 17), (21, 9)])
 @torch.no_grad()
 def test_a_window_has_the_values_of_the_whole(grid, guided):
-    """Positions, interpolation and zero padding must be those of the whole photograph, to rounding."""
+    """Positions, interpolation and zero padding must be those of the whole photograph,
+    to rounding."""
     patch = 6 if guided else 14
     size = (patch * grid[0], patch * grid[1])
     tokens = _tokens(1, 1, *grid, patch_size=patch, dtype=torch.float64)
@@ -53,7 +54,8 @@ def test_a_window_has_the_values_of_the_whole(grid, guided):
     ("source", "target"), [((7, 9), (14, 18)), ((14, 18), (27, 35)), ((8, 1), (3, 5)), ((5, 6), (5, 6))]
 )
 def test_a_window_is_interpolated_as_the_whole(source, target):
-    """Resizing a part gives that part of the resized whole, from the cells that it names and no others."""
+    """Resizing a part gives that part of the resized whole,
+    from the cells that it names and no others."""
     for dtype in (torch.float32, torch.float64, torch.bfloat16):
         maps = torch.randn(2, 3, *source).to(dtype)
         whole = F.interpolate(maps, target, mode="bilinear", align_corners=True)
@@ -125,7 +127,8 @@ def _windows(masks):
 @pytest.mark.parametrize("name", list(CASES))
 @torch.no_grad()
 def test_every_wanted_pixel_is_decoded_as_in_the_whole(name, largest, monkeypatch):
-    """Images one by one or in one window: each wanted pixel is in a part, with the value of the whole map."""
+    """Images one by one or in one window: each wanted pixel is in a part,
+    with the value of the whole map."""
     monkeypatch.setattr(dense, "_LARGEST", largest)
     masks, tokens = CASES[name], _tokens(1, 3, 5, 4)
     head = _head()

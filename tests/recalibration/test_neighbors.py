@@ -28,7 +28,8 @@ def test_neighbors_are_those_of_the_definition(k, dtype):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_ties_on_the_image_plane_favor_no_view_and_no_side(dtype):
-    """Views share their places there, so most distances are equal; lower views had a quarter more."""
+    """Views share their places there, so most distances are equal;
+    lower views had a quarter more."""
     tokens, points = scene(((144, 144, 144, 144),), grid=(12, 12))
     module = make_stage(neighborhood="image_plane", k=48)
     position = module.positions(tokens, points).to(dtype)

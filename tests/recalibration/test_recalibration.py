@@ -237,7 +237,8 @@ def test_impossible_options_are_refused(options, key):
 
 @pytest.mark.parametrize("similarity", SIMILARITIES)
 def test_gathered_neighbors_give_what_a_product_of_all_tokens_gives(similarity, monkeypatch):
-    """The path of a GPU and of many tokens, in one part and in several, computed again for the gradient."""
+    """The path of a GPU and of many tokens, in one part and in several,
+    computed again for the gradient."""
     torch.manual_seed(0)
     block = SemanticAttention(64, 2, similarity).double()
     inputs = [torch.randn(40, 16, dtype=torch.float64, requires_grad=True) for _ in range(3)]

@@ -1,4 +1,5 @@
-"""Cameras of a capture: corrected where photographs contradict one another, and otherwise left alone."""
+"""Cameras of a capture: corrected where photographs contradict one another,
+and otherwise left alone."""
 
 import dataclasses
 
@@ -50,7 +51,8 @@ def far_away(batch):
 
 
 def contradiction(batch, truth):
-    """Reprojection error in pixels of surface points, triangulated from where photographs show them."""
+    """Reprojection error in pixels of surface points,
+    triangulated from where photographs show them."""
     points = unproject_maps(truth.depths, truth.cameras)[truth.masks].double()[::7]
     lens, pose = truth.cameras.intrinsics[0, :, None].double(), truth.cameras.extrinsics[0, :, None].double()
     lenses, poses = (
@@ -91,7 +93,8 @@ def test_views_agree_better(views, pixels, seed):
 
 
 def test_focal_lengths_are_corrected_where_silhouettes_tell_them():
-    """One element has a lens that is too long, the other none: only the first one's lenses change."""
+    """One element has a lens that is too long, the other none:
+    only the first one's lenses change."""
     truth = scene(batch=2)
     lenses = truth.cameras.intrinsics.clone()
     lenses[0, 1, [0, 1], [0, 1]] *= 1.08
@@ -107,7 +110,8 @@ def test_focal_lengths_are_corrected_where_silhouettes_tell_them():
 
 
 def test_exact_cameras_stay():
-    """A user who asks for it without need must not lose, not even digits far from the world's origin."""
+    """A user who asks for it without need must not lose,
+    not even digits far from the world's origin."""
     truth = scene()
     for batch in (truth, far_away(truth)):
         found = CameraRefinement(2, predictor(truth), RENDERER)(batch)
@@ -137,7 +141,8 @@ def test_elements_are_corrected_as_if_alone(is_exact):
 
 @pytest.mark.parametrize("views", [3, 4])
 def test_cameras_that_silhouettes_agree_with_need_more_to_be_moved(monkeypatch, views):
-    """The first element has exact cameras, the other ones that are off by pixels; three views tell less."""
+    """The first element has exact cameras, the other ones that are off by pixels;
+    three views tell less."""
     truth = scene(batch=2, views=views)
     poses = torch.stack((truth.cameras.extrinsics[0], off(truth, 4.0, (0, 5)).cameras.extrinsics[1]))
     batch = dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, extrinsics=poses))

@@ -53,7 +53,8 @@ def bumped(truth, off_by, seed):
 
 
 def pixels_off(cameras, truth):
-    """How far surface points are from where they should be seen, root mean square over all views."""
+    """How far surface points are from where they should be seen,
+    root mean square over all views."""
     points = unproject_maps(truth.depths, truth.cameras)[truth.masks][::5]
     seen = [
         project(points.expand(*each.extrinsics.shape[:2], -1, 3), *(m[:, :, None] for m in matrices))[0]
@@ -65,7 +66,8 @@ def pixels_off(cameras, truth):
 
 @pytest.mark.parametrize(("views", "pixels", "seed"), [(3, 6.0, 1), (4, 6.0, 0), (4, 6.0, 2), (5, 6.0, 3)])
 def test_silhouettes_correct_cameras(views, pixels, seed):
-    """Errors of pixels become errors of a fraction; lenses hardly change, rotations are rotations."""
+    """Errors of pixels become errors of a fraction;
+    lenses hardly change, rotations are rotations."""
     truth = figure(views=views)
     wrong = off(truth, pixels, (seed,))
     found, _, _ = coherent_cameras(wrong)
@@ -99,7 +101,8 @@ def test_distances_tell_exact_cameras_from_others():
 
 
 def test_a_quick_look_tells_exact_cameras_from_others():
-    """Also ones that are off by a pixel or two, each element by itself; nothing without an outline."""
+    """Also ones that are off by a pixel or two, each element by itself;
+    nothing without an outline."""
     truth = figure(batch=2)
     poses = torch.stack((truth.cameras.extrinsics[0], off(truth, 3.0, (0, 5)).cameras.extrinsics[1]))
     cameras = dataclasses.replace(truth.cameras, extrinsics=poses)
@@ -161,7 +164,8 @@ def test_a_subject_may_go_on_beyond_a_photograph():
 
 
 def test_gradients_are_those_of_finite_differences():
-    """Of distances by small motions of points, in a map that is smooth (a cone's slopes are constant)."""
+    """Of distances by small motions of points,
+    in a map that is smooth (a cone's slopes are constant)."""
     truth = figure()
     lens, pose = truth.cameras.intrinsics[0], truth.cameras.extrinsics[0]
     u, v = torch.meshgrid(torch.arange(4 * 126.0), torch.arange(4 * 126.0), indexing="xy")
@@ -270,7 +274,8 @@ def test_focal_lengths_that_contradict_one_another_come_nearer(monkeypatch):
 
 
 def test_a_ray_is_looked_up_in_the_other_silhouettes():
-    """The depth is the least one in the others, at a point of the ray that no other point of it beats."""
+    """The depth is the least one in the others,
+    at a point of the ray that no other point of it beats."""
     truth = figure()
     outlines = Outlines.of(truth.alpha[0])
     lens, pose = truth.cameras.intrinsics[0], truth.cameras.extrinsics[0]
@@ -287,7 +292,8 @@ def test_a_ray_is_looked_up_in_the_other_silhouettes():
 
 
 def test_phases_weigh_rays_by_what_they_make_small():
-    """First, only rays that miss count; then, only those about as deep as in their own silhouette."""
+    """First, only rays that miss count; then,
+    only those about as deep as in their own silhouette."""
     first, second = coherence._MEET, coherence._LIE
     depth = torch.tensor([3.0, -0.5, -4.0])
     distances = first.distances(depth, torch.ones(3))
@@ -320,7 +326,8 @@ def instants(count=3, views=4, size=98):
 
 
 def corners_off(cameras, truth):
-    """Pixels by which a box around all instants is seen elsewhere in the first's views, root mean square."""
+    """Pixels by which a box around all instants is seen elsewhere in the first's views,
+    root mean square."""
     corners = HEIGHT / 3 * torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
     seen = [
         project(corners.expand(4, -1, -1), each.intrinsics[0][:, None], each.extrinsics[0][:, None])[0]

@@ -103,7 +103,8 @@ def test_some_photographs_of_a_batch_are_a_batch():
 
 
 def test_what_is_beside_the_subject_takes_no_part():
-    """Photographs may come with their background; those with a matte are premultiplied by it, on black."""
+    """Photographs may come with their background;
+    those with a matte are premultiplied by it, on black."""
     splats, inputs, _ = scene(size=42)
     room = dataclasses.replace(inputs, images=torch.where(inputs.masks[:, :, None], inputs.images, 0.7))
     matte = dataclasses.replace(inputs, alpha=inputs.masks.float())

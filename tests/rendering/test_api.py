@@ -75,7 +75,8 @@ def test_auto_is_the_cpu_backend_for_cpu_tensors():
 
 @pytest.mark.parametrize("verb", ["train", "evaluate"])
 def test_the_release_renders_with_its_own_constants(verb):
-    """A splat 0.1 m from the camera cost 4 dB: the authors cull below 0.2 m and cap alpha at 0.99."""
+    """A splat 0.1 m from the camera cost 4 dB:
+    the authors cull below 0.2 m and cap alpha at 0.99."""
     nodes = [
         OmegaConf.to_container(project_compose(verb, overrides).renderer)
         for overrides in ([], ["compat=release"], ["compat=release", "renderer.near=0.05"])
@@ -95,7 +96,8 @@ def test_the_release_renders_with_its_own_constants(verb):
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 def test_backgrounds(backend):
-    """Every form of background is blended by one minus alpha; a wrong number of channels is refused."""
+    """Every form of background is blended by one minus alpha;
+    a wrong number of channels is refused."""
     gaussians, views = cloud(20), camera_ring(2, 20, 30)
     black = render(gaussians, views, backend)
     behind = 1 - black.alpha
@@ -170,7 +172,8 @@ def test_elements_of_worlds_far_apart_are_drawn_as_near_the_origin(backend):
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 def test_the_worlds_unit_changes_no_image(backend):
-    """Gaussians that know how long a metre is: in millimetres the image is the same, depth is 1000 times."""
+    """Gaussians that know how long a metre is: in millimetres the image is the same,
+    depth is 1000 times."""
     splats, views = cloud(20, splits=(12, 8)), camera_ring(2, 20, 30, batch=2)
     expected = render(splats, views, backend, near=2.5, far=3.2)
     units = torch.tensor([1.0, 1000.0])
@@ -189,7 +192,8 @@ def test_the_worlds_unit_changes_no_image(backend):
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 @pytest.mark.parametrize(("near", "far", "drawn"), [(0.5, 2.0, 0), (1.5, 4.0, 1), (1.0, 3.0, 2)])
 def test_near_and_far_are_depths_of_centres(backend, near, far, drawn):
-    """Of two splats beside each other, 1 m and 3 m away: those within the range, its ends included."""
+    """Of two splats beside each other, 1 m and 3 m away: those within the range,
+    its ends included."""
     views = Cameras(
         torch.tensor([[[[20.0, 0, 10], [0, 20, 10], [0, 0, 1]]]]), torch.eye(4)[None, None], 20, 20
     )

@@ -22,7 +22,8 @@ from tests.helpers.splats import (
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize(("height", "width"), [(45, 70), (16, 32), (1, 1), (3, 33)])
 def test_random_scenes(height, width, antialiased):
-    """Image and gradients equal the reference for images of any size, with and without anti-aliasing."""
+    """Image and gradients equal the reference for images of any size,
+    with and without anti-aliasing."""
     assert_cpu_matches_reference(
         cloud(150, size=0.1), camera_ring(2, height, width), RasterSettings(antialiased=antialiased)
     )
@@ -131,7 +132,8 @@ def test_hundreds_of_opaque_layers():
 
 
 def test_inputs_of_any_layout_and_dtype():
-    """Strided, float64 and bfloat16 inputs are converted, and gradients come back in their dtype."""
+    """Strided, float64 and bfloat16 inputs are converted,
+    and gradients come back in their dtype."""
     plain, views = cloud(40), camera_ring(1, 24, 24)
     wanted = render(plain, views, "cpu").image
     strided = dataclasses.replace(

@@ -134,7 +134,8 @@ def test_far_off_screen(far_off):
 
 
 def test_beyond_the_limit_of_the_jacobian():
-    """Wide splats outside the frame, where the Jacobian is clamped, equal the reference with gradients."""
+    """Wide splats outside the frame, where the Jacobian is clamped,
+    equal the reference with gradients."""
     gaussians = few(
         means=[[3.0, 0.1, 0], [-2.5, 0.2, 0.3], [0.2, 2.5, -0.1], [0.1, -4.0, 0.4]], scales=[[1.0, 0.5, 0.7]]
     )
@@ -187,7 +188,8 @@ def test_thresholds_at_equality():
         scenes = [few(opacities=torch.tensor([o], dtype=torch.float64)) for o in (just * (1 + 1e-6), below)]
         shown = [float(render(scene, views, backend).alpha[0, 0, 0, 8, 8]) for scene in scenes]
         assert shown == [pytest.approx(just, rel=1e-5), 0.0]
-    # The transmittance behind the second layer is 1/16: with a ``stop`` of that or more it is left out.
+    # The transmittance behind the second layer is 1/16:
+    # with a ``stop`` of that or more it is left out.
     layers = few(
         means=[[0, 0, 0], [0, 0, 0.1], [0, 0, 0.2]], opacities=[0.75, 0.75, 0.01], scales=[[0.5] * 3]
     )
@@ -212,7 +214,8 @@ def test_antialiased_splats_without_area_vanish():
 
 
 def test_more_splats_in_tiles_than_memory_are_refused_at_once():
-    """60 000 splats that fill the frame take 5 GB with their gradients; one line, before any is allocated."""
+    """60 000 splats that fill the frame take 5 GB with their gradients;
+    one line, before any is allocated."""
     gaussians = cloud(60_000)
     full = dataclasses.replace(gaussians, scales=torch.full_like(gaussians.scales, 1e4))
     full.means.requires_grad_()

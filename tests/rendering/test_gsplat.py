@@ -1,4 +1,5 @@
-"""gsplat: its projection in PyTorch as an independent check, how it is called, and its image on a GPU."""
+"""gsplat: its projection in PyTorch as an independent check, how it is called,
+and its image on a GPU."""
 
 import contextlib
 import inspect
@@ -29,7 +30,8 @@ def test_covariances_are_those_of_gsplat():
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("distance", [3.0, 0.8])
 def test_projection_is_that_of_gsplat(distance, antialiased):
-    """Centres, inverse covariances, depths, opacities and their gradients equal gsplat's projection."""
+    """Centres, inverse covariances, depths, opacities and their gradients equal gsplat's
+    projection."""
     gaussians, views = with_gradients(cloud(200), torch.float64), camera_ring(3, 40, 50, distance=distance)
     views = Cameras(views.intrinsics.double(), views.extrinsics.double(), 40, 50)
     settings = RasterSettings(antialiased=antialiased)
@@ -101,7 +103,8 @@ def forgotten():
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("gsplat", [Documented, InParts])
 def test_gsplat_is_called_as_documented(monkeypatch, gsplat, antialiased):
-    """gsplat gets finite, normalised input, and its output is read as documented; once for a batch."""
+    """gsplat gets finite, normalised input, and its output is read as documented;
+    once for a batch."""
     monkeypatch.setattr(gsplat_backend, "load", lambda: gsplat)
     gaussians, views = cloud(40, splits=(15, 0, 25)), camera_ring(2, 20, 30, batch=3)
     gaussians.quaternions[3] = 0

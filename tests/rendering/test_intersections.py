@@ -1,4 +1,5 @@
-"""Splats of tiles against gsplat's functions in plain PyTorch, and room for them that never is too small."""
+"""Splats of tiles against gsplat's functions in plain PyTorch,
+and room for them that never is too small."""
 
 import pytest
 import torch

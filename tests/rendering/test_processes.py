@@ -90,7 +90,8 @@ class _Renderings(torch.utils.data.Dataset):
 @pytest.mark.filterwarnings("ignore:This DataLoader will create 4 worker processes")
 def test_training_in_four_workers_of_a_data_loader():
     """Rendering with gradients works in worker processes."""
-    # In a process of its own: where a backward pass ran on another device, PyTorch refuses one after a fork.
+    # In a process of its own: where a backward pass ran on another device,
+    # PyTorch refuses one after a fork.
     run_prepared(train_in_workers)
 
 
@@ -115,7 +116,8 @@ def sums() -> tuple[float, float]:
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="takes x86 vectors away")
 def test_the_same_image_without_wide_vectors():
-    """A processor with 128-bit vectors only gives the same image (the first run compiles for a while)."""
+    """A processor with 128-bit vectors only gives the same image (the first run compiles
+    for a while)."""
     code = "from tests.rendering.test_processes import sums; print(*sums())"
     done = run_python(code, NUMBA_CPU_NAME="x86-64", NUMBA_CPU_FEATURES="+sse2")
     assert [float(number) for number in done.stdout.split()] == pytest.approx(sums(), rel=1e-5)

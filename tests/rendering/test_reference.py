@@ -1,4 +1,5 @@
-"""The reference renderer: its gradients, and its image against closed forms and a loop over pixels."""
+"""The reference renderer: its gradients, and its image against closed forms and a loop
+over pixels."""
 
 import math
 

@@ -53,7 +53,8 @@ def stacked(*batches):
 
 
 def test_the_height_of_each_subject_decides():
-    """Its tallest view, or the widest, in the pixels of its own photographs; sides are whole patches."""
+    """Its tallest view, or the widest, in the pixels of its own photographs;
+    sides are whole patches."""
     tall, small = make_batch(1, 3, SIDE, SIDE), make_batch(1, 3, SIDE, SIDE, zoom=0.3)
     pair = stacked(tall, small)
     rows = tall.masks[0].any(-1).sum(-1).max().item()
@@ -70,7 +71,8 @@ def test_the_height_of_each_subject_decides():
 
 
 def test_smaller_copies_show_the_same_scene():
-    """Points of the surface have the same place in the picture, colours and shares stay where they are."""
+    """Points of the surface have the same place in the picture,
+    colours and shares stay where they are."""
     batch = with_soft_rims(make_batch(1, 3, 112, 84))
     batch = dataclasses.replace(batch, images=batch.alpha[:, :, None].expand(-1, -1, 3, -1, -1) / 2)
     found = shrunk(batch, (56, 42), 0.125)
@@ -117,7 +119,8 @@ def test_coarse_depths_stay_within_bounds():
 
 
 def test_tokens_of_copies_are_interpolated_where_the_patches_of_photographs_lie():
-    """Values that are linear in the picture stay so, with a border, and beside tokens that are missing."""
+    """Values that are linear in the picture stay so, with a border,
+    and beside tokens that are missing."""
     batch, small, patch = make_batch(1, 2, 98, 108), (56, 70), 14
     padding = pad_to_patches(batch.masks, patch)
     padded = padding.pad_batch(batch)
@@ -149,7 +152,8 @@ def test_tokens_of_copies_are_interpolated_where_the_patches_of_photographs_lie(
 
 
 def test_rounds_start_from_what_is_found_in_a_smaller_copy():
-    """Encoder and depth head see the copy alone; rounds start from its final depths and its tokens."""
+    """Encoder and depth head see the copy alone;
+    rounds start from its final depths and its tokens."""
     batch, seen, tokens = make_batch(1, 3, SIDE, SIDE), [], []
     model = recurrent(HEIGHT, "model.frame=world")  # one frame for both sizes
     model.depth_head.register_forward_hook(lambda head, inputs, maps: seen.append(inputs[1]))
@@ -218,7 +222,8 @@ def without_copies(model, batch):
 
 
 def person(folder, side):
-    """A built-in person in four photographs, with depths; photographs of other sizes are smaller copies."""
+    """A built-in person in four photographs, with depths;
+    photographs of other sizes are smaller copies."""
     said = [f"data.size={side}", "data.render={size: 322, positions: [0, 4, 8, 12], views: [0]}"]
     said += ["data=synthetic", "data.people={train: 1, val: 1}", f"data.cache_dir={folder}"]
     config = resolve(compose("evaluate", ["checkpoint=shipped", *said]))
@@ -233,7 +238,8 @@ def error(prediction, batch):
 
 @torch.no_grad()
 def test_a_larger_photograph_is_placed_better_with_the_weights_of_the_package(shipped, tmp_path):
-    """Than at once, and than a photograph of the size of the training, which is predicted as ever."""
+    """Than at once, and than a photograph of the size of the training,
+    which is predicted as ever."""
     assert shipped.rounds.height == 202
     assert shipped.config["rounds"]["height"] == 202
     small, large = person(tmp_path, 252), person(tmp_path, 322)

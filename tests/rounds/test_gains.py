@@ -25,7 +25,8 @@ def halves(points):
 
 
 def painted(batch=1, views=4, spread=40.0, paint=waves, radii=RADII):
-    """A surface whose colour is a function of the place in the world, so that all views agree about it."""
+    """A surface whose colour is a function of the place in the world,
+    so that all views agree about it."""
     batch = make_batch(batch, views, spread=spread)
     masks, depths = ellipsoid(batch.cameras, radii=radii)
     batch = dataclasses.replace(batch, masks=masks, depths=depths)
@@ -100,7 +101,8 @@ def test_what_a_view_does_not_see_does_not_count():
 
 
 def test_dark_rims_do_not_count():
-    """Half-covered pixels at the outline of a narrow board are darker in one view than their matte says."""
+    """Half-covered pixels at the outline of a narrow board are darker in one view than their
+    matte says."""
     sharp = painted(views=3, spread=20.0, radii=torch.tensor([0.1, 0.8, 0.01]))
     soft = with_soft_rims(sharp)
     soft = dataclasses.replace(soft, images=sharp.images * soft.alpha[:, :, None])
@@ -114,7 +116,8 @@ def test_dark_rims_do_not_count():
 
 @pytest.mark.parametrize("kind", ["white", "black"])
 def test_colours_without_a_ratio_do_not_count(kind):
-    """Clipped highlights, and shadows that lie on a sensor's black level, on most of the surface."""
+    """Clipped highlights, and shadows that lie on a sensor's black level,
+    on most of the surface."""
     value = {"white": 0.97, "black": 0.01}[kind]
     batch = painted(paint=lambda p: torch.where(p[..., 1:2] > 1.1, 0.4, value).expand(p.shape))
     gains = drawn(batch)
@@ -146,7 +149,8 @@ def test_photographs_that_say_nothing_have_no_gains(value):
 
 
 def test_the_model_equalizes_before_its_rounds():
-    """Colours of the Gaussians are those of the equalized photographs; without the option they are not."""
+    """Colours of the Gaussians are those of the equalized photographs;
+    without the option they are not."""
     batch = painted()
     dark = seen_with(batch, drawn(batch))
     models = [make_model("model=recurrent", "skip=exact", f"rounds.gains={on}") for on in ("false", "true")]

@@ -107,7 +107,8 @@ def test_what_is_not_finite_reaches_no_other_element():
 
 
 def test_photographs_are_compared_with_renders_where_both_are_premultiplied():
-    """Gaussians with the subject's colours and its share as opacity; the share takes the mask's place."""
+    """Gaussians with the subject's colours and its share as opacity;
+    the share takes the mask's place."""
     batch = with_soft_rims(make_batch(1, 2))
     plain = observe(splats(batch), dataclasses.replace(batch, alpha=None))
     each = observe(splats(batch), batch)
@@ -149,7 +150,8 @@ def slanted(batch):
 
 
 def test_slopes_say_by_how_much_the_error_changes():
-    """Against differences of the rendered error as means move along rays, scales grow, colours change."""
+    """Against differences of the rendered error as means move along rays, scales grow,
+    colours change."""
     batch = make_batch(1, 3, 28, 28)
     gaussians = slanted(batch)
     n = len(gaussians)
@@ -207,7 +209,8 @@ def test_slopes_of_inference_are_those_of_training():
 
 
 def test_elements_of_different_sizes_are_looked_up_as_one_by_one():
-    """Elements are padded to one number of Gaussians: what pads is in no result, also beside one of none."""
+    """Elements are padded to one number of Gaussians: what pads is in no result,
+    also beside one of none."""
     batch = make_batch(3, 3, 42, 56)
     whole = splats(batch)
     first, _, last = (whole[i] for i in range(3))

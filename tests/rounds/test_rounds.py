@@ -155,7 +155,8 @@ def test_what_padding_added_is_cut_off_every_round():
 
 
 def test_validation_shows_what_each_round_is_worth():
-    """PSNR and depth error before each round: those of the whole model where rounds change nothing."""
+    """PSNR and depth error before each round:
+    those of the whole model where rounds change nothing."""
     batch = make_batch(1, 3)
     batch = dataclasses.replace(batch, targets=Targets(batch.images, batch.masks, batch.cameras))
     trained = GHGSModule(
@@ -171,7 +172,8 @@ def test_validation_shows_what_each_round_is_worth():
 
 
 def test_each_round_changes_half_as_much_as_the_one_before():
-    """Raw attributes, and how far depths may move: with the same output of the network each round."""
+    """Raw attributes, and how far depths may move:
+    with the same output of the network each round."""
     batch, recurrent = make_batch(1, 3), model("rounds.gains=false")
     recurrent.rounds.count = 3
     torch.nn.init.constant_(recurrent.rounds.change[-1].bias, 0.01)

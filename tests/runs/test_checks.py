@@ -1,4 +1,5 @@
-"""What is refused before anything starts: random frozen encoders, presets that depend on the training."""
+"""What is refused before anything starts: random frozen encoders,
+presets that depend on the training."""
 
 import pytest
 

@@ -1,4 +1,5 @@
-"""A directory is that of one configuration: what goes on in it, what is refused, and what may be deleted."""
+"""A directory is that of one configuration: what goes on in it, what is refused,
+and what may be deleted."""
 
 import json
 import os
@@ -59,7 +60,8 @@ def verb(monkeypatch, capsys):
 
 
 def test_a_single_run_goes_on_with_the_same_command(tmp_path, capsys):
-    """A batch system that queues a job again runs its command again: nothing is refused, nothing is lost."""
+    """A batch system that queues a job again runs its command again: nothing is refused,
+    nothing is lost."""
     path = tmp_path / "run"
     last = str(path / "checkpoints" / "last.ckpt")
     assert killed(path, checkpoint=False) == [None]
@@ -80,7 +82,8 @@ def test_a_single_run_goes_on_with_the_same_command(tmp_path, capsys):
 
 
 def test_what_is_trained_again_leaves_no_logs_of_before(tmp_path):
-    """A kill before the first checkpoint left event files, beside which the same steps stood again."""
+    """A kill before the first checkpoint left event files,
+    beside which the same steps stood again."""
     killed(tmp_path / "run", checkpoint=False)
     (tmp_path / "run" / "tensorboard" / "events").rename(tmp_path / "run" / "tensorboard" / "events.1")
     killed(tmp_path / "run", checkpoint=False)
@@ -177,7 +180,8 @@ def test_files_of_others_are_neither_deleted_nor_mixed_with_a_run(verb, tmp_path
 
 
 def test_overwriting_deletes_a_run_and_nothing_else(verb, tmp_path):
-    """A link in the run is removed, not what it points to; notes of the user stay; the run has a new name."""
+    """A link in the run is removed, not what it points to; notes of the user stay;
+    the run has a new name."""
     outside = tmp_path / "outside"
     outside.mkdir()
     (outside / "a.png").touch()

@@ -30,8 +30,8 @@ def fresh(monkeypatch):
 
 @pytest.mark.parametrize("launcher", sorted(SETTINGS))
 def test_launchers_run_a_sweep_once(launcher, monkeypatch, capsys, tmp_path):
-    """Jobs in other processes must find resolvers and locks, and start processes that load data; a second
-    call must run nothing."""
+    """Jobs in other processes must find resolvers and locks, and start processes that load data; a
+    second call must run nothing."""
     module, extra, settings = SETTINGS[launcher]
     pytest.importorskip(module, reason=f"the extra {extra} is not installed", exc_type=ImportError)
     chosen = ["-m", f"hydra/launcher={launcher}", *settings, f"hydra.sweep.dir={tmp_path}", "data.workers=1"]

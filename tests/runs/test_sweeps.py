@@ -47,7 +47,8 @@ def sweep(monkeypatch, capsys, tmp_path):
 
 
 def test_a_grid_that_grows_runs_what_is_missing(sweep):
-    """A larger grid must not train finished runs again; keys without influence must not make new runs."""
+    """A larger grid must not train finished runs again;
+    keys without influence must not make new runs."""
     code, out, _ = sweep("seed=1,2")
     assert (code, len(executed(sweep.directory))) == (0, 2)
     code, out, _ = sweep("seed=1,2,3")
@@ -63,7 +64,8 @@ def test_a_grid_that_grows_runs_what_is_missing(sweep):
 
 
 def test_directories_of_a_users_own_hold_one_configuration_each(sweep):
-    """A grid in directories that are numbered was "done before" and never trained, for numbers begin anew."""
+    """A grid in directories that are numbered was "done before" and never trained,
+    for numbers begin anew."""
     numbered = "hydra.sweep.subdir=${hydra.job.num}"
     code, out, _ = sweep(numbered, "seed=1,2")
     assert (code, executed(sweep.directory)) == (0, ["0", "1"])
@@ -93,7 +95,8 @@ def test_directories_may_say_what_sets_them_apart(sweep):
 
 
 def test_dry_run_runs_nothing_and_says_what_it_would(sweep):
-    """A plan must not start training, and its expected time must follow from budgets and measured steps."""
+    """A plan must not start training, and its expected time must follow from budgets and
+    measured steps."""
     code, out, _ = sweep("seed=1,2", "dry_run=true", "trainer.max_steps=100")
     assert code == 0
     assert not sweep.directory.exists()

@@ -1,4 +1,5 @@
-"""What a run of a grid is called where runs are compared: by what sets it apart, not by its hash."""
+"""What a run of a grid is called where runs are compared: by what sets it apart,
+not by its hash."""
 
 from pathlib import Path
 
@@ -23,7 +24,8 @@ def planned(folder, *grid: str, shared=SHARED) -> list[RunDirectory]:
 
 
 def test_runs_of_a_grid_have_the_names_of_what_differs(tmp_path):
-    """TensorBoard's files lie in folders of these names, below the sweep's; a seed is always said."""
+    """TensorBoard's files lie in folders of these names, below the sweep's;
+    a seed is always said."""
     runs = planned(tmp_path, "ablation=full seed=1", "ablation=neither seed=1", "+optimizer.lr=0.1 seed=1")
     expected = ["ablation=full,seed=1", "ablation=neither,seed=1", "+optimizer.lr=0.1,seed=1"]
     assert [run.title for run in runs] == expected
@@ -32,7 +34,8 @@ def test_runs_of_a_grid_have_the_names_of_what_differs(tmp_path):
 
 
 def test_a_run_keeps_its_name_when_the_grid_grows(tmp_path):
-    """Also where the longer grid says more of it; other settings of the same name get their hash."""
+    """Also where the longer grid says more of it;
+    other settings of the same name get their hash."""
     (first,) = planned(tmp_path, "seed=1", shared=("ablation=full",))
     assert first.title == "ablation=full,seed=1"
     again, other = planned(tmp_path, "seed=1", "seed=2", shared=("ablation=full",))

@@ -25,5 +25,6 @@ def test_freed_memory_is_used_again_where_the_user_set_no_limits(monkeypatch, li
         monkeypatch.delenv(name, raising=False)
     said, faults = run_python(CODE, **limits).stdout.split()
     assert said == asked
-    # 64 MB are 16384 pages. Where blocks are used again they first find their places, for some rounds.
+    # 64 MB are 16384 pages. Where blocks are used again they first find their places,
+    # for some rounds.
     assert (int(faults) < 1000) == (asked == "True")

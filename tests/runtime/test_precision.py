@@ -1,4 +1,5 @@
-"""Precisions: what rounds products and convolutions of float32 numbers on CUDA, set and read without it."""
+"""Precisions: what rounds products and convolutions of float32 numbers on CUDA,
+set and read without it."""
 
 import warnings
 

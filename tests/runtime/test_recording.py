@@ -180,7 +180,8 @@ def test_what_cannot_be_played_back_stays_eager(function):
 
 
 def test_copies_from_the_host_are_refused():
-    """A recording would read memory that holds something else by then; a waiting copy fails on CUDA."""
+    """A recording would read memory that holds something else by then;
+    a waiting copy fails on CUDA."""
     recorder = Recorder(tape=OperatorTape())
     with pretend_device():
         values = numbers(0).to(DEVICE)

@@ -1,4 +1,5 @@
-"""Random budgets of tokens: each is a preset of skipping, and the draw depends on the step alone."""
+"""Random budgets of tokens: each is a preset of skipping,
+and the draw depends on the step alone."""
 
 from collections import Counter
 from types import SimpleNamespace

@@ -152,7 +152,8 @@ def test_too_little_room_is_answered_by_another_recording(monkeypatch):
 
 
 def test_sizes_are_kept_while_they_are_enough():
-    """Smaller subjects are played back; one that is larger leaves room for others; nothing else changes."""
+    """Smaller subjects are played back; one that is larger leaves room for others;
+    nothing else changes."""
     model = recording("model=hull", "skip=fast")
     for share in (0.1, 0.1, 0.07, 0.16, 0.17, 0.05):
         batch = dataclasses.replace(ellipsoid_batch(share, 3, 56, 1), subjects=("a",)).to(DEVICE)

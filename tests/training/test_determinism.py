@@ -40,7 +40,8 @@ def train(folder, workers: int, noise: int) -> tuple[list[float], torch.Tensor]:
 
 @pytest.mark.filterwarnings("ignore:.*fork.*")
 def test_a_curve_does_not_depend_on_the_number_of_loading_processes(tmp_path):
-    """Equal losses and weights in every bit; what a batch is for any number is tested with the data."""
+    """Equal losses and weights in every bit;
+    what a batch is for any number is tested with the data."""
     before = torch.are_deterministic_algorithms_enabled()
     try:
         losses, weights = train(tmp_path, 0, noise=1)

@@ -39,7 +39,8 @@ def after(module, name, change):
 
 @pytest.mark.parametrize("overrides", [(), ("model=paper", "skip=none"), ("skip=balanced",)])
 def test_an_ordinary_step_has_no_fault(overrides):
-    """Values that are infinite on purpose would be blamed; gradients of the weights must stay untouched."""
+    """Values that are infinite on purpose would be blamed;
+    gradients of the weights must stay untouched."""
     module = make_module(*overrides)
     assert first_fault(module, Step(training_batch(2), 1)) is None
     assert all(p.grad is None for p in module.parameters())

@@ -26,7 +26,8 @@ def data_of(**augmentation):
 
 
 def test_it_says_how_much_room_it_needs_before_it_writes(tmp_path, caplog, monkeypatch):
-    """32 photographs of 37 x 37 patches, 32 channels of two bytes; a full disk is found at the start."""
+    """32 photographs of 37 x 37 patches, 32 channels of two bytes;
+    a full disk is found at the start."""
     caplog.set_level(logging.INFO)
     model = SimpleNamespace(encoder=make_encoder(**SMALL_VGGT))
     options = DiskFeatureCache(folder=tmp_path / "features")
@@ -65,7 +66,8 @@ def test_a_network_that_learns_has_no_cache(tmp_path, options):
 
 
 def test_a_run_and_its_rest_read_what_is_there(tmp_path, monkeypatch):
-    """From the command line: a run that is stopped, its rest, and the same run without the cache."""
+    """From the command line: a run that is stopped, its rest,
+    and the same run without the cache."""
     monkeypatch.chdir(tmp_path)
     boxes = tmp_path / "rendered"
     render_boxes(boxes, tmp_path / "scans", train=1, val=1)

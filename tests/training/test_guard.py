@@ -1,4 +1,5 @@
-"""A step that is not finite is explained, saved and skipped, or stops the run, in all processes alike."""
+"""A step that is not finite is explained, saved and skipped, or stops the run,
+in all processes alike."""
 
 import csv
 import dataclasses
@@ -62,7 +63,8 @@ class Depths(L.Callback):
 
 
 def test_a_step_that_is_not_finite_is_skipped_and_counted(tmp_path, capsys):
-    """Weights and the optimizer stay as they were; one line says why; the logs count, the rest is trained."""
+    """Weights and the optimizer stay as they were; one line says why;
+    the logs count, the rest is trained."""
     depths, subject = Depths(), module(limit=1)
     log = CsvLog(tmp_path, name="csv", version="", flush_logs_every_n_steps=1)
     run = trainer(tmp_path, 6, [depths], logger=log, log_every_n_steps=1)
@@ -111,7 +113,8 @@ def test_a_gradient_that_is_not_finite_names_the_stage_that_it_comes_from(tmp_pa
 
 
 def test_with_a_scaled_loss_the_guard_leaves_overflows_to_the_scaler(tmp_path):
-    """A loss that is not finite is the guard's, at any scale; an overflow is how the scale is found."""
+    """A loss that is not finite is the guard's, at any scale;
+    an overflow is how the scale is found."""
     scaler = torch.amp.GradScaler("cpu", init_scale=2.0**127)
     subject, depths = module(limit=1, depth=100.0), Depths()
     run = trainer(tmp_path, 4, [depths], plugins=[MixedPrecision("16-mixed", "cpu", scaler)])
@@ -157,7 +160,8 @@ def test_a_saved_step_is_plain_data_and_fails_again_at_the_same_place(tmp_path, 
 
 
 class Noted(Depths):
-    """Writes what each process saw at the end, and its error, for which it waits until the other has one."""
+    """Writes what each process saw at the end, and its error,
+    for which it waits until the other has one."""
 
     def __init__(self, folder):
         super().__init__()

@@ -16,7 +16,8 @@ from tests.training.test_resume import Cut, fit, rows
 
 
 class Signal(L.Callback):
-    """Sends a signal to this process in step ``at`` (counted from 1), or in the validation after it."""
+    """Sends a signal to this process in step ``at`` (counted from 1),
+    or in the validation after it."""
 
     def __init__(self, at: int, number: int, validating: bool = False, times: int = 1):
         self.at, self.number, self.validating, self.times = at, number, validating, times
@@ -68,7 +69,8 @@ def whole(tmp_path_factory):
 def test_a_run_that_is_stopped_goes_on_as_if_it_had_not_been(
     whole, tmp_path, number, at, validating, accumulate
 ):
-    """The step and a validation that is due are finished and saved: weights, logs and validations agree."""
+    """The step and a validation that is due are finished and saved: weights,
+    logs and validations agree."""
     options = {"accumulate_grad_batches": accumulate}
     folder, expected, validations = whole(accumulate)
     before = handlers()
@@ -88,7 +90,8 @@ def test_a_run_that_is_stopped_goes_on_as_if_it_had_not_been(
 
 
 def test_a_second_signal_stops_at_once(tmp_path, monkeypatch):
-    """Who does not want to wait for the step is not made to; one signal that arrives twice is one."""
+    """Who does not want to wait for the step is not made to;
+    one signal that arrives twice is one."""
     assert stopped(tmp_path / "twice", Signal(5, signal.SIGINT, times=2)) == 130
     assert (tmp_path / "twice" / "checkpoints" / "last.ckpt").exists()
     monkeypatch.setattr("ghgs_lit.training.checkpoints._SAME", -1.0)
@@ -106,7 +109,8 @@ def test_a_batch_system_that_announces_and_then_asks_gets_a_checkpoint(tmp_path,
 
 
 def test_signals_that_a_batch_system_handles_stay_its_own(tmp_path):
-    """submitit ignores SIGTERM and requeues on SIGUSR2: neither must end the run here, nor be replaced."""
+    """submitit ignores SIGTERM and requeues on SIGUSR2: neither must end the run here,
+    nor be replaced."""
     seen = []
     own = {n: signal.signal(n, lambda n, _: seen.append(n)) for n in (signal.SIGTERM, signal.SIGUSR2)}
     try:

@@ -131,7 +131,8 @@ def test_no_chart_has_a_single_point(run):
 
 
 def test_distributions_are_of_the_predicted_gaussians(run):
-    """At each validation; opacities and sizes in millimetres are those that the stand-in predicts."""
+    """At each validation; opacities and sizes in millimetres are those that the
+    stand-in predicts."""
     found = events(run[0] / "tensorboard")
     for name, value in {"opacity": 0.9, "scale_mm": 10.0}.items():
         drawn = found.Histograms(f"values/{name}")
@@ -252,7 +253,8 @@ def test_a_kill_loses_nothing_that_was_logged(tmp_path):
 
 
 def test_wandb_has_one_run_for_each_run_here(tmp_path, monkeypatch):
-    """Resumed runs were several there, moved ones too; another run in the same directory is another one."""
+    """Resumed runs were several there, moved ones too;
+    another run in the same directory is another one."""
     seen = []
     monkeypatch.setattr("ghgs_lit.training.loggers.installed", lambda *_: None)
     monkeypatch.setattr("ghgs_lit.training.loggers.WandbLog", lambda **options: seen.append(options["id"]))

@@ -77,7 +77,8 @@ def test_progress_is_the_further_of_steps_and_time(monkeypatch):
 
 
 def test_training_lowers_the_loss_and_ends_with_no_rate(tmp_path):
-    """The gradient reaches the model through renderer and losses, and the schedule reaches its end."""
+    """The gradient reaches the model through renderer and losses,
+    and the schedule reaches its end."""
     torch.manual_seed(0)
     subject, batch = module(), example_batch()
     before = subject.losses(*subject(batch), batch)[0].item()
@@ -89,7 +90,8 @@ def test_training_lowers_the_loss_and_ends_with_no_rate(tmp_path):
 
 
 def test_checkpoints_are_plain_and_resume_to_the_same_weights(tmp_path):
-    """Checkpoints load with weights_only=True, hold the configuration, and continue the same run."""
+    """Checkpoints load with weights_only=True, hold the configuration,
+    and continue the same run."""
     last = CheckpointOptions(filename="last", every_n_train_steps=3).build()
     best = CheckpointOptions(filename="best", monitor="val/psnr").build()
     whole = module()
@@ -139,7 +141,8 @@ def test_the_gradient_is_clipped(tmp_path):
 
 
 def scaled(folder, scale: float, steps: int = 3, renderer=flat_renderer, **weights):
-    """Train in float16 with a scaled loss, on a CPU; returns the norms before clipping, module and scaler."""
+    """Train in float16 with a scaled loss, on a CPU;
+    returns the norms before clipping, module and scaler."""
     scaler = torch.amp.GradScaler("cpu", init_scale=scale)
     norms = []
     subject = GHGSModule(
@@ -155,7 +158,8 @@ def scaled(folder, scale: float, steps: int = 3, renderer=flat_renderer, **weigh
 
 
 def test_a_scaled_loss_is_unscaled_before_the_gradient_is_clipped(tmp_path):
-    """With 16-mixed the norm that is clipped and logged is that of the loss, not of its multiple."""
+    """With 16-mixed the norm that is clipped and logged is that of the loss,
+    not of its multiple."""
     plain, _, _ = scaled(tmp_path / "a", scale=1.0)
     many, subject, _ = scaled(tmp_path / "b", scale=4096.0)
     assert many == pytest.approx(plain, rel=1e-3)
@@ -182,7 +186,8 @@ def test_several_processes_have_all_parameters(devices, processes):
 
 
 def test_tf32_is_for_networks_alone():
-    """``trainer.precision=tf32`` lets products round; geometry's do not, and the setting comes back."""
+    """``trainer.precision=tf32`` lets products round;
+    geometry's do not, and the setting comes back."""
     matmul = torch.backends.cuda.matmul
     try:
         trainer = TrainerOptions(accelerator="cpu", precision="tf32", max_steps=1).build(logger=False)
@@ -297,7 +302,8 @@ def test_two_seeds_of_training_differ_and_one_repeats(tmp_path):
 
 
 def test_a_trainer_of_ones_own_needs_no_configuration(tmp_path):
-    """Its checkpoint rebuilds the model and, with the parts that no configuration describes, the module."""
+    """Its checkpoint rebuilds the model and, with the parts that no configuration describes,
+    the module."""
     parts = {"losses": losses_of({"render_l1": 1.0}), "optimization": Optimization(lr=1e-3)}
     subject = GHGSModule(make_model(), flat_renderer, **parts)
     batch = make_batch(1, 3, 42, 42)

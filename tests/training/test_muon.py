@@ -41,7 +41,8 @@ def set_gradients(model, seed):
 
 
 def test_what_counts_as_a_matrix():
-    """Convolutions and linear layers from 3 rows and columns on; no tokens, biases, heads of two channels."""
+    """Convolutions and linear layers from 3 rows and columns on;
+    no tokens, biases, heads of two channels."""
     found = [name for name, parameter in Small().named_parameters() if is_matrix(parameter)]
     assert found == ["conv", "square", "tall", "wide"]
     shapes = [(3, 3), (3, 1, 3), (2, 9), (9, 2), (9,), ()]
@@ -50,7 +51,8 @@ def test_what_counts_as_a_matrix():
 
 @pytest.mark.parametrize("shape", [(3, 16, 16), (2, 16, 144), (2, 144, 16), (1, 64, 24)])
 def test_singular_vectors_stay_and_singular_values_become_one(shape):
-    """Beside U V^T of the decomposition, in float64: close to one is what the polynomials promise."""
+    """Beside U V^T of the decomposition, in float64:
+    close to one is what the polynomials promise."""
     matrices = torch.randn(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     u, _, v = torch.linalg.svd(matrices, full_matrices=False)
     inside = u.mT @ torch.stack(orthogonalized(matrices)) @ v.mT
@@ -61,7 +63,8 @@ def test_singular_vectors_stay_and_singular_values_become_one(shape):
 
 
 def test_float32_is_enough():
-    """Singular values over three decades: the iterations on the Gram matrix hardly amplify rounding."""
+    """Singular values over three decades: the iterations on the Gram matrix hardly
+    amplify rounding."""
     matrices = torch.randn(4, 32, 64, generator=torch.Generator().manual_seed(1))
     u, _, v = torch.linalg.svd(matrices, full_matrices=False)
     matrices = u @ torch.diag(torch.logspace(0, -3, 32)) @ v
@@ -88,7 +91,8 @@ def test_matrices_of_one_size_do_not_meet():
 
 @pytest.mark.parametrize("kind", ["cpu", "gpu"])
 def test_padding_and_company_change_nothing(kind, monkeypatch):
-    """Small ones of all shapes together, as on a CPU and on a GPU, and large ones beside them; float64."""
+    """Small ones of all shapes together, as on a CPU and on a GPU, and large ones beside them;
+    float64."""
     if kind == "gpu":
         monkeypatch.setattr(muon, "_power_of_two", lambda count: 128)
     muon._packing.cache_clear()
@@ -114,7 +118,8 @@ def test_padding_and_company_change_nothing(kind, monkeypatch):
 
 @pytest.mark.parametrize(("ours", "most"), [(True, 150), (False, 1500)])
 def test_a_gpu_is_asked_for_a_tenth_of_pytorchs_launches(ours, most):
-    """Of a step with the weights that come with the package: 134 matrices, of which PyTorch's takes 61."""
+    """Of a step with the weights that come with the package: 134 matrices,
+    of which PyTorch's takes 61."""
     model = GHGS.from_checkpoint()
     with pretend_device() as log:
         trained = [p for p in model.to(DEVICE).parameters() if p.requires_grad]

@@ -1,4 +1,5 @@
-"""A loss with weights of its own, from a file outside of the package: nothing of a training forgets them."""
+"""A loss with weights of its own, from a file outside of the package:
+nothing of a training forgets them."""
 
 import shutil
 import sys
@@ -120,7 +121,8 @@ def test_its_weights_can_be_frozen_for_a_share_of_the_run(tmp_path):
 
 
 def test_a_run_goes_on_with_them(tmp_path):
-    """Weights and the optimizer's averages, bit for bit; a loss without such weights is refused by name."""
+    """Weights and the optimizer's averages, bit for bit;
+    a loss without such weights is refused by name."""
     path, whole, seen = tmp_path / "last.ckpt", module(matrix_scale=1.0), Seen()
     trainer(tmp_path, 6, Save(path, 3), seen).fit(whole, StepData())
     again = module(matrix_scale=1.0)
@@ -136,7 +138,8 @@ def test_a_run_goes_on_with_them(tmp_path):
 
 
 def test_the_average_is_of_all_weights(tmp_path):
-    """Lightning's, beside one that is computed here; a run that goes on has both it and the weights."""
+    """Lightning's, beside one that is computed here;
+    a run that goes on has both it and the weights."""
     subject, seen = module(), Seen()
     run = trainer(tmp_path, 4, AveragingOptions(decay=0.75).build(), seen)
     run.fit(subject, StepData())
@@ -164,7 +167,8 @@ def test_a_run_with_an_average_goes_on(tmp_path):
 
 
 def test_a_checkpoint_brings_the_loss_and_does_without_it(tmp_path, monkeypatch):
-    """The whole module is read with its weights, and the model alone where nobody knows the loss."""
+    """The whole module is read with its weights,
+    and the model alone where nobody knows the loss."""
     settings = {**config(), "loss": NODE}
     subject = module(make_model(), settings)
     subject.losses.mixing.data.add_(1)

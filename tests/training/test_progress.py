@@ -17,7 +17,8 @@ from tests.helpers.training import loader, module, trainer
 
 
 def test_lines_say_how_far_the_run_is(tmp_path, capsys, monkeypatch):
-    """A log of a batch job shows step, loss, seconds a step, time left and validation, as does train.log."""
+    """A log of a batch job shows step, loss, seconds a step, time left and validation,
+    as does train.log."""
     monkeypatch.setattr("ghgs_lit.training.callbacks.Lines.due", lambda _: True)
     trainer(tmp_path, steps=12, callbacks=[RunProgress()]).fit(module(), loader(), loader(1))
     lines = (tmp_path / "train.log").read_text().splitlines()
@@ -41,7 +42,8 @@ def test_a_bar_shows_how_far_the_run_is(tmp_path, capsys, monkeypatch):
 
 
 def test_the_first_step_says_whom_tokens_attend_to(tmp_path, capsys):
-    """With more neighbours than tokens the other setting has the same: the ablation would compare nothing."""
+    """With more neighbours than tokens the other setting has the same:
+    the ablation would compare nothing."""
     batch = make_batch(1, 3)
     own = Targets(batch.images[:, :1], batch.masks[:, :1], batch.cameras[:, :1])
     batches = DataLoader(

@@ -42,7 +42,8 @@ def check(path, checkpoint):
 
 
 def changed(content, keys, value):
-    """Set what ``keys`` lead to, or with ... delete it. A key of text counts as one that begins with it."""
+    """Set what ``keys`` lead to, or with ... delete it.
+    A key of text counts as one that begins with it."""
     *before, last = keys.split("/")
     for key in before:
         content = content[int(key)] if key.isdecimal() else content[named(content, key)]

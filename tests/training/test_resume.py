@@ -1,4 +1,5 @@
-"""An interrupted run resumes to the same weights, logs and best checkpoint; its files stay complete."""
+"""An interrupted run resumes to the same weights, logs and best checkpoint;
+its files stay complete."""
 
 import csv
 import shutil
@@ -175,7 +176,8 @@ def test_every_batch_is_trained_once_and_in_order(tmp_path, monkeypatch, accumul
 
 @pytest.mark.parametrize("elsewhere", [False, True])
 def test_a_run_with_frozen_weights_resumes_from_one_file_of_them(tmp_path, monkeypatch, elsewhere):
-    """Killed and resumed, also in another folder when the first is gone: weights as of a run in one piece."""
+    """Killed and resumed, also in another folder when the first is gone:
+    weights as of a run in one piece."""
 
     def half_frozen():
         subject = module()
@@ -240,7 +242,8 @@ def test_time_that_was_used_stays_used(tmp_path):
 
 
 def test_a_checkpoint_of_another_model_is_refused_by_its_tensor(tmp_path):
-    """Resuming needs the same model and the state of the optimizer; changed settings are reported."""
+    """Resuming needs the same model and the state of the optimizer;
+    changed settings are reported."""
 
     class Other(Standin):
         def __init__(self):
@@ -310,7 +313,8 @@ def test_groups_of_another_optimizer_are_refused(tmp_path):
 
 
 def test_an_optimizer_whose_state_was_damaged_is_refused(tmp_path):
-    """Broken averages of the gradient would be trained on in silence: the file has checksums of all."""
+    """Broken averages of the gradient would be trained on in silence:
+    the file has checksums of all."""
     path = tmp_path / "checkpoints" / "last.ckpt"
     fit(tmp_path, Cut())
     step, _ = check_resume(path, held(Standin()), CONFIG)
@@ -324,7 +328,8 @@ def test_an_optimizer_whose_state_was_damaged_is_refused(tmp_path):
 
 
 def test_a_run_counts_the_cost_of_all_its_sessions(tmp_path):
-    """Seconds and peak memory of a resumed run are those of the whole training, not of its last session."""
+    """Seconds and peak memory of a resumed run are those of the whole training,
+    not of its last session."""
     first, second = TrainingCost(), TrainingCost()
     with pytest.raises(PowerCut):
         fit(tmp_path, Cut(13), more=[first])
@@ -342,7 +347,8 @@ def test_a_run_counts_the_cost_of_all_its_sessions(tmp_path):
 
 
 def test_the_pictures_of_the_checkpoints_own_step_stay(tmp_path):
-    """TensorBoard drops what is logged again after a restart, and no picture of an earlier validation."""
+    """TensorBoard drops what is logged again after a restart,
+    and no picture of an earlier validation."""
     with pytest.raises(PowerCut):
         fit(tmp_path, Cut(10), every=4, more=[PicturesOptions(subjects=1).build()])
     last = tmp_path / "checkpoints" / "last.ckpt"
@@ -372,7 +378,8 @@ def test_one_way_to_start(tmp_path):
     ("minutes", "steps", "saved"), [(1e-6, 1000, STEPS), (1000, 5, 15), (1000, 1000, None)]
 )
 def test_minutes_and_steps_both_count(tmp_path, minutes, steps, saved):
-    """Slow steps are saved by the clock, fast ones by their number; Lightning's own class refuses both."""
+    """Slow steps are saved by the clock, fast ones by their number;
+    Lightning's own class refuses both."""
     by_both = CheckpointOptions(filename="both", minutes=minutes, every_n_train_steps=steps).build()
     fit(tmp_path, Cut(), every=1000, more=[by_both])
     path = tmp_path / "checkpoints" / "both.ckpt"

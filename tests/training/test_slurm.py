@@ -42,7 +42,8 @@ def test_tasks_of_a_batch_script_are_no_processes(monkeypatch, tmp_path):
 
 @pytest.fixture
 def task(monkeypatch, tmp_path):
-    """The environment of ``srun``, in a new working directory; the file that requests to SLURM go to."""
+    """The environment of ``srun``, in a new working directory;
+    the file that requests to SLURM go to."""
     for name, value in (BATCH | {"SLURM_NTASKS": "1", "SLURM_STEP_ID": "0"}).items():
         monkeypatch.setenv(name, value)
     monkeypatch.delenv("SLURM_RESTART_COUNT", raising=False)
@@ -67,8 +68,8 @@ def stopped_by(number):
 @pytest.mark.parametrize("places", [("seed=3",), ("-m", "seed=3,4"), ("seed=3", "hydra.run.dir=mine")])
 @pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGTERM])
 def test_a_job_that_is_queued_again_goes_on(monkeypatch, capsys, task, places, number):
-    """The same command began anew in another directory, or was refused. A job that ends early is queued again
-    by SLURM, one whose time is up (SIGUSR1) on request."""
+    """The same command began anew in another directory, or was refused. A job that ends early is
+    queued again by SLURM, one whose time is up (SIGUSR1) on request."""
     monkeypatch.setattr(train_verb, "train", stopped_by(number))
     code, _, err = call(monkeypatch, capsys, "train", *places)
     assert code == 128 + number
@@ -100,7 +101,8 @@ def test_a_job_that_was_not_queued_again_begins_anew(monkeypatch, capsys, task):
 
 
 def test_only_tasks_of_srun_are_queued_again(monkeypatch, task):
-    """A batch script without ``srun`` is stopped, with a checkpoint; jobs of arrays have two numbers."""
+    """A batch script without ``srun`` is stopped, with a checkpoint;
+    jobs of arrays have two numbers."""
     monkeypatch.setenv("SLURM_ARRAY_JOB_ID", "1230")
     monkeypatch.setenv("SLURM_ARRAY_TASK_ID", "4")
     assert processes.queue_again(signal.SIGUSR1)
@@ -124,7 +126,8 @@ def test_lightning_queues_nothing_again_itself(task):
 
 
 def test_processes_that_start_together_take_the_start_of_the_first(monkeypatch, tmp_path):
-    """The others read whether the first resumes; they wait for it, and not for one of an earlier start."""
+    """The others read whether the first resumes;
+    they wait for it, and not for one of an earlier start."""
     from ghgs_lit.runs import job
 
     monkeypatch.setattr(job, "_PATIENCE", 0.3)

@@ -11,7 +11,8 @@ from tests.helpers.training import Standin
 
 
 class Other(torch.nn.Module):
-    """Shares ``depth`` with the stand-in; ``shift`` has another shape, ``more`` is new, ``bias`` is not."""
+    """Shares ``depth`` with the stand-in; ``shift`` has another shape, ``more`` is new,
+    ``bias`` is not."""
 
     def __init__(self):
         super().__init__()
@@ -28,7 +29,8 @@ def checkpoint(path, model, **changes):
 
 
 def test_each_tensor_has_its_line(tmp_path):
-    """Tensors that do not fit stay as initialised and are reported: a partial load is never silent."""
+    """Tensors that do not fit stay as initialised and are reported:
+    a partial load is never silent."""
     path, model = checkpoint(tmp_path / "a.ckpt", Other()), Standin()
     model.bias = torch.nn.Parameter(torch.full((2,), 5.0))
     lines = initialize(model, path)
@@ -63,7 +65,8 @@ def test_strict_takes_all_or_nothing(tmp_path):
 
 
 def test_weights_that_do_not_fit_at_all_are_refused(tmp_path):
-    """Weights of something else, or a mistyped path, must not start a training from scratch unnoticed."""
+    """Weights of something else, or a mistyped path,
+    must not start a training from scratch unnoticed."""
     path = checkpoint(tmp_path / "a.ckpt", torch.nn.Linear(2, 2))
     with pytest.raises(InputError, match=r"init_from.*a\.ckpt"):
         initialize(Standin(), path)
@@ -72,7 +75,8 @@ def test_weights_that_do_not_fit_at_all_are_refused(tmp_path):
 
 
 def test_what_does_not_learn_needs_weights(tmp_path):
-    """A checkpoint of another encoder would leave the frozen one random, with a line that nobody reads."""
+    """A checkpoint of another encoder would leave the frozen one random,
+    with a line that nobody reads."""
     path = checkpoint(tmp_path / "a.ckpt", Other())
     model = Standin()
     model.shift.requires_grad_(False)
@@ -84,7 +88,8 @@ def test_what_does_not_learn_needs_weights(tmp_path):
 
 
 def test_a_checkpoint_does_not_say_where_this_machine_writes(tmp_path):
-    """A checkpoint of somebody else must not make folders or processes here; the command line may."""
+    """A checkpoint of somebody else must not make folders or processes here;
+    the command line may."""
     machine = {"cache_dir": str(tmp_path / "theirs"), "workers": 1024, "cache_images_mb": 1e9}
     data = {"name": "synthetic", "size": 56}
     path = checkpoint(

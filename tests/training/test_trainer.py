@@ -1,4 +1,5 @@
-"""Habits of Lightning's users act: few batches or steps, equal batches, profiles, strategies, precisions."""
+"""Habits of Lightning's users act: few batches or steps, equal batches, profiles, strategies,
+precisions."""
 
 import lightning.pytorch as L
 import pytest
@@ -46,7 +47,8 @@ def fit(folder, **options) -> tuple[L.Trainer, Seen]:
 
 
 def test_an_epoch_of_fewer_batches_goes_on_with_the_next(tmp_path):
-    """``limit_train_batches`` makes epochs shorter, and the samples of a step stay those of the step."""
+    """``limit_train_batches`` makes epochs shorter,
+    and the samples of a step stay those of the step."""
     (whole, all_of_them), (trainer, seen) = fit(tmp_path), fit(tmp_path, limit_train_batches=2)
     assert (whole.current_epoch, trainer.current_epoch) == (2, 3)
     assert trainer.global_step == len(seen.trained) == 6
@@ -79,7 +81,8 @@ def test_a_profile_is_a_file_of_the_run(tmp_path, profiler):
 
 
 def test_options_of_lightning_reach_it(monkeypatch):
-    """Whatever a key is called, it must arrive; several processes allow parameters without a gradient."""
+    """Whatever a key is called, it must arrive;
+    several processes allow parameters without a gradient."""
     seen = []
     monkeypatch.setattr(L, "Trainer", lambda **arguments: seen.append(arguments))
     for options in (

@@ -58,7 +58,8 @@ def test_depth_error_is_of_pixels_with_a_prediction(tmp_path):
 
 
 def test_rounds_are_measured_as_the_result_is(tmp_path):
-    """Renders of the Gaussians before each round are clamped, too, and depths are those before it."""
+    """Renders of the Gaussians before each round are clamped, too,
+    and depths are those before it."""
 
     def brighter(gaussians, cameras):
         drawn = flat_renderer(gaussians, cameras)

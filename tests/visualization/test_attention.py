@@ -1,4 +1,5 @@
-"""Attention of one token: the weights are those that the recalibration uses; where they are drawn."""
+"""Attention of one token: the weights are those that the recalibration uses;
+where they are drawn."""
 
 import dataclasses
 
@@ -61,7 +62,8 @@ def test_the_weights_are_those_of_the_forward(overrides):
 
 
 def test_attention_on_other_parts_is_the_sum_over_tokens_one_by_one():
-    """Parts by chance, some unknown; tokens of the background and of the other person count nowhere."""
+    """Parts by chance, some unknown; tokens of the background and of the other person
+    count nowhere."""
     model, batch = make_model("skip=none", "recalibration.similarity=log").eval(), make_batch(2, 3)
     (tokens, points), _, _ = seen(model, batch)
     part = torch.randint(-1, 3, tokens.image.shape, generator=torch.Generator().manual_seed(5))

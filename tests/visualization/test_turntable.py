@@ -24,7 +24,8 @@ def test_a_turntable_of_a_ring_is_the_ring():
 @pytest.mark.parametrize("pitch", [-30, 0, 40])
 @pytest.mark.parametrize("yaws", [(0, 90, 180, 270), (-20, 0, 20), (10,)])
 def test_up_does_not_depend_on_where_cameras_look(pitch, yaws):
-    """Cameras on one side that all look down: their mean up is tilted, up is not. A single one is level."""
+    """Cameras on one side that all look down: their mean up is tilted, up is not.
+    A single one is level."""
     turned = Rotation.from_euler("YX", [(yaw, pitch) for yaw in yaws], degrees=True)
     for world in (Rotation.identity(), Rotation.from_rotvec([0.4, 0.3, 1.0])):
         extrinsics = torch.eye(4).repeat(len(yaws), 1, 1)

@@ -230,7 +230,8 @@ def test_a_loaded_model_trains_what_its_encoder_says(tmp_path, trainable):
 
 @pytest.mark.parametrize("verb", ["evaluate", "predict"])
 def test_no_resolver_of_a_checkpoint_is_evaluated(tmp_path, verb):
-    """``${sqlite:...}`` in the data of a checkpoint made folders: verbs merge it into their configuration."""
+    """``${sqlite:...}`` in the data of a checkpoint made folders:
+    verbs merge it into their configuration."""
     path, called = tmp_path / "a.ckpt", []
     OmegaConf.register_new_resolver("called", called.append, replace=True)
     for node in (
@@ -262,7 +263,8 @@ def doubled(levels=40):
 
 @pytest.mark.parametrize("many", [loop(), {"kind": "scans", "x": doubled(20)}, doubled(60)])
 def test_a_configuration_without_end_is_refused(tmp_path, many):
-    """PyTorch's files may hold references; recursion and memory ended in tracebacks, or not at all."""
+    """PyTorch's files may hold references; recursion and memory ended in tracebacks,
+    or not at all."""
     path = tmp_path / "a.ckpt"
     checkpoint(path, config={**config(), "data": many})
     with pytest.raises(InputError, match=r"a\.ckpt: config\.data.*: expected less than 32 levels and 100000"):

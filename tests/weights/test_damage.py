@@ -82,7 +82,8 @@ def packed_again(path, compression):
 
 
 def claim(path, size):
-    """Let the last record of a PyTorch file say that it has ``size`` bytes, in both of its headers."""
+    """Let the last record of a PyTorch file say that it has ``size`` bytes,
+    in both of its headers."""
     with zipfile.ZipFile(path) as archive:
         last = archive.infolist()[-1]
     data, name = bytearray(path.read_bytes()), last.filename.encode()
@@ -97,7 +98,8 @@ FILES_OF_WEIGHTS = {**READERS, "any file of weights": open_file}
 
 @pytest.mark.parametrize("reader", FILES_OF_WEIGHTS)
 def test_compressed_records_are_refused_by_every_reader(tmp_path, reader):
-    """PyTorch maps records as they lie on the disk: all weights would be other numbers, in silence."""
+    """PyTorch maps records as they lie on the disk: all weights would be other numbers,
+    in silence."""
     path = tmp_path / "a.ckpt"
     torch.save(content(), path)
     packed_again(path, zipfile.ZIP_STORED)
@@ -128,7 +130,8 @@ def test_a_file_that_unpacks_without_limit_is_refused_before_it_is_read(tmp_path
 
 
 def test_weights_in_double_precision_are_read_in_single(tmp_path):
-    """A converter, or a run with ``trainer.precision=64-true``, writes them; the model computes in single."""
+    """A converter, or a run with ``trainer.precision=64-true``, writes them;
+    the model computes in single."""
     made = content()
     double = {key: value.double() for key, value in made["state_dict"].items() if value.is_floating_point()}
     torch.save({**made, "state_dict": {**made["state_dict"], **double}}, tmp_path / "a.ckpt")

@@ -15,7 +15,8 @@ def a_checkpoint(path, *overrides):
 
 
 def test_a_model_without_a_published_form_says_so_and_what_differs(tmp_path):
-    """A tensor's name alone does not tell that no model of this kind can be exported; nothing is written."""
+    """A tensor's name alone does not tell that no model of this kind can be exported;
+    nothing is written."""
     path = a_checkpoint(tmp_path / "hull.ckpt", "model=hull")
     said = r"hull\.ckpt: expected a model of the release's form .*gaussian_head\.guide=True for False"
     with pytest.raises(InputError, match=said) as error:

@@ -1,4 +1,5 @@
-"""Weights that do not train are stored once beside the checkpoints of a run, which find them anywhere."""
+"""Weights that do not train are stored once beside the checkpoints of a run,
+which find them anywhere."""
 
 import os
 import shutil
@@ -130,7 +131,8 @@ def test_a_reference_leads_nowhere_else(run, reference):
 
 @pytest.mark.parametrize("links", [True, False])
 def test_runs_of_a_sweep_share_one_copy(tmp_path, monkeypatch, links):
-    """Each has a name of its own for it, where the file system has links: one of them may be deleted."""
+    """Each has a name of its own for it, where the file system has links:
+    one of them may be deleted."""
     model, paths = make_model(FROZEN), [tmp_path / run / "checkpoints" / "last.ckpt" for run in "ab"]
     if not links:
         monkeypatch.setattr(os, "link", lambda *_: os.stat(tmp_path / "none"))

@@ -1,4 +1,5 @@
-"""Downloads with a replacement of the hub's client: checks and error messages are this project's."""
+"""Downloads with a replacement of the hub's client:
+checks and error messages are this project's."""
 
 import hashlib
 import sys

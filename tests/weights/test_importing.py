@@ -106,7 +106,8 @@ def test_the_checkpoint_is_the_published_model_and_says_so(tmp_path, files):
 
 
 def test_without_the_release_the_file_holds_the_encoder_alone(tmp_path, files):
-    """It held the heads of one seed, so that the seeds of a table were equal in all 164 tensors of heads."""
+    """It held the heads of one seed, so that the seeds of a table were equal in all 164
+    tensors of heads."""
     vggt, _, agg, _ = files
     out, settings = str(tmp_path / "out.ckpt"), config("compat=none")
     report = import_weights(settings, out, vggt)
@@ -321,7 +322,8 @@ def test_switches_that_differ_from_the_releases_are_listed():
 
 
 def test_tiny_files_have_the_published_structure():
-    """The small files of these tests must have the structure of the published ones, but for their size."""
+    """The small files of these tests must have the structure of the published ones,
+    but for their size."""
     vggt, network = published_tensors()
 
     def kinds(tensors):
@@ -333,7 +335,8 @@ def test_tiny_files_have_the_published_structure():
 
 
 def test_training_from_imported_weights_says_where_they_come_from(tmp_path, files):
-    """Tables read ``encoder.weights``, so it must follow the encoder's tensors if all of them are loaded."""
+    """Tables read ``encoder.weights``, so it must follow the encoder's tensors if all of them
+    are loaded."""
     out = str(tmp_path / "out.ckpt")
     settings = config("compat=none", "encoder.trainable=last_1")
     import_weights(settings, out, files[0])

@@ -25,7 +25,8 @@ def checkpoint(tmp_path):
 
 @pytest.mark.parametrize("dtype", ["float16", "bfloat16", "float32"])
 def test_weights_and_configuration_alone_are_written(checkpoint, tmp_path, dtype):
-    """Every tensor is the rounded one; optimizer and progress are gone; the model is built without a YAML."""
+    """Every tensor is the rounded one; optimizer and progress are gone;
+    the model is built without a YAML."""
     write_inference(checkpoint, tmp_path / "b.ckpt", dtype)
     before, after = read_checkpoint(checkpoint), read_checkpoint(tmp_path / "b.ckpt")
     assert set(after) == {"state_dict", "config", "format_version"}

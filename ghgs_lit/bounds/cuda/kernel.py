@@ -14,7 +14,8 @@ LEAST = tl.constexpr(NEAREST)
 
 @triton.jit
 def _cell(x, inverse, size):
-    """The index along an axis of the cell at a homogeneous place, or of the nearest one; 0 for NaN."""
+    """The index along an axis of the cell at a homogeneous place, or of the nearest one;
+    0 for NaN."""
     place = x * inverse
     place = tl.where(place > 0, place, 0.0)
     return tl.where(place < size - 1, place, size - 1).to(tl.int32)
@@ -22,7 +23,8 @@ def _cell(x, inverse, size):
 
 @triton.jit
 def _vote(outside, view, x, y, w, height, width):
-    """Entries of tables at homogeneous pixels; outside the frame, those of the nearest border pixel.
+    """Entries of tables at homogeneous pixels;
+    outside the frame, those of the nearest border pixel.
 
     Args:
         outside: tables [images, height, width] of uint8.

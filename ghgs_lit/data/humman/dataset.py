@@ -1,10 +1,11 @@
 """Options and reader of HuMMan-Recon v1.0.
 
-``<root>/p<subject>_a<action>/`` holds, for the Kinects 000 to 009 and frames that are multiples of 6 (some
-are missing), ``kinect_color/kinect_<k>/<frame>.png`` (1920 x 1080), ``kinect_mask/`` with the same names
-(matting: any value but 0 is the performer), for the test sequences ``kinect_mask_manual/``,
-``smpl_params/<frame>.npz`` and ``cameras.json``: ``K`` (3, 3), ``R`` (3, 3) and ``T`` (3) of each
-``kinect_color_<k>`` as in OpenCV, world to camera in metres, without lens distortion.
+``<root>/p<subject>_a<action>/`` holds, for the Kinects 000 to 009 and frames that are multiples of
+6 (some are missing), ``kinect_color/kinect_<k>/<frame>.png`` (1920 x 1080), ``kinect_mask/`` with
+the same names (matting: any value but 0 is the performer), for the test sequences
+``kinect_mask_manual/``, ``smpl_params/<frame>.npz`` and ``cameras.json``: ``K`` (3, 3), ``R``
+(3, 3) and ``T`` (3) of each ``kinect_color_<k>`` as in OpenCV, world to camera in metres, without
+lens distortion.
 """
 
 import logging
@@ -54,8 +55,8 @@ def read_cameras(path: Path) -> list[Camera]:
         path: of ``cameras.json``.
 
     Returns:
-        Intrinsics [3, 3] in pixels, with centres at integers, and extrinsics [4, 4] in metres of each
-        camera.
+        Intrinsics [3, 3] in pixels, with centres at integers, and extrinsics [4, 4] in metres
+        of each camera.
 
     Raises:
         InputError: the file or a camera is missing or bad, or translations are not in metres.
@@ -99,8 +100,8 @@ class _Frame:
 
 
 class HuMManReader(FrameReader):
-    """Frames of the sequences of a phase, each a subject ``<sequence>_<frame>``; positions are the colour
-    cameras.
+    """Frames of the sequences of a phase, each a subject ``<sequence>_<frame>``; positions are the
+    colour cameras.
 
     Missing sequences, frames and cameras of a frame are left out.
 
@@ -229,8 +230,8 @@ class HuMMan(DataSet):
     masks: Literal["kinect_mask", "kinect_mask_manual"] = "kinect_mask"
     """Folder of masks; kinect_mask_manual is there for the test sequences only."""
     smpl_model: options.PathText | None = None
-    """The licensed SMPL_NEUTRAL.pkl, or a folder with smpl/SMPL_NEUTRAL.pkl: its vertices are the bodies. It
-    needs the package smplx. Null: no bodies; train with loss.weights.chamfer=0."""
+    """The licensed SMPL_NEUTRAL.pkl, or a folder with smpl/SMPL_NEUTRAL.pkl: its vertices are the
+    bodies. It needs the package smplx. Null: no bodies; train with loss.weights.chamfer=0."""
 
     @model_validator(mode="after")
     def _check(self) -> "HuMMan":

@@ -1,7 +1,7 @@
 """Bodies from HuMMan's SMPL parameters, with the licensed SMPL_NEUTRAL and the package ``smplx``.
 
-No code of the model file is run: the chumpy and SciPy classes that pickles of the official release name are
-replaced by harmless ones that keep the arrays.
+No code of the model file is run: the chumpy and SciPy classes that pickles of the official release
+name are replaced by harmless ones that keep the arrays.
 """
 
 import contextlib
@@ -84,8 +84,8 @@ def read_parameters(path: Path) -> dict[str, np.ndarray]:
         path: of an ``.npz`` file with the vectors of :data:`PARAMETERS`.
 
     Raises:
-        InputError: the file is missing or broken, or a vector is missing, has another length or is not
-            finite.
+        InputError: the file is missing or broken, or a vector is missing, has another length or
+            is not finite.
     """
     require_file(path, "SMPL parameters")
     try:
@@ -120,7 +120,8 @@ class Body:
 
     @torch.no_grad()
     def vertices(self, parameters: dict[str, np.ndarray]) -> np.ndarray:
-        """Vertices [6890, 3] float32 in the parameters' frame; ``global_orient`` turns about the pelvis.
+        """Vertices [6890, 3] float32 in the parameters' frame;
+        ``global_orient`` turns about the pelvis.
 
         Args:
             parameters: as of :func:`read_parameters`.

@@ -1,10 +1,10 @@
 """Mattes of photographs whose masks are a few pixels off, ragged or have holes.
 
-A mask that is off by a pixel paints colours of the background, different in each view, on the subject's
-outline. A network estimates the matte from photograph and mask: a U-Net (Ronneberger et al., MICCAI 2015)
-with a rough mask beside the colours, as in Deep Image Matting (Xu et al., CVPR 2017), and the differences of
-each colour from those of subject and background nearby. It was trained on generated people before many kinds
-of backgrounds (``scripts/bake_matting.py``).
+A mask that is off by a pixel paints colours of the background, different in each view, on the
+subject's outline. A network estimates the matte from photograph and mask: a U-Net (Ronneberger et
+al., MICCAI 2015) with a rough mask beside the colours, as in Deep Image Matting (Xu et al., CVPR
+2017), and the differences of each colour from those of subject and background nearby. It was
+trained on generated people before many kinds of backgrounds (``scripts/bake_matting.py``).
 """
 
 import functools
@@ -28,7 +28,8 @@ FARTHEST = 8.0
 #: Colours nearby are averaged in images smaller by this factor, over squares of these sides, twice.
 _COARSER = 4
 _SIDES = (3, 7)
-#: Channels: colours, mask, distance from its outline; differences from colours inside and outside nearby.
+#: Channels: colours, mask, distance from its outline;
+#: differences from colours inside and outside nearby.
 _FEATURES = 5 + 3 * 2 * len(_SIDES)
 
 
@@ -69,7 +70,8 @@ class MattingNetwork(nn.Module):
         # A correction of up to 1.1 can invert a mask; the initial one is 0.
         estimate = mattes + 1.1 * torch.tanh(out[:, 0])
         share = estimate.clamp(0, 1)
-        # A pixel mixes the colours of subject and background; the network predicts their difference.
+        # A pixel mixes the colours of subject and background;
+        # the network predicts their difference.
         colors = images + (1 - share.detach())[:, None] * out[:, 1:]
         if not self.training:
             estimate = share
@@ -86,7 +88,8 @@ def _convolutions(before: int, after: int) -> nn.Sequential:
 def _features(
     images: Float[Tensor, "B 3 h w"], mattes: Float[Tensor, "B h w"]
 ) -> Float[Tensor, "B features h w"]:
-    """Colours, mask, distance from its outline, and differences from colours inside and outside nearby."""
+    """Colours, mask, distance from its outline,
+    and differences from colours inside and outside nearby."""
     with exact(images.device.type):
         inside = np.stack([_insideness(mask) for mask in (mattes > 0.5).cpu().numpy()])
         depth = torch.from_numpy(inside).to(images)[:, None]
@@ -100,7 +103,8 @@ def _features(
 
 
 def _insideness(mask: np.ndarray) -> np.ndarray:
-    """Signed distance from the outline over :data:`FARTHEST`, in [-1, 1], positive inside; float32."""
+    """Signed distance from the outline over :data:`FARTHEST`, in [-1, 1], positive inside;
+    float32."""
     return (signed_distance(mask) / FARTHEST).clip(-1, 1).astype(np.float32)
 
 
@@ -126,9 +130,10 @@ def refined_matte(
     Args:
         image: photograph with its background; best if the subject is 170 to 330 pixels tall, as in
             training.
-        matte: 255 times the share of each pixel that shows the subject, such as 0 and 255 of a mask.
-        pixels: greatest error of the outline, above 0 (8 in training); holes of twice that width may be
-            filled.
+        matte: 255 times the share of each pixel that shows the subject,
+            such as 0 and 255 of a mask.
+        pixels: greatest error of the outline, above 0 (8 in training); holes of twice that width
+            may be filled.
 
     Returns:
         Image and matte of the same sizes.
@@ -157,6 +162,7 @@ def _network() -> MattingNetwork:
 
 
 def _window(inside: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice]:
-    """The box around what is inside, with a margin in pixels; everything where nothing is inside."""
+    """The box around what is inside, with a margin in pixels;
+    everything where nothing is inside."""
     lines = (np.nonzero(inside.any(axis))[0] for axis in (1, 0))
     return tuple(slice(max(n[0] - margin, 0), n[-1] + margin + 1) if len(n) else slice(None) for n in lines)

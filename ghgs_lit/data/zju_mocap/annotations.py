@@ -1,9 +1,10 @@
 """Reading of ``annots.npy`` of a ZJU-MoCap sequence: its cameras and the names of its photographs.
 
 A pickled dictionary in an array without dimensions: ``cams`` with lists ``K`` (3, 3), ``D`` (4 or 5
-coefficients in any shape), ``R`` (3, 3), ``T`` (3, 1) in **millimetres**, world to camera; ``ims`` with a
-dictionary for each frame, whose ``ims`` are the paths of its photographs in the order of the cameras. In
-sequences 313 and 315 these are the original long names, whose fifth field is the frame number from 1.
+coefficients in any shape), ``R`` (3, 3), ``T`` (3, 1) in **millimetres**, world to camera; ``ims``
+with a dictionary for each frame, whose ``ims`` are the paths of its photographs in the order of the
+cameras. In sequences 313 and 315 these are the original long names, whose fifth field is the frame
+number from 1.
 """
 
 from collections.abc import Mapping, Sequence
@@ -91,7 +92,8 @@ def frame_number(name: PurePath) -> int:
 
 
 def frame_field(name: PurePath) -> str:
-    """Frame number as written in a name: ``000012``, or ``0001`` of ``…_Camera_(1)_0001_2019-…``."""
+    """Frame number as written in a name: ``000012``,
+    or ``0001`` of ``…_Camera_(1)_0001_2019-…``."""
     fields = name.stem.split("_")
     return fields[4] if len(fields) > 4 else name.stem
 

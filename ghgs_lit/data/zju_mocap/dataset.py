@@ -1,8 +1,8 @@
 """Options and reader of ZJU-MoCap.
 
-``<root>/CoreView_<id>/`` holds ``annots.npy`` (see :mod:`.annotations`), the photographs of each camera,
-``mask_cihp/`` and sometimes ``mask/`` (label maps: any value but 0 is the subject), ``new_vertices/`` and
-``vertices/`` (<frame number>.npy: 6890 x 3, metres, world with z up).
+``<root>/CoreView_<id>/`` holds ``annots.npy`` (see :mod:`.annotations`), the photographs of each
+camera, ``mask_cihp/`` and sometimes ``mask/`` (label maps: any value but 0 is the subject),
+``new_vertices/`` and ``vertices/`` (<frame number>.npy: 6890 x 3, metres, world with z up).
 """
 
 import functools
@@ -193,7 +193,8 @@ class ZJUMoCapReader(FrameReader):
 
 
 def _find(folder: Path, photograph: PurePosixPath, suffix: str) -> Path:
-    """File of a photograph, under its name or its frame field alone (renamed files of 313 and 315)."""
+    """File of a photograph, under its name or its frame field alone (renamed files of
+    313 and 315)."""
     usual = photograph.with_suffix(suffix)
     renamed = usual.with_name(frame_field(photograph) + suffix)
     return find_path(folder, str(usual)) or find_path(folder, str(renamed)) or folder / usual
@@ -223,7 +224,8 @@ class ZJUMoCap(DataSet):
     split: FramesByPhase
     """Sequences of each phase, and which of their frames."""
     cameras: Annotated[int, Field(ge=2)] | None = 20
-    """Cameras used of each sequence, the first ones, which make up the ring; null: all, a ring of 21."""
+    """Cameras used of each sequence, the first ones, which make up the ring;
+    null: all, a ring of 21."""
     undistorted: bool = True
     """Remove the lens distortion of photographs and masks (SHERF does not, most others do)."""
     masks: tuple[Text, ...] = Field(("mask_cihp",), min_length=1)

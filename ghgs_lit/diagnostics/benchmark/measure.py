@@ -22,8 +22,9 @@ from ghgs_lit.runs.results import Row
 from ghgs_lit.types import Batch, Gaussians, Prediction, Rendering
 
 ATTRIBUTES = ("means", "quaternions", "scales", "opacities", "colors")
-#: Share of the values that budgets judge differences by: where a decision lies within rounding (which of two
-#: points is nearer, whether a splat is drawn at all), single values change as far as they may.
+#: Share of the values that budgets judge differences by: where a decision lies within rounding
+#: (which of two points is nearer, whether a splat is drawn at all), single values change as
+#: far as they may.
 MOST = 0.99
 _ROUNDINGS = 2  #: Random roundings of photographs that :func:`amplification` takes the larger effect of
 
@@ -37,8 +38,8 @@ def relative_difference(found: Tensor, expected: Tensor, share: float = 1.0) -> 
         share: of the values, above 0, at most 1; 1: the largest difference.
 
     Returns:
-        The difference; infinite if a value of the difference is not finite, or only ``expected`` is 0
-        everywhere; 0 without values.
+        The difference; infinite if a value of the difference is not finite, or only ``expected`` is
+        0 everywhere; 0 without values.
     """
     if found.numel() == 0:
         return 0.0
@@ -58,8 +59,8 @@ def partners(found: Gaussians, expected: Gaussians) -> tuple[Int[Tensor, " n"], 
         expected: others of the same batch.
 
     Returns:
-        Indices of the pairs [n] into both; those without a partner are left out. Without input pixels
-        the first ones of both are pairs.
+        Indices of the pairs [n] into both; those without a partner are left out. Without input
+        pixels the first ones of both are pairs.
     """
     if found.image is None or expected.image is None:
         n = min(len(found), len(expected))
@@ -86,10 +87,11 @@ def differences(
         share: as for :func:`relative_difference`; of renders at most :data:`MOST`.
 
     Returns:
-        By name. :func:`relative_difference` of each of :data:`ATTRIBUTES`, of the subject's ``depth``
-        and of the ``render``; their largest, ``max_rel_diff``; ``mse_to_none`` and ``psnr_to_none`` of
-        the renders, the latter in dB; and ``unmatched``, the Gaussians without a partner (of the
-        preset or the yardstick, whichever has more) over the number of the yardstick's.
+        By name. :func:`relative_difference` of each of :data:`ATTRIBUTES`, of the subject's
+        ``depth`` and of the ``render``; their largest, ``max_rel_diff``; ``mse_to_none`` and
+        ``psnr_to_none`` of the renders, the latter in dB; and ``unmatched``, the Gaussians
+        without a partner (of the preset or the yardstick, whichever has more) over the number of
+        the yardstick's.
     """
     (prediction, rendering), (yardstick, reference) = found, expected
     ours = prediction.gaussians
@@ -111,7 +113,8 @@ def differences(
 
 
 def amplification(case: Case, batch: Batch, result: Result) -> dict[str, float]:
-    """Condition of a result: how far most values move where all photographs are rounded once at random.
+    """Condition of a result: how far most values move where all photographs are rounded
+    once at random.
 
     Another order of summation rounds as much in every layer.
 
@@ -136,7 +139,8 @@ def amplification(case: Case, batch: Batch, result: Result) -> dict[str, float]:
 
 
 def conditioned(found: Result, expected: Result, batch: Batch, condition: Mapping[str, float]) -> float:
-    """Largest difference of attributes, depth and render of :data:`MOST` values over their condition.
+    """Largest difference of attributes, depth and render of :data:`MOST` values over
+    their condition.
 
     Args:
         found: prediction of the preset and its render.
@@ -168,7 +172,8 @@ class Times:
 
 @dataclass
 class Work:
-    """Cost of a forward pass: FLOPs and peak bytes by stage; tokens, points, Gaussians and PLY bytes."""
+    """Cost of a forward pass: FLOPs and peak bytes by stage;
+    tokens, points, Gaussians and PLY bytes."""
 
     flops: dict[str, float]
     peaks: dict[str, int]
@@ -195,7 +200,8 @@ class Record:
 
 
 def order(turn: int, count: int) -> list[int]:
-    """Order of the cases in a round; each begins one case later, so that drift affects all cases alike.
+    """Order of the cases in a round; each begins one case later,
+    so that drift affects all cases alike.
 
     Args:
         turn: number of the round; negative ones do not count.

@@ -1,4 +1,5 @@
-"""Cases of a benchmark: one model in every preset of ``conf/skip`` and with every value of the knobs."""
+"""Cases of a benchmark: one model in every preset of ``conf/skip`` and with every value
+of the knobs."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -25,7 +26,8 @@ KNOBS = (*STAGES, "rounds", "skip", "model", "renderer", "precision")  #: Nodes 
 
 @dataclass(frozen=True)
 class Source:
-    """Weights (path of a checkpoint; None: random) and the configuration, with :data:`MODEL_NODES`."""
+    """Weights (path of a checkpoint; None: random) and the configuration,
+    with :data:`MODEL_NODES`."""
 
     config: Mapping[str, Any]
     checkpoint: str | None
@@ -107,7 +109,8 @@ def cases_of(
     device: torch.device,
     seed: int = 0,
 ) -> list[Case]:
-    """Cases of a model: every preset with every combination of knobs; they share one copy of the weights.
+    """Cases of a model: every preset with every combination of knobs;
+    they share one copy of the weights.
 
     Args:
         source: weights and configuration.

@@ -113,7 +113,8 @@ def difference_db(mse: float, psnr: float) -> float:
 
 
 def broken_budgets(rows: Sequence[Row]) -> list[str]:
-    """Broken budgets, one line each. PSNR counts for trained weights only; differences count for all.
+    """Broken budgets, one line each. PSNR counts for trained weights only;
+    differences count for all.
 
     Args:
         rows: as of :func:`rows_of`.

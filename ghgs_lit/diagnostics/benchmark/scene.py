@@ -1,4 +1,5 @@
-"""Measurement without training or data: random weights, and a subject of a given size in the frame."""
+"""Measurement without training or data: random weights,
+and a subject of a given size in the frame."""
 
 import math
 from collections.abc import Mapping
@@ -11,7 +12,8 @@ from ghgs_lit.errors import require
 from ghgs_lit.model import GHGS
 from ghgs_lit.types import Batch, Cameras, Targets
 
-#: Width over height of the silhouette, as of a standing person, and its largest height over the frame's.
+#: Width over height of the silhouette, as of a standing person,
+#: and its largest height over the frame's.
 _ASPECT = 0.4
 _TALLEST = 0.9
 
@@ -61,7 +63,8 @@ def ring(count: int, height: int, width: int) -> Cameras:
 
 
 def ellipsoid_batch(share: float, views: int, size: int | tuple[int, int], batch: int) -> Batch:
-    """Batch of photographs of noise on an ellipsoid of revolution; the mask is the same in every view.
+    """Batch of photographs of noise on an ellipsoid of revolution;
+    the mask is the same in every view.
 
     Args:
         share: part of the frame that the subject covers.

@@ -20,20 +20,21 @@ from ghgs_lit.types import Batch, Cameras, Gaussians
 PASSED = "pass"
 FAILED = "fail"
 SKIPPED = "skip"
-#: Largest errors of images and their gradients. Rounding to float32 gives 1e-6 and 1e-5 on a CPU; a splat
-#: that is cut off at 1/255 or at a tile's border, or drawn in another order, gives more than 1e-3.
+#: Largest errors of images and their gradients. Rounding to float32 gives 1e-6 and 1e-5 on a
+#: CPU; a splat that is cut off at 1/255 or at a tile's border, or drawn in another order, gives
+#: more than 1e-3.
 IMAGE_LIMIT = 1e-4
 IMAGE_GRADIENT_LIMIT = 1e-3
-#: Largest error of a stage, by precision. In float32 it is 1e-6 on a CPU; with another order of summation
-#: another of two equally distant neighbours may be chosen, which moves one token. The other precisions round
-#: every product: 8 times one rounding (2^-8 in bfloat16, 2^-11 in float16 and TF32); 1.6 times in bfloat16 on
-#: a CPU.
+#: Largest error of a stage, by precision. In float32 it is 1e-6 on a CPU; with another order of
+#: summation another of two equally distant neighbours may be chosen, which moves one token. The
+#: other precisions round every product: 8 times one rounding (2^-8 in bfloat16, 2^-11 in float16
+#: and TF32); 1.6 times in bfloat16 on a CPU.
 LIMITS = {"float32": 1e-4, "tf32": 2.0**-8, "bfloat16": 2.0**-5, "float16": 2.0**-8}
 #: What is checked: ``precision`` as of the verbs, in the order in which it is most used.
 PRECISIONS = ("inherit", *LIMITS)
-#: Largest error of the gradient of all weights in float32, and number of models that are tried. It jumps if
-#: rounding moves a unit across 0 or a token to another neighbour: 2e-6 to 4e-2 on a CPU. At least one of
-#: three models has no such jump; a wrong kernel affects all.
+#: Largest error of the gradient of all weights in float32, and number of models that are tried. It
+#: jumps if rounding moves a unit across 0 or a token to another neighbour: 2e-6 to 4e-2 on a CPU.
+#: At least one of three models has no such jump; a wrong kernel affects all.
 GRADIENT_LIMIT = 1e-2
 _MODELS = 3
 _SIZE = 48  #: Side of the images of splats, in pixels
@@ -102,7 +103,8 @@ def compared(check: str, found: Tensor, expected: Tensor, limit: float) -> Outco
 
 
 def renderer(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]:
-    """Check images and gradients of splats: random, antialiased, and around the renderer's thresholds.
+    """Check images and gradients of splats: random, antialiased,
+    and around the renderer's thresholds.
 
     Args:
         config: as for ``ghgs train``; names the renderer's backend.
@@ -144,8 +146,9 @@ def _random_splats() -> Gaussians:
 
 
 def _splats_at_thresholds(cameras: Cameras) -> Gaussians:
-    """Splats before the first camera of each element: opacities just below and above 1/255; ten opaque ones
-    behind one another, which saturate before the last; one nearer than ``near``; one behind the camera."""
+    """Splats before the first camera of each element: opacities just below and above 1/255; ten
+    opaque ones behind one another, which saturate before the last; one nearer than ``near``; one
+    behind the camera."""
     depths = [2.0, 2.0, *(2.2 + 0.05 * i for i in range(10)), 0.005, -1.0]
     opacities = [0.9 / 255, 1.2 / 255, *[0.9, 1.0] * 5, 1.0, 1.0]
     right = [-0.4, 0.4, *[0.02 * i for i in range(10)], 0.0, 0.0]
@@ -289,7 +292,8 @@ def _results(model: GHGS, batch: Batch) -> dict[str, Tensor]:
 
 
 def _gradients(model: GHGS, batch: Batch) -> Tensor:
-    """Gradient of a number that depends on all attributes by all weights [n], in float64 on the CPU."""
+    """Gradient of a number that depends on all attributes by all weights [n],
+    in float64 on the CPU."""
     gaussians = model.requires_grad_(True)(batch).gaussians
     sum(_waves(getattr(gaussians, name)).mean() for name in ATTRIBUTES).backward()
     rows = [torch.zeros_like(p) if p.grad is None else p.grad for p in model.parameters()]
@@ -297,6 +301,7 @@ def _gradients(model: GHGS, batch: Batch) -> Tensor:
 
 
 def _waves(values: Tensor) -> Tensor:
-    """Values times weights of both signs; the sum of squares of a unit quaternion has no gradient."""
+    """Values times weights of both signs; the sum of squares of a unit quaternion has
+    no gradient."""
     weights = torch.arange(values.numel(), device=values.device, dtype=torch.float32).cos()
     return values * weights.view_as(values).to(values.dtype)

@@ -1,4 +1,5 @@
-"""Random inputs of one case in float64. A family changes its own ingredient; the others stay ordinary."""
+"""Random inputs of one case in float64. A family changes its own ingredient;
+the others stay ordinary."""
 
 import math
 
@@ -129,8 +130,8 @@ def points(family: str, g: Generator, count: int, middle: Tensor, poses: Tensor 
         g: source of the numbers.
         count: number of points.
         middle: of the scene [3].
-        poses: [v, 3, 4], world to camera; the first is what families relative to a camera need. None:
-            these families change nothing.
+        poses: [v, 3, 4], world to camera; the first is what families relative to a camera need.
+            None: these families change nothing.
 
     Returns:
         Points [count, 3].

@@ -18,10 +18,11 @@ from ghgs_lit.runs.results import plain
 #: Relative size of the random roundings of inputs that estimate the condition number.
 _STEP = torch.finfo(torch.float32).eps
 
-#: A cell of the matrix: ``stage``, ``family``, ``dtype``; numbers of ``cases`` and ``failures``; largest
-#: ``error`` and ``median`` in units of eps times the condition number (None: unbounded); ``budget``, the
-#: allowed factor; ``nonfinite``, the share of cases with a value that is not finite; ``gradient``, the median
-#: of the largest gradient; ``worst``, the output and seed of the largest error; ``seconds``.
+#: A cell of the matrix: ``stage``, ``family``, ``dtype``; numbers of ``cases`` and ``failures``;
+#: largest ``error`` and ``median`` in units of eps times the condition number (None: unbounded);
+#: ``budget``, the allowed factor; ``nonfinite``, the share of cases with a value that is not
+#: finite; ``gradient``, the median of the largest gradient; ``worst``, the output and seed of the
+#: largest error; ``seconds``.
 Row = dict[str, Any]
 
 
@@ -142,7 +143,8 @@ def _weights(name: str, value: Tensor) -> Tensor:
 
 
 def _comparison(stage: Stage, family: str, cases: Values) -> Callable[[str], Outcome]:
-    """The check of a family whose outputs are compared with the reference, which runs once for all dtypes.
+    """The check of a family whose outputs are compared with the reference,
+    which runs once for all dtypes.
 
     Args:
         stage: of the cases.
@@ -165,10 +167,11 @@ def _inputs(cases: Values, dtype: str) -> Values:
 
 
 def _spread(run: Callable[[Values], Values], exact: Values, truth: Values, stage: Stage) -> Values:
-    """Largest change of each output of the reference under random roundings of the inputs, over their size.
+    """Largest change of each output of the reference under random roundings of the inputs,
+    over their size.
 
-    Two roundings have size eps. Two more are opposite and as large as the budget, so that one of them
-    flips any decision within it (a ray that grazes a box).
+    Two roundings have size eps. Two more are opposite and as large as the budget, so that one of
+    them flips any decision within it (a ray that grazes a box).
 
     Args:
         run: the reference, with gradients among its outputs.

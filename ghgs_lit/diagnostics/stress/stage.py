@@ -1,4 +1,5 @@
-"""Families of adversarial inputs, and stages of the stress test: inputs, function, reference and budget."""
+"""Families of adversarial inputs, and stages of the stress test: inputs, function,
+reference and budget."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -91,9 +92,9 @@ LARGEST = 100.0
 class Stage:
     """A row of the matrix.
 
-    The budget of a case is ``factor * eps * kappa`` of each output and gradient (its largest entry).
-    ``kappa`` is the condition number of the reference at the case's inputs: its change under random roundings
-    of the inputs, in units of eps.
+    The budget of a case is ``factor * eps * kappa`` of each output and gradient (its largest
+    entry). ``kappa`` is the condition number of the reference at the case's inputs: its change
+    under random roundings of the inputs, in units of eps.
 
     Args:
         ingredients: what the inputs contain; families of other ingredients do not apply.
@@ -103,13 +104,16 @@ class Stage:
         reference: computes the same in float64 by other means; None: ``run`` in float64.
         gradients: inputs whose gradients are compared, too.
         steady: inputs that are not rounded for kappa.
-        seeds: number of cases of each family and dtype in the full run; a quick run misses rare failures.
-        kind: a formula computes in float32 or wider, a kernel in float32 only, a network in autocast's dtype.
-        kappa: lower bound of the condition number, where the stage's definition subtracts large numbers.
-        excluded: families that do not apply although their ingredient does, separated by spaces, with the
-            reason.
-        sizes: magnitude [n] of terms that cancel in the gradients by definition; where these are not unique
-            and must only be finite, the largest number.
+        seeds: number of cases of each family and dtype in the full run;
+            a quick run misses rare failures.
+        kind: a formula computes in float32 or wider, a kernel in float32 only,
+            a network in autocast's dtype.
+        kappa: lower bound of the condition number,
+            where the stage's definition subtracts large numbers.
+        excluded: families that do not apply although their ingredient does, separated by spaces,
+            with the reason.
+        sizes: magnitude [n] of terms that cancel in the gradients by definition; where these are
+            not unique and must only be finite, the largest number.
         refused: families that must be refused with an :class:`~ghgs_lit.errors.InputError`.
         silent: why a value that is not finite need not show in the outputs; empty: it must.
     """

@@ -1,4 +1,5 @@
-"""Attention for CPUs with AVX2 or AVX-512, in one pass without the matrix of all scores in memory."""
+"""Attention for CPUs with AVX2 or AVX-512, in one pass without the matrix of all
+scores in memory."""
 
 import itertools
 from functools import partial
@@ -18,7 +19,8 @@ KEYS = 256
 QUERIES = 96
 
 
-#: Multiplications from which the kernel is faster on one thread: 360 tokens in two heads of 32 channels.
+#: Multiplications from which the kernel is faster on one thread:
+#: 360 tokens in two heads of 32 channels.
 _SMALL = 1 << 23
 #: The same on several threads, where PyTorch's operator divides small products better: 1450 tokens.
 _LARGE = 1 << 27
@@ -34,8 +36,9 @@ def is_supported(q: Tensor, v: Tensor) -> bool:
         v: values [n, a, s, d].
 
     Returns:
-        False while gradients are recorded, for other devices and dtypes than float32 and bfloat16 on a CPU
-        with AVX2, for small products, and for head widths that are no multiples of :data:`WIDTH`.
+        False while gradients are recorded, for other devices and dtypes than float32 and bfloat16
+        on a CPU with AVX2, for small products, and for head widths that are no multiples of
+        :data:`WIDTH`.
     """
     if torch.is_grad_enabled() or v.device.type != "cpu" or v.dtype not in (torch.float32, torch.bfloat16):
         return False
@@ -47,7 +50,8 @@ def is_supported(q: Tensor, v: Tensor) -> bool:
 def attend(
     q: Float[Tensor, "n a t d"], k: Float[Tensor, "n a s d"], v: Float[Tensor, "n a s d"]
 ) -> Float[Tensor, "n t a d"]:
-    """``softmax(q k^T / sqrt(d)) v`` of every head, computed in float32, where :func:`is_supported`.
+    """``softmax(q k^T / sqrt(d)) v`` of every head, computed in float32,
+    where :func:`is_supported`.
 
     Args:
         q: queries [n, a, t, d] of n sequences and a heads.

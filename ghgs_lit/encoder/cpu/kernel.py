@@ -1,5 +1,5 @@
-"""Attention of one head, ``KEYS`` keys at a time with a running maximum (Dao et al., FlashAttention, 2022).
-Powers of 2 replace the exponential: ``exp(x) = 2^(x log2 e)``."""
+"""Attention of one head, ``KEYS`` keys at a time with a running maximum (Dao et al.,
+FlashAttention, 2022). Powers of 2 replace the exponential: ``exp(x) = 2^(x log2 e)``."""
 
 import math
 
@@ -139,7 +139,8 @@ def _score(queries, row, keys, key, seen, steps, scores):
 
 @helper
 def _highest(scores, r, seen):
-    """The highest score of a row. NaN is ignored here; it reaches the result through the weights."""
+    """The highest score of a row. NaN is ignored here;
+    it reaches the result through the weights."""
     highest = simd.full(LOWEST)
     for i in range(0, seen, LANES):
         highest = simd.maximum(memory.load(scores, r * KEYS + i), highest)
@@ -165,7 +166,8 @@ def _scale_down(exponent, sums, totals, r, width):
 
 @helper
 def _weigh(scores, r, seen, scale, top, weights, sums, query):
-    """Write the weights ``2^(scale s - top)`` of a row of scores, and add them to the sum of each lane.
+    """Write the weights ``2^(scale s - top)`` of a row of scores,
+    and add them to the sum of each lane.
 
     Args:
         scores: of :func:`_score`.

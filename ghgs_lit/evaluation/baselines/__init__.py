@@ -1,4 +1,5 @@
-"""Baselines: methods that a user might pick instead of a model, and simple ones that it must beat."""
+"""Baselines: methods that a user might pick instead of a model,
+and simple ones that it must beat."""
 
 from collections.abc import Callable, Mapping
 from functools import partial

@@ -1,4 +1,5 @@
-"""Baselines of splats: at the depth of a hull, plane sweep, body or the truth, or fitted per scene."""
+"""Baselines of splats: at the depth of a hull, plane sweep, body or the truth,
+or fitted per scene."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +19,8 @@ from ghgs_lit.heads.surface import surface_axes
 from ghgs_lit.refinement import Change, Refinement
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians
 
-#: Finer and closer to the masks than a model's bounds, which must contain the subject despite bad masks.
+#: Finer and closer to the masks than a model's bounds,
+#: which must contain the subject despite bad masks.
 HULL = VisualHull(dilation=0.005, samples=192)
 
 
@@ -35,8 +37,8 @@ def hull_bounds(batch: Batch) -> DepthBounds:
 
 
 def hull_depth(batch: Batch) -> Tensor:
-    """Depth of the visual hull's surface. Its splats resemble the image-based visual hull (Matusik et al.
-    2000).
+    """Depth of the visual hull's surface. Its splats resemble the image-based visual hull
+    (Matusik et al. 2000).
 
     Args:
         batch: Masks and cameras are read.
@@ -47,8 +49,9 @@ def hull_depth(batch: Batch) -> Tensor:
     return batch.once(hull_bounds).near * batch.masks
 
 
-#: Number of compared depths; half the side of the window over which consistency is averaged, over the longer
-#: side of the image; temperature of the softmax over depths. Tuned on four people, with 3 to 5 views.
+#: Number of compared depths; half the side of the window over which consistency is averaged, over
+#: the longer side of the image; temperature of the softmax over depths. Tuned on four people,
+#: with 3 to 5 views.
 DEPTHS = 32
 WINDOW = 0.02
 SOFTNESS = 0.03
@@ -57,8 +60,9 @@ SOFTNESS = 0.03
 def photo_depth(batch: Batch) -> Tensor:
     """Depths of a plane sweep between the hull's surfaces.
 
-    They are means of the sweep's depths, weighted by their photo-consistency in a window (soft argmin of
-    Kendall et al., ICCV 2017): the middle of the hull where all depths are equally consistent.
+    They are means of the sweep's depths, weighted by their photo-consistency in a window
+    (soft argmin of Kendall et al., ICCV 2017): the middle of the hull where all depths are
+    equally consistent.
 
     Args:
         batch: Photographs, masks and cameras are read.
@@ -76,7 +80,8 @@ def photo_depth(batch: Batch) -> Tensor:
 
 
 def _shared(values: Tensor, masks: Tensor, radius: int) -> Tensor:
-    """Means of ``values`` [B, V, S, H, W] over the subject's pixels in a window around each pixel."""
+    """Means of ``values`` [B, V, S, H, W] over the subject's pixels in a window around
+    each pixel."""
     inside = masks.to(values.dtype)
     counts = _window_mean(inside, radius)
     sums = _window_mean((values * inside[:, :, None]).flatten(1, 2), radius).view_as(values)
@@ -90,8 +95,8 @@ def _window_mean(maps: Tensor, radius: int) -> Tensor:
     return F.avg_pool2d(maps, (1, side), 1, (0, radius))
 
 
-#: Discs, as ``model=recurrent`` starts: standard deviations along and across the surface and distance behind
-#: it in pixel footprints; opacity; low-pass filter in px^2.
+#: Discs, as ``model=recurrent`` starts: standard deviations along and across the surface and
+#: distance behind it in pixel footprints; opacity; low-pass filter in px^2.
 _ALONG = 0.5
 _ACROSS = 0.1
 _INWARD = 0.4
@@ -131,7 +136,8 @@ def splats_at(
 
 
 def discs_at(batch: Batch, depth: Tensor, valid: Tensor) -> Gaussians:
-    """Discs on the surface of depth maps, like the initial Gaussians of heads with ``axes=surface``.
+    """Discs on the surface of depth maps, like the initial Gaussians of heads with
+    ``axes=surface``.
 
     Args:
         batch: Gives colours, mattes and cameras.
@@ -218,8 +224,8 @@ def splatted(batch: Batch, depth_of: Callable[[Batch], Tensor], renderer: Render
     return Estimate(image, depth, valid, gaussians)
 
 
-#: Limits and rates of the fitted attributes, tuned for novel views on four people with 3 to 5 views. A limit
-#: of 0.1 or more for colours costs 0.2 to 1 dB in novel views.
+#: Limits and rates of the fitted attributes, tuned for novel views on four people with 3 to 5
+#: views. A limit of 0.1 or more for colours costs 0.2 to 1 dB in novel views.
 CHANGES = {
     "means": Change(limit=30.0, rate=0.5),
     "quaternions": Change(limit=1.0, rate=0.05),
@@ -234,10 +240,11 @@ OPACITY = 0.5
 
 @dataclass(frozen=True)
 class PerScene:
-    """3D Gaussian splatting (Kerbl et al. 2023) on the inputs, a Gaussian for each pixel, as a method.
+    """3D Gaussian splatting (Kerbl et al. 2023) on the inputs, a Gaussian for each pixel,
+    as a method.
 
-    Gaussians start at :func:`photo_depth`. None is added or pruned: one for each pixel of each photograph
-    is more than the photographs determine.
+    Gaussians start at :func:`photo_depth`. None is added or pruned: one for each pixel of each
+    photograph is more than the photographs determine.
 
     Args:
         renderer: Draws inputs and targets.

@@ -39,7 +39,8 @@ PEERS = {"gps": "After GPS-Gaussian", "pixel": "Pixel-aligned"}
 
 
 def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOptions) -> list[Table]:
-    """Tables of the measurements of a sweep: one for each setting, and for each model if rows are ablations.
+    """Tables of the measurements of a sweep: one for each setting,
+    and for each model if rows are ablations.
 
     Args:
         sweep: Runs of ours.
@@ -50,8 +51,8 @@ def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOpt
         Tables in the order in which their settings first appear.
 
     Raises:
-        InputError: Nothing was measured on these targets, two runs claim one cell, configurations in a cell
-            differ, or results of other methods fit no table.
+        InputError: Nothing was measured on these targets, two runs claim one cell, configurations
+            in a cell differ, or results of other methods fit no table.
     """
     layout = options.layout
     if others and layout.rows == "ablation":
@@ -160,8 +161,8 @@ def _signs(switches: tuple[bool, bool]) -> tuple[str, str]:
 
 
 def _measured_lines(variants: list[Variant], planned: list[Planned], layout: Layout) -> list[Line]:
-    """Rows of all four ablations, then of a user's own; or of baselines, other methods and ours, in this
-    order."""
+    """Rows of all four ablations, then of a user's own; or of baselines, other methods and ours, in
+    this order."""
     begun = list(dict.fromkeys([*variants, *(p.variant for p in planned if not p.done)]))
     if layout.rows == "ablation":
         first = variants[0]

@@ -25,7 +25,8 @@ def fill(table: Table, figures: Sequence[Mapping[str, Any]]) -> None:
         figures: Reported cells, each with ``line``, ``group``, ``metric`` and ``mean``.
 
     Raises:
-        InputError: Runs with other numbers claim one cell and seed, or configurations in a cell differ.
+        InputError: Runs with other numbers claim one cell and seed,
+            or configurations in a cell differ.
     """
     values = _values(table)
     options = table.options
@@ -56,7 +57,8 @@ def _columns(table: Table) -> tuple[range, list[str]]:
 
 
 def _values(table: Table) -> pd.DataFrame:
-    """One row for each value: ``CELL``, ``seed``, ``source``, ``run``, ``subject``, ``count``, ``value``."""
+    """One row for each value: ``CELL``, ``seed``, ``source``, ``run``, ``subject``, ``count``,
+    ``value``."""
     lines = {line.variant: i for i, line in enumerate(table.lines) if not line.is_reported}
     numbers = {(g.views, g.data): i for i, g in enumerate(table.groups)}
     rows = table.rows
@@ -144,8 +146,8 @@ def _competing(table: Table, column: tuple) -> pd.Series:
 
 
 def _mark_best(table: Table, column: tuple) -> None:
-    """Mark the best means of a column, as printed. None is marked if all are equal, no direction is better,
-    or the best leads by no more than the larger deviation over seeds of the best two."""
+    """Mark the best means of a column, as printed. None is marked if all are equal, no direction is
+    better, or the best leads by no more than the larger deviation over seeds of the best two."""
     means = _competing(table, column).round(decimals(column[1]))
     if means.nunique() < 2 or not arrow(column[1]):
         return
@@ -165,8 +167,9 @@ def _by_person(values: pd.DataFrame, unit: re.Pattern[str] | None) -> pd.DataFra
 
 
 def _test(table: Table, people: pd.DataFrame, test: PairedTest) -> None:
-    """Test each row against the reference of its column, corrected over all comparisons of the table. If the
-    reference was chosen by its figures, every pair of rows of the column counts as a comparison."""
+    """Test each row against the reference of its column, corrected over all comparisons of the
+    table. If the reference was chosen by its figures, every pair of rows of the column counts as a
+    comparison."""
     tested: list[tuple[tuple | None, Comparison]] = []
     for column in product(range(len(table.groups)), table.tested):
         means = _competing(table, column)
@@ -201,7 +204,8 @@ def _reference(table: Table, means: pd.Series, metric: str, against: str) -> tup
         table: With lines and options.
         means: Means of the rows that compete, by number of the line.
         metric: Of the column.
-        against: ``full``: the row of the whole method, where there is one; ``best``: the best of the column.
+        against: ``full``: the row of the whole method, where there is one;
+            ``best``: the best of the column.
 
     Returns:
         Number of the line, None without any, and whether it was chosen by its figures.

@@ -1,4 +1,5 @@
-"""Layouts of tables (the paper's four, the ablation at several numbers of views) and their parts."""
+"""Layouts of tables (the paper's four, the ablation at several numbers of views) and
+their parts."""
 
 import itertools
 import re
@@ -133,7 +134,8 @@ def title(metric: str) -> str:
 
 @dataclass(frozen=True)
 class Group:
-    """Columns below one heading: the metrics on ``data`` (None: the table's) with ``views`` input views."""
+    """Columns below one heading: the metrics on ``data`` (None: the table's) with ``views``
+    input views."""
 
     title: str
     views: int
@@ -142,7 +144,8 @@ class Group:
 
 @dataclass(frozen=True)
 class Line:
-    """A row of a table: a variant, its texts in the first columns, and the text of cells without a number."""
+    """A row of a table: a variant, its texts in the first columns,
+    and the text of cells without a number."""
 
     variant: Variant
     stub: tuple[str, ...]
@@ -160,12 +163,14 @@ class Line:
 
     @property
     def competes(self) -> bool:
-        """Whether the row can be best and is tested; baselines, some of which know the truth, do not."""
+        """Whether the row can be best and is tested;
+        baselines, some of which know the truth, do not."""
         return self.variant.kind in ("model", "other")
 
 
 CELL = ["line", "group", "metric"]
-"""What tells the cells of a table apart: numbers of the line and of the group of columns, and the metric."""
+"""What tells the cells of a table apart: numbers of the line and of the group of columns,
+and the metric."""
 
 
 @dataclass
@@ -181,10 +186,10 @@ class Table:
         groups: Groups of columns.
         metrics: Names of the metrics of each group.
         lines: Rows of the table.
-        cells: By ``CELL``: ``mean`` over subjects and seeds (nan: no number), ``deviation`` over seeds,
-            ``seeds`` and ``lacking`` (seeds of planned runs without results) as tuples, ``count`` of
-            subjects, ``runs`` (hashes or files), ``best`` (of its column, as printed), ``test`` (a
-            :class:`Comparison` or None), ``marked`` (significant).
+        cells: By ``CELL``: ``mean`` over subjects and seeds (nan: no number), ``deviation`` over
+            seeds, ``seeds`` and ``lacking`` (seeds of planned runs without results) as tuples,
+            ``count`` of subjects, ``runs`` (hashes or files), ``best`` (of its column, as printed),
+            ``test`` (a :class:`Comparison` or None), ``marked`` (significant).
         caption: Above the table.
         notes: Below the table.
         reported_on: Data of the reported figures, if any.

@@ -16,7 +16,8 @@ FOOTNOTE = (
 )
 NO_SEMANTICS = "features carry no semantics: this encoder was never trained for semantics"
 MARK = "*"
-#: Share of equal neighbours above which the ablation of 3D unprojection compares nearly the same methods.
+#: Share of equal neighbours above which the ablation of 3D unprojection compares nearly
+#: the same methods.
 MOSTLY_SHARED = 0.8
 
 
@@ -52,8 +53,8 @@ def write_caption(table: Table) -> str:
 
 
 def write_notes(table: Table) -> list[str]:
-    """Notes below a table: what its rows are, where figures come from, what was tested, and what runs differ
-    in.
+    """Notes below a table: what its rows are, where figures come from, what was tested, and what
+    runs differ in.
 
     Args:
         table: With its cells.
@@ -151,7 +152,8 @@ def _about_test(table: Table) -> list[str]:
 
 
 def _could_show(table: Table) -> list[str]:
-    """The smallest differences that comparisons find, by metric, such as ``0.21 to 0.25 dB of PSNR``."""
+    """The smallest differences that comparisons find, by metric,
+    such as ``0.21 to 0.25 dB of PSNR``."""
     texts = []
     for metric in table.tested:
         tests = table.cells["test"].xs(metric, level="metric").dropna()

@@ -7,8 +7,8 @@ The file (described in ``docs/tables.md``; ``docs/example_others.json`` is an ex
        {"data": "thuman2", "split": "val", "targets": "release", "protocol": "release", "views": 4,
         "subject": "0501", "seed": 1, "metrics": {"psnr": 28.9, "ssim": 0.96}}]}
 
-A row with ``subject`` has the values of one subject and can be tested; others have means over ``subjects``
-subjects (optional). ``seed`` is optional.
+A row with ``subject`` has the values of one subject and can be tested; others have means over
+``subjects`` subjects (optional). ``seed`` is optional.
 """
 
 from pathlib import Path
@@ -51,14 +51,15 @@ class _Others(_Exact):
 
 
 def read_others(path: Path) -> pd.DataFrame:
-    """Rows of another method's results file, like those of :class:`ghgs_lit.evaluation.tables.records.Sweep`.
+    """Rows of another method's results file,
+    like those of :class:`ghgs_lit.evaluation.tables.records.Sweep`.
 
     Args:
         path: JSON file of the format above.
 
     Returns:
-        Rows; ``said`` is the file's ``source``; means have no ``subject`` and may have a ``count`` of
-        subjects.
+        Rows; ``said`` is the file's ``source``; means have no ``subject`` and may have a
+        ``count`` of subjects.
 
     Raises:
         FileNotFoundError: There is no such file.

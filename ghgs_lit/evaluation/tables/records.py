@@ -48,14 +48,16 @@ class Variant:
     """Identity of a row of a table.
 
     Attributes:
-        kind: ``model`` (ours), ``baseline``, ``other`` (another method) or ``reported`` (by the paper).
+        kind: ``model`` (ours), ``baseline``,
+            ``other`` (another method) or ``reported`` (by the paper).
         name: Of the method.
-        model: Name of the model, with what sets it apart from the shipped one; empty for other methods.
+        model: Name of the model, with what sets it apart from the shipped one;
+            empty for other methods.
         encoder: Name of its encoder; empty for other methods.
         ablation: The option that was chosen; empty for other methods.
         switches: Whether its 3D unprojection and semantic consistency are on.
-        has_semantics: Whether the semantic features were trained (published weights or `ghgs pretext`);
-            unknown before training starts, so it does not distinguish rows.
+        has_semantics: Whether the semantic features were trained (published weights or
+            `ghgs pretext`); unknown before training starts, so it does not distinguish rows.
         extra: Further configuration keys and values that do.
     """
 
@@ -101,9 +103,10 @@ class Sweep:
     """All runs below the directories of a sweep.
 
     Attributes:
-        rows: One for each run, method, number of views, target protocol and subject, with ``variant``,
-            ``SETTING``, ``views``, ``seed``, ``source`` (the file), ``run`` (the configuration's hash),
-            ``git`` (in words), ``subject``, and the metrics, averaged over the subject's targets.
+        rows: One for each run, method, number of views, target protocol and subject, with
+            ``variant``, ``SETTING``, ``views``, ``seed``, ``source`` (the file), ``run`` (the
+            configuration's hash), ``git`` (in words), ``subject``, and the metrics, averaged over
+            the subject's targets.
         planned: Training runs, finished or not.
         configs: Configuration of our model by ``source``.
     """
@@ -130,7 +133,8 @@ def encoder_name(config: Mapping[str, Any]) -> str:
         config: Resolved configuration of a training.
 
     Returns:
-        The option of conf/encoder with its sizes, or ``unnamed``, and whether it has a semantic branch.
+        The option of conf/encoder with its sizes, or ``unnamed``,
+        and whether it has a semantic branch.
     """
     encoder = config.get("encoder")
     encoder = encoder if isinstance(encoder, Mapping) else {}
@@ -142,8 +146,8 @@ def encoder_name(config: Mapping[str, Any]) -> str:
 
 
 def _model_name(config: Mapping[str, Any]) -> str:
-    """A user's own option of conf/model, which may have kept the name of the one that it changes; else the
-    name in the configuration."""
+    """A user's own option of conf/model, which may have kept the name of the one that it changes;
+    else the name in the configuration."""
     chosen = lookup(config, "chosen.model")
     is_own = chosen is not None and chosen not in _shipped("model")
     return chosen if is_own else str(lookup(config, "model.name") or "unnamed")
@@ -183,8 +187,8 @@ def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()
     encoder = encoder_name(config)
     model = [_model_name(config)]
     model += [f"compat {compat}"] * (compat not in (None, "none"))
-    # What an ablation of one's own changes is a row of the model's table, not another model. The paper's
-    # ablations find neighbours in 3D or on the image plane.
+    # What an ablation of one's own changes is a row of the model's table, not another model. The
+    # paper's ablations find neighbours in 3D or on the image plane.
     if is_own_ablation(ablation):
         if any(is_below(key, ["encoder"]) for key in ablation_sets(config)):
             encoder = encoder.replace("unnamed", str(lookup(config, "chosen.encoder")))
@@ -243,8 +247,8 @@ class _Provenance(_Strict):
 
 
 def _read_run(path: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
-    """Rows of a ``metrics.json``, without ``variant``, and the configuration of its model as trained and
-    measured."""
+    """Rows of a ``metrics.json``, without ``variant``, and the configuration of its model as
+    trained and measured."""
     content = read_results(path)
     source = validated(_Provenance, content["provenance"], f"{path}: provenance")
     trained = (source.checkpoint_config or source.config) | (source.changed_model or {})
@@ -295,7 +299,8 @@ def _with_variants(rows: pd.DataFrame, model: Variant | None) -> pd.DataFrame:
 
 
 def _training_config(path: Path) -> dict[str, Any] | None:
-    """The configuration of a training run in a ``config.yaml``; None: it is another verb's or incomplete."""
+    """The configuration of a training run in a ``config.yaml``;
+    None: it is another verb's or incomplete."""
     try:
         config = read_yaml(path)
     except InputError:
@@ -313,8 +318,8 @@ def _planned(path: Path, config: Mapping[str, Any], variant: Variant) -> Planned
 
 
 def keys_of_rows(configs: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Keys of views and targets in which runs that could share a row differ: runs on the same data by how
-    they were trained, those with a protocol of the same name by its targets.
+    """Keys of views and targets in which runs that could share a row differ: runs on the same data
+    by how they were trained, those with a protocol of the same name by its targets.
 
     Args:
         configs: Of all runs.
@@ -334,8 +339,8 @@ def keys_of_rows(configs: Iterable[Mapping[str, Any]]) -> list[str]:
 
 
 def _variants(configs: Mapping[str, Mapping[str, Any]], by: Sequence[str]) -> dict[str, Variant]:
-    """Variants of models by file. Those of one configuration have one row, whatever their ablations are
-    called: by the paper's name if one has it."""
+    """Variants of models by file. Those of one configuration have one row, whatever their ablations
+    are called: by the paper's name if one has it."""
     variants = {path: model_variant(config, path, by) for path, config in configs.items()}
     keys = {path: config_hash(config, (*OF_A_RUN, *OF_A_PLACE)) for path, config in configs.items()}
     names: dict[str, str] = {}
@@ -370,15 +375,16 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
 
     Args:
         folders: Directories of sweeps or runs.
-        by: Configuration keys that distinguish rows beside model, encoder, ablation and the views and targets
-            of the training.
+        by: Configuration keys that distinguish rows beside model, encoder, ablation and the views
+            and targets of the training.
 
     Returns:
         Measurements, planned runs and configurations.
 
     Raises:
         FileNotFoundError: A folder is missing.
-        InputError: There is no finished run, a ``metrics.json`` is damaged, or no run has a key of ``by``.
+        InputError: There is no finished run, a ``metrics.json`` is damaged,
+            or no run has a key of ``by``.
     """
     runs = {str(path): _read_run(path) for path in files_below(folders, "metrics.json")}
     files = {str(path): _training_config(path) for path in files_below(folders, "config.yaml")}

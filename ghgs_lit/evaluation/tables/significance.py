@@ -1,11 +1,11 @@
 """Tests of differences between rows of a table, with intervals and what they could have found.
 
-A value is the sum of a fixed effect of its row, random effects of the seed and the subject, which rows share,
-and their interactions with the row: a mixed model with crossed effects. Seeds are few: their variance is
-pooled over all rows of a column (residuals of the two-way table of rows and seeds). Subjects are many: each
-pair of rows has its own. The two squared standard errors are added (min F', Clark 1973), with the degrees of
-freedom of the smaller sample (Mickey and Brown 1966), so that the level holds whichever of the two varies
-more.
+A value is the sum of a fixed effect of its row, random effects of the seed and the subject, which
+rows share, and their interactions with the row: a mixed model with crossed effects. Seeds are few:
+their variance is pooled over all rows of a column (residuals of the two-way table of rows and
+seeds). Subjects are many: each pair of rows has its own. The two squared standard errors are added
+(min F', Clark 1973), with the degrees of freedom of the smaller sample (Mickey and Brown 1966), so
+that the level holds whichever of the two varies more.
 """
 
 import math
@@ -25,9 +25,11 @@ RATIO = 2.0
 
 @dataclass(frozen=True)
 class Comparison:
-    """Comparison of a row with the reference row of its column, on the seeds and subjects that both have.
+    """Comparison of a row with the reference row of its column,
+    on the seeds and subjects that both have.
 
-    Interval, p-values and all that follows from them are None with fewer than two seeds or subjects.
+    Interval, p-values and all that follows from them are None with fewer than two
+    seeds or subjects.
 
     Attributes:
         seeds: Number of seeds.
@@ -39,8 +41,8 @@ class Comparison:
         corrected: The same, corrected by Holm.
         error: Standard error of the difference.
         freedom: Degrees of freedom of the error.
-        smallest: The difference that is found with a probability of ``POWER`` among all comparisons of the
-            table.
+        smallest: The difference that is found with a probability of ``POWER`` among all
+            comparisons of the table.
     """
 
     seeds: int
@@ -71,14 +73,14 @@ class Pool:
 
     @property
     def allowance(self) -> float:
-        """Factor by which the variance of a difference can exceed twice the pooled one, if the deviation of
-        the reference is ``RATIO`` times that of the others; 1 for two rows."""
+        """Factor by which the variance of a difference can exceed twice the pooled one, if the
+        deviation of the reference is ``RATIO`` times that of the others; 1 for two rows."""
         return (RATIO**2 + 1) * self.rows / (2 * (RATIO**2 + self.rows - 1))
 
 
 def pool(rows: Sequence[pd.DataFrame]) -> Pool:
-    """Pool the variance of rows over seeds. Each row counts with the subjects that it has at all its seeds;
-    rows may lack seeds.
+    """Pool the variance of rows over seeds. Each row counts with the subjects that it has at all
+    its seeds; rows may lack seeds.
 
     Args:
         rows: Values of each row by seed (index) and subject (columns).
@@ -93,7 +95,8 @@ def pool(rows: Sequence[pd.DataFrame]) -> Pool:
     seed, row = np.nonzero(known)
     if not len(seed):
         return Pool(0.0, 0, 0)
-    # Effects of seeds are taken out of values and of the rows' indicators (Frisch, Waugh and Lovell).
+    # Effects of seeds are taken out of values and of the rows' indicators (Frisch,
+    # Waugh and Lovell).
     values = (table - np.nanmean(table, axis=1, keepdims=True))[seed, row]
     indicators = np.eye(len(rows))[row] - (known / known.sum(axis=1, keepdims=True))[seed]
     effects, _, rank, _ = np.linalg.lstsq(indicators, values)
@@ -132,7 +135,8 @@ def compare(
 
 
 def needed_errors(alpha: float, freedom: int, comparisons: int = 1) -> float:
-    """Standard errors by which rows must differ so that the smallest p of several comparisons is significant.
+    """Standard errors by which rows must differ so that the smallest p of several comparisons
+    is significant.
 
     Args:
         alpha: Level of all comparisons together.
@@ -146,7 +150,8 @@ def needed_errors(alpha: float, freedom: int, comparisons: int = 1) -> float:
 
 
 def smallest_difference(comparison: Comparison, alpha: float, comparisons: int) -> float:
-    """Difference that is significant with a probability of ``POWER``, by the noncentral t distribution.
+    """Difference that is significant with a probability of ``POWER``,
+    by the noncentral t distribution.
 
     Args:
         comparison: With its standard error and degrees of freedom.

@@ -26,7 +26,8 @@ Write = Callable[[str, str, bool], str]
 
 
 def _cell(cell: Any, line: Line, write: Write) -> str:
-    """A cell as printed: number, deviation over seeds, mark, interval of its difference, missing seeds."""
+    """A cell as printed: number, deviation over seeds, mark, interval of its difference,
+    missing seeds."""
     if pd.isna(cell.mean):
         return write(line.absent, "", False)
     digits = decimals(cell.Index[2])
@@ -101,7 +102,8 @@ def _bold(text: str, best: bool) -> str:
 
 
 def to_terminal(table: Table) -> str:
-    """The table for a terminal: each group of columns has lines of its own, so that no table is wide.
+    """The table for a terminal: each group of columns has lines of its own,
+    so that no table is wide.
 
     Args:
         table: With its cells.
@@ -221,7 +223,8 @@ def _number(number: str, tail: str, best: bool) -> str:
 
 
 def _column_spec(table: Table) -> str:
-    """Columns such as ``ccccc`` (ablation) or ``l | c c c | c c c`` (methods; no first bar for data sets)."""
+    """Columns such as ``ccccc`` (ablation) or ``l | c c c | c c c`` (methods; no first bar for
+    data sets)."""
     if table.layout.rows == "ablation" and len(table.groups) == 1:
         return "c" * (len(table.stub) + len(table.metrics))
     stub = " ".join("c" * len(table.stub)) if len(table.stub) > 1 else "l"

@@ -22,8 +22,8 @@ def padded(photo: Float[Tensor, "B V 3 H W"], masks: Bool[Tensor, "B V H W"]) ->
         masks: of the subject [B, V, H, W].
 
     Returns:
-        Channels are innermost. A rim of zeros surrounds each photograph, and the end is padded for reads of
-        whole vectors.
+        Channels are innermost. A rim of zeros surrounds each photograph, and the end is padded for
+        reads of whole vectors.
     """
     from ghgs_lit.geometry.cpu.kernel import smooth_rows  # here: it loads a compiler
     from ghgs_lit.kernels.simd import LANES

@@ -1,4 +1,5 @@
-"""Plane sweep of 16 pixels of four channels at once (see :mod:`ghgs_lit.geometry.photo_consistency`)."""
+"""Plane sweep of 16 pixels of four channels at once (see
+:mod:`ghgs_lit.geometry.photo_consistency`)."""
 
 import math
 
@@ -188,7 +189,8 @@ def _rays(turn, u, v):
 def _project(rays, shift, depth, height, width, places, rights, downs):
     """Project points of rays into an image.
 
-    Points outside the image or behind the camera, and NaN, are put into the rim, where the mask is 0.
+    Points outside the image or behind the camera, and NaN, are put into the rim,
+    where the mask is 0.
 
     Args:
         rays: what a unit of depth adds to the homogeneous pixel: three vectors.

@@ -1,4 +1,5 @@
-"""Photo-consistency for a GPU, in Triton: formulas of :mod:`ghgs_lit.geometry.photo_consistency`."""
+"""Photo-consistency for a GPU, in Triton: formulas of
+:mod:`ghgs_lit.geometry.photo_consistency`."""
 
 import triton
 import triton.language as tl

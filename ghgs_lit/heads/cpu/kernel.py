@@ -1,5 +1,6 @@
-"""The kernel of the Gaussian head, without a gradient: :meth:`ghgs_lit.heads.gaussian.GaussianHead.activate`
-for 16 Gaussians of one image at once. A line of ``values`` holds one number of each."""
+"""The kernel of the Gaussian head, without a gradient:
+:meth:`ghgs_lit.heads.gaussian.GaussianHead.activate` for 16 Gaussians of one image at once. A line
+of ``values`` holds one number of each."""
 
 import math
 
@@ -113,7 +114,8 @@ def _rotate(q, v):
 
 @helper
 def _slope(values, line, own, footprint):
-    """Relative change of depth along an axis, from the pixels before and after; see ``surface_axes``.
+    """Relative change of depth along an axis, from the pixels before and after;
+    see ``surface_axes``.
 
     Args:
         values: lines of the Gaussians.

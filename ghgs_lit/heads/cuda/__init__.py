@@ -97,7 +97,8 @@ def activate(
     constants: Constants,
     on_surface: bool,
 ) -> tuple[Tensor, ...]:
-    """:func:`ghgs_lit.heads.activations.footprint_gaussians`, differentiable in ``raw`` and ``points``.
+    """:func:`ghgs_lit.heads.activations.footprint_gaussians`,
+    differentiable in ``raw`` and ``points``.
 
     Args:
         raw: offsets, scales, rotations, opacities and colours (or None) before activations.

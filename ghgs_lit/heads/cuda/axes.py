@@ -109,7 +109,8 @@ def _to_world(extrinsics, image):
 
 @triton.jit
 def _neighbour(depth, valid, image, row, column, own, footprint, height, width):
-    """How much deeper a neighbour is, times its weight from 0 to 1, and the weight: 0 for another surface.
+    """How much deeper a neighbour is, times its weight from 0 to 1, and the weight:
+    0 for another surface.
 
     Args:
         depth: [images, height, width] in metres.

@@ -1,7 +1,8 @@
-"""Activations of Gaussians and their gradients for a GPU, in Triton: ``ROWS`` Gaussians in a program.
+"""Activations of Gaussians and their gradients for a GPU, in Triton:
+``ROWS`` Gaussians in a program.
 
-Formulas are those of :mod:`ghgs_lit.heads.activations` and :mod:`ghgs_lit.heads.surface`. A Gaussian reads at
-most 45 numbers, so that its gradient computes again what it needs."""
+Formulas are those of :mod:`ghgs_lit.heads.activations` and :mod:`ghgs_lit.heads.surface`. A
+Gaussian reads at most 45 numbers, so that its gradient computes again what it needs."""
 
 import triton
 import triton.language as tl
@@ -18,7 +19,8 @@ SHORTEST = tl.constexpr(activations.SHORTEST)
 
 @triton.jit
 def _sigmoid(x):
-    """The sigmoid of ``x`` within its limit, and its slope, exact also where the sigmoid is nearly 1."""
+    """The sigmoid of ``x`` within its limit, and its slope,
+    exact also where the sigmoid is nearly 1."""
     x = clamp(x, -SIGMOID, SIGMOID)
     shrunk = tl.exp(-tl.abs(x))
     other = 1 / (1 + shrunk)
@@ -108,7 +110,8 @@ def activate_rows(
         photo: [B, V, 3, height, width], colours.
         share: [B, V, height, width], factors of opacities.
         intrinsics, extrinsics: [B, V, 3, 3] in pixels, and [B, V, 4, 4].
-        means, quaternions, scales, opacities, colors: [N, 3], [N, 4], [N, 3], [N] and [N, 3], written.
+        means, quaternions, scales, opacities, colors: [N, 3], [N, 4], [N, 3], [N] and [N, 3],
+            written.
         height, width: of the images.
         limit, unit, inward, floor, span, across, thickness, least, bias, change: numbers of
             :class:`ghgs_lit.heads.activations.Constants`, in their order.

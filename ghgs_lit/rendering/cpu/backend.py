@@ -20,7 +20,8 @@ from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 @dataclass(frozen=True)
 class Plan:
-    """The work of a call, without the values of the Gaussians. View ``v`` shows batch element ``v // T``.
+    """The work of a call, without the values of the Gaussians.
+    View ``v`` shows batch element ``v // T``.
 
     Attributes:
         views: cameras as rows of ``layout.VIEW`` doubles, [B T, VIEW].
@@ -131,7 +132,8 @@ def _view_rows(cameras: Cameras, settings: RasterSettings) -> np.ndarray:
 _RUNS = 8
 # Kernels are compiled for this number of channels, and once for all others.
 _COLORS = 3
-# Limit of the lists of tiles and their gradients in bytes: a splat that fills the frame is in all its tiles.
+# Limit of the lists of tiles and their gradients in bytes:
+# a splat that fills the frame is in all its tiles.
 _MEMORY = 1 << 32
 
 
@@ -140,8 +142,8 @@ def rasterize(
 ) -> Rendering:
     """Render on black in float32; see :func:`ghgs_lit.rendering.render`.
 
-    Differentiable in the Gaussians, not in the cameras. The result has the same bits with any number of
-    threads.
+    Differentiable in the Gaussians, not in the cameras. The result has the same bits with any
+    number of threads.
 
     Args:
         gaussians: of B elements, on a CPU, in metres.
@@ -197,7 +199,8 @@ def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differen
         differentiable: whether there must be memory for gradients, too.
 
     Raises:
-        InputError: the lists and, if ``differentiable``, their gradients would exceed :data:`_MEMORY`.
+        InputError: the lists and, if ``differentiable``,
+            their gradients would exceed :data:`_MEMORY`.
     """
     settings = plan.settings
     tiles_x, tiles_y = plan.tiles
@@ -371,7 +374,8 @@ def _scratch(count: int) -> np.ndarray:
 
 
 def _zeros(*shape: int) -> Tensor:
-    """Zeros by NumPy, in memory that the system has zeroed; PyTorch would start threads to write them."""
+    """Zeros by NumPy, in memory that the system has zeroed;
+    PyTorch would start threads to write them."""
     return torch.from_numpy(np.zeros(shape, np.float32))
 
 
@@ -382,5 +386,6 @@ def _flat(tensor: Tensor | None) -> np.ndarray:
 
 
 def _channels(count: int):
-    """The number of channels for a kernel; as a tuple of that length, it is a constant of the compiler."""
+    """The number of channels for a kernel; as a tuple of that length,
+    it is a constant of the compiler."""
     return (0,) * count if count == _COLORS else count

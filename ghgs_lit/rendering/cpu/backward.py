@@ -1,9 +1,9 @@
 """Gradients of splats from gradients of pixels, one tile at a time.
 
-The backward pass repeats the forward pass front to back. Let ``v_i`` be the product of the pixel's gradient
-with splat ``i``'s colour, depth and 1, and ``S`` the sum of ``w_j v_j`` over the splats behind it. Then
-``dL/d alpha_i = T_i v_i - S / (1 - alpha_i)``. ``S``, one number per pixel, starts as the sum over all
-splats."""
+The backward pass repeats the forward pass front to back. Let ``v_i`` be the product of the pixel's
+gradient with splat ``i``'s colour, depth and 1, and ``S`` the sum of ``w_j v_j`` over the splats
+behind it. Then ``dL/d alpha_i = T_i v_i - S / (1 - alpha_i)``. ``S``, one number per pixel, starts
+as the sum over all splats."""
 
 import numpy as np
 
@@ -44,10 +44,11 @@ def _read_gradients(
     view, first, height, width, rows, columns, count, image, alpha, depth, d_image, d_alpha, d_depth,
     upstream, suffix,
 ):  # fmt: skip
-    """Fill ``upstream`` with the gradients of a tile's planes and ``suffix`` with ``S`` of all splats.
+    """Fill ``upstream`` with the gradients of a tile's planes and ``suffix`` with ``S``
+    of all splats.
 
-    With depth = D / A, ``dL/dD = g / A`` and ``dL/dA = -g depth / A``, so the parts of D and A in ``S``
-    cancel.
+    With depth = D / A, ``dL/dD = g / A`` and ``dL/dA = -g depth / A``, so the parts of D and A
+    in ``S`` cancel.
 
     Args:
         view: index of the view.
@@ -63,8 +64,8 @@ def _read_gradients(
         d_image: gradient of the image, flat [V C h w].
         d_alpha: gradient of alpha, flat [V h w]; of size 0 if there is none.
         d_depth: gradient of the depth, flat [V h w]; of size 0 if there is none.
-        upstream: gets gradients of the planes (C colours, ``w z``, ``w``), [(C + 2) PIXELS], block by
-            block.
+        upstream: gets gradients of the planes (C colours, ``w z``, ``w``), [(C + 2) PIXELS],
+            block by block.
         suffix: gets ``S``, [PIXELS], block by block.
     """
     channels = simd.length(count)
@@ -99,7 +100,8 @@ def _read_gradients(
 def _differentiate_splat(
     records, s, colors, n, count, x0, y0, hit, pixels, transmittance, upstream, suffix, sums, alpha_max, stop
 ):
-    """Gradients of one entry: a splat in a tile. Moves ``transmittance`` and ``suffix`` behind the splat.
+    """Gradients of one entry: a splat in a tile.
+    Moves ``transmittance`` and ``suffix`` behind the splat.
 
     Args:
         records: [splats, RECORD].
@@ -114,8 +116,8 @@ def _differentiate_splat(
         transmittance: before the splat, [PIXELS]; afterwards behind it.
         upstream: gradients of the planes, from :func:`_read_gradients`.
         suffix: ``S`` with this splat, [PIXELS]; afterwards without it.
-        sums: gets a row of 16 lanes for each gradient of an entry (see ``layout``), to be summed over
-            lanes.
+        sums: gets a row of 16 lanes for each gradient of an entry (see ``layout``), to be
+            summed over lanes.
         alpha_max: upper limit of alpha.
         stop: transmittance at which a pixel ends.
     """

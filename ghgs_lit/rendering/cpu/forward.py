@@ -1,6 +1,6 @@
-"""Drawing of splats, one tile at a time, front to back. First each part of the Gaussians lists its splats in
-their tiles by index; then each tile sorts its list by depth with a stable sort. So the order does not depend
-on the number of parts or threads, and no sort is larger than a tile."""
+"""Drawing of splats, one tile at a time, front to back. First each part of the Gaussians lists its
+splats in their tiles by index; then each tile sorts its list by depth with a stable sort. So the
+order does not depend on the number of parts or threads, and no sort is larger than a tile."""
 
 import numpy as np
 
@@ -131,8 +131,8 @@ _COLOR = 8
 def _touches(numbers, slope_x, slope_y, block):
     """Which of 16 splats have an ellipse that meets a block, as bits.
 
-    The smallest p^2 + q^2 over a box lies on its column or row nearest to the splat's centre, at the
-    minimum along it. The comparison is slightly generous, since it only saves work.
+    The smallest p^2 + q^2 over a box lies on its column or row nearest to the splat's centre, at
+    the minimum along it. The comparison is slightly generous, since it only saves work.
 
     Args:
         numbers: vectors of :func:`tiles.read_splat`, one lane for each splat.
@@ -157,7 +157,8 @@ def _touches(numbers, slope_x, slope_y, block):
 
 @helper
 def _fetch(order, i, entries, shift, records, colors, splats):
-    """Write the splats of a chunk, filled up with the last one; prefetch the records of the next chunk.
+    """Write the splats of a chunk, filled up with the last one;
+    prefetch the records of the next chunk.
 
     Args:
         order: keys of the tile's entries, from :func:`depth_order`.
@@ -188,8 +189,8 @@ def _list_chunk(splats, count, shift, records, colors, x0, y0, live, rows, todo)
         x0: first column of the tile, in pixels.
         y0: first row of the tile, in pixels.
         live: blocks through which light still passes, as bits.
-        rows: gets ``_CHUNK`` numbers for each value of :func:`tiles.read_splat`, the depth, and each
-            channel.
+        rows: gets ``_CHUNK`` numbers for each value of :func:`tiles.read_splat`, the depth,
+            and each channel.
         todo: gets the splats that touch each block, as bits, int64 [BLOCKS].
     """
     todo[:] = 0

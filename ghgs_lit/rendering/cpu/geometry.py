@@ -1,6 +1,6 @@
-"""Geometry of eight splats at once in doubles, for the projection and its gradient. Points, vectors and
-matrices (row by row) are tuples of vectors of eight doubles. Doubles cost little, as they are used once per
-splat, not per pixel, and with them no finite float32 input overflows."""
+"""Geometry of eight splats at once in doubles, for the projection and its gradient. Points, vectors
+and matrices (row by row) are tuples of vectors of eight doubles. Doubles cost little, as they are
+used once per splat, not per pixel, and with them no finite float32 input overflows."""
 
 import math
 

@@ -1,5 +1,6 @@
-"""Gradients of Gaussians from gradients of entries: the derivative of the projection, eight at a time. Sums
-have a fixed order (entries of a splat, then views), so results do not depend on threads."""
+"""Gradients of Gaussians from gradients of entries: the derivative of the projection, eight
+at a time. Sums have a fixed order (entries of a splat, then views), so results do not depend
+on threads."""
 
 import numpy as np
 
@@ -57,8 +58,8 @@ def _gather_splats(m, boxes, entry_starts, reached, gradients, width, lines):
 def _footprint_gradient(moments, record, m, low_pass, antialiased):
     """``dL/dM`` (2 x 3) and ``dL/d opacity`` of eight splats.
 
-    The covariance's gradient is ``G = L^-T H L^-1 / 2`` with the whitened second moments H, and ``dL/dM =
-    2 G M``. With anti-aliasing, opacity also contains ``(det before / det after)^(1/2)``.
+    The covariance's gradient is ``G = L^-T H L^-1 / 2`` with the whitened second moments H, and
+    ``dL/dM = 2 G M``. With anti-aliasing, opacity also contains ``(det before / det after)^(1/2)``.
 
     Args:
         moments: gradients of entries, summed (see ``layout``); tuple of vectors.

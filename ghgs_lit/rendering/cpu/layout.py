@@ -1,15 +1,16 @@
 """Layout of the arrays that the kernels share.
 
-A *splat* is one Gaussian seen by one camera: splat ``m`` of view ``v`` is Gaussian ``m - shift[v]``; the
-splats of a view start at a multiple of eight. Its record is 16 floats. With ``Sigma = L L^T`` its 2D
-covariance (low-pass included) and ``d`` the vector from its centre to a pixel's centre, the exponent of the
-Gaussian is ``-(p^2 + q^2) ln 2`` where ``p = K_XX dx`` and ``q = K_YX dx + K_YY dy``: a sum of squares, which
-loses no digits and is never negative."""
+A *splat* is one Gaussian seen by one camera: splat ``m`` of view ``v`` is Gaussian
+``m - shift[v]``; the splats of a view start at a multiple of eight. Its record is 16 floats. With
+``Sigma = L L^T`` its 2D covariance (low-pass included) and ``d`` the vector from its centre to a
+pixel's centre, the exponent of the Gaussian is ``-(p^2 + q^2) ln 2`` where ``p = K_XX dx`` and
+``q = K_YX dx + K_YY dy``: a sum of squares, which loses no digits and is never negative."""
 
 from ghgs_lit.kernels.compile import helper
 
 RECORD = 16
-# Centre: the pixel, and 0.5 minus the fraction, so that small distances from it keep all their digits.
+# Centre: the pixel, and 0.5 minus the fraction,
+# so that small distances from it keep all their digits.
 COLUMN = 0
 ROW = 1
 REST_X = 2
@@ -37,17 +38,17 @@ X1 = 1
 Y0 = 2
 Y1 = 3
 
-# An entry is a splat in a tile, a row of integers: the bits of its depth, the splat, the slot of its
-# gradients (the slots of a splat are contiguous). After a tile is drawn, its visible splats come first, front
-# to back, with the blocks that each reaches in place of the depth.
+# An entry is a splat in a tile, a row of integers: the bits of its depth, the splat, the slot of
+# its gradients (the slots of a splat are contiguous). After a tile is drawn, its visible splats
+# come first, front to back, with the blocks that each reaches in place of the depth.
 KEY = 0
 SPLAT = 1
 SLOT = 2
 BLOCKS = KEY
 ENTRY = 4
 
-# Gradients of an entry, with ``h = dL / d ln(alpha)`` and sums over pixels: moments of h in whitened
-# coordinates, the gradient of the depth, then from COLOR on those of the colours.
+# Gradients of an entry, with ``h = dL / d ln(alpha)`` and sums over pixels: moments of h in
+# whitened coordinates, the gradient of the depth, then from COLOR on those of the colours.
 H = 0
 H_P = 1
 H_Q = 2

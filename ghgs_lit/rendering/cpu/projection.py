@@ -57,7 +57,8 @@ def _project_vector(
         m: first splat.
         records: gets the records, [splats, RECORD].
         depths: gets z in metres, [splats, 1].
-        boxes: gets the tiles that each splat touches, int32 [splats, 4]; empty if it is not visible.
+        boxes: gets the tiles that each splat touches, int32 [splats, 4];
+            empty if it is not visible.
 
     Returns:
         The visible splats, as bits.

@@ -1,9 +1,9 @@
 """Loads and stores of vectors: 4 x 4 blocks of an image, columns of a table, transposed rows.
 
 Functions with ``@intrinsic`` are called in kernels without their first parameter, Numba's
-``typing_context``; their others are Numba types when a kernel is compiled. ``emit(context, builder, sig,
-args)`` writes the LLVM instructions: ``builder`` adds to the kernel's code, ``args`` are the LLVM values
-of the parameters. Arrays are contiguous.
+``typing_context``; their others are Numba types when a kernel is compiled.
+``emit(context, builder, sig, args)`` writes the LLVM instructions: ``builder`` adds to the kernel's
+code, ``args`` are the LLVM values of the parameters. Arrays are contiguous.
 """
 
 from llvmlite import ir
@@ -108,8 +108,8 @@ def row_sums(typing_context, array, index, count):
         typing_context: Numba's.
         array: flat float32, aligned to a cache line.
         index: of the first number.
-        count: number of channels, or a tuple of that length: then rows from ``COLOR + len(count)`` on
-            count as 0.
+        count: number of channels, or a tuple of that length: then rows from ``COLOR + len(count)``
+            on count as 0.
     """
     used = layout.COLOR + len(count) if isinstance(count, types.BaseTuple) else LANES
 
@@ -183,7 +183,8 @@ def _make_columns(count: int):
 
     @intrinsic
     def columns(typing_context, array, row, last):
-        """Rows ``row`` to ``row + 8`` of a table, a vector of doubles per column; 0 from ``last`` on.
+        """Rows ``row`` to ``row + 8`` of a table, a vector of doubles per column;
+        0 from ``last`` on.
 
         Args:
             typing_context: Numba's.
@@ -233,7 +234,8 @@ def _make_columns(count: int):
 
 
 def _interleave(builder, columns: list):
-    """A long vector with the first lanes of all (eight-lane) columns, then their second lanes, and so on."""
+    """A long vector with the first lanes of all (eight-lane) columns, then their second lanes,
+    and so on."""
     lines = columns[0]
     for column in columns[1:]:
         # A shuffle needs two vectors of the same length.
@@ -271,7 +273,8 @@ def store_boxes(typing_context, array, row, values):
 
 
 def _transpose(builder, vectors: list):
-    """Transpose 16 vectors; with eight vectors, transpose the two 8 x 8 matrices of their halves."""
+    """Transpose 16 vectors; with eight vectors,
+    transpose the two 8 x 8 matrices of their halves."""
     distance = len(vectors) // 2
     while distance > 0:
         low = [i if not i & distance else LANES + i - distance for i in range(LANES)]

@@ -1,6 +1,7 @@
-"""Parts of drawing a tile that the forward and the backward pass share. A tile is 16 x 16 pixels in 16 blocks
-of 4 x 4; a block is one vector. Most splats are small (one for each input pixel) and fit a 4 x 4 block better
-than a row of 16. The planes of a tile are its colour channels, the sum of ``w z`` and the sum of ``w``."""
+"""Parts of drawing a tile that the forward and the backward pass share. A tile is 16 x 16 pixels in
+16 blocks of 4 x 4; a block is one vector. Most splats are small (one for each input pixel) and fit
+a 4 x 4 block better than a row of 16. The planes of a tile are its colour channels, the sum of
+``w z`` and the sum of ``w``."""
 
 import numpy as np
 
@@ -40,8 +41,8 @@ def place(tile, tiles_x, tiles_y, height, width):
         width: of the images, in pixels.
 
     Returns:
-        View, first column and row, rows and columns that lie in the image, and index of the first pixel
-        in a plane of the image.
+        View, first column and row, rows and columns that lie in the image, and index of the first
+        pixel in a plane of the image.
     """
     view = tile // (tiles_x * tiles_y)
     inner = tile % (tiles_x * tiles_y)
@@ -148,8 +149,8 @@ def whiten(numbers, dx, dy):
 def blend(numbers, p, q, before, alpha_max, stop):
     """Blend a splat over a block of pixels.
 
-    Masked lanes hold zeros, so that vectors are stored whole: a masked store could not be forwarded to
-    the next splat's load.
+    Masked lanes hold zeros, so that vectors are stored whole: a masked store could not be forwarded
+    to the next splat's load.
 
     Args:
         numbers: from :func:`read_splat`.
@@ -160,9 +161,9 @@ def blend(numbers, p, q, before, alpha_max, stop):
         stop: transmittance at which a pixel ends.
 
     Returns:
-        The unclamped and the clamped alpha; the lanes that the splat reaches, where it is seen, and that
-        stay open; and the transmittance behind it. Where that would fall to ``stop``, the splat is left
-        out and the transmittance becomes 0, which excludes all splats behind.
+        The unclamped and the clamped alpha; the lanes that the splat reaches, where it is seen, and
+        that stay open; and the transmittance behind it. Where that would fall to ``stop``, the
+        splat is left out and the transmittance becomes 0, which excludes all splats behind.
     """
     squared = simd.fma(p, p, q * q)
     reached = squared <= numbers[6]

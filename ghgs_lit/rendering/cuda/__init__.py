@@ -1,1 +1,2 @@
-"""Rendering for GPUs: the tiles of each splat, and what each place of a tile's list holds, in two kernels."""
+"""Rendering for GPUs: the tiles of each splat, and what each place of a tile's list holds,
+in two kernels."""

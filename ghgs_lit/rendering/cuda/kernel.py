@@ -1,4 +1,5 @@
-"""Which splats each tile draws, for a GPU, in Triton; see :mod:`ghgs_lit.rendering.intersections`."""
+"""Which splats each tile draws, for a GPU, in Triton;
+see :mod:`ghgs_lit.rendering.intersections`."""
 
 import torch
 import triton

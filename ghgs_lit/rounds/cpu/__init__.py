@@ -26,10 +26,11 @@ def remembered(
     known: Float[Tensor, "N k"],
     before: Float[Tensor, "N h"],
 ) -> Float[Tensor, "N h"]:
-    """``tanh(before + memory(update(seen, known, before)))``, differentiable in ``before`` and the layers.
+    """``tanh(before + memory(update(seen, known, before)))``,
+    differentiable in ``before`` and the layers.
 
-    As :meth:`ghgs_lit.rounds.Rounds._remembered`; what is seen are results of ``view`` for the Gaussian's own
-    view, and their mean and maximum over the other views.
+    As :meth:`ghgs_lit.rounds.Rounds._remembered`; what is seen are results of ``view`` for the
+    Gaussian's own view, and their mean and maximum over the other views.
 
     Args:
         view: two layers, for each view.

@@ -1,4 +1,5 @@
-"""Gradients of the memory of rounds; values of inner layers are computed again, which stays in the cache."""
+"""Gradients of the memory of rounds; values of inner layers are computed again,
+which stays in the cache."""
 
 import numpy as np
 from numba.core import types
@@ -85,7 +86,8 @@ def _look(each, known, before, layers, places, start, count, given, one, two, se
         places: [layers + 1, 3], of :class:`ghgs_lit.kernels.layers.Sums`.
         start: first row.
         count: number of rows, 1 to ``PANEL``.
-        given: written, observations of each view in lines of ``PANEL`` floats, as are all that follow.
+        given: written, observations of each view in lines of ``PANEL`` floats,
+            as are all that follow.
         one: written, results of the first layer of each view.
         two: written, results of the second layer of each view.
         seen: written, inputs of the update.

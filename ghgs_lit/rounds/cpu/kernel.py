@@ -141,7 +141,8 @@ def _between(plane, rows, columns, weights):
 
 @helper
 def _cells(lane, down, across):
-    """Rows, columns and weights of the four pixels around one of 16 points, from :func:`_put_cells`."""
+    """Rows, columns and weights of the four pixels around one of 16 points,
+    from :func:`_put_cells`."""
     rows = np.uint64(down[lane]), np.uint64(down[LANES + lane])
     columns = np.uint64(across[lane]), np.uint64(across[LANES + lane])
     top = down[2 * LANES + lane]

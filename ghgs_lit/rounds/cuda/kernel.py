@@ -1,7 +1,7 @@
 """Kernels of rounds for a GPU, in Triton.
 
-Observations: a row of a program is a Gaussian in a view. See :func:`ghgs_lit.rounds.observation.compared`;
-bilinear values are as of ``grid_sample``.
+Observations: a row of a program is a Gaussian in a view. See
+:func:`ghgs_lit.rounds.observation.compared`; bilinear values are as of ``grid_sample``.
 
 The memory: a row is a Gaussian. See :mod:`ghgs_lit.rounds.memory`.
 """
@@ -192,8 +192,8 @@ def remember_rows(
         bias_0: [hidden].
         view_1: [hidden, hidden].
         bias_1: [hidden].
-        update_0: [wide, 4 hidden + more]: of the own view, the mean and the largest of the others, what is
-            known, the memory.
+        update_0: [wide, 4 hidden + more]: of the own view, the mean and the largest of the others,
+            what is known, the memory.
         bias_2: [wide].
         update_1: [hidden, wide].
         bias_3: [hidden].

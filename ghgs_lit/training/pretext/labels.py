@@ -47,7 +47,8 @@ def _vertex_parts(vertices: int) -> np.ndarray | None:
 
 
 def parts_of_points(points: Float[Tensor, "n 3"], vertices: Float[Tensor, "m 3"]) -> Int[Tensor, " n"]:
-    """The body part of each world point on clothes, hair or skin: that of the nearest vertex of the skin.
+    """The body part of each world point on clothes, hair or skin:
+    that of the nearest vertex of the skin.
 
     Args:
         points: in the unit of ``vertices``.
@@ -89,8 +90,8 @@ def part_shares(batch: Batch, patch_size: int) -> Float[Tensor, "n P"]:
     """Shares of :data:`PARTS` among the subject's pixels of each patch.
 
     Args:
-        batch: with true depths and vertices of bodies whose parts are known; sides are divisible by the patch
-            size.
+        batch: with true depths and vertices of bodies whose parts are known; sides are divisible by
+            the patch size.
         patch_size: side of a patch in pixels.
 
     Returns:

@@ -1,4 +1,5 @@
-"""The LightningModule of the pretext stage, and its measure of how well features tell body parts."""
+"""The LightningModule of the pretext stage, and its measure of how well features tell
+body parts."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -23,7 +23,8 @@ STEP = torch.tensor([0.5, 0.0, 0.1])  # from one instant to the next
 
 
 def walk(count: int) -> list[tuple[Batch, Prediction]]:
-    """Instants of a body that walks steadily out of the first photographs, of less and less Gaussians."""
+    """Instants of a body that walks steadily out of the first photographs,
+    of less and less Gaussians."""
     cameras, found = camera_ring(3, 60, 60), []
     for number in range(count):
         gaussians = body(1500 - 100 * number, 60)
@@ -53,7 +54,8 @@ def write(directory, instants, *formats) -> Instants:
 
 
 def test_a_page_plays_the_instants_and_numbered_plys_are_theirs(tmp_path):
-    """One file for all, no address; the cameras of the first instant, and how the viewer's follows."""
+    """One file for all, no address; the cameras of the first instant,
+    and how the viewer's follows."""
     instants = walk(3)
     together = write(tmp_path, instants, "html", "ply")
     text = (tmp_path / "viewer.html").read_text()
@@ -92,7 +94,8 @@ def test_the_video_shows_all_of_a_subject_that_walks_away(tmp_path):
 
 
 def test_files_of_another_origin_stay(tmp_path):
-    """An output replaces no input and nobody's file; those of a longer sequence before are removed."""
+    """An output replaces no input and nobody's file;
+    those of a longer sequence before are removed."""
     instants = walk(3)
     write(tmp_path, instants, "ply")
     assert {*(path.name for path in (tmp_path / "sequence").iterdir())} == {f"000{n}.ply" for n in range(3)}
@@ -117,7 +120,8 @@ def test_instants_without_files_of_all_get_none(tmp_path):
 
 
 def test_an_empty_instant_does_not_end_the_sequence(tmp_path):
-    """Nobody in the photographs of one instant: the page has none there, the video a black picture."""
+    """Nobody in the photographs of one instant: the page has none there,
+    the video a black picture."""
     instants = walk(3)
     batch, prediction = instants[1]
     nothing = prediction.gaussians.select(slice(0, 0), (0,))

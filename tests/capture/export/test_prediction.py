@@ -57,7 +57,8 @@ def subject():
 
 
 def test_everything_is_written_and_reported(subject, tmp_path):
-    """The report names each file with its size; other programs read depths, points and photographs."""
+    """The report names each file with its size;
+    other programs read depths, points and photographs."""
     batch, prediction = subject
     depth = prediction.depth.detach() + torch.rand(batch.masks.shape)
     prediction = dataclasses.replace(prediction, depth=depth)
@@ -96,7 +97,8 @@ def test_everything_is_written_and_reported(subject, tmp_path):
 
 
 def test_mattes_are_the_alpha_of_the_photographs(subject, tmp_path):
-    """Colours of a PNG are the subject's own; on black they give the photograph that the model saw."""
+    """Colours of a PNG are the subject's own;
+    on black they give the photograph that the model saw."""
     batch, prediction = subject
     share = torch.rand(batch.masks.shape, generator=torch.Generator().manual_seed(1)) * batch.masks
     batch = dataclasses.replace(batch, images=batch.images * share[:, :, None], alpha=share)
@@ -216,7 +218,8 @@ def test_a_missing_package_is_named_before_any_work(monkeypatch):
 
 @pytest.mark.parametrize(("antialiased", "size"), [(False, 0.3), (True, 1.0)])
 def test_smooth_files_have_no_gaps_on_larger_screens(tmp_path, antialiased, size):
-    """At four times the resolution a smooth file shows the same picture, enlarged; another shows dots."""
+    """At four times the resolution a smooth file shows the same picture, enlarged;
+    another shows dots."""
     gaussians, cameras = body(1500, 60), camera_ring(2, 60, 60)
     gaussians = dataclasses.replace(gaussians, scales=gaussians.scales * size, antialiased=antialiased)
     rendering = render(gaussians, cameras)
@@ -234,7 +237,8 @@ def test_smooth_files_have_no_gaps_on_larger_screens(tmp_path, antialiased, size
 
 
 def made_for_thin_pixels(size: int = 60):
-    """Discs of about a pixel, made for a low-pass of 0.1 px^2 with antialiasing, and their photographs."""
+    """Discs of about a pixel, made for a low-pass of 0.1 px^2 with antialiasing,
+    and their photographs."""
     gaussians, cameras = body(1500, size), camera_ring(2, size, size)
     gaussians = dataclasses.replace(gaussians, low_pass=0.1, antialiased=True)
     rendering = render(gaussians, cameras)
@@ -259,8 +263,8 @@ def test_other_viewers_draw_what_ours_draws(tmp_path):
 
 
 def test_other_viewers_see_the_inputs_as_ours_does():
-    """Better than scales and opacities alone make it; between the inputs these discs, whose colours are
-    drawn at random, lose less than 1 dB; places and rotations stay."""
+    """Better than scales and opacities alone make it; between the inputs these discs, whose colours
+    are drawn at random, lose less than 1 dB; places and rotations stay."""
     batch, prediction = made_for_thin_pixels()
     ours = prediction.gaussians
     subject = exported_subject(batch, prediction, Renderer(), OutputOptions())

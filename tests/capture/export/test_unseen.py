@@ -47,7 +47,8 @@ def test_what_one_photograph_alone_shows_is_a_guess():
 
 
 def test_a_subject_that_frames_cut_is_said(tmp_path):
-    """Six of eight photographs end above its feet: which, where, and that the lowest part is a guess."""
+    """Six of eight photographs end above its feet: which, where,
+    and that the lowest part is a guess."""
     whole = {0, 4}
     batch, prediction = photographed(8, tuple(SIZE if view in whole else SIZE // 2 for view in range(8)))
     found = said(batch, prediction)

@@ -87,7 +87,8 @@ def test_more_cameras_than_a_prediction_takes_are_refused(calibration):
 
 
 def test_weights_learn_and_are_written(calibration, tmp_path, monkeypatch, capsys):
-    """The file predicts, holds other weights than those it began with, and both are measured alike."""
+    """The file predicts, holds other weights than those it began with,
+    and both are measured alike."""
     monkeypatch.setattr(jobs.figures, "generate", lambda seed, index, active: box_person(f"p{index}"))
     monkeypatch.setenv("GHGS_CACHE", str(tmp_path / "cache"))
     small = ["data.size=42", "data.people={train: 2, val: 1}", "data.active.train=0", "data.active.val=0"]
@@ -134,7 +135,8 @@ def test_people_are_as_large_as_the_subject_of_the_photographs():
 
 
 def test_a_data_set_lends_its_cameras(tmp_path):
-    """The inputs of its protocol, in the size of its photographs; people are as tall as its subject."""
+    """The inputs of its protocol, in the size of its photographs;
+    people are as tall as its subject."""
     make_miniature(zju_mocap, tmp_path / "zju", ["386", "313"], 112, seed=3, frames=2)
     data = ["data=zju_mocap", f"data.root={tmp_path / 'zju'}", "data.size=112", "data.workers=0"]
     data += [
@@ -158,7 +160,8 @@ def test_a_data_set_lends_its_cameras(tmp_path):
 
 
 def test_numbers_of_views_can_be_said(calibration, tmp_path, monkeypatch):
-    """Weights for a rig of which a camera may fail are trained with fewer, too; measured are all cameras."""
+    """Weights for a rig of which a camera may fail are trained with fewer, too;
+    measured are all cameras."""
     seen = []
     monkeypatch.setattr(adapt, "run_job", lambda config, *_: seen.append(config["views"]))
     for number, said in enumerate(([], ["views.training_counts=[3,4]"])):

@@ -46,8 +46,8 @@ def inside_the_figure(path: Path, scale: float = 1.0) -> float:
 
 
 def test_photographs_become_a_splat_where_the_subject_is(here, checkpoint, capsys, monkeypatch):
-    """In the user's world and unit, with what was done in the report; a read-only working directory is no
-    obstacle, as nothing is written there."""
+    """In the user's world and unit, with what was done in the report; a read-only working directory
+    is no obstacle, as nothing is written there."""
     cameras = Figure(scale=1000.0).write(here / "images")
     closed = here / "closed"
     closed.mkdir(mode=0o555)
@@ -66,7 +66,8 @@ def test_photographs_become_a_splat_where_the_subject_is(here, checkpoint, capsy
 
 
 def test_cameras_are_corrected_where_asked(here, checkpoint, capsys):
-    """The report says by how many pixels; the splat is where the corrected cameras see the subject."""
+    """The report says by how many pixels; the splat is where the corrected cameras see
+    the subject."""
     cameras = Figure(scale=1000.0).write(here / "images")
     run = (
         f"checkpoint={checkpoint}",
@@ -217,7 +218,8 @@ def test_gains_of_a_rig_are_written_read_and_said(here, checkpoint, capsys, monk
 
 
 def test_a_sequence_goes_on_where_an_instant_lacks_photographs(here, checkpoint, capsys):
-    """Three of four predict; two do not, which is said and counted. Of nothing else there is an error."""
+    """Three of four predict; two do not, which is said and counted.
+    Of nothing else there is an error."""
     for instant in ("000", "001", "002"):
         cameras = Figure().write(here / "images" / instant)
     for path in (here / "images" / "000" / "cam0.png", here / "images" / "001" / "cam1.png"):
@@ -271,7 +273,8 @@ def test_wrong_cameras_are_refused_and_the_doctor_mends_them(here, checkpoint, c
 
 @pytest.mark.parametrize("fisheye", [False, True])
 def test_the_doctor_draws_photographs_of_a_lens(here, fisheye):
-    """Its picture has them without distortion, with masks of files; every lens once ended the report."""
+    """Its picture has them without distortion, with masks of files;
+    every lens once ended the report."""
     figure = Figure()
     lens = {"distortion": [0.02, 0.001, 0.001, 0.001], "fisheye": fisheye}
     cameras = figure.write(here / "images", cameras={name: c | lens for name, c in figure.cameras.items()})
@@ -296,7 +299,8 @@ def test_the_example_runs(here, checkpoint, monkeypatch, capsys):
 
 
 def test_inputs_are_never_replaced(here, checkpoint, capsys):
-    """Neither a calibration of the name of an output nor photographs, though an earlier run wrote them."""
+    """Neither a calibration of the name of an output nor photographs,
+    though an earlier run wrote them."""
     cameras = Figure().write(here / "cap")
     before = cameras.read_bytes()
     common = (f"checkpoint={checkpoint}", "turntable.frames=0", "device=cpu")

@@ -1,4 +1,5 @@
-"""The page of a live view: the newest instant is shown, what was shown is kept, and all ends cleanly."""
+"""The page of a live view: the newest instant is shown, what was shown is kept,
+and all ends cleanly."""
 
 import dataclasses
 import json
@@ -179,7 +180,8 @@ def test_it_ends_in_time_although_no_instant_comes(capsys):
 
 
 def test_what_was_shown_is_kept_in_place_of_an_earlier_recording(tmp_path):
-    """Other files of earlier runs stay, and files of somebody else are refused before any is removed."""
+    """Other files of earlier runs stay, and files of somebody else are refused before any
+    is removed."""
     for names in (("3", "4", "5"), ("6", "7")):
         show_live(instants(*names), Pause(), crop, predicted, lambda _: Page(), Recording(tmp_path))
         written = sorted((tmp_path / "sequence").iterdir())

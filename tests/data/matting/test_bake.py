@@ -1,4 +1,5 @@
-"""The script that trains the matting network: its samples, and that a run goes on where it ended."""
+"""The script that trains the matting network: its samples,
+and that a run goes on where it ended."""
 
 import importlib.util
 from pathlib import Path
@@ -55,7 +56,8 @@ def test_samples_show_the_subject_before_a_background(bake):
 
 @pytest.mark.filterwarnings("ignore")
 def test_runs_go_on_where_they_ended(bake, tmp_path, monkeypatch):
-    """Steps see their own photographs whatever was run before; the weights are those of a network."""
+    """Steps see their own photographs whatever was run before;
+    the weights are those of a network."""
     monkeypatch.setattr(bake, "_CROP", 32)
     monkeypatch.setattr(bake, "_KEPT", 1)
     seen = []

@@ -17,7 +17,8 @@ HEIGHT, WIDTH = 216, 180
 
 @pytest.fixture(scope="module")
 def scene():
-    """A textured ellipse before a cloudy background: the photograph, its colours on black, its matte."""
+    """A textured ellipse before a cloudy background: the photograph, its colours on black,
+    its matte."""
     rng = np.random.default_rng(3)
     v, u = np.mgrid[: 4 * HEIGHT, : 4 * WIDTH] / 4
     inside = ((u - 93) / 51) ** 2 + ((v - 105) / 81) ** 2 < 1
@@ -54,7 +55,8 @@ def error(matte, alpha):
 
 @pytest.mark.parametrize("name", ["exact", "grown", "shrunk", "ragged", "holed"])
 def test_the_photograph_mends_the_mask(scene, name):
-    """What is left is a small part of the mask's error, and no background is left in the colours."""
+    """What is left is a small part of the mask's error,
+    and no background is left in the colours."""
     photograph, premultiplied, alpha = scene
     mask = (255 * masks_of(alpha)[name]).astype(np.uint8)
     subject, matte = refined_matte(photograph, mask, 4)

@@ -87,7 +87,8 @@ def test_without_an_outline_all_is_far_from_it(value):
 
 
 def test_colors_nearby_are_weighted_means():
-    """Of one colour on each side: that colour wherever something weighs; black, not NaN, elsewhere."""
+    """Of one colour on each side: that colour wherever something weighs;
+    black, not NaN, elsewhere."""
     weight = torch.zeros(1, 1, 12, 12)
     weight[..., :6] = 0.7
     color = torch.tensor([0.2, 0.5, 0.9])[None, :, None, None]

@@ -111,7 +111,8 @@ def test_quartiles_of_one_round_are_its_value():
 
 
 def test_relative_differences_are_always_defined():
-    """An empty or broken result must not pass a budget as nan, and no difference needs no division."""
+    """An empty or broken result must not pass a budget as nan,
+    and no difference needs no division."""
     one = torch.ones(2)
     assert relative_difference(one * 3, one * 2) == 0.5
     assert relative_difference(one[:0], one[:0]) == 0
@@ -134,7 +135,8 @@ def test_budgets_look_at_most_values():
 
 
 def test_the_condition_is_what_a_rounding_of_the_photographs_changes(model, scene, monkeypatch):
-    """A depth that changes 64 times as much as the photographs has a condition of 64, what is fixed 1."""
+    """A depth that changes 64 times as much as the photographs has a condition of 64,
+    what is fixed 1."""
     result = forward(model, Renderer(), scene, SecondsProbe(CPU))
     place = scene.images.argmax()
 
@@ -155,7 +157,8 @@ def test_the_condition_is_what_a_rounding_of_the_photographs_changes(model, scen
 
 
 def test_gaussians_are_compared_by_their_pixel(model, scene):
-    """A preset that drops some Gaussians, or orders them otherwise, is compared on those that it has."""
+    """A preset that drops some Gaussians, or orders them otherwise,
+    is compared on those that it has."""
     expected = forward(model, Renderer(), scene, SecondsProbe(CPU))
     gaussians = expected[0].gaussians
     kept = torch.arange(len(gaussians)).flip(0)[: len(gaussians) // 2]
@@ -186,7 +189,8 @@ def test_flops_of_products_and_attention():
 
 
 def test_flops_count_the_calls_of_the_compiled_kernel(monkeypatch):
-    """The kernel is called through its module, by which the count sees it; afterwards it does not."""
+    """The kernel is called through its module, by which the count sees it;
+    afterwards it does not."""
     monkeypatch.setattr(encoder.cpu, "attend", lambda *_: None)
     with FlopsProbe() as probe:
         probe.begin("kernel")

@@ -86,7 +86,8 @@ def test_what_auto_chose_and_why_is_said(measured):
 
 
 def test_exact_is_exact(measured):
-    """The promise of ``exact`` holds for a model of which every output depends on the photographs."""
+    """The promise of ``exact`` holds for a model of which every output depends on the
+    photographs."""
     row = totals(json.loads((measured / "benchmark.json").read_text()))["exact"]
     assert row["rel_diff"] <= row["max_rel_diff_budget"] == 1e-5
     assert row["differences"]["unmatched"] == 0

@@ -1,4 +1,5 @@
-"""The selfcheck: it passes where nothing is wrong, and a planted defect fails in its row, in none before."""
+"""The selfcheck: it passes where nothing is wrong, and a planted defect fails in its row,
+in none before."""
 
 import dataclasses
 
@@ -72,8 +73,8 @@ def test_it_runs_on_the_pretend_device():
 
 
 def test_it_checks_what_a_user_has(monkeypatch):
-    """``inherit`` leaves the process as it is, with convolutions in TF32, and may round as much; the gradient
-    is that of a training in float32."""
+    """``inherit`` leaves the process as it is, with convolutions in TF32, and may round as much;
+    the gradient is that of a training in float32."""
     right, seen = GHGS.predict, []
 
     def noted(self, batch, kept, coarse=None):

@@ -131,7 +131,8 @@ def test_what_the_data_lacks_is_an_error(name, field):
 
 @pytest.fixture(scope="module")
 def painted():
-    """A painted ellipsoid from other sides for each of two subjects, and its targets of another size."""
+    """A painted ellipsoid from other sides for each of two subjects,
+    and its targets of another size."""
     cameras, seen = ring_around(2, 6, 32, 32), ring_around(2, 4, 40, 24)[:, 1:3]
     images, masks, depths = painted_ellipsoid(cameras)
     images[1] = 1 - images[1]

@@ -21,7 +21,8 @@ def scene(views=4, size=42):
 
 
 def test_the_photographs_are_fitted():
-    """The render of an input comes nearer to its photograph with steps, far beyond what refinement may do."""
+    """The render of an input comes nearer to its photograph with steps,
+    far beyond what refinement may do."""
     batch = scene()
     method = PerScene(RENDERER, steps=40)
     begin = RENDERER(method.begin(batch), batch.targets.cameras).image
@@ -32,7 +33,8 @@ def test_the_photographs_are_fitted():
 
 
 def test_every_gaussian_begins_on_its_pixel_and_may_become_another():
-    """The start is where photographs agree; position, rotation, scale, opacity and colour all change."""
+    """The start is where photographs agree; position, rotation, scale,
+    opacity and colour all change."""
     batch = scene()
     method = PerScene(RENDERER, steps=3)
     begin = method.begin(batch)

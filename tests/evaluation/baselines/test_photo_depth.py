@@ -15,7 +15,8 @@ def painted(views=8, height=64, width=56):
 
 
 def test_colours_say_where_in_the_hull_the_surface_is():
-    """Nearer to the truth than the hull's front and than its middle, on photographs that are not square."""
+    """Nearer to the truth than the hull's front and than its middle,
+    on photographs that are not square."""
     batch = painted()
     found, bounds = photo_depth(batch), batch.once(hull_bounds)
 

@@ -1,4 +1,5 @@
-"""LaTeX tables against the layout of the paper's own, and through a TeX engine where there is one."""
+"""LaTeX tables against the layout of the paper's own,
+and through a TeX engine where there is one."""
 
 import json
 import re

@@ -1,4 +1,5 @@
-"""Tables of methods: the paper's reported figures, other methods' files, baselines, our variants."""
+"""Tables of methods: the paper's reported figures, other methods' files, baselines,
+our variants."""
 
 import json
 import shutil

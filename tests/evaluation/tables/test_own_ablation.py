@@ -1,4 +1,5 @@
-"""Ablations of a user's own: rows by the option that was chosen, never one row for two configurations."""
+"""Ablations of a user's own: rows by the option that was chosen,
+never one row for two configurations."""
 
 import csv
 import itertools

@@ -1,4 +1,5 @@
-"""Tests over seeds and subjects: their level and power, Holm's correction, what is marked and said."""
+"""Tests over seeds and subjects: their level and power, Holm's correction,
+what is marked and said."""
 
 import re
 
@@ -20,7 +21,8 @@ SEED_EFFECT, SUBJECT_EFFECT = 0.1, 1.0  # dB
 
 
 def runs_of(rng, seeds, subjects, people, own=0.0, noise=0.05):
-    """A configuration: ``people`` [subjects], a chance of each seed, of it with each person, and the rest."""
+    """A configuration: ``people`` [subjects], a chance of each seed, of it with each person,
+    and the rest."""
     by_person = people + own * rng.normal(size=subjects)
     by_seed = SEED_EFFECT * rng.normal(size=(seeds, 1))
     return pd.DataFrame(by_person + by_seed + noise * rng.normal(size=(seeds, subjects)))
@@ -126,7 +128,8 @@ def test_seeds_of_one_row_alone_say_nothing_about_their_variance():
 
 @pytest.mark.parametrize("rows", [2, 3, 4, 6])
 def test_the_reference_may_vary_twice_as_much(rows):
-    """Largest ratio of the variance of a difference to what the pooled one expects; 1 for two rows."""
+    """Largest ratio of the variance of a difference to what the pooled one expects;
+    1 for two rows."""
     variances = np.array([RATIO**2] + [1] * (rows - 1))
     expected = variances[:2].sum() / (2 * variances.mean())
     pooled = Pool(0.3, 8, rows)
@@ -188,7 +191,8 @@ def table_of(folder, shift, noise=0.01, shifts=SUBJECTS, seeds=(1, 2, 3), **opti
 
 
 def test_a_clear_difference_is_marked_and_noise_is_not(tmp_path):
-    """Marks, intervals of all that was tested, and the notes say what, and what could have been shown."""
+    """Marks, intervals of all that was tested, and the notes say what,
+    and what could have been shown."""
     table = table_of(tmp_path / "clear", 1.0)
     rows, _ = body(to_markdown(table))
     assert re.fullmatch(r"\*\*25\.00 ± 0\.00\\\* \[\+(0\.9|1\.0)\d, \+1\.0\d\]\*\*", rows["✗", "✗"][0])

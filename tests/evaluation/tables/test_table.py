@@ -14,7 +14,8 @@ from tests.helpers.tables import body, start_run, tables_of, write_run
 
 
 def test_rows_columns_best_and_missing(tmp_path):
-    """All combinations and numbers of views appear, missing ones too, and only a real best is bold."""
+    """All combinations and numbers of views appear, missing ones too,
+    and only a real best is bold."""
     write_run(tmp_path / "0", "full", 20.0)
     write_run(tmp_path / "1" / "deep", "no_semantic", 21.0, views=(4,))
     write_run(tmp_path / "2", "no_unprojection", 19.0)

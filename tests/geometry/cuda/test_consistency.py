@@ -34,8 +34,9 @@ def test_the_agreement_is_as_exact_as_plain_pytorchs(b, v, height, width, spread
         with kernels() as called:
             found = photo_consistency(fresh, bounds.to(DEVICE), steps)
         assert sorted(called) == ["relations", "smoothed", "swept"]
-        # Pixels are exact to roundings of the frame's size times the depth's ratio to the least in front of a
-        # camera; colours differ by up to 1 a pixel, and the agreement by 1 / TOLERANCE of that.
+        # Pixels are exact to roundings of the frame's size times the depth's ratio to the least
+        # in front of a camera; colours differ by up to 1 a pixel, and the agreement by 1 /
+        # TOLERANCE of that.
         difference = (found.cpu() - exact).abs()
         assert difference.max() < 1e-3
         assert difference.mean() < 64 * EPS / stage.TOLERANCE
@@ -43,7 +44,8 @@ def test_the_agreement_is_as_exact_as_plain_pytorchs(b, v, height, width, spread
 
 @pytest.mark.parametrize("views", [1, 2, 5])
 def test_relations_of_views_are_those_of_float64(views):
-    """With skew. Products are exact to roundings of a focal length times the distance of a camera."""
+    """With skew. Products are exact to roundings of a focal length times the distance
+    of a camera."""
     cameras = make_batch(2, views, 42, 28).cameras
     lenses = cameras.intrinsics.clone()
     lenses[..., 0, 1] = 3.0

@@ -20,7 +20,8 @@ def to(value, *where):
 
 
 def gaussians_and_gradients(head, raw, batch, points, maps, slopes):
-    """Attributes, and the gradients of their products with ``slopes`` by raw attributes and points."""
+    """Attributes, and the gradients of their products with ``slopes`` by raw attributes
+    and points."""
     leaves = [getattr(raw, name) for name in RAW] + [points.pixels]
     leaves = [None if x is None else x.detach().clone().requires_grad_() for x in leaves]
     raw = dataclasses.replace(raw, **dict(zip(RAW, leaves, strict=False)))
@@ -63,7 +64,8 @@ def assert_as_exact_as_pytorch(head, *inputs):
 def test_values_and_gradients_are_as_exact_as_plain_pytorchs(
     axes, b, v, height, width, scale, limit, is_soft
 ):
-    """With saturated attributes, with and without mattes, limits of offsets, and changes of colours."""
+    """With saturated attributes, with and without mattes, limits of offsets,
+    and changes of colours."""
     raw, batch, points, maps = scene(b, v, height, width, scale, color=is_soft)
     batch = batch if is_soft else dataclasses.replace(batch, alpha=None)
     options = {"axes": axes, "guide": True, "color_limit": 0.5 * is_soft, "offset_limit": limit}

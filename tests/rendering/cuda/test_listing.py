@@ -1,4 +1,5 @@
-"""The GPU's kernels that list the splats of tiles: equal to plain PyTorch, which is gsplat's order."""
+"""The GPU's kernels that list the splats of tiles: equal to plain PyTorch,
+which is gsplat's order."""
 
 import pytest
 import torch

@@ -40,7 +40,8 @@ def test_the_kernel_remembers_what_plain_pytorch_does(hidden, views, count):
 
 @pytest.mark.parametrize(("hidden", "views", "count"), [(48, 4, 2500), (17, 2, 33), (5, 3, 1), (64, 5, 32)])
 def test_gradients_are_those_of_plain_pytorch(hidden, views, count):
-    """Those of more Gaussians than one task has, of views that show the same, and of a single Gaussian."""
+    """Those of more Gaussians than one task has, of views that show the same,
+    and of a single Gaussian."""
     rounds, (each, known, before) = scene(hidden, views, count)
     each[::3, 1] = each[::3, -1]  # two views without the Gaussian show the same
     weights = torch.randn(count, hidden)

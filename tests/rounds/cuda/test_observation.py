@@ -27,7 +27,8 @@ def on_device(*values):
 @pytest.mark.parametrize("spread", [0.0, 0.3, 3.0])
 @pytest.mark.parametrize("is_soft", [False, True])
 def test_values_are_as_exact_as_plain_pytorchs(b, v, height, width, spread, is_soft):
-    """Elements with unequal numbers of Gaussians, or none; Gaussians outside of frames and behind cameras."""
+    """Elements with unequal numbers of Gaussians, or none;
+    Gaussians outside of frames and behind cameras."""
     batch = make_batch(b, v, height, width)
     batch = with_soft_rims(batch) if is_soft else batch
     gaussians = splats(make_batch(b, v, height, width))
@@ -43,8 +44,9 @@ def test_values_are_as_exact_as_plain_pytorchs(b, v, height, width, spread, is_s
     with kernels() as called:
         found = observe(gaussians, batch, rendering)
     assert called == ["observe"]
-    # A pixel is a quotient of products, exact to some roundings of its size: colours differ by as much of the
-    # largest difference of neighbouring pixels. A distance behind the surface is divided by 5 cm.
+    # A pixel is a quotient of products, exact to some roundings of its size: colours differ by as
+    # much of the largest difference of neighbouring pixels. A distance behind the surface is
+    # divided by 5 cm.
     pixel = 8 * EPS * max(height, width)
     same = (found[..., 9] == exact[..., 9].float()).all(-1)
     assert same.float().mean() > 0.995  # rounding may move a point across a border

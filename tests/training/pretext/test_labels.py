@@ -74,7 +74,8 @@ def test_shares_are_those_of_a_patchs_pixels():
     everywhere = torch.zeros(2 * 2 * 6 * 5, dtype=torch.bool)
     everywhere[kept.index] = True
     assert torch.equal(part_shares(batch, SIZE).any(1), everywhere)
-    # A vertex is not exactly at its pixel's centre, so that another one may be nearer at a border of parts.
+    # A vertex is not exactly at its pixel's centre,
+    # so that another one may be nearer at a border of parts.
     assert (shares - expected).abs().sum(1).mean() < 0.05
 
 

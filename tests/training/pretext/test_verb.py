@@ -67,7 +67,8 @@ def test_a_run_resumes_where_it_stopped(pretrained, data, tmp_path):
 
 
 def test_a_model_starts_from_it_and_leaves_it_as_it_is(pretrained, data, tmp_path):
-    """After training the branch is still that of the pretext stage, and counts as one that holds parts."""
+    """After training the branch is still that of the pretext stage,
+    and counts as one that holds parts."""
     source = pretrained / "checkpoints" / "last.ckpt"
     options = [
         *data,

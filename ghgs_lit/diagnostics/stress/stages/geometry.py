@@ -1,4 +1,5 @@
-"""Stages of geometry: bounds, projection, unprojection, token points, padding, photo-consistency."""
+"""Stages of geometry: bounds, projection, unprojection, token points, padding,
+photo-consistency."""
 
 import torch
 from torch import Generator, Tensor
@@ -114,9 +115,9 @@ def scene(family: str, g: Generator, views: int, size: int, target: bool = False
         target: whether there is a target view, too.
 
     Returns:
-        ``images`` [v, 3, s, s], ``masks`` and ``truth`` [v, s, s] (true depths, 0 beside the sphere),
-        ``lenses`` [v, 4], ``poses`` [v, 3, 4] and ``middle`` [3]; with a target ``target`` [1, 3, s, s],
-        ``target_lenses`` and ``target_poses``.
+        ``images`` [v, 3, s, s], ``masks`` and ``truth`` [v, s, s] (true depths, 0 beside the
+        sphere), ``lenses`` [v, 4], ``poses`` [v, 3, 4] and ``middle`` [3]; with a target ``target``
+        [1, 3, s, s], ``target_lenses`` and ``target_poses``.
     """
     rig = _rig(family, g, views + target, size)
     unit = inputs.UNITS.get(family, 1.0)
@@ -148,7 +149,8 @@ def scene(family: str, g: Generator, views: int, size: int, target: bool = False
 
 
 def batch_of(v: Values) -> Batch:
-    """Batch of stacked cases without targets, from ``images``, ``masks``, ``lenses`` and ``poses``."""
+    """Batch of stacked cases without targets, from ``images``, ``masks``,
+    ``lenses`` and ``poses``."""
     return Batch(v["images"], v["masks"], cameras_of(v, v["images"].shape[-1]))
 
 
@@ -156,8 +158,8 @@ _HULL = VisualHull(dilation=0.02)
 
 
 def _bounds(v: Values) -> Values:
-    """Bounds of the subject's pixels, computed in the subject's frame as the model does, and the distance of
-    the true surface outside them."""
+    """Bounds of the subject's pixels, computed in the subject's frame as the model does, and the
+    distance of the true surface outside them."""
     batch = batch_of(v)
     masks = v["masks"]
     frame = Frame.of(batch)
@@ -174,7 +176,8 @@ def _bounds(v: Values) -> Values:
 
 
 def _cells(v: Values) -> Tensor:
-    """Condition number by which bounds, decisions on a grid, may differ by one cell of 1/20 of the depth."""
+    """Condition number by which bounds, decisions on a grid,
+    may differ by one cell of 1/20 of the depth."""
     return torch.full((len(v["images"]),), 0.05 / (100 * torch.finfo(torch.float32).eps))
 
 

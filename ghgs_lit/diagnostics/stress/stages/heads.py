@@ -1,4 +1,5 @@
-"""Stages of heads: dense heads, activations of depth and attributes, quaternions and covariances."""
+"""Stages of heads: dense heads, activations of depth and attributes,
+quaternions and covariances."""
 
 import copy
 

@@ -31,7 +31,8 @@ def _lens_inputs(family: str, g: Generator) -> Values:
 
 
 def _lens(v: Values) -> Values:
-    """Where the pixels of the undistorted image lie in the photograph, for OpenCV's and a fisheye's model."""
+    """Where the pixels of the undistorted image lie in the photograph,
+    for OpenCV's and a fisheye's model."""
     matrices = inputs.intrinsics(v["lens"]).numpy()
     k1, k2, k3, _ = v["radial"].mT
     opencv = torch.stack((k1, k2, *v["p"].mT, k3), -1).numpy()
@@ -71,7 +72,8 @@ def _between_knots(pixels: Tensor) -> Tensor:
 
 
 def _surface_inputs(views: int, size: int, family: str, g: Generator) -> Values:
-    """A sphere with the same colours in all views, up to their gains, where the family is none of images.
+    """A sphere with the same colours in all views, up to their gains,
+    where the family is none of images.
 
     Args:
         views: number v of input views.
@@ -93,7 +95,8 @@ def _surface_inputs(views: int, size: int, family: str, g: Generator) -> Values:
 
 
 def _seen(v: Values) -> tuple[Gaussians, Batch]:
-    """Splats of a pixel's size on the true surface of one case, and its photographs, darker by gains."""
+    """Splats of a pixel's size on the true surface of one case, and its photographs,
+    darker by gains."""
     one = {name: value[None] for name, value in v.items()}
     one["images"] = one["images"] * one["gains"][..., None, None]
     batch = batch_of(one)

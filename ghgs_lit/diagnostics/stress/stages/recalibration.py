@@ -1,4 +1,5 @@
-"""Stages of recalibration: neighbours, cosines and attention; and the encoder's compiled attention."""
+"""Stages of recalibration: neighbours, cosines and attention;
+and the encoder's compiled attention."""
 
 import torch
 from torch import Generator, Tensor
@@ -91,7 +92,8 @@ def _attention_slowly(v: Values) -> Values:
 
 
 def _products(v: Values) -> Tensor:
-    """Size of the products of a value and a query or key, whose mean a softmax's gradient subtracts."""
+    """Size of the products of a value and a query or key,
+    whose mean a softmax's gradient subtracts."""
     q, k, value = (v[name].abs().flatten(1).amax(1) for name in ("q", "k", "v"))
     return torch.maximum(q, k) * value
 

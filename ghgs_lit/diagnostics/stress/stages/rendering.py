@@ -100,12 +100,14 @@ def _brightest(v: Values) -> Tensor:
 
 
 def _moments(v: Values) -> Tensor:
-    """Condition number of SSIM, which subtracts moments of size x^2 and compares the rest with 0.03^2."""
+    """Condition number of SSIM, which subtracts moments of size x^2 and compares the rest
+    with 0.03^2."""
     return _brightest(v).square() / 9e-4
 
 
 def _terms(v: Values) -> Tensor:
-    """Size of the terms that SSIM's gradients subtract: 2 x / 0.03^2, each a mean over the windows."""
+    """Size of the terms that SSIM's gradients subtract: 2 x / 0.03^2,
+    each a mean over the windows."""
     windows = 3 * (_SIZE - 10) ** 2
     return 2 * _brightest(v) / (9e-4 * windows)
 
@@ -125,7 +127,8 @@ def _clouds(family: str, g: Generator) -> Values:
 
 
 def _ties(v: Values) -> Tensor:
-    """The largest number where several points are at one place, so that any of them may be the nearest."""
+    """The largest number where several points are at one place,
+    so that any of them may be the nearest."""
     apart = (v["points"][:, :, None] - v["points"][:, None]).abs().sum(-1)
     tied = (apart == 0).flatten(1).sum(1) > apart.shape[1]
     return tied * torch.tensor(torch.finfo(torch.float64).max, dtype=torch.float64)
@@ -168,7 +171,8 @@ STAGES = (
     Stage(
         "PSNR and FLIP", ("images",), _pair, _metrics, 100,
         "powers 0.42 and 2.4 of colours, seven filters, a power 0.7 of a distance",
-        # FLIP raises a rounding error of a colour to a power of about 0.1; one pixel of 256 may have one.
+        # FLIP raises a rounding error of a colour to a power of about 0.1;
+        # one pixel of 256 may have one.
         kappa=lambda v: torch.full((len(v["image"]),), 8.0, dtype=torch.float64),
         silent="FLIP clamps colours to [0, 1]",
     ),

@@ -52,7 +52,8 @@ def _models(name: str, kicked: bool) -> dict[torch.dtype, GHGS]:
 
 
 def _in_float32(bounds: Callable[[Batch], DepthBounds | None], batch: Batch) -> DepthBounds | None:
-    """Bounds computed in float32, so that their decisions, tested in a stage of their own, agree."""
+    """Bounds computed in float32, so that their decisions, tested in a stage of their own,
+    agree."""
     computed = bounds(replace(batch, cameras=batch.cameras.to(torch.float32)))
     return computed if computed is None else DepthBounds(computed.near.double(), computed.far.double())
 
@@ -108,8 +109,8 @@ def _step(name: str, v: Values) -> Values:
 
 
 def _far(v: Values) -> Tensor:
-    """Condition number of points, sums of a camera's centre and a depth in float32: the distance over the
-    subject's size, of whose depth one half is seen."""
+    """Condition number of points, sums of a camera's centre and a depth in float32: the distance
+    over the subject's size, of whose depth one half is seen."""
     depth = v["truth"].flatten(1)
     nearest = torch.where(depth > 0, depth, torch.inf).amin(1)
     return depth.amax(1) / (2 * (depth.amax(1) - nearest))
