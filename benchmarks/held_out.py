@@ -72,7 +72,8 @@ def main() -> None:
     refinement = Refinement(options.refine, renderer) if options.refine else None
     for path in options.checkpoints:
         methods[str(path)] = ModelMethod(GHGS.from_checkpoint(path, device), renderer, refinement)
-    if options.refine_cameras:  # by the first checkpoint, from all photographs: the calibration is theirs
+    # by the first checkpoint, from all photographs: the calibration is theirs
+    if options.refine_cameras:
         model = methods[str(options.checkpoints[0])].model
         batch = CameraRefinement(options.refine_cameras, model, renderer)(batch.to(device))
     rows = []

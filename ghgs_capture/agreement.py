@@ -160,7 +160,8 @@ def _looked_up(
         Pixels inside the mask [n] float32, and number of the cell [n].
     """
     rotation = photograph.extrinsics[:3, :3]
-    shift = rotation @ middle + photograph.extrinsics[:3, 3]  # in float64: worlds far from their origin
+    # in float64: worlds far from their origin
+    shift = rotation @ middle + photograph.extrinsics[:3, 3]
     lens = photograph.intrinsics
     seen = grid.astype(np.float32) @ (lens @ rotation).T.astype(np.float32) + (lens @ shift).astype(
         np.float32

@@ -82,7 +82,8 @@ class PartialIntrinsics:
     None: nothing."""
 
     focal: tuple[float | None, float | None]  #: in pixels
-    middle: tuple[float | None, float | None]  #: principal point in pixels; None: the photograph's middle
+    #: principal point in pixels; None: the photograph's middle
+    middle: tuple[float | None, float | None]
     angles: tuple[float | None, float | None]  #: of view in radians, where there is no focal length
 
     @property

@@ -40,7 +40,8 @@ class Diagnosis:
     option: str  #: of the command line, for the best meaning; empty: none
     ranking: tuple[Hypothesis, ...]  #: all meanings that were tried, the best first
     size: float  #: the subject's largest extent in the user's unit, by the best meaning
-    suspects: tuple[str, ...] = ()  #: views that disagree with the others; a few may also if consistent
+    #: views that disagree with the others; a few may also if consistent
+    suspects: tuple[str, ...] = ()
 
 
 def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:

@@ -110,7 +110,8 @@ def _refined(
         The subject on black [h, w, 3] and its matte [h, w], uint8. Where the refined mask has less
         than half or more than twice the area, a warning says so and the matte stays as it is.
     """
-    from ghgs_lit.data.matting import refined_matte  # here: photographs are read while PyTorch is imported
+    # here: photographs are read while PyTorch is imported
+    from ghgs_lit.data.matting import refined_matte
 
     sides = [min(_FINER * side, whole) for side, whole in zip(size, matte.shape, strict=True)]
     image = area_image(image, *sides)

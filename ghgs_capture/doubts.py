@@ -15,7 +15,8 @@ _REACH = 6  #: Pixels beside an outline in which contrast is measured
 _OFF = 0.35
 #: Mean pixels by which rays near outlines miss other silhouettes, above which cameras are off.
 _MISSED = 4e-3
-_MISSED_BY_FEW = 1.5e-3  #: The same where the others agree without one camera, or without either of two
+#: The same where the others agree without one camera, or without either of two
+_MISSED_BY_FEW = 1.5e-3
 _REST = 0.25  #: Share of the distance that the others have where one camera may be to blame
 
 

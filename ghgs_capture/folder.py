@@ -75,7 +75,8 @@ class CaptureFolder:
         for name in ("masks", "backgrounds"):
             path = getattr(self, name)
             require(path is None or path.is_dir(), name, "a folder", str(path))
-        _ = self.paths  # reads the calibration and lists the photographs: missing files are refused here
+        # reads the calibration and lists the photographs: missing files are refused here
+        _ = self.paths
 
     @functools.cached_property
     def _calibration(self) -> nodes.Calibration:

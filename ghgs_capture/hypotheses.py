@@ -38,7 +38,8 @@ class Hypothesis:
     option: str  #: of the command line, for this meaning; empty: none
     views: tuple[StoredView, ...]
     blames: tuple[str, ...] = ()  #: the cameras that are wrong by it; empty: all, or none
-    shares: dict[str, float] = field(default_factory=dict)  #: of each mask, in the hull of the others
+    #: of each mask, in the hull of the others
+    shares: dict[str, float] = field(default_factory=dict)
 
     @property
     def score(self) -> float:

@@ -31,14 +31,19 @@ from ghgs_lit.weights.reading import SHIPPED, file_of
 class TimedPrediction:
     """A prediction with the batch that the model saw."""
 
-    batch: Batch  #: photographs or crops around the subject, masks and cameras, corrected where asked
+    #: photographs or crops around the subject, masks and cameras, corrected where asked
+    batch: Batch
     prediction: Prediction  #: of this batch, in the world and unit of its cameras
     seconds: dict[str, float] = field(default_factory=dict)
-    moved: tuple[float, ...] = ()  #: pixels that correcting cameras moved the subject by in each photograph
-    changed: tuple[float, ...] = ()  #: share of the subject that refining masks changed in each crop
+    #: pixels that correcting cameras moved the subject by in each photograph
+    moved: tuple[float, ...] = ()
+    #: share of the subject that refining masks changed in each crop
+    changed: tuple[float, ...] = ()
     refined: Report | None = None  #: what refining the Gaussians gained, where asked; depths stay
-    why: dict[str, str] = field(default_factory=dict)  #: doubts, by the refinement that ``auto`` chose
-    tones: dict[str, float] = field(default_factory=dict)  #: gammas of cameras that were undone, by name
+    #: doubts, by the refinement that ``auto`` chose
+    why: dict[str, str] = field(default_factory=dict)
+    #: gammas of cameras that were undone, by name
+    tones: dict[str, float] = field(default_factory=dict)
 
     @property
     def gaussians(self) -> Gaussians:

@@ -53,7 +53,8 @@ class Rig:
     zoom: Mapping[str, float]  #: factor of their focal lengths
     moved: Mapping[str, float]  #: pixels of a crop that the correction moved the subject by
     why: str = ""  #: what the given cameras contradicted, where ``auto`` decided
-    gains: Mapping[str, np.ndarray] = field(default_factory=dict)  #: [3], with a geometric mean of 1
+    #: [3], with a geometric mean of 1
+    gains: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def applied(self, capture: Capture) -> Capture:
         """Give a capture the corrected cameras.

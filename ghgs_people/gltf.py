@@ -211,7 +211,8 @@ def _skinned(
     chosen = np.concatenate([_values(tree, buffers, attributes[f"JOINTS_{i}"]) for i in sets], 1)
     weights = np.concatenate([_values(tree, buffers, attributes[f"WEIGHTS_{i}"]) for i in sets], 1)
     weights = weights.astype(np.float64)
-    weights[weights.sum(1) <= 0, 0] = 1  # a vertex without weights goes with its first joint, as in viewers
+    # a vertex without weights goes with its first joint, as in viewers
+    weights[weights.sum(1) <= 0, 0] = 1
     total = weights.sum(1, keepdims=True)
     points = np.concatenate((vertices, np.ones((len(vertices), 1))), 1)
     moved = np.zeros_like(vertices)

@@ -96,13 +96,15 @@ class Rig:
 
     positions: int = 16
     radius: float = 2.0  # distance of the cameras from ``look_at``, metres
-    look_at: tuple[float, float, float] = (0.0, 0.85, 0.0)  # the point that all cameras look at, metres
+    # the point that all cameras look at, metres
+    look_at: tuple[float, float, float] = (0.0, 0.85, 0.0)
     pitch: float = -8.0  # degrees; below 0 the cameras look down
     focal: float = 0.8  # focal length as a fraction of the image's height
     # offset of the principal point below the centre, as a fraction of the image's height
     shift_y: float = 25 / 1024
     yaw_jitter: float = 11.0  # largest rotation of the ring of a subject, degrees
-    height: float | None = 1.80  # height that subjects are scaled to, metres (None: they keep their own)
+    # height that subjects are scaled to, metres (None: they keep their own)
+    height: float | None = 1.80
     height_jitter: float = 0.05  # largest deviation from ``height``, metres
     variation: Variation = STILL
 
@@ -183,7 +185,8 @@ class Rig:
         pitch = deviations[..., 0]
         roll = deviations[..., 1]
         shift = deviations[..., 2:]
-        higher = rng.uniform(-1, 1, yaws.shape)  # drawn last, so that the numbers above do not change
+        # drawn last, so that the numbers above do not change
+        higher = rng.uniform(-1, 1, yaws.shape)
         higher[:, :2] = 0
         pitch = v.camera_pitch * pitch + v.between_pitch * higher
         poses = Poses(pitch, v.camera_roll * roll, v.camera_look_at * shift)

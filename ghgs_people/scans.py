@@ -191,7 +191,8 @@ def _texture(path: Path, material: object, is_alone: bool) -> np.ndarray | None:
         InputError: its alpha cuts parts away.
     """
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    if image is not None and image.format is None:  # not from a file: trimesh replaced a missing material
+    # not from a file: trimesh replaced a missing material
+    if image is not None and image.format is None:
         image = None
     factor = getattr(material, "baseColorFactor", None)
     if image is None and factor is not None:  # one plain colour, as buttons and eyes often have

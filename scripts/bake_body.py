@@ -123,7 +123,8 @@ def sample_adults(model: anny.Anny, count: int, rng: np.random.Generator) -> tup
         )
         vertices.append(out["rest_vertices"].numpy())
         joints.append(out["rest_bone_heads"].numpy())
-    turn = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]])  # from z up, facing -y, to y up, facing +z
+    # from z up, facing -y, to y up, facing +z
+    turn = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]])
     return np.concatenate(vertices) @ turn, np.concatenate(joints) @ turn, female, phenotypes["age"]
 
 

@@ -135,7 +135,8 @@ def test_attention_knows_the_true_parts(controls, monkeypatch):
     for similarity in ("product", "none"):
         model = model_of(similarity=similarity)
         tokens, points, result = calls_of(model, batch)
-        assert torch.equal(tokens.semantic, points.shares.sqrt())  # as pictures of attention see them
+        # as pictures of attention see them
+        assert torch.equal(tokens.semantic, points.shares.sqrt())
         results = [result.latent[3]]
         with monkeypatch.context() as patched:
             patched.setattr(controls, "part_shares", lambda batch, patch_size: shares)

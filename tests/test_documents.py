@@ -43,7 +43,8 @@ OPTIONS = {
     "hydra/launcher": {"joblib", "ray", "submitit_local"},
     "hydra/sweeper": {"optuna"},
 }
-NO_MODULES = {"ghgs_lit.plugins", "ghgs_lit.others"}  # a group of entry points, and the format of a file
+# a group of entry points, and the format of a file
+NO_MODULES = {"ghgs_lit.plugins", "ghgs_lit.others"}
 
 
 def _script(name: str):
@@ -63,7 +64,8 @@ def code(document: str) -> list[str]:
     text = (REPOSITORY / document).read_text()
     blocks = re.findall(r"^```(?!python)\w*\n(.*?)^```", text, re.M | re.S)
     prose = re.sub(r"^```.*?^```", "", text, flags=re.M | re.S)
-    prose = re.sub(r"`[^`]*` of commit \w+", "", prose)  # what made a table, and is not needed any more
+    # what made a table, and is not needed any more
+    prose = re.sub(r"`[^`]*` of commit \w+", "", prose)
     return [" ".join(s.split()) for s in [*re.findall(r"(?<!`)`([^`]+)`(?!`)", prose), *blocks]]
 
 
@@ -172,7 +174,8 @@ def test_promised_pythons_agree():
     assert f"Python {versions[0]} to {versions[-1]} on" in (REPOSITORY / "README.md").read_text()
     assert f"{versions[0]} {versions[-1]}" in (REPOSITORY / "scripts" / "test_pythons.sh").read_text()
     markers = re.findall(r"python_version . \W3\.(\d+)", (REPOSITORY / "constraints.txt").read_text())
-    assert all(int(oldest) < int(minor) for minor in markers)  # no pins of versions that are not promised
+    # no pins of versions that are not promised
+    assert all(int(oldest) < int(minor) for minor in markers)
 
 
 def test_commands_are_read_whole(tmp_path, monkeypatch):

@@ -118,7 +118,8 @@ def limited_write(kind, path, answers):
     """In a process of its own: write 4 MB where files may have half of one,
     as on a disk that is full."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 19, 1 << 19))
-    content = {"weights": torch.from_numpy(np.zeros(1 << 20, np.float32))}  # no threads after a fork
+    # no threads after a fork
+    content = {"weights": torch.from_numpy(np.zeros(1 << 20, np.float32))}
     write = {
         "text": lambda temporary: temporary.write_text("x" * (4 << 20)),
         "torch": lambda temporary: torch.save(content, temporary),

@@ -52,7 +52,8 @@ class MyReader(Reader):
         return View(
             image=pixels[..., :3] * mask[..., None],  # on black
             mask=mask,
-            inverse_depth=None,  # CHANGE: uint16, 2^15 / metres, 0 where unknown (data.view.encode_depth)
+            # CHANGE: uint16, 2^15 / metres, 0 where unknown (data.view.encode_depth)
+            inverse_depth=None,
             intrinsics=intrinsics.astype(np.float32),
             extrinsics=extrinsics.astype(np.float32),
         )

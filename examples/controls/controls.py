@@ -97,7 +97,8 @@ class Control(Recalibration):
     def __init__(self, options: ControlOptions, dim_latent: int):
         super().__init__(options, dim_latent)
         self.control = options.control
-        self.register_forward_pre_hook(_with_parts)  # a hook: pictures of attention see these features, too
+        # a hook: pictures of attention see these features, too
+        self.register_forward_pre_hook(_with_parts)
 
     def forward(self, tokens: Tokens, points: KnownPoints, plan) -> Tokens:
         """Recalibrated tokens, changed as ``control`` says.

@@ -102,7 +102,8 @@ class Instants:
         if not names:
             return []
         for name in begin_files(directory, names):
-            if name.startswith("sequence/"):  # of an earlier, longer sequence: programs would play these, too
+            # of an earlier, longer sequence: programs would play these, too
+            if name.startswith("sequence/"):
                 (directory / name).unlink()
         contents = {name: partial(self.others.get, name) for name in self.others}
         contents |= {"viewer.html": self._page, "instants.mp4": self._video}

@@ -56,7 +56,8 @@ def pack(gaussians: Gaussians, pixel: float, center: Tensor, steps: Mapping[str,
     numbers = torch.cat([part.round().long() for part in parts], dim=1).numpy()
     numbers[:, [6, 8]] -= numbers[:, [7]]  # red and blue are like green
     wide, narrow = np.split(np.diff(numbers, axis=0, prepend=0), [_WIDE], axis=1)
-    wide = ((wide << 1) ^ (wide >> 63)).astype("<u4")  # with the sign as last bit, high bytes are mostly 0
+    # with the sign as last bit, high bytes are mostly 0
+    wide = ((wide << 1) ^ (wide >> 63)).astype("<u4")
     planes = wide.view(np.uint8).T.tobytes() + narrow.astype(np.uint8).T.tobytes()
     packer = zlib.compressobj(9, strategy=zlib.Z_FILTERED)
     return packer.compress(planes) + packer.flush()

@@ -85,7 +85,8 @@ class OutputOptions:
     """Choices for the files of a prediction."""
 
     formats: tuple[str, ...] = ("ply",)  #: names of :data:`ghgs_capture.export.prediction.FORMATS`
-    up: str | None = None  #: axis (``y``, ``-y``, ``z``) that points up in files; None: the cameras' world
+    #: axis (``y``, ``-y``, ``z``) that points up in files; None: the cameras' world
+    up: str | None = None
     smooth: bool = False  #: files hold the :func:`smoothed` Gaussians
     frames: int = 24  #: pictures of the turntable
     fps: int = 12  #: pictures per second of the video

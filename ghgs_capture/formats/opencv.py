@@ -25,7 +25,8 @@ IRRELEVANT = (
     *("ignore", "verifiedresolutions", "rectifyalpha", "metadata", "cameras"),
     *("time", "n", "f", "v", "ccm", "bounds"),
 )
-_ROTATIONS = ((3, 3),), ((3,), (3, 1), (1, 3))  # A matrix is preferred to a vector where there are both
+# A matrix is preferred to a vector where there are both
+_ROTATIONS = ((3, 3),), ((3,), (3, 1), (1, 3))
 
 
 class _Loader(yaml.SafeLoader):
@@ -134,7 +135,8 @@ def _by_name(fields: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], dict
         # The longest name: K_1 beside K_cam_1.
         name = max((name for name in cameras if key.endswith(f"_{name}")), key=len, default="")
         field = key.removesuffix(f"_{name}")
-        cameras.get(name, others)["time" if field == "t" else field] = value  # EasyVolcap's t is a time
+        # EasyVolcap's t is a time
+        cameras.get(name, others)["time" if field == "t" else field] = value
     return cameras, others
 
 

@@ -103,7 +103,8 @@ class Verb:
             verb = read_verb(self.name, config)
             if verb.begins_run:
                 run = RunDirectory(directory)
-                run.start(config if run.marker is None else resolve(cfg))  # it compares whole configurations
+                # it compares whole configurations
+                run.start(config if run.marker is None else resolve(cfg))
             write_hydra_files(cfg, directory)
             verb.require_files(config)
             resolve(cfg)  # with all defaults, before the verb imports what takes longer

@@ -143,7 +143,8 @@ def environments() -> list[ClusterEnvironment]:
     """
     if "SLURM_NTASKS" not in os.environ or "TORCHELASTIC_RUN_ID" in os.environ:
         return []
-    try:  # this package stops, saves and queues again: Lightning's own checkpoint may lie within a step
+    # this package stops, saves and queues again: Lightning's own checkpoint may lie within a step
+    try:
         return [SLURMEnvironment(auto_requeue=False) if in_srun() else LightningEnvironment()]
     except RuntimeError as error:
         raise InputError(f"trainer: {error}") from None

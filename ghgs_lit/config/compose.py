@@ -153,7 +153,8 @@ def check_ablation(cfg: DictConfig, hydra_node: DictConfig) -> None:
     name = hydra_node.runtime.choices.get("ablation")
     wanted = _set_by_ablation(name)
     composed = OmegaConf.to_container(cfg)
-    overrides = OmegaConf.to_container(hydra_node.overrides.task)  # with interpolations as they were typed
+    # with interpolations as they were typed
+    overrides = OmegaConf.to_container(hydra_node.overrides.task)
     given = [part.key_or_group for part in OverridesParser.create().parse_overrides(overrides)]
     for key, value in wanted.items():
         present = lookup(composed, key)

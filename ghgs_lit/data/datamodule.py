@@ -226,7 +226,8 @@ class PhotographsDataModule(LightningDataModule):
         reader = packed_reader(reader, packing, data.packed_gb, announce)
         if reader is photographs.reader:
             return photographs
-        return PhotographCache(reader, photographs.size, 0, data.resampling)  # the system keeps pages
+        # the system keeps pages
+        return PhotographCache(reader, photographs.size, 0, data.resampling)
 
     def train_dataloader(self) -> DataLoader:
         """Batches of one epoch, which continues where the last one ended."""

@@ -143,7 +143,8 @@ def area_weights(old: int, new: int) -> "sparse.csr_array":
     """
     from scipy import sparse  # here: a wrong path is refused before it is needed
 
-    edges = np.union1d(np.arange(old + 1) * new, np.arange(new + 1) * old)  # in units of 1 / (old * new)
+    # in units of 1 / (old * new)
+    edges = np.union1d(np.arange(old + 1) * new, np.arange(new + 1) * old)
     middles = (edges[:-1] + edges[1:]) / 2
     places = ((middles / old).astype(int), (middles / new).astype(int))
     shares = (np.diff(edges) / old).astype(np.float32)

@@ -130,7 +130,8 @@ def soft_signed_distance(matte: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "
         return coarse
     away, nearest = distance_transform_edt(~rim, return_indices=True)
     fine = np.where(inside, away, -away) + matte[tuple(nearest)] - 0.5
-    return np.where(np.abs(fine - coarse) < 0.6, fine, coarse)  # a part of the outline may have no rim
+    # a part of the outline may have no rim
+    return np.where(np.abs(fine - coarse) < 0.6, fine, coarse)
 
 
 def with_matte(batch: Batch, least: float | None) -> Batch:

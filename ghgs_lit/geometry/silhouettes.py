@@ -94,7 +94,8 @@ class HullSearch:
     rays: int = 300  # largest number of cells of a mask that are tried
     depths: int = 96  # points along each ray
     reach: float = 1.25  # range of depths around the subject's middle, in radii of the subject
-    others: int | None = None  # largest number of other silhouettes that a ray is compared with; None: all
+    # largest number of other silhouettes that a ray is compared with; None: all
+    others: int | None = None
     wrong: float = 0.0  # share of these that may say "outside"
 
     def shares(self, silhouettes: Sequence[Silhouette]) -> list[float]:

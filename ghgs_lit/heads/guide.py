@@ -65,7 +65,8 @@ class GuidePyramid(nn.Module):
         )
         seen = seen.coarser(4).finer(4, size)
         parts = [part[..., *seen.slices].permute(0, 2, 3, 1) for part in guide]
-        full = F.relu(self.to_full(torch.cat(parts, -1).permute(0, 3, 1, 2)))  # channels are innermost
+        # channels are innermost
+        full = F.relu(self.to_full(torch.cat(parts, -1).permute(0, 3, 1, 2)))
         half = F.relu(self.to_half(full))
         maps = (full, half, F.relu(self.to_quarter(half)))
         return [

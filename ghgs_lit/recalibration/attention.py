@@ -63,7 +63,8 @@ class SemanticAttention(nn.Module):
         self.num_heads = num_heads
         self.similarity = similarity
         inner = dim // 4
-        for name, value in (("one", 1.0), ("zero", 0.0)):  # on the CPU: not in checkpoints, need storage
+        # on the CPU: not in checkpoints, need storage
+        for name, value in (("one", 1.0), ("zero", 0.0)):
             self.register_buffer(name, torch.tensor(value, device="cpu"), persistent=False)
         self.norm1 = nn.LayerNorm(dim)
         self.q_proj = Linear(dim, inner)

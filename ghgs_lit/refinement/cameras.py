@@ -105,7 +105,8 @@ class CameraRefinement:
                 break
             inside = replace(inside, cameras=cameras)
             moved = moved | is_better
-        left = frame.leave_cameras(inside.cameras, batch.cameras)  # to the frame and back is not exact
+        # to the frame and back is not exact
+        left = frame.leave_cameras(inside.cameras, batch.cameras)
         return replace(batch, cameras=_chosen(moved[:, None] & free, left, batch.cameras))
 
     @torch.no_grad()

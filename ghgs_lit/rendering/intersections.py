@@ -177,7 +177,8 @@ class _Fixed(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-@torch.inference_mode(False)  # a validation may ask first, and a training step has them in its graph
+# a validation may ask first, and a training step has them in its graph
+@torch.inference_mode(False)
 def _fixed(images: torch.Size, rows: int, columns: int, device: torch.device) -> _Fixed:
     """Constants of :func:`intersections` on a device, kept for later calls.
 

@@ -55,7 +55,8 @@ def with_known_height(nodes: Mapping[str, Any], trained: Mapping[str, Any]) -> d
     """
     rounds = nodes.get("rounds")
     rounds = OmegaConf.to_container(rounds, resolve=True) if OmegaConf.is_config(rounds) else rounds
-    is_known = isinstance(rounds, Mapping) and rounds.get("kind") == "recurrent"  # not a user's own kind
+    # not a user's own kind
+    is_known = isinstance(rounds, Mapping) and rounds.get("kind") == "recurrent"
     if not is_known or rounds.get("height", "auto") != "auto":
         return dict(nodes)
     sides: list[int] = []

@@ -52,7 +52,8 @@ class CsvLog(_StepsTaken, CSVLogger):
         # A killed run may have left an incomplete last line.
         rows = [row for row in rows if (row.get("step") or "").isdecimal() and int(row["step"]) <= step]
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", ".*will be deleted")  # the rows are written again below
+            # the rows are written again below
+            warnings.filterwarnings("ignore", ".*will be deleted")
             writer = self.experiment  # starts with an empty file
         writer.metrics = [{name: value for name, value in row.items() if value} for row in rows]
         writer.save()

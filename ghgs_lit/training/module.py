@@ -197,7 +197,8 @@ class GHGSModule(BudgetedModule):
         autocast = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else None
         budget = count = None
         shared = self.class_numbers(batch_idx)
-        if self.token_budgets is not None:  # the same in all processes, so that none waits for another
+        # the same in all processes, so that none waits for another
+        if self.token_budgets is not None:
             budget = drawn_budget(self.token_budgets, shared or self.step_numbers(batch_idx))
         if shared and getattr(self.model, "rounds", None) is not None:
             count = drawn_budget(self.model.rounds.options.training_counts, shared, stream=2)

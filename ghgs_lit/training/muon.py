@@ -142,7 +142,8 @@ def _orthogonalized(matrices: Tensor) -> Tensor:
         return _orthogonalized(matrices.mT).mT
     a, b, c = COEFFICIENTS
     largest = torch.linalg.vector_norm(matrices, torch.inf, dim=(1, 2), keepdim=True)
-    matrices = matrices / largest.clamp(min=torch.finfo(matrices.dtype).tiny)  # no square underflows
+    # no square underflows
+    matrices = matrices / largest.clamp(min=torch.finfo(matrices.dtype).tiny)
     gram = matrices @ matrices.mT
     square = gram.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None]  # squared Frobenius norms
     square = square.clamp(min=1)  # below it only for zeros, as the largest value is 1

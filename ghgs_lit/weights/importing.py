@@ -92,7 +92,8 @@ class Source:
     ignored: Sequence[str] = ()  #: prefixes of tensors that are not used
     entry: str | None = None  #: the key of the file that holds its tensors, if any
     used: dict[str, str] = field(default_factory=dict)  #: published names of used tensors by ours
-    skipped: Counter = field(default_factory=Counter)  #: ignored tensors by the first part of their name
+    #: ignored tensors by the first part of their name
+    skipped: Counter = field(default_factory=Counter)
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors of the file, mapped from the disk.

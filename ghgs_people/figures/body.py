@@ -30,8 +30,10 @@ class Surface:
 class BodyModel:
     """The body model as stored in the asset."""
 
-    mean: np.ndarray  # [n + b, 3] float64, the n vertices and then the b joints of the average adult at rest
-    components: np.ndarray  # [k, n + b, 3] float64, principal components for coefficients of unit variance
+    # [n + b, 3] float64, the n vertices and then the b joints of the average adult at rest
+    mean: np.ndarray
+    # [k, n + b, 3] float64, principal components for coefficients of unit variance
+    components: np.ndarray
     bodies: np.ndarray  # [s, k] coefficients of plausible adults
     female: np.ndarray  # [s] bool
     age: np.ndarray  # [s] from 0.67 (young) to 1 (old)

@@ -28,7 +28,8 @@ class Chart:
     weights: np.ndarray  # [g, b] skinning weights
     smooth: sparse.csr_matrix  # [g, g] sparse, one step of Laplacian smoothing
     point_faces: np.ndarray  # [m, 3] triangles over the g points
-    point_of_vertex: np.ndarray  # [c] the point of each textured vertex (a point on a UV seam has several)
+    # [c] the point of each textured vertex (a point on a UV seam has several)
+    point_of_vertex: np.ndarray
     faces: np.ndarray  # [m, 3] triangles over the c textured vertices
     uv: np.ndarray  # [c, 2] of the textured vertices
     place: Place  # of the g points

@@ -260,7 +260,8 @@ def drape_trousers(figure: Figure, bottom: Bottom, noise: Noise) -> np.ndarray:
     points = points + (ease + folds)[:, None] * vertex_normals(points, piece.point_faces)
     if not tight:
         points = _widen_legs(figure, points, place, bottom, folds)
-    drop = max(ANKLE - bottom.hem, 0.0)  # the helper surface ends at the ankle; the hem falls on the shoe
+    # the helper surface ends at the ankle; the hem falls on the shoe
+    drop = max(ANKLE - bottom.hem, 0.0)
     points[:, 1] -= drop * (1 - smoothstep(ANKLE, 0.24, place.y))
     clearance = np.where(place.y < 0.15, -1.0, 0.002)  # the hem may touch the foot
     return _pose(figure, piece, points, clearance)

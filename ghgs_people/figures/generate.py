@@ -257,7 +257,8 @@ def skin_part(
             texture = piece.shaded(texture, ambient_occlusion(piece, points, spheres))
         if name == "skin":
             field = bare_field(piece.place, outfit)
-            under = np.clip(OVERLAP - field, 0.0, OVERLAP)  # skin below clothes must not pierce them
+            # skin below clothes must not pierce them
+            under = np.clip(OVERLAP - field, 0.0, OVERLAP)
             points = points - 0.12 * under[:, None] * vertex_normals(points, piece.point_faces)
         parts.append(piece.mesh(points, field, texture))
     return join(parts)

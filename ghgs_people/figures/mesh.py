@@ -24,7 +24,8 @@ class TexturedMesh:
 
     vertices: np.ndarray  # [n, 3] float32, metres
     faces: np.ndarray  # [m, 3] int64, counter-clockwise seen from outside
-    uv: np.ndarray  # [n, 2] float32, origin at the bottom left of the texture, v upwards, as trimesh has them
+    # [n, 2] float32, origin at the bottom left of the texture, v upwards, as trimesh has them
+    uv: np.ndarray
     texture: np.ndarray  # [h, w, 3] uint8, row 0 at the top
 
     def __post_init__(self) -> None:

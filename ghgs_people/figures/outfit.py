@@ -24,7 +24,8 @@ class Top:
     """A garment for the upper body."""
 
     kind: str  # tee, sweater, shirt, tank or jacket
-    sleeve: float  # length of the sleeves in metres; of a tank, distance of the armholes from the middle
+    # length of the sleeves in metres; of a tank, distance of the armholes from the middle
+    sleeve: float
     hem: float  # height in metres
     neck: str  # neckline: crew, scoop, vee, collar or straps
     ease: float  # air between cloth and body in metres

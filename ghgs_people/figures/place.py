@@ -13,7 +13,8 @@ from ghgs_people.figures.blending import smoothstep
 from ghgs_people.figures.body import load_body
 
 CROTCH = 0.766  # height of the average body's crotch, metres
-EYE = np.array([0.0288, 1.5661, 0.1909])  # centre of the left eye in the frame that faces are described in
+# centre of the left eye in the frame that faces are described in
+EYE = np.array([0.0288, 1.5661, 0.1909])
 
 
 @dataclass(frozen=True)

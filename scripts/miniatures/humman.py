@@ -72,7 +72,8 @@ def _write_sequence(
     rng = np.random.default_rng(identity)
     person, lights = figures.generate(*identity), Lights().draw(rng)
     cameras = _rig(scale, rng)
-    to_world = cameras.extrinsics[0].double().numpy()  # from the floor's frame to that of the first camera
+    # from the floor's frame to that of the first camera
+    to_world = cameras.extrinsics[0].double().numpy()
     from_world = torch.from_numpy(np.linalg.inv(to_world))
     _write_cameras(folder, cameras, from_world)
     for number in frames:

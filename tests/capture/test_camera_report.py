@@ -128,7 +128,8 @@ def test_the_picture_has_the_hull_on_the_mask_and_lines_through_the_body(tmp_pat
     near = np.lib.stride_tricks.sliding_window_view(grown, (9, 9)).any((2, 3))
     assert hull.any()
     assert (hull & near).sum() > 0.3 * hull.sum()
-    line = (picture[14 + 130 + 14 :][:128, 98 : 98 + 96] == (160, 255, 120)).all(-1)  # of the middle point
+    # of the middle point
+    line = (picture[14 + 130 + 14 :][:128, 98 : 98 + 96] == (160, 255, 120)).all(-1)
     assert (line & figure.masks[1]).any()
 
 

@@ -177,7 +177,8 @@ def test_gains_are_found_once_written_and_used_by_the_next_capture(tmp_path, ask
     path.write_text(json_text(rig.calibrations(folder, given)))
     next_one = CaptureFolder(tmp_path / "images" / "1", path)
     capture = Capture("next", next_one.photographs(*next_one.instants))
-    monkeypatch.setattr("ghgs_lit.rounds.rounds.equalized", None)  # what an instant would guess with
+    # what an instant would guess with
+    monkeypatch.setattr("ghgs_lit.rounds.rounds.equalized", None)
     result = predict(capture, model, (112, 112), refine_cameras=0, refine_masks=0)
     plain = given[1].batch((112, 112))
     np.testing.assert_allclose(result.batch.log_gains[0].exp(), found, rtol=1e-6)
@@ -275,5 +276,6 @@ def test_cameras_of_a_rig_are_known_in_any_world_order_and_number():
     off = looking(0, 90, 200, 250)
     between = np.degrees(Rotation.from_matrix(off[1, :3, :3] @ rig[1, :3, :3].T).magnitude())
     assert turned_from(rig, off @ world) == pytest.approx(between, abs=0.1)
-    assert turned_from(rig, looking(0, -70, -200, -250) @ world) > 15  # a mirrored rig is another one
+    # a mirrored rig is another one
+    assert turned_from(rig, looking(0, -70, -200, -250) @ world) > 15
     assert turned_from(rig, looking(0, 70, 200, 250, raised=1.6) @ world) > 10

@@ -89,7 +89,8 @@ def test_a_composed_configuration_has_every_key(group):
         ("gaussian_head.attributes.inward=0.25", "gaussian_head.attributes.inward", 0.25),
         ("optimizer.freeze_until.encoder=0.5", "optimizer.freeze_until.encoder", 0.5),
         ("callbacks.ema.decay=0.5", "callbacks.ema.decay", 0.5),
-        ("trainer.profiler=${data.resampling}", "trainer.profiler", "area"),  # a key that no file says
+        # a key that no file says
+        ("trainer.profiler=${data.resampling}", "trainer.profiler", "area"),
     ],
 )
 def test_a_key_that_no_file_says_can_be_set(override, key, value):

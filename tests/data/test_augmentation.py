@@ -41,7 +41,8 @@ def test_nothing_varies_by_default(root):
     none = compose("train").augmentation
     assert Augmentation.read(none, "augmentation") == Augmentation()
     data = module(root, augmentation=none)
-    builder = dataclasses.replace(data.builder("train"), target_depths=False)  # for measurements alone
+    # for measurements alone
+    builder = dataclasses.replace(data.builder("train"), target_depths=False)
     for step in range(3):
         batch = builder.batch(data.training_sampler().batch(step))
         assert equal(data.training_batch(step), batch)

@@ -107,7 +107,8 @@ def ring(shift=0.0, dtype=torch.float64) -> tuple[Cameras, torch.Tensor, torch.T
         columns, rows = pixels.floor().long().unbind(-1)
         masks[v, rows, columns] = True
     extrinsics = cameras.extrinsics.to(dtype).clone()
-    extrinsics[:, :3, 3] -= shift * extrinsics[:, :3, :3].sum(-1)  # the world's origin moves by (s, s, s)
+    # the world's origin moves by (s, s, s)
+    extrinsics[:, :3, 3] -= shift * extrinsics[:, :3, :3].sum(-1)
     return Cameras(cameras.intrinsics.to(dtype), extrinsics, 96, 72), masks, points + shift
 
 

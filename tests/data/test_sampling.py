@@ -141,7 +141,8 @@ def test_batches_have_the_shapes_and_values_they_promise(root):
     assert torch.equal(batch.depths > 0, batch.alpha > 0)
     assert torch.equal(batch.masks, batch.alpha > 0.5)
     assert ((batch.alpha > 0) & (batch.alpha < 1)).any()
-    assert (batch.images.amax(2) <= batch.alpha + 4 / 255).all()  # premultiplied; JPEG may add a little
+    # premultiplied; JPEG may add a little
+    assert (batch.images.amax(2) <= batch.alpha + 4 / 255).all()
     assert [len(v) for v in batch.views] == [4, 4]
     # Antialiased rims stay: some light outside the mask.
     outside = batch.images.movedim(2, -1)[~batch.masks]

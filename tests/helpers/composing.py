@@ -20,7 +20,8 @@ from omegaconf import DictConfig, ListConfig, OmegaConf, omegaconf
 
 _load, _merge = ConfigRepository.load_config, ConfigLoaderImpl._compose_config_from_defaults_list
 _map = getattr(defaults_list, "_create_interpolation_map", None)  # of Hydra 1.3 alone
-_pickled: dict[tuple, bytes] = {}  # what is composed is changed afterwards: each caller gets its own
+# what is composed is changed afterwards: each caller gets its own
+_pickled: dict[tuple, bytes] = {}
 
 
 def _map_where_needed(overrides, defaults, *arguments):

@@ -20,7 +20,8 @@ def kernels() -> Iterator[list[str]]:
     pytest.importorskip("triton")
     from ghgs_lit.kernels import tiles  # here: it imports Triton
 
-    called, rows = [], tiles.ROWS if DEVICE.type == "cuda" else 4096  # the interpreter is as fast for more
+    # the interpreter is as fast for more
+    called, rows = [], tiles.ROWS if DEVICE.type == "cuda" else 4096
 
     def noted(name):
         def call(*inputs):

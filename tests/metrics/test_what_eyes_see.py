@@ -106,7 +106,8 @@ def test_light_beside_the_subject_and_sharpness_inside_it():
     assert spill(image, target, ~mask & mask).isnan().all()
     phase = torch.pi * torch.arange(40.0) / 2
     grating = (0.5 + 0.2 * torch.cos(phase)).expand(1, 3, 40, 40)
-    blurred = (grating.roll(1, -1) + grating.roll(-1, -1) + 2 * grating) / 4  # halves this frequency
+    # halves this frequency
+    blurred = (grating.roll(1, -1) + grating.roll(-1, -1) + 2 * grating) / 4
     assert sharpness(blurred, grating, mask).item() == pytest.approx(0.25, rel=1e-4)
     assert sharpness(grating, grating, mask).item() == 1
     assert sharpness(grating, torch.ones_like(grating), mask).isnan().all()

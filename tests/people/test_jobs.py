@@ -196,7 +196,8 @@ def test_a_script_without_a_main_guard_ends_with_a_reason(scans, tmp_path):
 
 def test_several_workers_make_the_same_files(scans, reference, tmp_path, monkeypatch):
     """Files are independent of the number of processes."""
-    monkeypatch.setattr(jobs.multiprocessing, "get_context", lambda *_: PREPARED)  # spawned ones import all
+    # spawned ones import all
+    monkeypatch.setattr(jobs.multiprocessing, "get_context", lambda *_: PREPARED)
     render_boxes(tmp_path / "out", scans, 3, 1, settings=SMALL, workers=2)
     assert contents(tmp_path / "out") == reference
 

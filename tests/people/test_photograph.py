@@ -295,7 +295,8 @@ def test_shadows_are_soft():
 
     light = lights.shade(points, np.tile(np.float32([0, 1, 0]), (len(points), 1)), is_blocked)[:201, 0]
     x = np.clip(fine / (height * np.tan(np.radians(20))), -1, 1)
-    share = 1 - (np.pi / 2 + np.arcsin(x) + x * np.sqrt(1 - x**2)) / np.pi  # of the disc beside the screen
+    # of the disc beside the screen
+    share = 1 - (np.pi / 2 + np.arcsin(x) + x * np.sqrt(1 - x**2)) / np.pi
     cosine = (lights.directions[0] @ [0, 1, 0]).mean()
     # Two of twelve samples.
     np.testing.assert_allclose((light**2.2 - 0.1) / lights.strengths[0] / cosine, share, atol=2 / 12)

@@ -28,7 +28,8 @@ def test_obj_scans_are_loaded_as_they_are(tmp_path):
     assert np.abs(part.texture.reshape(-1, 3).mean(0) - [200, 90, 30]).max() < 3
     assert person.body_vertices.dtype == np.float32
     assert len(person.body_vertices) == 8
-    (tmp_path / "a" / "material0.mtl").unlink()  # often lost: the picture beside the mesh is found anyway
+    # often lost: the picture beside the mesh is found anyway
+    (tmp_path / "a" / "material0.mtl").unlink()
     assert ScanSource(tmp_path).load("a").parts[0].texture.shape == (4, 4, 3)
 
 
@@ -38,7 +39,8 @@ def test_names_of_windows_programs(tmp_path):
     folder = tmp_path / "a"
     (folder / "textures").mkdir()
     (folder / "material0.jpeg").rename(folder / "textures" / "My Skin.JPEG")
-    Image.new("RGB", (4, 4)).save(folder / "black.png")  # beside the mesh, so that nothing is guessed
+    # beside the mesh, so that nothing is guessed
+    Image.new("RGB", (4, 4)).save(folder / "black.png")
     Image.new("RGB", (4, 4)).save(folder / "white.png")
     (folder / "material0.mtl").rename(folder / "Material0.MTL")
     (folder / "a.obj").rename(folder / "a.OBJ")

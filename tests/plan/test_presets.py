@@ -20,7 +20,8 @@ def people():
     masks = torch.zeros(3, 3, 84, 84, dtype=torch.bool)
     masks[0] = True  # exact: there is no background
     masks[1, :, 20:78, 20:78] = True  # balanced: the margin of fast is more than the window
-    masks[2, :, 2:12, 2:12] = masks[2, :, 72:82, 72:82] = True  # fast: two people, far from each other
+    # fast: two people, far from each other
+    masks[2, :, 2:12, 2:12] = masks[2, :, 72:82, 72:82] = True
     return [replace(make_batch(1, 3, 84, 84), masks=mask[None]) for mask in masks]
 
 

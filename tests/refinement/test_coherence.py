@@ -174,7 +174,8 @@ def test_gradients_are_those_of_finite_differences():
     points = 0.3 * torch.randn(40, 3, generator=torch.Generator().manual_seed(2))
     other = torch.arange(40) % 4
     gradients = rays.gradients_of(outlines, lens, pose, points, other)
-    middle = torch.tensor([0.2, -0.1, 0.3])  # a turn is about the frame's origin, not about the subject
+    # a turn is about the frame's origin, not about the subject
+    middle = torch.tensor([0.2, -0.1, 0.3])
     rows = rays.rows_of(points, gradients, pose[other], middle)
 
     def distances(step):

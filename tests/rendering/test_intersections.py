@@ -25,7 +25,8 @@ def splats(images, count, height, width, seed=0):
     radii = (torch.rand(images, count, 2, generator=generator) * 24 - 2).clamp(min=0).ceil().int()
     depths = 1 + torch.rand(images, count, generator=generator)
     depths[:, ::5] = 1.5
-    centers[:, ::7] = float("nan")  # gsplat leaves values of splats that it does not draw as they were
+    # gsplat leaves values of splats that it does not draw as they were
+    centers[:, ::7] = float("nan")
     radii[:, ::7] = 0
     return centers - 10, radii, depths
 

@@ -22,7 +22,8 @@ from ghgs_lit.types import DepthBounds, DepthMaps, Tokens
 from tests.helpers.models import ATTRIBUTES, close, make_model
 from tests.helpers.scenes import in_dtype, make_batch, with_soft_rims
 
-SIDE = 112  #: of photographs that are too large for weights that know a subject of ``HEIGHT`` pixels
+#: of photographs that are too large for weights that know a subject of ``HEIGHT`` pixels
+SIDE = 112
 HEIGHT = 40
 
 
@@ -96,7 +97,8 @@ def test_enlarged_depths_lie_on_planes_up_to_a_pixel_beyond_what_is_known():
         return 1 / (0.4 + 0.1 * along[:, None] + 0.05 * along).expand(1, 1, side, side)
 
     found = enlarged(DepthMaps(plane(24), plane(24) > 0, plane(24)), (60, 60))
-    inner = (..., slice(2, -2), slice(2, -2))  # beyond the outermost centres nothing is interpolated
+    # beyond the outermost centres nothing is interpolated
+    inner = (..., slice(2, -2), slice(2, -2))
     torch.testing.assert_close(found[inner], plane(60)[inner], rtol=1e-12, atol=0)
     known = torch.ones(1, 1, 24, 24, dtype=torch.bool)
     known[..., :6] = False
@@ -195,7 +197,8 @@ def test_the_training_says_what_height_the_weights_know(trained, height):
         assert with_known_height(nodes, trained) == nodes
     assert with_known_height({"model": {}}, trained) == {"model": {}}
     side = lookup_side(trained)
-    if side is not None:  # what fits into a photograph of the training is never predicted from a copy
+    # what fits into a photograph of the training is never predicted from a copy
+    if side is not None:
         batch = make_batch(1, 2, side, side)
         filled = dataclasses.replace(batch, masks=torch.ones_like(batch.masks))
         assert coarse_sizes(filled, height, 14) == [None]

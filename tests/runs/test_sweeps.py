@@ -129,7 +129,8 @@ def test_an_interrupted_run_resumes_and_a_failed_one_is_tried_again(sweep, monke
     code, _, _ = sweep("seed=3,1,2,4")
     assert code == 130
     assert len(executed(sweep.directory)) == 1
-    assert len(list(sweep.directory.glob("*/config.yaml"))) == 4  # tables list planned runs as missing
+    # tables list planned runs as missing
+    assert len(list(sweep.directory.glob("*/config.yaml"))) == 4
     _, out, _ = sweep("seed=1,2,3,4", "dry_run=true")
     assert "4 runs: 1 done, 1 partial, 1 failed, 1 missing" in out
     monkeypatch.setattr(train_verb, "train", record_execution)

@@ -140,7 +140,8 @@ def test_distributions_are_of_the_predicted_gaussians(run):
         histogram = drawn[0].histogram_value
         assert (histogram.min, histogram.max) == pytest.approx((value, value))
         assert histogram.num > 100
-    assert "values/offset_mm" not in found.Tags()["histograms"]  # pixels of its Gaussians are not known
+    # pixels of its Gaussians are not known
+    assert "values/offset_mm" not in found.Tags()["histograms"]
 
 
 def test_offsets_are_distances_from_the_pixels_points():
@@ -316,7 +317,8 @@ def test_final_numbers_name_their_protocol():
 def test_memory_is_that_of_this_process():
     """The unit is bytes and the value follows what is allocated."""
     before = resident_bytes()
-    with mmap.mmap(-1, 64 << 20) as block:  # a tensor may lie in memory that the process has already
+    # a tensor may lie in memory that the process has already
+    with mmap.mmap(-1, 64 << 20) as block:
         block.write(b"1" * (64 << 20))
         assert resident_bytes() - before > 40 << 20
 

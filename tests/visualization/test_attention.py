@@ -89,7 +89,8 @@ def test_the_chosen_token_is_of_its_element_and_has_a_point():
         query = chosen_token(tokens, points, element)
         assert int(tokens.image[query]) == element * 3
         assert points.tokens_valid[query]
-    query = chosen_token(tokens, points, 1, (2, 0, 0))  # nothing there: the nearest that has a point
+    # nothing there: the nearest that has a point
+    query = chosen_token(tokens, points, 1, (2, 0, 0))
     assert int(tokens.image[query]) == 5
     with pytest.raises(InputError, match=r"callbacks\.pictures\.token"):
         chosen_token(tokens, points, 0, (3, 0, 0))

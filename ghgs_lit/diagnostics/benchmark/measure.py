@@ -26,7 +26,8 @@ ATTRIBUTES = ("means", "quaternions", "scales", "opacities", "colors")
 #: (which of two points is nearer, whether a splat is drawn at all), single values change as
 #: far as they may.
 MOST = 0.99
-_ROUNDINGS = 2  #: Random roundings of photographs that :func:`amplification` takes the larger effect of
+#: Random roundings of photographs that :func:`amplification` takes the larger effect of
+_ROUNDINGS = 2
 
 
 def relative_difference(found: Tensor, expected: Tensor, share: float = 1.0) -> float:

@@ -21,7 +21,8 @@ from ghgs_lit.weights.checkpoint import check_preset, load_weights, read_checkpo
 YARDSTICK = "none"  #: Preset that all others are compared with
 #: Nodes of a configuration that a model is built from, beside ``skip``.
 MODEL_NODES = (*STAGES, "rounds", "model")
-KNOBS = (*STAGES, "rounds", "skip", "model", "renderer", "precision")  #: Nodes that knobs can change
+#: Nodes that knobs can change
+KNOBS = (*STAGES, "rounds", "skip", "model", "renderer", "precision")
 
 
 @dataclass(frozen=True)

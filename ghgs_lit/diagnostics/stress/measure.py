@@ -63,7 +63,8 @@ def measure(
         else:
             check = _comparison(stage, family, cases)
         outcomes = {dtype: check(dtype) for dtype in chosen}
-    except Exception as error:  # whatever a stage raises is a failure of its own, and the others go on
+    except Exception as error:
+        # whatever a stage raises is a failure of its own, and the others go on
         message = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
         none = torch.full((len(seeds),), torch.inf)
         outcomes = dict.fromkeys(chosen, Outcome(none, none > 0, [message] * len(seeds)))

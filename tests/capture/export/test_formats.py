@@ -103,7 +103,8 @@ def test_a_glb_has_the_khronos_extension_and_stands_upright(gaussians, tmp_path)
     assert decibels(read, gaussians) > 80
     turned = Rotation.from_quat(model.nodes[0].rotation).apply(UP.numpy())
     assert np.allclose(turned, [0, 1, 0], atol=1e-6)
-    cloud = trimesh.load(tmp_path / "a.glb").to_geometry()  # as points, for programs without the extension
+    # as points, for programs without the extension
+    cloud = trimesh.load(tmp_path / "a.glb").to_geometry()
     upright = gaussians.means.numpy() * [1, -1, -1]
     assert np.allclose(np.sort(cloud.vertices[:, 1]), np.sort(upright[:, 1]), atol=1e-5)
     colors = (gaussians.colors.clamp(0, 1) * 255).round().numpy()
@@ -119,7 +120,8 @@ def test_a_ply_is_lossless(gaussians, tmp_path):
 def test_a_page_holds_the_scene_and_needs_no_network(gaussians, tmp_path):
     """One file: no address, the Gaussians, the cameras; names cannot end the script."""
     cameras = camera_ring(2, 100, 80)[0]
-    name, wicked = "</title><script>{{data}}", "</script><!--<script>"  # the last two open a second script
+    # the last two open a second script
+    name, wicked = "</title><script>{{data}}", "</script><!--<script>"
     subject = SimpleNamespace(gaussians=gaussians, cameras=cameras, views=("a", wicked), up=UP)
     subject.center = torch.tensor([0.0, 0.1, 0.2])
     subject.pixel = pixel_size(cameras, subject.center)

@@ -43,7 +43,8 @@ def test_gaussians_come_back_within_half_a_step_in_their_order(gaussians, steps,
     assert (found.opacities - gaussians.opacities).abs().max() <= 0.501 / steps["opacity"]
     assert (found.colors - gaussians.colors).abs().max() <= 0.501 / 255
     cosines = (normalize(found.quaternions) * normalize(gaussians.quaternions)).sum(-1).abs()
-    assert cosines.min() > math.cos(math.radians(degrees) / 2)  # half a step of all three numbers, four times
+    # half a step of all three numbers, four times
+    assert cosines.min() > math.cos(math.radians(degrees) / 2)
 
 
 def test_floaters_and_scales_of_nothing_stay_finite(gaussians):

@@ -286,7 +286,8 @@ def test_gaussians_for_other_viewers_stay_as_they_are():
 def test_no_picture_of_a_turntable_cuts_the_subject(tmp_path):
     """Also where optical axes meet elsewhere: crops have their principal point anywhere."""
     gaussians, cameras = body(1500, 60), camera_ring(3, 60, 60)
-    shift = torch.tensor([0.0, 0.7, 0.0])  # what is photographed is above the point that all cameras look at
+    # what is photographed is above the point that all cameras look at
+    shift = torch.tensor([0.0, 0.7, 0.0])
     gaussians = dataclasses.replace(gaussians, means=gaussians.means + shift)
     intrinsics = cameras.intrinsics.clone()
     intrinsics[..., 1, 2] -= 0.7 / 3.0 * intrinsics[..., 1, 1]

@@ -37,7 +37,8 @@ def test_an_option_of_the_model_beside_a_checkpoint_is_refused(monkeypatch):
 def test_frames_in_flight_are_drawn_by_processes(monkeypatch, capsys):
     """Each of which has a part of the threads; the table is that of one frame after the other."""
     monkeypatch.setattr(sys, "argv", [str(SCRIPT), *SMALL, "--in-flight", "2", "presets=[exact]"])
-    monkeypatch.setattr(script.multiprocessing, "get_context", lambda *_: PREPARED)  # spawned ones import all
+    # spawned ones import all
+    monkeypatch.setattr(script.multiprocessing, "get_context", lambda *_: PREPARED)
     with threads(1):
         script.main()
     lines = [line.split("|") for line in capsys.readouterr().out.splitlines() if line[:2] == "| "]

@@ -83,7 +83,8 @@ def test_it_checks_what_a_user_has(monkeypatch):
         return right(self, batch, kept, coarse)
 
     monkeypatch.setattr(GHGS, "predict", noted)
-    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)  # PyTorch's default, which trainings change
+    # PyTorch's default, which trainings change
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)
     with pretend_device():
         found = [*stages(settings(), DEVICE), *gradient(settings(), DEVICE)]
     assert failures(found) == []
