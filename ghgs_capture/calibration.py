@@ -223,8 +223,8 @@ def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[in
     if size != photograph:
         if not same_ratio(size, photograph):
             raise InputError(
-                f"{camera.origin}: expected a photograph of {height}x{width} (height x width) or scaled "
-                f"from it, as it was calibrated; found {photograph[0]}x{photograph[1]}"
+                f"{camera.origin}: expected a photograph of {height}x{width} (height x width) or "
+                f"scaled from it, as it was calibrated; found {photograph[0]}x{photograph[1]}"
             )
         intrinsics[:2] *= np.array([[photograph[1] / width], [photograph[0] / height]])
     intrinsics[:2] *= convention.resized

@@ -156,8 +156,8 @@ def require_all_read(
             continue
         if kind in PICTURES.split() or not begins.isdisjoint(known):
             raise InputError(
-                f"{path}: expected a file that can be read ({', '.join(suffixes)}); found another kind"
-                " (convert it, or move it elsewhere to do without it)"
+                f"{path}: expected a file that can be read ({', '.join(suffixes)}); found another"
+                " kind (convert it, or move it elsewhere to do without it)"
             )
 
 

@@ -65,8 +65,8 @@ def placement_lines(photographs: Sequence[Photograph], stored: Sequence[np.ndarr
     gap, before, after = _largest_gap(photographs, sight)
     if gap > _GAP:
         lines.append(
-            f"no camera for {gap:.0f} degrees between {before} and {after}: what only that side shows is a"
-            " guess, and one more camera there helps most"
+            f"no camera for {gap:.0f} degrees between {before} and {after}: what only that side"
+            " shows is a guess, and one more camera there helps most"
         )
     return lines
 
@@ -82,8 +82,8 @@ def _coarse(
     if off < _COARSE or not all(map(_is_float32, np.stack(stored)[:, :3, 3].ravel())):
         return []
     return [
-        f"cameras are {far.max():.2g} units from the world's origin, in float32: off by up to {off:.1g} of"
-        f" {_SIDE} pixels; float64, or a nearer origin, has none of this"
+        f"cameras are {far.max():.2g} units from the world's origin, in float32: off by up to"
+        f" {off:.1g} of {_SIDE} pixels; float64, or a nearer origin, has none of this"
     ]
 
 

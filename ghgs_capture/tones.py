@@ -69,8 +69,8 @@ def tone_lines(tones: Mapping[str, float], what_is_done: str) -> Iterator[str]:
     """
     for name, gamma in tones.items():
         yield (
-            f"photograph {name} has a gamma of about {gamma:.2f} beside the others: a tone curve, profile or"
-            f" contrast of its own, {what_is_done}"
+            f"photograph {name} has a gamma of about {gamma:.2f} beside the others: a tone curve,"
+            f" profile or contrast of its own, {what_is_done}"
         )
 
 

@@ -91,8 +91,8 @@ def _read(path: Path) -> tuple[dict[str, Any], list[bytes]]:
 def _check_extensions(path: Path, tree: dict[str, Any]) -> None:
     required = [name for name in tree.get("extensionsRequired", []) if not name.startswith(_READ)]
     expected = (
-        "a mesh without extensions (npx @gltf-transform/cli dequantize in.glb out.glb removes compression, or"
-        " export it uncompressed)"
+        "a mesh without extensions (npx @gltf-transform/cli dequantize in.glb out.glb removes"
+        " compression, or export it uncompressed)"
     )
     require(not required, str(path), expected, ", ".join(required))
 

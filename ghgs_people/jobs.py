@@ -356,8 +356,8 @@ def _check_main_guard() -> None:
     # Set by multiprocessing while a spawned process imports the main module of its parent.
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         raise InputError(
-            f"{sys.argv[0]}: expected `{_GUARD}` around what a script does (rendering processes import it), "
-            "or data.render_workers=0; found neither"
+            f"{sys.argv[0]}: expected `{_GUARD}` around what a script does (rendering processes "
+            "import it), or data.render_workers=0; found neither"
         )
 
 

@@ -45,8 +45,8 @@ class Progress(Completeness):
         stored = self.lights
         if wanted != stored:
             raise InputError(
-                f"{path}: expected data.render.lights={wanted}; found {stored} (render into another folder,"
-                f" or data.render.lights={stored} goes on with this one)"
+                f"{path}: expected data.render.lights={wanted}; found {stored} (render into another"
+                f" folder, or data.render.lights={stored} goes on with this one)"
             )
         kept = flatten(read_json(path))
         settings = flatten(json.loads(json.dumps(settings)))  # tuples to lists, as they were stored

@@ -70,7 +70,7 @@ def _format_of(path: Path) -> str:
     elif suffix in (".bin", ".txt") and model_folder(folder) is not None:
         return "colmap"
     raise InputError(
-        f"{path}: expected JSON, transforms.json, a COLMAP model, YAML of OpenCV or EasyMocap, TOML, or"
-        f" Qualisys' .qca.txt; "
-        f"found {'a folder without any' if path.is_dir() else repr(path.suffix)}"
+        f"{path}: expected JSON, transforms.json, a COLMAP model, YAML of OpenCV or EasyMocap,"
+        " TOML, or Qualisys' .qca.txt; found"
+        f" {'a folder without any' if path.is_dir() else repr(path.suffix)}"
     )

@@ -320,8 +320,8 @@ class Entries:
         }
         lens = [key for key, value in left.items() if _bends(plain(key), value)]
         expected = (
-            "lens distortion as D or dist: k1 k2 p1 p2 k3 k4 k5 k6, with fisheye k1 k2 k3 k4, and no other"
-            " camera model"
+            "lens distortion as D or dist: k1 k2 p1 p2 k3 k4 k5 k6, with fisheye k1 k2 k3 k4, and"
+            " no other camera model"
         )
         require(not lens, self.origin, expected, lens)
         return tuple(left)

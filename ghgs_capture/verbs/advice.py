@@ -52,8 +52,8 @@ def advice_of(directory: Path) -> Iterator[str]:
         left = [key for key in ("refine_cameras", "refine_masks") if key not in report]
         hint = f" ({' and '.join(f'{key}=4' for key in left)} may mend them)" if left else ""
         yield (
-            f"photographs come back at {low:.1f} to {high:.1f} dB only, sound ones at 30 or more: mostly"
-            f" cameras or masks are off{hint}; sheet.png shows where"
+            f"photographs come back at {low:.1f} to {high:.1f} dB only, sound ones at 30 or more:"
+            f" mostly cameras or masks are off{hint}; sheet.png shows where"
         )
 
 

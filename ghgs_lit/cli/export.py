@@ -72,8 +72,8 @@ def run(options: "Export", cfg: DictConfig) -> None:
         sizes = (file_of(path).stat().st_size / 1e6 for path in (checkpoint, inference))
         print("{:.1f} MB to {:.1f} MB".format(*sizes), flush=True)
         print(
-            f"against the checkpoint, on an ellipsoid: {measured['psnr_to_none']:.1f} dB between renders;"
-            f" largest relative difference of depth {measured['depth']:.1e},"
+            f"against the checkpoint, on an ellipsoid: {measured['psnr_to_none']:.1f} dB between"
+            f" renders; largest relative difference of depth {measured['depth']:.1e},"
             f" of means {measured['means']:.1e}",
             flush=True,
         )

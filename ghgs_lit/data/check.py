@@ -277,9 +277,9 @@ def _compare_subject(seen: Sequence[Seen], reader: Reader, least: float) -> None
     worst = min(seen, key=lambda one: one.agreement)
     if worst.agreement < least:
         worst.problem = (
-            f"{reader.place(*worst.photograph)}: expected a mask that the others of its subject allow "
-            f"({least:.0%} of it or more); found {worst.agreement:.0%} (wrong axes, units, direction or size "
-            "of a camera?)"
+            f"{reader.place(*worst.photograph)}: expected a mask that the others of its subject "
+            f"allow ({least:.0%} of it or more); found {worst.agreement:.0%} (wrong axes, units, "
+            "direction or size of a camera?)"
         )
 
 
@@ -290,8 +290,8 @@ def _notes(published: int | None, phase: str, results: Phase) -> list[str]:
         notes.append(f"{phase}: expected {published} people as published; found {reader.people}")
     if results.bodies < len(reader.subjects):
         notes.append(
-            f"{phase}: expected a body for each of {len(reader.subjects)} subjects; found {results.bodies} "
-            "(no Chamfer term; cameras are checked by their masks alone)"
+            f"{phase}: expected a body for each of {len(reader.subjects)} subjects; found "
+            f"{results.bodies} (no Chamfer term; cameras are checked by their masks alone)"
         )
     if sizes := results.known("tall"):
         tall = np.median(sizes)
@@ -320,8 +320,8 @@ def _notes_on_lights(wanted: str, stored: str | None, phase: str, results: Phase
     bright = np.mean(results.known("bright") or [0.0])
     why = "lit again where textures have light of their own" if stored == "studio" else "not lit"
     return [
-        f"{phase}: expected renders with data.render.lights={wanted}; found {stored} ({why}), subjects of"
-        f" {bright:.3f} of full brightness (errors of darker ones count less in dB)"
+        f"{phase}: expected renders with data.render.lights={wanted}; found {stored} ({why}),"
+        f" subjects of {bright:.3f} of full brightness (errors of darker ones count less in dB)"
     ]
 
 

@@ -42,8 +42,8 @@ def read_photograph(path: Path) -> np.ndarray:
     if turn != UPRIGHT:
         # Programs disagree on whether a calibration belongs to the stored or to the turned pixels.
         raise InputError(
-            f"{path}: expected a photograph that is stored as it is shown (its mask and camera fit these "
-            f"pixels); found EXIF orientation {turn}"
+            f"{path}: expected a photograph that is stored as it is shown (its mask and camera fit "
+            f"these pixels); found EXIF orientation {turn}"
         )
     return rgb_of(image, path)
 

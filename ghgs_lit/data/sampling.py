@@ -255,8 +255,8 @@ class TrainingSampler:
         for name, positions in self.subjects.items():
             if len(positions) < max(wanted, most):
                 raise InputError(
-                    f"views.training_counts: expected {wanted} ring positions of subject {name} to draw "
-                    f"{most} views from; found {len(positions)}"
+                    f"views.training_counts: expected {wanted} ring positions of subject {name} to "
+                    f"draw {most} views from; found {len(positions)}"
                 )
 
     def batch(self, step: int, rank: int = 0, world: int = 1) -> list[SampleSpec]:
@@ -328,8 +328,8 @@ def evaluation_samples(
     for name, available in subjects.items():
         if lacking := sorted(set(inputs) - set(available)):
             raise InputError(
-                f"evaluation with {count} views: expected ring positions {inputs} of subject {name}; "
-                f"found no position {lacking[0]}"
+                f"evaluation with {count} views: expected ring positions {inputs} of subject "
+                f"{name}; found no position {lacking[0]}"
             )
         each = [p.evaluation(available, inputs, ring, subject_rng(seed, name)) for p in protocols]
         names = []

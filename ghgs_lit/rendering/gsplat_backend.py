@@ -52,10 +52,10 @@ def load() -> Any:
         # Building gsplat's kernels can fail in many ways; the message repeats the reason.
         reason = str(error).strip().splitlines()
         raise BackendUnavailable(
-            "renderer.backend=gsplat: `import gsplat` failed with "
-            f"{type(error).__name__}: {reason[0] if reason else 'no message'}; install the extra with "
-            "`pip install 'ghgs-lit[gpu]'` (it needs a CUDA compiler or a prebuilt gsplat wheel for "
-            f"torch {torch.__version__}, CUDA {torch.version.cuda})"
+            f"renderer.backend=gsplat: `import gsplat` failed with {type(error).__name__}: "
+            f"{reason[0] if reason else 'no message'}; install the extra with `pip install "
+            "'ghgs-lit[gpu]'` (it needs a CUDA compiler or a prebuilt gsplat wheel for torch "
+            f"{torch.__version__}, CUDA {torch.version.cuda})"
         ) from error
 
 

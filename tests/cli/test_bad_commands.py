@@ -109,8 +109,8 @@ def test_a_disk_that_refuses_a_file_is_one_line_with_its_path(
     verb = command.split()[0]
     assert code == 1, text
     assert text == (
-        f"ghgs {verb}: {tmp_path}/run/.hydra/config.yaml: expected a file that can be read or written;"
-        f" found {os.strerror(number)}\n"
+        f"ghgs {verb}: {tmp_path}/run/.hydra/config.yaml: expected a file that can be read or"
+        f" written; found {os.strerror(number)}\n"
     )
 
 

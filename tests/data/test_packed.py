@@ -156,8 +156,8 @@ def test_size_and_place_are_said_once(root, caplog):
     line = next(record.message for record in caplog.records if "packed" in record.message)
     whole = sum(path.stat().st_size for path in files(root)) / 1e9
     assert line == (
-        f"photographs of training are packed: about {whole:.2g} GB for 2 subjects in {root / 'packed'} "
-        "(data.packed_gb=0: none)"
+        f"photographs of training are packed: about {whole:.2g} GB for 2 subjects in "
+        f"{root / 'packed'} (data.packed_gb=0: none)"
     )
 
 

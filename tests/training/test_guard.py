@@ -78,8 +78,8 @@ def test_a_step_that_is_not_finite_is_skipped_and_counted(tmp_path, capsys):
     lines = [line for line in capsys.readouterr().out.splitlines() if "skipped" in line]
     assert len(lines) == 2
     assert lines[0].startswith(
-        "step 1: expected a finite loss and gradient; found 768 of 1536 values are not finite in the data"
-        " that enters the model (batch.targets.images, subject p1); `ghgs stress dump="
+        "step 1: expected a finite loss and gradient; found 768 of 1536 values are not finite in"
+        " the data that enters the model (batch.targets.images, subject p1); `ghgs stress dump="
     )
     # A second fault of the same stage says the same: one file is enough.
     assert [path.name for path in (tmp_path / "faults").iterdir()] == ["step_000001.pt"]

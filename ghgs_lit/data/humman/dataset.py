@@ -147,8 +147,8 @@ class HuMManReader(FrameReader):
             positions_of[number] = tuple(k for k in KINECTS if number in there[k])
         if not positions_of:
             raise InputError(
-                f"{path / 'kinect_color'}: expected frames such as {frames[0]:06d}.png; found none of "
-                f"{len(frames)} (frame numbers are multiples of 6)"
+                f"{path / 'kinect_color'}: expected frames such as {frames[0]:06d}.png; found none "
+                f"of {len(frames)} (frame numbers are multiples of 6)"
             )
         if len(positions_of) < len(frames):
             log.info("%s: %d of %d frames are there", path, len(positions_of), len(frames))

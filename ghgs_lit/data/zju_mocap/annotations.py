@@ -62,8 +62,8 @@ def read_annotations(path: Path) -> Annotations:
     spread = np.linalg.norm(centers - centers[0], axis=-1).max()
     if len(centers) > 1 and spread < _NEAREST:
         raise InputError(
-            f"{path}: expected translations T in millimetres; found cameras within {spread * 1000:.0f} mm of "
-            "one another (metres?)"
+            f"{path}: expected translations T in millimetres; found cameras within "
+            f"{spread * 1000:.0f} mm of one another (metres?)"
         )
     lenses = [check_intrinsics(f"{path}: K of camera {k}", m) for k, m in enumerate(lists["K"])]
     return Annotations(

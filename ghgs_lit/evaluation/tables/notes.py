@@ -10,9 +10,9 @@ from ghgs_lit.evaluation.tables.records import ablation_sets
 from ghgs_lit.evaluation.tables.significance import POWER, RATIO
 
 FOOTNOTE = (
-    "All four combinations are listed. The paper's Table 4 prints three and has (✗, ✓) among them, while its"
-    " text says that semantic consistency alone is not included. Without 3D unprojection there are no token"
-    " points: neighbours are then found on the image plane."
+    "All four combinations are listed. The paper's Table 4 prints three and has (✗, ✓) among them,"
+    " while its text says that semantic consistency alone is not included. Without 3D unprojection"
+    " there are no token points: neighbours are then found on the image plane."
 )
 NO_SEMANTICS = "features carry no semantics: this encoder was never trained for semantics"
 MARK = "*"
@@ -73,9 +73,9 @@ def write_notes(table: Table) -> list[str]:
         notes.append("FLIP replaces the paper's LPIPS, which at least one run could not compute.")
     if table.reported_on:
         notes.append(
-            f"Reported: figures that {reported_source()}, prints for {table.reported_on}, measured by its"
-            " authors on their data, split and views. They were not measured here, and are not comparable"
-            " with figures on other data or protocols."
+            f"Reported: figures that {reported_source()}, prints for {table.reported_on}, measured"
+            " by its authors on their data, split and views. They were not measured here, and are"
+            " not comparable with figures on other data or protocols."
         )
     notes += _about_others(table)
     notes += _about_test(table)
@@ -193,9 +193,9 @@ def _about_neighbors(table: Table) -> list[str]:
     if shares.empty or shares.max() <= MOSTLY_SHARED:
         return []
     return [
-        f"**The switch of 3D unprojection hardly switches: {shares.max():.0%} of a token's neighbours are the"
-        " same with and without it** (recalibration.k is close to the number of tokens; a share, such as 0.1,"
-        " means the same at every size)."
+        f"**The switch of 3D unprojection hardly switches: {shares.max():.0%} of a token's"
+        " neighbours are the same with and without it** (recalibration.k is close to the number of"
+        " tokens; a share, such as 0.1, means the same at every size)."
     ]
 
 
