@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from pydantic import Field
 from torch import Tensor
 
+from ghgs_lit.bounds import cpu
 from ghgs_lit.bounds.box import SubjectBox
 from ghgs_lit.bounds.rays import (
     Silhouettes,
@@ -97,8 +98,10 @@ def hull_bounds(
     if gpu.is_supported(start.near, directions, matrices):
         tables = (outside, masks, matrices, directions, cameras.centers)
         return DepthBounds(*_marching(*tables, start.near, start.far, samples, tolerance))
+    steps = constant(middles, samples, like=start.near)
+    if cpu.fits(start.near, directions, matrices):
+        return cpu.march(outside, masks, matrices, directions, cameras.centers, start, steps, tolerance)
     near, far = (bound.clone(memory_format=torch.contiguous_format) for bound in (start.near, start.far))
-    steps = constant(middles, samples, like=near)
     if rays is None:
         known = count is not None
         rays = true_places(masks, count, repeats=True) if known else masks.flatten().nonzero()[:, 0]
