@@ -2,10 +2,11 @@
 are exact and carry no gradient; the gradient runs through the matched pairs only."""
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from ghgs_lit.geometry.constants import constant
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.runtime.precision import exact
 
@@ -36,7 +37,11 @@ def nearest(queries: Float[Tensor, "n 3"], references: Float[Tensor, "m 3"]) -> 
     return torch.from_numpy(index)
 
 
-def nearest_by_products(queries: Float[Tensor, "n 3"], references: Float[Tensor, "m 3"]) -> Int[Tensor, " n"]:
+def nearest_by_products(
+    queries: Float[Tensor, "n 3"],
+    references: Float[Tensor, "m 3"],
+    counts: Bool[Tensor, " m"] | None = None,
+) -> Int[Tensor, " n"]:
     """:func:`nearest` by matrix products: ``|r|^2 - 2 q r`` finds a few candidates,
     differences decide.
 
@@ -47,6 +52,8 @@ def nearest_by_products(queries: Float[Tensor, "n 3"], references: Float[Tensor,
     Args:
         queries: points [n, 3]; finite.
         references: points [m, 3]; not empty, finite.
+        counts: which references are looked at first; None: all. Others are found where fewer than four
+            count, and should be copies of those.
 
     Returns:
         Indices [n] of references.
@@ -55,6 +62,8 @@ def nearest_by_products(queries: Float[Tensor, "n 3"], references: Float[Tensor,
     queries = queries - middle
     references = references - middle
     squares = references.square().sum(1)
+    if counts is not None:
+        squares = torch.where(counts, squares, torch.inf)
     count = min(_CANDIDATES, len(references))
     index = [queries.new_zeros(0, dtype=torch.long)]
     with exact(queries.device.type):
@@ -110,3 +119,32 @@ def chamfer(
     there = (some - references[nearest(some, references)]).square().sum(-1)
     back = (points[nearest(few, points)] - few).square().sum(-1)
     return there.mean() + back.mean()
+
+
+def chamfer_of_rows(
+    points: Float[Tensor, "n 3"], counts: Bool[Tensor, " n"], references: Float[Tensor, "m 3"]
+) -> Float[Tensor, ""]:
+    """:func:`chamfer` of the points that count, without a wait for their number: work of one size.
+
+    Args:
+        points: the prediction [n, 3], in metres; not empty.
+        counts: which points count.
+        references: the surface [m, 3], in metres; not empty.
+
+    Returns:
+        As of :func:`chamfer`.
+    """
+    points = at_least_float32(points)
+    references = at_least_float32(references)
+    number = counts.sum()
+    # All others are copies of the first that counts, so that a pair always has the gradient of its point.
+    place = constant(torch.arange, len(points), like=points, dtype=torch.long)
+    first = counts.to(torch.uint8).argmax()
+    points = torch.where(number > 0, points[torch.where(counts, place, first)], 0)
+    finite = points.isfinite().all() & references.isfinite().all()
+    known = points.detach().nan_to_num(0.0, 0.0, 0.0)
+    surface = references.detach().nan_to_num(0.0, 0.0, 0.0)
+    there = (points - references[nearest_by_products(known, surface)]).square().sum(-1)
+    back = (points[nearest_by_products(surface, known, counts)] - references).square().sum(-1)
+    value = torch.where(counts, there, 0).sum() / number.clamp(min=1) + back.mean()
+    return torch.where(finite, torch.where(number > 0, value, 0), torch.nan)

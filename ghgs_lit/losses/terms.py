@@ -4,12 +4,14 @@ Every term takes a prediction, its Gaussians rendered from the batch's target ca
 batch, and returns a scalar without dimensions, in float32 or wider."""
 
 import torch
-from jaxtyping import Float
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.extents import extents
 from ghgs_lit.geometry.chamfer import chamfer as chamfer_distance
+from ghgs_lit.geometry.chamfer import chamfer_of_rows
 from ghgs_lit.geometry.masks import coverage
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.kernels.pool import have_values
@@ -77,11 +79,39 @@ def chamfer(prediction: Prediction, rendering: Rendering, batch: Batch, points: 
     if batch.body_vertices is None:
         raise InputError("loss.weights.chamfer: expected 0 for data without body vertices; found more")
     used = prediction.points.valid & batch.masks
-    values = [
-        chamfer_distance(prediction.points.pixels[b][used[b]], vertices, points)
-        for b, vertices in enumerate(batch.body_vertices)
-    ]
+    rows = None
+    if points is None and used.device.type != "cpu":
+        rows = _rows_of_gaussians(prediction, used)
+    values = []
+    for element, vertices in enumerate(batch.body_vertices):
+        if rows is not None and len(vertices):
+            values.append(chamfer_of_rows(*(each[element] for each in rows), vertices))
+        else:
+            own = prediction.points.pixels[element][used[element]]
+            values.append(chamfer_distance(own, vertices, points))
     return torch.stack(values).mean()
+
+
+def _rows_of_gaussians(
+    prediction: Prediction, used: Bool[Tensor, "B V H W"]
+) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]] | None:
+    """Points of the pixels that Gaussians belong to, whose number is known without a wait.
+
+    Args:
+        prediction: each of its valid pixels has a Gaussian; a size class may be filled by Gaussians of pixels
+            that precede them.
+        used: pixels that count.
+
+    Returns:
+        Points [n, 3] of each element, and which of them count [n]; None: Gaussians belong to no pixels.
+    """
+    gaussians = prediction.gaussians
+    if gaussians.image is None or not all(gaussians.splits):
+        return None
+    place = gaussians.image * used[0, 0].numel() + gaussians.pixel
+    is_new = F.pad(place[1:] != place[:-1], (1, 0), value=True)
+    points = prediction.points.pixels.flatten(0, 3)[place]
+    return points.split(gaussians.splits), (used.flatten()[place] & is_new).split(gaussians.splits)
 
 
 def depth(prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:

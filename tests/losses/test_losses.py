@@ -8,7 +8,7 @@ from scipy.spatial.distance import cdist
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry import chamfer as geometry_chamfer
-from ghgs_lit.geometry.chamfer import chamfer, nearest, nearest_by_products
+from ghgs_lit.geometry.chamfer import chamfer, chamfer_of_rows, nearest, nearest_by_products
 from ghgs_lit.losses import terms
 from ghgs_lit.metrics.functional import ssim_map
 from ghgs_lit.types import (
@@ -124,6 +124,39 @@ def test_chamfer_gradient_is_that_of_finite_differences():
     a = torch.rand(12, 3, generator=g, dtype=torch.float64, requires_grad=True)
     b = torch.rand(9, 3, generator=g, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(chamfer, (a, b))
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 200])
+def test_points_that_do_not_count_change_nothing(count):
+    """Neither the distance nor its gradient, whatever they are: against a tree on those that count."""
+    points = torch.rand(260, 3, generator=torch.Generator().manual_seed(count))
+    references = torch.rand(150, 3, generator=torch.Generator().manual_seed(7)) + 0.3
+    counts = torch.zeros(260, dtype=torch.bool)
+    counts[torch.randperm(260, generator=torch.Generator().manual_seed(1))[:count]] = True
+    slopes = []
+    for filling in (0.0, torch.nan):
+        rows = torch.where(counts[:, None], points, filling).requires_grad_()
+        found = chamfer_of_rows(rows, counts, references)
+        own = points[counts].requires_grad_()
+        expected = chamfer(own, references)
+        torch.testing.assert_close(found, expected, rtol=2e-6, atol=0)
+        found.backward()
+        expected.backward()
+        slope = torch.zeros_like(points)
+        slope[counts] = own.grad
+        torch.testing.assert_close(rows.grad, slope, rtol=2e-6, atol=1e-8)
+        slopes.append(rows.grad)
+    assert torch.equal(*slopes)
+
+
+def test_a_point_that_counts_and_is_not_finite_is_seen():
+    points = torch.zeros(4, 3)
+    points[2, 1] = torch.inf
+    counts = torch.tensor([True, True, False, True])
+    references = torch.ones(2, 3)
+    assert chamfer_of_rows(points, counts, references).isfinite()
+    assert chamfer_of_rows(points, ~counts, references).isnan()
+    assert chamfer_of_rows(points[:2], counts[:2], references * torch.nan).isnan()
 
 
 def test_chamfer_of_empty_and_of_broken_sets():
