@@ -57,9 +57,11 @@ class CudaTape:
         """
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(stream):
-            call()
-        torch.cuda.current_stream().wait_stream(stream)
+        try:
+            with torch.cuda.stream(stream):
+                call()
+        finally:
+            torch.cuda.current_stream().wait_stream(stream)
         self._pool = self._pool or torch.cuda.graph_pool_handle()
         graph = torch.cuda.CUDAGraph()
         # Other threads may work meanwhile: that which pins memory of the next batch,
@@ -134,7 +136,13 @@ class Recorder:
         """
         self._recordings.pop(self._class(inputs, key, []), None)
 
-    def __call__(self, function: Callable[[Any], Result], inputs: Any, key: Hashable = ()) -> Result:
+    def __call__(
+        self,
+        function: Callable[[Any], Result],
+        inputs: Any,
+        key: Hashable = (),
+        written: Sequence[Tensor] = (),
+    ) -> Result:
         """``function(inputs)``, without a gradient.
 
         Args:
@@ -144,6 +152,8 @@ class Recorder:
             inputs: dataclasses, tuples, lists and dicts of tensors on one device, and of anything
                 hashable.
             key: all else that may change what ``function`` does.
+            written: memory that ``function`` writes to and that was there before. Recording calls it
+                without effect.
 
         Returns:
             Its result, in memory that later calls do not write to.
@@ -163,7 +173,7 @@ class Recorder:
                 self.counts["eager"] += 1
                 return function(inputs)
             try:
-                recording = _recorded(self.tape, function, inputs)
+                recording = _recorded(self.tape, function, inputs, written)
             except (
                 Exception
             ) as error:  # a driver has many ways to fail; the eager call shows the function's own
@@ -255,13 +265,16 @@ def _replaced(value: Any, replace: Callable[[Tensor], Tensor]) -> Any:
     return replace(value) if isinstance(value, Tensor) else value
 
 
-def _recorded(tape: Tape, function: Callable[[Any], Any], inputs: Any) -> _Recording:
+def _recorded(
+    tape: Tape, function: Callable[[Any], Any], inputs: Any, written: Sequence[Tensor]
+) -> _Recording:
     """Record ``function(inputs)``.
 
     Args:
         tape: makes the recording.
         function: as of :meth:`Recorder.__call__`.
         inputs: as of :meth:`Recorder.__call__`; they are copied.
+        written: as of :meth:`Recorder.__call__`; as before in the end.
 
     Raises:
         NotRecordable: the function reads a value of the device or copies from the host.
@@ -282,7 +295,12 @@ def _recorded(tape: Tape, function: Callable[[Any], Any], inputs: Any) -> _Recor
         with guards[-1]:
             return function(fixed)
 
-    result, play = tape.record(guarded)
+    values = [tensor.clone() for tensor in written]
+    try:
+        result, play = tape.record(guarded)
+    finally:
+        with torch.no_grad():
+            _copy_all(written, values)
     torch.clear_autocast_cache()
     return _Recording(places, result, play, list(guards[-1].kept.values()))
 
@@ -319,7 +337,7 @@ def _copy_all(places: Sequence[Tensor], sources: Sequence[Tensor]) -> None:
     for place, source in zip(places, sources, strict=True):
         # One pair of another type, or that lies in memory otherwise,
         # makes PyTorch copy all one by one.
-        kind = (source.dtype, place.stride() == source.stride())
+        kind = (source.dtype, source.device, place.stride() == source.stride())
         group = groups.setdefault(kind, ([], []))
         group[0].append(place)
         group[1].append(source)

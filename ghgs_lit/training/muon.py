@@ -11,7 +11,7 @@ that come with the package, PyTorch's takes 61, for which it asks a GPU for 1 40
 module asks for 133 for all weights."""
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import torch
@@ -165,6 +165,11 @@ def _layout(weight: Tensor) -> torch.memory_format:
     return torch.channels_last if is_last else torch.contiguous_format
 
 
+def _place(value: Any) -> Any:
+    """Where a tensor lies, which a recording depends on, or any other value."""
+    return value.untyped_storage()._cdata if isinstance(value, Tensor) else value
+
+
 class Muon(torch.optim.AdamW):
     """Muon for the matrices among parameters, AdamW for all others.
 
@@ -173,7 +178,7 @@ class Muon(torch.optim.AdamW):
         matrix_lr: learning rate of matrices, whose steps are as long as AdamW's with this rate. A
             number, or, as AdamW's ``lr``, a tensor without dimensions on the parameters' device, so
             that a recorded step follows the schedule.
-        records: whether a GPU's products are recorded as a CUDA graph.
+        records: whether a GPU's steps are recorded as a CUDA graph.
         **options: of AdamW; weight decay is for both."""
 
     def __init__(
@@ -205,11 +210,36 @@ class Muon(torch.optim.AdamW):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
+        moved = [p for group in self.param_groups for p in group["params"] if p.grad is not None]
+        gradients = [parameter.grad for parameter in moved]
+        if self.recorder is None:
+            self._move(moved, gradients)
+        else:
+            written = [*moved, *self._states(moved)]
+            numbers = [item for group in self.param_groups for item in group.items() if item[0] != "params"]
+            key = tuple((name, _place(value)) for name, value in numbers), tuple(map(_place, written))
+            self.recorder(partial(self._move, moved), gradients, key, written)
+        for parameter, gradient in zip(moved, gradients, strict=True):
+            parameter.grad = None if is_matrix(parameter) else gradient
+        return loss
+
+    def _states(self, moved: Sequence[nn.Parameter]) -> list[Tensor]:
+        """All that a step of some parameters writes beside themselves."""
+        return [value for parameter in moved for value in self.state.get(parameter, {}).values()]
+
+    def _move(self, moved: Sequence[nn.Parameter], gradients: Sequence[Tensor]) -> None:
+        """Take a step along gradients that may lie elsewhere than those of the parameters.
+
+        Args:
+            moved: parameters.
+            gradients: of each.
+        """
+        for parameter, gradient in zip(moved, gradients, strict=True):
+            parameter.grad = gradient
         for group in self.param_groups:
             if group["orthogonal"]:
                 self._step_matrices(group)
         super().step()
-        return loss
 
     def _step_matrices(self, group: dict[str, Any]) -> None:
         """Take a step of the matrices, and remove their gradients, so that AdamW skips them."""
@@ -225,8 +255,7 @@ class Muon(torch.optim.AdamW):
         torch._foreach_lerp_(averages, gradients, 1 - MOMENTUM)
         directions = torch._foreach_lerp(gradients, averages, MOMENTUM)  # Nesterov momentum
         directions = [direction.flatten(1) for direction in directions]
-        record = self.recorder
-        steps = orthogonalized(directions) if record is None else record(orthogonalized, directions)
+        steps = orthogonalized(directions)
         torch._foreach_mul_(steps, [-ROOT_MEAN_SQUARE * max(step.shape) ** 0.5 for step in steps])
         torch._foreach_mul_(steps, group["lr"])
         torch._foreach_mul_(moved, 1 - group["lr"] * group["weight_decay"])

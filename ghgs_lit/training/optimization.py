@@ -73,7 +73,7 @@ class Optimization(Options):
                 on the device of the training.
             fused: PyTorch's fastest AdamW. It undoes the scaling of a loss (``16-mixed``) inside
                 its step, too late for clipping gradients.
-            records: whether Muon's products are recorded as a CUDA graph on a GPU.
+            records: whether Muon's steps are recorded as a CUDA graph on a GPU.
 
         Returns:
             AdamW, or Muon where there is a ``matrix_scale``.
