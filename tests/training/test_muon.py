@@ -247,7 +247,7 @@ def test_parameters_without_gradient_stay():
 
 
 def stepped(tape, capturable=True, steps=5):
-    """Weights after some steps on the pretend device, whose rates follow a schedule, and how they came about."""
+    """Weights after some steps on the pretend device, whose rates follow a schedule, and counts."""
     model = Small().to(DEVICE)
     model.conv.data = model.conv.data.contiguous(memory_format=torch.channels_last)
     optimizer = Muon(model.parameters(), matrix_lr=0.02, capturable=capturable, **OPTIONS)
