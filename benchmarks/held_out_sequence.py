@@ -1,27 +1,32 @@
 """Each camera of a rig held out over a sequence, predicted from the others, and a generated person beside it.
 
     python benchmarks/held_out_sequence.py photographs cameras.json --out held_out_sequence --step 5 \\
-        --adapted mine.ckpt --people 2
+        --adapted odd.ckpt even.ckpt --people 2
 
-Cameras are corrected with all photographs (the calibration is theirs), once, as `ghgs predict` does; so are
-colour gains, with a mean of 1 over those that predict. All ways are measured against the same masks: those of
-the sequence, tested by leaving each view out and cut anew where they fail; photographs whose mask still fails
-are not measured, and counted. Prints over all instants and cameras PSNR of the photograph on black, whole and
-in the box of the subject; there of images scaled to one brightness; and there of the photograph as it is, the
-render before the background, which asks no mask. Flicker in place (thousandths of white) of the first and
-of the last; the share of instants that were predicted anew; CPU seconds of an instant without the rig's. A
-black render has the flicker of the photographs. Generated people stand in the same rig, with exact masks,
-cameras and exposures: what the protocol leaves of sound data. What is done stays in --out, and is not
-done again.
+Cameras are corrected with all photographs (the calibration is theirs), once, as `ghgs predict`
+does; so are colour gains, with a mean of 1 over those that predict. All ways are measured against
+the same masks: those of the sequence, tested by leaving each view out and cut anew where they fail;
+photographs whose mask still fails are not measured, and counted. Prints over all instants and
+cameras PSNR of the photograph on black, whole and in the box of the subject; there of images scaled
+to one brightness; and there of the photograph as it is, the render before the background, which
+asks no mask. Flicker in place (thousandths of white) of the first and of the last; the share of
+instants that were predicted anew; CPU seconds of an instant without the rig's. A black render has
+the flicker of the photographs. Generated people stand in the same rig, with exact masks, cameras
+and exposures: what the protocol leaves of sound data. What is done stays in --out, and is not done
+again: a run that was stopped goes on. Each instant is said, and in --out/results.json at once.
+Weights that learned from the odd instants predict the even ones, and the other way round:
+`--adapted odd.ckpt even.ckpt`.
 """
 
 import argparse
 import dataclasses
+import functools
+import json
+import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -43,11 +48,12 @@ from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.data.view import area_image
+from ghgs_lit.files import write_text_atomically
 from ghgs_lit.metrics.flicker import flicker_in_place
 from ghgs_lit.metrics.functional import box_of, decibels, mean_over, psnr, psnr_box_40
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.rounds.gains import divided
-from ghgs_lit.types import Batch, Cameras, Prediction
+from ghgs_lit.types import Batch, Cameras
 from ghgs_lit.weights.checkpoint import read_config
 
 #: Which masks, cameras and colour gains, whose weights,
@@ -59,20 +65,31 @@ WAYS = {
     "adapted to the capture": ("mended", "once", "once", "adapted", 1),
 }
 COLUMNS = ("whole", "box", "box_40", "photograph", "flicker", "flicker_photograph", "anew", "seconds")
+BOX = COLUMNS.index("box")
 
 
 class Measured:
-    """A sequence, and what was found of it so far."""
+    """A sequence, and what was found of it so far.
 
-    def __init__(self, images: Path, cameras: Path, out: Path, step: int, adapted: str | None):
+    Args:
+        images: folder with a folder for each instant.
+        cameras: the calibration.
+        out: folder of what is done; gets ``results.json`` after each instant.
+        step: every how many instants one is measured.
+        weights: files of weights by name, ``shipped`` first; of several the instant of number i in the
+            sequence is predicted by the one of number i modulo their count.
+    """
+
+    def __init__(self, images: Path, cameras: Path, out: Path, step: int, weights: dict[str, list[str]]):
         self.folder = CaptureFolder(images, cameras)
         self.out = out
-        self.models = {"shipped": GHGS.from_checkpoint("shipped").eval()}
-        if adapted is not None:
-            self.models["adapted"] = GHGS.from_checkpoint(adapted).eval()
+        self.weights = weights
+        self.models = {name: [_model(path) for path in paths] for name, paths in weights.items()}
         self.renderer = Renderer()
-        self.size = crop_size(None, read_config("shipped"), self.models["shipped"])
+        self.size = crop_size(None, read_config(weights["shipped"][0]), self.models["shipped"][0])
         self.names = self.folder.instants[::step]
+        self.cameras = [p.name for p in self.folder.photographs(self.names[0])]
+        self.results: dict[str, Any] = {"step": step, "weights": weights, "rows": {}}
         out.mkdir(parents=True, exist_ok=True)
 
     def kept(self, name: str, make: Callable[[], Any]) -> Any:
@@ -82,111 +99,117 @@ class Measured:
             path.with_suffix(".part").rename(path)
         return torch.load(path, weights_only=False)
 
+    def say(self, way: str, subject: str, rows: Sequence[Sequence[float]]) -> None:
+        """Keep the columns of all cameras of an instant or a person in the JSON; print the box's."""
+        columns = (dict(zip(COLUMNS, row, strict=True)) for row in rows)
+        self.results["rows"].setdefault(way, {})[subject] = dict(zip(self.cameras, columns, strict=True))
+        write_text_atomically(self.out / "results.json", json.dumps(self.results, indent=1))
+        print(f"{way}: {subject}: {' '.join(f'{row[BOX]:.2f}' for row in rows)}", file=sys.stderr, flush=True)
+
+    @functools.cached_property
     def shared(self) -> tuple[Backgrounds, Rig | None, float]:
         """Backgrounds, rig, and their CPU seconds."""
+        return self.kept("shared", self.found)
+
+    def found(self) -> tuple[Backgrounds, Rig | None, float]:
         begin = time.process_time()
         names = spread(self.folder.instants, BACKGROUND_INSTANTS)
         captures = [Capture(name, self.folder.photographs(name)) for name in names]
         backgrounds = Backgrounds.of(captures)
         captures = [backgrounds.applied(capture) for capture in spread(captures, INSTANTS)]
-        rig = corrected_rig(captures, self.models["shipped"], self.size, "auto", "auto", self.renderer)
+        rig = corrected_rig(captures, self.models["shipped"][0], self.size, "auto", "auto", self.renderer)
         return backgrounds, rig, time.process_time() - begin
 
-    def batches(self, masks: str, cameras: str) -> list[tuple[Batch, np.ndarray, float]]:
-        """The batch, intrinsics [v, 3, 3] of the photographs, and CPU seconds of each instant."""
-        backgrounds, rig, _ = self.kept("shared", self.shared)
+    def batch(self, masks: str, cameras: str, name: str) -> tuple[Batch, np.ndarray, float]:
+        """The batch, intrinsics [v, 3, 3] of the photographs, and CPU seconds of an instant."""
+        backgrounds, rig, _ = self.shared
+        capture, begin = Capture(name, self.folder.photographs(name)), time.process_time()
+        capture = backgrounds.applied(capture) if masks == "mended" else capture
+        if cameras == "once" and rig:
+            capture = dataclasses.replace(rig, gains={}).applied(capture)
+        found = capture.batch(self.size, CORRECTION if doubt_of_masks(capture, self.size) else 0)
+        lenses = np.stack([photograph.intrinsics for photograph in capture.photographs])
+        return found, lenses, time.process_time() - begin
 
-        def batch(name: str) -> tuple[Batch, np.ndarray, float]:
-            capture, begin = Capture(name, self.folder.photographs(name)), time.process_time()
-            capture = backgrounds.applied(capture) if masks == "mended" else capture
-            if cameras == "once" and rig:
-                capture = dataclasses.replace(rig, gains={}).applied(capture)
-            found = capture.batch(self.size, CORRECTION if doubt_of_masks(capture, self.size) else 0)
-            lenses = np.stack([photograph.intrinsics for photograph in capture.photographs])
-            return found, lenses, time.process_time() - begin
+    def truth(self, name: str) -> list[dict[str, Any]]:
+        """Of each camera: photographs on black and as they are, verified masks, halved."""
+        backgrounds = self.shared[0]
+        capture = backgrounds.applied(Capture(name, self.folder.photographs(name)))
+        agreement = Agreement.of(capture)
+        failed = [False] * len(capture.photographs) if agreement is None else agreement.failed
+        both = zip(capture.photographs, failed, strict=True)
+        return [_truth(p, backgrounds.cameras[p.name], bool(fails)) for p, fails in both]
 
-        return [self.kept(f"batch_{masks}_{cameras}_{name}", partial(batch, name)) for name in self.names]
+    @torch.no_grad()
+    def drawn(self, way: str, name: str, view: int, temporal: Temporal) -> tuple[Tensor, int, float]:
+        """A held-out camera: colours and alpha [4, h, w] of the photograph's half size as bytes,
+        how many instants were predicted anew, and CPU seconds."""
+        masks, cameras, gains, weights, _ = WAYS[way]
+        rig = self.shared[1]
+        truth = self.kept(f"truth_{name}", partial(self.truth, name))[view]
+        read = self.kept(f"batch_{masks}_{cameras}_{name}", partial(self.batch, masks, cameras, name))
+        batch, lenses, before = read
+        models = self.models[weights]
+        model = models[self.folder.instants.index(name) % len(models)]
+        temporal.predict = partial(in_frame, model)
+        anew, begin = temporal.anew, time.process_time()
+        seen = batch.of_views([other for other in range(len(lenses)) if other != view])
+        gaussians = temporal(with_gains_of(rig, seen) if gains == "once" else seen).gaussians
+        seconds = time.process_time() - begin + before
+        shown = self.renderer(gaussians, _halved(lenses[view], batch, view, truth))
+        image = torch.cat([shown.image[0, 0], shown.alpha[0, 0]]).clamp(0, 1)
+        return (255 * image).round().byte(), temporal.anew - anew, seconds
 
-    def truth(self) -> list[list[dict[str, Tensor]]]:
-        """Of each instant and camera: photographs on black and as they are, verified masks,
-        halved."""
-        backgrounds = self.kept("shared", self.shared)[0]
-        found = []
+    def rows(self, way: str) -> np.ndarray:
+        """The columns [cameras, n, 8] of each camera held out; ``black`` draws nothing."""
+        every = 1 if way == "black" else WAYS[way][-1]
+        temporals = [Temporal(partial(in_frame, None), every, self.renderer) for _ in self.cameras]
+        found: list[list[list[float]]] = []
+        last: list[Any] = [None] * len(self.cameras)
         for name in self.names:
-            capture = backgrounds.applied(Capture(name, self.folder.photographs(name)))
-            agreement = Agreement.of(capture)
-            failed = [False] * len(capture.photographs) if agreement is None else agreement.failed
-            both = zip(capture.photographs, failed, strict=True)
-            found.append([_truth(p, backgrounds.cameras[p.name], bool(fails)) for p, fails in both])
-        return found
+            found.append([])
+            truths = self.kept(f"truth_{name}", partial(self.truth, name))
+            for view, (truth, temporal) in enumerate(zip(truths, temporals, strict=True)):
+                image = torch.zeros(4, *truth["mask"].shape, dtype=torch.uint8)
+                costs = [np.nan, np.nan]
+                if way != "black":
+                    of_weights = "_".join(Path(path).stem for path in self.weights[WAYS[way][3]])
+                    place = f"drawn_{way}_{of_weights}_{name}_{self.cameras[view]}"
+                    image, *costs = self.kept(place, partial(self.drawn, way, name, view, temporal))
+                values, pair = compared(*(image.float() / 255).split([3, 1]), truth)
+                now = *pair, truth["mask"]
+                found[-1].append([*values, *flicker_between(last[view], now), *costs])
+                last[view] = now
+            self.say(way, name, found[-1])
+        return np.array(found).swapaxes(0, 1)
 
-    @torch.no_grad()
-    def rows(
-        self, masks: str, cameras: str, gains: str, weights: str, view: int, everies: tuple[int, ...]
-    ) -> list[np.ndarray]:
-        """The columns [n, 8] of a held-out camera,
-        for each of some ``every`` of :class:`Temporal`."""
-        known: dict[str, tuple[Prediction, float]] = {}
-        rig, spent = self.kept("shared", self.shared)[1], 0.0
-
-        def predict(batch: Batch) -> Prediction:
-            """As in the run before, with the seconds that it took there."""
-            nonlocal spent
-            name = batch.subjects[0]
-            if name in known:
-                spent += known[name][1]
-            else:
-                begin = time.process_time()
-                known[name] = in_frame(self.models[weights], batch), time.process_time() - begin
-            return known[name][0]
-
-        found = []
-        for every in everies:
-            temporal, rows, errors = Temporal(predict, every, self.renderer), [], []
-            truths = (each[view] for each in self.kept("truth", self.truth))
-            for (batch, lenses, before), truth in zip(self.batches(masks, cameras), truths, strict=True):
-                anew, begin, spent = temporal.anew, time.process_time(), before
-                others = [other for other in range(batch.images.shape[1]) if other != view]
-                seen = batch.of_views(others)
-                gaussians = temporal(with_gains_of(rig, seen) if gains == "once" else seen).gaussians
-                seconds = time.process_time() - begin + spent
-                drawn = self.renderer(gaussians, _halved(lenses[view], batch, view, truth))
-                values, pair = compared(drawn.image[0, 0].clamp(0, 1), drawn.alpha[0, 0], truth)
-                errors.append((*pair, truth["mask"]))
-                rows.append([*values, np.nan, np.nan, temporal.anew - anew, seconds])
-            found.append(with_flicker(rows, errors))
-        return found
-
-    def black(self, view: int) -> np.ndarray:
-        rows, errors = [], []
-        for truth in (each[view] for each in self.kept("truth", self.truth)):
-            image = torch.zeros_like(truth["subject"])
-            values, pair = compared(image, image[:1], truth)
-            errors.append((*pair, truth["mask"]))
-            rows.append([*values, np.nan, np.nan, np.nan, np.nan])
-        return with_flicker(rows, errors)
-
-    @torch.no_grad()
     def control(self, config: dict[str, Any], weights: str) -> np.ndarray:
         """Columns [cameras, people, 8] of generated people in the rig, each camera held out."""
         data = build_data(config)
         data.prepare_data(["val"])
+        found = []
+        for path, model in zip(self.weights[weights], self.models[weights], strict=True):
+            for name in data.subjects("val"):
+                place = f"control_{Path(path).stem}_{name}"
+                found.append(self.kept(place, lambda: self.person(model, data.evaluation_batch(name))))  # noqa: B023
+                self.say(f"generated people, {Path(path).stem}", name, found[-1])
+        return np.array(found).swapaxes(0, 1)
+
+    @torch.no_grad()
+    def person(self, model: GHGS, batch: Batch) -> list[list[float]]:
+        """The columns of each camera held out of a person whose cameras and masks are exact."""
         rows = []
-        for name in data.subjects("val"):
-            batch = data.evaluation_batch(name)
-            views = range(batch.images.shape[1])
-            for view in views:
-                begin = time.process_time()
-                seen = batch.of_views([other for other in views if other != view])
-                gaussians = in_frame(self.models[weights], seen).gaussians
-                seconds = time.process_time() - begin
-                cameras = batch.of_views([view]).cameras
-                image = self.renderer(gaussians, cameras).image[0].clamp(0, 1)
-                target, mask = batch.images[0, view : view + 1], batch.masks[0, view : view + 1]
-                pair = psnr(image, target), psnr(image, target, box_of(mask))
-                values = [value.item() for value in (*pair, psnr_box_40(image, target, mask))]
-                rows.append([*values, np.nan, np.nan, np.nan, 1.0, seconds])
-        return np.array(rows).reshape(-1, len(views), len(COLUMNS)).swapaxes(0, 1)
+        for view in range(len(self.cameras)):
+            begin = time.process_time()
+            seen = batch.of_views([other for other in range(len(self.cameras)) if other != view])
+            gaussians = in_frame(model, seen).gaussians
+            seconds = time.process_time() - begin
+            image = self.renderer(gaussians, batch.of_views([view]).cameras).image[0].clamp(0, 1)
+            target, mask = batch.images[0, view : view + 1], batch.masks[0, view : view + 1]
+            pair = psnr(image, target), psnr(image, target, box_of(mask))
+            values = [value.item() for value in (*pair, psnr_box_40(image, target, mask))]
+            rows.append([*values, np.nan, np.nan, np.nan, 1.0, seconds])
+        return rows
 
 
 def with_gains_of(rig: Rig | None, batch: Batch) -> Batch:
@@ -214,12 +237,17 @@ def compared(image: Tensor, alpha: Tensor, truth: dict[str, Tensor]) -> tuple[li
     return values, (image - truth["subject"], off)
 
 
-def with_flicker(rows: list[list[float]], errors: list[tuple]) -> np.ndarray:
-    """Rows with the flicker since the instant before; the first has none."""
-    for row, pair in zip(rows[1:], pairwise(errors), strict=True):
-        *both, masks = (torch.stack(parts)[:, None] for parts in zip(*pair, strict=True))
-        row[4:6] = [1e3 * flicker_in_place(each, masks).item() for each in both]
-    return np.array(rows)
+def flicker_between(last: tuple | None, now: tuple) -> list[float]:
+    """Flicker of the errors on black and before the background since the instant before;
+    nan at the first."""
+    if last is None:
+        return [np.nan, np.nan]
+    *both, masks = (torch.stack(parts)[:, None] for parts in zip(last, now, strict=True))
+    return [1e3 * flicker_in_place(each, masks).item() for each in both]
+
+
+def _model(path: str) -> GHGS:
+    return GHGS.from_checkpoint(path).eval()
 
 
 def _halved(lens: np.ndarray, batch: Batch, view: int, truth: dict[str, Tensor]) -> Cameras:
@@ -252,39 +280,31 @@ def main() -> None:
     parser.add_argument("cameras", type=Path)
     parser.add_argument("--out", type=Path, default=Path("held_out_sequence"))
     parser.add_argument("--step", type=int, default=1, help="every how many instants one is measured")
-    parser.add_argument("--adapted", help="weights of ghgs adapt for this capture")
+    parser.add_argument("--checkpoint", default="shipped", help="weights of the ways that do not adapt")
+    several = "weights of ghgs adapt for this capture; of n, instant i is predicted by number i modulo n"
+    parser.add_argument("--adapted", nargs="+", help=several)
+    parser.add_argument("--ways", nargs="+", default=list(WAYS), choices=list(WAYS))
     parser.add_argument("--people", type=int, default=2, help="generated people in the rig")
     options = parser.parse_args()
-    measured = Measured(options.images, options.cameras, options.out, options.step, options.adapted)
-    views = range(len(measured.folder.paths[measured.names[0]]))
+    weights = {"shipped": [options.checkpoint]} | ({"adapted": options.adapted} if options.adapted else {})
+    measured = Measured(options.images, options.cameras, options.out, options.step, weights)
     print("| | " + " | ".join(COLUMNS) + " | by camera |\n|---" + "|---" * (len(COLUMNS) + 1) + "|")
-    print(
-        line("black", [measured.kept(f"rows_black_{view}", partial(measured.black, view)) for view in views])
-    )
-    for kind in dict.fromkeys(way[:4] for way in WAYS.values()):
-        if kind[3] not in measured.models:
-            continue
-        named = {name: way[4] for name, way in WAYS.items() if way[:4] == kind}
-        found = [
-            measured.kept(
-                f"rows_{'_'.join(kind)}_{view}", partial(measured.rows, *kind, view, tuple(named.values()))
-            )
-            for view in views
-        ]
-        for name, rows in zip(named, zip(*found, strict=True), strict=True):
-            print(line(name, rows), flush=True)
-    said = [f"images={options.images}", f"cameras={options.cameras}", "data.active.val=0"]
-    config = with_rig(resolve(compose("adapt", [*said, f"data.people.val={options.people}"])))
-    for weights in measured.models:
-        rows = measured.kept(f"control_{weights}", partial(measured.control, config, weights))
-        print(line(f"generated people, {weights}", rows), flush=True)
-    rig, seconds = measured.kept("shared", measured.shared)[1:]
-    failed = sum(truth["fails"] for each in measured.kept("truth", measured.truth) for truth in each)
+    for way in ["black", *(way for way in options.ways if WAYS[way][3] in weights)]:
+        print(line(way, measured.rows(way)), flush=True)
+    if options.people:
+        said = [f"images={options.images}", f"cameras={options.cameras}", "data.active.val=0"]
+        config = with_rig(resolve(compose("adapt", [*said, f"data.people.val={options.people}"])))
+        for name in weights:
+            print(line(f"generated people, {name}", measured.control(config, name)), flush=True)
+    rig, seconds = measured.shared[1:]
+    truths = [measured.kept(f"truth_{name}", partial(measured.truth, name)) for name in measured.names]
+    failed = sum(truth["fails"] for each in truths for truth in each)
     print(f"rig: {seconds:.0f} s; moved by {rig and rig.moved} pixels, gains {rig and rig.gains}")
-    print(f"{failed} of {len(views) * len(measured.names)} photographs are not measured: their masks fail")
+    count = len(measured.cameras) * len(measured.names)
+    print(f"{failed} of {count} photographs are not measured: their masks fail")
 
 
-def line(name: str, rows: Sequence[np.ndarray]) -> str:
+def line(name: str, rows: np.ndarray) -> str:
     """Means over instants and cameras, and of the box by camera."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # columns without a value
