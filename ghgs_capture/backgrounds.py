@@ -306,7 +306,8 @@ class Backgrounds:
             after = Agreement.of(mended)
             if agreement and sum(after.misses) >= sum(agreement.misses):
                 break
-            small, agreement = mended, after
+            small = mended
+            agreement = after
         photographs = map(self._taken_over, capture.photographs, given.photographs, small.photographs)
         return replace(capture, photographs=tuple(photographs))
 

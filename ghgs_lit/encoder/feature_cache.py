@@ -53,19 +53,19 @@ class FeatureCache:
             OSError: the disk is full.
         """
         paths = [self._path(image, images.device) for image in images.detach().cpu()]
-        found = [_mapped(path) for path in paths]
-        lacking = [number for number, tokens in enumerate(found) if tokens is None]
+        stored = [_mapped(path) for path in paths]
+        lacking = [number for number, tokens in enumerate(stored) if tokens is None]
         if lacking:
             new = compute(images[lacking]).to(self.dtype)
             expected = f"tokens that {str(self.dtype).removeprefix('torch.')} can hold"
             require(bool(new.isfinite().all()), "feature_cache.dtype", expected, "larger ones")
             for number, tokens in zip(lacking, new.cpu(), strict=True):
-                found[number] = tokens.view(torch.int16).numpy()  # NumPy has no bfloat16
-                write_atomically(paths[number], partial(_write, found[number]))
+                stored[number] = tokens.view(torch.int16).numpy()  # NumPy has no bfloat16
+                write_atomically(paths[number], partial(_write, stored[number]))
         self.computed += len(lacking)
         self.read += len(paths) - len(lacking)
-        result = torch.empty(len(found), *found[0].shape, dtype=torch.int16, pin_memory=images.is_cuda)
-        np.stack(found, out=result.numpy())
+        result = torch.empty(len(stored), *stored[0].shape, dtype=torch.int16, pin_memory=images.is_cuda)
+        np.stack(stored, out=result.numpy())
         return result.view(self.dtype).to(images.device, non_blocking=True).to(images.dtype)
 
     def place(self, device: torch.device) -> Path:

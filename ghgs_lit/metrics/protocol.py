@@ -174,7 +174,7 @@ class ImageMetrics:
         options = self.options
         renders = {"release": "as they are", "files": "and targets in 8 bits"}
         renders = renders.get(options.protocol, "clamped to [0, 1]")
-        said = {
+        text = {
             "image": f"renders {renders}, RGB, data range 1",
             "psnr": f"-10 log10(MSE) of each image, at most {PSNR_CAP:g} dB (equal images)",
             "depth_error_mm": "mean |z - true z| over a subject's input pixels with predicted and true depth",
@@ -183,24 +183,24 @@ class ImageMetrics:
         }
         measured = set().union(*(MEASURED[region] for region in options.regions))
         if "ssim" in measured:
-            said["ssim"] = f"11x11 Gaussian window, sigma 1.5, padding {options.ssim_padding}"
+            text["ssim"] = f"11x11 Gaussian window, sigma 1.5, padding {options.ssim_padding}"
         if "flip" in measured:
-            said["flip"] = f"FLIP at {PIXELS_PER_DEGREE:.2f} pixels a degree"
+            text["flip"] = f"FLIP at {PIXELS_PER_DEGREE:.2f} pixels a degree"
         if "box" in options.regions:
-            said["box"] = "the smallest upright box of the subject's mask in the target"
-            said["psnr_box_40"] = f"psnr_box of images scaled to a mean of {BRIGHTNESS:.2f} in the mask"
+            text["box"] = "the smallest upright box of the subject's mask in the target"
+            text["psnr_box_40"] = f"psnr_box of images scaled to a mean of {BRIGHTNESS:.2f} in the mask"
         if "subject" in options.regions:
-            said["subject"] = "the pixels of the subject's mask in the target"
+            text["subject"] = "the pixels of the subject's mask in the target"
         if "crop" in options.regions:
-            said["crop"] = "1000/1024 of the height and 500/1024 of the width, around the mask's box"
+            text["crop"] = "1000/1024 of the height and 500/1024 of the width, around the mask's box"
         if "edge" in options.regions:
-            said["edge"] = f"pixels at most {EDGE} rows and columns from the outline of the subject's mask"
-            said["edge"] += f", and from steps of more than {DEPTH_STEP:.0%} of the true depth where known"
-            said["spill"] = f"light farther than {BESIDE} pixels from the mask, per mille of the subject's"
-            said["sharpness"] = f"energy of the Laplacian over the target's, {INNER} pixels inside the mask"
+            text["edge"] = f"pixels at most {EDGE} rows and columns from the outline of the subject's mask"
+            text["edge"] += f", and from steps of more than {DEPTH_STEP:.0%} of the true depth where known"
+            text["spill"] = f"light farther than {BESIDE} pixels from the mask, per mille of the subject's"
+            text["sharpness"] = f"energy of the Laplacian over the target's, {INNER} pixels inside the mask"
         if self.lpips is not None:
-            said["lpips"] = f"{NETWORK} on {'[0, 1]' if options.is_release else '[-1, 1]'}, whole image"
-        return said
+            text["lpips"] = f"{NETWORK} on {'[0, 1]' if options.is_release else '[-1, 1]'}, whole image"
+        return text
 
     def __call__(
         self,

@@ -182,17 +182,17 @@ def coarse_of(
     rows = None
     for size in wanted:
         chosen = torch.tensor([i for i, own in enumerate(sizes) if own == size], device=depths.device)
-        found = predict(shrunk(_elements(photographs, chosen), size, least_matte))
-        maps = found.depth_maps
+        prediction = predict(shrunk(_elements(photographs, chosen), size, least_matte))
+        maps = prediction.depth_maps
         grown = torch.stack((enlarged(maps, full), _resized(maps.confidence, full)))
         depths = depths.index_copy(1, chosen, grown.to(depths.dtype))
-        spread = spread_tokens(found.tokens, batch, patch_size)
+        spread = spread_tokens(prediction.tokens, batch, patch_size)
         rows = spread.new_zeros(len(sizes), *spread.shape[1:]) if rows is None else rows
         rows = rows.index_copy(0, chosen, spread)
     if isinstance(batch, PaddedBatch):
         depths = torch.stack([batch.padding.pad(each) for each in depths])
     of_elements = tuple(size is not None for size in sizes)
-    return Coarse(CoarseDepths(*depths, of_elements), _packed(rows, found.tokens))
+    return Coarse(CoarseDepths(*depths, of_elements), _packed(rows, prediction.tokens))
 
 
 def coarse_sizes(batch: Batch, height: int, patch_size: int) -> list[Size | None]:

@@ -93,12 +93,12 @@ class NeighborsAtStart(Callback):
         self._stack.close()
         if self._seen and trainer.is_global_zero:
             around = neighborhoods(*self._seen[-1])
-            tokens, count, shared = (
-                fmean(getattr(one, name) for one in around) for name in ("tokens", "neighbors", "shared")
-            )
+            tokens = fmean(one.tokens for one in around)
+            count = fmean(one.neighbors for one in around)
+            shared = fmean(one.shared for one in around)
             other = "without" if pl_module.model.recalibration.neighborhood == "xyz" else "with"
-            said = f"{tokens:.0f} tokens take part, {count:.0f} neighbours each, {shared:.0%} of them"
-            print(f"recalibration: {said} the same {other} 3D unprojection", flush=True)
+            line = f"{tokens:.0f} tokens take part, {count:.0f} neighbours each, {shared:.0%} of them"
+            print(f"recalibration: {line} the same {other} 3D unprojection", flush=True)
         self._seen = []
 
     def on_exception(self, *args: Any) -> None:

@@ -82,16 +82,16 @@ class Guard:
         if trainer.world_size > 1:
             lines = [""] * trainer.world_size
             torch.distributed.all_gather_object(lines, line)
-        said = "; ".join(filter(None, lines)) or "a value that is finite when the step is run again"
-        said = f"step {module.global_step}: expected a finite loss and gradient; found {said}"
+        faults = "; ".join(filter(None, lines)) or "a value that is finite when the step is run again"
+        message = f"step {module.global_step}: expected a finite loss and gradient; found {faults}"
         if self._in_a_row >= self.limit:
-            raise DivergedError(said)
+            raise DivergedError(message)
         self._in_a_row += 1
         self.skipped += 1
         for parameter in module.parameters():
             parameter.grad = None
         if trainer.is_global_zero:
-            print(f"{said}; the step is skipped", flush=True)
+            print(f"{message}; the step is skipped", flush=True)
 
     def _explain(self, module: L.LightningModule, scale: float) -> str:
         """The first fault of this process, "" if none, and, for the first fault of a stage,

@@ -260,15 +260,15 @@ class GHGSModule(BudgetedModule):
 
     def _rounds(self, batch: Batch, prediction: Prediction) -> dict[str, Tensor]:
         """PSNR in dB and depth error in mm before each round."""
-        found = {}
+        values = {}
         for number, draft in enumerate(prediction.drafts, start=1):
             image = self.renderer(draft, batch.targets.cameras).image
             psnr = self._measured(image, batch.targets, ("psnr",))["psnr"]
-            found[f"val/psnr_before_round_{number}"] = psnr.mean()
+            values[f"val/psnr_before_round_{number}"] = psnr.mean()
             if batch.depths is not None:
                 error = _depth_error(batch, prediction.rounds[number - 1])
-                found[f"val/depth_error_mm_before_round_{number}"] = error
-        return found
+                values[f"val/depth_error_mm_before_round_{number}"] = error
+        return values
 
     def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
         """Clip the gradients of all weights to ``optimizer.clip`` and log their norm before.

@@ -130,9 +130,9 @@ class Pictures(Callback):
         padding = pad_to_patches(batch.masks, tokens.patch_size)
         shares = part_shares(padding.pad_batch(batch) if padding else batch, tokens.patch_size)
         part = token_parts(shares, tokens)
-        found = attention_on_other_parts(stage, tokens, points, part)
+        share = attention_on_other_parts(stage, tokens, points, part)
         pl_module.log(
-            "val/attention_on_other_parts", found.mean(), batch_size=len(batch.images), rank_zero_only=True
+            "val/attention_on_other_parts", share.mean(), batch_size=len(batch.images), rank_zero_only=True
         )
 
 
@@ -146,11 +146,11 @@ def distributions(prediction: Prediction) -> dict[str, Tensor]:
         Finite values by name: opacities, standard deviations in millimetres and, where their pixels
         are known, the distances from these pixels' points, in millimetres."""
     gaussians = prediction.gaussians
-    found = {"opacity": gaussians.opacities, "scale_mm": 1000 * gaussians.scales}
+    known = {"opacity": gaussians.opacities, "scale_mm": 1000 * gaussians.scales}
     if gaussians.pixel is not None:
         points = prediction.points.pixels.flatten(0, 1).flatten(1, 2)[gaussians.image, gaussians.pixel]
-        found["offset_mm"] = 1000 * (gaussians.means - points).norm(dim=-1)
-    return {name: values[values.isfinite()] for name, values in found.items()}
+        known["offset_mm"] = 1000 * (gaussians.means - points).norm(dim=-1)
+    return {name: values[values.isfinite()] for name, values in known.items()}
 
 
 def _show_distributions(trainer: L.Trainer, prediction: Prediction) -> None:

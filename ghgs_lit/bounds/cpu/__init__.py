@@ -55,6 +55,6 @@ def march(
     near, far = (bound.clone(memory_format=torch.contiguous_format) for bound in (start.near, start.far))
     tables = (outside, masks, matrices, directions, centers, near, far, steps)
     arrays = [table.contiguous().numpy() for table in tables]
-    ranges = [(element, view, 0, height) for element in range(elements) for view in range(views)]
+    ranges = [(image // views, image % views, 0, height) for image in range(elements * views)]
     pool.run_rows(march_rows(), (*arrays, tolerance), ranges, _ROWS, masks.numel())
     return DepthBounds(near, far)

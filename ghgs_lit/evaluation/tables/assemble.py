@@ -20,7 +20,8 @@ from ghgs_lit.evaluation.tables.layouts import (
     reported_table,
 )
 from ghgs_lit.evaluation.tables.notes import write_caption, write_notes
-from ghgs_lit.evaluation.tables.records import SETTING, Planned, Sweep, Variant
+from ghgs_lit.evaluation.tables.records import SETTING, Planned, Sweep
+from ghgs_lit.evaluation.tables.variants import Variant
 
 NO_FIGURE = "-"
 """Where there is no figure, as the paper prints it."""

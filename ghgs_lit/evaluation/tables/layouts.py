@@ -13,7 +13,8 @@ import pandas as pd
 
 from ghgs_lit.config.nodes import PairedTest
 from ghgs_lit.errors import choice
-from ghgs_lit.evaluation.tables.records import TRAINING, Planned, Variant
+from ghgs_lit.evaluation.tables.records import TRAINING, Planned
+from ghgs_lit.evaluation.tables.variants import Variant
 from ghgs_lit.parsing import read_yaml
 
 DECIMALS = {"psnr": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1, "surface_mm": 1}

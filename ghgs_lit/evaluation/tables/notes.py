@@ -6,8 +6,8 @@ import pandas as pd
 
 from ghgs_lit.evaluation.tables.differences import differing, differing_text
 from ghgs_lit.evaluation.tables.layouts import Table, data_title, decimals, reported_source, title
-from ghgs_lit.evaluation.tables.records import ablation_sets
 from ghgs_lit.evaluation.tables.significance import POWER, RATIO
+from ghgs_lit.evaluation.tables.variants import ablation_sets
 
 FOOTNOTE = (
     "All four combinations are listed. The paper's Table 4 prints three and has (✗, ✓) among them,"

@@ -107,10 +107,10 @@ def part_shares(batch: Batch, patch_size: int) -> Float[Tensor, "n P"]:
     parts = []
     for element, body in enumerate(batch.body_vertices):
         parts.append(parts_of_points(points[element][valid[element]], body))
-    found = torch.cat(parts)
+    labels = torch.cat(parts)
     grid = (b, v, height // patch_size, width // patch_size)
-    numbers = torch.arange(grid[0] * grid[1] * grid[2] * grid[3], device=found.device)
+    numbers = torch.arange(grid[0] * grid[1] * grid[2] * grid[3], device=labels.device)
     patch = F.interpolate(numbers.view(grid).double(), scale_factor=patch_size).long()[valid]
-    counts = torch.bincount(patch * len(PARTS) + found, minlength=len(numbers) * len(PARTS))
+    counts = torch.bincount(patch * len(PARTS) + labels, minlength=len(numbers) * len(PARTS))
     counts = counts.view(-1, len(PARTS)).float()
     return counts / counts.sum(1, keepdim=True).clamp_min(1)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ghgs_lit import GHGS
-from ghgs_lit.evaluation.tables.records import model_variant
+from ghgs_lit.evaluation.tables.variants import model_variant
 from ghgs_people.figures.body import BODY_VERTICES, load_body
 from tests.helpers.people import render_boxes
 from tests.helpers.verbs import ghgs

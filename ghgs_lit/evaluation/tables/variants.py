@@ -1,0 +1,198 @@
+"""Whose row of a table a run is: its model, encoder and ablation, read from its configuration."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import Any
+
+from ghgs_lit.config import conf_dir
+from ghgs_lit.config.keys import (
+    OF_A_PLACE,
+    OF_A_RUN,
+    OF_TARGETS,
+    OF_TRAINING,
+    ablation_of,
+    is_below,
+    is_own_ablation,
+    lookup,
+    switches_of,
+)
+from ghgs_lit.errors import require
+from ghgs_lit.parsing import read_yaml
+from ghgs_lit.runs.provenance import config_hash
+
+# Keys that identify an encoder of conf/encoder; models change its other keys.
+_ENCODER_KEYS = ("width", "heads", "depth", "layers", "vit")
+
+
+@dataclass(frozen=True)
+class Variant:
+    """Identity of a row of a table.
+
+    Attributes:
+        kind: ``model`` (ours), ``baseline``,
+            ``other`` (another method) or ``reported`` (by the paper).
+        name: Of the method.
+        model: Name of the model, with what sets it apart from the shipped one;
+            empty for other methods.
+        encoder: Name of its encoder; empty for other methods.
+        ablation: The option that was chosen; empty for other methods.
+        switches: Whether its 3D unprojection and semantic consistency are on.
+        has_semantics: Whether the semantic features were trained (published weights or
+            `ghgs pretext`); unknown before training starts, so it does not distinguish rows.
+        extra: Further configuration keys and values that do.
+    """
+
+    kind: str
+    name: str
+    model: str = ""
+    encoder: str = ""
+    ablation: str = ""
+    switches: tuple[bool, bool] | None = None
+    has_semantics: bool = field(default=True, compare=False)
+    extra: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def is_own(self) -> bool:
+        """Whether this is a row of a user's own ablation."""
+        return bool(self.ablation) and is_own_ablation(self.ablation)
+
+    @property
+    def trained(self) -> tuple:
+        """Identity of the model without its ablation."""
+        return (self.model, self.encoder, self.extra)
+
+
+@cache
+def _shipped(group: str) -> dict[str, dict]:
+    return {path.stem: read_yaml(path) for path in (conf_dir() / group).glob("*.yaml")}
+
+
+def _said(value: Any) -> Any:
+    """A value as files say it, without keys that are null."""
+    return {k: v for k, v in value.items() if v is not None} if isinstance(value, Mapping) else value
+
+
+def encoder_name(config: Mapping[str, Any]) -> str:
+    """Name of the encoder in a configuration.
+
+    Args:
+        config: Resolved configuration of a training.
+
+    Returns:
+        The option of conf/encoder with its sizes, or ``unnamed``,
+        and whether it has a semantic branch.
+    """
+    encoder = config.get("encoder")
+    encoder = encoder if isinstance(encoder, Mapping) else {}
+    branch = ", semantic branch" * (encoder.get("semantic") is not None)
+    for name, shipped in sorted(_shipped("encoder").items()):
+        if all(key in encoder and _said(encoder[key]) == shipped.get(key) for key in _ENCODER_KEYS):
+            return name + branch
+    return "unnamed" + branch
+
+
+def _model_name(config: Mapping[str, Any]) -> str:
+    """A user's own option of conf/model, which may have kept the name of the one that it changes;
+    else the name in the configuration."""
+    chosen = lookup(config, "chosen.model")
+    is_own = chosen is not None and chosen not in _shipped("model")
+    return chosen if is_own else str(lookup(config, "model.name") or "unnamed")
+
+
+def ablation_sets(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What the chosen ablation of a training sets.
+
+    Args:
+        config: Resolved configuration of the training.
+
+    Returns:
+        Dotted keys with their values; empty where the configuration does not say.
+    """
+    sets = lookup(config, "chosen.sets")
+    return dict(sets) if isinstance(sets, Mapping) else {}
+
+
+def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()) -> Variant:
+    """Variant of a model.
+
+    Args:
+        config: Configuration of the model as trained and measured.
+        source: File of the configuration, for messages.
+        by: Keys that distinguish rows beside model, encoder and ablation.
+
+    Returns:
+        The row that the model belongs to.
+
+    Raises:
+        InputError: The configuration has no recalibration, of which the ablation takes parts away.
+    """
+    recalibration = config.get("recalibration")
+    require(isinstance(recalibration, Mapping), f"{source}: recalibration", "a mapping", recalibration)
+    compat = lookup(config, "compat.name")
+    ablation = ablation_of(config)
+    encoder = encoder_name(config)
+    model = [_model_name(config)]
+    model += [f"compat {compat}"] * (compat not in (None, "none"))
+    # What an ablation of one's own changes is a row of the model's table, not another model. The
+    # paper's ablations find neighbours in 3D or on the image plane.
+    if is_own_ablation(ablation):
+        if any(is_below(key, ["encoder"]) for key in ablation_sets(config)):
+            encoder = encoder.replace("unnamed", str(lookup(config, "chosen.encoder")))
+    elif recalibration.get("neighborhood") == "feature":
+        model.append("neighbours by feature")
+    return Variant(
+        kind="model",
+        name="ours",
+        model=", ".join(model),
+        encoder=encoder,
+        ablation=ablation,
+        switches=switches_of(config),
+        # Without such weights the encoder has learned from the rendering loss only.
+        has_semantics=bool(lookup(config, "encoder.weights")),
+        extra=tuple((key, str(lookup(config, key))) for key in by),
+    )
+
+
+def keys_of_rows(configs: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Keys of views and targets in which runs that could share a row differ: runs on the same data
+    by how they were trained, those with a protocol of the same name by its targets.
+
+    Args:
+        configs: Of all runs.
+
+    Returns:
+        Dotted keys, each once.
+    """
+    values: dict[tuple[str, ...], set[str]] = {}
+    for config in configs:
+        data = str(lookup(config, "data.name"))
+        protocol = str(lookup(config, "targets.name"))
+        for key in OF_TRAINING:
+            values.setdefault((key, data), set()).add(str(lookup(config, key)))
+        for key in OF_TARGETS:
+            values.setdefault((key, data, protocol), set()).add(str(lookup(config, key)))
+    return list(dict.fromkeys(key for (key, *_), different in values.items() if len(different) > 1))
+
+
+def variants_of(configs: Mapping[str, Mapping[str, Any]], by: Sequence[str]) -> dict[str, Variant]:
+    """Variants of models by file. Those of one configuration have one row, whatever their ablations
+    are called: by the paper's name if one has it.
+
+    Args:
+        configs: of models, by file.
+        by: keys that distinguish rows beside model, encoder and ablation.
+
+    Returns:
+        The variant of each file.
+
+    Raises:
+        InputError: a configuration has no recalibration.
+    """
+    variants = {path: model_variant(config, path, by) for path, config in configs.items()}
+    keys = {path: config_hash(config, (*OF_A_RUN, *OF_A_PLACE)) for path, config in configs.items()}
+    names: dict[str, str] = {}
+    for path, variant in variants.items():
+        if keys[path] not in names or not variant.is_own:
+            names[keys[path]] = variant.ablation
+    return {path: replace(variant, ablation=names[keys[path]]) for path, variant in variants.items()}
