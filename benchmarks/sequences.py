@@ -31,7 +31,7 @@ from ghgs_lit.data.sampling import SampleSpec, evaluation_samples
 from ghgs_lit.evaluation.measure import Estimate, Method, ModelMethod, measure
 from ghgs_lit.metrics import ImageMetrics
 from ghgs_lit.metrics.flicker import flicker, flicker_in_place
-from ghgs_lit.metrics.functional import box_of
+from ghgs_lit.metrics.regions import box_of
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs import results
 from ghgs_lit.types import Batch, Cameras, Prediction

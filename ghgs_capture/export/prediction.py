@@ -21,7 +21,7 @@ from ghgs_capture.export.unseen import unseen
 from ghgs_lit.errors import choice, installed, require
 from ghgs_lit.geometry.frame import HEIGHT
 from ghgs_lit.metrics import psnr
-from ghgs_lit.metrics.functional import box_of
+from ghgs_lit.metrics.regions import box_of
 from ghgs_lit.ply import ply_bytes
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import versions

@@ -18,7 +18,7 @@ from ghgs_lit.data.images import read_image
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.metrics import flip_map, psnr
-from ghgs_lit.metrics.functional import box_of, mean_over
+from ghgs_lit.metrics.regions import box_of, mean_over
 from ghgs_lit.ply import read_ply
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Batch, Cameras, Gaussians

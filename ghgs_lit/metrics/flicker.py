@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.geometry.projection import project, sample
-from ghgs_lit.metrics.functional import box_of
+from ghgs_lit.metrics.regions import box_of
 from ghgs_lit.types import Cameras
 
 #: Largest distance in metres of a visible point from the depth map.

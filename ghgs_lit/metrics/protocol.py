@@ -14,19 +14,16 @@ from ghgs_lit.metrics.flip import PIXELS_PER_DEGREE, flip_map
 from ghgs_lit.metrics.functional import (
     BESIDE,
     BRIGHTNESS,
-    DEPTH_STEP,
-    EDGE,
     INNER,
     PSNR_CAP,
     decibels,
-    mean_inside,
     psnr_box_40,
-    region_of,
     sharpness,
     spill,
     squared_error,
     ssim_map,
 )
+from ghgs_lit.metrics.regions import DEPTH_STEP, EDGE, mean_inside, region_of
 
 NETWORK = "vgg"
 

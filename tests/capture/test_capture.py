@@ -17,7 +17,8 @@ from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.geometry.masks import on_black
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.geometry.undistortion import undistorting_grid
-from ghgs_lit.metrics.functional import box_of, psnr
+from ghgs_lit.metrics.functional import psnr
+from ghgs_lit.metrics.regions import box_of
 from ghgs_lit.refinement import Refinement
 from ghgs_lit.rendering import Renderer
 from tests.helpers.figures import PARTS, Figure

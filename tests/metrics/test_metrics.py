@@ -18,7 +18,8 @@ from torchmetrics.functional.image import (
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.metrics import PSNR_CAP, MetricsOptions, depth_error_mm, flip_map, psnr, ssim
-from ghgs_lit.metrics.functional import box_of, crop_of, ssim_map
+from ghgs_lit.metrics.functional import ssim_map
+from ghgs_lit.metrics.regions import box_of, crop_of
 from ghgs_lit.training.base import image_mean
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"

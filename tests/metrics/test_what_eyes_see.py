@@ -7,7 +7,8 @@ import torch
 from scipy import ndimage
 
 from ghgs_lit.metrics import PSNR_CAP, MetricsOptions, surface_error_mm
-from ghgs_lit.metrics.functional import depth_edges, psnr_box_40, region_of, sharpness, spill
+from ghgs_lit.metrics.functional import psnr_box_40, sharpness, spill
+from ghgs_lit.metrics.regions import depth_edges, region_of
 
 SEEN = ("psnr_edge", "spill", "sharpness", "psnr_box_40")
 METRICS = MetricsOptions(lpips="off").build()

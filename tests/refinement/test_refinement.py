@@ -8,7 +8,8 @@ import torch
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import splats_at
 from ghgs_lit.geometry.projection import world_to_camera
-from ghgs_lit.metrics.functional import box_of, psnr
+from ghgs_lit.metrics.functional import psnr
+from ghgs_lit.metrics.regions import box_of
 from ghgs_lit.refinement import Refinement
 from ghgs_lit.refinement.refinement import _footprints
 from ghgs_lit.rendering import Renderer

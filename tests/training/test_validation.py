@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from ghgs_lit.metrics.functional import box_of, psnr, ssim
+from ghgs_lit.metrics.functional import psnr, ssim
+from ghgs_lit.metrics.regions import box_of
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.types import DepthMaps
 from tests.helpers.losses import losses_of

@@ -30,7 +30,7 @@ from ghgs_capture.verbs import Predict
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.metrics import psnr
-from ghgs_lit.metrics.functional import box_of
+from ghgs_lit.metrics.regions import box_of
 from ghgs_lit.ply import read_ply
 from ghgs_lit.rendering import Renderer, render
 from ghgs_lit.types import Batch, Cameras
