@@ -56,7 +56,7 @@ def map_tensors(value: _T, fn: Callable[[Tensor], Tensor]) -> _T:
     return value
 
 
-class _TensorStruct:
+class TensorStruct:
     """``to``, ``detach`` and ``pin_memory`` for a dataclass of tensors."""
 
     def to(self, *args, **kwargs):
@@ -73,7 +73,7 @@ class _TensorStruct:
 
 
 @dataclass(frozen=True)
-class Cameras(_TensorStruct):
+class Cameras(TensorStruct):
     """Pinhole cameras with any leading dimensions, all of one image size in pixels."""
 
     intrinsics: Float[Tensor, "*batch 3 3"]
@@ -133,7 +133,7 @@ class Cameras(_TensorStruct):
 
 
 @dataclass(frozen=True)
-class Targets(_TensorStruct):
+class Targets(TensorStruct):
     """Photographs to predict, from cameras other than the input cameras. ``names``: the photographs
     of each subject. ``protocols``: the target protocol of each of the ``T`` targets, the same for
     all subjects. ``depths``: true z-depths in metres, 0 where unknown; None: unknown."""
@@ -157,7 +157,7 @@ class Targets(_TensorStruct):
 
 
 @dataclass(frozen=True)
-class Batch(_TensorStruct):
+class Batch(TensorStruct):
     """Input photographs of ``B`` subjects, with everything that is known about them.
 
     ``body_vertices``: points of the body's surface in metres. ``depths``: true z-depths in
@@ -221,7 +221,7 @@ class Batch(_TensorStruct):
 
 
 @dataclass(frozen=True)
-class DepthBounds(_TensorStruct):
+class DepthBounds(TensorStruct):
     """The nearest and the farthest z-depth, in metres,
     at which each pixel's ray can meet the subject."""
 
@@ -230,7 +230,7 @@ class DepthBounds(_TensorStruct):
 
 
 @dataclass(frozen=True)
-class Tokens(_TensorStruct):
+class Tokens(TensorStruct):
     """Tokens of the kept patches of the whole batch, packed. Token ``n`` is the patch at
     ``row[n]``, ``column[n]`` of image ``image[n]`` (``b * V + v``); tokens are ordered by image,
     row, column. ``grid`` is ``(B, V, h, w)``. ``latent``: embeddings E of the encoder's read-out
@@ -296,7 +296,7 @@ class Tokens(_TensorStruct):
 
 
 @dataclass(frozen=True)
-class DepthMaps(_TensorStruct):
+class DepthMaps(TensorStruct):
     """Z-depth of each pixel in metres, and the bounds that it lies between, if any."""
 
     depth: Float[Tensor, "B V H W"]
@@ -306,7 +306,7 @@ class DepthMaps(_TensorStruct):
 
 
 @dataclass(frozen=True)
-class Points(_TensorStruct):
+class Points(TensorStruct):
     """World points of pixels and of tokens, in metres. Invalid ones are finite but meaningless.
     ``token_image`` is the image (``b * V + v``) of each token."""
 
@@ -318,7 +318,7 @@ class Points(_TensorStruct):
 
 
 @dataclass(frozen=True)
-class Gaussians(_TensorStruct):
+class Gaussians(TensorStruct):
     """3D Gaussians of a batch, packed; ``splits[b]`` of them belong to element ``b``.
 
     ``quaternions`` need not have unit norm; ``scales`` are standard deviations in metres;
@@ -349,23 +349,21 @@ class Gaussians(_TensorStruct):
         fields = (self.means, self.quaternions, self.scales, self.opacities[:, None], self.colors)
         return torch.stack([field.isfinite().all(1) for field in fields]).all(0)
 
+    def _rows(self) -> dict[str, Tensor]:
+        """The tensors with a row for each Gaussian, by name."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {n: value for n, value in values.items() if n != "metre" and isinstance(value, Tensor)}
+
     def select(self, index: Tensor | slice, splits: tuple[int, ...]) -> "Gaussians":
         """The Gaussians at ``index`` (slice, mask or indices).
         ``splits``: their number in each element."""
-        changes = {
-            f.name: getattr(self, f.name)[index]
-            for f in dataclasses.fields(self)
-            if f.name != "metre" and isinstance(getattr(self, f.name), Tensor)
-        }
+        changes = {name: values[index] for name, values in self._rows().items()}
         return dataclasses.replace(self, **changes, splits=splits)
 
     def with_more(self, others: "Gaussians") -> "Gaussians":
         """These and then others; both of one element, with the same optional fields."""
-        both = {
-            f.name: torch.cat((getattr(self, f.name), getattr(others, f.name)))
-            for f in dataclasses.fields(self)
-            if f.name != "metre" and isinstance(getattr(self, f.name), Tensor)
-        }
+        more = others._rows()
+        both = {name: torch.cat((values, more[name])) for name, values in self._rows().items()}
         return dataclasses.replace(self, **both, splits=(len(self) + len(others),))
 
     def __getitem__(self, element: int) -> "Gaussians":
@@ -400,7 +398,7 @@ class Decision:
 
 
 @dataclass(frozen=True)
-class Prediction(_TensorStruct):
+class Prediction(TensorStruct):
     """The result of ``model(batch)``, in the world and the unit of its cameras. ``depth``
     has a meaning where ``depth_valid``. ``decisions``: one for each element with
     ``skip=auto``. ``rounds``: depths before the first round and after each (the last is
@@ -419,7 +417,7 @@ class Prediction(_TensorStruct):
 
 
 @dataclass(frozen=True)
-class Rendering(_TensorStruct):
+class Rendering(TensorStruct):
     """Rendered Gaussians. ``depth`` is the expected z in metres,
     ``sum(w z) / max(sum(w), 1e-10)``."""
 

@@ -25,7 +25,7 @@ from ghgs_lit.data.sampling import RING_VIEW, Photo, SampleSpec, photo_name
 from ghgs_lit.data.view import DEPTH_SCALE, SAME_SURFACE, View, area_weights, neighbors, resize_view
 from ghgs_lit.errors import require
 from ghgs_lit.runtime.precision import exact
-from ghgs_lit.types import Batch, Cameras, Targets, map_tensors
+from ghgs_lit.types import Batch, Cameras, Targets, TensorStruct
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +35,7 @@ _SHARE = 0.5
 
 
 @dataclass(frozen=True)
-class Drawn:
+class Drawn(TensorStruct):
     """A batch whose photographs are on the device.
 
     Attributes:
@@ -51,14 +51,6 @@ class Drawn:
     targets: Int[Tensor, "B T"]
     target_cameras: Cameras
     specs: tuple[SampleSpec, ...]
-
-    def to(self, *args: Any, **kwargs: Any) -> "Drawn":
-        """Move the numbers and cameras to a device."""
-        return map_tensors(self, lambda tensor: tensor.to(*args, **kwargs))
-
-    def pin_memory(self) -> "Drawn":
-        """Put them into page-locked memory, for copies that do not wait."""
-        return map_tensors(self, Tensor.pin_memory)
 
 
 class ResidentPhotographs:
