@@ -77,8 +77,8 @@ class Measured:
         cameras: the calibration.
         out: folder of what is done; gets ``results.json`` after each instant.
         step: every how many instants one is measured.
-        weights: files of weights by name, ``shipped`` first; of several the instant of number i in the
-            sequence is predicted by the one of number i modulo their count.
+        weights: files of weights by name, ``shipped`` first; of several the instant of number i in
+            the sequence is predicted by the one of number i modulo their count.
     """
 
     def __init__(self, images: Path, cameras: Path, out: Path, step: int, weights: dict[str, list[str]]):
@@ -101,7 +101,8 @@ class Measured:
         return torch.load(path, weights_only=False)
 
     def say(self, way: str, subject: str, rows: Sequence[Sequence[float]]) -> None:
-        """Keep the columns of all cameras of an instant or a person in the JSON; print the box's."""
+        """Keep the columns of all cameras of an instant or a person in the JSON;
+        print the box's."""
         columns = (dict(zip(COLUMNS, row, strict=True)) for row in rows)
         self.results["rows"].setdefault(way, {})[subject] = dict(zip(self.cameras, columns, strict=True))
         write_text_atomically(self.out / "results.json", json.dumps(self.results, indent=1))

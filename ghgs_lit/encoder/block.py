@@ -93,6 +93,14 @@ class Attention(nn.Module):
         rotary: Rotary | None = None,
         real: Bool[Tensor, " t"] | None = None,
     ) -> Float[Tensor, "t c"]:
+        """Attend inside each sequence.
+
+        Args:
+            x: tokens of all sequences, one after another.
+            lengths: tokens of each sequence, inside which attention stays.
+            rotary: tables of all tokens; None: no rotation.
+            real: tokens that others attend to, where all sequences have one length; None: all.
+        """
         q, k, v = rearrange(self.qkv(x), "t (s a d) -> s a t d", s=3, a=self.heads)
         q = self._norm_and_rotate(q, self.q_norm, rotary)
         k = self._norm_and_rotate(k, self.k_norm, rotary)
@@ -210,6 +218,14 @@ class Block(nn.Module):
         rotary: Rotary | None = None,
         real: Bool[Tensor, " t"] | None = None,
     ) -> Float[Tensor, "t c"]:
+        """Change the tokens of each sequence.
+
+        Args:
+            x: tokens of all sequences, one after another.
+            lengths: tokens of each sequence, inside which attention stays.
+            rotary: tables of all tokens; None: no rotation.
+            real: tokens that others attend to, where all sequences have one length; None: all.
+        """
         x = self.ls1(x, self.attn(self.norm1(x), lengths, rotary, real))
         if torch.is_grad_enabled():
             return self.ls2(x, self.mlp(self.norm2(x)))

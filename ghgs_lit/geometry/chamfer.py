@@ -52,8 +52,8 @@ def nearest_by_products(
     Args:
         queries: points [n, 3]; finite.
         references: points [m, 3]; not empty, finite.
-        counts: which references are looked at first; None: all. Others are found where fewer than four
-            count, and should be copies of those.
+        counts: which references are looked at first; None: all. Others are found where fewer than
+            four count, and should be copies of those.
 
     Returns:
         Indices [n] of references.
@@ -137,7 +137,8 @@ def chamfer_of_rows(
     points = at_least_float32(points)
     references = at_least_float32(references)
     number = counts.sum()
-    # All others are copies of the first that counts, so that a pair always has the gradient of its point.
+    # All others are copies of the first that counts,
+    # so that a pair always has the gradient of its point.
     place = constant(torch.arange, len(points), like=points, dtype=torch.long)
     first = counts.to(torch.uint8).argmax()
     points = torch.where(number > 0, points[torch.where(counts, place, first)], 0)

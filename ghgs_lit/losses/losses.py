@@ -73,7 +73,14 @@ class Losses(Options):
         return total, values
 
     def _term(self, name: str, prediction: Prediction, rendering: Rendering, batch: Batch) -> Tensor:
-        """A term by name, before its weight."""
+        """A term before its weight.
+
+        Args:
+            name: a field of :class:`LossWeights`.
+            prediction: of the model for the batch.
+            rendering: its Gaussians from the target cameras.
+            batch: with what the term reads.
+        """
         if name == "chamfer":
             return terms.chamfer(prediction, rendering, batch, self.chamfer_points)
         return getattr(terms, name)(prediction, rendering, batch)

@@ -98,12 +98,13 @@ def _rows_of_gaussians(
     """Points of the pixels that Gaussians belong to, whose number is known without a wait.
 
     Args:
-        prediction: each of its valid pixels has a Gaussian; a size class may be filled by Gaussians of pixels
-            that precede them.
+        prediction: each of its valid pixels has a Gaussian; a size class may be filled by Gaussians
+            of pixels that precede them.
         used: pixels that count.
 
     Returns:
-        Points [n, 3] of each element, and which of them count [n]; None: Gaussians belong to no pixels.
+        Points [n, 3] of each element, and which of them count [n];
+        None: Gaussians belong to no pixels.
     """
     gaussians = prediction.gaussians
     if gaussians.image is None or not all(gaussians.splits):

@@ -66,7 +66,14 @@ def _weights_of(layers: Sequence[nn.Linear]) -> list[Tensor]:
 
 
 def _remembered(each: Tensor, known: Tensor, memory: Tensor, weights: Sequence[Tensor]) -> Tensor:
-    """The operator in plain PyTorch, with the weights and biases of its layers in turn."""
+    """The operator in plain PyTorch.
+
+    Args:
+        each: observations of each view [N, V, c].
+        known: beside them [N, k].
+        memory: of the rounds before [N, h].
+        weights: weights and biases of the five layers, in turn.
+    """
     own, others = _two_layers(each, weights[:4]).split((1, each.shape[1] - 1), 1)
     inputs = torch.cat((own[:, 0], others.mean(1), others.amax(1), known, memory), -1)
     return torch.tanh(memory + F.linear(_two_layers(inputs, weights[4:8]), *weights[8:]))

@@ -144,8 +144,8 @@ class Recorder:
             inputs: dataclasses, tuples, lists and dicts of tensors on one device, and of anything
                 hashable.
             key: all else that may change what ``function`` does.
-            written: memory that ``function`` writes to and that was there before. Recording calls it
-                without effect.
+            written: memory that ``function`` writes to and that was there before. Recording calls
+                it without effect.
 
         Returns:
             Its result, in memory that later calls do not write to.

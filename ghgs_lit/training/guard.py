@@ -112,7 +112,14 @@ class Guard:
 
 
 def _write(path: Path, module: L.LightningModule, step: Step, fault: Fault) -> None:
-    """Write all that :func:`ghgs_lit.training.replay.replay` needs."""
+    """Write all that :func:`ghgs_lit.training.replay.replay` needs.
+
+    Args:
+        path: of the file.
+        module: whose weights, optimizer and configuration are written.
+        step: that was not finite.
+        fault: what was not finite first.
+    """
     inputs = dataclasses.asdict(step)
     inputs["autocast"] = str(step.autocast or "").removeprefix("torch.")
     weights = {name.removeprefix(STATE_PREFIX): value for name, value in module.state_dict().items()}

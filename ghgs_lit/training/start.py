@@ -71,8 +71,17 @@ def check_resume(
 def _check_optimizer(
     path: str | Path, checkpoint: Mapping[str, Any], module: L.LightningModule, config: Mapping[str, Any]
 ) -> None:
-    """Refuse to resume with Muon from AdamW's state, the reverse,
-    or with other parameter groups."""
+    """Refuse to resume with Muon from AdamW's state, the reverse, or with other parameter groups.
+
+    Args:
+        path: of the checkpoint, for messages.
+        checkpoint: its content.
+        module: whose optimizer goes on.
+        config: of the run that resumes.
+
+    Raises:
+        InputError: the optimizer, its groups or its schedule do not fit.
+    """
     states = checkpoint["optimizer_states"]
     stored = itertools.chain.from_iterable(state["param_groups"] for state in states)
     by_muon = any("orthogonal" in group for group in stored)

@@ -111,7 +111,14 @@ class Pictures(Callback):
         self._seen = None
 
     def _show_attention(self, trainer: L.Trainer, batch: Batch, element: int, name: str) -> None:
-        """Publish whom the chosen token of an element attends to."""
+        """Publish whom the chosen token of an element attends to.
+
+        Args:
+            trainer: with the loggers and the folder of the run.
+            batch: that the model was called with last.
+            element: of the batch.
+            name: of its subject, in the names of pictures.
+        """
         if self._seen is None:
             return
         stage, tokens, points = self._seen
@@ -162,8 +169,14 @@ def _show_distributions(trainer: L.Trainer, prediction: Prediction) -> None:
 
 
 def _publish(trainer: L.Trainer, tag: str, picture: np.ndarray, file: str) -> None:
-    """Write ``<run>/pictures/step_<step>/<file>.png`` and log it as ``tag`` to loggers
-    of pictures."""
+    """Write ``<run>/pictures/step_<step>/<file>.png`` and log it to loggers of pictures.
+
+    Args:
+        trainer: with the loggers, the folder of the run and the step.
+        tag: name in the loggers.
+        picture: [h, w, 3] uint8.
+        file: name without suffix.
+    """
     step = trainer.global_step
     save_png(picture, Path(trainer.default_root_dir) / "pictures" / f"step_{step:06d}" / f"{file}.png")
     for logger in trainer.loggers:
@@ -174,7 +187,15 @@ def _publish(trainer: L.Trainer, tag: str, picture: np.ndarray, file: str) -> No
 
 
 def _show_clouds(trainer: L.Trainer, batch: Batch, prediction: Prediction, element: int, name: str) -> None:
-    """Log the point clouds of an element to TensorBoard."""
+    """Log the point clouds of an element to TensorBoard.
+
+    Args:
+        trainer: with the loggers and the step.
+        batch: with the photographs.
+        prediction: of the batch.
+        element: of the batch.
+        name: of its subject.
+    """
     loggers = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
     for kind, (positions, colors) in clouds(batch, prediction, element).items() if loggers else ():
         for logger in loggers:

@@ -128,7 +128,8 @@ def test_chamfer_gradient_is_that_of_finite_differences():
 
 @pytest.mark.parametrize("count", [0, 1, 3, 200])
 def test_points_that_do_not_count_change_nothing(count):
-    """Neither the distance nor its gradient, whatever they are: against a tree on those that count."""
+    """Neither the distance nor its gradient, whatever they are:
+    against a tree on those that count."""
     points = torch.rand(260, 3, generator=torch.Generator().manual_seed(count))
     references = torch.rand(150, 3, generator=torch.Generator().manual_seed(7)) + 0.3
     counts = torch.zeros(260, dtype=torch.bool)

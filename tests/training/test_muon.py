@@ -270,8 +270,8 @@ MATRICES = {"conv", "square", "tall", "wide"}
 
 @pytest.mark.parametrize("capturable", [True, False])
 def test_steps_that_are_played_back_are_the_same(capturable):
-    """Recording takes no step by itself, and neither does a try that fails: AdamW counts on the host.
-    The first step makes the state. Weights of a convolution in another layout, too."""
+    """Recording takes no step by itself, and neither does a try that fails: AdamW counts on the
+    host. The first step makes the state. Weights of a convolution in another layout, too."""
     with pretend_device():
         wanted, _ = stepped(None, capturable)
         with nullcontext() if capturable else pytest.warns(UserWarning, match="not recorded"):

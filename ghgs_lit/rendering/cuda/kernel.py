@@ -102,7 +102,18 @@ def placed_rows(
 
 
 def boxed(centers: Tensor, radii: Tensor, order: Tensor, rows: int, columns: int) -> Tensor:
-    """The operator of :mod:`ghgs_lit.rendering.intersections`."""
+    """The operator of :mod:`ghgs_lit.rendering.intersections`.
+
+    Args:
+        centers: of splats in pixels [I, N, 2].
+        radii: half sides in pixels [I, N, 2]; 0 where a splat is not drawn.
+        order: splats of all images [I * N], in the order of the result.
+        rows: of tiles that have pixels, in one image.
+        columns: of tiles in one image.
+
+    Returns:
+        Number of each splat's tiles, index of the first one, and the number across [3, I * N].
+    """
     out = radii.new_empty(3, len(order), dtype=torch.int32)
     start(boxed_rows, len(order), centers, radii, order, out, centers.shape[1], rows, columns)
     return out
@@ -111,7 +122,19 @@ def boxed(centers: Tensor, radii: Tensor, order: Tensor, rows: int, columns: int
 def placed(
     ends: Tensor, boxes: Tensor, order: Tensor, every: Tensor, capacity: int, columns: int
 ) -> tuple[Tensor, Tensor]:
-    """The operator of :mod:`ghgs_lit.rendering.intersections`."""
+    """The operator of :mod:`ghgs_lit.rendering.intersections`.
+
+    Args:
+        ends: places up to the end of each splat's [N].
+        boxes: as of :func:`boxed` [3, N].
+        order: splats of the rows of ``ends`` and ``boxes`` [N].
+        every: numbers of all tiles; places that no splat needs are of the last one.
+        capacity: number of places.
+        columns: of tiles in one image.
+
+    Returns:
+        The tile of each place, in the type of ``every``, and its splat [capacity].
+    """
     tile = every.new_empty(capacity)
     splat = boxes.new_empty(capacity)
     splats = len(order)

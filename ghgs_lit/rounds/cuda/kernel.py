@@ -139,7 +139,14 @@ def times(
 
 @triton.jit
 def biases(bias, top, outputs, OUTPUTS: tl.constexpr):
-    """Part of a bias from ``top`` on as a row [1, OUTPUTS], 0 from ``outputs`` on."""
+    """Part of a bias as a row [1, OUTPUTS].
+
+    Args:
+        bias: [outputs] numbers.
+        top: the first one that is read.
+        outputs: their number; beyond them the row is 0.
+        OUTPUTS: length of the row, a power of two.
+    """
     column = top + tl.arange(0, OUTPUTS)
     return tl.load(bias + column, mask=column < outputs, other=0.0)[None]
 
@@ -244,7 +251,17 @@ _TOGETHER = 32
 
 
 def remember(each: Tensor, known: Tensor, memory: Tensor, weights: list[Tensor]) -> Tensor:
-    """The operator of :mod:`ghgs_lit.rounds.memory`."""
+    """The operator of :mod:`ghgs_lit.rounds.memory`.
+
+    Args:
+        each: observations of each view [N, V, c].
+        known: beside them [N, k].
+        memory: of the rounds before [N, h].
+        weights: weights and biases of the five layers, in turn.
+
+    Returns:
+        The new memory [N, h].
+    """
     count, views, channels = each.shape
     out = torch.empty_like(memory, memory_format=torch.contiguous_format)
     numbers = (channels, memory.shape[1], known.shape[1], len(weights[4]))
