@@ -16,8 +16,8 @@ from ghgs_lit.config.registry import build, read_node
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.padding import bounds_of
 from ghgs_lit.heads.dpt import LEVELS, DPTHead
-from ghgs_lit.plan import Plan, Sizes, SkipOptions, planned
-from ghgs_lit.playback import Playback
+from ghgs_lit.plan import Measured, Plan, Sizes, SkipOptions, planned
+from ghgs_lit.playback import Entered, Playback
 from ghgs_lit.rendering.capacity import settled
 from ghgs_lit.rounds import (
     Coarse,
@@ -127,12 +127,18 @@ class GHGS(nn.Module):
             InputError: the batch does not fit the stages.
         """
         asked = (self.options, self.encoder.patch_size, self.checks_values)
-        enter = functools.partial(entered, *asked)
+
+        def enter(batch: Batch) -> Entered:
+            around, inside, findings = entered(*asked, batch)
+            return around, inside, findings, self.measured(inside, findings)
+
         if self.options.capture == "auto":
-            around, inside, findings = self.playback.entered(enter, batch, repr(asked))
+            key = (repr(asked), self.settings(("encoder",)))
+            around, *of_batch = self.playback.entered(enter, batch, key)
         else:
-            around, inside, findings = enter(batch)
-        return around, inside, self.plan(inside, findings, least)
+            around, *of_batch = enter(batch)
+        inside, findings, measured = of_batch
+        return around, inside, self.plan(inside, findings, least, measured)
 
     def finished(self, around: Sequence[Surrounding], batch: Batch, plan: Plan) -> Prediction:
         """The prediction for what is prepared.
@@ -145,7 +151,7 @@ class GHGS(nn.Module):
         with self.in_precision(batch.masks.device):
             prediction = self._predicted(batch, plan, self._coarse(batch))
         prediction = plan.trimmed(left(around, prediction))
-        return dataclasses.replace(prediction, decisions=plan.decisions, tokens=None)
+        return dataclasses.replace(prediction, decisions=plan.decisions)
 
     def in_precision(self, device: torch.device) -> AbstractContextManager[None]:
         """The precision of the stages' products on a device, while the context lasts."""
@@ -160,58 +166,92 @@ class GHGS(nn.Module):
         height = None if self.rounds is None else self.rounds.height
         return height is not None and any(coarse_sizes(batch, height, self.encoder.patch_size))
 
-    def plan(self, batch: Batch, findings: Sequence[Finding] = (), least: Sizes | None = None) -> Plan:
+    def measured(self, batch: Batch, findings: Sequence[Finding] = ()) -> Measured:
+        """What a plan reads, where it is: a function of tensors.
+
+        Args:
+            batch: as the stages see it, with whole patches.
+            findings: of its checks, which are to be read, too.
+        """
+        encoder = self.encoder
+        masks = batch.masks
+        choices = [encoder.keeps(masks)] if self.auto is None else self.auto.choices(encoder, masks)
+        flags = [batch.cameras.any_skew, *([any_bad(findings)] if findings else [])]
+        return Measured.of(masks, encoder.patch_size, choices, flags)
+
+    def plan(
+        self,
+        batch: Batch,
+        findings: Sequence[Finding] = (),
+        least: Sizes | None = None,
+        measured: Measured | None = None,
+    ) -> Plan:
         """What the stages work on; a GPU is waited for once.
 
         Args:
             batch: as the stages see it, with whole patches.
             findings: of its checks, which are read, too.
             least: sizes that are kept as long as they are enough; None: those of the scene.
+            measured: of the batch; None: it is measured now.
 
         Raises:
             InputError: the batch violates one of the checks.
         """
         auto = self.auto
         encoder = self.encoder
-        masks = batch.masks
-        cameras = [batch.cameras] if batch.targets is None else [batch.cameras, batch.targets.cameras]
+        targets = [] if batch.targets is None else [batch.targets.cameras]
         plan = planned(
-            masks,
+            batch.masks,
             encoder.patch_size,
-            [encoder.keeps(masks)] if auto is None else auto.choices(encoder, masks),
+            measured or self.measured(batch, findings),
             self.skip.pixels,
             self.recalibration.tokens,
             None if auto is None else functools.partial(auto.choose, encoder),
-            [*(each.any_skew for each in cameras), *([any_bad(findings)] if findings else [])],
+            [cameras.any_skew for cameras in targets],
             least=least,
         )
-        *skews, is_bad = plan.flags if findings else (*plan.flags, False)
-        if is_bad:
+        has_skew, *others = plan.flags
+        if findings and others.pop(0):
             refuse(findings)
-        for each, has_skew in zip(cameras, skews, strict=True):
-            vars(each)["has_skew"] = has_skew
-        batch.note(plan.extents, plan.subject.index)
+        vars(batch.cameras)["has_skew"] = has_skew
+        for cameras, has_skew in zip(targets, others, strict=True):
+            vars(cameras)["has_skew"] = has_skew
+        batch.note(plan.extents, lambda: plan.subject.index)
         return plan
 
-    def _predicted(self, batch: Batch, plan: Plan, coarse: Coarse | None) -> Prediction:
-        """:meth:`_predict`, played back where it can be; renderings have room enough."""
-        if self.options.capture == "auto" and not self.training and self.playback.fits(batch, plan):
-            return self.playback(self, batch, plan, coarse, self.settings())
-        return settled(lambda: self.predict(batch, plan, coarse))
+    def _predicted(
+        self, batch: Batch, plan: Plan, coarse: Coarse | None, keeps_tokens: bool = False
+    ) -> Prediction:
+        """:meth:`predict`, played back where it can be; renderings have room enough.
 
-    def predict(self, batch: Batch, plan: Plan, coarse: Coarse | None = None) -> Prediction:
+        Args:
+            batch: as of :meth:`predict`, as are all others.
+            plan: of the batch.
+            coarse: what was found in smaller copies.
+            keeps_tokens: whether tokens are asked for.
+        """
+        predict = functools.partial(self.predict, keeps_tokens=keeps_tokens)
+        if self.options.capture == "auto" and not self.training and self.playback.fits(batch, plan):
+            return self.playback(predict, batch, plan, coarse, (keeps_tokens, self.settings()))
+        return settled(lambda: predict(batch, plan, coarse))
+
+    def predict(
+        self, batch: Batch, plan: Plan, coarse: Coarse | None = None, keeps_tokens: bool = False
+    ) -> Prediction:
         """The stages of Figure 2: bounds, tokens, and what is decoded from them.
 
         Args:
             batch: as the stages see it.
             plan: of the batch.
             coarse: what was found in smaller copies of the photographs; None: there are none.
+            keeps_tokens: whether the prediction contains the tokens of the encoder.
         """
         bounds = self.bounded(batch)
         encode = functools.partial(self.encoded, batch, bounds, plan)
         tokens = encode() if coarse is None else coarse.encoded(plan, encode)
         depths = None if coarse is None else coarse.depths
-        return dataclasses.replace(self.decoded(batch, bounds, tokens, plan, depths), tokens=tokens)
+        prediction = self.decoded(batch, bounds, tokens, plan, depths)
+        return dataclasses.replace(prediction, tokens=tokens) if keeps_tokens else prediction
 
     def bounded(self, batch: Batch) -> DepthBounds | None:
         """Near and far of each pixel's ray; None for stages without bounds."""
@@ -289,15 +329,19 @@ class GHGS(nn.Module):
             return None
 
         def predict(small: Batch) -> Prediction:
-            return self._predicted(small, self.plan(small), None)
+            return self._predicted(small, self.plan(small), None, keeps_tokens=True)
 
         return coarse_of(batch, self.rounds.height, self.encoder.patch_size, self.options.matte, predict)
 
-    def settings(self) -> Hashable:
+    def settings(self, parts: Sequence[str] = (*STAGES, "rounds")) -> Hashable:
         """All that may be changed after a model was made and decides what it computes,
-        but its weights."""
+        but its weights.
+
+        Args:
+            parts: stages that compute.
+        """
         settings: list[Hashable] = [self.skip.pixels, self.keeps_drafts]
-        for name in (*STAGES, "rounds"):
+        for name in parts:
             of_stage = getattr(getattr(self, name), "__dict__", {}).items()
             settings += [(name, *item) for item in of_stage if isinstance(item[1], (str, int, float, tuple))]
         return repr(settings)

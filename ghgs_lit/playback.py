@@ -8,14 +8,13 @@ of by thousands of calls."""
 import dataclasses
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
 from ghgs_lit.extents import Extent
-from ghgs_lit.plan import Plan, Sizes
+from ghgs_lit.plan import Measured, Plan, Sizes
 from ghgs_lit.plan.patches import KeptPatches
 from ghgs_lit.rendering.capacity import Rooms, deferred
 from ghgs_lit.rounds import Coarse
@@ -24,21 +23,14 @@ from ghgs_lit.runtime.watching import is_watched
 from ghgs_lit.surroundings import Finding, Surrounding
 from ghgs_lit.types import Batch, DecodedPixels, Prediction
 
-#: Layers around the stages, the batch inside of them, and what is expected of its values.
-_Entered = tuple[Sequence[Surrounding], Batch, list[Finding]]
+#: Layers around the stages, the batch inside of them, what is expected of its values,
+#: and what a plan reads of it.
+Entered = tuple[Sequence[Surrounding], Batch, list[Finding], Measured]
 
 
-class Stages(Protocol):
-    """The stages of a prediction, as :class:`ghgs_lit.model.GHGS` has them."""
-
-    def predict(self, batch: Batch, plan: Plan, coarse: Coarse | None = None) -> Prediction:
-        """What all stages make of a batch.
-
-        Args:
-            batch: as the stages see it.
-            plan: of the batch.
-            coarse: what was found in smaller copies of the photographs; None: there are none.
-        """
+#: What all stages make of a batch as they see it, of its plan, and of what was found in smaller copies of
+#: the photographs (None: there are none).
+Predict = Callable[[Batch, Plan, Coarse | None], Prediction]
 
 
 @dataclass(frozen=True)
@@ -74,7 +66,7 @@ class Scene:
         else:
             kept = KeptPatches(self.kept, device, size=self.sizes.kept)
         plan = Plan(batch.masks, self.shown, kept, *facts, least=self.sizes, is_least=True)
-        batch.note(plan.extents, plan.subject.index)
+        batch.note(plan.extents, lambda: plan.subject.index)
         vars(batch.cameras)["has_skew"] = False
         return batch, plan
 
@@ -101,12 +93,13 @@ class Playback:
         self.recorder.clear()
         self.steps.clear()
 
-    def entered(self, enter: Callable[[Batch], _Entered], batch: Batch, key: Hashable) -> _Entered:
+    def entered(self, enter: Callable[[Batch], Entered], batch: Batch, key: Hashable) -> Entered:
         """What precedes the plan, played back where no gradient is wanted;
         its work depends on sizes alone.
 
         Args:
-            enter: gives layers around the stages, the batch inside of them, and findings.
+            enter: gives layers around the stages, the batch inside of them, findings, and what a
+                plan reads.
             batch: outside of all layers.
             key: all that ``enter`` depends on.
         """
@@ -115,12 +108,14 @@ class Playback:
         described(batch, tensors)
         if not here or is_watched() or any(tensor.requires_grad for tensor in tensors):
             return enter(batch)
-        bare = dataclasses.replace(batch, targets=None, subjects=(), views=())
+        # Without what was computed of the cameras, or the same batch would be of another class the next time.
+        cameras = dataclasses.replace(batch.cameras)
+        bare = dataclasses.replace(batch, cameras=cameras, targets=None, subjects=(), views=())
         with torch.no_grad():
-            around, inside, findings = self.recorder(enter, bare, ("entered", key))
+            around, inside, findings, measured = self.recorder(enter, bare, ("entered", key))
         # Targets and names take no part; what was computed of the batch stays with it.
         vars(inside).update(targets=batch.targets, subjects=batch.subjects, views=batch.views)
-        return around, inside, findings
+        return around, inside, findings, measured
 
     def fits(self, batch: Batch, plan: Plan) -> bool:
         """Whether recordings of this batch are worth a try.
@@ -143,7 +138,7 @@ class Playback:
 
     def __call__(
         self,
-        stages: Stages,
+        predict: Predict,
         batch: Batch,
         plan: Plan,
         coarse: Coarse | None,
@@ -152,7 +147,7 @@ class Playback:
         """The prediction for a batch that :meth:`fits`.
 
         Args:
-            stages: of the model.
+            predict: of the model.
             batch: as the stages see it.
             plan: of the batch.
             coarse: what was found in smaller copies, if there are any.
@@ -162,14 +157,14 @@ class Playback:
             The prediction; its Gaussians fill their size class.
         """
 
-        def predict(inputs: tuple[Scene, Coarse | None]) -> tuple[Prediction, Rooms]:
+        def predicted(inputs: tuple[Scene, Coarse | None]) -> tuple[Prediction, Rooms]:
             scene, coarse = inputs
             with deferred() as rooms:
-                return stages.predict(*scene.read(), coarse), rooms
+                return predict(*scene.read(), coarse), rooms
 
         inputs = (Scene.of(batch, plan), coarse)
-        prediction, rooms = self.recorder(predict, inputs, key)
+        prediction, rooms = self.recorder(predicted, inputs, key)
         while not rooms.suffice():
             self.recorder.forget(inputs, key)
-            prediction, rooms = self.recorder(predict, inputs, key)
+            prediction, rooms = self.recorder(predicted, inputs, key)
         return prediction

@@ -191,8 +191,8 @@ class Batch(TensorStruct):
     def recolored(self, **changes: Tensor) -> "Batch":
         """The batch with other colours and the same masks, whose extents stay known."""
         changed = dataclasses.replace(self, **changes)
-        known = {name: self.__dict__[name] for name in ("extents", "pixels") if name in self.__dict__}
-        changed.__dict__.update(known)
+        names = ("extents", "pixels", "_pixels")
+        changed.__dict__.update({name: vars(self)[name] for name in names if name in vars(self)})
         return changed
 
     def once(self, function: Callable[["Batch"], _T]) -> _T:
@@ -203,10 +203,14 @@ class Batch(TensorStruct):
             known[function] = function(self)
         return known[function]
 
-    def note(self, extents: Sequence[Extent], pixels: Int[Tensor, " n"]) -> None:
-        """Keep what a plan read of the masks: :attr:`extents`,
-        and :attr:`pixels` in ascending order."""
-        self.__dict__.update(extents=list(extents), pixels=pixels)
+    def note(self, extents: Sequence[Extent], pixels: Callable[[], Int[Tensor, " n"]]) -> None:
+        """Keep what a plan read of the masks.
+
+        Args:
+            extents: :attr:`extents`.
+            pixels: gives :attr:`pixels` in ascending order, when they are first asked for.
+        """
+        self.__dict__.update(extents=list(extents), _pixels=pixels)
 
     @cached_property
     def extents(self) -> list[Extent]:
@@ -217,7 +221,8 @@ class Batch(TensorStruct):
     @cached_property
     def pixels(self) -> Int[Tensor, " n"]:
         """Indices of the subject's pixels among those of all images."""
-        return true_places(self.masks, sum(extent.count for extent in self.extents))
+        noted = self.__dict__.get("_pixels")
+        return true_places(self.masks, sum(e.count for e in self.extents)) if noted is None else noted()
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,7 @@ def test_every_stage_runs_there_and_predicts_the_same(kind, skip):
             assert found.gaussians.means.device == found.points.tokens.device == DEVICE
             found = found.to("cpu")
     # Unbounded depths amplify rounding.
-    close(found.gaussians, expected.gaussians, 1e-3 if kind == "compat=release" else 1e-5)
+    close(found.gaussians, expected.gaussians, 1e-3 if kind == "compat=release" else 1e-6)
     assert torch.equal(found.depth_valid, expected.depth_valid)
 
 

@@ -106,7 +106,8 @@ def test_what_is_watched_or_has_a_gradient_is_called():
         assert model(scene()).gaussians.means.requires_grad
     eager(model, scene())
     model.train()(scene())
-    assert counts(model) == before | {"played": 2}  # what precedes the plan
+    # What precedes the plan is played back with a gradient, and of another class in training.
+    assert counts(model) == before | {"played": 1, "eager": 3}
 
 
 def test_too_little_room_is_answered_by_another_recording(monkeypatch):
@@ -147,7 +148,7 @@ def test_what_is_played_back_is_not_asked_for(there):
         asked.append((there.launches, there.waits.total()))
     (eager, waits), _, (played, as_many) = asked
     print(eager, played, waits, as_many)
-    assert 5 * played < eager
+    assert 20 * played < eager
     assert as_many <= waits
 
 

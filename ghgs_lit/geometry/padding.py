@@ -111,10 +111,11 @@ class PaddedBatch(Batch):
     photographs: Batch | None = None
     padding: Padding | None = None
 
-    def note(self, extents: Sequence[Extent], pixels: Int[Tensor, " n"]) -> None:
+    def note(self, extents: Sequence[Extent], pixels: Callable[[], Int[Tensor, " n"]]) -> None:
         """Keep them for the photographs, too, in their own pixels."""
         super().note(extents, pixels)
-        self.photographs.note([self.padding.cut_extent(e) for e in extents], self.padding.cut_pixels(pixels))
+        inner = [self.padding.cut_extent(extent) for extent in extents]
+        self.photographs.note(inner, lambda: self.padding.cut_pixels(self.pixels))
 
 
 def bounds_of(stage: Callable[[Batch], DepthBounds | None], batch: Batch) -> DepthBounds | None:

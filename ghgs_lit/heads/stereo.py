@@ -23,6 +23,7 @@ from ghgs_lit.heads.activations import bounded_sigmoid
 from ghgs_lit.heads.depth import BOUNDED, finite_maps
 from ghgs_lit.heads.dpt import ResidualUnit
 from ghgs_lit.plan import Plan
+from ghgs_lit.plan.rows import size_class
 from ghgs_lit.runtime.precision import exact, without_float16
 from ghgs_lit.types import Batch, Cameras, DepthBounds, DepthMaps, Tokens
 
@@ -103,7 +104,7 @@ class StereoHead(nn.Module):
         features = at_least_float32(features).unflatten(0, batch.masks.shape[:2])
         cameras = batch.cameras.cropped(0, 0, *images.shape[-2:]).resized(*features.shape[-2:])
         inside = F.max_pool2d(images[:, :, 3], CELL) > 0
-        cells = true_places(inside, int(inside.sum()))
+        cells = true_places(inside, _most_cells(batch, inside.numel()), repeats=True)
         matches = correlations(features, cameras, cells, near, far, self.options.consistency_depths)
         volume = matches.new_zeros(inside.numel(), matches.shape[1]).index_copy(0, cells, matches)
         volume = volume.view(-1, *inside.shape[2:], matches.shape[1]).movedim(-1, 1)
@@ -115,6 +116,18 @@ class StereoHead(nn.Module):
             memory, change = self.update(memory, context, levels, bounded_sigmoid(raw))
             raw = raw + change
         return upsampled(bounded_sigmoid(raw), at_least_float32(self.weights(memory)))
+
+
+def _most_cells(batch: Batch, count: int) -> int:
+    """The number of cells that the subjects touch, or more, without a wait.
+
+    Args:
+        batch: extents of its masks are known; mattes may go beyond them.
+        count: of all cells.
+    """
+    if batch.alpha is not None:
+        return count
+    return min(size_class(sum(extent.cells(CELL) for extent in batch.extents)), count)
 
 
 def _two_layers(inputs: int, outputs: int) -> nn.Sequential:

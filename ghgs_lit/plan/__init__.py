@@ -18,7 +18,7 @@ the kind themselves.
 Something else that a scene does not need is left out in three steps: a field of the preset says so,
 the plan holds what is left, and the stage works on that."""
 
-from ghgs_lit.plan.plan import Plan, Sizes, planned
+from ghgs_lit.plan.plan import Measured, Plan, Sizes, planned
 from ghgs_lit.plan.presets import SkipOptions
 
-__all__ = ["Plan", "Sizes", "SkipOptions", "planned"]
+__all__ = ["Measured", "Plan", "Sizes", "SkipOptions", "planned"]

@@ -26,8 +26,7 @@ class KeptPatches:
         size: number of rows of each image, at least that of its kept patches: others repeat its
             last one (the first of all patches where none is kept); None: those that are kept.
 
-    Attributes:
-        real: which rows are kept patches; None: all."""
+    Places are found when they are first asked for."""
 
     def __init__(
         self,
@@ -43,21 +42,9 @@ class KeptPatches:
         counts = [extent.count for extent in self._extents]
         self._counts = [counts[first : first + views] for first in range(0, len(counts), views)]
         self._kept = kept
-        self._device = device
+        self.device = device
         self.size = size
-        self.real = None
         self.is_whole = size is None and sum(counts) == kept.numel()
-        if self.is_whole:
-            self.index = torch.arange(kept.numel(), device=device)
-        elif size is None:
-            self.index = true_places(self.mask, sum(counts))
-        else:
-            self._rows = Rows.filled(self.mask.flatten(0, 1).flatten(1), (size,), 1)
-            self.index = self._rows.index
-            self.real = self._rows.real
-        self.image = self.index // (height * width)
-        self.row = self.index // width % height
-        self.column = self.index % width
         self._packed: dict[int, Int[Tensor, " N"]] = {}
 
     @classmethod
@@ -73,6 +60,40 @@ class KeptPatches:
         return cls(kept, device, [Extent(height * width, 0, height, 0, width)] * images)
 
     @cached_property
+    def _rows(self) -> Rows:
+        """Rows of one number for each image."""
+        return Rows.filled(self.mask.flatten(0, 1).flatten(1), (self.size,), 1)
+
+    @property
+    def real(self) -> Bool[Tensor, " N"] | None:
+        """Which rows are kept patches; None: all."""
+        return None if self.size is None else self._rows.real
+
+    @cached_property
+    def index(self) -> Int[Tensor, " N"]:
+        """Place of each row among all patches."""
+        if self.is_whole:
+            return torch.arange(self._kept.numel(), device=self.device)
+        if self.size is None:
+            return true_places(self.mask, sum(extent.count for extent in self._extents))
+        return self._rows.index
+
+    @cached_property
+    def image(self) -> Int[Tensor, " N"]:
+        """Image ``b * V + v`` of each row."""
+        return self.index // (self.grid[2] * self.grid[3])
+
+    @cached_property
+    def row(self) -> Int[Tensor, " N"]:
+        """Row of each one's patch."""
+        return self.index // self.grid[3] % self.grid[2]
+
+    @cached_property
+    def column(self) -> Int[Tensor, " N"]:
+        """Column of each one's patch."""
+        return self.index % self.grid[3]
+
+    @cached_property
     def number(self) -> Int[Tensor, " p"]:
         """The number of each kept one of all patches; 0 or more for others, without a meaning."""
         if self.size is not None:
@@ -83,8 +104,8 @@ class KeptPatches:
     def mask(self) -> Bool[Tensor, "b v h w"]:
         """The kept patches, on the tokens' device."""
         if self.is_whole:
-            return torch.ones(self.grid, dtype=torch.bool, device=self._device)
-        return self._kept.to(self._device)
+            return torch.ones(self.grid, dtype=torch.bool, device=self.device)
+        return self._kept.to(self.device)
 
     @property
     def is_even(self) -> bool:

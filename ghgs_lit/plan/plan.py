@@ -10,13 +10,13 @@ from functools import cached_property
 from itertools import islice
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghgs_lit.extents import Extent, extent_numbers, true_places
 from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.plan.patches import KeptPatches
-from ghgs_lit.plan.rows import Rows, rounds_up, size_class
+from ghgs_lit.plan.rows import Rows, rounds_up, rows_of_group, size_class
 from ghgs_lit.plan.window import Span, Window, subject_windows
 from ghgs_lit.types import Decision, DecodedPixels, Prediction
 
@@ -104,13 +104,29 @@ class Plan:
     def shown_patches(self) -> KeptPatches:
         """The patches ``shown``, each of which has a token."""
         size = self._shown_size if self.classes else None
-        return KeptPatches(self.shown, self.kept.index.device, self.shown_extents, size)
+        return KeptPatches(self.shown, self.kept.device, self.shown_extents, size)
 
     @property
     def sizes(self) -> Sizes:
         """The sizes of the scene's class."""
-        rows = (self.subject.counts[0], self.peers.counts[0])
+        rows = (self._pixel_rows, self._peer_rows)
         return Sizes(*rows, self.kept.size or 0, self._shown_size, self._patches)
+
+    @property
+    def _pixel_rows(self) -> int:
+        """Rows of each element's pixels in ``classes``."""
+        return rows_of_group([self._held("pixels", self.counts)], self.masks[0].numel())
+
+    @property
+    def _peer_rows(self) -> int:
+        """Rows of each element's recalibrated tokens in ``classes``."""
+        return rows_of_group([self._held("peers", self._peer_counts)], self.shown[0].numel())
+
+    @property
+    def _peer_counts(self) -> Sequence[int]:
+        """Number of tokens of each element that are recalibrated."""
+        everyone = self.tokens == "all"
+        return self.kept.element_lengths(0) if everyone else self._of_elements(self.shown_extents)
 
     @property
     def _shown_size(self) -> int:
@@ -120,21 +136,21 @@ class Plan:
     def subject(self) -> Rows:
         """The subject's pixels among those of all images."""
         if self.classes:
-            return Rows.filled(self.masks.flatten(1), [self._held("pixels", self.counts)], self.views)
+            return Rows.filled(self.masks.flatten(1), [self._pixel_rows], self.views)
         return Rows.exact(self.masks, [extent.count for extent in self.extents], 1)
 
     @cached_property
     def peers(self) -> Rows:
         """Tokens that are recalibrated, among the packed ones, by element."""
         everyone = self.tokens == "all"
-        counts = self.kept.element_lengths(0) if everyone else self._of_elements(self.shown_extents)
         if self.classes:
             wanted = self.kept.mask if everyone else self.shown
-            rows = Rows.filled(wanted.flatten(1), [self._held("peers", counts)], self.views)
+            rows = Rows.filled(wanted.flatten(1), [self._peer_rows], self.views)
             kept = self.kept
             return rows if kept.is_whole else dataclasses.replace(rows, index=kept.number[rows.index])
         every = torch.ones_like(self.kept.index, dtype=torch.bool)
-        return Rows.exact(every if everyone else self.shown.flatten()[self.kept.index], counts, self.views)
+        wanted = every if everyone else self.shown.flatten()[self.kept.index]
+        return Rows.exact(wanted, self._peer_counts, self.views)
 
     @property
     def views(self) -> int:
@@ -160,10 +176,13 @@ class Plan:
         Returns:
             On a GPU those of pixels whose depth is not finite stay, with opacity 0.
         """
-        real = self.subject.real
-        if real is None or prediction.gaussians.splits != self.subject.splits(self.views):
+        filled = (self._pixel_rows,) * len(self.counts) if self.classes else None
+        if prediction.gaussians.splits != filled:
             return prediction
-        index = slice(0, self.counts[0]) if len(self.counts) == 1 else true_places(real, sum(self.counts))
+        if len(self.counts) == 1:
+            index = slice(0, self.counts[0])
+        else:
+            index = true_places(self.subject.real, sum(self.counts))
         every = (prediction.gaussians, *prediction.drafts)
         gaussians, *drafts = (each.select(index, self.counts) for each in every)
         return dataclasses.replace(prediction, gaussians=gaussians, drafts=tuple(drafts))
@@ -171,7 +190,7 @@ class Plan:
     @property
     def is_of_class(self) -> bool:
         """Whether sizes are those of a class, and every image can have a row of it."""
-        return self.classes and min(self.subject.counts[0], self.peers.counts[0]) >= self.views
+        return self.classes and min(self._pixel_rows, self._peer_rows) >= self.views
 
     def extents_of_class(self) -> tuple[tuple[Extent, ...], tuple[Extent, ...]]:
         """Extents with which a plan has the same sizes and windows for every scene of the class.
@@ -183,16 +202,13 @@ class Plan:
         """
         window = self._windows(self.patch_size)[0]
         grid = Window.whole(tuple(self.shown.shape[2:]))
-        return self._shared(self.subject, window), self._shared(self.peers, grid)
+        return self._shared(self._pixel_rows, window), self._shared(self._peer_rows, grid)
 
-    def _shared(self, rows: Rows, window: Window) -> tuple[Extent, ...]:
-        """The rows of each element, shared by its images in one window."""
-        extents: list[Extent] = []
-        for size in rows.counts:
-            share = Extent(size // self.views, *window.rows[:2], *window.columns[:2])
-            first = share._replace(count=size - (self.views - 1) * share.count)
-            extents += [first, *[share] * (self.views - 1)]
-        return tuple(extents)
+    def _shared(self, size: int, window: Window) -> tuple[Extent, ...]:
+        """Rows of each element, ``size`` in number, shared by its images in one window."""
+        share = Extent(size // self.views, *window.rows[:2], *window.columns[:2])
+        first = share._replace(count=size - (self.views - 1) * share.count)
+        return (first, *[share] * (self.views - 1)) * len(self.counts)
 
     @property
     def together(self) -> int:
@@ -238,10 +254,49 @@ def _of_image(rows: int, patches: Bool[Tensor, "B V h w"]) -> int:
     return min(size_class(rows), patches.shape[-2] * patches.shape[-1])
 
 
+@dataclass(frozen=True)
+class Measured:
+    """What masks say, where they are: a function of tensors, before anything is read.
+
+    Attributes:
+        shown: patches with a pixel of the subject.
+        choices: patches that become tokens, of each preset.
+        numbers: of the patches ``shown``, then :func:`ghgs_lit.extents.extent_numbers` of the masks
+            and of each choice.
+        flags: further values that are read with them.
+    """
+
+    shown: Bool[Tensor, "B V h w"]
+    choices: tuple[Bool[Tensor, "B V h w"], ...]
+    numbers: tuple[Int[Tensor, "..."], ...]
+    flags: tuple[Bool[Tensor, ""], ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        masks: Bool[Tensor, "B V H W"],
+        patch_size: int,
+        choices: Sequence[Bool[Tensor, "B V h w"]],
+        flags: Sequence[Bool[Tensor, ""]] = (),
+    ) -> "Measured":
+        """What these masks say.
+
+        Args:
+            masks: the subject's pixels; sides are divisible by the patch size.
+            patch_size: in pixels.
+            choices: patches that become tokens, of each preset.
+            flags: further values that are read with them.
+        """
+        shown = patches_around_subject(masks, patch_size, 0)
+        numbers = [shown.flatten(2).sum(-1)]
+        numbers += [extent_numbers(each.flatten(0, 1)) for each in (masks, *choices)]
+        return cls(shown, tuple(choices), tuple(numbers), tuple(flags))
+
+
 def planned(
     masks: Bool[Tensor, "B V H W"],
     patch_size: int,
-    choices: Sequence[Bool[Tensor, "B V h w"]],
+    choices: Sequence[Bool[Tensor, "B V h w"]] | Measured,
     pixels: DecodedPixels = "subject",
     tokens: DecodedPixels = "subject",
     choose: Choose | None = None,
@@ -254,24 +309,24 @@ def planned(
     Args:
         masks: the subject's pixels; sides are divisible by the patch size.
         patch_size: in pixels.
-        choices: patches that become tokens; of several presets if ``choose`` is there.
+        choices: patches that become tokens, of several presets if ``choose`` is there; or all that
+            is measured of them and the masks.
         pixels: of the preset.
         tokens: which ones the recalibration works on.
         choose: gives each element one of the ``choices``; None: all get the first.
-        flags: tensors whose values are to be read with those of the masks.
+        flags: tensors whose values are to be read with those that are measured, and after them.
         classes: whether numbers of rows are size classes; None: as the masks' device needs it.
         least: as of :class:`Plan`; None: nothing is held.
     """
     least = least or _NOTHING
     b, v = masks.shape[:2]
-    shown = patches_around_subject(masks, patch_size, 0)
-    asked = [masks, *choices]
-    numbers = [shown.flatten(2).sum(-1), *(extent_numbers(each.flatten(0, 1)) for each in asked)]
-    if flags:
-        numbers.append(torch.stack(list(flags)))
-    counts, *values = _read(numbers)
+    measured = choices if isinstance(choices, Measured) else Measured.of(masks, patch_size, choices)
+    shown = measured.shown
+    choices = measured.choices
+    flags = (*measured.flags, *flags)
+    counts, *values = _read([*measured.numbers, *([torch.stack(flags)] if flags else [])])
     of_masks = []
-    for rows in values[: len(asked)]:
+    for rows in values[: 1 + len(choices)]:
         firsts = range(0, len(rows), 5)
         of_masks.append(tuple(Extent(*rows[first : first + 5]) for first in firsts))
     extents, *of_choices = of_masks

@@ -31,6 +31,16 @@ def size_class(count: int) -> int:
     return -(-count // step) * step
 
 
+def rows_of_group(counts: Sequence[int], most: int) -> int:
+    """The number of rows of each group where rows are filled.
+
+    Args:
+        counts: how many rows of each group are wanted.
+        most: rows that a group has.
+    """
+    return min(size_class(max(max(counts, default=0), 1)), most)
+
+
 @dataclass(frozen=True)
 class Rows:
     """Rows of each group (an image, or an element of the batch), one group after another.
@@ -71,7 +81,7 @@ class Rows:
             images: number of images of a group.
         """
         groups, of_group = wanted.shape
-        size = min(size_class(max(max(counts, default=0), 1)), of_group)
+        size = rows_of_group(counts, of_group)
         number = torch.arange(of_group, device=wanted.device)
         # One long sum: a GPU sums rows of a table with a block of threads each.
         ranks = wanted.flatten().cumsum(0).view_as(wanted)

@@ -104,7 +104,9 @@ def may_be_recorded(model: nn.Module, renderer: Callable, losses: Callable, devi
     return known and model.options.capture == "auto" and device == model.playback.steps.tape.device
 
 
-def is_recordable(model: nn.Module, renderer: Callable, losses: Callable, batch: Batch) -> bool:
+def is_recordable(
+    model: nn.Module, renderer: Callable, losses: Callable, batch: Batch, is_scaled: bool = False
+) -> bool:
     """Whether a training step can be recorded.
 
     Args:
@@ -112,42 +114,48 @@ def is_recordable(model: nn.Module, renderer: Callable, losses: Callable, batch:
         renderer: as of :func:`may_be_recorded`.
         losses: as of :func:`may_be_recorded`.
         batch: of a step.
+        is_scaled: whether the loss has a factor.
 
     Returns:
-        True on a device that records, with ``model.capture=auto``, where the gradient needs no
-        scaling and no tokens are read from disk.
+        True on a device that records, with ``model.capture=auto``, where no tokens are read from
+        disk, and a loss with float16 has a factor.
     """
     device = batch.masks.device.type
     if not may_be_recorded(model, renderer, losses, device) or is_watched():
         return False
     if getattr(model.encoder, "keeps_features", False):  # a plug-in's may not say
         return False
-    if torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device) == torch.float16:
-        return False  # gradients would underflow before they are scaled
+    is_half = torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device) == torch.float16
+    if is_half and not is_scaled:
+        return False  # gradients would underflow
     return model.training
 
 
-def played(model: GHGS, renderer: Renderer, losses: Losses, batch: Batch) -> Outcome | None:
+def played(
+    model: GHGS, renderer: Renderer, losses: Losses, batch: Batch, scale: Tensor | None = None
+) -> Outcome:
     """The forward pass of a training step, played back from the third batch of a class on.
+
+    A batch whose subjects are tall, or whose sizes are no class, is called operator by operator.
 
     Args:
         model: of the training.
         renderer: of the training.
         losses: of the training.
         batch: on the device of the training, with targets; :func:`is_recordable`.
-
-    Returns:
-        The loss; None where this batch must be called: its subjects are tall,
-        or its sizes are no class.
+        scale: factor of the loss (``16-mixed``), without dimensions; None: 1.
     """
     with nullcontext() if model.rounds is None else model.rounds.drawn():
         around, inside, plan = _prepared(model, batch)
         if not model.playback.repeats(inside, plan) or model.needs_copies(inside):
-            return None
+            prediction = model.finished(around, inside, plan)
+            rendering = renderer(prediction.gaussians, batch.targets.cameras)
+            return Outcome(*losses(prediction, rendering, batch), len(prediction.gaussians))
         targets = dataclasses.replace(batch.targets, names=(), protocols=())
         bodies = batch.body_vertices if losses.weights.chamfer else None
         seen = dataclasses.replace(batch, targets=targets, body_vertices=bodies, subjects=(), views=())
-        return _recorded(_Pass(model, renderer, losses), around, Scene.of(inside, plan), seen, plan)
+        one_pass = _Pass(model, renderer, losses)
+        return _recorded(one_pass, around, Scene.of(inside, plan), seen, sum(plan.counts), scale)
 
 
 def _prepared(model: GHGS, batch: Batch) -> tuple[Sequence[Surrounding], Batch, Plan]:
@@ -172,6 +180,28 @@ def _prepared(model: GHGS, batch: Batch) -> tuple[Sequence[Surrounding], Batch, 
     return around, inside, plan
 
 
+def _differentiated(total: Tensor, weights: Sequence[Tensor], scale: Tensor | None) -> list[Tensor | None]:
+    """Gradients of a loss, of float16 as large as those of its multiple.
+
+    Args:
+        total: the loss.
+        weights: of which some may take no part.
+        scale: factor of the loss; None: 1.
+
+    Returns:
+        The gradient of the loss itself for each weight.
+    """
+    with torch.autocast(total.device.type, enabled=False):
+        if scale is None:
+            return list(torch.autograd.grad(total, weights, allow_unused=True))
+        gradients = list(torch.autograd.grad(total * scale, weights, allow_unused=True))
+        used = [number for number, gradient in enumerate(gradients) if gradient is not None]
+        unscaled = torch._foreach_mul([gradients[number] for number in used], 1 / scale)
+        for number, gradient in zip(used, unscaled, strict=True):
+            gradients[number] = gradient
+        return gradients
+
+
 def _laid_out(gradient: Tensor | None, weight: Tensor) -> Tensor | None:
     """A gradient in the layout of its weight: PyTorch would copy others, one by one."""
     if gradient is None or gradient.stride() == weight.stride():
@@ -180,7 +210,12 @@ def _laid_out(gradient: Tensor | None, weight: Tensor) -> Tensor | None:
 
 
 def _recorded(
-    one_pass: _Pass, around: Sequence[Surrounding], scene: Scene, seen: Batch, plan: Plan
+    one_pass: _Pass,
+    around: Sequence[Surrounding],
+    scene: Scene,
+    seen: Batch,
+    gaussians: int,
+    scale: Tensor | None,
 ) -> Outcome:
     """The loss, whose gradients come from a recording.
 
@@ -189,24 +224,24 @@ def _recorded(
         around: layers around the stages.
         scene: the batch inside of them.
         seen: the batch outside of them, without names.
-        plan: of the batch.
+        gaussians: their number.
+        scale: factor of the loss; None: 1.
     """
     weights = {name: weight for name, weight in one_pass.named_parameters() if weight.requires_grad}
 
     def differentiated(inputs: tuple) -> tuple[Tensor, dict[str, Tensor], tuple, Rooms]:
-        around, scene, seen = inputs
+        around, scene, seen, scale = inputs
         # Gradients of the weights themselves would be summed on the stream that first
         # asked for them.
         twins = {name: weight.detach().requires_grad_() for name, weight in weights.items()}
         with torch.enable_grad(), deferred() as rooms:
             total, values = functional_call(one_pass, twins, (around, *scene.read(), seen))
-            with torch.autocast(total.device.type, enabled=False):
-                gradients = torch.autograd.grad(total, list(twins.values()), allow_unused=True)
+            gradients = _differentiated(total, list(twins.values()), scale)
         gradients = tuple(map(_laid_out, gradients, weights.values()))
         return total.detach(), {name: value.detach() for name, value in values.items()}, gradients, rooms
 
     recorder = one_pass.model.playback.steps
-    inputs = (tuple(around), scene, seen)
+    inputs = (tuple(around), scene, seen, scale)
     key = (one_pass.model.settings(), repr((one_pass.renderer, one_pass.losses)), tuple(weights))
     with torch.no_grad():
         total, values, gradients, rooms = recorder(differentiated, inputs, key)
@@ -215,4 +250,4 @@ def _recorded(
             total, values, gradients, rooms = recorder(differentiated, inputs, key)
     used = [pair for pair in zip(weights.values(), gradients, strict=True) if pair[1] is not None]
     known = _Known.apply(total, [gradient for _, gradient in used], *[weight for weight, _ in used])
-    return Outcome(known, values, sum(plan.counts))
+    return Outcome(known, values, gaussians)

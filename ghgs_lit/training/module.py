@@ -185,11 +185,13 @@ class GHGSModule(BudgetedModule):
     def _played(self, step: Step) -> Outcome | None:
         """The forward pass of a step, played back; None where it must be called."""
         parts = (self.model, self.renderer, self.losses, step.batch)
-        if not is_recordable(*parts):
+        scaler = self._scaler
+        if not is_recordable(*parts, scaler is not None):
             return None
+        scale = None if scaler is None else scaler.scale(torch.ones((), device=self.device))
         torch.manual_seed(step.seed)
         with token_budget(self.model, step.budget), number_of_rounds(self.model, step.rounds):
-            return played(*parts)
+            return played(*parts, scale)
 
     def _step(self, batch: Batch, batch_idx: int) -> Step:
         """All inputs of a training step."""

@@ -16,7 +16,7 @@ from ghgs_lit.rendering import capacity
 from ghgs_lit.rendering.api import Renderer
 from ghgs_lit.runtime.recording import Recorder
 from ghgs_lit.runtime.watching import is_watched
-from ghgs_lit.training import GHGSModule, Optimization
+from ghgs_lit.training import GHGSModule, Optimization, captured
 from ghgs_lit.training.captured import is_recordable, played
 from ghgs_lit.training.cost import Costs
 from tests.helpers.losses import losses_of
@@ -95,6 +95,30 @@ def test_losses_and_gradients_are_those_of_a_step_that_is_called(kind, size, los
     assert dict(model.playback.steps.counts) == {"eager": 1, "recorded": 1, "played": 1}
 
 
+def test_a_factor_of_the_loss_changes_no_gradient():
+    """The same one or another, with the gradients of a step that is called."""
+    model, batch = recording("model=paper"), scene()
+    wanted = slopes(model, called(model, batch)[0])
+    for exponent in (10, 16, 12):
+        scale = torch.full((), 2.0**exponent, device=DEVICE)
+        found = played(model, Renderer(), LOSSES, batch, scale)
+        slope = slopes(model, found.total * scale)
+        for name in wanted:
+            wrong = (slope[name] / 2.0**exponent - wanted[name]).abs().max()
+            assert wrong <= 1e-5 * wanted[name].abs().max(), name
+    assert dict(model.playback.steps.counts) == {"eager": 1, "recorded": 1, "played": 1}
+
+
+def test_gradients_of_float16_do_not_underflow():
+    """2^-26 is 0 in float16, and its multiple is not."""
+    weight = torch.ones(4, requires_grad=True)
+    total = ((weight.half() * 2.0**-14).sum() * 2.0**-12).float()
+    assert captured._differentiated(total, [weight], None)[0].abs().max() == 0
+    total = ((weight.half() * 2.0**-14).sum() * 2.0**-12).float()
+    (slope,) = captured._differentiated(total, [weight], torch.tensor(2.0**10))
+    assert torch.equal(slope, torch.full((4,), 2.0**-26))
+
+
 def test_weights_that_move_are_read_where_they_are():
     """An optimizer moves them in place; the next step that is played back sees it."""
     model, batch = recording("model=paper"), scene()
@@ -156,6 +180,19 @@ def test_too_little_room_is_answered_by_another_recording(monkeypatch):
     assert model.playback.steps.counts["recorded"] == 2
 
 
+def test_a_batch_that_does_not_fit_is_called_and_prepared_once(monkeypatch):
+    """Such as one with subjects so tall that smaller copies are predicted, too."""
+    model, batch = recording("model=paper"), scene()
+    wanted = float(called(model, batch)[0].detach().cpu())
+    prepared, calls = model.prepared, []
+    monkeypatch.setattr(model, "prepared", lambda *given: calls.append(given) or prepared(*given))
+    monkeypatch.setattr(model, "needs_copies", lambda _: True)
+    found = played(model, Renderer(), LOSSES, batch)
+    assert float(found.total.detach().cpu()) == pytest.approx(wanted, rel=1e-6)
+    assert len(calls) == 1
+    assert not model.playback.steps.counts
+
+
 def test_sizes_are_kept_while_they_are_enough():
     """Smaller subjects are played back; one that is larger leaves room for others;
     nothing else changes."""
@@ -174,13 +211,19 @@ def test_sizes_are_kept_while_they_are_enough():
     assert dict(model.playback.steps.counts) == {"eager": 2, "recorded": 2, "played": 2}
 
 
-def test_what_cannot_be_recorded_is_called():
-    """Other devices, renderers and losses, predictions, ``model.capture=off``."""
+def test_what_cannot_be_recorded_is_called(monkeypatch):
+    """Other devices, renderers and losses, float16 without a factor of the loss, predictions,
+    ``model.capture=off``."""
     model, batch = recording("model=paper"), scene()
     assert is_recordable(model, Renderer(), LOSSES, batch)
     assert not is_recordable(model, Renderer(), LOSSES, batch.to("cpu"))
     assert not is_recordable(model, lambda *_: None, LOSSES, batch)
     assert not is_recordable(model, Renderer(), lambda *_: None, batch)
+    with monkeypatch.context() as patch:
+        patch.setattr(torch, "is_autocast_enabled", lambda *_: True)
+        patch.setattr(torch, "get_autocast_dtype", lambda *_: torch.float16)
+        assert not is_recordable(model, Renderer(), LOSSES, batch)
+        assert is_recordable(model, Renderer(), LOSSES, batch, is_scaled=True)
     model.encoder.aggregator.patch_embed.cache = object()  # tokens on disk
     assert not is_recordable(model, Renderer(), LOSSES, batch)
     model.encoder.aggregator.patch_embed.cache = None
