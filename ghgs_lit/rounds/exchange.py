@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from ghgs_lit.heads.gaussian import RawGaussians
+from ghgs_lit.kernels.linear import Linear
 from ghgs_lit.plan.rows import size_class
 from ghgs_lit.types import Batch
 
@@ -79,12 +80,12 @@ class Exchange(nn.Module):
 
     def __init__(self, width: int, channels: int):
         super().__init__()
-        self.tell = nn.Linear(width, channels)
+        self.tell = Linear(width, channels)
         # Channels last is several times as fast on a CPU, and the layout of rows of Gaussians.
         self.across = nn.Conv2d(channels, channels, SIDE, padding=SIDE // 2).to(
             memory_format=torch.channels_last
         )
-        self.hear = nn.Linear(channels, width)
+        self.hear = Linear(channels, width)
         nn.init.zeros_(self.hear.weight)
         nn.init.zeros_(self.hear.bias)
 

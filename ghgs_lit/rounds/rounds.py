@@ -24,6 +24,7 @@ from ghgs_lit.geometry.projection import at_least_float32, focal_lengths
 from ghgs_lit.heads.activations import bounded_tanh
 from ghgs_lit.heads.attributes import RAW_VALUES, RawGaussians
 from ghgs_lit.heads.gaussian import float32_last
+from ghgs_lit.kernels.linear import Linear
 from ghgs_lit.kernels.pool import at_once, even_parts, multiplies
 from ghgs_lit.rounds import cpu
 from ghgs_lit.rounds.exchange import Exchange, Windows
@@ -177,12 +178,12 @@ class Rounds(nn.Module):
         hidden = options.hidden
         depths = options.depths
         self.view = _two_layers(CHANNELS, hidden, hidden)
-        self.start = nn.Linear(channels, hidden)
+        self.start = Linear(channels, hidden)
         inputs = 4 * hidden + depths + _PLACE + 3 + (SLOPES if options.slopes else 0)
         self.update = _two_layers(inputs, 2 * hidden, hidden)
         self.memory = nn.Linear(hidden, hidden)
         self.exchange = None if options.exchange is None else Exchange(hidden, options.exchange)
-        self.change = nn.Sequential(nn.Linear(hidden, 1 + RAW_VALUES))
+        self.change = nn.Sequential(Linear(hidden, 1 + RAW_VALUES))
         nn.init.zeros_(self.change[-1].weight)
         nn.init.zeros_(self.change[-1].bias)
 
