@@ -68,9 +68,11 @@ def _shipped(group: str) -> dict[str, dict]:
     return {path.stem: read_yaml(path) for path in (conf_dir() / group).glob("*.yaml")}
 
 
-def _said(value: Any) -> Any:
-    """A value as files say it, without keys that are null."""
-    return {k: v for k, v in value.items() if v is not None} if isinstance(value, Mapping) else value
+def _is_of_file(value: Any, stored: Any) -> bool:
+    """Whether a value is that of a file, which says of a mapping what differs from other files."""
+    if isinstance(value, Mapping) and isinstance(stored, Mapping):
+        return stored.items() <= value.items()
+    return value == stored
 
 
 def encoder_name(config: Mapping[str, Any]) -> str:
@@ -87,7 +89,7 @@ def encoder_name(config: Mapping[str, Any]) -> str:
     encoder = encoder if isinstance(encoder, Mapping) else {}
     branch = ", semantic branch" * (encoder.get("semantic") is not None)
     for name, shipped in sorted(_shipped("encoder").items()):
-        if all(key in encoder and _said(encoder[key]) == shipped.get(key) for key in _ENCODER_KEYS):
+        if all(key in encoder and _is_of_file(encoder[key], shipped.get(key)) for key in _ENCODER_KEYS):
             return name + branch
     return "unnamed" + branch
 

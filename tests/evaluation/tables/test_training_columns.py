@@ -4,12 +4,20 @@ import json
 
 import pytest
 
+from ghgs_lit.config import compose, resolve
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.tables import read_sweep, to_markdown
+from ghgs_lit.evaluation.tables.variants import encoder_name
 from ghgs_lit.runs.provenance import config_hash
 from tests.helpers.tables import body, tables_of, write_run
 
 COLUMNS = ("psnr", "steps", "seconds", "peak_gb")
+
+
+@pytest.mark.parametrize("name", ["vggt_nano", "vggt_small", "vggt_1b"])
+def test_encoders_of_the_package_have_their_names(name):
+    """A file says of the nested ``vit`` what differs from the file below it."""
+    assert encoder_name(resolve(compose("train", [f"encoder={name}"]))) == name
 
 
 def test_steps_seconds_and_memory_can_be_columns(tmp_path):
