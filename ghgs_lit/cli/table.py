@@ -37,6 +37,14 @@ def _listed(options: Options, key: str) -> tuple | None:
     return values or None
 
 
+def _expression(key: str, text: str) -> re.Pattern[str]:
+    """A regular expression of a key, compiled; InputError: it is none."""
+    try:
+        return re.compile(text)
+    except re.error as error:
+        raise InputError(f"{key}: expected a regular expression; found {error}") from None
+
+
 def _options(options: "Table", evaluation: EvaluationOptions) -> t.TableOptions:
     """What tables are built by.
 
@@ -47,10 +55,7 @@ def _options(options: "Table", evaluation: EvaluationOptions) -> t.TableOptions:
     Raises:
         InputError: ``test.unit`` is no regular expression with a group, or a value is there twice.
     """
-    try:
-        unit = re.compile(options.test.unit or "(.+)")
-    except re.error as error:
-        raise InputError(f"test.unit: expected a regular expression; found {error}") from None
+    unit = _expression("test.unit", options.test.unit or "(.+)")
     require(unit.groups >= 1, "test.unit", "a regular expression with a group", unit.pattern)
     return t.TableOptions(
         layout=t.LAYOUTS[options.layout],
@@ -79,7 +84,11 @@ def run(verb: "Table", cfg: DictConfig) -> None:
     # Resolved: a run that is found by two paths counts once.
     folders = [resolved(path) for path in _listed(verb, "runs") or ()]
     others = [t.read_others(Path(p).expanduser()) for p in _listed(verb, "others") or ()]
+    wanted = _expression("subjects", verb.subjects)
     sweep = t.read_sweep(folders, _listed(verb, "by") or ())
+    shown = sweep.rows["subject"].map(wanted.fullmatch).notna()
+    require(shown.any(), "subjects", "the name of a measured subject", verb.subjects)
+    sweep.rows = sweep.rows[shown].reset_index(drop=True)
     tables = t.build_tables(sweep, others, options)
     labels = [f"table:{options.layout.name}" + (f"-{i}" if i else "") for i in range(len(tables))]
     latex = "\n".join(t.to_latex(table, label) for table, label in zip(tables, labels, strict=True))

@@ -158,6 +158,7 @@ NAMES = [
     ("prepare task=paint", 1, "task: expected one of render, check; found 'paint'"),
     ("table runs={tmp} test.unit=x", 1, "test.unit: expected a regular expression with a group"),
     ("table runs={tmp} 'test.unit=\"(\"'", 1, "test.unit: expected a regular expression"),
+    ("table runs={tmp} 'subjects=\"(\"'", 1, "subjects: expected a regular expression"),
 ]
 
 FOREIGN = [

@@ -294,12 +294,21 @@ def test_a_sweep_becomes_a_table(boxes, tmp_path):
     assert ghgs(*again, "layout=table2", "columns=psnr_box") == 1
     assert ghgs(*again, "layout=table2", "columns=psnr", "test.against=best", r'test.unit="(.+)"') == 0
     assert "RoGSplat" in (tmp_path / "second" / "table.md").read_text()
+    # One of the two subjects alone, as the run measured it.
+    runs = [path.read_text() for path in (tmp_path / "sweep").glob("*/metrics.json")]
+    (run,) = (run for run in map(json.loads, runs) if run["provenance"]["ablation"] == "neither")
+    row = run["rows"][-1]
+    assert ghgs(*again, "columns=psnr", f"subjects={row['subject'][0]}.*{row['subject'][-1]}") == 0
+    with open(tmp_path / "second" / "table.csv", newline="") as file:
+        (line,) = (cell for cell in csv.DictReader(file) if cell["ablation"] == "neither" and cell["mean"])
+    assert (float(line["mean"]), line["subjects"]) == (pytest.approx(row["psnr"]), "1")
     for wrong in (
         "layout=table9",
         "evaluation.views=four",
         "test.against=worst",
         "test.unit=x",
         "test.unt=1",
+        "subjects=nobody",
     ):
         assert ghgs(*again, wrong) == 1
     # Jobs that share a process cannot start others.
