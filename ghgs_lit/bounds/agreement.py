@@ -80,7 +80,7 @@ def _votes(coarse: Silhouettes, voting: Tensor, center: Tensor, reach: Tensor) -
     cameras = coarse.cameras
     b, v = voting.shape
     # At least one cell: the rays of a cell's pixels run beside the ray of its centre.
-    outside = votes_outside(dilate(masks, max(coarse.dilation, 1)), voting)
+    outside = votes_outside(dilate(masks, max(coarse.dilation, 1)), voting, coarse.cut)
     matrices = projection_matrices(cameras)
     middle = in_cameras(center, cameras.extrinsics)[..., 2]
     steps = 2 * constant(middles, _SAMPLES, like=center) - 1

@@ -13,6 +13,7 @@ from ghgs_lit.bounds import agreement
 from ghgs_lit.bounds.rays import (
     NEAREST,
     Silhouettes,
+    cut_sides,
     depths_in_box,
     dilate,
     look_up,
@@ -76,13 +77,17 @@ class SubjectBox(Options):
             coarse = silhouettes(batch.masks, batch.cameras, RESOLUTION, self.dilation)
             voting = self._voting(coarse)
             lower, upper = subject_box(
-                coarse.masks & voting[..., None, None], coarse.cameras, coarse.dilation, self.tolerance
+                coarse.masks & voting[..., None, None],
+                coarse.cameras,
+                coarse.dilation,
+                self.tolerance,
+                coarse.cut,
             )
             return self._within(batch, coarse, voting, lower - MARGIN, upper + MARGIN)
 
     def _voting(self, coarse: Silhouettes) -> Bool[Tensor, "B V"]:
         """Which views vote about the box, from copies of the masks that are coarser still."""
-        few = silhouettes(coarse.masks, coarse.cameras, agreement.RESOLUTION, self.dilation)
+        few = silhouettes(coarse.masks, coarse.cameras, agreement.RESOLUTION, self.dilation, coarse.cut)
         center = subject_center(few.masks, few.cameras)
         # The median, not the largest: with a mask of noise no sample would lie within the subject.
         reach = _reach(few.masks, few.cameras, center).nanmedian(1).values
@@ -111,7 +116,11 @@ class SubjectBox(Options):
 
 
 def subject_box(
-    masks: Bool[Tensor, "B V h w"], cameras: Cameras, radius: int, tolerance: int = 0
+    masks: Bool[Tensor, "B V h w"],
+    cameras: Cameras,
+    radius: int,
+    tolerance: int = 0,
+    cut: Bool[Tensor, "B V 4"] | None = None,
 ) -> tuple[Float[Tensor, "B 3"], Float[Tensor, "B 3"]]:
     """The axis-aligned box of the visual hull.
 
@@ -123,6 +132,7 @@ def subject_box(
         cameras: [B, V], whose pixels are those of the masks.
         radius: dilation of the masks in pixels.
         tolerance: how many views may say "outside" of a point that is kept.
+        cut: sides of the frame that cut the subject; None: those that the masks touch.
 
     Returns:
         The corners with the smallest and with the largest coordinates, in metres.
@@ -132,6 +142,7 @@ def subject_box(
     corners = torch.stack((center - reach, center + reach))
     focal = focal_lengths(cameras).amax(-1)
     voting = masks.flatten(2).any(-1)
+    cut = cut_sides(masks) if cut is None else cut
     for _ in range(2):
         lower, upper = corners
         cell = (upper - lower) / CELLS
@@ -141,7 +152,7 @@ def subject_box(
         pixels = focal * cell.norm(dim=-1, keepdim=True) / 2 / (0.6 * depth).clamp(min=NEAREST)
         grow = pixels.nan_to_num(nan=0.0).amax(1).clamp(max=max(masks.shape[-2:])).ceil().int()
         grown = dilate(masks, radius, grow)
-        kept = _carve(votes_outside(grown, voting), cameras, lower, cell, tolerance)
+        kept = _carve(votes_outside(grown, voting, cut), cameras, lower, cell, tolerance)
         # For each axis, the slices with a kept cell.
         slices = torch.stack([kept.any(axes) for axes in ((2, 3), (1, 3), (1, 2))], 1)
         first, last = first_and_last(slices)

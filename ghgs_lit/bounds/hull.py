@@ -11,6 +11,7 @@ from ghgs_lit.bounds import cpu
 from ghgs_lit.bounds.box import SubjectBox
 from ghgs_lit.bounds.rays import (
     Silhouettes,
+    cut_sides,
     depths_in_box,
     dilate,
     look_up,
@@ -54,9 +55,8 @@ class VisualHull(SubjectBox):
         radius = max(coarse.dilation, 1)
         rays = batch.pixels if coarse.stride == 1 else None
         count = size_class(sum(extent.cells(coarse.stride) for extent in batch.extents))
-        hull = hull_bounds(
-            coarse.masks, coarse.cameras, start, radius, self.tolerance, self.samples, rays, voting, count
-        )
+        seen = (coarse.masks, coarse.cameras, start, radius)
+        hull = hull_bounds(*seen, self.tolerance, self.samples, rays, voting, count, coarse.cut)
         near, far = (_enlarge(x, coarse.stride, batch.masks.shape[-2:]) for x in (hull.near, hull.far))
         return self._valid(DepthBounds(torch.maximum(box.near, near), torch.minimum(box.far, far)))
 
@@ -71,6 +71,7 @@ def hull_bounds(
     rays: Int[Tensor, " r"] | None = None,
     voting: Bool[Tensor, "B V"] | None = None,
     count: int | None = None,
+    cut: Bool[Tensor, "B V 4"] | None = None,
 ) -> DepthBounds:
     """First and last depth within ``start`` that the dilated masks of the other views allow.
 
@@ -87,12 +88,14 @@ def hull_bounds(
         voting: views that may say "outside"; None: those whose mask is not empty.
         count: the masks have no more pixels than this, so that a GPU need not be asked;
             None: unknown.
+        cut: sides of the frame that cut the subject; None: those that the masks touch.
 
     Returns:
         Bounds [B, V, h, w] in metres, half a step outside the depths that were tried.
     """
     voting = masks.flatten(2).any(-1) if voting is None else voting
-    outside = votes_outside(dilate(masks, radius), voting)
+    cut = cut_sides(masks) if cut is None else cut
+    outside = votes_outside(dilate(masks, radius), voting, cut)
     directions = ray_directions(cameras)
     matrices = projection_matrices(cameras)
     if gpu.is_supported(start.near, directions, matrices):

@@ -85,17 +85,36 @@ NEAREST = 1e-4
 
 @dataclass(frozen=True)
 class Silhouettes:
-    """Masks of cells of ``stride`` x ``stride`` pixels, the cameras of the cells,
-    and a dilation in cells."""
+    """Masks at a lower resolution.
+
+    Attributes:
+        masks: of cells.
+        cameras: whose pixels are the cells.
+        stride: side of a cell in pixels.
+        dilation: of the masks, in cells.
+        cut: sides of the frame that cut the subject, as of :func:`cut_sides`.
+    """
 
     masks: Bool[Tensor, "B V h w"]
     cameras: Cameras
     stride: int
     dilation: int
+    cut: Bool[Tensor, "B V 4"]
+
+
+def cut_sides(masks: Bool[Tensor, "*batch h w"]) -> Bool[Tensor, "*batch 4"]:
+    """Whether masks touch the first and the last row, the first and the last column of their frames."""
+    rows = masks[..., (0, -1), :].any(-1)
+    columns = masks[..., (0, -1)].any(-2)
+    return torch.cat((rows, columns), -1)
 
 
 def silhouettes(
-    masks: Bool[Tensor, "B V H W"], cameras: Cameras, resolution: int, dilation: float
+    masks: Bool[Tensor, "B V H W"],
+    cameras: Cameras,
+    resolution: int,
+    dilation: float,
+    cut: Bool[Tensor, "B V 4"] | None = None,
 ) -> Silhouettes:
     """Masks at a lower resolution, to limit the cost of a search.
 
@@ -104,7 +123,9 @@ def silhouettes(
         cameras: [B, V], of the masks.
         resolution: largest number of cells along the image's longer side.
         dilation: fraction of the image's longer side; that of the result is in cells, rounded up.
+        cut: sides of the frame that cut the subject; None: those that the masks touch.
     """
+    cut = cut_sides(masks) if cut is None else cut
     stride = ceil(max(masks.shape[-2:]) / resolution)
     if stride > 1:
         masks = F.max_pool2d(masks.float(), stride, stride, ceil_mode=True).bool()
@@ -112,7 +133,7 @@ def silhouettes(
     # Whole cells: the last row and column may extend beyond the image.
     matrices = map(at_least_float32, (cameras.intrinsics, cameras.extrinsics))
     full = Cameras(*matrices, height * stride, width * stride)
-    return Silhouettes(masks, full.resized(height, width), stride, ceil(dilation * max(height, width)))
+    return Silhouettes(masks, full.resized(height, width), stride, ceil(dilation * max(height, width)), cut)
 
 
 def dilate(
@@ -155,14 +176,23 @@ _grow = gpu.operator(
 )
 
 
-def votes_outside(dilated: Bool[Tensor, "B V h w"], voting: Bool[Tensor, "B V"]) -> UInt8[Tensor, "B V h w"]:
+def votes_outside(
+    dilated: Bool[Tensor, "B V h w"], voting: Bool[Tensor, "B V"], cut: Bool[Tensor, "B V 4"]
+) -> UInt8[Tensor, "B V h w"]:
     """1 where a voting view says "outside the subject".
+
+    Beyond a side of the frame that cuts the subject nothing was seen. Points there are looked up at the
+    nearest border pixel (:func:`look_up`), so that the border of such a side says "outside" nowhere.
 
     Args:
         dilated: masks, grown because real ones are noisy.
         voting: the others say "outside" nowhere.
+        cut: sides that cut the subject, as of :func:`cut_sides`.
     """
-    return (dilated < voting[..., None, None]).view(torch.uint8)
+    outside = dilated < voting[..., None, None]
+    outside[..., (0, -1), :] &= ~cut[..., :2, None]
+    outside[..., (0, -1)] &= ~cut[..., None, 2:]
+    return outside.view(torch.uint8)
 
 
 def look_up(
@@ -171,8 +201,8 @@ def look_up(
     """Entries of tables at homogeneous pixels.
 
     Points outside the frame take the entry of the nearest border pixel: a mask that does not
-    touch the border has the whole subject in its frame. Points behind the camera land far
-    outside the frame.
+    touch the border has the whole subject in its frame, and :func:`votes_outside` says what the
+    others know. Points behind the camera land far outside the frame.
 
     Args:
         tables: of votes or other values.

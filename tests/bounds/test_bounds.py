@@ -8,11 +8,12 @@ import torch.nn.functional as F
 
 from ghgs_lit.bounds import NoBounds, SubjectBox, VisualHull
 from ghgs_lit.bounds.box import subject_box
-from ghgs_lit.bounds.rays import depths_in_box, dilate, silhouettes
+from ghgs_lit.bounds.rays import cut_sides, depths_in_box, dilate, silhouettes, votes_outside
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.types import Batch, DepthBounds
 from tests.helpers.cameras import camera_ring
+from tests.helpers.figures import PARTS
 from tests.helpers.scenes import CENTER, RADII, ellipsoid, make_batch, ring
 
 STAGES = [SubjectBox, VisualHull]
@@ -81,6 +82,32 @@ def test_a_subject_that_the_frame_cuts_keeps_its_bounds():
     assert batch.masks[:, :, 0].any(), "the head must touch the border in this test"
     for stage in STAGES:
         assert inside(*near_and_far(stage(), batch), batch) == 1
+
+
+@pytest.mark.parametrize("view", [1, 3])
+def test_legs_below_one_frame_are_kept_for_the_other_views(view):
+    """One leg stands before the other: below the frame they do not run straight down."""
+    cameras = camera_ring(4, 84, 84, focal=(92.0, 92.0), center=(0, 0.9, 0), raised=0.4, radius=2.4)
+    intrinsics = cameras.intrinsics.clone()
+    intrinsics[0, view, 1, 2] += 44
+    cameras = dataclasses.replace(cameras, intrinsics=intrinsics)
+    parts = [ellipsoid(cameras, torch.tensor(center), torch.tensor(radii)) for center, radii in PARTS]
+    masks = torch.stack([mask for mask, _ in parts]).any(0)
+    depths = torch.stack([depth.where(mask, torch.inf) for mask, depth in parts]).amin(0)
+    assert cut_sides(masks)[0].any(-1).nonzero().tolist() == [[view]]
+    batch = Batch(masks[:, :, None].repeat(1, 1, 3, 1, 1).float(), masks, cameras, depths=depths)
+    assert inside(*near_and_far(VisualHull(), batch), batch) == 1
+
+
+def test_a_frame_that_cuts_nothing_says_what_is_outside():
+    """Beyond a side that the subject touches anything may be; beyond the others nothing is."""
+    masks = torch.zeros(1, 2, 6, 8, dtype=torch.bool)
+    masks[0, 0, 2:4, :3] = True
+    masks[0, 1, 2:4, 2:5] = True
+    votes = votes_outside(masks, torch.ones(1, 2, dtype=torch.bool), cut_sides(masks))
+    expected = (~masks).byte()
+    expected[0, 0, :, 0] = 0
+    assert torch.equal(votes, expected)
 
 
 @pytest.mark.parametrize("stage", STAGES)
