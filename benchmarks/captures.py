@@ -28,9 +28,10 @@ from ghgs_capture.prediction import predict, trained_size
 from ghgs_lit import GHGS
 from ghgs_lit.cli.evaluate import baselines_of
 from ghgs_lit.cli.inputs import build_data, build_renderer, pick_device
-from ghgs_lit.config import build, compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.config.compose import read_option
 from ghgs_lit.config.options import image_size
+from ghgs_lit.config.run import Run
 from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.imperfections import backgrounds
@@ -132,7 +133,7 @@ def data_of(
         f"data.evaluation_positions=[{list(capture.positions)}]",
         *(f"data.rig.variation.{name}={value}" for name, value in capture.rig.items()),
     ]
-    data = build_data(resolve(compose("prepare", overrides)))
+    data = build_data(run_of("prepare", overrides))
     data.prepare_data()
     return data
 
@@ -247,25 +248,23 @@ def table(results: Mapping[str, dict[str, float]]) -> str:
     return "\n".join(lines)
 
 
-def methods_of(
-    options: argparse.Namespace, config: Mapping[str, Any], device: torch.device
-) -> Iterator[tuple[str, Method]]:
+def methods_of(options: argparse.Namespace, run: Run, device: torch.device) -> Iterator[tuple[str, Method]]:
     """Every checkpoint, one in memory at a time, and every baseline."""
-    renderer, rounds = build_renderer(config, device), options.refine_cameras
+    renderer, rounds = build_renderer(run, device), options.refine_cameras
     for path in options.checkpoints:
         model = GHGS.from_checkpoint(path, device)
         cameras = CameraRefinement(rounds, model, renderer) if rounds else None
         yield str(path), ModelMethod(model, renderer, cameras=cameras)
     names = "all" if options.baselines == ["all"] else options.baselines
-    yield from baselines_of(names, config, device).items()
+    yield from baselines_of(names, run, device).items()
 
 
 def measure_mending(
-    options: argparse.Namespace, size: tuple[int, int], config: Mapping[str, Any], device: torch.device
+    options: argparse.Namespace, size: tuple[int, int], run: Run, device: torch.device
 ) -> None:
     """Print what captures lose as given, and what is left of it where ``predict`` decides."""
-    renderer, model = build_renderer(config, device), GHGS.from_checkpoint(options.checkpoints[0], device)
-    metrics, larger = build(config["metrics"], "metrics").to(device), [_LARGER * side for side in size]
+    renderer, model = build_renderer(run, device), GHGS.from_checkpoint(options.checkpoints[0], device)
+    metrics, larger = run.metrics.build().to(device), [_LARGER * side for side in size]
     data = tuple(data_of(Imperfection(), options.people, side, [], larger) for side in (list(size), larger))
     results, method = {}, ModelMethod(model, renderer)
     for name, capture in MENDED.items():
@@ -299,19 +298,19 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="with --mend: people before it take no part")
     parser.add_argument("--out", type=Path, default=Path("captures.json"))
     options = parser.parse_args()
-    config = resolve(compose("evaluate", ["data=synthetic", "metrics.lpips=off"]))
-    device = pick_device(config["device"])
+    run = run_of("evaluate", ["data=synthetic", "metrics.lpips=off"])
+    device = pick_device(run.device)
     size = options.size or trained_size(read_checkpoint(options.checkpoints[0])["config"])
     size = image_size("size", size)
     if options.mend:
-        measure_mending(options, size, config, device)
+        measure_mending(options, size, run, device)
         return
-    metrics = build(config["metrics"], "metrics").to(device)
+    metrics = run.metrics.build().to(device)
     clean = data_of(CAPTURES["clean"], options.people, list(size), _UNEVEN)
     larger = [_LARGER * side for side in size]
     own = {name: data_of(capture, options.people, larger, _UNEVEN) for name, capture in CAPTURES.items()}
     results = {}
-    for method_name, method in methods_of(options, config, device):
+    for method_name, method in methods_of(options, run, device):
         results[method_name] = {
             name: means(
                 measure(

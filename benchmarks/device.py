@@ -22,7 +22,7 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from ghgs_lit.config import build, compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.diagnostics.benchmark.stages import OTHER, TOTAL, top_level, watched
 from ghgs_lit.losses import Losses, LossWeights
@@ -150,10 +150,10 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=140)
     parser.add_argument("--lines", action="store_true", help="name the lines that wait")
     options = parser.parse_args()
-    config = resolve(compose("train", ["encoder=vggt_nano", *options.overrides]))
+    run = run_of("train", ["encoder=vggt_nano", *options.overrides])
     predictions, steps = [], []
     with pretend_device(options.lines) as log, drawing_nothing():
-        model = GHGS.from_config(config).to(DEVICE)
+        model = GHGS.from_config(run.plain).to(DEVICE)
         for size in options.batches:
             batch = ellipsoid_batch(0.15, options.views, options.size, size)
             depths = 2.0 * batch.masks
@@ -163,7 +163,7 @@ def main() -> None:
             if options.lines:
                 for (reason, line), count in log.waits.most_common():
                     print(f"batch {size}: {count:4} {reason:20} {line}")
-            steps.append(second_step(model, build(config["optimizer"], "optimizer"), batch, log))
+            steps.append(second_step(model, run.optimizer, batch, log))
     show("prediction", predictions, options.batches)
     show("training step", steps, options.batches)
 

@@ -8,11 +8,10 @@ from typing import Any
 import torch
 
 from benchmarks.gpu_measure import Gpu
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
+from ghgs_lit.config.run import Run
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.types import Batch
-
-Config = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -94,8 +93,8 @@ class Call:
         """Numbers of the people that are there: in training, active ones, in validation."""
         return [row["numbers"] for row in self.rows.read() if "numbers" in row][-1]
 
-    def config(self, *overrides: str) -> Config:
-        return resolve(compose("train", list(overrides)))
+    def run(self, *overrides: str) -> Run:
+        return run_of("train", list(overrides))
 
     @property
     def shipped(self) -> list[str]:

@@ -29,7 +29,7 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
 from benchmarks import device
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.kernels import gpu
 from ghgs_lit.model import GHGS
@@ -124,7 +124,7 @@ def main() -> None:
         stack.enter_context(device.drawing_nothing())
         round_products(True, "cpu")  # as on a GPU
         for overrides in (("model=recurrent",), ("model=hull", "skip=fast")):
-            model = GHGS.from_config(resolve(compose("train", [*SMALL, *overrides])))
+            model = GHGS.from_config(run_of("train", [*SMALL, *overrides]).plain)
             with torch.no_grad():
                 model.eval()(batch)
             prediction = model.train()(batch).gaussians

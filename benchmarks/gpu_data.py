@@ -31,7 +31,7 @@ def _numbers(train: int, active: int, val: int) -> list[str]:
 
 
 def _data(call: Call, train: int, active: int, val: int, *overrides: str) -> PhotographsDataModule:
-    return build_data(call.config(*call.shipped, *_numbers(train, active, val), *overrides))
+    return build_data(call.run(*call.shipped, *_numbers(train, active, val), *overrides))
 
 
 def loader(call: Call) -> None:

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from benchmarks.gpu_call import Call, Config
+from benchmarks.gpu_call import Call
 from benchmarks.gpu_data import loader, people, training
 from benchmarks.gpu_measure import reason
-from ghgs_lit.config import build
+from ghgs_lit.config.run import Run
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL, SecondsProbe, inside, top_level, watched
 from ghgs_lit.diagnostics.doctor.selfcheck import PASSED, selfcheck
 from ghgs_lit.diagnostics.machine import machine_facts
@@ -56,17 +56,17 @@ def machine(call: Call) -> None:
 def check(call: Call) -> None:
     """Self-check: what did not pass"""
     count, passed = 0, 0
-    for outcome in selfcheck(call.config("encoder=vggt_nano", "model=hull"), call.gpu.device):
+    for outcome in selfcheck(call.run("encoder=vggt_nano", "model=hull"), call.gpu.device):
         count, passed = count + 1, passed + (outcome.status == PASSED)
         if outcome.status != PASSED:
             call.add(outcome.check, outcome=outcome.status, found=outcome.found)
     call.add("all", outcome=f"{passed} of {count} pass")
 
 
-def _built(call: Call, config: Config) -> GHGS:
+def _built(call: Call, run: Run) -> GHGS:
     """A model with fresh weights, made on the device."""
     with call.gpu.device:
-        return GHGS.from_config(config).to(call.gpu.device)
+        return GHGS.from_config(run.plain).to(call.gpu.device)
 
 
 def _predicted(
@@ -109,7 +109,7 @@ def _recording(call: Call, model: GHGS) -> GHGS:
 
 def paper(call: Call) -> None:
     """A prediction of a large encoder, model=paper"""
-    model = _built(call, call.config(f"encoder={call.sizes.encoder}", "model=paper")).eval()
+    model = _built(call, call.run(f"encoder={call.sizes.encoder}", "model=paper")).eval()
     batch = replace(call.batch(1, call.sizes.large), targets=None).to(call.gpu.device)
     name = f"{call.sizes.encoder}, {call.sizes.large}²"
     _predicted(call, name, model, batch)
@@ -182,13 +182,13 @@ def _recorded(call: Call, name: str, function: Callable[[Inputs], Any], inputs: 
 class _Step:
     """A training step on a batch in page-locked memory, in parts."""
 
-    def __init__(self, call: Call, config: Config, batch: Batch, autocast: bool = False):
+    def __init__(self, call: Call, run: Run, batch: Batch, autocast: bool = False):
         self.device, self.host, self.autocast = call.gpu.device, batch, autocast
-        self.model = _recording(call, _built(call, config)).train()
+        self.model = _recording(call, _built(call, run)).train()
         if self.model.rounds is not None:
             self.model.rounds._drawn = lambda: 2
-        self.renderer, self.losses = (build(config[name], name) for name in ("renderer", "loss"))
-        self.options = build(config["optimizer"], "optimizer")
+        self.renderer, self.losses = run.renderer.build(), run.loss.build()
+        self.options = run.optimizer
         self.optimizer = self.options.optimizer(self.model)
 
     def data(self) -> None:
@@ -248,7 +248,7 @@ def _captured(call: Call, name: str, step: _Step) -> None:
 def step(call: Call) -> None:
     """A training step of experiment=shipped on a batch that is ready, two rounds; parts by themselves"""
     for size in reversed(call.sizes.batches):
-        made = _Step(call, call.config(*call.shipped), call.batch(size, call.sizes.side))
+        made = _Step(call, call.run(*call.shipped), call.batch(size, call.sizes.side))
         with precision_of("tf32", torch.device("cuda")):  # as trainer=gpu
             _stepped(call, f"batch of {size}", made)
             _captured(call, f"batch of {size}, captured", made)
@@ -263,7 +263,7 @@ def frozen(call: Call) -> None:
     encoder = [f"encoder={call.sizes.encoder}", "encoder.trainable=none", "model=paper", "loss=paper"]
     for size in call.sizes.large_batches:
         try:
-            made = _Step(call, call.config(*encoder), call.batch(size, call.sizes.large), autocast=True)
+            made = _Step(call, call.run(*encoder), call.batch(size, call.sizes.large), autocast=True)
             _stepped(call, f"batch of {size}", made)
         except torch.cuda.OutOfMemoryError as error:
             call.add(f"batch of {size}", refused=reason(error))

@@ -19,7 +19,7 @@ from ghgs_capture import Capture
 from ghgs_capture.prediction import trained_size
 from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_renderer, pick_device
-from ghgs_lit.config import build, compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.config.options import image_size
 from ghgs_lit.evaluation.baselines import nearest_view, splatted
 from ghgs_lit.evaluation.baselines.splats import hull_depth
@@ -57,9 +57,9 @@ def main() -> None:
     parser.add_argument("--refine-cameras", type=int, default=0, help="rounds that correct all cameras first")
     parser.add_argument("--out", type=Path, default=Path("held_out"))
     options = parser.parse_args()
-    config = resolve(compose("evaluate", ["data=synthetic"]))
-    device = pick_device(config["device"])
-    renderer, metrics = build_renderer(config, device), build(config["metrics"], "metrics").to(device)
+    run = run_of("evaluate", ["data=synthetic"])
+    device = pick_device(run.device)
+    renderer, metrics = build_renderer(run, device), run.metrics.build().to(device)
     size = options.size or trained_size(read_checkpoint(options.checkpoints[0])["config"])
     capture, size = Capture.read(options.images, options.cameras), image_size("size", size)
     # Targets are as their masks have them, whatever the inputs are.

@@ -43,10 +43,11 @@ from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.prediction import crop_size, in_frame
 from ghgs_capture.rig import INSTANTS, Rig, corrected_rig, spread
 from ghgs_capture.temporal import Temporal
+from ghgs_capture.verbs import Adapt
 from ghgs_capture.verbs.adapt import with_rig
 from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_data
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.data.view import area_image
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.metrics.flicker import flicker_in_place
@@ -185,9 +186,9 @@ class Measured:
             self.say(way, name, found[-1])
         return np.array(found).swapaxes(0, 1)
 
-    def control(self, config: dict[str, Any], weights: str) -> np.ndarray:
+    def control(self, run: Adapt, weights: str) -> np.ndarray:
         """Columns [cameras, people, 8] of generated people in the rig, each camera held out."""
-        data = build_data(config)
+        data = build_data(run)
         data.prepare_data(["val"])
         found = []
         for path, model in zip(self.weights[weights], self.models[weights], strict=True):
@@ -295,9 +296,9 @@ def main() -> None:
         print(line(way, measured.rows(way)), flush=True)
     if options.people:
         said = [f"images={options.images}", f"cameras={options.cameras}", "data.active.val=0"]
-        config = with_rig(resolve(compose("adapt", [*said, f"data.people.val={options.people}"])))
+        run = with_rig(run_of("adapt", [*said, f"data.people.val={options.people}"]))
         for name in weights:
-            print(line(f"generated people, {name}", measured.control(config, name)), flush=True)
+            print(line(f"generated people, {name}", measured.control(run, name)), flush=True)
     rig, seconds = measured.shared[1:]
     truths = [measured.kept(f"truth_{name}", partial(measured.truth, name)) for name in measured.names]
     failed = sum(truth["fails"] for each in truths for truth in each)

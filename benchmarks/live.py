@@ -25,7 +25,7 @@ from torch import Tensor
 
 from ghgs_lit.cli.benchmark import check_options, configured_cases
 from ghgs_lit.cli.inputs import pick_device
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.diagnostics.benchmark.measure import order
 from ghgs_lit.diagnostics.benchmark.presets import Case
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
@@ -60,11 +60,10 @@ class Live:
     def of(cls, options: argparse.Namespace) -> "Live":
         torch.set_num_threads(max(1, options.threads // options.in_flight))
         keep_freed_memory()  # as the command line does
-        cfg = compose("benchmark", options.options)
-        config = resolve(cfg)
-        device = pick_device(config["device"])
-        check_options(config, options.options)
-        cases = configured_cases(config, device)
+        run = run_of("benchmark", options.options)
+        device = pick_device(run.device)
+        check_options(run, options.options)
+        cases = configured_cases(run, device)
         batch, photographs = scene(options.share, options.views, options.size, options.target)
         return cls(cases, batch.to(device), photographs, device)
 

@@ -25,7 +25,7 @@ from rich.table import Table
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from ghgs_lit.cli.inputs import build_data
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from scripts.miniatures import thuman2
 
@@ -51,7 +51,7 @@ _PARTS = 5  #: of a measurement, of which the median counts
 
 def data_of(overrides: list[str]) -> PhotographsDataModule:
     """The data module that ``ghgs train`` makes of these overrides."""
-    return build_data(resolve(compose("train", [*overrides, *ENDLESS])))
+    return build_data(run_of("train", [*overrides, *ENDLESS]))
 
 
 def rate(data: PhotographsDataModule, seconds: float) -> tuple[float, int]:

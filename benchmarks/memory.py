@@ -15,7 +15,8 @@ import sys
 
 import torch
 
-from ghgs_lit.config import build, compose, resolve
+from ghgs_lit.config import run_of
+from ghgs_lit.config.run import Run
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch, random_model
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL, PeakProbe
 from ghgs_lit.model import GHGS
@@ -25,9 +26,9 @@ from ghgs_lit.types import Batch
 _AT_ONCE = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536"}
 
 
-def measured_prediction(config: dict, batch: Batch, device: torch.device) -> int:
+def measured_prediction(run: Run, batch: Batch, device: torch.device) -> int:
     """Peak bytes of a second prediction in addition to the weights."""
-    model = random_model(config).to(device)
+    model = random_model(run.plain).to(device)
     batch = dataclasses.replace(batch, targets=None).to(device)
     with torch.no_grad():
         model(batch)
@@ -38,13 +39,10 @@ def measured_prediction(config: dict, batch: Batch, device: torch.device) -> int
     return probe.peaks[TOTAL]
 
 
-def measured_training(config: dict, batch: Batch, device: torch.device) -> int:
+def measured_training(run: Run, batch: Batch, device: torch.device) -> int:
     """Peak bytes of a second training step in addition to weights and moments."""
-    model, renderer = GHGS.from_config(config).to(device), build(config["renderer"], "renderer")
-    losses, optimizer = (
-        build(config["loss"], "loss"),
-        build(config["optimizer"], "optimizer").optimizer(model),
-    )
+    model, renderer = GHGS.from_config(run.plain).to(device), run.renderer.build()
+    losses, optimizer = run.loss.build(), run.optimizer.optimizer(model)
     batch = dataclasses.replace(
         batch, depths=2.0 * batch.masks, body_vertices=[torch.rand(10475, 3) for _ in batch.images]
     ).to(device)
@@ -66,14 +64,14 @@ def measured(
     overrides: list[str], size: int, views: int, batch: int, device: torch.device, training: bool
 ) -> dict[str, int]:
     """Peak bytes, weights and moments included, and theirs."""
-    config = resolve(compose("train", overrides))
+    run = run_of("train", overrides)
     with torch.device("meta"):
-        model = GHGS.from_config(config)
+        model = GHGS.from_config(run.plain)
     held = sum(
         p.numel() * p.element_size() * (3 if training and p.requires_grad else 1) for p in model.parameters()
     )
     measure = measured_training if training else measured_prediction
-    return {"peak": held + measure(config, ellipsoid_batch(0.15, views, size, batch), device), "held": held}
+    return {"peak": held + measure(run, ellipsoid_batch(0.15, views, size, batch), device), "held": held}
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_data
-from ghgs_lit.config import build, compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.encoder.semantic import SemanticBranch, SemanticOptions
 from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.plan import planned
@@ -97,17 +97,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("arguments", nargs="*", help="checkpoints, and overrides (<key>=<value>)")
     arguments = parser.parse_args().arguments
-    config = resolve(compose("pretext", ["data.batch_size=1", *(a for a in arguments if "=" in a)]))
-    patch_size = config["encoder"]["patch_size"]
+    run = run_of("pretext", ["data.batch_size=1", *(a for a in arguments if "=" in a)])
+    patch_size = run.encoder.patch_size
     torch.manual_seed(0)
-    untrained = SemanticOptions(**config["encoder"]["semantic"]).build(patch_size).eval()
+    untrained = run.encoder.semantic.build(patch_size).eval()
     rows: dict[str, Features] = {
         "mean colour": colors(True, patch_size),
         "colours": colors(False, patch_size),
         "untrained branch": of_branch(untrained),
     }
     rows |= {path: of_checkpoint(path) for path in arguments if "=" not in path}
-    data, limbs = build_data(config), merged_sides()
+    data, limbs = build_data(run), merged_sides()
     data.prepare_data(["val"])
     right = {name: torch.zeros(2) for name in [*rows, "true shares"]}
     count = 0
@@ -121,14 +121,12 @@ def main() -> None:
             for column, parts in enumerate((part, limbs[part])):
                 shown = neighbor_shows_part(values[known], parts[known], kept.image[known])
                 right[name][column] += shown.sum()
-    print(
-        f"{count} patches of {len(data.subjects('val'))} people, {config['views']['evaluation_count']} views"
-    )
+    print(f"{count} patches of {len(data.subjects('val'))} people, {run.views.evaluation_count} views")
     print("| features | parts | limbs |\n|---|---|---|")
     for name, found in right.items():
         print(f"| {name} | {found[0] / count:.1%} | {found[1] / count:.1%} |")
     torch.set_num_threads(1)
-    encoder = build(config["encoder"], "encoder").eval()
+    encoder = run.encoder.build().eval()
     plan = planned(batch.masks, patch_size, [encoder.keeps(batch.masks)])
     branch = fastest(lambda: encoder.semantic(batch.images, batch.masks, plan))
     whole = fastest(lambda: encoder(batch.images, batch.masks))

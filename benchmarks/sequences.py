@@ -23,7 +23,7 @@ from torch import Tensor
 
 from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_data, build_renderer, pick_device
-from ghgs_lit.config import build, compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.data.batches import BatchBuilder
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.reader import PhotographCache
@@ -147,9 +147,9 @@ def main() -> None:
     parser.add_argument("--people", default=PEOPLE)
     parser.add_argument("overrides", nargs="*", help="of `ghgs evaluate`, such as data.size=140")
     options = parser.parse_intermixed_args()
-    config = resolve(compose("evaluate", [*_DATA, *options.overrides]))
-    device, data = pick_device(config["device"]), build_data(config)
-    renderer, metrics = build_renderer(config, device), build(config["metrics"], "metrics").to(device)
+    run = run_of("evaluate", [*_DATA, *options.overrides])
+    device, data = pick_device(run.device), build_data(run)
+    renderer, metrics = build_renderer(run, device), run.metrics.build().to(device)
     model = GHGS.from_checkpoint(options.checkpoint, device).eval()
     methods: dict[str, Method] = {"exact": ModelMethod(model, renderer), "black": black}
     if options.every:

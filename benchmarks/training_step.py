@@ -22,7 +22,7 @@ CHILD = """
 import json, logging, sys, tempfile
 import lightning.pytorch as L
 import torch
-from ghgs_lit.config import build, compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.model import GHGS
 from ghgs_lit.training import GHGSModule
 try:
@@ -38,11 +38,11 @@ try:  # as the command line of the version does
 except ImportError:
     pass
 logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
-config = resolve(compose("train", overrides))
-L.seed_everything(config["seed"], workers=True, verbose=False)
-data = build(config["data"], "data", views=config["views"], targets=config["targets"], seed=config["seed"])
-parts = [build(config[name], name) for name in ("renderer", "loss", "optimizer")]
-module = GHGSModule(GHGS.from_config(config), *parts, config)
+run = run_of("train", overrides)
+L.seed_everything(run.seed, workers=True, verbose=False)
+data = run.data.build(views=run.views, targets=run.targets, seed=run.seed)
+parts = [options.build() for options in (run.renderer, run.loss, run.optimizer)]
+module = GHGSModule(GHGS.from_config(run.plain), *parts, run.plain)
 found = {}
 
 class Keep(L.Callback):

@@ -162,14 +162,14 @@ def live_frames(
         InputError: the calibration, a video, a camera or the folder is missing or wrong.
     """
     calibration = Calibration.read(options.get("calibration", {}), "calibration")
-    part = options.get("sequence", {})
+    part = SequenceOptions.read(options.get("sequence", {}), "sequence")
     if is_folder := not isinstance(images, Mapping):
         folder = Path(images).expanduser()
         require(folder.is_dir(), str(images), "a folder", "no such folder")
         if images_in(folder, SUFFIXES):
             return _played(CaptureFolder(folder, cameras, masks, **options), clock, sleep)
     expected = f"all instants of {'a folder that is being written' if is_folder else 'cameras'}"
-    require(SequenceOptions.read(part, "sequence") == SequenceOptions(), "sequence", expected, part)
+    require(part == SequenceOptions(), "sequence", expected, dict(part))
     stored = read_cameras(cameras, calibration.format)
     if not is_folder:
         devices = by_camera(

@@ -21,7 +21,7 @@ from scipy.ndimage import gaussian_filter, zoom
 from torch.utils.data import DataLoader, IterableDataset
 
 from ghgs_lit.cli.inputs import build_data
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.imperfections import backgrounds, imperfect_mask
 from ghgs_lit.data.matting import WEIGHTS, MattingNetwork
@@ -211,7 +211,7 @@ def main() -> None:
     standing, active = options.people
     overrides = [f"data.people={{train: {standing}, val: 1}}", f"data.active={{train: {active}, val: 0}}"]
     overrides += ["data=synthetic", "data/rig=varied", "data.size=252", "views=random"]
-    data = build_data(resolve(compose("train", overrides)))
+    data = build_data(run_of("train", overrides))
     data.prepare_data(["train"])
     data.trains_on_depths = False
     seed_everything(0)

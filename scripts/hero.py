@@ -19,7 +19,7 @@ from ghgs_capture.crops import Photograph
 from ghgs_capture.prediction import predict, trained_size
 from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_data
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Gaussians
 from ghgs_lit.visualization.pictures import to_uint8
@@ -41,7 +41,7 @@ def photographs(person: int) -> Batch:
         "data.render.views=[0,3]",
         "targets.training_views=[0,3]",
     ]
-    data = build_data(resolve(compose("prepare", overrides)))
+    data = build_data(run_of("prepare", overrides))
     data.prepare_data()
     return data.evaluation_batch(list(data.subjects("val"))[person], views=4)
 

@@ -14,6 +14,7 @@ from benchmarks import device as device_counts
 from ghgs_capture.verbs import predict
 from ghgs_lit.bounds import box, hull
 from ghgs_lit.config import conf_dir
+from ghgs_lit.config.nodes import PerScene
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.measure import ModelMethod, measure
 from ghgs_lit.kernels import gpu
@@ -186,7 +187,7 @@ def test_everything_is_measured_there(tmp_path, monkeypatch):
         def build():
             return make_model("model=paper").to(device)
 
-        per_scene = {"steps": 1}
+        per_scene = PerScene(steps=1)
         methods = {name: baseline(name, REFERENCE, build, per_scene) for name in BASELINES}
         methods["model"] = ModelMethod(build().eval(), REFERENCE)
         methods["refined"] = ModelMethod(build().eval(), REFERENCE, Refinement(1, REFERENCE))

@@ -4,10 +4,8 @@ and where its work begins.
 The module that does the work is imported when the verb runs: ``ghgs --help`` waits for no library.
 """
 
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from omegaconf import DictConfig
 from pydantic import Field
 
 from ghgs_lit.cli.verb import Budgets, Device, Measured, Training, Verb
@@ -38,14 +36,13 @@ class OfPhotographs(Verb):
         """Whether photographs are decoded while the libraries are imported."""
         return False
 
-    def require_files(self, config: Mapping[str, Any]) -> None:
-        """As of every verb; photographs that are read at once are then decoded beside
-        the imports."""
-        super().require_files(config)
+    def require_files(self) -> None:
+        """As of every verb; photographs that are read at once are then decoded beside the imports."""
+        super().require_files()
         if self.reads_at_once() and self.images is not None and self.cameras is not None:
             from ghgs_capture.verbs.photographs import begin_to_read
 
-            begin_to_read(config)
+            begin_to_read(self)
 
 
 class Predict(OfPhotographs, Measured):
@@ -95,10 +92,10 @@ class Predict(OfPhotographs, Measured):
     def reads_at_once(self) -> bool:
         return True
 
-    def run(self, cfg: DictConfig) -> object:
+    def run(self) -> object:
         from ghgs_capture.verbs import predict
 
-        return predict.run(self, cfg)
+        return predict.run(self)
 
 
 class View(Predict):
@@ -136,10 +133,10 @@ class View(Predict):
     def reads_at_once(self) -> bool:
         return False
 
-    def run(self, cfg: DictConfig) -> object:
+    def run(self) -> object:
         from ghgs_capture.verbs import view
 
-        return view.run(self, cfg)
+        return view.run(self)
 
 
 class Adapt(OfPhotographs, Training):
@@ -159,10 +156,10 @@ class Adapt(OfPhotographs, Training):
     out: PathText | None = None
     """File for the weights; null: adapted.ckpt in the run's directory."""
 
-    def run(self, cfg: DictConfig) -> object:
+    def run(self) -> object:
         from ghgs_capture.verbs import adapt
 
-        return adapt.run(self, cfg)
+        return adapt.run(self)
 
 
 class Doctor(OfPhotographs):
@@ -184,7 +181,7 @@ class Doctor(OfPhotographs):
     def reads_at_once(self) -> bool:
         return self.task == "cameras"
 
-    def run(self, cfg: DictConfig) -> object:
+    def run(self) -> object:
         from ghgs_capture.verbs import doctor
 
-        return doctor.run(self, cfg)
+        return doctor.run(self)

@@ -6,19 +6,20 @@ import json
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig
+import torch
 
 from ghgs_capture.calibration import calibrate
 from ghgs_capture.capture import Capture
 from ghgs_capture.export.maps import camera_entry
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.formats import read_cameras
-from ghgs_capture.learning import LISTING, agrees, splits_of, write_instant
+from ghgs_capture.learning import LISTING, Instants, agrees, splits_of, write_instant
 from ghgs_capture.rig import spread
 from ghgs_capture.tones import without_tones
+from ghgs_capture.verbs import Adapt
 from ghgs_capture.verbs.photographs import capture_folder
 from ghgs_capture.verbs.predict import mended_by, shared_by
 from ghgs_lit.cli.inputs import (
@@ -32,9 +33,9 @@ from ghgs_lit.cli.inputs import (
 )
 from ghgs_lit.cli.runtime import announce, files_to_write, output_dir
 from ghgs_lit.cli.train import run_job, train
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.config.compose import read_option
-from ghgs_lit.config.options import image_size
+from ghgs_lit.config.options import PathText
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.report import measure_and_write
@@ -43,10 +44,6 @@ from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.weights.exporting import write_inference
 from ghgs_lit.weights.reading import file_of
-
-if TYPE_CHECKING:
-    from ghgs_capture.verbs import Adapt
-    from ghgs_lit.data.datamodule import PhotographsDataModule
 
 # Training people are as tall in a photograph as the user's subject, give or take this share.
 _SPREAD = 0.1
@@ -61,86 +58,91 @@ _SHARED = ("size", "batch_size", "cache_images_mb", "packed_gb", "resident", "re
 _LEARN_PEOPLE = "(learn=people needs no further ones)"
 
 
-def run(options: "Adapt", cfg: DictConfig) -> float | str | None:
+class Started(Adapt):
+    """A training from the weights of ``checkpoint``, with the keys of ``ghgs train`` that it needs."""
+
+    init_from: PathText
+    init_strict: bool
+    allow_random_encoder: bool
+    token_budgets: None = None
+
+
+def run(verb: Adapt) -> float | str | None:
     """Run the verb; Ctrl-C or SIGTERM interrupts it.
 
     Args:
-        options: of the verb.
-        cfg: the whole configuration.
+        verb: the run.
 
     Returns:
         Mean PSNR in dB of validation people in the rig or of instants that were not learned from,
         also of a run that is done; ``BUSY`` (:mod:`ghgs_lit.runs.job`): in a sweep, another
         process works on it.
     """
-    config = resolve(cfg) | model_of(options.checkpoint, cfg)
-    files_to_write(options, ["out"])
+    verb = verb.replace(**model_of(verb.checkpoint, verb))
+    files_to_write(verb, ["out"])
     directory = RunDirectory(output_dir())
-    return run_job(with_instants(with_rig(config), directory.path), directory, adapt)
+    return run_job(with_instants(with_rig(verb), directory.path), directory, adapt)
 
 
-def with_instants(config: dict[str, Any], directory: Path) -> dict[str, Any]:
+def with_instants(run: Adapt, directory: Path) -> Adapt:
     """Learn from the instants of ``images`` where ``learn`` says so, in place of or beside people.
 
     Args:
-        config: of :func:`with_rig`.
+        run: of :func:`with_rig`.
         directory: of the run, where instants are kept.
 
     Returns:
-        The configuration: of all cameras but one, the inputs, that one is the target.
+        The run: of all cameras but one, the inputs, that one is the target.
 
     Raises:
         InputError: there is one instant, or fewer than three cameras.
     """
-    learn = config["learn"]
-    count = len(config["data"]["cameras"])
-    instants = [] if config["images"] is None or learn == "people" else capture_folder(config).instants
+    learn = run.learn
+    count = len(run.data.cameras)
+    instants = [] if run.images is None or learn == "people" else capture_folder(run).instants
     if learn == "people" or (learn == "auto" and (len(instants) < 2 or count < 3)):
-        return config
+        return run
     expected = f"folders of two instants or more {_LEARN_PEOPLE}"
-    require(len(instants) > 1, "images", expected, config["images"] and len(instants))
+    require(len(instants) > 1, "images", expected, run.images and len(instants))
     require(count > 2, "cameras", f"three cameras or more: one is the target {_LEARN_PEOPLE}", count)
-    people = config["data"]
+    people = run.plain["data"]
     data = {name: people[name] for name in people if name in _SHARED}
     data |= {"kind": "instants", "name": "instants", "root": str(directory / "instants")}
     data |= {"cameras": list(people["cameras"]), "beside": people if learn == "both" else None}
-    weights = {**config["loss"]["weights"], **_WEIGHTS}
-    if learn == "both":
-        weights["depth"] = config["loss"]["weights"]["depth"]
-    return {
-        **config,
-        "data": data,
-        "targets": {**read_option("targets", "cameras"), "per_step": 1},
-        "views": {**config["views"], "training_counts": [count - 1], "evaluation_count": count - 1},
-        "evaluation": {**config["evaluation"], "views": [count - 1], "targets": ["cameras"]},
-        "loss": {**config["loss"], "weights": weights},
-    }
+    weights = run.plain["loss"]["weights"]
+    depth = {"depth": weights["depth"]} if learn == "both" else {}
+    run = run.replace(data=data, targets={**read_option("targets", "cameras"), "per_step": 1})
+    return run.changed(
+        views={"training_counts": [count - 1], "evaluation_count": count - 1},
+        evaluation={"views": [count - 1], "targets": ["cameras"]},
+        loss={"weights": {**weights, **_WEIGHTS, **depth}},
+    )
 
 
-def prepare_instants(config: dict[str, Any]) -> None:
+def prepare_instants(run: Adapt) -> None:
     """Write the instants that are learned from, with the masks, cameras and gains of a prediction.
 
     Those that an interrupted run has written are kept.
 
     Args:
-        config: of :func:`with_instants`.
+        run: of :func:`with_instants`.
 
     Raises:
         InputError: fewer than two instants have masks that agree.
     """
-    root = Path(config["data"]["root"])
+    root = Path(run.data.root)
     if (root / LISTING).exists():
         return
     root.mkdir(parents=True, exist_ok=True)
-    folder = capture_folder(config)
-    device = pick_device("cpu" if config["trainer"]["accelerator"] == "cpu" else "auto")
-    model = load_model({**config, "precision": "inherit"}, device)
-    size = image_size("data.size", config["data"]["size"])
+    folder = capture_folder(run)
+    device = _device(run)
+    model = load_model(run.plain, run.checkpoint, device)
+    size = run.data.size
     refining = dict.fromkeys(("refine_cameras", "refine_masks", "tones"), "auto")
-    tones, backgrounds, rig, _ = shared_by(folder, model, size, refining, build_renderer(config, device))
+    tones, backgrounds, rig, _ = shared_by(folder, model, size, refining, build_renderer(run, device))
     names = spread(folder.instants, _INSTANTS)
     used = []
-    for given in _whole(folder, names, config["data"]["cameras"]):
+    for given in _whole(folder, names, run.data.cameras):
         capture = without_tones(mended_by(backgrounds, given), tones)
         if agrees(capture):
             write_instant(rig.applied(capture) if rig else capture, root, size)
@@ -160,42 +162,39 @@ def _whole(folder: CaptureFolder, names: Sequence[str], cameras: Sequence[str]) 
         print(f"instant {name} is not learned from: a photograph or mask is missing", flush=True)
 
 
-def with_rig(config: dict[str, Any]) -> dict[str, Any]:
-    """Place the people of a configuration in the rig of ``cameras`` or of the data set ``data``.
+def with_rig(run: Adapt) -> Adapt:
+    """Place the people of a run in the rig of ``cameras`` or of the data set ``data``.
 
     All its cameras are inputs unless ``views.training_counts`` is given.
 
     Args:
-        config: of the verb, resolved.
+        run: as configured.
 
     Returns:
-        The configuration with cameras, people and views of the rig.
+        The run with cameras, people and views of the rig.
 
     Raises:
         InputError: a file or the data is bad or missing, or there are not 2 to 8 cameras.
     """
-    people = config["data"]
+    people = run.plain["data"]
     if people["kind"] != "people_in_rig":
-        people = resolve(compose("adapt"))["data"]
-        entries, fill = _cameras_of_data(config)
-    elif config["images"] is None:
-        entries = _cameras_of_file(config)
+        people = run_of("adapt").plain["data"]
+        entries, fill = _cameras_of_data(run)
+    elif run.images is None:
+        entries = _cameras_of_file(run)
         fill = people["fill"]
     else:
-        folder = capture_folder(config)
+        folder = capture_folder(run)
         photographs = folder.photographs(folder.instants[0])
         entries = {p.name: camera_entry(p.intrinsics, p.extrinsics, p.mask.shape) for p in photographs}
         fill = _fill_of([p.mask for p in photographs])
     count = len(entries)
     require(2 <= count <= 8, "cameras", "2 to 8 cameras, those of the photographs in images=", count)
-    trained = config["views"]["training_counts"] if "views.training_counts" in given_keys() else [count]
-    views = {**config["views"], "training_counts": trained, "evaluation_count": count}
-    return {
-        **config,
-        "data": {**people, **_more_people(people, config["minutes"]), "cameras": entries, "fill": fill},
-        "views": views,
-        "evaluation": {**config["evaluation"], "views": [count]},
-    }
+    is_given = "views.training_counts" in given_keys()
+    trained = list(run.views.training_counts) if is_given else [count]
+    data = {**people, **_more_people(people, run.minutes), "cameras": entries, "fill": fill}
+    views = {"training_counts": trained, "evaluation_count": count}
+    return run.replace(data=data).changed(views=views, evaluation={"views": [count]})
 
 
 def _more_people(data: dict[str, Any], minutes: float) -> dict[str, dict[str, int]]:
@@ -204,11 +203,12 @@ def _more_people(data: dict[str, Any], minutes: float) -> dict[str, dict[str, in
     return {k: {**data[k], "train": round(data[k]["train"] * max(1, minutes / _MINUTES))} for k in kinds}
 
 
-def _cameras_of_data(config: dict[str, Any]) -> tuple[dict[str, dict[str, Any]], list[float]]:
+def _cameras_of_data(run: Adapt) -> tuple[dict[str, dict[str, Any]], list[float]]:
     """Input cameras of the first validation subject, and the ``fill`` that its masks suggest."""
     for name in ("images", "cameras"):
-        require(config[name] is None, name, "null beside data=<data set>, which has cameras", config[name])
-    data = build_data(config)
+        path = getattr(run, name)
+        require(path is None, name, "null beside data=<data set>, which has cameras", path)
+    data = build_data(run)
     data.prepare_data()
     subjects = list(data.subjects("val"))
     require(subjects != [], "data", "a subject in the split val", subjects)
@@ -220,11 +220,11 @@ def _cameras_of_data(config: dict[str, Any]) -> tuple[dict[str, dict[str, Any]],
     return entries, _fill_of(masks)
 
 
-def _cameras_of_file(config: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def _cameras_of_file(run: Adapt) -> dict[str, dict[str, Any]]:
     """Entries of the calibration that ``cameras`` names.
 
     Args:
-        config: of the verb.
+        run: as configured.
 
     Returns:
         Those of :func:`ghgs_capture.export.maps.camera_entry`, by name.
@@ -232,9 +232,9 @@ def _cameras_of_file(config: dict[str, Any]) -> dict[str, dict[str, Any]]:
     Raises:
         InputError: there is no calibration, it has no sizes, or it is wrong.
     """
-    require(config["cameras"] is not None, "cameras", "cameras=<calibration>", None)
-    file = read_cameras(config["cameras"], config["calibration"]["format"])
-    convention = file.convention.with_options(config["calibration"])
+    require(run.cameras is not None, "cameras", "cameras=<calibration>", None)
+    file = read_cameras(run.cameras, run.calibration.format)
+    convention = file.convention.with_options(dict(run.calibration))
     entries = {}
     for name, camera in file.cameras.items():
         require(camera.size is not None, camera.origin, "the photographs' size, or images=<folder>", None)
@@ -249,11 +249,11 @@ def _fill_of(masks: Sequence[np.ndarray]) -> list[float]:
     return [float(np.clip(tallest * (1 + side * _SPREAD), 0.05, 0.99)) for side in (-1, 1)]
 
 
-def adapt(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float | None:
+def adapt(run: Adapt, directory: Path, stats: dict[str, Any]) -> float | None:
     """Render people, train and write the weights.
 
     Args:
-        config: of :func:`with_rig`.
+        run: of :func:`with_rig`.
         directory: of the run; the weights go there unless ``out`` is given.
         stats: gets the facts of the training, as for :func:`ghgs_lit.cli.train.train`.
 
@@ -261,26 +261,26 @@ def adapt(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
         Mean PSNR in dB of validation people after training; None: it was interrupted.
     """
     begin = time.perf_counter()
-    learns_instants = config["data"]["kind"] == "instants"
+    learns_instants = isinstance(run.data, Instants)
     if learns_instants:
-        prepare_instants(config)
-    data = build_data(config)
+        prepare_instants(run)
+    data = build_data(run)
     data.prepare_data()
     rendered = time.perf_counter() - begin
-    before = _measure(config, data, directory / "before")
-    training = {
-        **config,
-        "trainer": {**config["trainer"], "max_time": {"seconds": 60 * config["minutes"]}},
-        "init_from": str(file_of(config["checkpoint"])),
-        "init_strict": True,
-        "allow_random_encoder": False,
-        # Stages are frozen at first only where training starts from random weights.
-        "optimizer": {**config["optimizer"], "freeze_until": {}},
-    }
-    after = train(training, directory, stats)
+    device = _device(run)
+    method = ModelMethod(load_model(run.plain, run.checkpoint, device), build_renderer(run, device))
+    place = directory / "before"
+    path = measure_and_write({"model": method}, data, run, place, device, verb="adapt", choices=choices())
+    before = read_results(path)["summary"][0]["psnr"]
+    del method  # the training needs its memory
+    # Stages are frozen at first only where training starts from random weights.
+    seconds = 60 * run.plain["minutes"]
+    limited = run.changed(trainer={"max_time": {"seconds": seconds}}, optimizer={"freeze_until": {}})
+    start = {"init_from": str(file_of(run.checkpoint)), "init_strict": True, "allow_random_encoder": False}
+    after = train(Started.of({**limited.plain, **start}), directory, stats)
     if after is None:
         return None
-    out = Path(config["out"] or directory / "adapted.ckpt").expanduser()
+    out = Path(run.out or directory / "adapted.ckpt").expanduser()
     write_inference(directory / "checkpoints" / "last.ckpt", out, "float16")
     count = len(data.subjects("val"))
     measured = f"{count} people that were not trained on, half-way between the cameras"
@@ -292,26 +292,10 @@ def adapt(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
         flush=True,
     )
     if after <= before:
-        print(f"no better: checkpoint={config['checkpoint']} stays the better one for this rig", flush=True)
+        print(f"no better: checkpoint={run.checkpoint} stays the better one for this rig", flush=True)
     announce(out)
     return after
 
 
-def _measure(config: dict[str, Any], data: "PhotographsDataModule", directory: Path) -> float:
-    """Measure a checkpoint on validation people.
-
-    Args:
-        config: with ``checkpoint`` and the data.
-        data: prepared.
-        directory: where results are written.
-
-    Returns:
-        Mean PSNR in dB.
-    """
-    device = pick_device("cpu" if config["trainer"]["accelerator"] == "cpu" else "auto")
-    inference = {**config, "precision": "inherit"}
-    method = ModelMethod(load_model(inference, device), build_renderer(config, device))
-    path = measure_and_write(
-        {"model": method}, data, config, directory, device, verb="adapt", choices=choices()
-    )
-    return read_results(path)["summary"][0]["psnr"]
+def _device(run: Adapt) -> torch.device:
+    return pick_device("cpu" if run.trainer.accelerator == "cpu" else "auto")

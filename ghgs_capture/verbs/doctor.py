@@ -4,7 +4,6 @@ import os
 from typing import TYPE_CHECKING
 
 import rich
-from omegaconf import DictConfig
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -18,8 +17,7 @@ from ghgs_capture.prediction import predict
 from ghgs_capture.tones import tone_lines
 from ghgs_capture.verbs.photographs import capture_folder
 from ghgs_lit.cli.inputs import pick_device
-from ghgs_lit.cli.runtime import announce, output_dir, save_config
-from ghgs_lit.config import resolve
+from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.diagnostics.doctor.selfcheck import FAILED, selfcheck, table
 from ghgs_lit.diagnostics.machine import machine_lines, missing_extras
 from ghgs_lit.errors import InputError, require
@@ -32,37 +30,36 @@ if TYPE_CHECKING:
 _LISTED = 6  #: Number of interpretations of a calibration that are listed
 
 
-def run(options: "Doctor", cfg: DictConfig) -> None:
+def run(verb: "Doctor") -> None:
     """Run the task of the verb.
 
     Args:
-        options: of the verb.
-        cfg: the whole configuration.
+        verb: the run.
 
     Raises:
         InputError: as for the task.
     """
     tasks = {"cameras": cameras, "machine": machine, "selfcheck": selfcheck_device}
-    tasks[options.task](options, cfg)
+    tasks[verb.task](verb)
 
 
-def cameras(options: "Doctor", cfg: DictConfig) -> None:
+def cameras(run: "Doctor") -> None:
     """Check whether photographs, masks and calibration fit together.
 
     Writes ``cameras.png``, and ``cameras.json`` where another interpretation of the calibration
     fits.
 
     Args:
-        options: of the verb.
-        cfg: the whole configuration.
+        run: as configured.
 
     Raises:
         InputError: the cameras do not fit the masks, or a file is missing or wrong.
     """
     tasks = "images=<folder of photographs> cameras=<calibration>, task=machine or task=selfcheck"
-    require(options.images is not None, "images", tasks, None)
+    require(run.images is not None, "images", tasks, None)
     directory = output_dir()
-    folder = capture_folder(save_config(cfg, directory))
+    write_config(run, directory)
+    folder = capture_folder(run)
     inputs = {os.path.realpath(path) for path in folder.input_files}
     picture = directory / "cameras.png"
     calibration = directory / "cameras.json"
@@ -95,18 +92,18 @@ def cameras(options: "Doctor", cfg: DictConfig) -> None:
         announce(calibration)
     if not diagnosis.consistent:
         problems = "; ".join(diagnosis.lines)
-        raise InputError(f"{options.cameras}: expected cameras that fit the masks; found {problems}")
+        raise InputError(f"{run.cameras}: expected cameras that fit the masks; found {problems}")
 
 
-def machine(options: "Doctor", _: DictConfig) -> None:
+def machine(run: "Doctor") -> None:
     """Print what this machine has and which features lack a package or device.
 
     Args:
-        options: of the verb.
+        run: names the device.
     """
     console = Console(soft_wrap=True)
     for title, lines in (
-        ("This machine", machine_lines(pick_device(options.device))),
+        ("This machine", machine_lines(pick_device(run.device))),
         ("Missing", list(missing_extras()) or [("nothing", "")]),
     ):
         listing = Table("", "", title=title, title_justify="left", show_header=False, box=None)
@@ -115,22 +112,20 @@ def machine(options: "Doctor", _: DictConfig) -> None:
         console.print(listing)
 
 
-def selfcheck_device(options: "Doctor", cfg: DictConfig) -> None:
+def selfcheck_device(run: "Doctor") -> None:
     """Check whether a device computes as the CPU does.
 
     Prints each outcome, and writes all of them with facts of the machine to ``selfcheck.md``.
 
     Args:
-        options: of the verb.
-        cfg: the whole configuration.
+        run: as configured.
 
     Raises:
         InputError: a check failed.
     """
-    config = resolve(cfg)
-    device = pick_device(options.device)
+    device = pick_device(run.device)
     outcomes = []
-    for outcome in selfcheck(config, device):
+    for outcome in selfcheck(run, device):
         outcomes.append(outcome)
         print(f"{outcome.status} {outcome.check}: {outcome.found}", flush=True)
     facts = "\n".join(f"- {name}: {value}" for name, value in machine_lines(device))

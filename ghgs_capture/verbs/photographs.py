@@ -1,24 +1,26 @@
 """Folder of photographs that a configuration names,
 and the check of its cameras before a verb runs."""
 
-from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ghgs_capture.folder import CaptureFolder
 from ghgs_lit.config.nodes import Calibration
 from ghgs_lit.errors import InputError, require
 
+if TYPE_CHECKING:
+    from ghgs_capture.verbs import OfPhotographs
+
 _BEGUN: list[CaptureFolder] = []  #: The folder whose photographs are being decoded, if any
 
-_SOURCES = ("images", "cameras", "masks", "backgrounds", "segment", "calibration", "sequence")
+_SOURCES = ("images", "cameras", "masks", "backgrounds", "segment", "sequence")
 _CHECKED = 5  #: Number of instants of a sequence whose cameras are checked
 
 
-def sources_of(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Keys of a configuration that name photographs.
+def sources_of(run: "OfPhotographs") -> dict[str, Any]:
+    """What a run says of photographs.
 
     Args:
-        config: of a verb.
+        run: its groups need not be checked yet.
 
     Returns:
         ``images``, ``cameras`` and the keys beside them.
@@ -27,17 +29,18 @@ def sources_of(config: Mapping[str, Any]) -> dict[str, Any]:
         InputError: one of the two is missing.
     """
     for name, example in (("images", "images=<folder of photographs>"), ("cameras", "cameras=<calibration>")):
-        require(config[name] is not None, name, example, None)
-    # Whether defaults are filled in makes no other folder.
-    calibration = Calibration.read(config.get("calibration", {}), "calibration")
-    return {name: config[name] for name in _SOURCES if name in config} | {"calibration": calibration}
+        require(getattr(run, name) is not None, name, example, None)
+    calibration = run.calibration or Calibration.read(run.plain.get("calibration", {}), "calibration")
+    return {name: getattr(run, name) for name in _SOURCES if hasattr(run, name)} | {
+        "calibration": calibration
+    }
 
 
-def capture_folder(config: Mapping[str, Any]) -> CaptureFolder:
+def capture_folder(run: "OfPhotographs") -> CaptureFolder:
     """The folder that :func:`sources_of` describes, with what :func:`begin_to_read` decodes.
 
     Args:
-        config: of a verb.
+        run: as for :func:`sources_of`.
 
     Returns:
         The folder.
@@ -45,21 +48,21 @@ def capture_folder(config: Mapping[str, Any]) -> CaptureFolder:
     Raises:
         InputError: a key or file is missing or wrong.
     """
-    folder = CaptureFolder(**sources_of(config))
+    folder = CaptureFolder(**sources_of(run))
     return _BEGUN.pop() if [folder] == _BEGUN else folder
 
 
-def begin_to_read(config: Mapping[str, Any]) -> None:
+def begin_to_read(run: "OfPhotographs") -> None:
     """Start decoding the first instant for the next :func:`capture_folder`.
 
     Args:
-        config: of a verb.
+        run: as for :func:`sources_of`.
 
     Raises:
         InputError: as for :func:`capture_folder`.
     """
-    _BEGUN[:] = [capture_folder(config)]
-    if config["segment"] is None:
+    _BEGUN[:] = [capture_folder(run)]
+    if run.segment is None:
         _BEGUN[0].begin(_BEGUN[0].instants[0])
 
 

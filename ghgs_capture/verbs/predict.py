@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from omegaconf import DictConfig
 
 from ghgs_capture import export
 from ghgs_capture.backgrounds import BACKGROUND_INSTANTS, Backgrounds
@@ -26,118 +25,92 @@ from ghgs_capture.verbs.advice import advice_of, moved_line, rig_advice
 from ghgs_capture.verbs.photographs import capture_folder, check_cameras
 from ghgs_lit.cli import inputs
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
-from ghgs_lit.config import resolve
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import resolved
 from ghgs_lit.model import GHGS
 from ghgs_lit.rendering import Renderer
-from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import read_config
 
 if TYPE_CHECKING:  # it would import Lightning, which takes seconds
     from ghgs_capture.verbs import Predict
-    from ghgs_lit.data.datamodule import PhotographsDataModule
 
 
 @torch.no_grad()
-def run(options: "Predict", cfg: DictConfig) -> None:
+def run(verb: "Predict") -> None:
     """Run the verb.
 
     Args:
-        options: of the verb.
-        cfg: the whole configuration.
+        verb: the run.
     """
-    directory = output_dir() if options.out is None else resolved(options.out)
-    is_capture = options.images is not None or options.cameras is not None
-    config = resolve(cfg if is_capture else inputs.with_trained_data(cfg))
-    config |= inputs.model_of(options.checkpoint, cfg)
-    (predict_photographs if is_capture else predict_subject)(options, config, directory)
+    directory = output_dir() if verb.out is None else resolved(verb.out)
+    is_capture = verb.images is not None or verb.cameras is not None
+    verb = verb if is_capture else inputs.with_trained_data(verb)
+    verb = verb.replace(**inputs.model_of(verb.checkpoint, verb))
+    (predict_photographs if is_capture else predict_subject)(verb, directory)
     announce(directory)
 
 
-def subject_batch(
-    data: "PhotographsDataModule", subject: str | int, split: str, targets: dict[str, Any] | None
-) -> Batch:
-    """Photographs of one subject of a data set.
-
-    Args:
-        data: prepared.
-        subject: its name, or its number in the split from 0.
-        split: such as ``val``.
-        targets: a protocol whose targets are read too; None: none.
-
-    Returns:
-        A batch of one element.
-
-    Raises:
-        InputError: there is no such subject.
-    """
-    names = list(data.subjects(split))
-    if isinstance(subject, int) and 0 <= subject < len(names):
-        subject = names[subject]
-    expected = f"0 to {len(names) - 1} or a name such as {names[0]}"
-    require(subject in names, "subject", expected, subject)
-    return data.evaluation_batch(subject, split, targets=targets)
-
-
-def predict_subject(options: "Predict", config: dict[str, Any], directory: Path) -> None:
+def predict_subject(run: "Predict", directory: Path) -> None:
     """Predict a subject of a data set and write its files.
 
     Args:
-        options: of the verb.
-        config: its whole configuration, resolved.
+        run: with the checkpoint's model.
         directory: where files are written.
 
     Raises:
         InputError: there is no such subject, or an option does not fit.
     """
     expected = "0 without images=...: photographs of data sets are on black"
-    require(options.refine_masks in (0, "auto"), "refine_masks", expected, options.refine_masks)
-    output = export.output_options(options)
-    device = inputs.pick_device(options.device)
-    renderer = inputs.build_renderer(config, device)
-    model = inputs.load_model(config, device)
-    data = inputs.build_data(config)
+    require(run.refine_masks in (0, "auto"), "refine_masks", expected, run.refine_masks)
+    output = export.output_options(run)
+    device = inputs.pick_device(run.device)
+    renderer = inputs.build_renderer(run, device)
+    model = inputs.load_model(run.plain, run.checkpoint, device, run.precision)
+    data = inputs.build_data(run)
     inputs.check_size(data, model)
-    write_config(config, directory)
-    data.prepare_data([options.split])
-    batch = subject_batch(data, options.subject, options.split, config.get("targets")).to(device)
-    rounds = 0 if options.refine_cameras == "auto" else options.refine_cameras
-    result = predict_batch(batch, model, renderer, rounds, options.refine)
-    write_result(directory, result, model, renderer, options.checkpoint, output)
+    write_config(run, directory)
+    data.prepare_data([run.split])
+    names = list(data.subjects(run.split))
+    is_number = isinstance(run.subject, int) and 0 <= run.subject < len(names)
+    subject = names[run.subject] if is_number else run.subject
+    expected = f"0 to {len(names) - 1} or a name such as {names[0]}"
+    require(subject in names, "subject", expected, subject)
+    batch = data.evaluation_batch(subject, run.split, targets=run.targets).to(device)
+    rounds = 0 if run.refine_cameras == "auto" else run.refine_cameras
+    result = predict_batch(batch, model, renderer, rounds, run.refine)
+    write_result(directory, result, model, renderer, run.checkpoint, output)
 
 
-def predict_photographs(options: "Predict", config: dict[str, Any], directory: Path) -> None:
+def predict_photographs(run: "Predict", directory: Path) -> None:
     """Predict each instant of a folder of photographs and write its files.
 
     Several instants get a folder each and shared files.
 
     Args:
-        options: of the verb.
-        config: its whole configuration, resolved.
+        run: with the checkpoint's model.
         directory: where files are written.
 
     Raises:
         InputError: no instant can be read, or a file or option is wrong.
     """
-    folder = capture_folder(config)
-    output = export.output_options(options)
-    directories, together = _free_places(folder, output, directory, bool(options.refine_cameras))
+    folder = capture_folder(run)
+    output = export.output_options(run)
+    directories, together = _free_places(folder, output, directory, bool(run.refine_cameras))
     if folder.note:
         print(folder.note, flush=True)
-    if options.check_cameras:
+    if run.check_cameras:
         check_cameras(folder)
-    device = inputs.pick_device(options.device)
-    renderer = inputs.build_renderer(config, device)
-    model = inputs.load_model(config, device)
-    trained = read_config(options.checkpoint)
-    size = crop_size(options.size, trained, model)
-    write_config(config, directory)
+    device = inputs.pick_device(run.device)
+    renderer = inputs.build_renderer(run, device)
+    model = inputs.load_model(run.plain, run.checkpoint, device, run.precision)
+    trained = read_config(run.checkpoint)
+    size = crop_size(run.size, trained, model)
+    write_config(run, directory)
     refining: dict[str, Any] = {
-        "refine_cameras": options.refine_cameras,
-        "refine_masks": options.refine_masks,
-        "refine": options.refine,
-        "tones": options.refine_tones or {},
+        "refine_cameras": run.refine_cameras,
+        "refine_masks": run.refine_masks,
+        "refine": run.refine,
+        "tones": run.refine_tones or {},
     }
     temporal = Temporal(partial(in_frame, model), model.skip.every, renderer)
     totals: Counter[str] = Counter()
@@ -154,7 +127,7 @@ def predict_photographs(options: "Predict", config: dict[str, Any], directory: P
         capture = rig.applied(capture) if rig else capture
         result = predict(capture, model, size, **refining, renderer=renderer, temporal=temporal)
         result.seconds["read"] = waited
-        seconds = write_result(directories[capture.name], result, model, renderer, options.checkpoint, output)
+        seconds = write_result(directories[capture.name], result, model, renderer, run.checkpoint, output)
         if together:
             together.add(directories[capture.name], result.batch, result.prediction, renderer)
         count += 1

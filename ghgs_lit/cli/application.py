@@ -16,11 +16,12 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.cli import messages
-from ghgs_lit.config import VERSION_BASE, compose, conf_dir, resolve
-from ghgs_lit.config.compose import check_ablation, plain, read_verb, store_defaults
+from ghgs_lit.config import VERSION_BASE, compose, conf_dir
+from ghgs_lit.config.compose import check_ablation, plain, store_defaults
+from ghgs_lit.config.defaults import fill
 from ghgs_lit.config.options import UnknownKey
 from ghgs_lit.config.outside import check_outside_files
-from ghgs_lit.config.registry import check, verb_class
+from ghgs_lit.config.registry import read_nodes, verb_class
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import require_no_links, write_text_atomically
 from ghgs_lit.runs.job import register_resolvers
@@ -99,18 +100,18 @@ class Verb:
         try:
             directory = Path(HydraConfig.get().runtime.output_dir)
             check_ablation(cfg, HydraConfig.get())
-            config = plain(cfg)
-            verb = read_verb(self.name, config)
+            verb = verb_class(self.name).begin(plain(cfg))
             if verb.begins_run:
                 run = RunDirectory(directory)
-                # it compares whole configurations
-                run.start(config if run.marker is None else resolve(cfg))
+                if run.marker is not None:  # it compares whole configurations
+                    verb.complete(plain(fill(cfg)))
+                run.start(verb)
             write_hydra_files(cfg, directory)
-            verb.require_files(config)
-            resolve(cfg)  # with all defaults, before the verb imports what takes longer
+            verb.require_files()
+            verb.complete(plain(fill(cfg)))  # before the verb imports what takes longer
             collect_garbage_again()
             children_sleep()
-            return verb.run(cfg)
+            return verb.run()
         except messages.BAD_INPUT as error:
             # In a sweep Hydra prints the error with its job's number.
             if HydraConfig.get().mode == RunMode.MULTIRUN:
@@ -181,7 +182,7 @@ def _print_configuration(name: str, overrides: list[str], values: Namespace) -> 
     HydraConfig.instance().set_config(cfg)
     cfg = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
     try:
-        check(OmegaConf.to_container(cfg, resolve=True))
+        read_nodes(OmegaConf.to_container(cfg, resolve=True))
     except UnknownKey:
         raise
     except InputError:  # a wrong value is what somebody may look for

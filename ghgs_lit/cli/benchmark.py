@@ -3,16 +3,14 @@
 import itertools
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import lightning.pytorch as L
 import torch
-from omegaconf import DictConfig
 
 from ghgs_lit.cli.inputs import build_data, choices, overrides, pick_device, with_trained_data
-from ghgs_lit.cli.runtime import announce, output_dir, save_config
-from ghgs_lit.config import build
+from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config.compose import read_options
 from ghgs_lit.config.keys import is_below
 from ghgs_lit.diagnostics.benchmark import report
@@ -30,29 +28,29 @@ if TYPE_CHECKING:
     from ghgs_lit.cli.verbs import Benchmark
 
 
-def run(options: "Benchmark", cfg: DictConfig) -> None:
+def run(verb: "Benchmark") -> None:
     """Measure the presets, print the tables and write them.
 
     Args:
-        options: keys of the verb.
-        cfg: the whole configuration that Hydra composed.
+        verb: the run.
 
     Raises:
         InputError: the configuration, a checkpoint or the data is wrong.
         SystemExit: code 1: a preset exceeds its error budget.
     """
     directory = output_dir()
-    config = save_config(with_trained_data(cfg), directory)
-    check_options(config, overrides())
-    L.seed_everything(options.seed, workers=True, verbose=False)
-    device = pick_device(options.device)
-    with threads(options.threads):
-        content = _presets(configured_cases(config, device), options, config, device)
+    verb = with_trained_data(verb)
+    write_config(verb, directory)
+    check_options(verb, overrides())
+    L.seed_everything(verb.seed, workers=True, verbose=False)
+    device = pick_device(verb.device)
+    with threads(verb.threads):
+        content = _presets(configured_cases(verb, device), verb, device)
         content = {"machine": machine_facts(device), **content}
     tables = report.tables_of(content["rows"])
     print_tables(tables)
     print(*content["decisions"], sep="\n", flush=True)
-    source = provenance(config, seed=options.seed, verb="benchmark", choices=choices())
+    source = provenance(verb.plain, seed=verb.seed, verb="benchmark", choices=choices())
     announce(report.write_numbers(directory, {**content, "provenance": source}, tables))
     if content["broken"]:
         for line in content["broken"]:
@@ -60,17 +58,17 @@ def run(options: "Benchmark", cfg: DictConfig) -> None:
         raise SystemExit(1)
 
 
-def check_options(config: Mapping[str, Any], given: Sequence[str]) -> None:
+def check_options(run: "Benchmark", given: Sequence[str]) -> None:
     """Refuse options of the model beside a checkpoint, which brings its own model.
 
     Args:
-        config: the whole configuration as plain data.
+        run: as configured.
         given: overrides of the command line.
 
     Raises:
         InputError: names the first such key.
     """
-    if config["checkpoint"] is None:
+    if run.checkpoint is None:
         return
     for key in (text.split("=", 1)[0].lstrip("+~") for text in given):
         if is_below(key, [name for name in (*KNOBS, "ablation", "compat") if name not in _APPLIED]):
@@ -81,34 +79,32 @@ def check_options(config: Mapping[str, Any], given: Sequence[str]) -> None:
 _APPLIED = ("skip", "renderer", "precision")
 
 
-def configured_cases(config: Mapping[str, Any], device: torch.device) -> list[Case]:
+def configured_cases(run: "Benchmark", device: torch.device) -> list[Case]:
     """The model in every preset, always including the yardstick.
 
     Args:
-        config: the whole configuration as plain data.
+        run: as configured.
         device: where the models are.
 
     Raises:
         FileNotFoundError: there is no such checkpoint.
         InputError: a preset or knob does not exist, or the weights do not fit it.
     """
-    names = dict.fromkeys([YARDSTICK, *config["presets"]])
-    presets = read_options("skip", list(names), config["skip"], "presets")
-    path = config["checkpoint"]
+    config = run.plain
+    names = dict.fromkeys([YARDSTICK, *run.presets])
+    presets = read_options("skip", list(names), run, "presets")
+    path = run.checkpoint
     source = Source(config if path is None else read_config(path), path)
     shared = {name: config[name] for name in ("renderer", "precision")}
-    return cases_of(source, presets, config["knobs"] or {}, shared, device, config["seed"])
+    return cases_of(source, presets, config["knobs"] or {}, shared, device, run.seed)
 
 
-def _presets(
-    cases: list[Case], options: "Benchmark", config: dict[str, Any], device: torch.device
-) -> dict[str, Any]:
+def _presets(cases: list[Case], run: "Benchmark", device: torch.device) -> dict[str, Any]:
     """Measure cases on the first subjects of the split.
 
     Args:
         cases: the yardstick first.
-        options: keys of the verb.
-        config: the whole configuration as plain data.
+        run: as configured.
         device: where the models are.
 
     Returns:
@@ -119,21 +115,21 @@ def _presets(
     Raises:
         InputError: the data has no target photographs, or is wrong.
     """
-    data = build_data(config)
-    data.prepare_data([options.split])
-    loader = data.evaluation_loader(split=options.split)
-    number = options.subjects and math.ceil(options.subjects / data.dataset.batch_size)
+    data = build_data(run)
+    data.prepare_data([run.split])
+    loader = data.evaluation_loader(split=run.split)
+    number = run.subjects and math.ceil(run.subjects / data.dataset.batch_size)
     batches: list[Batch] = [batch.to(device) for batch in itertools.islice(loader, number)]
     if batches[0].targets is None:
-        raise InputError(f"targets={config['targets']['name']}: expected target photographs; found none")
-    metrics = build(config["metrics"], "metrics").to(device)
-    records = record_cases(cases, batches, metrics, device, options.timing.repeats)
+        raise InputError(f"targets={run.targets.name}: expected target photographs; found none")
+    metrics = run.metrics.build().to(device)
+    records = record_cases(cases, batches, metrics, device, run.timing.repeats)
     rows = report.rows_of(records)
     _, views, _, height, width = batches[0].images.shape
     subjects = sum(len(batch.images) for batch in batches)
     number = sum(p.numel() for p in cases[0].model.parameters()) / 1e6
-    weights = options.checkpoint or f"{choices().get('encoder', 'encoder')}, random weights"
-    weights = f"{weights} ({number:.1f} M parameters, precision {options.precision})"
+    weights = run.checkpoint or f"{choices().get('encoder', 'encoder')}, random weights"
+    weights = f"{weights} ({number:.1f} M parameters, precision {run.precision})"
     photographs = f"{subjects} subjects of {data.dataset.name}, {views} views of {height} x {width}"
     decisions = []
     for record in records:
@@ -142,7 +138,7 @@ def _presets(
             decisions.append(f"{record.case.label}: {auto.report(decisions_of(record.metrics))}")
     return {
         "about": f"{weights}; {photographs}",
-        "random_weights": options.checkpoint is None,
+        "random_weights": run.checkpoint is None,
         "rows": rows,
         "broken": report.broken_budgets(rows),
         "decisions": decisions,

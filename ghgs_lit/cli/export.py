@@ -3,9 +3,8 @@
 from typing import TYPE_CHECKING
 
 import torch
-from omegaconf import DictConfig
 
-from ghgs_lit.cli.runtime import announce, files_to_write, output_dir, save_config
+from ghgs_lit.cli.runtime import announce, files_to_write, output_dir, write_config
 from ghgs_lit.diagnostics.benchmark.measure import differences as prediction_differences
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.errors import require
@@ -45,20 +44,19 @@ def parity(checkpoint: str, exported: str) -> dict[str, float]:
     return prediction_differences(*results, batch.masks)
 
 
-def run(options: "Export", cfg: DictConfig) -> None:
+def run(verb: "Export") -> None:
     """Write the files that were asked for, and print how they differ from the checkpoint.
 
     Args:
-        options: keys of the verb.
-        cfg: the whole configuration that Hydra composed.
+        verb: the run.
 
     Raises:
         InputError: no file is asked for, one exists, or the checkpoint is wrong.
     """
-    save_config(cfg, output_dir())
-    checkpoint = options.checkpoint
+    write_config(verb, output_dir())
+    checkpoint = verb.checkpoint
     keys = ("vggt", "release", "inference")
-    paths = files_to_write(options, keys, [file_of(checkpoint)])
+    paths = files_to_write(verb, keys, [file_of(checkpoint)])
     vggt, release, inference = map(paths.get, keys)
     require(bool(paths), "vggt", "vggt=<file>, release=<file> or inference=<file>", None)
     if vggt is not None or release is not None:
@@ -67,7 +65,7 @@ def run(options: "Export", cfg: DictConfig) -> None:
         if release is not None and differing:
             print(f"differs from the release: {', '.join(differing)}", flush=True)
     if inference is not None:
-        write_inference(checkpoint, inference, options.dtype)
+        write_inference(checkpoint, inference, verb.dtype)
         measured = parity(checkpoint, inference)
         sizes = (file_of(path).stat().st_size / 1e6 for path in (checkpoint, inference))
         print("{:.1f} MB to {:.1f} MB".format(*sizes), flush=True)

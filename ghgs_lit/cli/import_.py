@@ -3,11 +3,10 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig
 from torch import Tensor
 
 from ghgs_lit.cli.inputs import MODEL_NODES
-from ghgs_lit.cli.runtime import announce, files_to_write, output_dir, save_config
+from ghgs_lit.cli.runtime import announce, files_to_write, output_dir, write_config
 from ghgs_lit.model import GHGS
 from ghgs_lit.weights.importing import import_weights
 from ghgs_lit.weights.switches import differences
@@ -27,22 +26,22 @@ def empty_state(config: Mapping[str, Any], release: str | None) -> dict[str, Ten
     return {name: tensor for name, tensor in state.items() if release or name.startswith("encoder.")}
 
 
-def run(options: "Import", cfg: DictConfig) -> None:
+def run(verb: "Import") -> None:
     """Write the checkpoint, and print what it was made of.
 
     Args:
-        options: keys of the verb.
-        cfg: the whole configuration that Hydra composed.
+        verb: the run.
 
     Raises:
         InputError: the weights do not fit the model, or the file exists.
     """
-    config = save_config(cfg, output_dir())
+    write_config(verb, output_dir())
+    config = verb.plain
     model = {key: config[key] for key in MODEL_NODES if key in config}
-    sources = (options.vggt, options.release)
-    out = files_to_write(options, ["out"], [path for path in sources if path is not None])["out"]
-    report = import_weights(empty_state(model, options.release), model, out, *sources, options.dtype)
+    sources = (verb.vggt, verb.release)
+    out = files_to_write(verb, ["out"], [path for path in sources if path is not None])["out"]
+    report = import_weights(empty_state(model, verb.release), model, out, *sources, verb.dtype)
     print("\n".join(report), flush=True)
-    if options.release is not None and (differing := differences(config)):
+    if verb.release is not None and (differing := differences(config)):
         print(f"differs from the release: {', '.join(differing)}", flush=True)
     announce(out)

@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
-from ghgs_lit.config import build
+from ghgs_lit.cli.verb import Measured
+from ghgs_lit.config.defaults import fill
 from ghgs_lit.config.keys import ablation_of, flatten, is_below, lookup
+from ghgs_lit.config.run import Run
 from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.model import GHGS
@@ -37,53 +39,53 @@ FREE = ("bounds", "encoder.precision", "model.pad", "rounds.count", "rounds.heig
 FREE += ("recalibration.k", "recalibration.neighborhood", "recalibration.similarity", "recalibration.tokens")
 
 
-def build_data(config: Mapping[str, Any]) -> "PhotographsDataModule":
+def build_data(run: Run) -> "PhotographsDataModule":
     """The configured data with its view and target protocols.
 
     Args:
-        config: the whole configuration as plain data.
+        run: of a verb with data.
 
     Raises:
-        InputError: a key is wrong, or files of the data are.
+        InputError: files of the data are wrong.
     """
     # Every data set has cameras that can be targets; a verb without a target protocol reads none.
-    targets = config.get("targets") or CAMERAS
-    extra = {"views": config["views"], "targets": targets, "seed": config["seed"]}
-    if "augmentation" in config:  # of verbs that train
-        extra["augmentation"] = config["augmentation"]
-    return build(config["data"], "data", **extra)
+    targets = run.targets or CAMERAS
+    extra = {} if run.augmentation is None else {"augmentation": run.augmentation}  # of verbs that train
+    return run.data.build(views=run.views, targets=targets, seed=run.seed, **extra)
 
 
-def build_renderer(config: Mapping[str, Any], device: torch.device) -> Renderer:
+def build_renderer(run: Run, device: torch.device) -> Renderer:
     """The configured renderer.
 
     Args:
-        config: the whole configuration as plain data.
+        run: of a verb with a renderer.
         device: where it will run.
 
     Raises:
         InputError: it does not run on ``device``.
     """
-    renderer = build(config["renderer"], "renderer")
+    renderer = run.renderer.build()
     if (backend := getattr(renderer, "backend", None)) is not None:  # a plug-in's may have none
         resolve_backend(backend, device)
     return renderer
 
 
-def load_model(config: Mapping[str, Any], device: torch.device) -> GHGS:
-    """The model of ``config["checkpoint"]`` in evaluation mode and the configured precision.
+def load_model(nodes: Mapping[str, Any], checkpoint: str, device: torch.device, precision="inherit") -> GHGS:
+    """The model of a checkpoint in evaluation mode.
 
     Args:
-        config: the whole configuration as plain data, with the checkpoint's model.
+        nodes: of the model by name as plain data, such as those of :func:`model_of`.
+        checkpoint: path of the file, or ``shipped``.
         device: where the model will run.
+        precision: of its products.
 
     Raises:
         FileNotFoundError: there is no such checkpoint.
         InputError: it is none of this package, or its weights do not fit the model.
     """
-    model = GHGS.from_config(config, empty=True)
-    load_weights(model, config["checkpoint"], device=device)
-    model.precision = config["precision"]
+    model = GHGS.from_config(nodes, empty=True)
+    load_weights(model, checkpoint, device=device)
+    model.precision = precision
     half = half_precision(model.precision, device)
     if half is not None and device.type == "cuda":
         keep_rounded(model.encoder, half)  # a verb never changes its precision
@@ -106,46 +108,50 @@ def check_size(data: "PhotographsDataModule", model: GHGS) -> None:
     require(not any(side % multiple for side in size), "data.size", expected, list(size))
 
 
-def with_trained_data(cfg: DictConfig) -> DictConfig:
+def with_trained_data(run: Measured) -> Measured:
     """Fill in the data that the checkpoint was trained on, unless ``data=<option>`` was chosen.
 
     Given keys such as ``data.root=...`` change it; keys of the machine that trained
     (:data:`OF_MACHINE`) have their defaults.
 
     Args:
-        cfg: the whole configuration that Hydra composed.
+        run: as composed.
+
+    Returns:
+        The run with data.
 
     Raises:
         InputError: there is no checkpoint, it stores no training data, or its folder is not here.
     """
-    if "kind" in (cfg.get("data") or {}):
-        return cfg
-    if cfg.checkpoint is None:
+    if run.data is not None:
+        return run
+    checkpoint = run.checkpoint
+    if checkpoint is None:
         raise InputError("data: expected data=<option> where there is no checkpoint; found none")
-    if cfg.checkpoint == SHIPPED:  # its training data would have to be rendered first
+    if checkpoint == SHIPPED:  # its training data would have to be rendered first
         expected = "images=<folder> cameras=<file>, or data=<option>, with the weights of the package"
         raise InputError(f"data: expected {expected}; found neither")
-    trained = read_config(cfg.checkpoint)
+    trained = read_config(checkpoint)
     if not trained.get("data"):
-        expected = f"data=<option> for weights that were imported ({cfg.checkpoint})"
+        expected = f"data=<option> for weights that were imported ({checkpoint})"
         raise InputError(f"data: expected {expected}; found none")
     data = {key: value for key, value in trained["data"].items() if key not in OF_MACHINE}
-    merged = OmegaConf.merge({"data": data}, cfg)
+    merged = OmegaConf.merge({"data": data}, {"data": run.plain.get("data") or {}})
     root = merged.data.get("root")
     if "root" in data and root == data["root"] and isinstance(root, str) and not Path(root).is_dir():
-        expected = f"data.root=<folder>, as the data of {cfg.checkpoint} is not where it was trained"
+        expected = f"data.root=<folder>, as the data of {checkpoint} is not where it was trained"
         raise InputError(f"data.root: expected {expected}; found no such folder {root!r}")
-    return merged
+    return run.replace(data=OmegaConf.to_container(fill(merged))["data"])
 
 
-def model_of(checkpoint: str, cfg: DictConfig) -> dict[str, Any]:
+def model_of(checkpoint: str, run: Run) -> dict[str, Any]:
     """Model nodes of a checkpoint, with the changes of the command line.
 
     The options that a verb composes by default do not count: they describe another model.
 
     Args:
         checkpoint: path of the file, or ``shipped``.
-        cfg: the whole configuration that Hydra composed.
+        run: as composed.
 
     Returns:
         The nodes :data:`MODEL_NODES` and ``chosen``, as far as the checkpoint has them.
@@ -168,7 +174,7 @@ def model_of(checkpoint: str, cfg: DictConfig) -> dict[str, Any]:
             _require_ablation(trained)
         if not is_below(key, MODEL_NODES):
             continue
-        value = OmegaConf.select(cfg, key)
+        value = lookup(run.plain, key)
         if is_below(key, FREE):
             OmegaConf.update(after, key, value, merge=False, force_add=True)
         else:
@@ -183,13 +189,12 @@ def _require_same(trained: Mapping[str, Any], key: str, value: Any) -> None:
     Args:
         trained: nodes of the model as plain data.
         key: dotted key or group of an override.
-        value: what the override composes; keys of :data:`FREE` below it may differ.
+        value: what the override composes, as plain data; keys of :data:`FREE` below it may differ.
 
     Raises:
         InputError: names the first key that differs.
     """
-    plain = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
-    for name, wanted in flatten(plain, key).items():
+    for name, wanted in flatten(value, key).items():
         before = lookup(trained, name)
         same = before == wanted or is_below(name, FREE)
         require(same, name, f"{before!r}, which the checkpoint's weights were trained with", wanted)
@@ -210,19 +215,19 @@ def _require_ablation(trained: Mapping[str, Any]) -> None:
     require(wanted == before, "ablation", f"{before}, as the checkpoint was trained ({switches})", wanted)
 
 
-def with_chosen_targets(config: dict[str, Any]) -> dict[str, Any]:
+def with_chosen_targets(run: Measured) -> Measured:
     """Measure only the protocol of ``targets=<option>``, if given without ``evaluation.targets``.
 
     Args:
-        config: the whole configuration as plain data.
+        run: as composed.
 
     Returns:
-        The configuration, with ``evaluation.targets`` where it is so; ``config`` stays as it is.
+        The run, with ``evaluation.targets`` where it is so.
     """
     keys = given_keys()
     if "targets" not in keys or is_below("evaluation.targets", keys):
-        return config
-    return {**config, "evaluation": {**config["evaluation"], "targets": [config["targets"]["name"]]}}
+        return run
+    return run.changed(evaluation={"targets": [run.targets.name]})
 
 
 def pick_device(name: str) -> torch.device:

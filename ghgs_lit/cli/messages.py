@@ -16,7 +16,8 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from ghgs_lit.config import compose, conf_dir, resolve
+from ghgs_lit.config import compose, conf_dir
+from ghgs_lit.config.compose import plain
 from ghgs_lit.config.keys import flatten, is_below
 from ghgs_lit.config.options import UnknownKey, did_you_mean
 from ghgs_lit.config.registry import verb_class, verbs
@@ -167,7 +168,7 @@ def _can_add(verb: str, chosen: Sequence[str], key: str, override: str) -> bool:
         return False
     try:
         cfg = compose(verb, [*chosen, override], with_hydra=key.startswith("hydra."))
-        return key.startswith("hydra.") or bool(resolve(cfg, verb))
+        return key.startswith("hydra.") or bool(verb_class(verb).of(plain(cfg)))
     except (HydraException, OmegaConfBaseException, InputError):
         return False
 

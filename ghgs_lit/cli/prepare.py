@@ -4,10 +4,7 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omegaconf import DictConfig
-
 from ghgs_lit.cli.runtime import announce, output_dir
-from ghgs_lit.config import build
 from ghgs_lit.config.nodes import Check
 from ghgs_lit.data.check import inspect
 from ghgs_lit.data.check_report import show, write
@@ -22,23 +19,22 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-def run(options: "Prepare", cfg: DictConfig) -> None:
+def run(verb: "Prepare") -> None:
     """Render or check a data set.
 
     Args:
-        options: keys of the verb.
-        cfg: the whole configuration that Hydra composed.
+        verb: the run.
 
     Raises:
         InputError: the configuration or the data is wrong.
     """
-    data = build(cfg.data, key="data", views=cfg.views, targets=cfg.targets, seed=options.seed)
+    data = verb.data.build(views=verb.views, targets=verb.targets, seed=verb.seed)
     root = resolved(data.dataset.root or ".")
-    if options.task == "render":
+    if verb.task == "render":
         render(data)
         announce(root)
     else:
-        check(data, output_dir(), options.check)
+        check(data, output_dir(), verb.check)
 
 
 def render(data: PhotographsDataModule) -> None:

@@ -5,14 +5,11 @@ from typing import Any
 
 import lightning.pytorch as L
 from lightning.pytorch.utilities import rank_zero_only
-from omegaconf import DictConfig
 
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.cli.train import build_trainer, fit, quiet, resume_step, run_job
 from ghgs_lit.cli.verb import Training
-from ghgs_lit.config import build, resolve
-from ghgs_lit.encoder.semantic import SemanticOptions
 from ghgs_lit.errors import require
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.training import loggers
@@ -20,11 +17,11 @@ from ghgs_lit.training.checkpoints import StopAtStep
 from ghgs_lit.training.pretext.module import Pretext, PretextModule
 
 
-def run(_: Training, cfg: DictConfig) -> float | str | None:
+def run(verb: Training) -> float | str | None:
     """Train the branch.
 
     Args:
-        cfg: the whole configuration that Hydra composed.
+        verb: the run.
 
     Returns:
         Part accuracy on validation people, 0 to 1; in a sweep ``job.BUSY`` where another process
@@ -33,14 +30,14 @@ def run(_: Training, cfg: DictConfig) -> float | str | None:
     Raises:
         Interrupted: by Ctrl-C or SIGTERM.
     """
-    return run_job(resolve(cfg), RunDirectory(output_dir()), pretrain)
+    return run_job(verb, RunDirectory(output_dir()), pretrain)
 
 
-def pretrain(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float | None:
+def pretrain(run: Training, directory: Path, stats: dict[str, Any]) -> float | None:
     """Train the branch and save it.
 
     Args:
-        config: the whole configuration as plain data.
+        run: as configured.
         directory: the run's.
         stats: receives the ``steps`` and ``seconds`` of this training.
 
@@ -52,23 +49,23 @@ def pretrain(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> 
             or the size of photographs is no multiple of its patch.
     """
     # Tables of models that start from this checkpoint show this origin.
-    config = {**config, "encoder": {**config["encoder"], "weights": "pretext"}}
-    options = config["encoder"]["semantic"]
-    patch_size = config["encoder"]["patch_size"]
+    run = run.changed(encoder={"weights": "pretext"})
+    options = run.encoder.semantic
+    patch_size = run.encoder.patch_size
     require(options is not None, "encoder.semantic", "the options of a branch to train", None)
     if rank_zero_only.rank == 0:
-        write_config(config, directory)
-    L.seed_everything(config["seed"], workers=True, verbose=False)
-    data = build_data(config)
+        write_config(run, directory)
+    L.seed_everything(run.seed, workers=True, verbose=False)
+    data = build_data(run)
     fits = not any(side % patch_size for side in data.dataset.size)
     require(fits, "data.size", f"sides divisible by the patch size {patch_size}", list(data.dataset.size))
-    model = Pretext(SemanticOptions.read(options, "encoder.semantic").build(patch_size))
-    module = PretextModule(model, build(config["optimizer"], "optimizer"), config)
-    step = resume_step(config, module)
+    model = Pretext(options.build(patch_size))
+    module = PretextModule(model, run.optimizer.build(), run.plain)
+    step = resume_step(run, module)
     quiet()
-    trainer = build_trainer(config, directory, StopAtStep())
+    trainer = build_trainer(run, directory, StopAtStep())
     try:
-        fit(trainer, module, data, config, step, stats)
+        fit(trainer, module, data, run.resume, step, stats)
         checkpoint = directory / "checkpoints" / "last.ckpt"
         trainer.save_checkpoint(checkpoint)
         accuracy = trainer.validate(module, data, verbose=False)[0]["val/part_accuracy"]

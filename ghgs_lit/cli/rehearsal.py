@@ -5,7 +5,7 @@ import json
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,9 +13,7 @@ from lightning.pytorch.callbacks import Callback
 
 from ghgs_lit.cli.inputs import build_data, build_renderer, check_size
 from ghgs_lit.cli.train import build_trainer, quiet
-from ghgs_lit.config import build
-from ghgs_lit.config.keys import WITHOUT_INFLUENCE, flatten, is_below, lookup
-from ghgs_lit.config.registry import read_node
+from ghgs_lit.config.keys import WITHOUT_INFLUENCE, flatten, is_below
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.protocols import check_evaluation
 from ghgs_lit.model import GHGS
@@ -25,6 +23,7 @@ from ghgs_lit.training import GHGSModule, start
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
 if TYPE_CHECKING:
+    from ghgs_lit.cli.verbs import Train
     from ghgs_lit.data.datamodule import PhotographsDataModule
 
 _STEPS = 3  #: Steps that are taken for the time of the last one
@@ -44,10 +43,10 @@ class _Clock(Callback):
 
 
 class _Rehearsed:
-    """What one configuration needs.
+    """What one run needs.
 
     Args:
-        config: of the run.
+        run: as configured.
         reasons: why runs would be refused, as keys in order of appearance.
         notes: what else they should know, likewise.
         listed: data and phases whose files were looked for, which several configurations share.
@@ -55,12 +54,12 @@ class _Rehearsed:
 
     def __init__(
         self,
-        config: Mapping[str, Any],
+        run: "Train",
         reasons: dict[str, None],
         notes: dict[str, None],
         listed: set[str],
     ) -> None:
-        self.config = dict(config)
+        self.run = run
         self.reasons = reasons
         self.notes = notes
         self.listed = listed
@@ -88,23 +87,22 @@ class _Rehearsed:
         Returns:
             The data, if it can be trained on.
         """
-        config = self.config
-        self.attempt(job.check_config, config)
-        model = self.attempt(GHGS.from_config, config, empty=True)
-        if model is not None and config["init_from"] is not None:
-            options = (config["init_from"], config["init_strict"], config["allow_random_encoder"])
-            self.attempt(start.initialize, model, *options)
-        if config["resume"] not in (None, "auto"):
-            self.attempt(read_checkpoint, config["resume"])
-        trainer = self.attempt(build_trainer, config, folder)
+        run = self.run
+        self.attempt(job.check_config, run)
+        model = self.attempt(GHGS.from_config, run.plain, empty=True)
+        if model is not None and run.init_from is not None:
+            self.attempt(start.initialize, model, run.init_from, run.init_strict, run.allow_random_encoder)
+        if run.resume not in (None, "auto"):
+            self.attempt(read_checkpoint, run.resume)
+        trainer = self.attempt(build_trainer, run, folder)
         if trainer is not None:
-            self.attempt(build_renderer, config, trainer.strategy.root_device)
-        for group in ("loss", "optimizer"):
-            self.attempt(build, config[group], group)
-        metrics = self.attempt(build, config["metrics"], "metrics")
+            self.attempt(build_renderer, run, trainer.strategy.root_device)
+        for options in (run.loss, run.optimizer):
+            self.attempt(options.build)
+        metrics = self.attempt(run.metrics.build)
         for name, reason in getattr(metrics, "left_out", {}).items():
             self.notes[f"{name} will be left out: {reason}"] = None
-        data = self.attempt(build_data, config)
+        data = self.attempt(build_data, run)
         return data if data is not None and self._check_data(data, model) else None
 
     def _check_data(self, data: "PhotographsDataModule", model: GHGS | None) -> bool:
@@ -120,18 +118,17 @@ class _Rehearsed:
         """
         if model is not None:
             self.attempt(check_size, data, model)
-        split = self.config["evaluation"]["split"]
+        split = self.run.evaluation.split
         if hasattr(data.dataset, "render_first") and not _is_rendered(data, {"train", "val", split}):
             self.notes[f"data={data.dataset.name}: people are rendered before the first step"] = None
             return False
         before = len(self.reasons)
         batch = self.attempt(data.training_batch, 0)
-        self.attempt(check_evaluation, self.config, data)
+        self.attempt(check_evaluation, self.run, data)
         if batch is not None and batch.body_vertices is None:
             self._lacks_body(data, batch.subjects[0])
-        if model is not None and "feature_cache" in self.config:
-            cache = read_node(self.config["feature_cache"], "feature_cache")
-            needed = self.attempt(cache.needs, model, data)
+        if model is not None and self.run.feature_cache is not None:
+            needed = self.attempt(self.run.feature_cache.needs, model, data)
             if needed is not None:
                 self.notes[needed] = None
         if len(self.reasons) == before:  # what was read is there: now the files of everybody
@@ -141,16 +138,16 @@ class _Rehearsed:
 
     def _lacks_body(self, data: "PhotographsDataModule", name: str) -> None:
         """Note that a subject of the training has no body, if the loss needs bodies."""
-        weight = lookup(self.config, "loss.weights.chamfer")
+        weights = getattr(self.run.loss, "weights", None)  # a plug-in's may have none
+        weight = getattr(weights, "chamfer", None)
         if weight:
             place = data.builder("train").inputs.reader.body_place(name)
             expected = f"body vertices for loss.weights.chamfer={weight} (0 does without)"
             self.reasons[f"{place}: expected {expected}; found none"] = None
 
     def _check_files(self, data: "PhotographsDataModule", phase: str) -> None:
-        """Note the first file of a phase that is not there,
-        and the first body that the loss lacks."""
-        key = json.dumps([self.config["data"], phase], sort_keys=True, default=str)
+        """Note the first file of a phase that is not there, and the first body that the loss lacks."""
+        key = json.dumps([self.run.plain["data"], phase], sort_keys=True, default=str)
         if key in self.listed:
             return
         self.listed.add(key)
@@ -177,14 +174,14 @@ class _Rehearsed:
         Returns:
             Seconds; None: the training refuses its input, which is noted.
         """
-        config = self.config
+        run = self.run
         clock = _Clock()
         few = {"max_steps": _STEPS, "max_time": None, "limit_val_batches": 0, "devices": 1, "num_nodes": 1}
-        trainer = {**config["trainer"], **few, "strategy": "auto", "profiler": None}
-        quick = {**config, "trainer": trainer, "logger": {}, "callbacks": {}}
-        model = GHGS.from_config(config)
-        parts = (build(config[group], group) for group in ("renderer", "loss", "optimizer"))
-        module = GHGSModule(model, *parts, quick, config.get("token_budgets"))
+        trainer = {**few, "strategy": "auto", "profiler": None}
+        quick = run.changed(trainer=trainer).replace(logger={}, callbacks={})
+        model = GHGS.from_config(run.plain)
+        parts = (options.build() for options in (run.renderer, run.loss, run.optimizer))
+        module = GHGSModule(model, *parts, quick.plain, run.token_budgets)
         self.attempt(build_trainer(quick, folder, clock).fit, module, data)
         return clock.seconds or None
 
@@ -197,13 +194,13 @@ def _is_rendered(data: "PhotographsDataModule", splits: Iterable[str]) -> bool:
         return False
 
 
-def rehearse(configs: Sequence[Mapping[str, Any]]) -> Rehearsal:
+def rehearse(runs: Sequence["Train"]) -> Rehearsal:
     """Try what runs need, each different need once, and time a step of the first run.
 
     Nothing is rendered or written; no step is taken if something is missing.
 
     Args:
-        configs: of the runs, as plain data.
+        runs: as configured.
 
     Returns:
         Reasons, notes and the seconds of a step.
@@ -216,15 +213,16 @@ def rehearse(configs: Sequence[Mapping[str, Any]]) -> Rehearsal:
     quiet()
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for config in configs:
-            flat = flatten({**config, "data": {**config["data"], "workers": 0}, "seed": 0})
+        for given in runs:
+            run = given.changed(data={"workers": 0})
+            flat = flatten({**run.plain, "seed": 0})
             needs = {k: v for k, v in flat.items() if not is_below(k, WITHOUT_INFLUENCE)}
             key = json.dumps(needs, sort_keys=True, default=str)
             if key in tried:
                 continue
-            run = _Rehearsed({**config, "data": {**config["data"], "workers": 0}}, reasons, notes, listed)
-            data = run.check(Path(folder))
+            rehearsed = _Rehearsed(run, reasons, notes, listed)
+            data = rehearsed.check(Path(folder))
             if not tried and data is not None and not reasons:
-                seconds = run.step_seconds(data, Path(folder))
+                seconds = rehearsed.step_seconds(data, Path(folder))
             tried.add(key)
     return Rehearsal(list(reasons), list(notes), seconds)

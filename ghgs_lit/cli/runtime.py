@@ -2,14 +2,12 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
 
 from ghgs_lit.cli.verb import Verb
-from ghgs_lit.config import resolve
 from ghgs_lit.config.compose import HEADER, saved_text
+from ghgs_lit.config.run import Run
 from ghgs_lit.errors import require
 from ghgs_lit.files import require_free, resolved, write_text_atomically
 
@@ -19,11 +17,11 @@ def output_dir() -> Path:
     return resolved(HydraConfig.get().runtime.output_dir)
 
 
-def write_config(config: dict[str, Any], directory: Path) -> None:
+def write_config(run: Run, directory: Path) -> None:
     """Write ``directory/config.yaml`` and print its path.
 
     Args:
-        config: the whole configuration as plain data.
+        run: its configuration.
         directory: the run's.
 
     Raises:
@@ -32,27 +30,9 @@ def write_config(config: dict[str, Any], directory: Path) -> None:
     path = directory / "config.yaml"
     is_free = not path.is_file() or path.read_text(errors="replace").startswith(HEADER)
     require(is_free, str(path), "no file, or the configuration of an earlier run", "another file")
-    write_text_atomically(path, saved_text(config))
+    write_text_atomically(path, saved_text(run.plain))
     overrides = " ".join(HydraConfig.get().overrides.task) if HydraConfig.initialized() else ""
     print(f"config: {path} ({overrides or 'no overrides'})", flush=True)
-
-
-def save_config(cfg: DictConfig, directory: Path) -> dict[str, Any]:
-    """Resolve the configuration and write it.
-
-    Args:
-        cfg: the whole configuration that Hydra composed.
-        directory: the run's.
-
-    Returns:
-        The configuration as plain data.
-
-    Raises:
-        InputError: a value is wrong, or another program's file is there.
-    """
-    config = resolve(cfg)
-    write_config(config, directory)
-    return config
 
 
 def files_to_write(options: Verb, keys: Sequence[str], read: Sequence[str | Path] = ()) -> dict[str, Path]:

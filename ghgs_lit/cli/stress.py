@@ -4,10 +4,8 @@ or repeat a saved training step."""
 import sys
 from typing import TYPE_CHECKING
 
-from omegaconf import DictConfig
-
 from ghgs_lit.cli.inputs import choices
-from ghgs_lit.cli.runtime import announce, output_dir, save_config
+from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.diagnostics.output import print_tables
 from ghgs_lit.diagnostics.stress import report
 from ghgs_lit.diagnostics.stress.run import run_tasks, tasks_of
@@ -20,32 +18,31 @@ if TYPE_CHECKING:
     from ghgs_lit.cli.verbs import Stress
 
 
-def run(options: "Stress", cfg: DictConfig) -> None:
+def run(verb: "Stress") -> None:
     """Compare stages with float64 and write the report, or repeat a saved training step.
 
     Args:
-        options: keys of the verb.
-        cfg: the whole configuration that Hydra composed.
+        verb: the run.
 
     Raises:
         InputError: there is no such stage or family.
         SystemExit: code 1: an error exceeds its budget, or the repeated step is not finite.
     """
     directory = output_dir()
-    config = save_config(cfg, directory)
-    if options.dump is not None:
-        step, recorded, fault = replay(options.dump)
+    write_config(verb, directory)
+    if verb.dump is not None:
+        step, recorded, fault = replay(verb.dump)
         print(f"step {step}, when it was saved: {recorded}")
         print(f"step {step}, now: {fault or 'all values are finite'}")
         if fault is not None:
             raise SystemExit(1)
         return
-    tasks = tasks_of(options.stages, options.families, options.quick)
-    require(bool(tasks), "families", "a family that one of the stages has", options.families)
-    rows = run_tasks(tasks, allowed_cores() if options.workers is None else options.workers)
+    tasks = tasks_of(verb.stages, verb.families, verb.quick)
+    require(bool(tasks), "families", "a family that one of the stages has", verb.families)
+    rows = run_tasks(tasks, allowed_cores() if verb.workers is None else verb.workers)
     print_tables(report.tables_of(rows))
     print(report.counts_of(rows))
-    source = provenance(config, seed=0, verb="stress", choices=choices())
+    source = provenance(verb.plain, seed=0, verb="stress", choices=choices())
     announce(report.write(directory, rows, source))
     failed = [row for row in rows if row["failures"]]
     for row in failed:

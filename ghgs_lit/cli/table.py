@@ -4,12 +4,8 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omegaconf import DictConfig
-
-from ghgs_lit.cli.runtime import announce, output_dir, save_config
-from ghgs_lit.config.nodes import EvaluationOptions
+from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config.options import Options
-from ghgs_lit.config.registry import read_node
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation import tables as t
 from ghgs_lit.files import resolved, write_text_atomically
@@ -45,42 +41,40 @@ def _expression(key: str, text: str) -> re.Pattern[str]:
         raise InputError(f"{key}: expected a regular expression; found {error}") from None
 
 
-def _options(options: "Table", evaluation: EvaluationOptions) -> t.TableOptions:
+def _options(run: "Table") -> t.TableOptions:
     """What tables are built by.
 
     Args:
-        options: keys of the verb.
-        evaluation: numbers of views and targets to show.
+        run: as configured.
 
     Raises:
         InputError: ``test.unit`` is no regular expression with a group, or a value is there twice.
     """
-    unit = _expression("test.unit", options.test.unit or "(.+)")
+    unit = _expression("test.unit", run.test.unit or "(.+)")
     require(unit.groups >= 1, "test.unit", "a regular expression with a group", unit.pattern)
     return t.TableOptions(
-        layout=t.LAYOUTS[options.layout],
-        views=_listed(evaluation, "evaluation.views"),
-        targets=_listed(evaluation, "evaluation.targets"),
-        metrics=_listed(options, "columns"),
-        reported=options.reported,
-        test=options.test,
+        layout=t.LAYOUTS[run.layout],
+        views=_listed(run.evaluation, "evaluation.views"),
+        targets=_listed(run.evaluation, "evaluation.targets"),
+        metrics=_listed(run, "columns"),
+        reported=run.reported,
+        test=run.test,
         unit=unit,
     )
 
 
-def run(verb: "Table", cfg: DictConfig) -> None:
+def run(verb: "Table") -> None:
     """Print the tables and write them as CSV, LaTeX and Markdown.
 
     Args:
-        verb: its keys.
-        cfg: the whole configuration that Hydra composed.
+        verb: the run.
 
     Raises:
         InputError: a key, a run or a file of other methods is wrong.
     """
     directory = output_dir()
-    config = save_config(cfg, directory)
-    options = _options(verb, read_node(config["evaluation"], "evaluation"))
+    write_config(verb, directory)
+    options = _options(verb)
     # Resolved: a run that is found by two paths counts once.
     folders = [resolved(path) for path in _listed(verb, "runs") or ()]
     others = [t.read_others(Path(p).expanduser()) for p in _listed(verb, "others") or ()]

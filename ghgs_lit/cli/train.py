@@ -14,13 +14,11 @@ from lightning.fabric.plugins.environments import ClusterEnvironment, LightningE
 from lightning.pytorch.callbacks import Callback, Checkpoint
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
-from omegaconf import DictConfig
 
 from ghgs_lit.cli.inputs import build_data, check_size, choices, given_keys, overrides
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
-from ghgs_lit.config import build, resolve
 from ghgs_lit.config.compose import chosen_options
-from ghgs_lit.config.registry import read_node
+from ghgs_lit.config.run import Run
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.protocols import check_evaluation
@@ -39,6 +37,7 @@ from ghgs_lit.weights import switches
 from ghgs_lit.weights.checkpoint import read_config
 
 if TYPE_CHECKING:
+    from ghgs_lit.cli.verb import Training
     from ghgs_lit.cli.verbs import Train
 
 
@@ -61,11 +60,11 @@ def say_which_model() -> None:
         print("training model=hull, which learns in minutes; model=paper is the paper's method", flush=True)
 
 
-def prepare_start(config: dict[str, Any], module: GHGSModule, directory: Path) -> int | None:
+def prepare_start(run: "Train", module: GHGSModule, directory: Path) -> int | None:
     """Load ``init_from`` or ``resume``.
 
     Args:
-        config: the whole configuration as plain data.
+        run: names them.
         module: gets the weights.
         directory: the run's; what was loaded is listed in its ``init_from.txt``.
 
@@ -75,23 +74,22 @@ def prepare_start(config: dict[str, Any], module: GHGSModule, directory: Path) -
     Raises:
         InputError: both are given, or the checkpoint does not fit.
     """
-    start.check_start(config, directory)
-    if config["init_from"] is not None and config["resume"] is None:
-        lines = start.initialize(
-            module.model, config["init_from"], config["init_strict"], config["allow_random_encoder"]
-        )
+    start.check_start(run, directory)
+    path = run.init_from
+    if path is not None and run.resume is None:
+        lines = start.initialize(module.model, path, run.init_strict, run.allow_random_encoder)
         if rank_zero_only.rank == 0:
-            print(start.report(lines, config["init_from"], directory / "init_from.txt"), flush=True)
-            if differing := switches.differences(config, read_config(config["init_from"])):
+            print(start.report(lines, path, directory / "init_from.txt"), flush=True)
+            if differing := switches.differences(run.plain, read_config(path)):
                 print(f"the weights were trained in a different model: {', '.join(differing)}", flush=True)
-    return resume_step(config, module)
+    return resume_step(run, module)
 
 
-def resume_step(config: dict[str, Any], module: L.LightningModule) -> int | None:
+def resume_step(run: "Training", module: L.LightningModule) -> int | None:
     """Load the weights of ``resume``.
 
     Args:
-        config: the whole configuration as plain data.
+        run: names the checkpoint.
         module: gets the weights.
 
     Returns:
@@ -100,30 +98,28 @@ def resume_step(config: dict[str, Any], module: L.LightningModule) -> int | None
     Raises:
         InputError: the checkpoint does not fit.
     """
-    if config["resume"] is None:
+    if run.resume is None:
         return None
-    step, changed = start.check_resume(config["resume"], module, config)
+    step, changed = start.check_resume(run.resume, module, run.plain)
     if rank_zero_only.rank == 0:
-        print("\n".join([f"resume {config['resume']}: at step {step}", *changed]), flush=True)
+        print("\n".join([f"resume {run.resume}: at step {step}", *changed]), flush=True)
     return step
 
 
-def build_trainer(config: dict[str, Any], directory: Path, *further: Callback) -> L.Trainer:
+def build_trainer(run: Run, directory: Path, *further: Callback) -> L.Trainer:
     """The Trainer with the configured loggers and callbacks.
 
     Args:
-        config: the whole configuration as plain data.
+        run: with the groups ``trainer``, ``logger`` and ``callbacks``.
         directory: the run's; loggers and callbacks write below it.
         *further: callbacks that come before the configured ones.
 
     Raises:
         InputError: it refuses its options.
     """
-    logs = [build(node, f"logger.{name}", save_dir=str(directory)) for name, node in config["logger"].items()]
-    callbacks = [*further, *(build(node, f"callbacks.{name}") for name, node in config["callbacks"].items())]
-    return build(
-        config["trainer"],
-        "trainer",
+    logs = [options.build(save_dir=str(directory)) for options in run.logger.values()]
+    callbacks = [*further, *(options.build() for options in run.callbacks.values())]
+    return run.trainer.build(
         logger=logs or False,
         plugins=[AtomicCheckpointIO(), *environments()],
         callbacks=callbacks,
@@ -150,12 +146,11 @@ def environments() -> list[ClusterEnvironment]:
         raise InputError(f"trainer: {error}") from None
 
 
-def run(options: "Train", cfg: DictConfig) -> float | str | None:
+def run(verb: "Train") -> float | str | None:
     """Train and measure a run; in a sweep unless it is done.
 
     Args:
-        options: keys of the verb.
-        cfg: the whole configuration that Hydra composed.
+        verb: the run.
 
     Returns:
         Mean PSNR of the first protocol in dB; in a sweep ``job.BUSY`` where another process
@@ -165,22 +160,20 @@ def run(options: "Train", cfg: DictConfig) -> float | str | None:
         InputError: the configuration, a checkpoint or the data is wrong.
         Interrupted: by Ctrl-C or SIGTERM.
     """
-    config = resolve(cfg)
-    run_directory = RunDirectory(output_dir())
-    config["chosen"] = chosen_options(config, HydraConfig.get())
-    require(not options.dry_run, "dry_run", "false without a grid (-m, or sweep=<file>)", True)
-    job.check_config(config)
+    require(not verb.dry_run, "dry_run", "false without a grid (-m, or sweep=<file>)", True)
+    job.check_config(verb)
     if job.in_sweep():
-        job.check_launcher(config, HydraConfig.get().runtime.choices["hydra/launcher"])
-    return run_job(config, run_directory, train)
+        job.check_launcher(verb, HydraConfig.get().runtime.choices["hydra/launcher"])
+    named = verb.replace(chosen=chosen_options(verb.plain, HydraConfig.get()))
+    return run_job(named, RunDirectory(output_dir()), train)
 
 
-def run_job(config: dict[str, Any], run_directory: RunDirectory, train: job.Train) -> float | str | None:
+def run_job(run: "Training", directory: RunDirectory, train: job.Train) -> float | str | None:
     """Train a run, alone or as one of several processes.
 
     Args:
-        config: the whole configuration as plain data.
-        run_directory: of the run.
+        run: as configured.
+        directory: of the run.
         train: trains and measures; returns the metric.
 
     Returns:
@@ -189,24 +182,24 @@ def run_job(config: dict[str, Any], run_directory: RunDirectory, train: job.Trai
     Raises:
         Interrupted: by Ctrl-C or a signal of a batch system; how to go on is printed.
     """
-    is_first = settle_rank(config["trainer"]) == 0
+    is_first = settle_rank(run.trainer) == 0
     with interruptible():
         try:
-            return (job.train_once if is_first else job.train_beside)(run_directory, config, train)
+            return (job.train_once if is_first else job.train_beside)(directory, run, train)
         except Interrupted as stop:
             if rank_zero_only.rank == 0 and not stop.explained:
-                place = f"hydra.run.dir={run_directory.path}"
+                place = f"hydra.run.dir={directory.path}"
                 if job.in_sweep():
                     place = f"hydra.sweep.dir={HydraConfig.get().sweep.dir}"
-                print_how_to_go_on(stop, str(run_directory.path), place, queue_again(stop.number))
+                print_how_to_go_on(stop, str(directory.path), place, queue_again(stop.number))
             raise
 
 
-def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float | None:
+def train(run: "Train", directory: Path, stats: dict[str, Any]) -> float | None:
     """Train, save the last weights and measure them.
 
     Args:
-        config: the whole configuration as plain data.
+        run: as configured.
         directory: the run's.
         stats: receives the ``steps`` and ``seconds`` of this training.
 
@@ -217,31 +210,29 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
         InputError: the configuration, a checkpoint or the data is wrong.
     """
     if rank_zero_only.rank == 0:
-        write_config(config, directory)
+        write_config(run, directory)
         say_which_model()
-    L.seed_everything(config["seed"], workers=True, verbose=False)
-    data = build_data(config)
-    model = GHGS.from_config(config)
+    L.seed_everything(run.seed, workers=True, verbose=False)
+    data = build_data(run)
+    model = GHGS.from_config(run.plain)
     check_size(data, model)
-    renderer = build(config["renderer"], "renderer")
-    losses = build(config["loss"], "loss")
+    renderer = run.renderer.build()
+    losses = run.loss.build()
     data.trains_on_depths &= getattr(losses, "reads_depths", True)  # a plug-in's may not say
-    module = GHGSModule(
-        model, renderer, losses, build(config["optimizer"], "optimizer"), config, config.get("token_budgets")
-    )
-    step = prepare_start(config, module, directory)
-    if "feature_cache" in config:  # of verbs that train the whole model
-        read_node(config["feature_cache"], "feature_cache").attach(model, data)
-    config = start.with_origin(config, model)
-    module.config = {**module.config, **config}
+    module = GHGSModule(model, renderer, losses, run.optimizer.build(), run.plain, run.token_budgets)
+    step = prepare_start(run, module, directory)
+    if run.feature_cache is not None:  # of verbs that train the whole model
+        run.feature_cache.attach(model, data)
+    run = start.with_origin(run, model)
+    module.config = {**module.config, **run.plain}
     quiet()
     cost = TrainingCost()
-    trainer = build_trainer(config, directory, cost, StopAtStep(), NeighborsAtStart())
-    module.metrics = build(config["metrics"], "metrics").to(trainer.strategy.root_device)
+    trainer = build_trainer(run, directory, cost, StopAtStep(), NeighborsAtStart())
+    module.metrics = run.metrics.build().to(trainer.strategy.root_device)
     # The last check, because it makes missing photographs.
-    check_evaluation(config, data)
+    check_evaluation(run, data)
     try:
-        fit(trainer, module, data, config, step, stats)
+        fit(trainer, module, data, run.resume, step, stats)
         checkpoint = directory / "checkpoints" / "last.ckpt"
         trainer.save_checkpoint(checkpoint)
         if not trainer.is_global_zero:
@@ -253,7 +244,7 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
             "processes": trainer.world_size,
         }
         print(f"trained {trainer.global_step} steps in {cost.seconds:.0f} s: {checkpoint}", flush=True)
-        return measure_last(trainer, module, data, config, directory, training)
+        return measure_last(trainer, module, data, run, directory, training)
     finally:
         loggers.close(trainer.loggers)
 
@@ -262,7 +253,7 @@ def fit(
     trainer: L.Trainer,
     module: L.LightningModule,
     data: L.LightningDataModule,
-    config: dict[str, Any],
+    resume: str | None,
     step: int | None,
     stats: dict[str, Any],
 ) -> None:
@@ -272,10 +263,9 @@ def fit(
         trainer: trains it.
         module: its weights are those of ``resume``, if any.
         data: of the training.
-        config: the whole configuration as plain data; ``resume`` is read.
-        step: where ``resume`` stands; None: a new run.
-        stats: receives ``steps``, those taken here, and ``seconds``,
-            even if training is interrupted.
+        resume: the checkpoint, if any.
+        step: where it stands; None: a new run.
+        stats: receives ``steps``, those taken here, and ``seconds``, even if training is interrupted.
 
     Raises:
         InputError: options of the Trainer do not fit the data.
@@ -284,7 +274,7 @@ def fit(
         loggers.resume(trainer.loggers, step)
     started = time.perf_counter()
     try:
-        trainer.fit(module, data, ckpt_path=config["resume"])
+        trainer.fit(module, data, ckpt_path=resume)
     except MisconfigurationException as error:  # of options that do not fit the data
         raise InputError(f"trainer: {error}") from None
     finally:
@@ -298,7 +288,7 @@ def measure_last(
     trainer: L.Trainer,
     module: GHGSModule,
     data: L.LightningDataModule,
-    config: dict[str, Any],
+    run: "Train",
     directory: Path,
     training: dict[str, Any],
 ) -> float:
@@ -308,7 +298,7 @@ def measure_last(
         trainer: has trained the module.
         module: its model is measured, and put into evaluation mode.
         data: gives the batches of the evaluation.
-        config: the whole configuration as plain data.
+        run: as configured.
         directory: the run's.
         training: facts about the training: ``steps``, ``seconds``, ``peak_bytes``, ``processes``.
 
@@ -321,7 +311,7 @@ def measure_last(
     path = measure_and_write(
         {"model": ModelMethod(model.to(device).eval(), module.renderer)},
         data,
-        config,
+        run,
         directory,
         device,
         verb="train",
@@ -337,7 +327,7 @@ def measure_last(
     )
     summary = read_results(path)["summary"]
     changes = RunDirectory(directory).swept or overrides()
-    values = loggers.hyperparameters(config, choices(), changes)
+    values = loggers.hyperparameters(run.plain, choices(), changes)
     loggers.log_results(trainer.loggers, values, summary, trainer.global_step)
     announce(path)
     return summary[0]["psnr"]

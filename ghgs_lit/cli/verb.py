@@ -1,17 +1,18 @@
 """A verb of ``ghgs`` is one class: its summary, an example, its keys, and what it does.
 
-The fields of a verb are the keys that ``conf/<verb>.yaml`` sets beside its groups. All come in by
-the door of :mod:`ghgs_lit.config.registry`, those of this distribution as those of a plug-in.
+The fields of a verb are the keys that ``conf/<verb>.yaml`` sets beside its groups, whose options are its
+attributes (:class:`ghgs_lit.config.run.Run`). All verbs come in by the door of
+:mod:`ghgs_lit.config.registry`, those of this distribution as those of a plug-in.
 """
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
-from omegaconf import DictConfig
 from pydantic import Field
 
-from ghgs_lit.config.options import Options, Patches, PathText, Seed
+from ghgs_lit.config.options import Patches, PathText, Seed
+from ghgs_lit.config.run import Run
 
 Device = Literal["auto", "cpu", "cuda"]
 Precision = Literal["inherit", "float32", "tf32", "bfloat16", "float16", "auto"]
@@ -20,9 +21,8 @@ Budget = Literal["all", "window"] | Patches
 Budgets = Annotated[tuple[Budget, ...], Field(min_length=1)]
 
 
-class Verb(Options):
-    """Base of all verbs; the first line of the docstring is the summary that
-    ``ghgs --help`` prints."""
+class Verb(Run):
+    """Base of all verbs; the first line of the docstring is the summary that ``ghgs --help`` prints."""
 
     example: ClassVar[str] = ""
     """A command, for ``ghgs --help``."""
@@ -41,11 +41,8 @@ class Verb(Options):
         """What the verb does, in one line."""
         return (cls.__doc__ or "").partition("\n")[0].rstrip(".")
 
-    def require_files(self, config: Mapping[str, Any]) -> None:
+    def require_files(self) -> None:
         """Check that the files of the verb exist, before anything is imported that takes seconds.
-
-        Args:
-            config: the whole configuration, groups included, as plain data.
 
         Raises:
             FileNotFoundError, InputError: a file or folder is missing or wrong;
@@ -57,16 +54,13 @@ class Verb(Options):
         for key in self.opens:
             if getattr(self, key) not in (None, "auto"):
                 require_weights(getattr(self, key))
-        data = config.get("data")
+        data = self.plain.get("data")  # which is not checked yet
         is_read = self.reads_data and isinstance(data, Mapping) and not data.get("source")
         if is_read and isinstance(data.get("root"), str):
             require_folder(Path(data["root"]).expanduser())
 
-    def run(self, cfg: DictConfig) -> object:
+    def run(self) -> object:
         """Do the work of the verb.
-
-        Args:
-            cfg: the whole configuration that Hydra composed, groups included.
 
         Returns:
             A number that a sweeper optimises, if any.

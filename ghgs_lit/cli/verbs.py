@@ -5,7 +5,6 @@ The module that does the work is imported when the verb runs: ``ghgs --help`` wa
 
 from typing import Annotated, Literal
 
-from omegaconf import DictConfig
 from pydantic import Field
 
 from ghgs_lit.cli.verb import Budgets, Measured, Training, Verb
@@ -35,10 +34,10 @@ class Train(Training):
     dry_run: bool = False
     """Print what would be run, how long it takes and where it goes, and run nothing."""
 
-    def run(self, cfg: DictConfig) -> object:
+    def run(self) -> object:
         from ghgs_lit.cli import train
 
-        return train.run(self, cfg)
+        return train.run(self)
 
 
 class Pretext(Training):
@@ -48,10 +47,10 @@ class Pretext(Training):
     begins_run = True
     reads_data = True
 
-    def run(self, cfg: DictConfig) -> object:
+    def run(self) -> object:
         from ghgs_lit.cli import pretext
 
-        return pretext.run(self, cfg)
+        return pretext.run(self)
 
 
 class Evaluate(Measured):
@@ -74,10 +73,10 @@ class Evaluate(Measured):
     per_scene: PerScene = PerScene()
     """3D Gaussian splatting on each subject's inputs."""
 
-    def run(self, cfg: DictConfig) -> object:
+    def run(self) -> object:
         from ghgs_lit.cli import evaluate
 
-        return evaluate.run(self, cfg)
+        return evaluate.run(self)
 
 
 class Benchmark(Measured):
@@ -102,10 +101,10 @@ class Benchmark(Measured):
     threads: int | None = Field(None, ge=1, le=1024)
     """Threads of PyTorch, of which no machine has more than 1024; null: as many as it chooses."""
 
-    def run(self, cfg: DictConfig) -> object:
+    def run(self) -> object:
         from ghgs_lit.cli import benchmark
 
-        return benchmark.run(self, cfg)
+        return benchmark.run(self)
 
 
 class Stress(Verb):
@@ -125,10 +124,10 @@ class Stress(Verb):
     workers: Workers | None = None
     """Processes; null: one for each processor, 0: this one."""
 
-    def run(self, cfg: DictConfig) -> object:
+    def run(self) -> object:
         from ghgs_lit.cli import stress
 
-        return stress.run(self, cfg)
+        return stress.run(self)
 
 
 class Table(Verb):
@@ -157,10 +156,10 @@ class Table(Verb):
     test: PairedTest = PairedTest()
     """The test between rows."""
 
-    def run(self, cfg: DictConfig) -> object:
+    def run(self) -> object:
         from ghgs_lit.cli import table
 
-        return table.run(self, cfg)
+        return table.run(self)
 
 
 class Prepare(Verb):
@@ -176,10 +175,10 @@ class Prepare(Verb):
     seed: Seed = 0
     """Of the samples that task=check draws."""
 
-    def run(self, cfg: DictConfig) -> object:
+    def run(self) -> object:
         from ghgs_lit.cli import prepare
 
-        return prepare.run(self, cfg)
+        return prepare.run(self)
 
 
 class Import(Verb):
@@ -199,10 +198,10 @@ class Import(Verb):
     overwrite: bool = False
     """Replace a file that exists."""
 
-    def run(self, cfg: DictConfig) -> object:
+    def run(self) -> object:
         from ghgs_lit.cli import import_
 
-        return import_.run(self, cfg)
+        return import_.run(self)
 
 
 class Export(Verb):
@@ -225,7 +224,7 @@ class Export(Verb):
     overwrite: bool = False
     """Replace files that exist."""
 
-    def run(self, cfg: DictConfig) -> object:
+    def run(self) -> object:
         from ghgs_lit.cli import export
 
-        return export.run(self, cfg)
+        return export.run(self)

@@ -1,7 +1,7 @@
 """The configuration: where its files are, how it is composed, and how objects are built from it."""
 
-from ghgs_lit.config.compose import compose, resolve
+from ghgs_lit.config.compose import compose, run_of
 from ghgs_lit.config.folder import VERSION_BASE, conf_dir
 from ghgs_lit.config.registry import build, register
 
-__all__ = ["VERSION_BASE", "build", "compose", "conf_dir", "register", "resolve"]
+__all__ = ["VERSION_BASE", "build", "compose", "conf_dir", "register", "run_of"]

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -16,11 +16,9 @@ from ghgs_lit.config.folder import VERSION_BASE, conf_dir
 from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.config.options import did_you_mean
 from ghgs_lit.config.outside import files_are_read
-from ghgs_lit.config.registry import KINDS, check, verb_class, verbs
+from ghgs_lit.config.registry import verb_class, verbs
+from ghgs_lit.config.run import Run
 from ghgs_lit.errors import InputError, require
-
-if TYPE_CHECKING:
-    from ghgs_lit.cli.verb import Verb
 
 #: First line of the configuration that a run saves; a file without it belongs to another program.
 HEADER = "# The configuration of this run, by ghgs."
@@ -84,22 +82,18 @@ def saved_text(config: dict[str, Any]) -> str:
     return f"{HEADER}\n{OmegaConf.to_yaml(OmegaConf.create(config))}"
 
 
-def resolve(cfg: DictConfig, verb: str | None = None) -> dict[str, Any]:
-    """A composed configuration as plain data, whose groups are checked.
+def run_of(verb: str, overrides: Sequence[str] = ()) -> Run:
+    """The run of ``ghgs <verb> <overrides>``: a verb's class with all of its keys and groups.
 
     Args:
-        cfg: the configuration, which gets all defaults;
-            nodes without a kind are checked when they are built.
-        verb: whose own keys are checked, too; None: none are.
+        verb: name of a verb.
+        overrides: as for :func:`compose`.
 
     Raises:
+        HydraException: an override does not fit.
         InputError: a value is missing or has a wrong type or range.
     """
-    data = plain(fill(cfg))
-    if verb is not None:
-        read_verb(verb, data)
-    check(data)
-    return data
+    return verb_class(verb).of(plain(compose(verb, overrides)))
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:
@@ -115,19 +109,6 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
     if missing:
         raise InputError(f"{missing[0]}: expected a value ({missing[0]}=...); found none")
     return OmegaConf.to_container(cfg, resolve=True)
-
-
-def read_verb(name: str, config: Mapping[str, Any]) -> "Verb":
-    """The verb with its own keys.
-
-    Args:
-        name: of the verb.
-        config: the whole configuration as plain data; all keys but groups are the verb's.
-
-    Raises:
-        InputError: a key is unknown, or a value has a wrong type or range.
-    """
-    return verb_class(name).read({key: value for key, value in config.items() if key not in KINDS}, "")
 
 
 #: Groups whose files set keys of the whole configuration.
@@ -191,23 +172,20 @@ def chosen_options(config: Mapping[str, Any], hydra_node: DictConfig) -> dict[st
     return {**names, "sets": {key: lookup(config, key) for key in _set_by_ablation(names["ablation"])}}
 
 
-def read_options(
-    group: str, names: Sequence[str], configured: Mapping[str, Any], key: str
-) -> dict[str, dict[str, Any]]:
+def read_options(group: str, names: Sequence[str], run: Run, key: str) -> dict[str, dict[str, Any]]:
     """Options of a group by name.
 
     Args:
         group: name of the group, such as ``skip``.
         names: of the options.
-        configured: the group's node of the configuration; the option that its ``name`` says has
-            these values instead of those of its file.
+        run: the option that its node of the group names has these values instead of those of its file.
         key: begins the message of an error.
 
     Raises:
         InputError: the group has no such option.
     """
-    chosen = configured["name"]
-    return {name: dict(configured) if name == chosen else read_option(group, name, key) for name in names}
+    chosen = getattr(run, group).name
+    return {name: run.plain[group] if name == chosen else read_option(group, name, key) for name in names}
 
 
 def read_option(group: str, name: str, key: str | None = None) -> dict[str, Any]:

@@ -398,16 +398,21 @@ def says_its_class(key: str, node: Mapping[str, Any]) -> bool:
     return "kind" in node or None in KINDS[key.split(".")[0]]
 
 
-def check(config: Mapping[str, Any]) -> None:
-    """Check the nodes of all groups; those without a kind are checked when they are built.
+def read_nodes(config: Mapping[str, Any]) -> dict[str, Options]:
+    """The checked options of the nodes of all groups.
 
     Args:
         config: the whole configuration as plain data.
 
+    Returns:
+        Options by the node's dotted key, without nodes that lack their kind.
+
     Raises:
         InputError: as for :func:`read_node`.
     """
+    options = {}
     for key, node in nodes_of(config):
         # Skipped without a kind: an optimizer that the verb lacks, for example.
         if key.split(".")[0] in NAMED or not isinstance(node, Mapping) or says_its_class(key, node):
-            read_node(node, key)
+            options[key] = read_node(node, key)
+    return options

@@ -1,20 +1,19 @@
 """Target protocols of an evaluation, and checks before it starts."""
 
-from collections.abc import Mapping
 from typing import Any
 
-from ghgs_lit.config import build
 from ghgs_lit.config.compose import read_options
+from ghgs_lit.config.run import Run
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.sampling import TargetProtocol
 from ghgs_lit.errors import choice, require
 
 
-def target_protocols(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def target_protocols(run: Run) -> dict[str, dict[str, Any]]:
     """Protocols that ``evaluation.targets`` lists.
 
     Args:
-        config: Resolved configuration with ``evaluation`` and ``targets``.
+        run: With the groups ``evaluation`` and ``targets``.
 
     Returns:
         Values of each protocol by name: those of its file in ``conf/targets`` or, for the one that
@@ -23,36 +22,35 @@ def target_protocols(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     Raises:
         InputError: There is no such file.
     """
-    names = config["evaluation"]["targets"]
-    protocols = read_options("targets", names, config["targets"], "evaluation.targets")
+    names = run.evaluation.targets
+    protocols = read_options("targets", names, run, "evaluation.targets")
     return {
         name: {**values, "kind": values.get("kind") or values["name"], "name": name}
         for name, values in protocols.items()
     }
 
 
-def check_evaluation(config: Mapping[str, Any], data: PhotographsDataModule) -> None:
+def check_evaluation(run: Run, data: PhotographsDataModule) -> None:
     """Check that an evaluation can be measured; data is prepared, no photograph is read.
 
     Args:
-        config: Resolved configuration with ``evaluation``, ``metrics`` and ``targets``.
+        run: With the groups ``evaluation``, ``metrics`` and ``targets``.
         data: The data that is measured.
 
     Raises:
         InputError: A value is impossible, a metric cannot be computed, the split has no subjects,
             or a subject lacks an input or a target.
     """
-    evaluation = config["evaluation"]
-    for key in ("views", "targets"):
-        values = evaluation[key]
-        require(isinstance(values, list) and bool(values), f"evaluation.{key}", "a list with a value", values)
-    views = evaluation["views"]
-    require(len(set(views)) == len(views), "evaluation.views", "different numbers from 2 on", views)
+    views = run.evaluation.views
+    for key, values in (("views", views), ("targets", run.evaluation.targets)):
+        shown = [] if values == () else values
+        require(isinstance(values, tuple) and values != (), f"evaluation.{key}", "a list with a value", shown)
+    require(len(set(views)) == len(views), "evaluation.views", "different numbers from 2 on", list(views))
     protocols = {
-        name: TargetProtocol.read(values, "targets") for name, values in target_protocols(config).items()
+        name: TargetProtocol.read(values, "targets") for name, values in target_protocols(run).items()
     }
-    build(config["metrics"], "metrics")
-    split = evaluation["split"]
+    run.metrics.build()
+    split = run.evaluation.split
     choice("evaluation.split", split, data.dataset.split_names)
     data.prepare_data([split])
     require(len(data.subjects(split)) > 0, f"evaluation.split={split}", "a subject or more", "none")

@@ -9,8 +9,8 @@ import torch
 from lightning.pytorch import LightningDataModule
 from tabulate import tabulate
 
-from ghgs_lit.config import build
 from ghgs_lit.config.keys import ablation_of
+from ghgs_lit.config.run import Run
 from ghgs_lit.evaluation.measure import Method, measure_all
 from ghgs_lit.evaluation.protocols import target_protocols
 from ghgs_lit.runs.provenance import provenance
@@ -31,9 +31,10 @@ SPLITS = {
 def measure_and_write(
     methods: Mapping[str, Method],
     data: LightningDataModule,
-    config: Mapping[str, Any],
+    run: Run,
     directory: Path,
     device: torch.device,
+    /,
     **facts: Any,
 ) -> Path:
     """Measure methods as configured, print the means and write ``metrics.json``, ``metrics.csv``
@@ -42,7 +43,7 @@ def measure_and_write(
     Args:
         methods: Methods by name; the trained model is called ``METHOD``.
         data: Gives the batches of an evaluation.
-        config: The run's full configuration.
+        run: As configured.
         directory: The run's directory.
         device: Where batches are predicted and measured.
         **facts: Further provenance.
@@ -53,20 +54,20 @@ def measure_and_write(
     Raises:
         InputError: A metric cannot be computed, or the split has no subjects.
     """
-    evaluation = config["evaluation"]
-    targets = target_protocols(config)
-    metrics = build(config["metrics"], "metrics").to(device)
+    evaluation = run.evaluation
+    targets = target_protocols(run)
+    metrics = run.metrics.build().to(device)
     for name, reason in metrics.left_out.items():
         print_once(f"{name} is left out: {reason}")
-    views = evaluation["views"]
-    split = evaluation["split"]
-    pictures = directory / "pictures", evaluation["pictures"]
+    views = list(evaluation.views)
+    split = evaluation.split
+    pictures = directory / "pictures", evaluation.pictures
     rows = measure_all(methods, data, views, targets, split, metrics, device, *pictures)
     if METHOD in methods:
-        facts["ablation"] = ablation_of(config)
+        facts["ablation"] = ablation_of(run.plain)
     source = provenance(
-        config,
-        seed=config["seed"],
+        run.plain,
+        seed=run.seed,
         data={**data.facts, **data.dataset.split_facts(split)},
         protocol={
             "metrics": metrics.protocol,

@@ -15,10 +15,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn, JobStatus, filter_overrides
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from ghgs_lit.config import resolve
-from ghgs_lit.config.compose import check_ablation, chosen_options, saved_text
+from ghgs_lit.config.compose import check_ablation, chosen_options, plain, saved_text
+from ghgs_lit.config.defaults import fill
 from ghgs_lit.config.keys import is_hyperparameter, key_of
-from ghgs_lit.config.registry import verbs
+from ghgs_lit.config.registry import verb_class
 from ghgs_lit.errors import require
 from ghgs_lit.files import resolved, write_text_atomically
 from ghgs_lit.runs.job import BUSY, check_config, check_launcher
@@ -89,14 +89,14 @@ def _sweep(
     if len(planned) < len(combos):
         print(f"{len(combos)} combinations, {len(planned)} different configurations", flush=True)
     for item in planned:  # an impossible launcher is refused before anything starts
-        check_launcher(item.config, config.hydra.runtime.choices["hydra/launcher"])
+        check_launcher(item.run, config.hydra.runtime.choices["hydra/launcher"])
     check_directories(planned)
     if config.get("dry_run"):
         print_plan(planned, directory, rehearse)
         return []
     require(not config.get("overwrite"), "overwrite", "false in a sweep, which goes on with its runs", True)
     for item in planned:
-        check_config(item.config)
+        check_config(item.run)
     write_plan(planned, config, directory)
     returns = run_all(planned, sweeper.launcher.launch, sweeper.max_batch_size)
     print_results(planned, directory)
@@ -149,18 +149,17 @@ def plan(
         with open_dict(cfg):
             cfg.hydra.job.num = len(planned)
             subdirectory = str(cfg.hydra.sweep.subdir)
-            verb = cfg.hydra.job.name
             hydra_node = cfg.hydra
             del cfg["hydra"]
-        config = resolve(cfg, verb if verb in verbs() else None)
-        config["chosen"] = chosen_options(config, hydra_node)
-        name = config_hash(config)
+        run = verb_class("train").of(plain(fill(cfg)))
+        run = run.replace(chosen=chosen_options(run.plain, hydra_node))
+        name = config_hash(run.plain)
         shown = tuple(filter_overrides(overrides))
         # The job writes to the planned directory, whatever number a launcher gives it.
         places = {"dir": str(directory), "subdir": subdirectory}
         fixed = (f"hydra.sweep.{key}={_quoted(place)}" for key, place in places.items())
-        run = RunDirectory(directory / subdirectory, name)
-        planned.setdefault(name, PlannedRun(name, (*overrides, *fixed), shown, config, run))
+        place = RunDirectory(directory / subdirectory, name)
+        planned.setdefault(name, PlannedRun(name, (*overrides, *fixed), shown, run, place))
     return list(planned.values())
 
 
@@ -180,11 +179,11 @@ def check_directories(planned: Sequence[PlannedRun]) -> None:
     """
     runs = {}
     for item in planned:
-        other = runs.setdefault(item.run.path, item)
-        shared = f"{item.run.path} for {' '.join(other.shown)} and {' '.join(item.shown)}"
+        other = runs.setdefault(item.directory.path, item)
+        shared = f"{item.directory.path} for {' '.join(other.shown)} and {' '.join(item.shown)}"
         require(other is item, "hydra.sweep.subdir", "a directory for each configuration", shared)
-        if not item.run.done:
-            item.run.start(item.config)
+        if not item.directory.done:
+            item.directory.start(item.run)
 
 
 def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Path) -> None:
@@ -199,15 +198,15 @@ def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Pat
     titles = {RunDirectory(path.parent).title for path in directory.glob(f"*/{SWEPT}")}
     shared = shared_overrides(planned)
     for item in planned:
-        path = item.run.path / "config.yaml"
+        path = item.directory.path / "config.yaml"
         if not path.exists():
-            write_text_atomically(path, saved_text(item.config))
-        if not item.run.swept:
+            write_text_atomically(path, saved_text(item.run.plain))
+        if not item.directory.swept:
             swept = [o for o in item.shown if _sets_apart(o, shared)]
-            write_text_atomically(item.run.path / SWEPT, json.dumps(swept or [f"run={item.name}"]))
-            if item.run.title in titles:  # of a grid with other settings in the same folder
-                write_text_atomically(item.run.path / SWEPT, json.dumps([*swept, f"run={item.name}"]))
-            titles.add(item.run.title)
+            write_text_atomically(item.directory.path / SWEPT, json.dumps(swept or [f"run={item.name}"]))
+            if item.directory.title in titles:  # of a grid with other settings in the same folder
+                write_text_atomically(item.directory.path / SWEPT, json.dumps([*swept, f"run={item.name}"]))
+            titles.add(item.directory.title)
     write_text_atomically(directory / PLAN, OmegaConf.to_yaml(config))
 
 
@@ -228,7 +227,7 @@ def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = N
     Raises:
         InputError: ``batch`` is less than 1.
     """
-    todo = [item for item in planned if not item.run.done]
+    todo = [item for item in planned if not item.directory.done]
     print(f"{len(planned)} runs: {len(planned) - len(todo)} done before, {len(todo)} to do", flush=True)
     returns: list[JobReturn] = []
     require(batch is None or batch >= 1, "hydra.sweeper.max_batch_size", "a number of at least 1", batch)
@@ -239,14 +238,15 @@ def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = N
             results = launch([item.overrides for item in jobs], len(returns))
             for item, result in zip(jobs, results, strict=True):
                 if result.status == JobStatus.FAILED:
-                    log.error("failed: %s (%s): %s", item.run.path, " ".join(item.shown), _error(result))
+                    shown = " ".join(item.shown)
+                    log.error("failed: %s (%s): %s", item.directory.path, shown, _error(result))
                 if result.status == JobStatus.COMPLETED and result.return_value == BUSY:
                     busy.append(item)
                 else:
                     returns.append(result)
         if todo := busy:
-            print(f"waiting for {', '.join(item.run.owner for item in todo)}", flush=True)
-        while todo and all(item.run.state == State.RUNNING for item in todo):
+            print(f"waiting for {', '.join(item.directory.owner for item in todo)}", flush=True)
+        while todo and all(item.directory.state == State.RUNNING for item in todo):
             time.sleep(_POLL)
     return returns
 

@@ -1,9 +1,9 @@
 """Jobs that train: lock a run that is free and not done, then train or resume it."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import omegaconf
 from hydra.core.hydra_config import HydraConfig
@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from ghgs_lit.config.compose import plain
 from ghgs_lit.config.defaults import fill
 from ghgs_lit.config.keys import lookup
+from ghgs_lit.config.run import Run
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import resolved
 from ghgs_lit.parsing import read_yaml
@@ -20,13 +21,17 @@ from ghgs_lit.runs.processes import is_queued_again, process_count
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import AUTO, MARKER, PLAN, RunDirectory, begun_by_job
 
+if TYPE_CHECKING:
+    from ghgs_lit.cli.verb import Training
+    from ghgs_lit.cli.verbs import Train as TrainVerb
+
 BUSY = "busy"  #: Return value of a job whose run another process works on
 _PATIENCE = 300.0  # seconds in which the first of several processes begins
 _TASK = "hydra.overrides.task"  # key of the overrides of a sweep's command
 SWEEPER = "hydra_plugins.ghgs_lit_sweeper.GridSweeper"
 
-Train = Callable[[dict[str, Any], Path, dict[str, Any]], float | None]
-"""``(config, directory, stats) -> metric``; ``stats`` is filled for ``sessions.jsonl``."""
+Train = Callable[[Run, Path, dict[str, Any]], float | None]
+"""``(run, directory, stats) -> metric``; ``stats`` is filled for ``sessions.jsonl``."""
 
 
 def in_sweep() -> bool:
@@ -79,12 +84,12 @@ def register_resolvers() -> None:
         register(name, resolver, replace=True)
 
 
-def train_once(run: RunDirectory, config: dict[str, Any], train: Train) -> float | str | None:
+def train_once(directory: RunDirectory, run: "Training", train: Train) -> float | str | None:
     """Train a run from where it stands, in the process that locks it.
 
     Args:
-        run: Its directory.
-        config: Resolved configuration.
+        directory: Of the run.
+        run: Its configuration.
         train: Trains and measures; returns the metric.
 
     Returns:
@@ -94,27 +99,29 @@ def train_once(run: RunDirectory, config: dict[str, Any], train: Train) -> float
         InputError: Outside of a sweep, another process works on it; its directory holds another run
             or other files.
     """
-    run = run.of(config)
-    with run.claim(wait=_waits()) as claimed:
+    directory = directory.of(run)
+    path = directory.path
+    with directory.claim(wait=_waits()) as claimed:
         if not claimed and in_sweep():
-            print(f"skipped: {run.owner} works on {run.path}", flush=True)
+            print(f"skipped: {directory.owner} works on {path}", flush=True)
             return BUSY
         if not claimed:
-            raise InputError(f"{run.path}: expected a directory that no process works in; found {run.owner}")
-        if run.done and (in_sweep() or run.goes_on(config)):
-            print(f"done before: {run.path}", flush=True)
-            return run.metric
-        config = run.begin(config)
-        with run.session(config["resume"]) as stats:
-            return train(config, run.path, stats)
+            expected = "a directory that no process works in"
+            raise InputError(f"{path}: expected {expected}; found {directory.owner}")
+        if directory.done and (in_sweep() or directory.goes_on(run)):
+            print(f"done before: {path}", flush=True)
+            return directory.metric
+        run = directory.begin(run)
+        with directory.session(run.resume) as stats:
+            return train(run, path, stats)
 
 
-def train_beside(run: RunDirectory, config: dict[str, Any], train: Train) -> float | str | None:
+def train_beside(directory: RunDirectory, run: "Training", train: Train) -> float | str | None:
     """Train a run as one of several processes, the first of which is in :func:`train_once`.
 
     Args:
-        run: Its directory.
-        config: Resolved configuration.
+        directory: Of the run.
+        run: Its configuration.
         train: Trains and measures; returns the metric.
 
     Returns:
@@ -123,56 +130,50 @@ def train_beside(run: RunDirectory, config: dict[str, Any], train: Train) -> flo
     Raises:
         InputError: There is no first process.
     """
-    run = run.of(config)
+    directory = directory.of(run)
     end = time.monotonic() + _PATIENCE
-    while (session := run.session_beside()) is None:
-        if run.done and (in_sweep() or run.goes_on(config)):
-            return run.metric
-        waits = time.monotonic() < end
-        require(waits, str(run.path), "the first process of this training to work in it", run.owner)
+    while (session := directory.session_beside()) is None:
+        if directory.done and (in_sweep() or directory.goes_on(run)):
+            return directory.metric
+        expected = "the first process of this training to work in it"
+        require(time.monotonic() < end, str(directory.path), expected, directory.owner)
         time.sleep(0.2)
-    return train({**config, "resume": session["resumed"]}, run.path, {})
+    return train(run.replace(resume=session["resumed"]), directory.path, {})
 
 
-def check_launcher(config: Mapping[str, Any], launcher: str) -> None:
+def check_launcher(run: Run, launcher: str) -> None:
     """Check that a job of a sweep can train in several processes, which only SLURM starts.
 
     Args:
-        config: Resolved configuration with ``trainer``.
+        run: With the group ``trainer``.
         launcher: Chosen option of ``hydra/launcher``.
 
     Raises:
         InputError: The launcher starts one process, the training wants several.
     """
-    fits = "slurm" in launcher or process_count(config["trainer"]) == 1
+    fits = "slurm" in launcher or process_count(run.trainer) == 1
     expected = "1 in a sweep, or hydra/launcher=slurm, which starts processes"
-    require(fits, "trainer.devices", expected, config["trainer"].get("devices"))
+    require(fits, "trainer.devices", expected, run.plain["trainer"]["devices"])
 
 
-def check_config(config: Mapping[str, Any]) -> None:
+def check_config(run: "TrainVerb") -> None:
     """Check that a run can train.
 
     Args:
-        config: Resolved configuration.
+        run: Its configuration.
 
     Raises:
         InputError: It has ``skip=auto``, or a frozen encoder without weights.
     """
-    one_preset = not any((lookup(config, "skip.choices") or {}).values())
-    require(one_preset, "skip", "the preset to train with, or one and token_budgets=[...]", "auto")
-    _require_weights(config)
-
-
-def _require_weights(config: Mapping[str, Any]) -> None:
-    trainable = lookup(config, "encoder.trainable")
-    starts = config.get("init_from") is not None or config.get("resume") not in (None, AUTO)
-    if starts or config.get("allow_random_encoder"):
+    require(not run.skip.presets, "skip", "the preset to train with, or one and token_budgets=[...]", "auto")
+    if run.init_from is not None or run.resume not in (None, AUTO) or run.allow_random_encoder:
         return
-    if lookup(config, "encoder.semantic") is not None:
+    if getattr(run.encoder, "semantic", None) is not None:  # a plug-in's may have none
         raise InputError(
             "init_from: expected a checkpoint of `ghgs pretext` for encoder.semantic, which does not learn in"
             " training; found none: it would stay random (allow_random_encoder=true to try things out)"
         )
+    trainable = getattr(run.encoder, "trainable", "all")
     if trainable in (None, "all"):
         return
     raise InputError(

@@ -4,13 +4,17 @@ import datetime
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from tabulate import tabulate
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.progress import clock
 from ghgs_lit.runs.run import RunDirectory, State
+
+if TYPE_CHECKING:
+    from ghgs_lit.cli.verbs import Train
+    from ghgs_lit.training.trainer import TrainerOptions
 
 OUTPUTS = "config.yaml, checkpoints/, metrics.json, metrics.csv, sessions.jsonl, pictures and logs"
 
@@ -23,27 +27,27 @@ class PlannedRun:
         name: hash of its configuration.
         overrides: of the job, with its directory.
         shown: overrides to print.
-        config: resolved configuration.
-        run: its directory.
+        run: its configuration.
+        directory: of the run.
     """
 
     name: str
     overrides: tuple[str, ...]
     shown: tuple[str, ...]
-    config: Mapping[str, Any]
-    run: RunDirectory
+    run: "Train"
+    directory: RunDirectory
 
 
-def time_budget(config: Mapping[str, Any]) -> float | None:
+def time_budget(trainer: "TrainerOptions") -> float | None:
     """Seconds of ``trainer.max_time``.
 
     Args:
-        config: Resolved configuration; the time is ``days:hours:minutes:seconds`` or a mapping.
+        trainer: Its options; the time is ``days:hours:minutes:seconds`` or a mapping.
 
     Returns:
         Seconds; None: no limit.
     """
-    value = config["trainer"].get("max_time")
+    value = trainer.max_time
     if value is None:
         return None
     if isinstance(value, Mapping):
@@ -70,23 +74,19 @@ def step_seconds(directory: Path) -> tuple[float, int] | None:
     return (seconds / steps, count) if steps else None
 
 
-def expected_seconds(config: Mapping[str, Any], step: float | None) -> float | None:
+def expected_seconds(trainer: "TrainerOptions", step: float | None) -> float | None:
     """Training time of a run by its budgets.
 
     Args:
-        config: Resolved configuration of the run.
+        trainer: Its options.
         step: Measured seconds of a step; None: not measured.
 
     Returns:
         Seconds; None: not known.
     """
-    steps = config["trainer"].get("max_steps", -1)
-    known = [time_budget(config), steps * step if steps > 0 and step is not None else None]
+    steps = trainer.max_steps
+    known = [time_budget(trainer), steps * step if steps > 0 and step is not None else None]
     return min((seconds for seconds in known if seconds is not None), default=None)
-
-
-def _budget(config: Mapping[str, Any], seconds: float | None) -> str:
-    return f"{config['trainer'].get('max_steps')} steps" if seconds is None else clock(seconds)
 
 
 def shared_overrides(planned: Sequence[PlannedRun]) -> set[str]:
@@ -106,7 +106,7 @@ def _print_table(planned: Sequence[PlannedRun], columns: Mapping[str, Sequence[s
 def _print_states(
     planned: Sequence[PlannedRun], columns: Mapping[str, Sequence[str]], end: str
 ) -> list[State]:
-    states = [item.run.state for item in planned]
+    states = [item.directory.state for item in planned]
     _print_table(planned, {"state": [s.value for s in states], **columns})
     counts = ", ".join(f"{states.count(state)} {state.value}" for state in State if state in states)
     print(f"{len(planned)} runs: {counts}{end}")
@@ -129,7 +129,7 @@ class Rehearsal:
 
 
 #: Tries what configurations need.
-Rehearse = Callable[[Sequence[Mapping[str, Any]]], Rehearsal]
+Rehearse = Callable[[Sequence["Train"]], Rehearsal]
 
 
 def print_plan(planned: Sequence[PlannedRun], directory: Path, rehearse: Rehearse) -> None:
@@ -144,14 +144,16 @@ def print_plan(planned: Sequence[PlannedRun], directory: Path, rehearse: Rehears
     Raises:
         InputError: Something is missing.
     """
-    rehearsal = rehearse([item.config for item in planned if not item.run.done])
+    rehearsal = rehearse([item.run for item in planned if not item.directory.done])
     measured = step_seconds(directory)
     step = measured[0] if measured else rehearsal.step
-    times = [expected_seconds(item.config, step) for item in planned]
-    budgets = [_budget(item.config, seconds) for item, seconds in zip(planned, times, strict=True)]
+    trainers = [item.run.trainer for item in planned]
+    times = [expected_seconds(trainer, step) for trainer in trainers]
+    both = zip(trainers, times, strict=True)
+    budgets = [f"{trainer.max_steps} steps" if time is None else clock(time) for trainer, time in both]
     states = _print_states(planned, {"trains for": budgets}, "; nothing was run")
     left = [t for t, state in zip(times, states, strict=True) if state != State.DONE]
-    basis = ["trainer.max_time"] if any(time_budget(item.config) is not None for item in planned) else []
+    basis = ["trainer.max_time"] if any(time_budget(trainer) is not None for trainer in trainers) else []
     if measured:
         basis.append(f"{measured[0]:.3g} s a step, measured in {measured[1]} finished runs")
     elif step:
@@ -176,7 +178,7 @@ def print_results(planned: Sequence[PlannedRun], directory: Path) -> None:
         planned: All runs of the sweep.
         directory: Of the sweep.
     """
-    shown = ["" if (m := item.run.metric) is None else f"{m:.2f}" for item in planned]
-    sessions = [str(len(item.run.sessions())) for item in planned]
+    shown = ["" if (m := item.directory.metric) is None else f"{m:.2f}" for item in planned]
+    sessions = [str(len(item.directory.sessions())) for item in planned]
     _print_states(planned, {"PSNR": shown, "sessions": sessions}, "")
     print(f"wrote {directory}", flush=True)

@@ -4,31 +4,33 @@ and the SLURM job that they are in."""
 import os
 import signal
 import subprocess
-from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ghgs_lit.training.trainer import TrainerOptions
 
 #: Variables that number the processes of a training;
 #: shells of jobs and of crashed launchers keep them.
 _RANKS = ("RANK", "LOCAL_RANK")
 
 
-def process_count(trainer: Mapping[str, Any]) -> int:
+def process_count(trainer: "TrainerOptions") -> int:
     """Number of processes that train: one for each device of each machine.
 
     Args:
-        trainer: Options of the group ``trainer``.
+        trainer: Its options.
 
     Returns:
         At least 1.
     """
-    devices = trainer.get("devices", 1)
-    if isinstance(devices, (list, tuple)):
+    devices = trainer.devices
+    if isinstance(devices, tuple):
         count = len(devices)
-    elif devices in ("auto", -1, "-1"):
-        count = _device_count(trainer.get("accelerator", "auto"))
+    elif devices in ("auto", -1):
+        count = _device_count(trainer.accelerator)
     else:
-        count = int(devices)
-    return count * (trainer.get("num_nodes") or 1)
+        count = devices
+    return count * trainer.num_nodes
 
 
 def _device_count(accelerator: str) -> int:
@@ -39,12 +41,12 @@ def _device_count(accelerator: str) -> int:
     return max(1, torch.cuda.device_count())
 
 
-def settle_rank(trainer: Mapping[str, Any]) -> int:
-    """Rank of this process among those of its training. What the environment says counts only where
-    a launcher has started several processes; elsewhere it is left over, and is forgotten.
+def settle_rank(trainer: "TrainerOptions") -> int:
+    """Rank of this process among those of its training. What the environment says counts only where a
+    launcher has started several processes; elsewhere it is left over, and is forgotten.
 
     Args:
-        trainer: Options of the group ``trainer``.
+        trainer: Its options.
 
     Returns:
         The rank; 0: the first, or the only one.

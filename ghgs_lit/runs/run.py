@@ -15,20 +15,24 @@ import os
 import shutil
 import socket
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ConfigDict
 
 from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, lookup
+from ghgs_lit.config.run import Run
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import append_line, is_locked, lock, lock_owner, resolved, write_text_atomically
 from ghgs_lit.parsing import read_json, read_lines_of_json, read_yaml
 from ghgs_lit.runs.processes import is_queued_again, launch, slurm_job
 from ghgs_lit.runs.provenance import config_hash, differences
 from ghgs_lit.runs.results import read_results, validated
+
+if TYPE_CHECKING:
+    from ghgs_lit.cli.verb import Training
 
 AUTO = "auto"  #: Value of ``resume``: as the directory stands
 MARKER = "run.json"
@@ -95,16 +99,16 @@ class RunDirectory:
         self._lock = self.path / ".lock"
         self._is_mine = False
 
-    def of(self, config: Mapping[str, Any]) -> "RunDirectory":
-        """The directory as one of the run of a configuration.
+    def of(self, run: Run) -> "RunDirectory":
+        """The directory as that of a run.
 
         Args:
-            config: Resolved configuration of the run.
+            run: Its configuration.
 
         Returns:
             A directory whose results count only if they are of that configuration.
         """
-        return RunDirectory(self.path, config_hash(config))
+        return RunDirectory(self.path, config_hash(run.plain))
 
     @property
     def results(self) -> dict[str, Any] | None:
@@ -203,11 +207,11 @@ class RunDirectory:
             return None
         return validated(Identity, read_json(path, "a run's identity"), str(path))
 
-    def start(self, config: Mapping[str, Any]) -> str | None:
+    def start(self, run: "Training") -> str | None:
         """The checkpoint that a run starts from in this directory. Nothing is written.
 
         Args:
-            config: Resolved configuration of the run.
+            run: Its configuration; in a new directory the keys of its verb alone are read.
 
         Returns:
             Path of the checkpoint; None: from the first step.
@@ -215,41 +219,40 @@ class RunDirectory:
         Raises:
             InputError: What another run wrote is there, or files of somebody else.
         """
-        resume = config.get("resume")
-        if self._has(resume) or self.goes_on(config):
+        resume = run.resume
+        given = None if resume == AUTO else resume
+        if self._has(resume) or self.goes_on(run):
             checkpoint = resume if self._has(resume) else self.checkpoint
-            return str(checkpoint) if checkpoint is not None else _given(resume)
+            return str(checkpoint) if checkpoint is not None else given
         owned = self.marker is not None
         there = self._there(*WRITTEN) if owned else self._there(*WRITTEN, SESSIONS)
         if not there:
-            return _given(resume)
-        if not (config.get("overwrite") and owned):
-            raise InputError(f"{self.path}: {self._refusal(config, there[0], owned)}")
-        for key in ("init_from", "resume"):
-            source = config.get(key)
+            return given
+        if not (run.overwrite and owned):
+            raise InputError(f"{self.path}: {self._refusal(run, there[0], owned)}")
+        for key, source in (("init_from", getattr(run, "init_from", None)), ("resume", resume)):
             require(not self._has(source), key, "a file outside the run that overwrite=true deletes", source)
-        return _given(resume)
+        return given
 
-    def goes_on(self, config: Mapping[str, Any]) -> bool:
-        """Whether the directory has the run that the same command began; only the length of a run
-        that is not complete, and what is measured after it, may differ.
+    def goes_on(self, run: "Training") -> bool:
+        """Whether the directory has the run that the same command began; only the length of a run that is not
+        complete, and what is measured after it, may differ.
 
         Args:
-            config: Resolved configuration of the command.
+            run: Configuration of the command.
 
         Returns:
             Whether the run goes on.
         """
         marker = self.marker
-        resume = config.get("resume")
-        if marker is None or resume is None or marker.resume != resume:
+        if marker is None or run.resume is None or marker.resume != run.resume:
             return False
-        if config.get("overwrite") and not (is_queued_again() and marker.job == slurm_job()):
+        if run.overwrite and not (is_queued_again() and marker.job == slurm_job()):
             return False
-        if marker.config_hash == config_hash(config):
+        if marker.config_hash == config_hash(run.plain):
             return True
         is_complete = RunDirectory(self.path).done
-        return not is_complete and marker.settings_hash == config_hash(config, MAY_CHANGE_ON_RESUME)
+        return not is_complete and marker.settings_hash == config_hash(run.plain, MAY_CHANGE_ON_RESUME)
 
     def _there(self, *names: str) -> list[str]:
         return [name for name in names if os.path.lexists(self.path / name)]
@@ -258,50 +261,50 @@ class RunDirectory:
         """Whether ``path`` is a file of this run."""
         return path not in (None, AUTO) and resolved(path).is_relative_to(self.path)
 
-    def _refusal(self, config: Mapping[str, Any], there: str, owned: bool) -> str:
+    def _refusal(self, run: Run, there: str, owned: bool) -> str:
         ways = "hydra.run.dir or hydra.sweep.subdir name another"
         if self.checkpoint is not None:
             ways += f", resume={self.checkpoint} goes on with its weights"
         if not owned:
             return f"expected a directory without a run or other files of these names; found {there} ({ways})"
         with contextlib.suppress(InputError, FileNotFoundError):
-            changed = differences(read_yaml(self.path / "config.yaml"), config)
+            changed = differences(read_yaml(self.path / "config.yaml"), run.plain)
             if changed:
                 there = f"{there} of another configuration: {', '.join(changed[:3])}"
         return (
             f"expected a directory without a run; found {there} ({ways}, overwrite=true deletes a single run)"
         )
 
-    def begin(self, config: Mapping[str, Any]) -> dict[str, Any]:
-        """Make the directory that of a run. Where there is no checkpoint to start from, what was
-        written is trained again, and deleted. Call it where the run is claimed.
+    def begin(self, run: "Training") -> "Training":
+        """Make the directory that of a run. Where there is no checkpoint to start from, what was written is
+        trained again, and deleted. Call it where the run is claimed.
 
         Args:
-            config: Resolved configuration of the run.
+            run: Its configuration.
 
         Returns:
-            The configuration with the checkpoint to start from as ``resume``.
+            The run with the checkpoint to start from as ``resume``.
 
         Raises:
             InputError: As for :meth:`start`.
         """
-        start = self.start(config)
+        start = self.start(run)
         marker = self.marker
-        is_same = self.goes_on(config)
+        is_same = self.goes_on(run)
         if not self._has(start):
             self._clear(with_sessions=not is_same)
         known = marker if is_same or self._has(start) else None
         identity = Identity(
             id=known.id if known else uuid.uuid4().hex[:8],
-            config_hash=config_hash(config),
-            settings_hash=config_hash(config, MAY_CHANGE_ON_RESUME),
-            resume=known.resume if known else config.get("resume"),
+            config_hash=config_hash(run.plain),
+            settings_hash=config_hash(run.plain, MAY_CHANGE_ON_RESUME),
+            resume=known.resume if known else run.resume,
             job=slurm_job(),
         )
         write_text_atomically(self.path / MARKER, identity.model_dump_json(indent=1) + "\n")
         if self.curves.parent != self.path:
             write_text_atomically(self.curves / ".run", identity.id)
-        return {**config, "resume": start}
+        return run.replace(resume=start)
 
     def _clear(self, with_sessions: bool) -> None:
         """Delete what training wrote; only in a run's folder that this process has claimed."""
@@ -404,7 +407,3 @@ def begun_by_job(folder: Path, pattern: str) -> list[RunDirectory]:
     """
     runs = [RunDirectory(path.parent) for path in folder.glob(pattern)]
     return [run for run in runs if slurm_job() is not None and run.marker.job == slurm_job()]
-
-
-def _given(resume: str | None) -> str | None:
-    return None if resume == AUTO else resume

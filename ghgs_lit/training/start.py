@@ -3,12 +3,10 @@
 import itertools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import lightning.pytorch as L
 from torch import nn
 
-from ghgs_lit.config import build
 from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, lookup
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import resolved
@@ -17,25 +15,29 @@ from ghgs_lit.stages import STAGES
 from ghgs_lit.training.restoring import check_optimizer_state, check_schedules, check_training_state
 from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint, require_finite, shape_of
 
+if TYPE_CHECKING:
+    from ghgs_lit.cli.verbs import Train
+    from ghgs_lit.training.base import BudgetedModule
 
-def check_start(config: Mapping[str, Any], directory: Path) -> None:
-    """Refuse ``init_from`` together with ``resume``, unless the run resumes in its own directory:
-    then its configuration still has the ``init_from`` that it began with.
+
+def check_start(run: "Train", directory: Path) -> None:
+    """Refuse ``init_from`` together with ``resume``, unless the run resumes in its own directory: then its
+    configuration still has the ``init_from`` that it began with.
 
     Args:
-        config: the run's, as plain data.
+        run: as configured.
         directory: of the run.
 
     Raises:
         InputError: both are given."""
-    if config["resume"] is None or config["init_from"] is None:
+    if run.resume is None or run.init_from is None:
         return
-    own = resolved(config["resume"]).is_relative_to(directory.resolve())
-    require(own, "init_from", "null where resume is given", config["init_from"])
+    own = resolved(run.resume).is_relative_to(directory.resolve())
+    require(own, "init_from", "null where resume is given", run.init_from)
 
 
 def check_resume(
-    path: str | Path, module: L.LightningModule, config: Mapping[str, Any]
+    path: str | Path, module: "BudgetedModule", config: Mapping[str, Any]
 ) -> tuple[int, list[str]]:
     """Check that a run can resume from a checkpoint, and load its weights.
 
@@ -64,35 +66,22 @@ def check_resume(
         require(str(key).split(".")[0] in parts, f"{path}: {key}", expected, "those of another part")
     for name, part in parts.items():
         load_strictly(part, model_state(checkpoint, f"{name}."), path)
-    _check_optimizer(path, checkpoint, module, config)
+    _check_optimizer(path, checkpoint, module)
     return checkpoint["global_step"], differences(checkpoint["config"], config, MAY_CHANGE_ON_RESUME)
 
 
-def _check_optimizer(
-    path: str | Path, checkpoint: Mapping[str, Any], module: L.LightningModule, config: Mapping[str, Any]
-) -> None:
-    """Refuse to resume with Muon from AdamW's state, the reverse, or with other parameter groups.
-
-    Args:
-        path: of the checkpoint, for messages.
-        checkpoint: its content.
-        module: whose optimizer goes on.
-        config: of the run that resumes.
-
-    Raises:
-        InputError: the optimizer, its groups or its schedule do not fit.
-    """
+def _check_optimizer(path: str | Path, checkpoint: Mapping[str, Any], module: "BudgetedModule") -> None:
+    """Refuse to resume with Muon from AdamW's state, the reverse, or with other parameter groups."""
     states = checkpoint["optimizer_states"]
     stored = itertools.chain.from_iterable(state["param_groups"] for state in states)
     by_muon = any("orthogonal" in group for group in stored)
-    key = "optimizer.matrix_scale"
-    scale = lookup(config, key)
-    require(by_muon == (scale is not None), key, f"{'a number' if by_muon else 'null'}, as in {path}", scale)
-    if "kind" in (node := config.get("optimizer") or {}):
-        groups = build(node, "optimizer").optimizer(module).param_groups
-        for state in states:
-            check_optimizer_state(path, state, groups)
-        check_schedules(path, checkpoint.get("lr_schedulers"), len(groups))
+    scale = getattr(module.optimization, "matrix_scale", None)  # a plug-in's may have none
+    expected = f"{'a number' if by_muon else 'null'}, as in {path}"
+    require(by_muon == (scale is not None), "optimizer.matrix_scale", expected, scale)
+    groups = module.optimization.optimizer(module).param_groups
+    for state in states:
+        check_optimizer_state(path, state, groups)
+    check_schedules(path, checkpoint.get("lr_schedulers"), len(groups))
 
 
 def initialize(
@@ -147,31 +136,31 @@ def initialize(
     return lines
 
 
-def with_origin(config: Mapping[str, Any], model: nn.Module) -> Mapping[str, Any]:
+def with_origin(run: "Train", model: nn.Module) -> "Train":
     """Take over the origin of the semantic features, which tables read.
 
     Args:
-        config: the run's, as plain data.
+        run: as configured.
         model: of the run.
 
     Returns:
-        ``config`` with ``encoder.weights`` from the checkpoint that the run starts from, if it has
-        one and all these weights fit; else ``config``."""
-    path = config["resume"] or config["init_from"]
+        The run with ``encoder.weights`` from the checkpoint that it starts from, if it has one and all these
+        weights fit; else ``run``."""
+    path = run.resume or run.init_from
     if path is None:
-        return config
+        return run
     checkpoint = read_checkpoint(path)
     origin = lookup(checkpoint["config"], "encoder.weights")
     state = model_state(checkpoint)
-    has_branch = lookup(config, "encoder.semantic") is not None
+    has_branch = getattr(run.encoder, "semantic", None) is not None  # a plug-in's may have none
     fits = has_branch == (lookup(checkpoint["config"], "encoder.semantic") is not None)
     source = "encoder.semantic." if has_branch else "encoder."
     for name, tensor in model.state_dict().items():
         if name.startswith(source):
             fits &= name in state and state[name].shape == tensor.shape
     if not origin or not fits:
-        return config
-    return {**config, "encoder": {**config["encoder"], "weights": origin}}
+        return run
+    return run.changed(encoder={"weights": origin})
 
 
 def report(lines: list[str], path: str | Path, written: Path) -> str:

@@ -11,7 +11,7 @@ from ghgs_capture.capture import Capture
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.learning import LISTING, Instants, agrees, splits_of, write_instant
 from ghgs_capture.verbs import adapt
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.frame import HEIGHT, Frame
 from ghgs_lit.model import GHGS
@@ -50,7 +50,7 @@ def written(tmp_path):
     cameras = tuple(crops[name].views[0])
     data = Instants(root=str(root), cameras=cameras, size=SIZE, batch_size=1, workers=0)
     views = {"training_counts": [3], "evaluation_count": 3}
-    targets = {**resolve(compose("adapt", ["targets=cameras"]))["targets"], "per_step": 1}
+    targets = {**run_of("adapt", ["targets=cameras"]).plain["targets"], "per_step": 1}
     return data.build(views, targets, seed=1), crops
 
 
@@ -122,7 +122,7 @@ def test_what_cannot_be_learned_from_is_refused(tmp_path, capsys, instants, view
 @pytest.mark.parametrize(("instants", "views"), [(1, 4), (3, 2)])
 def test_where_instants_are_too_few_people_are_learned_from(tmp_path, monkeypatch, instants, views):
     seen = []
-    monkeypatch.setattr(adapt, "run_job", lambda config, *_: seen.append(config["data"]["kind"]))
+    monkeypatch.setattr(adapt, "run_job", lambda run, *_: seen.append(run.plain["data"]["kind"]))
     assert ghgs("adapt", *sequence(tmp_path, instants, views), f"hydra.run.dir={tmp_path / 'run'}") == 0
     assert seen == ["people_in_rig"]
 
@@ -130,16 +130,16 @@ def test_where_instants_are_too_few_people_are_learned_from(tmp_path, monkeypatc
 def test_people_stand_beside_the_instants(tmp_path, monkeypatch):
     """With true depths, which instants lack."""
     seen = []
-    monkeypatch.setattr(adapt, "run_job", lambda config, *_: seen.append(config))
+    monkeypatch.setattr(adapt, "run_job", lambda run, *_: seen.append(run))
     said = sequence(tmp_path)
     for learn in ("auto", "both"):
         assert ghgs("adapt", *said, f"learn={learn}", f"hydra.run.dir={tmp_path / 'run'}") == 0
-    alone, both = seen
-    assert alone["data"]["kind"] == both["data"]["kind"] == "instants"
-    assert alone["data"]["beside"] is None
-    assert both["data"]["beside"]["kind"] == "people_in_rig"
-    assert [config["loss"]["weights"]["depth"] for config in seen] == [0.0, 0.5]
-    assert {tuple(config["views"]["training_counts"]) for config in seen} == {(3,)}
+    alone, both = (run.plain["data"] for run in seen)
+    assert alone["kind"] == both["kind"] == "instants"
+    assert alone["beside"] is None
+    assert both["beside"]["kind"] == "people_in_rig"
+    assert [run.loss.weights.depth for run in seen] == [0.0, 0.5]
+    assert {run.views.training_counts for run in seen} == {(3,)}
 
 
 def test_weights_learn_from_instants_and_an_interrupted_run_goes_on(tmp_path, monkeypatch, capsys):

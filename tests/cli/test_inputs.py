@@ -9,9 +9,9 @@ from omegaconf import open_dict
 
 from ghgs_lit.cli import inputs
 from ghgs_lit.cli.application import _for_hydra
-from ghgs_lit.config import compose, resolve
-from ghgs_lit.config.keys import lookup
-from ghgs_lit.config.registry import class_of
+from ghgs_lit.config import compose, run_of
+from ghgs_lit.config.compose import plain
+from ghgs_lit.config.registry import class_of, verb_class
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
 from ghgs_lit.weights.checkpoint import read_config, write_checkpoint
@@ -36,7 +36,7 @@ def composed(monkeypatch):
         monkeypatch.setattr(HydraConfig.instance(), "cfg", copy.deepcopy(cfg))
         with open_dict(cfg):
             del cfg["hydra"]
-        return cfg
+        return verb_class(verb).of(plain(cfg))
 
     return composed
 
@@ -44,8 +44,8 @@ def composed(monkeypatch):
 @pytest.mark.parametrize("verb", ["evaluate", "predict"])
 def test_a_checkpoint_is_not_changed_by_what_a_verb_composes(composed, checkpoint, verb):
     """The defaults of a verb describe another model: only what was said counts."""
-    cfg = composed(verb, f"checkpoint={checkpoint}")
-    assert inputs.model_of(checkpoint, cfg) == config(*TRAINED)
+    run = composed(verb, f"checkpoint={checkpoint}")
+    assert inputs.model_of(checkpoint, run) == config(*TRAINED)
 
 
 @pytest.mark.parametrize("verb", ["evaluate", "predict"])
@@ -81,8 +81,8 @@ def test_weights_know_the_height_of_their_own_training(composed, tmp_path, verb,
     """Four fifths of its photographs, whatever they are used for or trained further with."""
     path = str(tmp_path / "recurrent.ckpt")
     write_checkpoint(path, {}, {**config("model=recurrent"), "data": {"size": 42}})
-    cfg = composed(verb, f"checkpoint={path}", *said)
-    assert inputs.model_of(path, cfg)["rounds"]["height"] == height
+    run = composed(verb, f"checkpoint={path}", *said)
+    assert inputs.model_of(path, run)["rounds"]["height"] == height
 
 
 @pytest.mark.parametrize(
@@ -99,15 +99,15 @@ def test_weights_know_the_height_of_their_own_training(composed, tmp_path, verb,
 )
 def test_what_the_weights_were_trained_for_is_refused(composed, checkpoint, said, refused):
     """An option that cannot act must not be recorded as if it had."""
-    cfg = composed("evaluate", f"checkpoint={checkpoint}", said)
+    run = composed("evaluate", f"checkpoint={checkpoint}", said)
     with pytest.raises(InputError, match=refused):
-        inputs.model_of(checkpoint, cfg)
+        inputs.model_of(checkpoint, run)
 
 
 def test_what_agrees_with_the_checkpoint_is_accepted(composed, checkpoint):
     """Saying again what was trained changes nothing."""
-    cfg = composed("evaluate", f"checkpoint={checkpoint}", "model=hull", "compat=none", "ablation=full")
-    assert inputs.model_of(checkpoint, cfg) == config(*TRAINED)
+    run = composed("evaluate", f"checkpoint={checkpoint}", "model=hull", "compat=none", "ablation=full")
+    assert inputs.model_of(checkpoint, run) == config(*TRAINED)
 
 
 def test_a_stage_that_is_no_mapping_is_named(composed, tmp_path):
@@ -116,18 +116,18 @@ def test_a_stage_that_is_no_mapping_is_named(composed, tmp_path):
     write_checkpoint(path, {}, {**config(), "encoder": "vggt_nano"})
     said = r"b\.ckpt: config\.encoder: expected a mapping of its keys; found 'vggt_nano'"
     with pytest.raises(InputError, match=said):
-        inputs.model_of(path, composed("evaluate", f"checkpoint={path}", "encoder.width=3"))
+        inputs.model_of(path, composed("evaluate", f"checkpoint={path}", "encoder.width=64"))
 
 
 @pytest.mark.parametrize("verb", ["evaluate", "predict"])
 def test_data_that_moved_are_one_override(composed, checkpoint, verb):
     """``data.root=`` alone acts on the data that a checkpoint was trained on."""
-    cfg = composed(verb, f"checkpoint={checkpoint}", "data.root=new")
-    found = resolve(inputs.with_trained_data(cfg))["data"]
+    run = composed(verb, f"checkpoint={checkpoint}", "data.root=new")
+    found = inputs.with_trained_data(run).plain["data"]
     assert found.items() >= {"kind": "scans", "root": "new", "size": 42}.items()
     assert set(found) == {"kind", *class_of("data", "scans", "data").model_fields}
-    chosen = resolve(inputs.with_trained_data(composed(verb, f"checkpoint={checkpoint}", "data=scans")))
-    assert chosen["data"]["name"] == "scans"
+    chosen = inputs.with_trained_data(composed(verb, f"checkpoint={checkpoint}", "data=scans"))
+    assert chosen.data.name == "scans"
     with pytest.raises(InputError, match="data: expected data=<option> where there is no checkpoint"):
         inputs.with_trained_data(composed("evaluate", "data.root=new"))
 
@@ -152,7 +152,7 @@ def test_a_strange_size_of_rounds_takes_no_memory(tmp_path):
     state = GHGS.from_config(settings).state_dict()
     write_checkpoint(path, state, {**settings, "rounds": {**settings["rounds"], "hidden": 65536}})
     with pytest.raises(InputError, match=r"a\.ckpt: rounds\..*: expected shape \(65536, .* found \("):
-        inputs.load_model({**read_config(path), "checkpoint": path, "precision": "inherit"}, "cpu")
+        inputs.load_model(read_config(path), path, "cpu")
     with pytest.raises(InputError, match=r"a\.ckpt: rounds\..*: expected shape"):
         GHGS.from_checkpoint(path)
     write_checkpoint(path, state, settings)
@@ -161,13 +161,12 @@ def test_a_strange_size_of_rounds_takes_no_memory(tmp_path):
 
 
 def test_targets_on_the_command_line_are_measured_alone(composed):
-    """``targets=midway`` is the switch that its name says;
-    evaluation.targets is for several protocols."""
-    found = inputs.with_chosen_targets(resolve(composed("evaluate", "targets=midway")))
-    assert lookup(found, "evaluation.targets") == ["midway"]
+    """``targets=midway`` is the switch that its name says; evaluation.targets is for several protocols."""
+    found = inputs.with_chosen_targets(composed("evaluate", "targets=midway"))
+    assert found.evaluation.targets == ("midway",)
     for said in ([], ["targets.per_subject=2"], ["targets=ghg", "evaluation.targets=[release,midway]"]):
-        found = inputs.with_chosen_targets(resolve(composed("evaluate", *said)))
-        assert lookup(found, "evaluation.targets") == ["release", "midway"]
+        found = inputs.with_chosen_targets(composed("evaluate", *said))
+        assert found.evaluation.targets == ("release", "midway")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
@@ -178,6 +177,6 @@ def test_a_device_or_renderer_that_is_not_there_is_refused():
     ):
         inputs.pick_device("cuda")
     assert inputs.pick_device("auto").type == "cpu"
-    renderer = resolve(compose("evaluate", ["renderer=gsplat"]))
+    renderer = run_of("evaluate", ["renderer=gsplat"])
     with pytest.raises(InputError, match="needs a CUDA device"):
         inputs.build_renderer(renderer, torch.device("cpu"))

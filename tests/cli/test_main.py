@@ -18,7 +18,7 @@ from ghgs_lit.cli.application import discard_unused
 from ghgs_lit.cli.messages import parsed
 from ghgs_lit.cli.runtime import write_config
 from ghgs_lit.cli.verbs import Prepare, Train
-from ghgs_lit.config import compose, conf_dir
+from ghgs_lit.config import compose, conf_dir, run_of
 from ghgs_lit.config.registry import verb_class, verbs
 from tests.helpers.processes import run_python
 from tests.helpers.verbs import ghgs
@@ -86,7 +86,7 @@ def test_an_example_of_the_help_names_the_checkpoint_where_training_writes_it(mo
 def test_an_error_inside_a_verb_keeps_its_traceback(monkeypatch, capsys, tmp_path):
     """Only bad input is one line: a bug must not look like it."""
 
-    def run(self, cfg):
+    def run(self, *_):
         raise KeyError("bug")
 
     monkeypatch.setattr(Train, "run", run)
@@ -191,7 +191,7 @@ def test_the_verb_is_in_argv_while_the_task_runs(monkeypatch):
     which must contain the verb."""
     seen = {}
 
-    def run(self, cfg):
+    def run(self):
         seen["argv"] = list(sys.argv)
 
     monkeypatch.setattr("sys.argv", ["ghgs", "seed=1"])
@@ -207,11 +207,11 @@ def test_a_verb_prints_the_path_of_its_configuration(monkeypatch, capsys, tmp_pa
     """A sweep of many runs must not print thousands of lines of configuration;
     the file has it all."""
     monkeypatch.setattr(HydraConfig.instance(), "cfg", None)
-    config = {"optimizer": {"lr": 0.25}}
-    write_config(config, tmp_path)
+    run = run_of("stress", ["quick=true"])
+    write_config(run, tmp_path)
     assert capsys.readouterr().out == f"config: {tmp_path / 'config.yaml'} (no overrides)\n"
-    assert OmegaConf.load(tmp_path / "config.yaml") == config
-    write_config(config, tmp_path)  # its own file
+    assert OmegaConf.load(tmp_path / "config.yaml") == run.plain
+    write_config(run, tmp_path)  # its own file
 
 
 def test_flags_may_stand_anywhere():

@@ -24,7 +24,7 @@ class Greet(Verb):
     times: Count = 2
     """How often."""
 
-    def run(self, cfg):
+    def run(self):
         print(" ".join([f"hello {self.name}"] * self.times))
 '''
 

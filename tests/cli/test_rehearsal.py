@@ -11,7 +11,7 @@ import torch
 
 from ghgs_lit.cli import rehearsal
 from ghgs_lit.cli.inputs import build_data
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.weights.checkpoint import write_checkpoint
 from tests.cli.test_main import call
 from tests.helpers.models import config
@@ -29,7 +29,7 @@ def rendered(tmp_path_factory):
 
 
 def rehearsed(*overrides):
-    return rehearsal.rehearse([resolve(compose("train", [*SMALL, *overrides]))])
+    return rehearsal.rehearse([run_of("train", [*SMALL, *overrides])])
 
 
 def test_all_that_is_missing_is_said_at_once(monkeypatch, tmp_path):
@@ -119,7 +119,7 @@ def test_files_that_a_later_step_would_read_are_named(tmp_path, rendered, lackin
         folder = root / "train" / "smpl" / name
         folder.mkdir(parents=True, exist_ok=True)
         np.save(folder / "vertices.npy", np.random.default_rng(0).normal(size=(9, 3)) * 0.2)
-    run = resolve(compose("train", [*SMALL, f"data.root={root}", "loss=paper"]))
+    run = run_of("train", [*SMALL, f"data.root={root}", "loss=paper"])
     first = {name.split("/")[0] for name in build_data(run).training_batch(0).subjects}
     name = next(name for name in names if name not in first)
     (path,) = (root / "train").glob(lacking.format(name=name))
@@ -154,7 +154,7 @@ def test_what_a_sweep_lacks_ends_its_dry_run_with_an_error(monkeypatch, capsys, 
 
 def test_people_that_are_not_rendered_are_not_rendered_by_a_plan(tmp_path):
     """They take minutes."""
-    found = rehearsal.rehearse([resolve(compose("train", [f"data.cache_dir={tmp_path}", "loss=depth"]))])
+    found = rehearsal.rehearse([run_of("train", [f"data.cache_dir={tmp_path}", "loss=depth"])])
     assert (found.reasons, found.step) == ([], None)
     assert any("people are rendered before the first step" in note for note in found.notes)
     assert not list(tmp_path.iterdir())

@@ -7,7 +7,7 @@ import yaml
 from omegaconf import OmegaConf
 from pydantic import Field
 
-from ghgs_lit.config import compose, conf_dir, resolve
+from ghgs_lit.config import compose, conf_dir, run_of
 from ghgs_lit.config.defaults import with_defaults
 from ghgs_lit.config.keys import flatten
 from ghgs_lit.config.options import Count, Options, Size
@@ -100,7 +100,7 @@ def test_a_key_that_no_file_says_can_be_set(override, key, value):
 
 def test_an_inner_key_leaves_the_others_at_the_default_of_their_field():
     """Scans are rendered without lights; they had the lights of built-in people."""
-    data = resolve(compose("prepare", ["data=scans", "data.render.quality=90"]))["data"]
+    data = run_of("prepare", ["data=scans", "data.render.quality=90"]).plain["data"]
     assert (data["render"]["lights"], data["render"]["quality"]) == ("none", 90)
 
 

@@ -9,11 +9,10 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from ghgs_lit.config import compose, conf_dir, resolve
-from ghgs_lit.config.compose import read_verb
+from ghgs_lit.config import conf_dir, run_of
 from ghgs_lit.config.keys import flatten
 from ghgs_lit.config.options import expected, meanings, options_of
-from ghgs_lit.config.registry import KINDS, NAMED, check, class_of, verb_class, verbs
+from ghgs_lit.config.registry import KINDS, NAMED, class_of, read_nodes, verb_class, verbs
 from ghgs_lit.errors import InputError
 from tests.helpers.configs import composed, verb_with
 
@@ -119,8 +118,7 @@ def with_value(config, key, value):
 def message(verb, config):
     """What is wrong with a configuration; none: nothing."""
     try:
-        read_verb(verb, config)
-        check(config)
+        verb_class(verb).of(config)
     except InputError as error:
         return str(error)
 
@@ -158,7 +156,7 @@ def test_what_the_documentation_allows_passes(whole):
         ("callbacks", {}),
         ("data.size", [360, 640]),
     ):
-        check(with_value(whole, key, value))
+        read_nodes(with_value(whole, key, value))
 
 
 def test_an_unknown_key_is_refused_in_every_group(whole):
@@ -168,7 +166,7 @@ def test_an_unknown_key_is_refused_in_every_group(whole):
         config = whole if verb == "train" else OmegaConf.to_container(composed(verb), resolve=True)
         key = f"{group}.{next(iter(config[group]))}" if group in NAMED else group
         with pytest.raises(InputError, match=rf"{key} key: expected one of .*; found 'nonsense'"):
-            check(with_value(config, f"{key}.nonsense", 1))
+            read_nodes(with_value(config, f"{key}.nonsense", 1))
 
 
 def test_resolve_checks():
@@ -176,4 +174,4 @@ def test_resolve_checks():
     with pytest.raises(
         InputError, match=r"data\.batch_size: expected an integer >= 1 and <= 1024; found 1\.5"
     ):
-        resolve(compose("train", ["data.batch_size=1.5"]))
+        run_of("train", ["data.batch_size=1.5"])

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.config.options import meanings, options_of
 from ghgs_lit.config.registry import KINDS, verb_class, verbs
 from ghgs_lit.errors import InputError
@@ -21,11 +21,10 @@ def every_class(cls):
 @pytest.mark.parametrize("verb", verbs())
 def test_yaml_and_options_of_a_verb_agree(verb):
     """A default in two places that differ would be wrong in one of them."""
-    data = resolve(compose(verb, GIVEN.get(verb, [])), verb)
+    read = run_of(verb, GIVEN.get(verb, []))
     options = verb_class(verb)
-    own = {name: value for name, value in data.items() if name not in KINDS}
-    assert set(own) == set(options.model_fields)
-    read = options.read(own, "")
+    own = {name for name in read.plain if name not in KINDS}
+    assert own == set(options.model_fields)
     for name, field in options.model_fields.items():
         if name not in {text.split("=")[0] for text in GIVEN.get(verb, [])}:
             assert getattr(read, name) == field.get_default(call_default_factory=True), name
@@ -49,5 +48,5 @@ def test_every_key_of_a_verb_has_a_meaning():
 def test_a_wrong_value_is_named(verb, override, message):
     overrides = [text for text in GIVEN.get(verb, []) if text.split("=")[0] != override.split("=")[0]]
     with pytest.raises(InputError) as caught:
-        resolve(compose(verb, [*overrides, override]), verb)
+        run_of(verb, [*overrides, override])
     assert message in str(caught.value)

@@ -5,7 +5,7 @@ import shutil
 import pytest
 
 from ghgs_lit.cli.inputs import build_data
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.data.reader import PhotographCache
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.protocols import check_evaluation
@@ -15,8 +15,8 @@ from ghgs_lit.evaluation.report import print_summary
 def check(root, *overrides):
     """Check the evaluation of a training run."""
     said = ["data=scans", f"data.root={root}", "data.size=42", *overrides]
-    config = resolve(compose("train", said))
-    check_evaluation(config, build_data(config))
+    run = run_of("train", said)
+    check_evaluation(run, build_data(run))
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import pytest
 import yaml
 from PIL import Image
 
-from ghgs_lit.config import conf_dir
+from ghgs_lit.config import conf_dir, run_of
 from ghgs_lit.data.reader import PhotographCache
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import BASELINES
@@ -153,20 +153,18 @@ def test_an_evaluation_that_cannot_be_is_refused_before_training(boxes, tmp_path
 
 def test_each_target_protocol_has_the_values_of_its_own_file():
     """Only the selected protocol has overrides; the others are read from conf/targets."""
-    release = {"name": "release", "kind": "release", "per_subject": "all"}
-    config = {"targets": release, "evaluation": {"targets": ["midway", "release", "ghg"]}}
-    found = target_protocols(config)
+    run = run_of("evaluate", ["targets.per_subject=all", "evaluation.targets=[midway,release,ghg]"])
+    found = target_protocols(run)
     assert list(found) == ["midway", "release", "ghg"]
-    assert found["release"] == release
+    assert found["release"] == {**run.plain["targets"], "kind": "release"}
     for name in ("midway", "ghg"):
         own = yaml.safe_load((conf_dir() / "targets" / f"{name}.yaml").read_text())
         said = {key: value for key, value in own.items() if key != "defaults"}
         assert found[name].items() >= said.items()
         assert found[name]["training_views"] == {"midway": [0, 2, 3, 4], "ghg": [2, 3, 4]}[name]
-    config["evaluation"]["targets"] = ["release", "midwy"]
     said = r"evaluation\.targets: expected one of cameras, ghg, .*; found 'midwy' \(did you mean midway\?\)"
     with pytest.raises(InputError, match=said):
-        target_protocols(config)
+        target_protocols(run_of("evaluate", ["evaluation.targets=[release,midwy]"]))
 
 
 def test_protocols_are_measured_side_by_side_on_their_own_targets(boxes, tmp_path):

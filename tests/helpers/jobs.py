@@ -9,8 +9,12 @@ from typing import Any
 import hydra
 
 from ghgs_lit.cli.runtime import output_dir
-from ghgs_lit.config import VERSION_BASE, conf_dir, resolve
+from ghgs_lit.config import VERSION_BASE, conf_dir, run_of
+from ghgs_lit.config.compose import plain
+from ghgs_lit.config.defaults import fill
 from ghgs_lit.config.outside import files_are_read
+from ghgs_lit.config.registry import verb_class
+from ghgs_lit.config.run import Run
 from ghgs_lit.runs import job as job_module
 from ghgs_lit.runs.grid import run_all
 from ghgs_lit.runs.job import register_resolvers, train_once
@@ -29,12 +33,12 @@ def write_finished_run(directory: Path, config: dict[str, Any], psnr: float = 20
     return psnr
 
 
-def record_execution(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float:
+def record_execution(run: Run, directory: Path, stats: dict[str, Any]) -> float:
     """Replaces training: writes one line to the sweep's file ``executed``."""
     with open(directory.parent / "executed", "a") as file:
-        file.write(f"{directory.name} {os.getpid()} {config['resume']}\n")
+        file.write(f"{directory.name} {os.getpid()} {run.resume}\n")
     stats |= {"steps": 10, "seconds": 5.0}
-    return write_finished_run(directory, config, 20.0 + config["optimizer"]["lr"])
+    return write_finished_run(directory, run.plain, 20.0 + run.optimizer.lr)
 
 
 def rehearse_nothing(monkeypatch) -> None:
@@ -51,16 +55,16 @@ def executed(sweep: Path) -> list[str]:
 def job(cfg) -> float | str | None:
     """The job of a launcher: the verb without its training. With
     ``data.workers`` it loads data, as training does."""
-    return train_once(RunDirectory(output_dir()), resolve(cfg), load_and_record)
+    return train_once(RunDirectory(output_dir()), verb_class("train").of(plain(fill(cfg))), load_and_record)
 
 
-def load_and_record(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float:
+def load_and_record(run: Run, directory: Path, stats: dict[str, Any]) -> float:
     """:func:`record_execution` after two batches."""
-    if config["data"]["workers"] != "auto":
+    if run.data.workers != "auto":
         from ghgs_lit.data.workers import loader_of
 
-        assert list(loader_of([1, 2], config["data"]["workers"])) == [1, 2]
-    return record_execution(config, directory, stats)
+        assert list(loader_of([1, 2], run.data.workers)) == [1, 2]
+    return record_execution(run, directory, stats)
 
 
 def hydra_app(monkeypatch, *overrides: str) -> None:
@@ -73,12 +77,13 @@ def hydra_app(monkeypatch, *overrides: str) -> None:
 
 def plan_seeds(sweep: Path, count: int) -> list[PlannedRun]:
     """A grid of ``count`` seeds."""
-    configs = [{"seed": s, "resume": None, "optimizer": {"lr": 0.0}} for s in range(count)]
-    names = [config_hash(config) for config in configs]
-    return [
-        PlannedRun(n, (str(i),), (), c, RunDirectory(sweep / n))
-        for i, (n, c) in enumerate(zip(names, configs, strict=True))
-    ]
+    base = run_of("train", ["resume=null", "optimizer.lr=0.0"])
+    planned = []
+    for seed in range(count):
+        run = base.replace(seed=seed)
+        name = config_hash(run.plain)
+        planned.append(PlannedRun(name, (str(seed),), (), run, RunDirectory(sweep / name)))
+    return planned
 
 
 def work_through(sweep: Path, count: int, barrier) -> None:
@@ -87,20 +92,20 @@ def work_through(sweep: Path, count: int, barrier) -> None:
     job_module._waits = lambda: False
     items = plan_seeds(sweep, count)
 
-    def slow(config, directory, stats):
+    def slow(run, directory, stats):
         time.sleep(0.05)
-        return record_execution(config, directory, stats)
+        return record_execution(run, directory, stats)
 
     def launch(jobs, first):
         from hydra.core.utils import JobReturn, JobStatus
 
         picked = [items[int(overrides[0])] for overrides in jobs]
-        values = [train_once(item.run, dict(item.config), slow) for item in picked]
+        values = [train_once(item.directory, item.run, slow) for item in picked]
         return [JobReturn(_return_value=value, status=JobStatus.COMPLETED) for value in values]
 
     barrier.wait()
     run_all(items, launch)
-    (sweep / f"seen_{os.getpid()}").write_text(str(sum(item.run.done for item in items)))
+    (sweep / f"seen_{os.getpid()}").write_text(str(sum(item.directory.done for item in items)))
 
 
 def hold_run(directory: Path, ready, release=None) -> None:

@@ -89,9 +89,9 @@ class Standin(nn.Module):
         return Prediction(gaussians, depth, masks, Points(pixels, masks, *nothing), maps)
 
 
-def held(model: nn.Module) -> BudgetedModule:
+def held(model: nn.Module, optimization: Optimization | None = None) -> BudgetedModule:
     """A LightningModule that has nothing but the model."""
-    return BudgetedModule(model, Optimization(lr=0.05), None)
+    return BudgetedModule(model, optimization or Optimization(lr=0.05), None)
 
 
 def flat_renderer(gaussians: Gaussians, cameras: Cameras) -> Rendering:

@@ -7,7 +7,7 @@ import torch
 
 from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_data
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.geometry.projection import project, unproject_maps
 from ghgs_lit.rounds.coarse import (
@@ -229,8 +229,8 @@ def person(folder, side):
     photographs of other sizes are smaller copies."""
     said = [f"data.size={side}", "data.render={size: 322, positions: [0, 4, 8, 12], views: [0]}"]
     said += ["data=synthetic", "data.people={train: 1, val: 1}", f"data.cache_dir={folder}"]
-    config = resolve(compose("evaluate", ["checkpoint=shipped", *said]))
-    data = build_data({**config, "targets": None})
+    run = run_of("evaluate", ["checkpoint=shipped", *said])
+    data = build_data(run.replace(targets=None))
     data.prepare_data()
     return data.evaluation_batch("p0000000", "train", views=4)
 

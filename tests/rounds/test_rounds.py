@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.losses import terms
 from ghgs_lit.model import GHGS
@@ -129,7 +129,7 @@ def test_half_precision_gives_finite_values():
 def test_options_are_checked():
     with pytest.raises(InputError, match=r"rounds\.exchange: expected an integer >= 1 and <= 65536 or null"):
         RoundsOptions(exchange=0)
-    resolve(compose("train", ["model=recurrent", "encoder=vggt_nano", "rounds.exchange=null"]))
+    run_of("train", ["model=recurrent", "encoder=vggt_nano", "rounds.exchange=null"])
     assert model("rounds.exchange=null").rounds.exchange is None
     with pytest.raises(InputError, match=r"rounds: expected .* bounds"):
         GHGS.from_config(

@@ -4,15 +4,15 @@ presets that depend on the training."""
 import pytest
 
 from ghgs_lit.cli import train as train_verb
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.job import check_config
 from tests.cli.test_main import call
 from tests.helpers.jobs import executed, record_execution
 
 
-def config(*overrides: str) -> dict:
-    return resolve(compose("train", overrides))
+def run(*overrides: str):
+    return run_of("train", overrides)
 
 
 @pytest.fixture
@@ -47,28 +47,28 @@ def test_a_frozen_encoder_without_weights_is_refused(verb, tmp_path):
 )
 def test_encoders_that_learn_or_have_weights_pass(overrides):
     """Fine-tuning, resumed runs and experiments on purpose must still start."""
-    check_config(config(*overrides))
+    check_config(run(*overrides))
 
 
 def test_a_partly_frozen_encoder_needs_weights_too():
     """The blocks below the last one would stay random."""
     with pytest.raises(InputError, match=r"init_from: .*encoder\.trainable=last_1"):
-        check_config(config("encoder.trainable=last_1"))
+        check_config(run("encoder.trainable=last_1"))
 
 
 def test_a_semantic_branch_needs_weights():
     """It does not learn in training, so that it would stay random."""
     branch = "encoder.semantic={width: 16, depth: 1, heads: 2, channels: 8}"
     with pytest.raises(InputError, match="init_from: expected a checkpoint of `ghgs pretext`"):
-        check_config(config(branch))
-    check_config(config(branch, "init_from=pretext.ckpt"))
-    check_config(config(branch, "allow_random_encoder=true"))
+        check_config(run(branch))
+    check_config(run(branch, "init_from=pretext.ckpt"))
+    check_config(run(branch, "allow_random_encoder=true"))
 
 
 def test_training_needs_a_preset():
     """What ``skip=auto`` chooses depends on what the training has shown."""
     with pytest.raises(InputError, match=r"skip: expected the preset to train with.*token_budgets.*auto"):
-        check_config(config("skip=auto"))
+        check_config(run("skip=auto"))
 
 
 def test_a_sweep_overwrites_nothing(verb, tmp_path):

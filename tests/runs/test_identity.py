@@ -9,7 +9,7 @@ import time
 import pytest
 
 from ghgs_lit.cli import train as train_verb
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.config.compose import saved_text
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs import job
@@ -19,8 +19,7 @@ from tests.cli.test_main import call
 from tests.helpers.jobs import hold_run, record_execution, write_finished_run
 from tests.helpers.processes import PREPARED
 
-CONFIG = {"seed": 1, "resume": "auto", "init_from": None, "overwrite": False, "optimizer": {"lr": 0.5}}
-CONFIG |= {"trainer": {"max_steps": 4}}
+RUN = run_of("train", ["optimizer.lr=0.5", "trainer.max_steps=4"])
 
 
 class Killed(BaseException):
@@ -30,8 +29,8 @@ class Killed(BaseException):
 def train_to(checkpoint: bool, seen: list):
     """A training that is killed, after its first checkpoint or before."""
 
-    def train(config, directory, stats):
-        seen.append(config["resume"])
+    def train(run, directory, stats):
+        seen.append(run.resume)
         for name in ("csv/metrics.csv", "tensorboard/events", *["checkpoints/last.ckpt"] * checkpoint):
             (directory / name).parent.mkdir(exist_ok=True)
             (directory / name).write_text("seed 1")
@@ -40,16 +39,16 @@ def train_to(checkpoint: bool, seen: list):
     return train
 
 
-def killed(path, config=CONFIG, checkpoint=True) -> list:
+def killed(path, run=RUN, checkpoint=True) -> list:
     """Train in a directory until a kill; the checkpoint that was resumed."""
     seen = []
     with pytest.raises(Killed):
-        job.train_once(RunDirectory(path), dict(config), train_to(checkpoint, seen))
+        job.train_once(RunDirectory(path), run, train_to(checkpoint, seen))
     return seen
 
 
-def finished(path, config=CONFIG) -> float:
-    return job.train_once(RunDirectory(path), dict(config), record_execution)
+def finished(path, run=RUN) -> float:
+    return job.train_once(RunDirectory(path), run, record_execution)
 
 
 @pytest.fixture
@@ -109,10 +108,10 @@ def test_two_configurations_do_not_share_a_directory(tmp_path, is_done):
     with pytest.raises(
         InputError, match=r"run: expected a directory without a run; found .* \(.*overwrite=true"
     ):
-        killed(tmp_path / "run", CONFIG | {"seed": 2})
+        killed(tmp_path / "run", RUN.replace(seed=2))
     after = sorted((p, p.stat().st_mtime_ns) for p in (tmp_path / "run").rglob("*") if p.name != ".lock")
     assert after == before
-    other = RunDirectory(tmp_path / "run").of(CONFIG | {"seed": 2})
+    other = RunDirectory(tmp_path / "run").of(RUN.replace(seed=2))
     assert (other.done, other.metric) == (False, None)
 
 
@@ -120,7 +119,7 @@ def test_the_refusal_names_what_differs(verb, tmp_path):
     """Seconds of reading two configurations are saved."""
     where = f"hydra.run.dir={tmp_path / 'run'}"
     assert verb(where)[0] == 0
-    (tmp_path / "run" / "config.yaml").write_text(saved_text(resolve(compose("train", ["resume=null"]))))
+    (tmp_path / "run" / "config.yaml").write_text(saved_text(run_of("train", ["resume=null"]).plain))
     code, _, err = verb(where, "seed=2")
     assert code == 1
     assert len(err.splitlines()) == 1
@@ -129,7 +128,7 @@ def test_the_refusal_names_what_differs(verb, tmp_path):
 
 def test_the_length_of_a_run_may_change_until_it_is_complete(tmp_path):
     """A shorter budget lets a run end; the results of a complete one are not replaced unasked."""
-    longer = CONFIG | {"trainer": {"max_steps": 8}}
+    longer = RUN.replace(trainer={**RUN.plain["trainer"], "max_steps": 8})
     killed(tmp_path / "run")
     assert killed(tmp_path / "run", longer) == [str(tmp_path / "run" / "checkpoints" / "last.ckpt")]
     assert finished(tmp_path / "run", longer) == 20.5
@@ -141,25 +140,25 @@ def test_the_length_of_a_run_may_change_until_it_is_complete(tmp_path):
 def test_a_checkpoint_of_the_run_itself_goes_on_with_other_settings(tmp_path):
     """``resume=`` is how a finished run is trained on."""
     finished(tmp_path / "run")
-    killed(tmp_path / "run", CONFIG | {"resume": str(tmp_path / "run" / "checkpoints" / "last.ckpt")})
+    killed(tmp_path / "run", RUN.replace(resume=str(tmp_path / "run" / "checkpoints" / "last.ckpt")))
     best = str(tmp_path / "run" / "checkpoints" / "best.ckpt")
-    changed = CONFIG | {"optimizer": {"lr": 0.1}}
-    assert killed(tmp_path / "run", changed | {"resume": best}) == [best]
-    assert RunDirectory(tmp_path / "run").marker.config_hash == config_hash(changed)
+    changed = RUN.replace(optimizer={**RUN.plain["optimizer"], "lr": 0.1})
+    assert killed(tmp_path / "run", changed.replace(resume=best)) == [best]
+    assert RunDirectory(tmp_path / "run").marker.config_hash == config_hash(changed.plain)
 
 
 def test_a_run_that_began_elsewhere_goes_on_here(tmp_path):
     """The same command with a checkpoint of another run must not begin from it a second time."""
     other = tmp_path / "other.ckpt"
     other.touch()
-    from_other = CONFIG | {"resume": str(other)}
+    from_other = RUN.replace(resume=str(other))
     assert killed(tmp_path / "run", from_other) == [str(other)]
     assert killed(tmp_path / "run", from_other) == [str(tmp_path / "run" / "checkpoints" / "last.ckpt")]
     killed(tmp_path / "second")
     with pytest.raises(InputError, match="expected a directory without a run"):
         killed(tmp_path / "second", from_other)
     with pytest.raises(InputError, match="expected a directory without a run"):
-        killed(tmp_path / "second", CONFIG | {"resume": None})
+        killed(tmp_path / "second", RUN.replace(resume=None))
 
 
 @pytest.mark.parametrize(
@@ -189,7 +188,7 @@ def test_overwriting_deletes_a_run_and_nothing_else(verb, tmp_path):
     before = RunDirectory(tmp_path / "run").marker.id
     (tmp_path / "run" / "pictures").symlink_to(outside)
     (tmp_path / "run" / "notes.txt").touch()
-    killed(tmp_path / "run", CONFIG | {"seed": 2, "overwrite": True}, checkpoint=False)
+    killed(tmp_path / "run", RUN.replace(seed=2, overwrite=True), checkpoint=False)
     assert (outside / "a.png").exists()
     assert (tmp_path / "run" / "notes.txt").exists()
     assert not (tmp_path / "run" / "pictures").exists()
@@ -202,12 +201,12 @@ def test_overwriting_deletes_a_run_and_nothing_else(verb, tmp_path):
 def test_overwriting_never_deletes_what_the_run_starts_from(tmp_path, key):
     killed(tmp_path)
     last = tmp_path / "checkpoints" / "last.ckpt"
-    config = CONFIG | {"overwrite": True, key: str(last)}
+    run = RUN.replace(overwrite=True, **{key: str(last)})
     if key == "init_from":
         with pytest.raises(InputError, match="init_from: expected a file outside the run"):
-            killed(tmp_path, config)
+            killed(tmp_path, run)
     else:
-        assert killed(tmp_path, config) == [str(last)]
+        assert killed(tmp_path, run) == [str(last)]
     assert last.exists()
 
 
@@ -215,20 +214,20 @@ def test_nothing_is_deleted_without_the_lock(tmp_path):
     """Two processes that were started together decide one after the other."""
     killed(tmp_path)
     with pytest.raises(RuntimeError, match="claimed"):
-        RunDirectory(tmp_path).begin(CONFIG | {"overwrite": True})
+        RunDirectory(tmp_path).begin(RUN.replace(overwrite=True))
     assert (tmp_path / "checkpoints" / "last.ckpt").exists()
 
 
 def test_a_job_that_is_queued_again_does_not_overwrite_itself(tmp_path, monkeypatch):
     """Its command has ``overwrite=true`` still."""
-    config = CONFIG | {"overwrite": True}
+    run = RUN.replace(overwrite=True)
     monkeypatch.setenv("SLURM_JOB_ID", "77")
-    assert killed(tmp_path, config) == [None]
-    assert killed(tmp_path, config) == [None]
+    assert killed(tmp_path, run) == [None]
+    assert killed(tmp_path, run) == [None]
     monkeypatch.setenv("SLURM_RESTART_COUNT", "1")
-    assert killed(tmp_path, config) == [str(tmp_path / "checkpoints" / "last.ckpt")]
+    assert killed(tmp_path, run) == [str(tmp_path / "checkpoints" / "last.ckpt")]
     monkeypatch.setenv("SLURM_JOB_ID", "78")
-    assert killed(tmp_path, config) == [None]
+    assert killed(tmp_path, run) == [None]
 
 
 @pytest.mark.parametrize("text", ["[]", "{", '{"id": "a"}'])
@@ -236,7 +235,7 @@ def test_a_marker_of_another_program_is_refused(tmp_path, text):
     (tmp_path / MARKER).write_text(text)
     (tmp_path / "pictures").mkdir()
     with pytest.raises(InputError, match=r"run\.json"):
-        killed(tmp_path, CONFIG | {"overwrite": True})
+        killed(tmp_path, RUN.replace(overwrite=True))
     assert (tmp_path / "pictures").exists()
 
 
@@ -274,15 +273,15 @@ def test_numbers_of_processes_that_were_left_over_do_not_count(verb, tmp_path, m
 
 
 def test_results_are_those_of_the_configuration(tmp_path):
-    write_finished_run(tmp_path, CONFIG)
-    assert RunDirectory(tmp_path).of(CONFIG).metric == 20
-    assert RunDirectory(tmp_path).of(CONFIG | {"resume": None}).done
-    assert not RunDirectory(tmp_path).of(CONFIG | {"seed": 2}).done
+    write_finished_run(tmp_path, RUN.plain)
+    assert RunDirectory(tmp_path).of(RUN).metric == 20
+    assert RunDirectory(tmp_path).of(RUN.replace(resume=None)).done
+    assert not RunDirectory(tmp_path).of(RUN.replace(seed=2)).done
     # A verb may complete the configuration of its command.
     content = json.loads((tmp_path / "metrics.json").read_text())
-    content["provenance"]["run"] = {"config_hash": config_hash(CONFIG | {"seed": 2})}
+    content["provenance"]["run"] = {"config_hash": config_hash(RUN.replace(seed=2).plain)}
     (tmp_path / "metrics.json").write_text(json.dumps(content))
-    assert RunDirectory(tmp_path).of(CONFIG | {"seed": 2}).done
+    assert RunDirectory(tmp_path).of(RUN.replace(seed=2)).done
 
 
 def test_a_refused_command_changes_no_file_of_the_run(verb, tmp_path):

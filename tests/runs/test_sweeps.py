@@ -10,13 +10,14 @@ import pytest
 from hydra.core.utils import JobReturn, JobStatus
 
 from ghgs_lit.cli import train as train_verb
-from ghgs_lit.config import compose
+from ghgs_lit.config import compose, run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs import job, planned
 from ghgs_lit.runs.grid import combinations, run_all
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
+from ghgs_lit.training.trainer import TrainerOptions
 from tests.cli.test_main import call
 from tests.helpers.jobs import (
     executed,
@@ -116,14 +117,14 @@ def test_dry_run_runs_nothing_and_says_what_it_would(sweep):
 def test_an_interrupted_run_resumes_and_a_failed_one_is_tried_again(sweep, monkeypatch):
     """After Ctrl-C the same command must resume from the checkpoint and start failed runs again."""
 
-    def bad(config, directory, stats):
-        if config["seed"] == 1:
+    def bad(run, directory, stats):
+        if run.seed == 1:
             raise InputError("step 3: expected finite losses; found nan")
-        if config["seed"] == 2:
+        if run.seed == 2:
             (directory / "checkpoints").mkdir()
             (directory / "checkpoints" / "last.ckpt").touch()
             raise KeyboardInterrupt
-        return record_execution(config, directory, stats)
+        return record_execution(run, directory, stats)
 
     monkeypatch.setattr(train_verb, "train", bad)
     code, _, _ = sweep("seed=3,1,2,4")
@@ -151,7 +152,7 @@ def test_an_interrupted_run_resumes_and_a_failed_one_is_tried_again(sweep, monke
 def test_a_sweep_that_is_stopped_starts_no_further_run(sweep, monkeypatch, number):
     """Batch systems and ``&&`` read the exit code; the line says how the sweep goes on."""
 
-    def stopped(config, directory, stats):
+    def stopped(run, directory, stats):
         (directory / "started").touch()
         os.kill(os.getpid(), number)
         time.sleep(10)
@@ -171,10 +172,10 @@ def test_a_sweep_that_is_stopped_starts_no_further_run(sweep, monkeypatch, numbe
 def test_a_failing_run_is_named_and_the_others_are_run(sweep, monkeypatch):
     """One bad run must not cost the rest of the night."""
 
-    def bad(config, directory, stats):
-        if config["seed"] == 1:
+    def bad(run, directory, stats):
+        if run.seed == 1:
             raise InputError("step 3: expected finite losses; found nan")
-        return record_execution(config, directory, stats)
+        return record_execution(run, directory, stats)
 
     monkeypatch.setattr(train_verb, "train", bad)
     code, out, err = sweep("seed=1,2")
@@ -212,11 +213,13 @@ def test_an_impossible_job_fails_before_any_is_launched(sweep):
 def test_one_process_may_be_said_in_several_ways(monkeypatch, trainer, fits):
     """``[1]`` is the second GPU alone; ``auto`` is one on a CPU. Here with two GPUs."""
     monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
-    job.check_launcher({"trainer": trainer}, "submitit_slurm")
+    base = run_of("train", ["trainer=gpu"])
+    run = base.replace(trainer={**base.plain["trainer"], **trainer})
+    job.check_launcher(run, "submitit_slurm")
     with (
         contextlib.nullcontext() if fits else pytest.raises(InputError, match=r"trainer\.devices: expected 1")
     ):
-        job.check_launcher({"trainer": trainer}, "basic")
+        job.check_launcher(run, "basic")
 
 
 def test_two_processes_share_a_sweep_and_both_see_all_of_it(tmp_path):
@@ -255,7 +258,7 @@ def test_a_directory_of_a_single_run_is_not_shared_either(tmp_path):
     try:
         assert ready.wait(30)
         with pytest.raises(InputError, match=f"that no process works in; found process {holder.pid} on"):
-            job.train_once(RunDirectory(tmp_path), {"resume": None}, record_execution)
+            job.train_once(RunDirectory(tmp_path), run_of("train"), record_execution)
     finally:
         holder.kill()
         holder.join()
@@ -278,7 +281,7 @@ def test_a_sweep_over_all_options_of_a_group(monkeypatch, capsys, tmp_path):
 @pytest.mark.parametrize(("value", "seconds"), [("01:02:03:04", 93784), ({"minutes": 2}, 120), (None, None)])
 def test_time_budgets(value, seconds):
     """Expected times of a plan depend on both forms that Lightning accepts."""
-    assert planned.time_budget({"trainer": {"max_time": value}}) == seconds
+    assert planned.time_budget(TrainerOptions(max_time=value)) == seconds
 
 
 def composed(*overrides: str):

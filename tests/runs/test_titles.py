@@ -5,6 +5,7 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
+from ghgs_lit.config import run_of
 from ghgs_lit.runs.grid import write_plan
 from ghgs_lit.runs.planned import PlannedRun
 from ghgs_lit.runs.run import RunDirectory
@@ -18,9 +19,9 @@ def planned(folder, *grid: str, shared=SHARED) -> list[RunDirectory]:
     items = []
     for text in grid:
         shown, name = (*shared, *text.split()), f"{abs(hash((text, shared))):x}"[:12]
-        items.append(PlannedRun(name, shown, shown, {"seed": 1}, RunDirectory(folder / name)))
+        items.append(PlannedRun(name, shown, shown, run_of("train"), RunDirectory(folder / name)))
     write_plan(items, OmegaConf.create(), folder)
-    return [item.run for item in items]
+    return [item.directory for item in items]
 
 
 def test_runs_of_a_grid_have_the_names_of_what_differs(tmp_path):

@@ -12,7 +12,7 @@ import torch
 from lightning.pytorch.plugins.precision import MixedPrecision
 from torch.utils.data import DataLoader
 
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.training import DivergedError, GHGSModule, Optimization
 from ghgs_lit.training.loggers import CsvLog
@@ -127,7 +127,7 @@ def test_with_a_scaled_loss_the_guard_leaves_overflows_to_the_scaler(tmp_path):
 def test_a_saved_step_is_plain_data_and_fails_again_at_the_same_place(tmp_path, capsys):
     """Of a real model, from its configuration alone; exit code 1 while the fault is there."""
     overrides = ["skip=exact", "trainer.max_steps=2"]
-    config = resolve(compose("train", [*TINY, *overrides]))
+    config = run_of("train", [*TINY, *overrides]).plain
     model = make_model()
     header = model.gaussian_head.scale_header
     header[0].bias.data.fill_(3e38)

@@ -14,7 +14,7 @@ from lightning.pytorch.plugins.precision import MixedPrecision
 from lightning.pytorch.strategies import DDPStrategy
 from torch.utils.data import DataLoader
 
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
 from ghgs_lit.runtime.precision import exact
@@ -325,7 +325,7 @@ def test_a_trainer_of_ones_own_needs_no_configuration(tmp_path):
 def test_the_module_of_a_run_is_read_with_its_parts(tmp_path):
     """Losses, optimizer and renderer are those of the run's configuration."""
     names = ("renderer", "loss", "optimizer")
-    nodes = resolve(compose("train", ["loss.weights.depth=0.25", "optimizer.lr=0.003"]))
+    nodes = run_of("train", ["loss.weights.depth=0.25", "optimizer.lr=0.003"]).plain
     whole = {**config(), **{name: nodes[name] for name in names}, "seed": 7}
     write_checkpoint(tmp_path / "last.ckpt", make_model().state_dict(), whole)
     module = GHGSModule.load_from_checkpoint(tmp_path / "last.ckpt")

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from ghgs_lit import GHGS
-from ghgs_lit.config import build, compose, registry, resolve
+from ghgs_lit.config import build, registry, run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.averaging import AveragingOptions
@@ -199,7 +199,7 @@ def test_a_fault_in_its_weights_is_found(tmp_path):
 
 def test_a_saved_step_has_its_weights(tmp_path, monkeypatch):
     """Run again elsewhere, the loss is as it was."""
-    nodes = resolve(compose("train"))
+    nodes = run_of("train").plain
     settings = {**config(), "loss": NODE, "renderer": nodes["renderer"], "optimizer": nodes["optimizer"]}
     subject = module(make_model(), settings)
     subject.losses.mixing.data[0, 0] = torch.inf

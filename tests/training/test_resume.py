@@ -9,6 +9,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from ghgs_lit.config import run_of
 from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.provenance import differences
@@ -296,7 +297,7 @@ def test_averages_of_another_optimizer_are_refused(tmp_path, old, new):
     content |= {"config": CONFIG, "format_version": 1, "global_step": 5, "optimizer_states": states}
     torch.save(content, path)
     with pytest.raises(InputError, match=r"optimizer\.matrix_scale: expected .*a\.ckpt; found"):
-        check_resume(path, held(Standin()), {**CONFIG, "optimizer": dict(now)})
+        check_resume(path, held(Standin(), now), {**CONFIG, "optimizer": dict(now)})
 
 
 def test_groups_of_another_optimizer_are_refused(tmp_path):
@@ -367,11 +368,11 @@ def test_a_longer_budget_is_no_difference():
 
 def test_one_way_to_start(tmp_path):
     """init_from beside resume is ambiguous, except for a run that began with init_from."""
-    both = {"resume": "elsewhere/last.ckpt", "init_from": "a.ckpt"}
+    both = run_of("train", ["resume=elsewhere/last.ckpt", "init_from=a.ckpt"])
     with pytest.raises(InputError, match="init_from"):
         check_start(both, tmp_path)
-    check_start({**both, "resume": str(tmp_path / "checkpoints" / "last.ckpt")}, tmp_path)
-    check_start({"resume": None, "init_from": "a.ckpt"}, tmp_path)
+    check_start(both.replace(resume=str(tmp_path / "checkpoints" / "last.ckpt")), tmp_path)
+    check_start(both.replace(resume=None), tmp_path)
 
 
 @pytest.mark.parametrize(

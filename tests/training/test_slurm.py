@@ -8,7 +8,7 @@ import pytest
 
 from ghgs_lit.cli import train as train_verb
 from ghgs_lit.cli.train import build_trainer
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs import processes
 from ghgs_lit.runs.run import RunDirectory
@@ -29,15 +29,15 @@ BATCH = {
 
 def test_tasks_of_a_batch_script_are_no_processes(monkeypatch, tmp_path):
     """``#SBATCH --ntasks=4`` asks for cores; only ``srun`` starts as many processes."""
-    config = resolve(compose("train", ["trainer=cpu", "logger=none", "callbacks=none"]))
+    run = run_of("train", ["trainer=cpu", "logger=none", "callbacks=none"])
     for name, value in BATCH.items():
         monkeypatch.setenv(name, value)
     monkeypatch.delenv("SLURM_STEP_ID", raising=False)
     monkeypatch.delenv("SRUN_DEBUG", raising=False)
-    assert build_trainer(config, tmp_path).world_size == 1
+    assert build_trainer(run, tmp_path).world_size == 1
     monkeypatch.setenv("SLURM_STEP_ID", "0")
     with pytest.raises(InputError, match=r"trainer: .*--ntasks-per-node=4"):
-        build_trainer(config, tmp_path)
+        build_trainer(run, tmp_path)
 
 
 @pytest.fixture
@@ -57,9 +57,9 @@ def task(monkeypatch, tmp_path):
 
 
 def stopped_by(number):
-    def train(config, directory, stats):
+    def train(run, directory, stats):
         (directory / "checkpoints").mkdir()
-        (directory / "checkpoints" / "last.ckpt").write_text(str(config["seed"]))
+        (directory / "checkpoints" / "last.ckpt").write_text(str(run.seed))
         os.kill(os.getpid(), number)
 
     return train
@@ -132,24 +132,24 @@ def test_processes_that_start_together_take_the_start_of_the_first(monkeypatch, 
 
     monkeypatch.setattr(job, "_PATIENCE", 0.3)
     monkeypatch.setenv("SLURM_STEP_ID", "0")
-    config = {"seed": 1, "resume": "auto", "trainer": {}}
+    run = run_of("train")
     seen = []
 
-    def first(config, directory, stats):
+    def first(_, directory, stats):
         monkeypatch.setattr(job, "_PATIENCE", 0.0)
-        job.train_beside(run, {**config, "resume": "auto"}, lambda config, *_: seen.append(config["resume"]))
+        job.train_beside(place, run, lambda run, *_: seen.append(run.resume))
         monkeypatch.setenv("SLURM_STEP_ID", "1")
         with pytest.raises(InputError, match="the first process of this training to work in it"):
-            job.train_beside(run, config, lambda *_: seen.append("wrong"))
+            job.train_beside(place, run, lambda *_: seen.append("wrong"))
         monkeypatch.setenv("SLURM_STEP_ID", "0")
         (directory / "checkpoints").mkdir(exist_ok=True)
         (directory / "checkpoints" / "last.ckpt").touch()
         raise KeyboardInterrupt
 
-    run = RunDirectory(tmp_path)
+    place = RunDirectory(tmp_path)
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
-            job.train_once(run, dict(config), first)
+            job.train_once(place, run, first)
     with pytest.raises(InputError, match="the first process of this training"):
-        job.train_beside(run, dict(config), lambda *_: seen.append("wrong"))
+        job.train_beside(place, run, lambda *_: seen.append("wrong"))
     assert seen == [None, str(tmp_path / "checkpoints" / "last.ckpt")]

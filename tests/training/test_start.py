@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from ghgs_lit.cli.inputs import with_trained_data
+from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.training.start import initialize, report
 from tests.helpers.training import Standin
@@ -95,9 +95,9 @@ def test_a_checkpoint_does_not_say_where_this_machine_writes(tmp_path):
     path = checkpoint(
         tmp_path / "a.ckpt", Other(), config={"data": {**data, **machine, "render_workers": 64}}
     )
-    assert with_trained_data(OmegaConf.create({"checkpoint": str(path)})).data == data
-    said = {"checkpoint": str(path), "data": {"workers": 2}}
-    assert with_trained_data(OmegaConf.create(said)).data == {**data, "workers": 2}
+    run = run_of("evaluate", [f"checkpoint={path}"])
+    assert with_trained_data(run).plain["data"] == data
+    assert with_trained_data(run.replace(data={"workers": 2})).plain["data"] == {**data, "workers": 2}
 
 
 def test_a_long_report_ends(tmp_path):

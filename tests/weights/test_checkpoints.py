@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from safetensors.torch import save_file
 
 from ghgs_lit.cli.inputs import with_trained_data
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
 from ghgs_lit.training.optimization import Optimization
@@ -242,7 +242,7 @@ def test_no_resolver_of_a_checkpoint_is_evaluated(tmp_path, verb):
         with pytest.raises(
             InputError, match=r"a\.ckpt: config\.data\.\w+(\.val)?: expected a value, no interp"
         ):
-            resolve(with_trained_data(compose(verb, [f"checkpoint={path}"])))
+            with_trained_data(run_of(verb, [f"checkpoint={path}"]))
     assert called == []
 
 

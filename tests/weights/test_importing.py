@@ -8,6 +8,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
 from ghgs_lit.training import start
@@ -343,13 +344,14 @@ def test_training_from_imported_weights_says_where_they_come_from(tmp_path, file
     model = GHGS.from_config(settings)
     lines = start.initialize(model, out, strict=True)
     assert all(line.startswith("loaded" if " encoder." in line else "missing") for line in lines)
-    run = {**settings, "resume": None, "init_from": out}
-    assert start.with_origin(run, model)["encoder"]["weights"] == "vggt.safetensors"
+    run = run_of("train", ["resume=null", f"init_from={out}"]).replace(**settings)
+    assert start.with_origin(run, model).encoder.weights == "vggt.safetensors"
     before = read_checkpoint(out)["config"]
-    assert differences(run, before) == []
-    assert run["encoder"]["weights"] is None
-    assert start.with_origin({**run, "init_from": None}, model) == {**run, "init_from": None}
+    assert differences(settings, before) == []
+    assert run.encoder.weights is None
+    afresh = run.replace(init_from=None)
+    assert start.with_origin(afresh, model) is afresh
     wider = config("compat=none", "encoder.mask_input=true")
-    assert start.with_origin({**run, **wider}, GHGS.from_config(wider))["encoder"]["weights"] is None
-    assert differences({**run, **config()}, before) == []  # the release has the same encoder
-    assert differences({**run, **config()}, settings) != []
+    assert start.with_origin(run.replace(**wider), GHGS.from_config(wider)).encoder.weights is None
+    assert differences(config(), before) == []  # the release has the same encoder
+    assert differences(config(), settings) != []

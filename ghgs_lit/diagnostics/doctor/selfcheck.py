@@ -1,12 +1,12 @@
 """Comparison of a device with the CPU in float64: renderer, stages, gradient of all weights."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from ghgs_lit.config.run import Run
 from ghgs_lit.diagnostics.benchmark.measure import ATTRIBUTES
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch, random_model
 from ghgs_lit.errors import InputError
@@ -56,11 +56,11 @@ class Outcome:
     found: str
 
 
-def selfcheck(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]:
+def selfcheck(run: Run, device: torch.device) -> Iterator[Outcome]:
     """Compare a device with the CPU in float64. An error is an outcome and ends only its check.
 
     Args:
-        config: as for ``ghgs train``, as plain data; its model gets random weights.
+        run: as of ``ghgs train``, as plain data; its model gets random weights.
         device: what is checked.
 
     Yields:
@@ -68,7 +68,7 @@ def selfcheck(config: Mapping[str, Any], device: torch.device) -> Iterator[Outco
     """
     for check in CHECKS:
         try:
-            yield from check(config, device)
+            yield from check(run, device)
         except Exception as error:
             text = " ".join(f"{type(error).__name__}: {error}".split())
             yield Outcome(check.__name__, FAILED, text[:_LONGEST])
@@ -102,18 +102,17 @@ def compared(check: str, found: Tensor, expected: Tensor, limit: float) -> Outco
     return Outcome(check, PASSED if error <= limit else FAILED, f"error {error:.1e}, limit {limit:.0e}")
 
 
-def renderer(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]:
-    """Check images and gradients of splats: random, antialiased,
-    and around the renderer's thresholds.
+def renderer(run: Run, device: torch.device) -> Iterator[Outcome]:
+    """Check images and gradients of splats: random, antialiased, and around the renderer's thresholds.
 
     Args:
-        config: as for ``ghgs train``; names the renderer's backend.
+        run: as of ``ghgs train``; names the renderer's backend.
         device: what is checked.
 
     Yields:
         An outcome for each image and gradient; one alone where the backend cannot run.
     """
-    backend = config["renderer"]["backend"]
+    backend = run.renderer.backend
     try:
         backend = resolve_backend(backend, device)
     except InputError as error:
@@ -198,26 +197,26 @@ def _rendered(
     return parts | {f"gradient of {name}": leaf.grad for name, leaf in leaves.items()}
 
 
-def stages(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]:
+def stages(run: Run, device: torch.device) -> Iterator[Outcome]:
     """Check each stage in each precision that the device has, set as a user sets it.
 
     The first that fails is the one to examine. ``inherit`` may round as the process does.
 
     Args:
-        config: as for ``ghgs train``; its model gets random weights.
+        run: as of ``ghgs train``; its model gets random weights.
         device: what is checked.
 
     Yields:
         An outcome for each stage and precision; one alone for a precision that the device lacks.
     """
-    batch = _small_batch(config)
-    expected = _results(random_model(config).double(), _in_float64(batch))
+    batch = _small_batch(run)
+    expected = _results(random_model(run.plain).double(), _in_float64(batch))
     for precision in PRECISIONS:
         reason = _unsupported(precision, device)
         if reason is not None:
             yield Outcome(f"model, {precision}", SKIPPED, reason)
             continue
-        model = random_model(config).to(device)
+        model = random_model(run.plain).to(device)
         model.precision = precision
         found = _results(model, batch.to(device))
         inherited = "tf32" if rounds_products(device.type) else "float32"
@@ -228,22 +227,22 @@ def stages(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]
             yield compared(f"model, {precision}: {stage}", found[stage], value, allowed)
 
 
-def gradient(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]:
+def gradient(run: Run, device: torch.device) -> Iterator[Outcome]:
     """Check the gradient of all weights in float32, as ``trainer.precision=32-true`` has it.
 
     Args:
-        config: as for ``ghgs train``; its model gets random weights.
+        run: as of ``ghgs train``; its model gets random weights.
         device: what is checked.
 
     Yields:
         One outcome: the first of :data:`_MODELS` random models that passes, or the last one.
     """
-    batch = _small_batch(config)
+    batch = _small_batch(run)
     outcomes = []
     for seed in range(_MODELS):
-        expected = _gradients(random_model(config, seed).double(), _in_float64(batch))
+        expected = _gradients(random_model(run.plain, seed).double(), _in_float64(batch))
         with exact(device.type):
-            found = _gradients(random_model(config, seed).to(device), batch.to(device))
+            found = _gradients(random_model(run.plain, seed).to(device), batch.to(device))
         outcomes.append(compared("gradient of the weights, float32", found, expected, GRADIENT_LIMIT))
         if outcomes[-1].status == PASSED:
             break
@@ -253,8 +252,8 @@ def gradient(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcom
 CHECKS = (renderer, stages, gradient)
 
 
-def _small_batch(config: Mapping[str, Any]) -> Batch:
-    batch = ellipsoid_batch(0.15, 3, 4 * config["encoder"]["patch_size"], 2)
+def _small_batch(run: Run) -> Batch:
+    batch = ellipsoid_batch(0.15, 3, 4 * run.encoder.patch_size, 2)
     return replace(batch, targets=None)
 
 

@@ -1,13 +1,13 @@
 """Baselines: methods that a user might pick instead of a model,
 and simple ones that it must beat."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 
+from ghgs_lit.config import nodes
 from ghgs_lit.errors import choice
 from ghgs_lit.evaluation.baselines.splats import (
     PerScene,
@@ -29,7 +29,7 @@ BASELINES = ("black", "nearest_view", *DEPTHS, "per_scene", "untrained")
 
 
 def baseline(
-    name: str, renderer: Renderer, untrained: Callable[[], torch.nn.Module], per_scene: Mapping[str, Any]
+    name: str, renderer: Renderer, untrained: Callable[[], torch.nn.Module], per_scene: nodes.PerScene
 ) -> Method:
     """The baseline of a name.
 
@@ -37,7 +37,7 @@ def baseline(
         name: One of ``BASELINES``.
         renderer: Draws Gaussians from the target cameras.
         untrained: Builds a model with random weights, for ``untrained``.
-        per_scene: Options of :class:`PerScene`, for ``per_scene``.
+        per_scene: Options of the baseline of that name.
 
     Returns:
         The method, which predicts a batch without training.
@@ -49,7 +49,7 @@ def baseline(
     if name in DEPTHS:
         return partial(splatted, depth_of=DEPTHS[name], renderer=renderer)
     if name == "per_scene":
-        return PerScene(renderer, **per_scene)
+        return PerScene(renderer, per_scene.steps)
     if name == "untrained":
         return ModelMethod(untrained().eval(), renderer)
     return {"black": black, "nearest_view": nearest_view}[name]

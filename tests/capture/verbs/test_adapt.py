@@ -11,7 +11,7 @@ from ghgs_capture.verbs import adapt
 from ghgs_capture.verbs.adapt import _fill_of, with_rig
 from ghgs_capture.verbs.advice import rig_advice
 from ghgs_lit.cli.inputs import build_data
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import compose, run_of
 from ghgs_lit.data.view import half_centers
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
@@ -46,7 +46,7 @@ def calibration(tmp_path):
 def test_all_cameras_of_a_file_are_the_rig(calibration):
     """Every one is an input; what the file does not say acts on it."""
     said = [f"cameras={calibration}", "calibration.pixel_centers=integer"]
-    config = with_rig(resolve(compose("adapt", said)))
+    config = with_rig(run_of("adapt", said)).plain
     assert config["views"]["evaluation_count"] == 4
     assert config["views"]["training_counts"] == [4]
     assert config["evaluation"]["views"] == [4]
@@ -60,11 +60,11 @@ def test_all_cameras_of_a_file_are_the_rig(calibration):
 @pytest.mark.parametrize("numbers", ["data.active.train=5", "data.active={train: 5, val: 2}"])
 def test_longer_trainings_see_more_people(calibration, monkeypatch, numbers):
     """Ten minutes over the people of three learn these by heart; numbers that were said stay."""
-    config = resolve(compose("adapt", [f"cameras={calibration}", "minutes=9", numbers]))
+    run = run_of("adapt", [f"cameras={calibration}", "minutes=9", numbers])
     monkeypatch.setattr(adapt, "given_keys", lambda: [numbers.partition("=")[0]])
-    data, few = with_rig(config)["data"], with_rig({**config, "minutes": 1})["data"]
+    data, few = (with_rig(run.replace(minutes=minutes)).plain["data"] for minutes in (9, 1))
     assert (data["people"], data["active"]) == ({"train": 96, "val": 6}, {"train": 5, "val": 2})
-    assert few["people"] == config["data"]["people"]
+    assert few["people"] == run.plain["data"]["people"]
 
 
 def test_cameras_that_do_not_say_their_size_are_refused(calibration):
@@ -73,7 +73,7 @@ def test_cameras_that_do_not_say_their_size_are_refused(calibration):
         del camera["width"], camera["height"]
     calibration.write_text(json.dumps(content))
     with pytest.raises(InputError, match="the photographs' size, or images=<folder>"):
-        with_rig(resolve(compose("adapt", [f"cameras={calibration}"])))
+        with_rig(run_of("adapt", [f"cameras={calibration}"]))
 
 
 def test_more_cameras_than_a_prediction_takes_are_refused(calibration):
@@ -81,9 +81,9 @@ def test_more_cameras_than_a_prediction_takes_are_refused(calibration):
     content["cameras"] |= {f"d{i}": content["cameras"]["c0"] for i in range(5)}
     calibration.write_text(json.dumps(content))
     with pytest.raises(InputError, match="2 to 8 cameras, those of the photographs in images=; found 9"):
-        with_rig(resolve(compose("adapt", [f"cameras={calibration}"])))
+        with_rig(run_of("adapt", [f"cameras={calibration}"]))
     with pytest.raises(InputError, match="cameras=<calibration>; found None"):
-        with_rig(resolve(compose("adapt", [])))
+        with_rig(run_of("adapt", []))
 
 
 def test_weights_learn_and_are_written(calibration, tmp_path, monkeypatch, capsys):
@@ -142,8 +142,8 @@ def test_a_data_set_lends_its_cameras(tmp_path):
     data += [
         f"data.split.{p}=[{{sequences: [{s}], frames: [0, 2, 1]}}]" for p, s in (("train", 386), ("val", 313))
     ]
-    config = with_rig(resolve(compose("adapt", data)))
-    zju = build_data(resolve(compose("adapt", data)))
+    config = with_rig(run_of("adapt", data)).plain
+    zju = build_data(run_of("adapt", data))
     batch = zju.evaluation_batch(next(iter(zju.subjects("val"))))
     assert config["data"]["kind"] == "people_in_rig"
     assert config["data"]["people"] == compose("adapt").data.people
@@ -156,16 +156,16 @@ def test_a_data_set_lends_its_cameras(tmp_path):
     low, high = config["data"]["fill"]
     assert low < rows.max() / 112 < high
     with pytest.raises(InputError, match="cameras: expected null beside data=<data set>"):
-        with_rig(resolve(compose("adapt", [*data, "cameras=x.json"])))
+        with_rig(run_of("adapt", [*data, "cameras=x.json"]))
 
 
 def test_numbers_of_views_can_be_said(calibration, tmp_path, monkeypatch):
     """Weights for a rig of which a camera may fail are trained with fewer, too;
     measured are all cameras."""
     seen = []
-    monkeypatch.setattr(adapt, "run_job", lambda config, *_: seen.append(config["views"]))
+    monkeypatch.setattr(adapt, "run_job", lambda run, *_: seen.append(run.views))
     for number, said in enumerate(([], ["views.training_counts=[3,4]"])):
         run = f"hydra.run.dir={tmp_path / str(number)}"
         assert ghgs("adapt", f"cameras={calibration}", run, *said) == 0
-    assert [views["training_counts"] for views in seen] == [[4], [3, 4]]
-    assert [views["evaluation_count"] for views in seen] == [4, 4]
+    assert [views.training_counts for views in seen] == [(4,), (3, 4)]
+    assert [views.evaluation_count for views in seen] == [4, 4]

@@ -6,7 +6,7 @@ import dataclasses
 import pytest
 import torch
 
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.diagnostics.doctor import selfcheck as module
 from ghgs_lit.diagnostics.doctor.selfcheck import (
     FAILED,
@@ -33,7 +33,7 @@ CPU = torch.device("cpu")
 
 
 def settings(*overrides):
-    return resolve(compose("doctor", [*TINY, "model=hull", "data.size=56", "loss=depth", *overrides]))
+    return run_of("doctor", [*TINY, "model=hull", "data.size=56", "loss=depth", *overrides])
 
 
 def statuses(outcomes):
@@ -143,7 +143,7 @@ def test_a_weight_without_its_gradient_fails(monkeypatch):
 def test_an_error_is_an_outcome_and_other_checks_go_on(monkeypatch):
     """What a machine cannot do at all belongs into the table."""
 
-    def broken(config, device):
+    def broken(run, device):
         yield Outcome("first", PASSED, "1")
         raise RuntimeError("CUDA error:\nno kernel image")
 

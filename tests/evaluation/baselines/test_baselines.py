@@ -8,6 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
+from ghgs_lit.config.nodes import PerScene
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import BASELINES, baseline, nearest_view, splats_at
 from ghgs_lit.geometry.projection import project
@@ -25,7 +26,7 @@ def nothing(gaussians, cameras):
 
 
 def named(name, renderer):
-    return baseline(name, renderer, Standin, {"steps": 1})
+    return baseline(name, renderer, Standin, PerScene(steps=1))
 
 
 @pytest.mark.parametrize("views", [3, 5])

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from ghgs_lit.config import build, compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.evaluation.baselines.splats import discs_at, splats_at, splatted, true_depth
 from ghgs_lit.geometry.masks import with_matte
 from ghgs_lit.geometry.projection import unproject_maps
@@ -31,9 +31,9 @@ def test_splats_have_the_surfaces_own_colors():
 
 def test_discs_are_those_that_the_recurrent_model_starts_from():
     """The model's own Gaussian head gives them for raw values of 0 at the same points."""
-    config = resolve(compose("train", ["model=recurrent"]))
-    head = build(config["gaussian_head"], "gaussian_head", dim_latent=64)
-    batch = with_matte(with_soft_rims(make_batch(2, 3)), config["model"]["matte"])
+    run = run_of("train", ["model=recurrent"])
+    head = run.gaussian_head.build(dim_latent=64)
+    batch = with_matte(with_soft_rims(make_batch(2, 3)), run.model.matte)
     valid = batch.masks & (batch.depths > 0)
     image, pixel = valid.flatten(0, 1).flatten(1).nonzero().unbind(1)
     n = len(image)

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.tables import read_sweep, to_markdown
 from ghgs_lit.evaluation.tables.variants import encoder_name
@@ -17,7 +17,7 @@ COLUMNS = ("psnr", "steps", "seconds", "peak_gb")
 @pytest.mark.parametrize("name", ["vggt_nano", "vggt_small", "vggt_1b"])
 def test_encoders_of_the_package_have_their_names(name):
     """A file says of the nested ``vit`` what differs from the file below it."""
-    assert encoder_name(resolve(compose("train", [f"encoder={name}"]))) == name
+    assert encoder_name(run_of("train", [f"encoder={name}"]).plain) == name
 
 
 def test_steps_seconds_and_memory_can_be_columns(tmp_path):

@@ -8,7 +8,7 @@ from functools import cache, partial
 import torch
 from torch import Generator, Tensor, nn
 
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.diagnostics.stress import inputs
 from ghgs_lit.diagnostics.stress.stage import Stage, Values, case_by_case
 from ghgs_lit.diagnostics.stress.stages.geometry import batch_of, scene
@@ -39,7 +39,7 @@ def _models(name: str, kicked: bool) -> dict[torch.dtype, GHGS]:
         if name == SHIPPED:
             model = GHGS.from_checkpoint()
         else:
-            model = GHGS.from_config(resolve(compose("train", [f"model={name}", *_TINY])))
+            model = GHGS.from_config(run_of("train", [f"model={name}", *_TINY]).plain)
         for parameter in model.parameters():
             if kicked:  # as Adam moves every weight by the learning rate in its first step
                 parameter.data += 10.0 * torch.randn_like(parameter).sign()

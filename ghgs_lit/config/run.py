@@ -1,0 +1,139 @@
+"""A whole configuration as one object, checked once."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Self
+
+from pydantic import PrivateAttr
+
+from ghgs_lit.config.options import Options
+from ghgs_lit.config.registry import KINDS, NAMED, read_nodes
+
+if TYPE_CHECKING:  # libraries come with them
+    from ghgs_lit.config.nodes import Calibration, EvaluationOptions
+    from ghgs_lit.data.augmentation import Augmentation
+    from ghgs_lit.data.dataset import DataOptions
+    from ghgs_lit.data.sampling import TargetProtocol, ViewProtocol
+    from ghgs_lit.encoder import VGGTOptions
+    from ghgs_lit.losses import Losses
+    from ghgs_lit.metrics import MetricsOptions
+    from ghgs_lit.plan import SkipOptions
+    from ghgs_lit.rendering import Renderer
+    from ghgs_lit.surroundings import ModelOptions
+    from ghgs_lit.training import Optimization
+    from ghgs_lit.training.features import DiskFeatureCache
+    from ghgs_lit.training.trainer import TrainerOptions
+
+#: Entry of a configuration that is neither a key of a verb nor a group: what tables call a run by.
+CHOSEN = "chosen"
+
+
+def _is_of_verb(key: str) -> bool:
+    return key not in KINDS and key != CHOSEN
+
+
+class Run(Options):
+    """Keys of a verb as fields, options of each config group as attributes; None: it has no such group.
+
+    Types are those of the shipped kinds that verbs read; a kind of a user's own has these attributes, too. A
+    node that says no kind where its group has some, such as changes of a checkpoint's data, is part of
+    :attr:`plain` alone.
+    """
+
+    if TYPE_CHECKING:
+        augmentation: Augmentation
+        calibration: Calibration
+        callbacks: Mapping[str, Options]
+        data: DataOptions
+        encoder: VGGTOptions
+        evaluation: EvaluationOptions
+        feature_cache: DiskFeatureCache
+        logger: Mapping[str, Options]
+        loss: Losses
+        metrics: MetricsOptions
+        model: ModelOptions
+        optimizer: Optimization
+        renderer: Renderer
+        skip: SkipOptions
+        targets: TargetProtocol
+        trainer: TrainerOptions
+        views: ViewProtocol
+
+    _plain: dict[str, Any] = PrivateAttr(default_factory=dict)
+    _nodes: dict[str, Any] = PrivateAttr(default_factory=dict)
+
+    @classmethod
+    def begin(cls, config: Mapping[str, Any]) -> Self:
+        """Check the keys of the verb alone, which needs no library.
+
+        Args:
+            config: the whole configuration as plain data.
+
+        Raises:
+            InputError: a key is unknown, or a value has a wrong type or range.
+        """
+        run = cls.read({key: config[key] for key in config if _is_of_verb(key)}, "")
+        run._plain = dict(config)
+        return run
+
+    def complete(self, config: Mapping[str, Any]) -> Self:
+        """Check the groups, too.
+
+        Args:
+            config: as for :meth:`begin`, with the defaults of all nodes.
+
+        Returns:
+            This run.
+
+        Raises:
+            InputError: names the first wrong key of a node.
+        """
+        self._plain = dict(config)
+        self._nodes = read_nodes(config)
+        return self
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any]) -> Self:
+        """Check the whole configuration.
+
+        Args:
+            config: as plain data, with the defaults of all nodes.
+
+        Raises:
+            InputError: as for :meth:`begin` and :meth:`complete`.
+        """
+        return cls.begin(config).complete(config)
+
+    def __getattr__(self, name: str) -> Any:
+        if name in NAMED:
+            parts = ((key.partition("."), node) for key, node in self._nodes.items())
+            return {part: node for (group, _, part), node in parts if group == name}
+        return self._nodes.get(name) if name in KINDS else super().__getattr__(name)
+
+    @property
+    def plain(self) -> dict[str, Any]:
+        """The whole configuration as it is saved, in plain data; not to be changed."""
+        return self._plain
+
+    def changed(self, **nodes: Mapping[str, Any]) -> Self:
+        """The run with some keys of nodes changed; the result is checked.
+
+        Args:
+            **nodes: new values by key, as plain data, of groups that the run has.
+
+        Raises:
+            InputError: as for :meth:`of`.
+        """
+        return self.replace(**{group: {**self._plain[group], **keys} for group, keys in nodes.items()})
+
+    def replace(self, **changes: Any) -> Self:
+        """The run with other values of keys, and other nodes; the result is checked.
+
+        Args:
+            **changes: new values by key, and new nodes by group, as plain data.
+
+        Raises:
+            InputError: as for :meth:`of`.
+        """
+        config = {**self._plain, **changes}
+        run = self.begin(config) if any(map(_is_of_verb, changes)) else self.model_copy()
+        return run.complete(config)
