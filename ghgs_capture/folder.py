@@ -72,6 +72,8 @@ class CaptureFolder:
         for name in ("images", "cameras", "masks", "backgrounds"):
             if isinstance(path := getattr(self, name), str | Path):
                 object.__setattr__(self, name, Path(path).expanduser())
+        for name, kind in (("calibration", nodes.Calibration), ("sequence", nodes.SequenceOptions)):
+            object.__setattr__(self, name, kind.read(getattr(self, name), name))
         for name in ("masks", "backgrounds"):
             path = getattr(self, name)
             require(path is None or path.is_dir(), name, "a folder", str(path))
@@ -79,23 +81,15 @@ class CaptureFolder:
         _ = self.paths
 
     @functools.cached_property
-    def _calibration(self) -> nodes.Calibration:
-        return nodes.Calibration.read(self.calibration, "calibration")
-
-    @functools.cached_property
-    def _sequence(self) -> nodes.SequenceOptions:
-        return nodes.SequenceOptions.read(self.sequence, "sequence")
-
-    @functools.cached_property
     def file(self) -> CameraFile:
         """The cameras as stored."""
         given = self.cameras
-        return given if isinstance(given, CameraFile) else read_cameras(given, self._calibration.format)
+        return given if isinstance(given, CameraFile) else read_cameras(given, self.calibration.format)
 
     @functools.cached_property
     def convention(self) -> Convention:
         """Meaning of the stored numbers: the format's, unless the user says otherwise."""
-        return self.file.convention.with_options(vars(self._calibration))
+        return self.file.convention.with_options(vars(self.calibration))
 
     @functools.cached_property
     def _listing(self) -> tuple[dict[str, dict[str, Source]], str]:
@@ -103,10 +97,10 @@ class CaptureFolder:
         and a line about frames left over."""
         folder = self.images
         cameras = self.file.cameras
-        part = self._sequence
+        part = self.sequence
         if isinstance(folder, Mapping):
             return {"": dict(folder)}, ""
-        names = composed_names(self._calibration.names)
+        names = composed_names(self.calibration.names)
         if has_videos(folder, cameras, names):
             return find_frames(folder, self.masks, cameras, names, self.convention, part.sync, part.step)
         require(part.sync is None, "sequence.sync", "null for photographs", part.sync)
@@ -121,7 +115,7 @@ class CaptureFolder:
     def paths(self) -> dict[str, dict[str, Source]]:
         """``{instant: {camera: path or frame}}`` of the instants that ``sequence`` selects."""
         all_instants = self._listing[0]
-        part = self._sequence
+        part = self.sequence
         names = list(all_instants)[part.start : part.stop : part.step]
         expected = f"a part of {len(all_instants)} instants"
         require(bool(names), "sequence.start", expected, f"none from {part.start} to {part.stop}")
@@ -242,7 +236,7 @@ class CaptureFolder:
             camera: of the photograph, as its file stores it.
             pixels: the decoded photograph.
         """
-        return fits_stored(pixels, camera, self._calibration.exif)
+        return fits_stored(pixels, camera, self.calibration.exif)
 
     def photograph(
         self, name: str, camera: StoredCamera, pixels: Pixels, matte: np.ndarray, convention: Convention

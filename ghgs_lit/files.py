@@ -173,14 +173,10 @@ def append_line(path: Path, text: str) -> None:
         OSError: the file is a link, or cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "a+b", opener=_open_no_link) as file:
+    with open(path, "a+b", opener=lambda p, flags: os.open(p, flags | os.O_NOFOLLOW, 0o664)) as file:
         file.seek(max(0, file.tell() - 1))
         is_torn = file.read(1) not in (b"", b"\n")
         file.write((("\n" if is_torn else "") + text + "\n").encode())
-
-
-def _open_no_link(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_NOFOLLOW, 0o664)
 
 
 def _remove_leftovers(path: Path) -> None:

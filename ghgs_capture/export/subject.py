@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.errors import choice, require
+from ghgs_lit.errors import require
 from ghgs_lit.geometry.masks import coverage, surface_colors
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.geometry.rotations import multiply_quaternions, quaternion_to_matrix
@@ -90,10 +90,6 @@ class OutputOptions:
     smooth: bool = False  #: files hold the :func:`smoothed` Gaussians
     frames: int = 24  #: pictures of the turntable
     fps: int = 12  #: pictures per second of the video
-
-    def __post_init__(self):
-        choice("up", self.up, (None, *AXES))
-        require(self.frames >= 0, "turntable.frames", "a number of at least 0", self.frames)
 
 
 def smoothed(gaussians: Gaussians, pixel: float) -> Gaussians:

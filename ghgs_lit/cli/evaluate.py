@@ -47,9 +47,8 @@ def trained_method(run: "Evaluate", device: torch.device) -> tuple[ModelMethod, 
     }
     if "global_step" in checkpoint:
         facts["training"] = {"steps": checkpoint["global_step"]}
-    rounds = run.refine_cameras
     refinement = Refinement(run.refine, renderer) if run.refine else None
-    cameras = CameraRefinement(rounds, model, renderer) if rounds else None
+    cameras = CameraRefinement(run.refine_cameras, model, renderer) if run.refine_cameras else None
     return ModelMethod(model, renderer, refinement, cameras), facts
 
 

@@ -1,7 +1,6 @@
 """What ``dry_run`` tries of the runs of a sweep: everything that they need,
 and the time of one step."""
 
-import json
 import tempfile
 import time
 import warnings
@@ -13,12 +12,12 @@ from lightning.pytorch.callbacks import Callback
 
 from ghgs_lit.cli.inputs import build_data, build_renderer, check_size
 from ghgs_lit.cli.train import build_trainer, quiet
-from ghgs_lit.config.keys import WITHOUT_INFLUENCE, flatten, is_below
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.protocols import check_evaluation
 from ghgs_lit.model import GHGS
 from ghgs_lit.runs import job
 from ghgs_lit.runs.planned import Rehearsal
+from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.training import GHGSModule, start
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
@@ -147,7 +146,7 @@ class _Rehearsed:
 
     def _check_files(self, data: "PhotographsDataModule", phase: str) -> None:
         """Note the first file of a phase that is not there, and the first body that the loss lacks."""
-        key = json.dumps([self.run.plain["data"], phase], sort_keys=True, default=str)
+        key = f"{config_hash(self.run.plain['data'], without=())} {phase}"
         if key in self.listed:
             return
         self.listed.add(key)
@@ -215,9 +214,7 @@ def rehearse(runs: Sequence["Train"]) -> Rehearsal:
         warnings.simplefilter("ignore")
         for given in runs:
             run = given.changed(data={"workers": 0})
-            flat = flatten({**run.plain, "seed": 0})
-            needs = {k: v for k, v in flat.items() if not is_below(k, WITHOUT_INFLUENCE)}
-            key = json.dumps(needs, sort_keys=True, default=str)
+            key = config_hash({**run.plain, "seed": 0})
             if key in tried:
                 continue
             rehearsed = _Rehearsed(run, reasons, notes, listed)
