@@ -238,8 +238,8 @@ def test_cameras_are_shown_live_alone(tmp_path, capsys):
 
 
 def test_photographs_need_no_checkpoint(tmp_path, capsys, monkeypatch):
-    def refuse(options, cfg):
-        raise InputError(f"predicts with {cfg.checkpoint}")
+    def refuse(verb):
+        raise InputError(f"predicts with {verb.checkpoint}")
 
     monkeypatch.setattr("ghgs_capture.verbs.predict.run", refuse)
     assert ghgs("view", "images=.", "cameras=c.json", f"hydra.run.dir={tmp_path}") == 1
