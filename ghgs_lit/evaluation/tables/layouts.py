@@ -26,6 +26,7 @@ LOWER_IS_BETTER += ("prediction_seconds", "seconds", "peak_gb")
 TITLES = {
     "depth_error_mm": "Depth error (mm)",
     "surface_mm": "Surface error (mm)",
+    "shared_neighbors": "Shared neighbours",
     "gaussians": "Gaussians",
     "psnr_box_40": "PSNR box at 0.40",
     "spill": "Spill (‰)",
