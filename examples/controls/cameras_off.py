@@ -15,8 +15,7 @@ import torch
 
 from ghgs_lit.cli import inputs
 from ghgs_lit.cli.evaluate import trained_method
-from ghgs_lit.cli.verbs import Evaluate
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import run_of
 from ghgs_lit.config.registry import load_plugins
 from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.sampling import subject_rng
@@ -33,19 +32,18 @@ def measure_run(checkpoint: Path, directory: Path, pixels: float) -> None:
         pixels: Greatest error of a camera in pixels of the photographs, above 0.
     """
     keys = [f"checkpoint={checkpoint}", "metrics.lpips=off", "evaluation.pictures=0", "device=cpu"]
-    cfg = compose("evaluate", keys)
-    config = inputs.with_chosen_targets(resolve(inputs.with_trained_data(cfg)))
-    config |= inputs.model_of(str(checkpoint), cfg)
-    method, facts = trained_method(Evaluate(checkpoint=str(checkpoint)), config, torch.device("cpu"))
+    run = inputs.with_chosen_targets(inputs.with_trained_data(run_of("evaluate", keys)))
+    run = run.replace(**inputs.model_of(run.checkpoint, run))
+    method, facts = trained_method(run, torch.device("cpu"))
     error = Augmentation(calibration=pixels)
 
     def knocked(batch: Batch) -> Batch:
         return error.imperfections(batch, [subject_rng(0, subject) for subject in batch.subjects])
 
     methods = {"model": dataclasses.replace(method, cameras=knocked)}
-    data = inputs.build_data(config)
+    data = inputs.build_data(run)
     facts |= {"verb": "evaluate", "checkpoint": str(checkpoint)}
-    measure_and_write(methods, data, config, directory, torch.device("cpu"), **facts)
+    measure_and_write(methods, data, run, directory, torch.device("cpu"), **facts)
 
 
 def main() -> None:
