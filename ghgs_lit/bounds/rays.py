@@ -104,9 +104,22 @@ class Silhouettes:
 
 def cut_sides(masks: Bool[Tensor, "*batch h w"]) -> Bool[Tensor, "*batch 4"]:
     """Whether masks touch the first and the last row, the first and the last column of their frames."""
-    rows = masks[..., (0, -1), :].any(-1)
-    columns = masks[..., (0, -1)].any(-2)
-    return torch.cat((rows, columns), -1)
+    sides = [_ends(masks, axis).any(-3 - axis) for axis in (-2, -1)]
+    return torch.cat([side.expand(*side.shape[:-1], 2) for side in sides], -1)
+
+
+def _ends(values: Tensor, axis: int) -> Tensor:
+    """The first and the last line of values along an axis, of a single line that one.
+
+    Args:
+        values: [..., h, w].
+        axis: -2 or -1.
+
+    Returns:
+        A view: a list of places would be copied to a GPU.
+    """
+    places = slice(None, None, max(values.shape[axis] - 1, 1))
+    return values[..., places, :] if axis == -2 else values[..., places]
 
 
 def silhouettes(
@@ -190,8 +203,11 @@ def votes_outside(
         cut: sides that cut the subject, as of :func:`cut_sides`.
     """
     outside = dilated < voting[..., None, None]
-    outside[..., (0, -1), :] &= ~cut[..., :2, None]
-    outside[..., (0, -1)] &= ~cut[..., None, 2:]
+    whole = ~cut
+    for axis, sides in ((-2, whole[..., :2]), (-1, whole[..., 2:])):
+        ends = _ends(outside, axis)
+        known = sides if ends.shape[axis] == 2 else sides.all(-1, keepdim=True)
+        ends &= known.unsqueeze(-3 - axis)
     return outside.view(torch.uint8)
 
 
