@@ -215,7 +215,9 @@ class _Step:
     def captured(self) -> None:
         """The step with stages, rendering, loss and gradients played back."""
         self.data()
-        captured.played(self.model, self.renderer, self.losses, self.batch).total.backward()
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast):
+            outcome = captured.played(self.model, self.renderer, self.losses, self.batch)
+        outcome.total.backward()
         self.optimize()
 
     @property
@@ -265,6 +267,7 @@ def frozen(call: Call) -> None:
         try:
             made = _Step(call, call.run(*encoder), call.batch(size, call.sizes.large), autocast=True)
             _stepped(call, f"batch of {size}", made)
+            _captured(call, f"batch of {size}, captured", made)
         except torch.cuda.OutOfMemoryError as error:
             call.add(f"batch of {size}", refused=reason(error))
         made = None

@@ -6,7 +6,6 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from ghgs_lit.geometry.constants import constant
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.runtime.precision import exact
 
@@ -52,13 +51,15 @@ def nearest_by_products(
     Args:
         queries: points [n, 3]; finite.
         references: points [m, 3]; not empty, finite.
-        counts: which references are looked at first; None: all. Others are found where fewer than
-            four count, and should be copies of those.
+        counts: which references can be found; None: all. Without one, any is.
 
     Returns:
         Indices [n] of references.
     """
-    middle = references.mean(0)
+    if counts is None:
+        middle = references.mean(0)
+    else:
+        middle = torch.where(counts[:, None], references, 0).sum(0) / counts.sum().clamp(min=1)
     queries = queries - middle
     references = references - middle
     squares = references.square().sum(1)
@@ -71,6 +72,8 @@ def nearest_by_products(
             scores = torch.addmm(squares, block, references.mT, alpha=-2)
             candidates = scores.topk(count, largest=False, sorted=False).indices
             distances = (references[candidates] - block[:, None]).square().sum(-1)
+            if counts is not None:
+                distances = torch.where(counts[candidates], distances, torch.inf)
             index.append(candidates.gather(1, distances.argmin(1, keepdim=True))[:, 0])
     return torch.cat(index)
 
@@ -137,11 +140,7 @@ def chamfer_of_rows(
     points = at_least_float32(points)
     references = at_least_float32(references)
     number = counts.sum()
-    # All others are copies of the first that counts,
-    # so that a pair always has the gradient of its point.
-    place = constant(torch.arange, len(points), like=points, dtype=torch.long)
-    first = counts.to(torch.uint8).argmax()
-    points = torch.where(number > 0, points[torch.where(counts, place, first)], 0)
+    points = torch.where(counts[:, None], points, 0)
     finite = points.isfinite().all() & references.isfinite().all()
     known = points.detach().nan_to_num(0.0, 0.0, 0.0)
     surface = references.detach().nan_to_num(0.0, 0.0, 0.0)
