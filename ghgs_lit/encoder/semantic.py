@@ -24,13 +24,13 @@ class SemanticOptions(Options):
     """A branch of blocks over single views, whose features distinguish body parts."""
 
     group = "encoder.semantic"
-    width: Width
+    width: Width = 64
     """Channels of the blocks; a multiple of 4 * heads"""
-    depth: int = Field(ge=1, le=1024)
+    depth: int = Field(3, ge=1, le=1024)
     """Number of blocks"""
-    heads: Width
+    heads: Width = 2
     """Attention heads of each block"""
-    channels: Width
+    channels: Width = 24
     """Channels of the stem after its first convolution"""
 
     @model_validator(mode="after")
