@@ -379,7 +379,8 @@ class GHGS(nn.Module):
 
         encoder = stage("encoder", tokens=skip.tokens, margin=skip.margin)
         heads = {name: stage(name, dim_latent=encoder.dim_latent) for name in HEADS}
-        layers = getattr(read_node(config["encoder"], "encoder"), "layers", None)  # a plug-in's may not say
+        # a plug-in's may not say
+        layers = getattr(read_node(config["encoder"], "encoder"), "layers", None)
         modules = itertools.chain.from_iterable(head.modules() for head in heads.values())
         fused = any(isinstance(module, DPTHead) for module in modules)
         fits = layers is None or not fused or len(layers) == LEVELS

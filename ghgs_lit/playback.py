@@ -28,8 +28,8 @@ from ghgs_lit.types import Batch, DecodedPixels, Prediction
 Entered = tuple[Sequence[Surrounding], Batch, list[Finding], Measured]
 
 
-#: What all stages make of a batch as they see it, of its plan, and of what was found in smaller copies of
-#: the photographs (None: there are none).
+#: What all stages make of a batch as they see it, of its plan, and of what was found in smaller
+#: copies of the photographs (None: there are none).
 Predict = Callable[[Batch, Plan, Coarse | None], Prediction]
 
 
@@ -108,7 +108,8 @@ class Playback:
         described(batch, tensors)
         if not here or is_watched() or any(tensor.requires_grad for tensor in tensors):
             return enter(batch)
-        # Without what was computed of the cameras, or the same batch would be of another class the next time.
+        # Without what was computed of the cameras,
+        # or the same batch would be of another class the next time.
         cameras = dataclasses.replace(batch.cameras)
         bare = dataclasses.replace(batch, cameras=cameras, targets=None, subjects=(), views=())
         with torch.no_grad():

@@ -37,7 +37,8 @@ class OfPhotographs(Verb):
         return False
 
     def require_files(self) -> None:
-        """As of every verb; photographs that are read at once are then decoded beside the imports."""
+        """As of every verb; photographs that are read at once are then decoded beside
+        the imports."""
         super().require_files()
         if self.reads_at_once() and self.images is not None and self.cameras is not None:
             from ghgs_capture.verbs.photographs import begin_to_read

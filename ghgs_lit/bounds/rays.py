@@ -103,7 +103,8 @@ class Silhouettes:
 
 
 def cut_sides(masks: Bool[Tensor, "*batch h w"]) -> Bool[Tensor, "*batch 4"]:
-    """Whether masks touch the first and the last row, the first and the last column of their frames."""
+    """Whether masks touch the first and the last row,
+    the first and the last column of their frames."""
     sides = [_ends(masks, axis).any(-3 - axis) for axis in (-2, -1)]
     return torch.cat([side.expand(*side.shape[:-1], 2) for side in sides], -1)
 
@@ -194,8 +195,9 @@ def votes_outside(
 ) -> UInt8[Tensor, "B V h w"]:
     """1 where a voting view says "outside the subject".
 
-    Beyond a side of the frame that cuts the subject nothing was seen. Points there are looked up at the
-    nearest border pixel (:func:`look_up`), so that the border of such a side says "outside" nowhere.
+    Beyond a side of the frame that cuts the subject nothing was seen. Points there are looked up
+    at the nearest border pixel (:func:`look_up`), so that the border of such a side says
+    "outside" nowhere.
 
     Args:
         dilated: masks, grown because real ones are noisy.

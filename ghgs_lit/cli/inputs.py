@@ -50,7 +50,8 @@ def build_data(run: Run) -> "PhotographsDataModule":
     """
     # Every data set has cameras that can be targets; a verb without a target protocol reads none.
     targets = run.targets or CAMERAS
-    extra = {} if run.augmentation is None else {"augmentation": run.augmentation}  # of verbs that train
+    # of verbs that train
+    extra = {} if run.augmentation is None else {"augmentation": run.augmentation}
     return run.data.build(views=run.views, targets=targets, seed=run.seed, **extra)
 
 

@@ -145,7 +145,8 @@ class _Rehearsed:
             self.reasons[f"{place}: expected {expected}; found none"] = None
 
     def _check_files(self, data: "PhotographsDataModule", phase: str) -> None:
-        """Note the first file of a phase that is not there, and the first body that the loss lacks."""
+        """Note the first file of a phase that is not there,
+        and the first body that the loss lacks."""
         key = f"{config_hash(self.run.plain['data'], without=())} {phase}"
         if key in self.listed:
             return

@@ -265,7 +265,8 @@ def fit(
         data: of the training.
         resume: the checkpoint, if any.
         step: where it stands; None: a new run.
-        stats: receives ``steps``, those taken here, and ``seconds``, even if training is interrupted.
+        stats: receives ``steps``, those taken here, and ``seconds``,
+            even if training is interrupted.
 
     Raises:
         InputError: options of the Trainer do not fit the data.

@@ -1,7 +1,7 @@
 """A verb of ``ghgs`` is one class: its summary, an example, its keys, and what it does.
 
-The fields of a verb are the keys that ``conf/<verb>.yaml`` sets beside its groups, whose options are its
-attributes (:class:`ghgs_lit.config.run.Run`). All verbs come in by the door of
+The fields of a verb are the keys that ``conf/<verb>.yaml`` sets beside its groups, whose options
+are its attributes (:class:`ghgs_lit.config.run.Run`). All verbs come in by the door of
 :mod:`ghgs_lit.config.registry`, those of this distribution as those of a plug-in.
 """
 
@@ -22,7 +22,8 @@ Budgets = Annotated[tuple[Budget, ...], Field(min_length=1)]
 
 
 class Verb(Run):
-    """Base of all verbs; the first line of the docstring is the summary that ``ghgs --help`` prints."""
+    """Base of all verbs; the first line of the docstring is the summary that
+    ``ghgs --help`` prints."""
 
     example: ClassVar[str] = ""
     """A command, for ``ghgs --help``."""

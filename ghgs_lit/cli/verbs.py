@@ -148,7 +148,8 @@ class Table(Verb):
     by: Texts = ()
     """Configuration keys whose values get rows of their own, such as [optimizer.lr]."""
     subjects: Text = ".+"
-    """A regular expression: subjects whose whole names match are shown, such as a.* (people in action)."""
+    """A regular expression: subjects whose whole names match are shown,
+    such as a.* (people in action)."""
     others: Texts = ()
     """JSON files with results of other methods (docs/tables.md), for table1, table2 and table3."""
     reported: bool = True

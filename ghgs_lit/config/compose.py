@@ -178,7 +178,8 @@ def read_options(group: str, names: Sequence[str], run: Run, key: str) -> dict[s
     Args:
         group: name of the group, such as ``skip``.
         names: of the options.
-        run: the option that its node of the group names has these values instead of those of its file.
+        run: the option that its node of the group names has these values instead of
+            those of its file.
         key: begins the message of an error.
 
     Raises:

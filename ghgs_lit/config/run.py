@@ -32,11 +32,12 @@ def _is_of_verb(key: str) -> bool:
 
 
 class Run(Options):
-    """Keys of a verb as fields, options of each config group as attributes; None: it has no such group.
+    """Keys of a verb as fields, options of each config group as attributes;
+    None: it has no such group.
 
-    Types are those of the shipped kinds that verbs read; a kind of a user's own has these attributes, too. A
-    node that says no kind where its group has some, such as changes of a checkpoint's data, is part of
-    :attr:`plain` alone.
+    Types are those of the shipped kinds that verbs read; a kind of a user's own has these
+    attributes, too. A node that says no kind where its group has some, such as changes of a
+    checkpoint's data, is part of :attr:`plain` alone.
     """
 
     if TYPE_CHECKING:

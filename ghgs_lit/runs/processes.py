@@ -42,8 +42,8 @@ def _device_count(accelerator: str) -> int:
 
 
 def settle_rank(trainer: "TrainerOptions") -> int:
-    """Rank of this process among those of its training. What the environment says counts only where a
-    launcher has started several processes; elsewhere it is left over, and is forgotten.
+    """Rank of this process among those of its training. What the environment says counts only where
+    a launcher has started several processes; elsewhere it is left over, and is forgotten.
 
     Args:
         trainer: Its options.

@@ -235,8 +235,8 @@ class RunDirectory:
         return given
 
     def goes_on(self, run: "Training") -> bool:
-        """Whether the directory has the run that the same command began; only the length of a run that is not
-        complete, and what is measured after it, may differ.
+        """Whether the directory has the run that the same command began; only the length of a run
+        that is not complete, and what is measured after it, may differ.
 
         Args:
             run: Configuration of the command.
@@ -276,8 +276,8 @@ class RunDirectory:
         )
 
     def begin(self, run: "Training") -> "Training":
-        """Make the directory that of a run. Where there is no checkpoint to start from, what was written is
-        trained again, and deleted. Call it where the run is claimed.
+        """Make the directory that of a run. Where there is no checkpoint to start from, what was
+        written is trained again, and deleted. Call it where the run is claimed.
 
         Args:
             run: Its configuration.

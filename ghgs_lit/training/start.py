@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 
 def check_start(run: "Train", directory: Path) -> None:
-    """Refuse ``init_from`` together with ``resume``, unless the run resumes in its own directory: then its
-    configuration still has the ``init_from`` that it began with.
+    """Refuse ``init_from`` together with ``resume``, unless the run resumes in its own directory:
+    then its configuration still has the ``init_from`` that it began with.
 
     Args:
         run: as configured.
@@ -71,7 +71,8 @@ def check_resume(
 
 
 def _check_optimizer(path: str | Path, checkpoint: Mapping[str, Any], module: "BudgetedModule") -> None:
-    """Refuse to resume with Muon from AdamW's state, the reverse, or with other parameter groups."""
+    """Refuse to resume with Muon from AdamW's state, the reverse,
+    or with other parameter groups."""
     states = checkpoint["optimizer_states"]
     stored = itertools.chain.from_iterable(state["param_groups"] for state in states)
     by_muon = any("orthogonal" in group for group in stored)
@@ -144,8 +145,8 @@ def with_origin(run: "Train", model: nn.Module) -> "Train":
         model: of the run.
 
     Returns:
-        The run with ``encoder.weights`` from the checkpoint that it starts from, if it has one and all these
-        weights fit; else ``run``."""
+        The run with ``encoder.weights`` from the checkpoint that it starts from, if it has one and
+        all these weights fit; else ``run``."""
     path = run.resume or run.init_from
     if path is None:
         return run

@@ -161,7 +161,8 @@ def test_a_strange_size_of_rounds_takes_no_memory(tmp_path):
 
 
 def test_targets_on_the_command_line_are_measured_alone(composed):
-    """``targets=midway`` is the switch that its name says; evaluation.targets is for several protocols."""
+    """``targets=midway`` is the switch that its name says;
+    evaluation.targets is for several protocols."""
     found = inputs.with_chosen_targets(composed("evaluate", "targets=midway"))
     assert found.evaluation.targets == ("midway",)
     for said in ([], ["targets.per_subject=2"], ["targets=ghg", "evaluation.targets=[release,midway]"]):

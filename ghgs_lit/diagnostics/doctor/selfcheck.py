@@ -103,7 +103,8 @@ def compared(check: str, found: Tensor, expected: Tensor, limit: float) -> Outco
 
 
 def renderer(run: Run, device: torch.device) -> Iterator[Outcome]:
-    """Check images and gradients of splats: random, antialiased, and around the renderer's thresholds.
+    """Check images and gradients of splats: random, antialiased,
+    and around the renderer's thresholds.
 
     Args:
         run: as of ``ghgs train``; names the renderer's backend.
