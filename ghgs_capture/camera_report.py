@@ -9,7 +9,7 @@ import numpy as np
 
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.hypotheses import Hypothesis, StoredView, for_all, for_some, gradient_of, outline_of
-from ghgs_capture.photographs import Pixels
+from ghgs_capture.photographs import Pixels, fits_stored
 from ghgs_capture.placement import copies, placement_lines
 from ghgs_lit.data.mask_checks import twins
 from ghgs_lit.data.view import area_image, area_mask
@@ -113,7 +113,8 @@ def small_views(folder: CaptureFolder, instant: str) -> tuple[StoredView, ...]:
         scale = min(_SIDE / max(height, width), 1)
         size = max(round(height * scale), 1), max(round(width * scale), 1)
         # Without a stored size the intrinsics are for the whole photograph.
-        camera = camera.sized(pixels.stored_size if folder.keeps_stored(camera, pixels) else pixels.size)
+        keeps_stored = fits_stored(pixels, camera, folder.calibration.exif)
+        camera = camera.sized(pixels.stored_size if keeps_stored else pixels.size)
         small = Pixels(area_image(np.ascontiguousarray(pixels.image), *size), None, pixels.turns)
         mask = area_mask(np.ascontiguousarray(matte > 127), *size)
         views.append(StoredView(name, camera, small, mask, folder.convention))

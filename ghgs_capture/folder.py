@@ -229,15 +229,6 @@ class CaptureFolder:
             raise InputError(f"{path}: {problem}")
         return camera, pixels, matte
 
-    def keeps_stored(self, camera: StoredCamera, pixels: Pixels) -> bool:
-        """Whether a camera was calibrated with the photograph as stored, not as shown.
-
-        Args:
-            camera: of the photograph, as its file stores it.
-            pixels: the decoded photograph.
-        """
-        return fits_stored(pixels, camera, self.calibration.exif)
-
     def photograph(
         self, name: str, camera: StoredCamera, pixels: Pixels, matte: np.ndarray, convention: Convention
     ) -> Photograph:
@@ -259,7 +250,7 @@ class CaptureFolder:
         """
         image = pixels.image
         turns = 0
-        if self.keeps_stored(camera, pixels):
+        if fits_stored(pixels, camera, self.calibration.exif):
             turns = pixels.turns
             image = np.rot90(image, -turns)
             matte = np.rot90(matte, -turns)

@@ -363,15 +363,15 @@ class RunDirectory:
         if self._has(resumed):
             resumed = str(resolved(resumed).relative_to(self.path))
         process = {"host": socket.gethostname(), "pid": os.getpid(), "launch": launch()}
-        self._log({"started": _now(), **process, "resumed": resumed})
+        self._log("started", **process, resumed=resumed)
         stats: dict[str, Any] = {}
         try:
             yield stats
         except BaseException as error:
             outcome = "failed" if isinstance(error, Exception) else "interrupted"
-            self._log({"ended": _now(), "outcome": outcome, "error": str(error), **stats})
+            self._log("ended", outcome=outcome, error=str(error), **stats)
             raise
-        self._log({"ended": _now(), "outcome": "done", **stats})
+        self._log("ended", outcome="done", **stats)
 
     def session_beside(self) -> dict[str, Any] | None:
         """The present session of the first of the processes that were started together with this
@@ -382,12 +382,9 @@ class RunDirectory:
         resumed = last["resumed"]
         return {**last, "resumed": resumed and str(self.path / resumed)}
 
-    def _log(self, entry: dict[str, Any]) -> None:
-        append_line(self.path / SESSIONS, json.dumps(entry))
-
-
-def _now() -> str:
-    return datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
+    def _log(self, moment: str, **facts: Any) -> None:
+        now = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
+        append_line(self.path / SESSIONS, json.dumps({moment: now, **facts}))
 
 
 def _owner_of(curves: Path) -> str | None:
