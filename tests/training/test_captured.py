@@ -17,12 +17,13 @@ from ghgs_lit.rendering.api import Renderer
 from ghgs_lit.runtime.recording import Recorder
 from ghgs_lit.runtime.watching import is_watched
 from ghgs_lit.training import GHGSModule, Optimization, captured
+from ghgs_lit.training.averaging import Averaging
 from ghgs_lit.training.captured import is_recordable, played
 from ghgs_lit.training.cost import Costs
 from tests.helpers.losses import losses_of
 from tests.helpers.models import make_model
 from tests.helpers.pretend_device import DEVICE, pretend_device
-from tests.helpers.tape import OperatorTape
+from tests.helpers.tape import OperatorTape, SilentTape
 from tests.test_device import PretendAccelerator
 
 LOSSES = losses_of({"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 0.0, "depth": 0.2})
@@ -158,6 +159,45 @@ def test_a_training_comes_to_the_same_weights(tmp_path):
     assert (none, played_back) == (0, 6)
     for name in wanted:
         torch.testing.assert_close(found[name], wanted[name], rtol=1e-4, atol=1e-5, msg=name)
+
+
+class Asked(L.Callback):
+    """Launches and waits of each step of a training, the optimizer, the average and logging included."""
+
+    def __init__(self, log):
+        self.asked, self.found = log, []
+
+    def on_train_batch_start(self, *_):
+        self.asked.clear()
+
+    def on_train_batch_end(self, *_):
+        self.found.append((self.asked.launches, self.asked.waits.total()))
+
+
+def test_a_step_of_a_training_asks_for_little(there, tmp_path, monkeypatch):
+    """In Lightning's loop: waits for the plan, for the room of renderings, and for the guard."""
+    model, asked = recording("model=hull"), Asked(there)
+    model.playback = Playback(*(Recorder(tape=SilentTape()) for _ in range(2)))
+    module = GHGSModule(model, Renderer(), LOSSES, Optimization(lr=1e-2, matrix_scale=1.0))
+    configured = module.configure_optimizers
+
+    def recording_too():
+        answer = configured()
+        answer["optimizer"].recorder = Recorder(tape=SilentTape())
+        return answer
+
+    monkeypatch.setattr(module, "configure_optimizers", recording_too)
+    batches = [scene(color=1 - number / 20).to("cpu") for number in range(5)]
+    trainer = L.Trainer(
+        strategy=SingleDeviceStrategy(DEVICE, PretendAccelerator()), max_steps=5,
+        callbacks=[Averaging(0.999), asked], limit_val_batches=0, default_root_dir=tmp_path, logger=False,
+        enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
+    )  # fmt: skip
+    trainer.fit(module, DataLoader(batches, batch_size=None, collate_fn=lambda batch: batch))
+    launches, waits = asked.found[-1]
+    print(launches, waits)
+    assert waits <= 3
+    assert launches <= 80 < asked.found[0][0]
 
 
 def test_rounds_are_drawn_once_and_are_a_class_each():
