@@ -226,8 +226,14 @@ class CaptureFolder:
         matte = self._matte(name, camera, path, pixels)
         problem = implausible(matte > 127)
         if problem is not None:
-            raise InputError(f"{path}: {problem}")
+            mask = self._mask(path) if self.backgrounds is None else None
+            raise InputError(f"{mask or path}: {problem}")
         return camera, pixels, matte
+
+    def _mask(self, path: Source) -> Source | None:
+        """The file of a photograph's mask, in its own folder or beside it; None: there is none."""
+        masks = self.images if self.masks is None else self.masks
+        return mask_path(path, self.images, masks) if isinstance(path, Path) else path.mask
 
     def photograph(
         self, name: str, camera: StoredCamera, pixels: Pixels, matte: np.ndarray, convention: Convention
@@ -286,8 +292,7 @@ class CaptureFolder:
             InputError: there is no source, or the one that the user named has no file for this
                 photograph, or a wrong one.
         """
-        masks = self.images if self.masks is None else self.masks
-        mask = mask_path(path, self.images, masks) if isinstance(path, Path) else path.mask
+        mask = self._mask(path)
         if self.masks is not None:
             require(mask is not None, f"{self.masks}", f"a mask of {path}", "none")
         elif self.backgrounds is not None:

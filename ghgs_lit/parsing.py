@@ -56,7 +56,8 @@ def require_folder(folder: Path, expected: str = "the folder of the data set") -
         InputError: names the path.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: expected {expected}; found no such folder")
+        found = "a file" if folder.exists() else "no such folder"
+        raise InputError(f"{folder}: expected {expected}; found {found}")
 
 
 def composed(name: str) -> str:

@@ -126,8 +126,8 @@ class Verb:
 def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
     """Rewrite arguments for Hydra.
 
-    ``data.*`` keys are forced where the data comes from a checkpoint, and ``sweep=<file>`` sets
-    the mode, which Hydra 1.4 needs before it composes.
+    Keys of ``data`` and ``rounds`` are forced where these come from a checkpoint, and
+    ``sweep=<file>`` sets the mode, which Hydra 1.4 needs before it composes.
 
     Args:
         verb: name of the verb.
@@ -136,10 +136,11 @@ def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
     sweeps = any(re.match("sweep=(?!null)", argument) for argument in arguments)
     if sweeps and not any(argument.startswith("hydra.mode=") for argument in arguments):
         return [*arguments, "hydra.mode=MULTIRUN"]
+    if not verb_class(verb).has_trained_data:
+        return arguments
     has_data = any(argument.startswith("data=") for argument in arguments)
-    if verb_class(verb).has_trained_data and not has_data:
-        return [re.sub(r"^data\.", "++data.", argument) for argument in arguments]
-    return arguments
+    forced = r"^(?=rounds\.)" if has_data else r"^(?=(data|rounds)\.)"
+    return [re.sub(forced, "++", argument) for argument in arguments]
 
 
 def _help(verb: str, words: list[str], folder: str | None) -> int:

@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from ghgs_lit.cli.verb import Measured
 from ghgs_lit.config.defaults import fill
 from ghgs_lit.config.keys import ablation_of, flatten, is_below, lookup
+from ghgs_lit.config.registry import read_node
 from ghgs_lit.config.run import Run
 from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.errors import InputError, require
@@ -170,6 +171,8 @@ def model_of(checkpoint: str, run: Run) -> dict[str, Any]:
         require(isinstance(node, Mapping), place, "a stage of the model", node)
     before = {node: trained[node] for node in (*MODEL_NODES, "chosen") if node in trained}
     after = OmegaConf.create(before)
+    if any(is_below(key, ("rounds",)) for key in given_keys()):
+        _check_rounds(checkpoint, before.get("rounds"), run.plain["rounds"])
     for key in given_keys():
         if key == "ablation":
             _require_ablation(trained)
@@ -182,6 +185,23 @@ def model_of(checkpoint: str, run: Run) -> dict[str, Any]:
             _require_same(before, key, value)
     # Of the weights' own training, which may have seen smaller photographs than this one.
     return with_known_height(OmegaConf.to_container(after, resolve=True), trained)
+
+
+def _check_rounds(checkpoint: str, trained: Any, given: Mapping[str, Any]) -> None:
+    """Refuse keys of rounds that a checkpoint's model does not have: Hydra composes none to compare with.
+
+    Args:
+        checkpoint: path of the file, or ``shipped``.
+        trained: its node ``rounds``; None where its model has none.
+        given: keys of the command line with their values.
+
+    Raises:
+        InputError: names the key.
+    """
+    if not isinstance(trained, Mapping):
+        expected = f"no key of rounds, as the model of {checkpoint} has none (model=recurrent has)"
+        raise InputError(f"rounds.{next(iter(given))}: expected {expected}; found one")
+    read_node({**trained, **given}, "rounds")
 
 
 def _require_same(trained: Mapping[str, Any], key: str, value: Any) -> None:

@@ -1,12 +1,13 @@
 """One-line error messages: ``<path or key>: expected ...; found ...``."""
 
 import argparse
+import difflib
 import os
 import re
 import shlex
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from hydra._internal.utils import get_args_parser
@@ -20,7 +21,7 @@ from ghgs_lit.config import compose, conf_dir
 from ghgs_lit.config.compose import plain
 from ghgs_lit.config.keys import flatten, is_below
 from ghgs_lit.config.options import UnknownKey, did_you_mean
-from ghgs_lit.config.registry import verb_class, verbs
+from ghgs_lit.config.registry import KINDS, verb_class, verbs
 from ghgs_lit.errors import InputError
 
 #: Errors that are bad input, not bugs.
@@ -120,6 +121,9 @@ def _unknown_key(key: str, verb: str) -> str:
 def _hint(verb: str, key: str) -> str:
     """What the user may have meant by a key that does not exist, after trying it.
 
+    A word is compared with words, never with a whole dotted key, whose group would make all keys
+    of it alike. A group of another name is mended first: ``rouns.height`` is looked for in ``rounds``.
+
     Args:
         verb: name of the verb.
         key: a dotted key or group that it does not have.
@@ -131,19 +135,54 @@ def _hint(verb: str, key: str) -> str:
     folders = {str(path.relative_to(conf_dir())) for path in conf_dir().rglob("*") if path.is_dir()}
     chosen = [text for text in overrides if text.partition("=")[0] in folders and "," not in text]
     keys = _keys(verb, chosen) or _keys(verb)
-    group = key.partition(".")[0]
     if any(key in verb_class(name).model_fields for name in verbs()):
         return ""  # a key of another verb
-    for of in (group, "model") if "." in key else ():  # a model chooses groups of its own
-        options = [path.stem for path in sorted((conf_dir() / of).glob("*.yaml"))]
-        if holding := [name for name in options if key in _keys(verb, [*chosen, f"{of}={name}"])]:
-            return f" ({of}={' or '.join(holding)} has it)"
-    # A key without its group is close, too: lr for optimizer.lr.
-    whole = {known.rpartition(".")[2]: known for known in keys}.get(key)
-    of_group = [known for known in keys if known.startswith(f"{group}.")]
-    meant = f" (did you mean {whole}?)" if whole else did_you_mean(key, of_group or (*keys, *folders))
-    added = next((f"+{text}" for text in overrides if text.partition("=")[0] == key), "")
-    return f"{meant}; +{key}=... adds it" if _can_add(verb, chosen, key, added) else meant
+    names = {name: name for name in (*folders, *KINDS, *(known.partition(".")[0] for known in keys))}
+    group, dot, rest = key.partition(".")
+    holders: dict[str, str] = {}
+    if not dot:  # a key without its group is close, too: lr for optimizer.lr
+        leaves = {known.rpartition(".")[2]: known for known in keys if "." in known}
+        meant = leaves.get(key) or _closest(key, leaves | names)
+    else:
+        group = group if group in names else _closest(group, names) or group
+        holders = _holders(verb, chosen, group)
+        known_as = {known.removeprefix(f"{group}."): known for known in (*holders, *keys)}
+        meant = known_as.get(rest) or _closest(rest, known_as)
+    texts = [f"did you mean {meant}?" if meant not in (None, key) else ""]
+    texts += [holders[meant] if meant in holders and meant not in keys else ""]
+    text = " ".join(filter(None, texts))
+    text = f" ({text})" if text else ""
+    added = next((f"+{word}" for word in overrides if word.partition("=")[0] == key), "")
+    return f"{text}; +{key}=... adds it" if _can_add(verb, chosen, key, added) else text
+
+
+def _closest(word: str, known_as: Mapping[str, str]) -> str | None:
+    """What the closest of some words stands for; None: none is close."""
+    close = difflib.get_close_matches(word, known_as, 1)
+    return known_as[close[0]] if close else None
+
+
+def _holders(verb: str, chosen: Sequence[str], group: str) -> dict[str, str]:
+    """Keys of a group under any of its options, and under any model, which chooses groups of its own.
+
+    Args:
+        verb: name of the verb.
+        chosen: overrides that choose options of groups.
+        group: whose keys are wanted.
+
+    Returns:
+        For each dotted key who has it, such as ``model=recurrent has it``.
+    """
+    holders: dict[str, str] = {}
+    for of in (group, "model"):
+        options: dict[str, list[str]] = {}
+        for path in sorted((conf_dir() / of).glob("*.yaml")):
+            for known in _keys(verb, [*chosen, f"{of}={path.stem}"]):
+                if known.startswith(f"{group}."):
+                    options.setdefault(known, []).append(path.stem)
+        for known, names in options.items():
+            holders.setdefault(known, f"{of}={' or '.join(names)} has it")
+    return holders
 
 
 def _keys(verb: str, overrides: Sequence[str] = ()) -> list[str]:
@@ -181,6 +220,8 @@ def _system(error: OSError) -> str:
     path = error.filename2 or error.filename
     if path is None:
         path = HydraConfig.get().runtime.output_dir if HydraConfig.initialized() else Path.cwd()
+    if isinstance(error, FileExistsError | NotADirectoryError):
+        return f"{os.fsdecode(path)}: expected a path below folders; found a file in its place or above it"
     reason = error.strerror or error
     return f"{os.fsdecode(path)}: expected a file that can be read or written; found {reason}"
 

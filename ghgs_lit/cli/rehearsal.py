@@ -1,10 +1,13 @@
 """What ``dry_run`` tries of the runs of a sweep: everything that they need,
 and the time of one step."""
 
+import logging
+import re
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +27,7 @@ from ghgs_lit.weights.checkpoint import read_checkpoint
 if TYPE_CHECKING:
     from ghgs_lit.cli.verbs import Train
     from ghgs_lit.data.datamodule import PhotographsDataModule
+    from ghgs_lit.data.reader import Reader
 
 _STEPS = 3  #: Steps that are taken for the time of the last one
 
@@ -48,7 +52,8 @@ class _Rehearsed:
         run: as configured.
         reasons: why runs would be refused, as keys in order of appearance.
         notes: what else they should know, likewise.
-        listed: data and phases whose files were looked for, which several configurations share.
+        listed: data and phases whose files were looked for, which several configurations share,
+            and whether they are complete.
     """
 
     def __init__(
@@ -56,7 +61,7 @@ class _Rehearsed:
         run: "Train",
         reasons: dict[str, None],
         notes: dict[str, None],
-        listed: set[str],
+        listed: dict[str, bool],
     ) -> None:
         self.run = run
         self.reasons = reasons
@@ -122,47 +127,64 @@ class _Rehearsed:
             self.notes[f"data={data.dataset.name}: people are rendered before the first step"] = None
             return False
         before = len(self.reasons)
-        batch = self.attempt(data.training_batch, 0)
-        self.attempt(check_evaluation, self.run, data)
-        if batch is not None and batch.body_vertices is None:
-            self._lacks_body(data, batch.subjects[0])
+        phases = [name for name in dict.fromkeys(("train", split)) if name in data.dataset.split_names]
+        are_there = [self.attempt(self._check_files, data, phase) for phase in phases]
+        if all(are_there):  # now what is in the files
+            batch = self.attempt(data.training_batch, 0)
+            self.attempt(check_evaluation, self.run, data)
+            if self._chamfer and batch is not None and batch.body_vertices is None:
+                self.reasons[self._lacks_body(data.builder("train").inputs.reader, batch.subjects[0])] = None
         if model is not None and self.run.feature_cache is not None:
             needed = self.attempt(self.run.feature_cache.needs, model, data)
             if needed is not None:
                 self.notes[needed] = None
-        if len(self.reasons) == before:  # what was read is there: now the files of everybody
-            for phase in dict.fromkeys(("train", split)):
-                self.attempt(self._check_files, data, phase)
-        return len(self.reasons) == before
+        return all(are_there) and len(self.reasons) == before
 
-    def _lacks_body(self, data: "PhotographsDataModule", name: str) -> None:
-        """Note that a subject of the training has no body, if the loss needs bodies."""
+    @property
+    def _chamfer(self) -> float | None:
+        """Weight of the loss that needs bodies; None or 0: none are needed."""
         weights = getattr(self.run.loss, "weights", None)  # a plug-in's may have none
-        weight = getattr(weights, "chamfer", None)
-        if weight:
-            place = data.builder("train").inputs.reader.body_place(name)
-            expected = f"body vertices for loss.weights.chamfer={weight} (0 does without)"
-            self.reasons[f"{place}: expected {expected}; found none"] = None
+        return getattr(weights, "chamfer", None)
 
-    def _check_files(self, data: "PhotographsDataModule", phase: str) -> None:
-        """Note the first file of a phase that is not there,
-        and the first body that the loss lacks."""
+    def _lacks_body(self, reader: "Reader", name: str) -> str:
+        """What says that a subject of the training has no body, which the loss needs."""
+        expected = f"body vertices for loss.weights.chamfer={self._chamfer} (0 does without)"
+        return f"{reader.body_place(name)}: expected {expected}; found none"
+
+    def _check_files(self, data: "PhotographsDataModule", phase: str) -> bool:
+        """Note what a phase lacks, one line for files that differ in numbers alone:
+        what the reader says, files that are not there, bodies that the loss needs.
+
+        Args:
+            data: as configured.
+            phase: name of a split.
+
+        Returns:
+            Whether nothing is missing; of data that were looked at before, as it was then.
+        """
         key = f"{config_hash(self.run.plain['data'], without=())} {phase}"
         if key in self.listed:
-            return
-        self.listed.add(key)
-        reader = data.builder(phase).inputs.reader
-        missing: list[Path] = []
-        bodies: list[str] = []
+            return self.listed[key]
+        self.listed[key] = False
+        reader = data.dataset.reader(phase, strict=False)
+
+        def files_of(name: str) -> list[Path]:
+            return list(reader.files(name))
+
+        known = len(self.reasons)
+        lines = list(reader.problems)
+        needs_bodies = phase == "train" and self._chamfer
         for name in reader.subjects:
-            missing += [path for path in reader.files(name) if not path.exists()]
             body = reader.body_place(name)
-            bodies += [name] * (isinstance(body, Path) and not body.exists())
-        if missing:
-            more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
-            self.reasons[f"{missing[0]}: expected a file of the data set; found none{more}"] = None
-        if bodies and phase == "train":
-            self._lacks_body(data, bodies[0])
+            lacks_body = needs_bodies and isinstance(body, Path) and not body.exists()
+            for path in self.attempt(files_of, name) or ():
+                if not path.exists() and not (lacks_body and path == body):
+                    lines.append(f"{path}: expected a file of the data set; found none")
+            if lacks_body:
+                lines.append(self._lacks_body(reader, name))
+        self.reasons |= dict.fromkeys(summarized(lines))
+        self.listed[key] = not lines and len(self.reasons) == known
+        return self.listed[key]
 
     def step_seconds(self, data: "PhotographsDataModule", folder: Path) -> float | None:
         """Time of a training step of one process, which reads its own photographs.
@@ -186,6 +208,42 @@ class _Rehearsed:
         return clock.seconds or None
 
 
+def summarized(lines: Iterable[str]) -> list[str]:
+    """The first of lines that differ in numbers alone, with how many more there are.
+
+    Args:
+        lines: such as ``img/0001.png: expected a file; found none``.
+    """
+    alike: dict[str, list[str]] = {}
+    for line in lines:
+        alike.setdefault(re.sub(r"\d+", "#", line), []).append(line)
+    return [
+        first if not others else f"{first} (and {len(others)} more like it)"
+        for first, *others in alike.values()
+    ]
+
+
+@contextmanager
+def _warnings_as(notes: dict[str, None]) -> Iterator[None]:
+    """Add what readers log to notes; it would stand between the lines of the plan.
+
+    Args:
+        notes: get the warnings of the block, as keys.
+    """
+    heard: list[str] = []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: heard.append(record.getMessage())
+    logger = logging.getLogger("ghgs_lit.data")
+    logger.addHandler(handler)
+    logger.propagate = False
+    try:
+        yield
+    finally:
+        logger.propagate = True
+        logger.removeHandler(handler)
+        notes |= dict.fromkeys(summarized(dict.fromkeys(heard)))
+
+
 def _is_rendered(data: "PhotographsDataModule", splits: Iterable[str]) -> bool:
     """Whether all these splits have subjects that can be read."""
     try:
@@ -207,11 +265,11 @@ def rehearse(runs: Sequence["Train"]) -> Rehearsal:
     """
     reasons: dict[str, None] = {}
     notes: dict[str, None] = {}
-    listed: set[str] = set()
+    listed: dict[str, bool] = {}
     tried = set()
     seconds = None
     quiet()
-    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(), _warnings_as(notes):
         warnings.simplefilter("ignore")
         for given in runs:
             run = given.changed(data={"workers": 0})
@@ -223,4 +281,4 @@ def rehearse(runs: Sequence["Train"]) -> Rehearsal:
             if not tried and data is not None and not reasons:
                 seconds = rehearsed.step_seconds(data, Path(folder))
             tried.add(key)
-    return Rehearsal(list(reasons), list(notes), seconds)
+    return Rehearsal(summarized(reasons), list(notes), seconds)

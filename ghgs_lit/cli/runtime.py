@@ -31,8 +31,9 @@ def write_config(run: Run, directory: Path) -> None:
     is_free = not path.is_file() or path.read_text(errors="replace").startswith(HEADER)
     require(is_free, str(path), "no file, or the configuration of an earlier run", "another file")
     write_text_atomically(path, saved_text(run.plain))
-    overrides = " ".join(HydraConfig.get().overrides.task) if HydraConfig.initialized() else ""
-    print(f"config: {path} ({overrides or 'no overrides'})", flush=True)
+    overrides = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
+    words = " ".join(text.removeprefix("++") for text in overrides)  # which the command line forces
+    print(f"config: {path} ({words or 'no overrides'})", flush=True)
 
 
 def files_to_write(options: Verb, keys: Sequence[str], read: Sequence[str | Path] = ()) -> dict[str, Path]:

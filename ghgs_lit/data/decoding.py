@@ -137,7 +137,8 @@ def check_array(place: Path | str, array: Any, shapes: Shapes) -> np.ndarray:
             raise TypeError(f"numbers of type {array.dtype}")
         array = array.astype(np.float64)
     except (ValueError, TypeError, OverflowError) as error:
-        raise InputError(f"{place}: expected an array {_describe(shapes)}; found {error}") from error
+        found = "text" if getattr(array, "dtype", None) is not None and array.dtype.kind in "SU" else error
+        raise InputError(f"{place}: expected an array {_describe(shapes)}; found {found}") from error
     fits = False
     for shape in shapes:
         pairs = zip(shape, array.shape, strict=False)

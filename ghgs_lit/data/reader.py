@@ -168,10 +168,11 @@ class FrameReader(Reader):
             example: name that the message shows where none of them exists, which is a problem.
         """
         there = [name for name in names if (folder / name).is_dir()]
-        if len(there) < len(names):
+        if 0 < len(there) < len(names):
             log.warning("%s: %d of %d sequences are there", folder, len(there), len(names))
         if not there:
-            self.problem(f"{folder}: expected sequences such as {example}; found none of the split")
+            some = "such as" if names else "beside those of val, such as"
+            self.problem(f"{folder}: expected sequences {some} {example}; found none of the split")
         return there
 
 

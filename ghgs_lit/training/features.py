@@ -60,12 +60,14 @@ class DiskFeatureCache(Options):
             data: as of :meth:`attach`.
 
         Raises:
-            InputError: the encoder has no frozen ViT.
+            InputError: the encoder has no frozen ViT, the folder cannot be written,
+                or the disk has no room.
         """
         vit = _frozen_vit(model)
         if data.augmentation.changes_photographs:
             return "feature_cache: off, since augmentation makes a new photograph in each step"
         count, size = _amount(vit, data)
+        self._require_room(size, "*")
         return f"feature_cache: {self._root}: tokens of {count} photographs of training, {size / 1e9:.3g} GB"
 
     def attach(self, model: nn.Module, data: PhotographsDataModule) -> None:
@@ -84,16 +86,36 @@ class DiskFeatureCache(Options):
             return _say(text)
         heads = vit.blocks[0].attn.heads
         network = digest_of({**vit.state_dict(), f"heads {heads}": torch.zeros(0)})[:16]
+        there = self._require_room(_amount(vit, data)[1], network)
+        _say(f"{text}, of which {there / 1e9:.3g} GB are there")
+        vit.cache = FeatureCache(self._root, network, _DTYPES[self.dtype])
+
+    def _require_room(self, size: int, network: str) -> int:
+        """Refuse a folder that cannot be written, or whose disk has no room for the tokens.
+
+        Args:
+            size: bytes of all tokens.
+            network: name of the network whose tokens count as written; ``*``: any.
+
+        Returns:
+            Bytes of the tokens that are there.
+
+        Raises:
+            InputError: names the folder.
+        """
+        key = f"feature_cache.folder: {self._root}"
+        folders = (self._root.absolute(), *self._root.absolute().parents)
+        place = next(folder for folder in folders if folder.exists())
+        can_write = place.is_dir() and os.access(place, os.W_OK)
+        if not can_write:
+            raise InputError(f"{key}: expected a folder that can be written; found {place}, which cannot")
         files = self._root.glob(f"{network}-*-{self.dtype}/*/*.npy")
         there = sum(path.stat().st_size for path in files)
-        _say(f"{text}, of which {there / 1e9:.3g} GB are there")
-        self._root.mkdir(parents=True, exist_ok=True)
-        free = shutil.disk_usage(self._root).free
-        lacking = _amount(vit, data)[1] - there
-        if free < lacking:
-            room = f"expected {lacking / 1e9:.3g} GB of room for tokens; found {free / 1e9:.3g}"
-            raise InputError(f"feature_cache.folder: {self._root}: {room}")
-        vit.cache = FeatureCache(self._root, network, _DTYPES[self.dtype])
+        free = shutil.disk_usage(place).free
+        if free < size - there:
+            room = f"expected {(size - there) / 1e9:.3g} GB of room for tokens; found {free / 1e9:.3g}"
+            raise InputError(f"{key}: {room}")
+        return there
 
 
 def _frozen_vit(model: nn.Module) -> VisionTransformer:

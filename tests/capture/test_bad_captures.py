@@ -123,10 +123,10 @@ BAD = {
     ),
     "inverted mask": (
         lambda p: image(p, "cam1_mask", ~Figure().masks[1]),
-        "cam1.png",
+        "cam1_mask.png: expected",
         "not of the background",
     ),
-    "empty mask": (lambda p: image(p, "cam1_mask", WIDE[:, :96, 0]), "cam1.png", "found 0 pixels"),
+    "empty mask": (lambda p: image(p, "cam1_mask", WIDE[:, :96, 0]), "cam1_mask.png: exp", "0 pixels"),
     "no calibration": (
         lambda p: {"cameras": p / "none.json"},
         "none.json: expected a file or folder",

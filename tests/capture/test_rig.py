@@ -213,7 +213,7 @@ def test_gains_of_some_cameras_alone_are_not_used(tmp_path):
     [
         ([1.0, 1.0], "expected an array 3; found 2"),
         (0.9, "expected an array 3; found "),
-        ([1.0, 1.0, "red"], "expected an array 3; found could not convert"),
+        ([1.0, 1.0, "red"], "expected an array 3; found text"),
         ([1.0, 1.0, float("nan")], "expected finite numbers"),
         ([1.0, 0.0, 1.0], "expected numbers from 0.5 to 2; found"),
         ([1.0, 2.1, 1.0], "expected numbers from 0.5 to 2; found"),

@@ -31,6 +31,10 @@ USAGE = [
 MISSPELT = [
     ("train experiment=demo ~evaluation.views", 1, "evaluation.views: expected a value", "~evaluation.views"),
     ("train optimizer.lrr=1", 1, "optimizer.lrr: expected a key", "did you mean optimizer.lr?"),
+    ("train rouns=null", 1, "rouns: expected a key", "(did you mean rounds?)"),
+    ("train rouns.height=null", 1, "(did you mean rounds.height? model=recurrent has it)\n"),
+    ("train data.rot=x", 1, "(did you mean data.root? data=humman or scans or"),
+    ("train optimizer.learning_rate=1", 1, "found none of that name\n"),
     ("train lr=1e-3", 1, "lr: expected a key", "did you mean optimizer.lr?"),
     (
         "train experiment=demo callbacks=none callbacks.pictures.subjects=4",
@@ -180,11 +184,21 @@ FOREIGN = [
 ]
 
 SYSTEM = [
-    ("train hydra.run.dir=/dev/null/run", 1, "/dev/null/run", "expected a file", "Not a directory"),
-    ("train hydra.run.dir={text}/run", 1, "{text}/run: expected", "Not a directory"),
-    ("export checkpoint={ckpt} vggt=/dev/null/x.pt", 1, "/dev/null/x.pt: expected a file", "Not a directory"),
+    ("train hydra.run.dir=/dev/null/run", 1, "/dev/null/run: expected a path below folders", "found a file"),
+    ("train hydra.run.dir={text}/run", 1, "{text}/run: expected", "found a file in its place or above it"),
+    (
+        "export checkpoint={ckpt} vggt=/dev/null/x.pt",
+        1,
+        "/dev/null/x.pt: expected a path below folders",
+        "found a file",
+    ),
     ("export checkpoint={ckpt} vggt={empty}", 1, "{empty}: expected", "a directory"),
-    ("train -m seed=1,2 hydra.sweep.dir=/dev/null/s", 1, "/dev/null/s/", "Not a directory"),
+    (
+        "train -m seed=1,2 hydra.sweep.dir=/dev/null/s",
+        1,
+        "/dev/null/s/",
+        "found a file in its place or above it",
+    ),
 ]
 
 # Values without end would run until somebody kills them, or take all memory.

@@ -72,8 +72,8 @@ def test_what_is_said_of_the_model_acts_on_a_checkpoint(composed, checkpoint, ve
     ("verb", "said", "height"),
     [
         ("predict", [], 34),
-        ("predict", ["+rounds.height=null"], None),
-        ("evaluate", ["+rounds.height=60"], 60),
+        ("predict", ["rounds.height=null"], None),
+        ("evaluate", ["rounds.height=60", "data=scans"], 60),
         ("adapt", ["data.size=518"], 34),
     ],
 )
@@ -83,6 +83,26 @@ def test_weights_know_the_height_of_their_own_training(composed, tmp_path, verb,
     write_checkpoint(path, {}, {**config("model=recurrent"), "data": {"size": 42}})
     run = composed(verb, f"checkpoint={path}", *said)
     assert inputs.model_of(path, run)["rounds"]["height"] == height
+
+
+@pytest.mark.parametrize(
+    ("model", "said", "refused"),
+    [
+        ("recurrent", "rounds.heigt=null", r"rounds key: .* found 'heigt' \(did you mean height\?\)"),
+        ("recurrent", "rounds.height=-3", r"rounds\.height: expected .*; found -3"),
+        (
+            "hull",
+            "rounds.height=9",
+            r"rounds\.height: expected no key of rounds, as the model of",
+        ),
+    ],
+)
+def test_a_key_that_the_rounds_of_a_checkpoint_lack_is_refused(composed, tmp_path, model, said, refused):
+    """Null was taken for the value of a key that is not there, and acted on nothing."""
+    path = str(tmp_path / "trained.ckpt")
+    write_checkpoint(path, {}, config(f"model={model}"))
+    with pytest.raises(InputError, match=refused):
+        inputs.model_of(path, composed("evaluate", f"checkpoint={path}", said))
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,7 @@ CASES = {
     ),
     "text for a matrix": (
         put("K", "none"),
-        r"kinect_color_003: K: expected an array 3x3; found could not convert",
+        r"kinect_color_003: K: expected an array 3x3; found text",
     ),
     "millimetres": (
         calibrated(millimetres),

@@ -18,7 +18,7 @@ from scipy import sparse
 
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.data.pickles import load_pickle
-from ghgs_lit.errors import InputError, installed, require
+from ghgs_lit.errors import InputError, installed
 from ghgs_lit.parsing import require_file
 
 VERTICES = 6890
@@ -113,8 +113,8 @@ class Body:
 
     def __init__(self, path: Path) -> None:
         file = path / _FILE if path.is_dir() else path
-        expected = f"SMPL_NEUTRAL.pkl, or a folder with {_FILE}"
-        require(file.is_file(), str(path), expected, "neither")
+        if not file.is_file():
+            raise InputError(f"{path}: expected SMPL_NEUTRAL.pkl, or a folder with {_FILE}; found neither")
         self.file = file
         self.model = _model(file)
 
