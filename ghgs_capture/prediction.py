@@ -21,6 +21,7 @@ from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.model import GHGS
 from ghgs_lit.refinement import CameraRefinement, Refinement, Report, pixels_moved
 from ghgs_lit.rendering import Renderer
+from ghgs_lit.rounds.coarse import FILLED
 from ghgs_lit.surroundings import side_multiple
 from ghgs_lit.types import Batch, Gaussians, Prediction
 from ghgs_lit.weights.checkpoint import read_config
@@ -245,13 +246,20 @@ def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:
     """Size of the photographs that a checkpoint's model was trained with.
 
     Args:
-        config: of the checkpoint; of imported weights the size of the encoder's position embedding
-            counts.
+        config: of the checkpoint. A training from coarse to fine saw larger photographs than those
+            in which its stages know a subject (``rounds.height``): the latter count, for larger
+            ones are asked for. Of imported weights the encoder's position embedding counts.
 
     Returns:
         Side or (height, width) in pixels.
     """
-    return lookup(config, "data.size") or lookup(config, "encoder.image_size") or 518
+    size = lookup(config, "data.size") or lookup(config, "encoder.image_size") or 518
+    known = lookup(config, "rounds.height")
+    if not isinstance(known, int):
+        return size
+    patch = lookup(config, "encoder.patch_size")
+    side = int(known / FILLED) // patch * patch
+    return side if side < min(image_size("size", size)) else size
 
 
 def crop_size(size: int | tuple[int, int] | None, config: Mapping[str, Any], model: GHGS) -> tuple[int, int]:
