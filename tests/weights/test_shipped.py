@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from ghgs_capture.prediction import trained_size
 from ghgs_lit import GHGS
 from ghgs_lit.weights.checkpoint import read_checkpoint
 from tests.helpers.verbs import ghgs
@@ -18,6 +19,12 @@ def test_they_are_what_a_model_without_a_path_has_and_name_no_machine():
     assert model.rounds is not None
     assert not model.training
     assert not re.search(r"/(tmp|work|home|root)\b", json.dumps(config))
+
+
+def test_predictions_are_of_crops_that_need_no_smaller_copy_though_training_saw_larger_ones():
+    config = read_checkpoint("shipped")["config"]
+    assert config["data"]["size"] == 518
+    assert trained_size(config) == 252
 
 
 def test_their_figures_are_those_of_the_model_card(tmp_path, monkeypatch):
