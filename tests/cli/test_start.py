@@ -57,7 +57,7 @@ class Cycle:
 
 class Module:
     @staticmethod
-    def run(options, cfg):
+    def run(options):
         atexit.register(print, "hook")
         Cycle()
         print("said", end=" ")

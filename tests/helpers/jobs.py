@@ -77,7 +77,7 @@ def hydra_app(monkeypatch, *overrides: str) -> None:
 
 def plan_seeds(sweep: Path, count: int) -> list[PlannedRun]:
     """A grid of ``count`` seeds."""
-    base = run_of("train", ["resume=null", "optimizer.lr=0.0"])
+    base = run_of("train", ["resume=null", "optimizer.lr=1.0"])
     planned = []
     for seed in range(count):
         run = base.replace(seed=seed)

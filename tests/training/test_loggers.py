@@ -15,7 +15,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 from tensorboard.plugins.hparams import plugin_data_pb2
 
-from ghgs_lit.config import build
+from ghgs_lit.config import build, run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.runtime.allocation import resident_bytes
@@ -259,13 +259,13 @@ def test_wandb_has_one_run_for_each_run_here(tmp_path, monkeypatch):
     seen = []
     monkeypatch.setattr("ghgs_lit.training.loggers.installed", lambda *_: None)
     monkeypatch.setattr("ghgs_lit.training.loggers.WandbLog", lambda **options: seen.append(options["id"]))
-    config = {"seed": 1, "resume": "auto"}
+    config = run_of("train", ["seed=1", "resume=auto"])
     for folder, overwrite in (("a", False), ("a", False), ("b", False), ("b", True)):
         if folder == "b" and not overwrite:
             (tmp_path / "a").rename(tmp_path / "b")
         run = RunDirectory(tmp_path / folder)
         with run.claim():
-            run.begin(config | {"overwrite": overwrite})
+            run.begin(config.replace(overwrite=overwrite))
         build({"kind": "wandb"}, "logger.wandb", save_dir=str(run.path))
     assert seen[0] == seen[1] == seen[2] != seen[3]
     assert len(seen[0]) == 8

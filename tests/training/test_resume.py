@@ -254,6 +254,7 @@ def test_a_checkpoint_of_another_model_is_refused_by_its_tensor(tmp_path):
     path = tmp_path / "a.ckpt"
     content = {"state_dict": {f"model.{k}": v for k, v in Other().state_dict().items()}}
     content |= {"config": CONFIG, "format_version": 1, "global_step": 5, "optimizer_states": []}
+    content["lr_schedulers"] = []
     torch.save(content, path)
     with pytest.raises(InputError, match=r"a\.ckpt: shift.*\(3,\).*\(4,\)"):
         check_resume(path, held(Standin()), CONFIG)

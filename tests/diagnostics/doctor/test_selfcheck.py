@@ -77,10 +77,10 @@ def test_it_checks_what_a_user_has(monkeypatch):
     the gradient is that of a training in float32."""
     right, seen = GHGS.predict, []
 
-    def noted(self, batch, kept, coarse=None):
+    def noted(self, batch, kept, coarse=None, keeps_tokens=False):
         if batch.images.dtype == torch.float32:
             seen.append((self.precision, self.training, rounds_products("cuda")))
-        return right(self, batch, kept, coarse)
+        return right(self, batch, kept, coarse, keeps_tokens)
 
     monkeypatch.setattr(GHGS, "predict", noted)
     # PyTorch's default, which trainings change
