@@ -90,7 +90,7 @@ def main() -> None:
     refinement = Refinement(options.refine, render) if options.refine else None
     methods = {}
     for name in options.checkpoints:
-        methods[Path(name).stem] = ModelMethod(GHGS.from_checkpoint(name), render, refinement)
+        methods[name] = ModelMethod(GHGS.from_checkpoint(name), render, refinement)
     for subject in options.subjects:
         batch = data.evaluation_batch(subject, "sealed", 4, read_option("targets", "midway"))
         target = batch.targets.images[0]
@@ -108,7 +108,7 @@ def main() -> None:
             captions = [f"{subject}, {part}"]
             for name, image in renders.items():
                 tiles += [_shown(p, part, crop) for p in (to_uint8(image), error_map(image, target[0]))]
-                captions += [name, "error"]
+                captions += [Path(name).stem, "error"]
             rows.append(row(tiles, captions))
         save_png(stack(rows), options.out / f"{subject}.png")
     print(f"wrote {options.out}")
