@@ -130,7 +130,8 @@ def main() -> None:
             prediction = model.train()(batch).gaussians
             sum(getattr(prediction, name).sum() for name in ("means", "scales", "colors")).backward()
         boxes = torch.rand(1, 9, 2)
-        intersections(boxes, boxes.ceil().int(), boxes[..., 0], 60, 75, 100)
+        for height, width in ((60, 75), (16, 75), (60, 16)):  # one tile is a constant
+            intersections(boxes, boxes.ceil().int(), boxes[..., 0], height, width, 100)
 
 
 if __name__ == "__main__":

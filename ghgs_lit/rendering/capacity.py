@@ -158,7 +158,7 @@ class Coming:
             self.value = torch.empty((), dtype=value.dtype, pin_memory=True)
             self.value.copy_(value, non_blocking=True)
             self.arrived = torch.cuda.Event()
-            self.arrived.record()
+            self.arrived.record(torch.cuda.current_stream(value.device))
 
     def read(self) -> int:
         """The number; waits for what the device was asked before it was made, and no longer."""

@@ -4,7 +4,7 @@ gsplat's own function asks the device for the number of intersections, and the G
 host has read it and has launched what follows. Here arrays have a fixed capacity instead, and the
 number needed is a tensor that can be read later (:mod:`ghgs_lit.rendering.capacity`)."""
 
-from functools import lru_cache
+from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -176,7 +176,8 @@ class _Fixed(NamedTuple):
     has_pixels: Tensor
 
 
-@lru_cache(maxsize=64)
+# without a limit: a recorded CUDA graph draws with them
+@cache
 # a validation may ask first, and a training step has them in its graph
 @torch.inference_mode(False)
 def _fixed(images: torch.Size, rows: int, columns: int, device: torch.device) -> _Fixed:

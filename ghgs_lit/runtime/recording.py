@@ -12,55 +12,17 @@ import warnings
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
+from weakref import WeakSet
 
 import torch
 from torch import Tensor
 
 from ghgs_lit.runtime.precision import rounding_state
 from ghgs_lit.runtime.repeatable import Guard
+from ghgs_lit.runtime.tape import CudaTape, Tape
 
 Result = TypeVar("Result")
-
-
-class Tape(Protocol):
-    """Records calls on devices of one type, ``device``."""
-
-    device: str
-
-    def record(self, call: Callable[[], Result]) -> tuple[Result, Callable[[], None]]:
-        """The result of a call, and a function that fills it again from the same inputs."""
-
-
-class CudaTape:
-    """CUDA graphs. One pool of memory for all,
-    since none is played while another's results are needed."""
-
-    def __init__(self, device: str = "cuda") -> None:
-        self.device = device
-        self._pool: Any = None
-
-    def record(self, call: Callable[[], Result]) -> tuple[Result, Callable[[], None]]:
-        """See :class:`Tape`. The call is made once before on the stream that records,
-        for workspaces.
-
-        Args:
-            call: starts work of the GPU alone.
-        """
-        stream = torch.cuda.Stream()
-        stream.wait_stream(torch.cuda.current_stream())
-        try:
-            with torch.cuda.stream(stream):
-                call()
-        finally:
-            torch.cuda.current_stream().wait_stream(stream)
-        self._pool = self._pool or torch.cuda.graph_pool_handle()
-        graph = torch.cuda.CUDAGraph()
-        # Other threads may work meanwhile: that which pins memory of the next batch,
-        # that of the gradients.
-        with torch.cuda.graph(graph, pool=self._pool, stream=stream, capture_error_mode="thread_local"):
-            result = call()
-        return result, graph.replay
 
 
 @dataclass
@@ -81,8 +43,15 @@ class _Recording:
     kept: list[Any]
 
 
+#: Recorders of this process.
+_recorders: WeakSet = WeakSet()
+
+
 class Recorder:
     """Calls functions of tensors, and plays them back from the second call of a class on.
+
+    Recordings keep memory. Where an eager call finds too little of it, all recordings of the process
+    are forgotten, recorders that had some make no more, which is said, and the call is repeated.
 
     Args:
         limit: largest number of recordings, at least 1;
@@ -108,6 +77,7 @@ class Recorder:
         self.reason = ""
         self._lock = threading.RLock()
         self.clear()
+        _recorders.add(self)
 
     def __reduce__(self) -> tuple:
         """Copies of a model record anew."""
@@ -152,9 +122,11 @@ class Recorder:
         """
         tensors: list[Tensor] = []
         kind = self._class(inputs, key, tensors)
-        if kind is None or kind in self._refused or {t.device.type for t in tensors} != {self.tape.device}:
+        devices = {tensor.device for tensor in tensors}
+        is_here = len(devices) == 1 and devices.pop().type == self.tape.device
+        if kind is None or kind in self._refused or not is_here or not self.limit:
             self.counts["eager"] += 1
-            return function(inputs)
+            return self._called(function, inputs, written)
         with self._lock:
             if kind in self._recordings:
                 self._recordings.move_to_end(kind)
@@ -163,19 +135,42 @@ class Recorder:
             if self._seen.get(kind, 0) < self.eager:
                 self._note(kind)
                 self.counts["eager"] += 1
-                return function(inputs)
+                return self._called(function, inputs, written)
             try:
-                recording = _recorded(self.tape, function, inputs, written)
-            except (
-                Exception
-            ) as error:  # a driver has many ways to fail; the eager call shows the function's own
+                # Streams and graphs belong to the current GPU.
+                with torch.cuda.device_of(tensors[0]):
+                    recording = _recorded(self.tape, function, inputs, written)
+            except Exception as error:  # a driver has many ways to fail
                 self._refuse(kind, error)
-                return function(inputs)
+                recording = None
+            # Not where the error is known, which keeps all memory of the recording.
+            if recording is None:
+                return self._called(function, inputs, written)
             while len(self._recordings) >= self.limit:
                 self._recordings.popitem(last=False)
             self._recordings[kind] = recording
             self.counts["recorded"] += 1
             return _played(recording, tensors)
+
+    def _called(self, function: Callable[[Any], Result], inputs: Any, written: Sequence[Tensor]) -> Result:
+        """``function(inputs)``, once more where recordings left too little memory for it.
+
+        Args:
+            function: as of :meth:`__call__`.
+            inputs: as of :meth:`__call__`.
+            written: as of :meth:`__call__`; with some of it a call cannot be repeated.
+        """
+        try:
+            return function(inputs)
+        except torch.OutOfMemoryError:
+            holders = [recorder for recorder in _recorders if recorder._recordings]
+            if written or not holders:
+                raise
+            for recorder in holders:
+                recorder.clear()
+                recorder.limit = 0
+        warnings.warn("CUDA graphs: too little memory is left, none is recorded any more", stacklevel=4)
+        return function(inputs)
 
     def _class(self, inputs: Any, key: Hashable, tensors: list[Tensor]) -> Hashable | None:
         """What must be equal for a recording to be valid; None: it cannot be told.
@@ -284,16 +279,18 @@ def _recorded(
         # Casts of weights would be shared between what is recorded and what is not.
         torch.clear_autocast_cache()
         guards.append(Guard())
+        # What the first call computes and keeps beside fields must be computed by the recording.
+        fresh = _replaced(fixed, lambda tensor: tensor)
         with guards[-1]:
-            return function(fixed)
+            return function(fresh)
 
     values = [tensor.clone() for tensor in written]
     try:
         result, play = tape.record(guarded)
     finally:
+        torch.clear_autocast_cache()  # of a recording that failed, casts are no numbers
         with torch.no_grad():
             _copy_all(written, values)
-    torch.clear_autocast_cache()
     return _Recording(places, result, play, list(guards[-1].kept.values()))
 
 

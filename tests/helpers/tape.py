@@ -21,6 +21,7 @@ class OperatorTape:
         self.recorded: list[int] = []
 
     def record(self, call: Callable[[], Any]) -> tuple[Any, Callable[[], None]]:
+        call()  # as CUDA graphs need it: once before, with the same inputs
         with _Operators() as operators:
             result = call()
         self.recorded.append(len(operators.calls))

@@ -3,18 +3,18 @@
 import copy
 import dataclasses
 import warnings
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from functools import lru_cache
-from types import SimpleNamespace
+from weakref import ref
 
 import pytest
 import torch
 from torch import nn
 
-from ghgs_lit.runtime import recording
+from ghgs_lit.runtime import recording, tape
 from ghgs_lit.runtime.precision import precision_of
 from ghgs_lit.runtime.recording import CudaTape, Recorder
-from ghgs_lit.types import Cameras
+from ghgs_lit.types import Batch, Cameras
 from tests.helpers.pretend_device import DEVICE, pretend_device
 from tests.helpers.tape import OperatorTape
 
@@ -61,7 +61,7 @@ def test_other_values_give_what_an_eager_call_gives():
         assert torch.equal(result["order"][0], wanted["order"][0])
         assert result["order"][1:] == (3, "name")
         assert result["best"] is result["same"]
-    assert len(calls) == 2
+    assert len(calls) == 3  # as always, once before the recording, and for it
     assert recorder.counts == {"eager": 1, "recorded": 1, "played": 4}
 
 
@@ -79,6 +79,25 @@ def test_dataclasses_come_back_with_what_they_keep():
         found = recorder(moved, cameras)
         assert torch.equal(found.extrinsics, cameras.extrinsics + vars(cameras)["noted"])
         assert (found.height, found.width) == (5, 6)
+    assert recorder.counts["played"] == 2
+
+
+def test_what_a_call_keeps_is_computed_by_the_recording():
+    """The call before it has computed it, too, of inputs that are not those to come."""
+    recorder = made()
+
+    def shifted(batch):
+        return batch.images + batch.once(of_images)
+
+    def of_images(batch):
+        return batch.images.sum()
+
+    for seed in range(4):
+        images = numbers(seed, 1, 1, 3, 2, 2)
+        batch = Batch(
+            images, images[:, :, 0] > 0, Cameras(numbers(1, 1, 1, 3, 3), numbers(1, 1, 1, 4, 4), 2, 2)
+        )
+        assert torch.equal(recorder(shifted, batch), images + images.sum())
     assert recorder.counts["played"] == 2
 
 
@@ -271,42 +290,186 @@ def test_a_class_can_be_forgotten():
     assert recorder.counts == {"eager": 1, "recorded": 2, "played": 1}
 
 
-def test_graphs_are_made_as_pytorch_documents(monkeypatch):
-    """A warm-up on a stream of its own, then the recording there, all in one pool of memory."""
-    log = []
+class Graphs:
+    """Stand-ins for CUDA's streams and graphs, which note what happens to them.
+
+    Args:
+        log: gets what happens.
+        end_fails: ending a recording that failed fails, too, as where CUDA has ended it.
+    """
+
+    def __init__(self, log, end_fails=False):
+        self.log, self.end_fails = log, end_fails
+        self.current = self.main = self.Stream("main")
+        self.pools = 0
 
     class Stream:
+        def __init__(self, name="side"):
+            self.name = name
+
         def wait_stream(self, other):
-            log.append("wait")
+            pass
 
-    class Within:
-        def __init__(self, *arguments, **options):
-            log.append(sorted(options))
+    class Graph:
+        def __init__(self, log):
+            self.log = log
 
-        def __enter__(self):
-            log.append("in")
+        def replay(self):
+            self.log.append("play")
 
-        def __exit__(self, *_):
-            log.append("out")
+    def new_stream(self, device):
+        self.log.append(f"stream of {device}")
+        return self.Stream()
 
-    stand_ins = {
-        "Stream": Stream,
-        "current_stream": Stream,
-        "stream": Within,
-        "graph": Within,
-        "graph_pool_handle": lambda: log.append("pool") or (0, 1),
-        "CUDAGraph": lambda: SimpleNamespace(replay=lambda: log.append("play")),
-    }
-    for name, value in stand_ins.items():
-        monkeypatch.setattr(torch.cuda, name, value)
-    tape = CudaTape()
-    for _ in range(2):
-        result, play = tape.record(lambda: log.append("call") or 5)
-        play()
+    @contextmanager
+    def stream(self, stream):
+        before, self.current = self.current, stream
+        self.log.append("warm")
+        yield
+        self.current = before
+
+    @contextmanager
+    def graph(self, graph, pool, stream, capture_error_mode):
+        before, self.current = self.current, stream
+        self.log.append(f"record {capture_error_mode} {pool}")
+        try:
+            yield
+        except Exception as error:
+            if self.end_fails:
+                raise RuntimeError("cannot end") from error
+            self.current = before
+            raise
+        self.current = before
+
+    def new_graph(self):
+        return self.Graph(self.log)
+
+    def new_pool(self):
+        self.pools += 1
+        return self.pools
+
+    def set_stream(self, stream):
+        self.current = stream
+
+    def install(self, patch):
+        tape._side_stream.cache_clear()
+        members = {
+            "Stream": self.new_stream,
+            "current_stream": lambda device=None: self.current,
+            "current_device": lambda: 0,
+            "stream": self.stream,
+            "set_stream": self.set_stream,
+            "graph": self.graph,
+            "graph_pool_handle": self.new_pool,
+            "CUDAGraph": self.new_graph,
+        }
+        for name, value in members.items():
+            patch.setattr(torch.cuda, name, value)
+
+
+@pytest.fixture
+def graphs(monkeypatch):
+    yield lambda *given, **options: Graphs(*given, **options).install(monkeypatch)
+    tape._side_stream.cache_clear()
+
+
+def test_graphs_are_made_as_pytorch_documents(graphs):
+    """A call on a side stream, then the recording there; all on one stream, whose memory they share,
+    and in one pool as long as a graph of it is there."""
+    log = []
+    graphs(log)
+    cuda = CudaTape()
+    (result, play), (_, other) = (cuda.record(lambda: log.append("call") or 5) for _ in range(2))
+    play()
     assert result == 5
-    once = ["wait", [], "in", "call", "out", "wait"]
-    then = [["capture_error_mode", "pool", "stream"], "in", "call", "out", "play"]
-    assert log == [*once, "pool", *then, *once, *then]
+    once = ["warm", "call", "record thread_local 1", "call"]
+    assert log == ["stream of 0", *once, *once, "play"]
+    del play, other
+    cuda.record(lambda: log.append("call"))
+    assert log[-2] == "record thread_local 2"
+
+
+@pytest.mark.parametrize("end_fails", [True, False])
+def test_a_recording_that_fails_leaves_the_device_as_it_was(monkeypatch, end_fails):
+    """PyTorch's context does not restore the stream where it cannot end a recording. What was cast
+    meanwhile was not computed, and memory that was written is as before."""
+    log, calls, weight = [], [], torch.ones(3)
+    stand_in = Graphs(log, end_fails)
+    stand_in.install(monkeypatch)
+    recorder = Recorder(tape=CudaTape("cpu"))
+    cleared = []
+    monkeypatch.setattr(torch, "clear_autocast_cache", lambda: cleared.append(len(calls)))
+
+    def work(values):
+        calls.append(stand_in.current.name)
+        weight.add_(values)
+        if len(calls) == 3:
+            raise RuntimeError("operation not permitted when stream is capturing")
+        return weight * 2
+
+    expected = weight.clone()
+    for number in range(3):
+        if number == 1:
+            with pytest.warns(UserWarning, match="cannot end" if end_fails else "not permitted"):
+                found = recorder(work, torch.ones(3), written=[weight])
+        else:
+            found = recorder(work, torch.ones(3), written=[weight])
+        expected += 1
+        assert torch.equal(found, 2 * expected)
+        assert stand_in.current is stand_in.main
+    assert calls == ["main", "side", "side", "main", "main"]
+    assert cleared == [1, 2, 3]
+    assert recorder.counts == {"eager": 2, "refused": 1}
+    tape._side_stream.cache_clear()
+
+
+def test_where_memory_is_lacking_recordings_make_room():
+    """Those of all recorders, for good; without any, or where a call has written, the error stands."""
+    holder, other = made(), made()
+    for seed in range(2):
+        holder(work, (numbers(seed), numbers(seed)))
+    failures = iter([True, False, True, True])
+
+    def large(values):
+        if next(failures, False):
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        return values + 1
+
+    with pytest.raises(torch.OutOfMemoryError):
+        made()(large, numbers(0), written=[torch.ones(1)])
+    assert holder._recordings
+    failures = iter([True, False, True])
+    with pytest.warns(UserWarning, match="too little memory"):
+        assert torch.equal(other(large, numbers(0)), numbers(0) + 1)
+    with pytest.raises(torch.OutOfMemoryError):  # nothing is left that could make room
+        other(large, numbers(0), key="another")
+    before = holder.counts["eager"]
+    for seed in range(3):
+        holder(work, (numbers(seed), numbers(seed)))
+    assert holder.counts["eager"] == before + 3
+
+
+def test_a_recording_that_finds_too_little_memory_is_let_go_first():
+    """The call that follows needs the memory that the error would keep."""
+    recorder, alive, calls = made(), [], []
+
+    def large(values):
+        calls.append(None)
+        if len(calls) == 2:
+            held = Held()
+            alive.append(ref(held))
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        assert all(each() is None for each in alive)
+        return values + 1
+
+    recorder(large, numbers(0))
+    with pytest.warns(UserWarning, match="out of memory"):
+        recorder(large, numbers(0))
+    assert recorder.counts == {"eager": 1, "refused": 1}
+
+
+class Held:
+    """Memory of a call that fails."""
 
 
 def test_what_comes_again_too_late_is_not_recorded():

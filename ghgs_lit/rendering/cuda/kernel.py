@@ -25,8 +25,9 @@ def ends_of(center, radius, limit):
     """
     reach = radius.to(tl.float32) / TILE
     middle = center / TILE
-    begin = tl.minimum(tl.maximum(tl.floor(middle - reach), 0.0), limit.to(tl.float32))
-    end = tl.minimum(tl.maximum(tl.ceil(middle + reach), 0.0), limit.to(tl.float32))
+    most = limit + 0.0  # a single tile is a constant of the compiler
+    begin = tl.minimum(tl.maximum(tl.floor(middle - reach), 0.0), most)
+    end = tl.minimum(tl.maximum(tl.ceil(middle + reach), 0.0), most)
     return begin.to(tl.int32), end.to(tl.int32)
 
 
