@@ -43,7 +43,7 @@ def camera_sheet(
         for shape, color in ((np.asarray(hull), _HULL), (view.mask, _MASK)):
             picture[shape ^ ndimage.binary_erosion(shape)] = color
         tiles.append(picture)
-    rows = [row(tiles, [f"{name}: mask green, hull of the others red" for name in names])]
+    rows = [row(tiles, [f"{name}: its mask green, the hull of the other masks red" for name in names])]
     for i, view in enumerate(views):
         order = [i, *(j for j in range(len(views)) if j != i)]
         points = _extremes(view.mask)

@@ -2,6 +2,7 @@
 ``docs/evidence/outputs.md`` has sizes and losses."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -20,6 +21,23 @@ RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), 
 opacity, and the rotation (w, x, y, z), of which 128 is zero."""
 
 
+def half_turned(gaussians: Gaussians) -> Gaussians:
+    """Turn Gaussians by half a turn about x: from a PLY's axes (right, down, front) to those in
+    which SPZ is stored (right, up, back), or back.
+
+    https://github.com/nianticlabs/spz, "Coordinate System"; gaussforge stores numbers as they are.
+
+    Args:
+        gaussians: of any number of subjects; their colours must not depend on direction.
+
+    Returns:
+        The same with y and z of places, and with them those of quaternions, negated.
+    """
+    means = gaussians.means * gaussians.means.new_tensor([1, -1, -1])
+    quaternions = gaussians.quaternions * gaussians.quaternions.new_tensor([1, 1, -1, -1])
+    return replace(gaussians, means=means, quaternions=quaternions)
+
+
 def converted(name: str, gaussians: Gaussians) -> bytes:
     """Convert Gaussians to another program's format, by the package gaussforge.
 
@@ -35,6 +53,8 @@ def converted(name: str, gaussians: Gaussians) -> bytes:
     """
     from gaussforge import GaussForge
 
+    if name == "spz":
+        gaussians = half_turned(gaussians)
     answer = GaussForge().convert(ply_bytes(gaussians), "ply", CONVERTED[name])
     if answer.get("error"):
         expected = "formats: expected Gaussians that gaussforge converts to"

@@ -104,7 +104,7 @@ def machine(run: "Doctor") -> None:
     console = Console(soft_wrap=True)
     for title, lines in (
         ("This machine", machine_lines(pick_device(run.device))),
-        ("Missing", list(missing_extras()) or [("nothing", "")]),
+        ("Extras that are not installed", list(missing_extras()) or [("none", "")]),
     ):
         listing = Table("", "", title=title, title_justify="left", show_header=False, box=None)
         for line in lines:

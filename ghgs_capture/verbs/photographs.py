@@ -10,7 +10,8 @@ from ghgs_lit.errors import InputError, require
 if TYPE_CHECKING:
     from ghgs_capture.verbs import OfPhotographs
 
-_BEGUN: list[CaptureFolder] = []  #: The folder whose photographs are being decoded, if any
+#: The folder whose photographs are being decoded, if any, and what was said of it
+_BEGUN: list[tuple[dict[str, Any], CaptureFolder]] = []
 
 _SOURCES = ("images", "cameras", "masks", "backgrounds", "segment", "sequence")
 _CHECKED = 5  #: Number of instants of a sequence whose cameras are checked
@@ -48,8 +49,10 @@ def capture_folder(run: "OfPhotographs") -> CaptureFolder:
     Raises:
         InputError: a key or file is missing or wrong.
     """
-    folder = CaptureFolder(**sources_of(run))
-    return _BEGUN.pop() if [folder] == _BEGUN else folder
+    sources = sources_of(run)
+    if _BEGUN and _BEGUN[0][0] == sources:
+        return _BEGUN.pop()[1]
+    return CaptureFolder(**sources)
 
 
 def begin_to_read(run: "OfPhotographs") -> None:
@@ -61,9 +64,11 @@ def begin_to_read(run: "OfPhotographs") -> None:
     Raises:
         InputError: as for :func:`capture_folder`.
     """
-    _BEGUN[:] = [capture_folder(run)]
+    sources = sources_of(run)
+    folder = CaptureFolder(**sources)
+    _BEGUN[:] = [(sources, folder)]
     if run.segment is None:
-        _BEGUN[0].begin(_BEGUN[0].instants[0])
+        folder.begin(folder.instants[0])
 
 
 def check_cameras(folder: CaptureFolder) -> None:

@@ -3,7 +3,7 @@
 import contextlib
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from functools import partial
@@ -115,31 +115,35 @@ def predict_photographs(run: "Predict", directory: Path) -> None:
     temporal = Temporal(partial(in_frame, model), model.skip.every, renderer)
     totals: Counter[str] = Counter()
     count = 0
-    begin = time.perf_counter()
     rig = None
     backgrounds = Backgrounds({})
     if together:
         shared = shared_by(folder, model, size, refining, renderer)
         refining["tones"], backgrounds, rig, together.others["rig.json"] = shared
         refining["refine_cameras"] = 0
+    begin = time.perf_counter()
     for given, waited in captures_of(folder):
         capture = mended_by(backgrounds, given)
         capture = rig.applied(capture) if rig else capture
         result = predict(capture, model, size, **refining, renderer=renderer, temporal=temporal)
         result.seconds["read"] = waited
-        seconds = write_result(directories[capture.name], result, model, renderer, run.checkpoint, output)
+        place = directories[capture.name]
+        seconds = write_result(
+            place, result, model, renderer, run.checkpoint, output, lists_files=not together
+        )
         if together:
-            together.add(directories[capture.name], result.batch, result.prediction, renderer)
+            print(place, flush=True)
+            together.add(place, result.batch, result.prediction, renderer)
         count += 1
         if count == 1:
-            for line in (*advice_of(directories[capture.name]), *rig_advice(trained, result.batch)):
+            for line in (*advice_of(place), *rig_advice(trained, result.batch)):
                 print(line, flush=True)
         totals.update(seconds)
     left_out = len(folder.instants) - count
     require(count > 0, str(folder.images), "an instant that can be read", f"none of {left_out}")
     if together:
         paths = together.write(directory)
-        print("\n".join(str(path) for path in paths if path.parent == directory), flush=True)
+        print("\n".join(_listing(directory, paths)), flush=True)
         total = time.perf_counter() - begin
         stages = ", ".join(f"{stage} {value / count:.3g} s" for stage, value in totals.items())
         print(f"{count} instants, {count / total:.3g} a second (each: {stages})", flush=True)
@@ -284,6 +288,7 @@ def write_result(
     renderer: Renderer,
     checkpoint: str,
     options: export.OutputOptions,
+    lists_files: bool = True,
 ) -> dict[str, float]:
     """Write the files of a result and print what was done.
 
@@ -294,6 +299,7 @@ def write_result(
         renderer: draws pictures of the files.
         checkpoint: name of the weights, for the report.
         options: formats and choices for them.
+        lists_files: whether the files are printed, too.
 
     Returns:
         The seconds of each stage, with those of writing.
@@ -322,5 +328,16 @@ def write_result(
         print(result.refined, flush=True)
     begin = time.perf_counter()
     paths = export.write_prediction(directory, result.batch, prediction, renderer, options, facts)
-    print("\n".join(str(path) for path in paths if path.parent == directory), flush=True)
+    if lists_files:
+        print("\n".join(_listing(directory, paths)), flush=True)
     return {**seconds, "write": time.perf_counter() - begin}
+
+
+def _listing(directory: Path, paths: Iterable[Path]) -> list[str]:
+    """Lines of files in a directory, and of its folders with the numbers of files in them."""
+    counts = Counter(path.relative_to(directory).parts[0] for path in paths)
+    lines = []
+    for name, count in counts.items():
+        path = directory / name
+        lines.append(f"{path}/ ({count} files)" if path.is_dir() else str(path))
+    return lines

@@ -3,6 +3,7 @@
 import gc
 import os
 import sys
+import warnings
 
 from ghgs_lit.runtime.allocation import collect_garbage_again, keep_freed_memory
 from ghgs_lit.runtime.cores import spin_if_alone
@@ -46,6 +47,20 @@ def _command(argv: list[str]) -> int:
     return run(argv[1], argv)
 
 
+#: Files of this distribution's packages begin so.
+_OURS = os.path.join(os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))), "ghgs_")
+_THEIRS = warnings.formatwarning
+
+
+def _text_of_warning(
+    message: Warning, category: type, filename: str, lineno: int, line: str | None = None
+) -> str:
+    """Text of a warning, as ``warnings.formatwarning``: of ours a line without the place in the code."""
+    if category is UserWarning and os.path.abspath(filename).startswith(_OURS):
+        return f"warning: {message}\n"
+    return _THEIRS(message, category, filename, lineno, line)
+
+
 def main() -> int:
     """The console script.
 
@@ -53,6 +68,7 @@ def main() -> int:
         The exit code. 0; 1: bad input; 2: bad usage; 130, 143: interrupted.
     """
     argv = list(sys.argv)
+    warnings.formatwarning = _text_of_warning
     # Schedulers and daemons may have closed them.
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:

@@ -94,7 +94,8 @@ def missing_extras() -> Iterator[Line]:
 
 def _gpus() -> list[Line]:
     if not torch.cuda.is_available():
-        return [("GPU", f"none that PyTorch can use (built for CUDA {torch.version.cuda})")]
+        built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "built without CUDA"
+        return [("GPU", f"none that PyTorch can use ({built})")]
     lines = []
     for number in range(torch.cuda.device_count()):
         free, total = map(decimal, torch.cuda.mem_get_info(number))

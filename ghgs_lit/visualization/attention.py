@@ -68,18 +68,18 @@ def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> 
     count = len(attention.neighbors)
     ranks = torch.linspace(1, 0.25, count)
     near = tokens.image[attention.neighbors] % views
-    captions = [f"{name}: {int((near == v).sum())}/{count}" for v, name in enumerate(names)]
+    captions = [f"{name}: {int((near == v).sum())} of {count} neighbours" for v, name in enumerate(names)]
     rows = [row(_tiles(images, tokens, attention, ranks), captions)]
-    kinds = {"": attention.weights, ", s = 1": attention.plain}
+    kinds = {"": attention.weights, " without semantics (s = 1)": attention.plain}
     if torch.equal(attention.weights, attention.plain):
-        del kinds[", s = 1"]
+        del kinds[" without semantics (s = 1)"]
     for layer in range(len(attention.weights)):
         tiles = []
         captions = []
         for what, all_weights in kinds.items():
             weights = all_weights[layer].float().mean(0).cpu()
             shares = [float(weights[(near == v).cpu()].sum()) for v in range(views)]
-            captions += [f"layer {layer}{what}: {100 * share:.0f}%" for share in shares]
+            captions += [f"layer {layer}{what}: {100 * share:.0f}% of attention" for share in shares]
             tiles += _tiles(images, tokens, attention, weights / weights.max())
         rows.append(row(tiles, captions))
     return stack(rows)

@@ -5,13 +5,14 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from ghgs_lit.files import write_atomically
 from ghgs_lit.types import Batch
 
-_CAPTION = 14  # height of a caption in pixels
+_LETTERS = 22  # Height of letters: the narrowest tile's width over this, ...
+_LEAST_LETTERS = 10  # ... at least, in pixels
 _GAP = 2
 ERROR_GAIN = 4.0  #: Factor of errors before they are shown
 
@@ -79,24 +80,47 @@ def error_map(image: Tensor, target: Tensor) -> np.ndarray:
     return colorize((image - target).abs().mean(0) * ERROR_GAIN, 0, 1, "inferno")
 
 
+def _caption_lines(caption: str, width: int, font: ImageFont.FreeTypeFont) -> list[str]:
+    """Break a caption at its spaces into lines no wider than its tile; longer words stay as they are."""
+    lines = []
+    for word in caption.split():
+        longer = f"{lines[-1]} {word}" if lines else word
+        if lines and font.getlength(longer) <= width:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    return lines
+
+
 def row(tiles: Sequence[np.ndarray], captions: Sequence[str]) -> np.ndarray:
     """Tiles side by side, each below its caption.
 
     Args:
         tiles: Pictures [h, w, 3] uint8 of any sizes.
-        captions: One for each tile.
+        captions: One for each tile; long ones take several lines, and what is wider than its tile is cut.
 
     Returns:
         Picture [h, w, 3] uint8.
     """
-    height = max(tile.shape[0] for tile in tiles) + _CAPTION
+    letters = max(_LEAST_LETTERS, min(tile.shape[1] for tile in tiles) // _LETTERS)
+    font = ImageFont.load_default(letters)
+    texts = [
+        _caption_lines(caption, tile.shape[1] - 2 * _GAP, font)
+        for tile, caption in zip(tiles, captions, strict=True)
+    ]
+    line_height = letters + 4
+    above = line_height * max(len(lines) for lines in texts)
+    height = max(tile.shape[0] for tile in tiles) + above
     width = sum(tile.shape[1] for tile in tiles) + _GAP * (len(tiles) - 1)
     canvas = Image.new("RGB", (width, height), (24, 24, 24))
-    draw = ImageDraw.Draw(canvas)
     left = 0
-    for tile, caption in zip(tiles, captions, strict=True):
-        draw.text((left + 2, 1), caption, fill=(230, 230, 230))
-        canvas.paste(Image.fromarray(tile), (left, _CAPTION))
+    for tile, lines in zip(tiles, texts, strict=True):
+        strip = Image.new("RGB", (tile.shape[1], above), (24, 24, 24))
+        draw = ImageDraw.Draw(strip)
+        for number, line in enumerate(lines):
+            draw.text((_GAP, 1 + number * line_height), line, fill=(230, 230, 230), font=font)
+        canvas.paste(strip, (left, 0))
+        canvas.paste(Image.fromarray(tile), (left, above))
         left += tile.shape[1] + _GAP
     return np.asarray(canvas)
 
@@ -117,7 +141,9 @@ def stack(rows: Sequence[np.ndarray]) -> np.ndarray:
 def _depth_rows(
     batch: Batch, element: int, depth: Tensor | None, depth_valid: Tensor | None
 ) -> list[np.ndarray]:
-    """A row of predicted and a row of true depths of one subject, in the same colours: near is red.
+    """A row of predicted and a row of true depths of one subject, in the same colours.
+
+    Captions say which depth is red (near) and which is blue.
 
     Args:
         batch: With masks, and depths where they are known.
@@ -144,7 +170,7 @@ def _depth_rows(
     for name, values in maps.items():
         tiles = zip(*values, ends, strict=True)
         tiles = [colorize(-d, -high, -low, "turbo", valid) for d, valid, (low, high) in tiles]
-        rows.append(row(tiles, [name] * len(tiles)))
+        rows.append(row(tiles, [f"{name}: red {low:.4g}, blue {high:.4g}" for low, high in ends]))
     return rows
 
 
@@ -162,7 +188,8 @@ def sheet(
         image: renders of the targets [B, T, 3, h, w]; without targets, renders of the inputs, which
             then stand below them with their errors; None: no renders.
         element: number of the subject in the batch.
-        depth: predicted depths [B, V, H, W], metres; None: no row of them.
+        depth: predicted depths [B, V, H, W] in the unit of the cameras, as in captions (of data sets:
+            metres); None: no row of them.
         depth_valid: where they are defined [B, V, H, W]; None: in the masks.
 
     Returns:

@@ -37,6 +37,22 @@ def call(monkeypatch, capsys, *argv: str) -> tuple[int, str, str]:
     return code, out, err
 
 
+def test_a_warning_of_ours_is_a_line_and_others_say_where_they_are_from(capsys):
+    """Also once Lightning has put its own text of warnings in their place."""
+    run = """
+import sys, warnings
+from ghgs_lit.cli import main
+sys.argv = ["ghgs", "--version"]
+main.main()
+import lightning.fabric.utilities.warnings
+for file in (main.__file__, "/elsewhere/ghgs_lit/.venv/torch.py"):
+    warnings.warn_explicit("size: too large", UserWarning, file, 3)
+"""
+    lines = run_python(run).stderr.splitlines()
+    assert lines[0] == "warning: size: too large"
+    assert lines[1].startswith("/elsewhere/ghgs_lit/.venv/torch.py:3: UserWarning: size")
+
+
 def test_help_shows_an_example_for_every_verb_and_only_built_verbs(monkeypatch, capsys):
     """A verb in the help without a module or a configuration would fail only when a
     user calls it."""

@@ -33,6 +33,7 @@ def test_the_machine_is_described():
     """Versions, processor, memory, GPU and renderer are there."""
     found = dict(machine_lines(torch.device("cpu")))
     assert f"torch {torch.__version__.split('+')[0]}" in found["versions"]
+    assert "None" not in found.get("GPU", "")
     assert {"processor", "threads", "memory", "renderer", "compiled kernels"} <= set(found)
 
 

@@ -4,20 +4,34 @@ import dataclasses
 
 import numpy as np
 
-from ghgs_lit.visualization.pictures import sheet, to_uint8
+from ghgs_lit.visualization.pictures import row, sheet, to_uint8
 from tests.helpers.scenes import make_batch
 
 
 def test_renders_stand_below_the_photographs_where_there_are_no_targets():
     """Of photographs of one's own, too, the sheet shows what came back of them, and the error."""
-    batch = dataclasses.replace(make_batch(1, 3, 28, 42), depths=None, targets=None)
+    batch = dataclasses.replace(make_batch(1, 3, 28, 140), depths=None, targets=None)
     renders = batch.images.flip(-1)
     alone, picture = sheet(batch, None), sheet(batch, renders)
     height, gap = len(alone), 2
     assert picture.shape == (3 * height, alone.shape[1], 3)
     assert np.array_equal(picture[:height], alone)
     for view in range(3):
-        tile = picture[2 * height - gap - 28 : 2 * height - gap, view * 44 : view * 44 + 42]
+        tile = picture[2 * height - gap - 28 : 2 * height - gap, view * 142 : view * 142 + 140]
         assert np.array_equal(tile, to_uint8(renders[0, view]))
-    error = picture[3 * height - gap - 28 : 3 * height - gap, :42].astype(int).sum(-1)
+    error = picture[3 * height - gap - 28 : 3 * height - gap, :140].astype(int).sum(-1)
     assert (error[(renders - batch.images)[0, 0].abs().sum(0) == 0] == error.min()).all()
+
+
+def test_a_caption_stays_above_its_own_tile():
+    """A long one takes several lines, a word that is too wide is cut; letters grow with tiles."""
+    tiles = [np.zeros((20, 100, 3), np.uint8)] * 2
+    plain = row(tiles, ["a", ""])
+    for caption in ("its mask green, the hull of the other masks red", 40 * "w"):
+        picture = row(tiles, [caption, ""])
+        text = picture[: len(picture) - 20] != 24
+        assert text[:, :100].any()
+        assert not text[:, 100:].any()
+    assert len(row(tiles, ["its mask green, the hull of the other masks red", ""])) > len(plain)
+    large = row([np.zeros((20, 1000, 3), np.uint8)], ["a"])
+    assert len(large) - 20 > 2 * (len(plain) - 20)

@@ -168,7 +168,7 @@ def tables_of(rows: Sequence[Row]) -> Tables:
         ply_mb=whole.ply_bytes / 1e6,
         budget=["broken" if _broken(row) else "kept" if promises(row) else "-" for row in totals(rows)],
     )
-    stages = pivoted(pd.DataFrame(rows), "stage", "preset", "seconds", "{:.4f}")
+    stages = pivoted(pd.DataFrame(rows), "preset", "stage", "seconds", "{:.4f}")
     return {"Presets": texts(cases, _COLUMNS), "Seconds by stage": stages}
 
 

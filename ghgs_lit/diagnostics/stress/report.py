@@ -16,6 +16,9 @@ from ghgs_lit.diagnostics.stress.stage import FAMILIES
 from ghgs_lit.diagnostics.stress.stages import STAGES
 from ghgs_lit.files import write_text_atomically
 
+#: Ticks of the picture's colours: log10 of error over budget, and text.
+_TICKS = {-6: "1e-6 or less", -4: "1e-4", -2: "1 %", 0: "budget", 3: "1000 or more"}
+
 
 def bounded(error: float | None) -> str:
     """Text of an error, with three digits.
@@ -75,9 +78,11 @@ def draw(rows: Sequence[Row]) -> Figure:
     picture = axes.imshow(np.ma.masked_invalid(values), cmap="RdYlGn_r", norm=norm, aspect="auto")
     for i, j in zip(*np.nonzero(values > 0), strict=True):
         axes.text(j, i, "✗", ha="center", va="center", color="white", fontweight="bold")
-    axes.set_xticks(range(width), ratios.columns, rotation=90, fontsize=8)
+    axes.set_facecolor("0.93")  # families that a stage has no case of
+    axes.set_xticks(range(width), ratios.columns.str.replace("_", " "), rotation=90, fontsize=8)
     axes.set_yticks(range(height), ratios.index, fontsize=8)
-    figure.colorbar(picture, ax=axes, fraction=0.02, pad=0.01, label="log10")
+    bar = figure.colorbar(picture, ax=axes, fraction=0.02, pad=0.01, ticks=list(_TICKS))
+    bar.ax.set_yticklabels(_TICKS.values())
     return figure
 
 

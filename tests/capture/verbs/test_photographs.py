@@ -4,6 +4,7 @@ import json
 import runpy
 import shutil
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -52,11 +53,20 @@ def test_photographs_become_a_splat_where_the_subject_is(here, checkpoint, capsy
     closed = here / "closed"
     closed.mkdir(mode=0o555)
     monkeypatch.chdir(closed)
-    common = (f"checkpoint={checkpoint}", "formats=[ply]", "turntable.frames=0", "device=cpu")
+    common = (f"checkpoint={checkpoint}", "formats=[ply,depth]", "turntable.frames=0", "device=cpu")
     places = (f"images={here / 'images'}", f"cameras={cameras}", f"out={here / 'splat'}")
-    assert ghgs("predict", *places, *common) == 0
+    extended = json.loads(cameras.read_text()) | {"note": "by hand"}
+    cameras.write_text(json.dumps(extended))
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("always")
+        assert ghgs("predict", *places, *common) == 0
+    assert [str(w.message) for w in shown if "note" in str(w.message)] == [
+        "cameras: entries that are not read: note"
+    ]
     assert not list(closed.iterdir())
     out = capsys.readouterr().out
+    assert f"{here / 'splat' / 'depth'}/ (4 files)" in out
+    assert "gaussians.ply" in out
     assert "calibration.unit=0.001" in out
     assert inside_the_figure(here / "splat" / "gaussians.ply", 1000.0) > 0.95
     report = json.loads((here / "splat" / "report.json").read_text())
@@ -139,7 +149,11 @@ def test_a_folder_for_each_instant_becomes_a_folder_of_splats(here, checkpoint, 
     shutil.copytree(here / "images" / "000", here / "images" / "001")
     common = (f"checkpoint={checkpoint}", "formats=[ply,mp4]", "turntable.frames=1", "device=cpu")
     assert ghgs("predict", "images=images", f"cameras={cameras}", "out=splats", *common) == 0
-    assert "2 instants" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "2 instants" in out
+    assert f"{here / 'splats' / '001'}\n" in out  # a line for each instant, not for each of its files
+    assert "001/gaussians.ply" not in out
+    assert f"{here / 'splats' / 'sequence'}/ (2 files)" in out
     _, first, second = read_frames(str(here / "splats" / "instants.mp4"))
     first, second = (np.frombuffer(frame, np.uint8) for frame in (first, second))
     assert first.max() > 60  # the person is in the picture
