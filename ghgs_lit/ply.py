@@ -2,7 +2,8 @@
 
 Positions in metres in the world frame, opacity as logit, standard deviations as logarithm, unit
 quaternions ``(w, x, y, z)``, colour as the constant term of spherical harmonics. A comment in the
-header has the image constants that the Gaussians were made for; other programs ignore it."""
+header has the image constants that the Gaussians were made for; other programs ignore it, below the
+line of the element: 3D Gaussian Splatting's own viewer takes the third line for that."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -103,15 +104,15 @@ def vertices_ply(columns: Mapping[str, np.ndarray], comments: Sequence[str] = ()
 
     Args:
         columns: numbers of each property by name [N].
-        comments: lines of the header.
+        comments: lines of the header, below that of the vertices.
 
     Returns:
         A little-endian binary PLY.
     """
     vertices = np.rec.fromarrays(list(columns.values()), names=list(columns))
     content = BytesIO()
-    elements = [PlyElement.describe(np.asarray(vertices), "vertex")]
-    PlyData(elements, byte_order="<", comments=list(comments)).write(content)
+    elements = [PlyElement.describe(np.asarray(vertices), "vertex", comments=list(comments))]
+    PlyData(elements, byte_order="<").write(content)
     return content.getvalue()
 
 
@@ -147,7 +148,8 @@ def read_ply(path: Path) -> Gaussians:
             if group != "normals":
                 numbers = [np.asarray(vertices[name], np.float32) for name in names]
                 columns[group] = torch.from_numpy(np.stack(numbers, -1))
-        matches = filter(None, map(_CONSTANTS_PATTERN.fullmatch, content.comments))
+        comments = [*vertices.comments, *content.comments]
+        matches = filter(None, map(_CONSTANTS_PATTERN.fullmatch, comments))
         constants = [{"low_pass": float(m[1]), "antialiased": m[2] == "True"} for m in matches]
     except (PlyParseError, KeyError, ValueError, MemoryError, OverflowError) as error:
         raise InputError(f"{path}: expected a 3D Gaussian Splatting PLY; found {error}") from error

@@ -40,6 +40,22 @@ def test_a_ply_renders_as_what_was_written(tmp_path):
     assert torch.allclose(a, b, atol=1e-4)
 
 
+def test_the_viewer_of_3d_gaussian_splatting_reads_it(tmp_path):
+    """As SIBR's ``GaussianView.cpp``: the third line has the count, then come records of degree 0."""
+    written = gaussians()
+    write_ply(written, tmp_path / "a.ply")
+    header, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
+    count = int(header.split(b"\n")[2].split()[2])
+    record = [("pos", "<f4", 3), ("n", "<f4", 3), ("sh", "<f4", 3), ("opacity", "<f4")]
+    points = np.frombuffer(body, [*record, ("scale", "<f4", 3), ("rot", "<f4", 4)])
+    assert len(points) == count == len(written)
+    assert np.allclose(points["pos"], written.means)
+    assert np.allclose(1 / (1 + np.exp(-points["opacity"])), written.opacities, atol=1e-5)
+    assert np.allclose(np.exp(points["scale"]), written.scales, rtol=1e-5)
+    assert np.allclose(0.5 + 0.28209479 * points["sh"], written.colors, atol=1e-5)
+    assert np.allclose(np.linalg.norm(points["rot"], axis=1), 1, atol=1e-6)
+
+
 def test_comments_that_are_not_ascii(tmp_path):
     written = gaussians()
     write_ply(written, tmp_path / "a.ply")
@@ -108,3 +124,14 @@ def test_a_ply_of_another_program_is_for_the_renderer_of_3dgs(tmp_path):
     plyfile.PlyData([element], comments=["ghgs_lit of another kind"]).write(tmp_path / "b.ply")
     read = read_ply(tmp_path / "b.ply")
     assert (read.low_pass, read.antialiased) == (0.3, False)
+
+
+def test_a_comment_at_the_head_counts_as_well(tmp_path):
+    """There earlier versions wrote it, and other programs move comments there."""
+    plyfile = pytest.importorskip("plyfile")
+    write_ply(gaussians(), tmp_path / "a.ply")
+    element = plyfile.PlyElement.describe(plyfile.PlyData.read(tmp_path / "a.ply")["vertex"].data, "vertex")
+    comments = ["by hand", "ghgs_lit low_pass=0.1 antialiased=True"]
+    plyfile.PlyData([element], comments=comments).write(tmp_path / "b.ply")
+    read = read_ply(tmp_path / "b.ply")
+    assert (read.low_pass, read.antialiased) == (0.1, True)
