@@ -244,13 +244,14 @@ class GHGS(nn.Module):
             batch: as the stages see it.
             plan: of the batch.
             coarse: what was found in smaller copies of the photographs; None: there are none.
-            keeps_tokens: whether the prediction contains the tokens of the encoder.
+            keeps_tokens: whether the prediction contains the tokens of the encoder. It is for its
+                depths then, and the Gaussians of the last round are left out.
         """
         bounds = self.bounded(batch)
         encode = functools.partial(self.encoded, batch, bounds, plan)
         tokens = encode() if coarse is None else coarse.encoded(plan, encode)
         depths = None if coarse is None else coarse.depths
-        prediction = self.decoded(batch, bounds, tokens, plan, depths)
+        prediction = self.decoded(batch, bounds, tokens, plan, depths, not keeps_tokens)
         return dataclasses.replace(prediction, tokens=tokens) if keeps_tokens else prediction
 
     def bounded(self, batch: Batch) -> DepthBounds | None:
@@ -276,6 +277,7 @@ class GHGS(nn.Module):
         tokens: Tokens,
         plan: Plan,
         coarse: CoarseDepths | None = None,
+        shows_last: bool = True,
     ) -> Prediction:
         """What the stages after the encoder make of its tokens, and the rounds of that.
 
@@ -285,6 +287,7 @@ class GHGS(nn.Module):
             tokens: of the encoder.
             plan: which tokens are recalibrated and which pixels become Gaussians.
             coarse: depths from smaller copies of the photographs; None: there are none.
+            shows_last: whether the Gaussians of the last round are wanted.
 
         Returns:
             The prediction in the world of the stages.
@@ -297,7 +300,7 @@ class GHGS(nn.Module):
         first = replaced(activate, self.training) if self.rounds else activate
         state = State(raw, first(raw, batch, points, depth_maps), points, depth_maps)
         step = 1.0 if coarse is None else coarse.step
-        states = self.rounds(state, activate, batch, step) if self.rounds else (state,)
+        states = self.rounds(state, activate, batch, step, shows_last) if self.rounds else (state,)
         return prediction_of(states, self.keeps_drafts and not self.training)
 
     def _depths(

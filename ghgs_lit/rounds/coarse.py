@@ -181,7 +181,8 @@ def coarse_of(
     depths = at_least_float32(photographs.images).new_zeros(2, *photographs.masks.shape)
     rows = None
     for size in wanted:
-        chosen = torch.tensor([i for i, own in enumerate(sizes) if own == size], device=depths.device)
+        numbers = tuple(i for i, own in enumerate(sizes) if own == size)
+        chosen = constant(torch.tensor, numbers, like=depths, dtype=torch.long)
         prediction = predict(shrunk(_elements(photographs, chosen), size, least_matte))
         maps = prediction.depth_maps
         grown = torch.stack((enlarged(maps, full), _resized(maps.confidence, full)))
@@ -237,8 +238,8 @@ def spread_tokens(tokens: Tokens, batch: Batch, patch_size: int) -> Float[Tensor
     photographs = batch.photographs if isinstance(batch, PaddedBatch) else batch
     height, width = photographs.masks.shape[2:]
     grid = [side // patch_size for side in batch.masks.shape[2:]]
-    places = patch_size * pixel_centers(*grid, maps) + maps.new_tensor((left, top))
-    places = 2 / maps.new_tensor((width, height)) * places - 1
+    places = patch_size * pixel_centers(*grid, maps) + constant(torch.tensor, (left, top), like=maps)
+    places = 2 / constant(torch.tensor, (width, height), like=maps) * places - 1
     places = places.expand(len(maps), -1, -1, -1)
     values = F.grid_sample(maps, places, padding_mode="border", align_corners=False)
     values, weight = values[:, :-1], values[:, -1:]

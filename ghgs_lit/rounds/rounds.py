@@ -195,7 +195,12 @@ class Rounds(nn.Module):
         return None if known == "auto" else known
 
     def forward(
-        self, state: State, activate: Activate, batch: Batch, step: float | Float[Tensor, " B"] = 1.0
+        self,
+        state: State,
+        activate: Activate,
+        batch: Batch,
+        step: float | Float[Tensor, " B"] = 1.0,
+        shows_last: bool = True,
     ) -> tuple[State, ...]:
         """The states before the first round and after each.
 
@@ -205,6 +210,8 @@ class Rounds(nn.Module):
             batch: photographs, masks and cameras are read.
             step: size of the first step in depth, in those after a depth head; one for all elements
                 or for each. Attributes take whole steps.
+            shows_last: whether the last Gaussians are wanted; the last state has those before it
+                otherwise.
 
         Returns:
             As many states as there are rounds, and one more.
@@ -222,7 +229,9 @@ class Rounds(nn.Module):
         for number in range(count):
             share = 0.5**number
             change, memory = self._round(states[-1], batch, rays, memory, windows, share, step * share)
-            shown = activate if number == count - 1 else replaced(activate, self.training)
+            shown = replaced(activate, self.training)
+            if number == count - 1:
+                shown = activate if shows_last else None
             states.append(_moved(states[-1], shown, batch, rays, *change))
         return tuple(states)
 
@@ -367,7 +376,7 @@ def _footprints(state: State, batch: Batch, rays: Rays) -> Tensor:
 
 def _moved(
     state: State,
-    activate: Activate,
+    activate: Activate | None,
     batch: Batch,
     rays: Rays,
     moved: Float[Tensor, " N"],
@@ -377,7 +386,7 @@ def _moved(
 
     Args:
         state: before it.
-        activate: gives Gaussians from their raw attributes.
+        activate: gives Gaussians from their raw attributes; None: those before the round stay.
         batch: photographs, mattes and cameras are read.
         rays: of the Gaussians' pixels, along which they move.
         moved: changes of depths in metres.
@@ -392,4 +401,5 @@ def _moved(
     maps = dataclasses.replace(maps, depth=depth)
     pixels = pixels.flatten(0, 3).index_add(0, rays.place, moved[:, None] * rays.direction).view_as(pixels)
     points = dataclasses.replace(state.points, pixels=pixels)
-    return State(raw, activate(raw, batch, points, maps), points, maps)
+    gaussians = state.gaussians if activate is None else activate(raw, batch, points, maps)
+    return State(raw, gaussians, points, maps)

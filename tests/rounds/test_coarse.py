@@ -285,3 +285,16 @@ def test_training_reaches_the_depth_head_through_the_copy():
     slopes = [parameter.grad for parameter in model.depth_head.parameters() if parameter.requires_grad]
     assert all(slope is not None and slope.isfinite().all() for slope in slopes)
     assert any(slope.abs().max() > 0 for slope in slopes)
+
+
+def test_copies_are_not_asked_for_their_last_gaussians(monkeypatch):
+    """Their depths and tokens start the rounds at full size; bit for bit those of a prediction."""
+    model, batch = recurrent(HEIGHT), make_batch(1, 3, 56, 56)
+    plan, activate, calls = model.plan(batch), model.gaussian_head.activate, []
+    monkeypatch.setattr(model.gaussian_head, "activate", lambda *given: calls.append(1) or activate(*given))
+    with torch.no_grad():
+        whole, copy = (model.predict(batch, plan, keeps_tokens=keeps) for keeps in (False, True))
+    assert sum(calls) == 2 * (1 + model.rounds.count) - 1
+    assert torch.equal(copy.depth_maps.depth, whole.depth_maps.depth)
+    assert torch.equal(copy.depth_maps.confidence, whole.depth_maps.confidence)
+    assert not torch.equal(copy.gaussians.means, whole.gaussians.means)
