@@ -21,9 +21,13 @@ from ghgs_lit.refinement.refinement import NEAR, Change, Descent, Renderer, seen
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
 
 _SHOWN = 0.03  #: A view shows Gaussians this near to the rendered surface, in metres
-#: Steps at each instant, with larger changes than ``NEAR``: flow is less exact than a prediction.
+#: Steps at each instant. Means may change more than in ``NEAR``: flow is less exact than a prediction.
 _STEPS = 2
-_CHANGES = NEAR | {"means": Change(10.0, 0.1), "colors": Change(0.1, 0.004)}
+_CHANGES = NEAR | {
+    "means": Change(10.0, 0.1),
+    "scales": Change(1.0, 0.02),
+    "colors": Change(0.1, 0.004),
+}
 #: Of L1, 1 - SSIM (it takes as long as the renders) and the silhouettes' L1.
 _WEIGHTS = (0.8, 0.0, 0.1)
 _CROSSING = 4  #: Instants in which a new prediction takes the place of the last one

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ghgs_lit.errors import require
@@ -33,11 +34,18 @@ class Change:
 
 #: Changes so small that what no photograph shows stays as predicted.
 NEAR = {
-    "means": Change(1.0, 0.02),
-    "scales": Change(1.0, 0.02),
+    "means": Change(1.0, 0.04),
+    "scales": Change(1.0, 0.03),
     "opacities": Change(2.0, 0.04),
     "colors": Change(0.05, 0.001),
 }
+#: Times that what a pixel lacks of fine detail is added to the colour of its Gaussian at the end.
+#: Above 1: a pixel shows its own Gaussian and others, of other photographs too.
+DETAIL = 2.0
+#: The largest such change of a colour.
+DETAIL_LIMIT = 0.1
+#: Share of a pixel above which the subject covers it.
+WHOLE = 0.99
 #: Weights of L1, 1 - SSIM (as in the paper's L_render) and L1 of the silhouette.
 Weights = tuple[float, float, float]
 WEIGHTS: Weights = (0.8, 0.2, 0.1)
@@ -124,21 +132,33 @@ class Descent:
 class Refinement:
     """``refinement(gaussians, batch)``: the same Gaussians, nearer to the photographs.
 
+    Splats that overlap blur what they show, and no step of a mean error undoes it: it is small.
+    So what is missing of fine detail goes to the colours at last. Low frequencies stay as they are,
+    which photographs of other exposures, and wrong geometry, would spoil.
+
     Args:
         steps: of the optimiser, 1 or more.
         renderer: draws the inputs, with gradients.
         changes: by field, what may change: means in footprints of their pixels, scales by their
             logarithm, opacities by their logit, quaternions, colours. Other fields stay.
+        detail: times that fine detail which is missing is added to colours, 0 or more.
 
     Raises:
         InputError: ``steps`` is below 1.
     """
 
-    def __init__(self, steps: int, renderer: Renderer, changes: Mapping[str, Change] = NEAR):
+    def __init__(
+        self,
+        steps: int,
+        renderer: Renderer,
+        changes: Mapping[str, Change] = NEAR,
+        detail: float = DETAIL,
+    ):
         require(steps >= 1, "refine", "1 or more steps", steps)
         self.steps = steps
         self.renderer = renderer
         self.changes = changes
+        self.detail = detail
 
     def __call__(self, gaussians: Gaussians, batch: Batch) -> Gaussians:
         """The refined Gaussians.
@@ -153,10 +173,13 @@ class Refinement:
         Raises:
             InputError: they do not belong to pixels of ``batch``.
         """
-        return deque(self.states(gaussians, batch), maxlen=1).pop()
+        if self.detail:
+            require(gaussians.pixel is not None, "refine", "Gaussians of the inputs' pixels", "others")
+        refined = deque(self.states(gaussians, batch), maxlen=1).pop()
+        return self._detailed(refined, batch) if self.detail else refined
 
     def states(self, gaussians: Gaussians, batch: Batch) -> Iterator[Gaussians]:
-        """The Gaussians before the first step and after each.
+        """The Gaussians before the first step and after each, without the detail of the end.
 
         Args:
             gaussians: predicted from ``batch``.
@@ -201,6 +224,21 @@ class Refinement:
             both = predicted, self(predicted, others)
             held_out = tuple(self._psnr(splats, batch.of_views([hidden])) for splats in both)
         return Report(self.steps, inputs, held_out)
+
+    @torch.no_grad()
+    def _detailed(self, gaussians: Gaussians, batch: Batch) -> Gaussians:
+        """Gaussians whose colours have what their own pixels lack of fine detail: the error there
+        without its mean in 3 x 3 pixels, 2 pixels or more within the outline."""
+        photographs, silhouettes, cameras = seen_by(batch)
+        with exact(gaussians.means.device.type):
+            drawn = self.renderer(gaussians, cameras, background=0.0).image
+            missing = (photographs - drawn).flatten(0, 1)
+            fine = missing - F.avg_pool2d(missing, 3, 1, 1, count_include_pad=False)
+        is_inside = -F.max_pool2d(-silhouettes.flatten(0, 1), 5, 1, 2) > WHOLE
+        places = gaussians.image * batch.masks[0, 0].numel() + gaussians.pixel
+        own = (fine * is_inside).movedim(1, -1).flatten(0, 2)[places]
+        change = (self.detail * own).clamp(-DETAIL_LIMIT, DETAIL_LIMIT)
+        return replace(gaussians, colors=gaussians.colors + change)
 
     @torch.no_grad()
     def _psnr(self, gaussians: Gaussians, batch: Batch) -> float:

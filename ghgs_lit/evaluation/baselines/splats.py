@@ -124,6 +124,7 @@ def splats_at(
     points = unproject_maps(depth, batch.cameras)[valid]
     focal = batch.cameras.intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2].mean(-1)
     scale = (sigma * depth / focal[..., None, None])[valid]
+    image, pixel = valid.flatten(0, 1).flatten(1).nonzero().unbind(1)
     return Gaussians(
         means=points,
         quaternions=points.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(len(points), 4),
@@ -131,7 +132,8 @@ def splats_at(
         opacities=torch.full_like(scale, opacity),
         colors=batch.once(surface_colors).movedim(2, -1)[valid],
         splits=tuple(valid.flatten(1).sum(1).tolist()),
-        image=valid.flatten(0, 1).nonzero()[:, 0],
+        image=image,
+        pixel=pixel,
     )
 
 
@@ -147,8 +149,7 @@ def discs_at(batch: Batch, depth: Tensor, valid: Tensor) -> Gaussians:
     Returns:
         Gaussians in the order of the valid pixels.
     """
-    places = valid.flatten(0, 1).flatten(1).nonzero()
-    image, pixel = places.unbind(1)
+    image, pixel = valid.flatten(0, 1).flatten(1).nonzero().unbind(1)
     focal = focal_lengths(batch.cameras).prod(-1).sqrt()
     footprint = (depth / focal[..., None, None])[valid][:, None]
     axes = surface_axes(DepthMaps(depth, valid, valid.to(depth)), batch.cameras, image, pixel)
@@ -257,7 +258,7 @@ class PerScene:
     @property
     def fitting(self) -> Refinement:
         """Optimisation that fits the Gaussians."""
-        return Refinement(self.steps, self.renderer, CHANGES)
+        return Refinement(self.steps, self.renderer, CHANGES, detail=0)
 
     def begin(self, batch: Batch) -> Gaussians:
         """Initial Gaussians.

@@ -131,7 +131,8 @@ def _renders(gaussians: Gaussians, batch: Batch, backend: str) -> Values:
 
 
 def _refined_slowly(v: Values) -> Values:
-    """The same with Adam (Kingma and Ba, 2015, Algorithm 1) and all changes written out."""
+    """The same with Adam (Kingma and Ba, 2015, Algorithm 1), all changes and the detail at the
+    end written out."""
     start, batch = _seen(v)
     views = start.image
     photographs = batch.images * batch.masks[:, :, None]
@@ -161,9 +162,24 @@ def _refined_slowly(v: Values) -> Values:
             slopes = torch.autograd.grad(0.8 * error + 0.2 * (1 - alike) + 0.1 * outline, leaves)
         means = [0.9 * m + 0.1 * slope for m, slope in zip(means, slopes, strict=True)]
         squares = [0.95 * s + 0.05 * slope**2 for s, slope in zip(squares, slopes, strict=True)]
-        for x, m, s, rate in zip(raw, means, squares, (0.02, 0.02, 0.04, 0.001), strict=True):
+        for x, m, s, rate in zip(raw, means, squares, (0.04, 0.03, 0.04, 0.001), strict=True):
             x -= rate * m / (1 - 0.9**number) / ((s / (1 - 0.95**number)).sqrt() + 1e-15)
-    return _renders(changed(raw), batch, "reference")
+    refined = changed(raw)
+    missing = photographs - render(refined, batch.cameras, "reference").image
+    sums = sum(_shifted(missing, 1, 0.0))
+    fine = missing - sums / sum(_shifted(torch.ones_like(missing), 1, 0.0))
+    inside = torch.stack(_shifted(batch.masks.double(), 2, 1.0)).amin(0)
+    detail = (fine * inside[:, :, None]).movedim(2, -1)[0].flatten(1, 2)[views, start.pixel]
+    refined = replace(refined, colors=refined.colors + (2 * detail).clamp(-0.1, 0.1))
+    return _renders(refined, batch, "reference")
+
+
+def _shifted(maps: Tensor, pixels: int, beyond: float) -> list[Tensor]:
+    """The maps, moved up to some pixels along both axes, with a value beyond the border."""
+    height, width = maps.shape[-2:]
+    padded = torch.nn.functional.pad(maps, [pixels] * 4, value=beyond)
+    steps = range(2 * pixels + 1)
+    return [padded[..., i : i + height, j : j + width] for i in steps for j in steps]
 
 
 _EXCLUDED = {
@@ -187,7 +203,7 @@ STAGES = (
     Stage(
         "refinement", ("cameras", "images", "masks", "opacities"), partial(_surface_inputs, 2, 14),
         case_by_case(_refined), 100,
-        "two renders and their gradients, and steps that divide them by their size",
+        "three renders, gradients of two, and steps that divide them by their size",
         case_by_case(_refined_slowly),
         steady=("middle", "truth"), seeds=24, excluded=_EXCLUDED,
         silent="what is not drawn does not show",
