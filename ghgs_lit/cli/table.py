@@ -60,6 +60,7 @@ def _options(run: "Table") -> t.TableOptions:
         reported=run.reported,
         test=run.test,
         unit=unit,
+        subjects=None if run.subjects is None else _expression("subjects", run.subjects),
     )
 
 
@@ -78,11 +79,7 @@ def run(verb: "Table") -> None:
     # Resolved: a run that is found by two paths counts once.
     folders = [resolved(path) for path in _listed(verb, "runs") or ()]
     others = [t.read_others(Path(p).expanduser()) for p in _listed(verb, "others") or ()]
-    wanted = _expression("subjects", verb.subjects)
     sweep = t.read_sweep(folders, _listed(verb, "by") or ())
-    shown = sweep.rows["subject"].map(wanted.fullmatch).notna()
-    require(shown.any(), "subjects", "the name of a measured subject", verb.subjects)
-    sweep.rows = sweep.rows[shown].reset_index(drop=True)
     tables = t.build_tables(sweep, others, options)
     labels = [f"table:{options.layout.name}" + (f"-{i}" if i else "") for i in range(len(tables))]
     latex = "\n".join(t.to_latex(table, label) for table, label in zip(tables, labels, strict=True))

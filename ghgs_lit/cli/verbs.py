@@ -147,9 +147,9 @@ class Table(Verb):
     null: psnr, ssim, lpips (flip where a run has no lpips)."""
     by: Texts = ()
     """Configuration keys whose values get rows of their own, such as [optimizer.lr]."""
-    subjects: Text = ".+"
+    subjects: Text | None = None
     """A regular expression: subjects whose whole names match are shown,
-    such as a.* (people in action)."""
+    such as a.* (people in action); null: all."""
     others: Texts = ()
     """JSON files with results of other methods (docs/tables.md), for table1, table2 and table3."""
     reported: bool = True

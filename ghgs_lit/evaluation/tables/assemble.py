@@ -1,13 +1,14 @@
 """Assembly of tables from measurements: their rows, columns and cells."""
 
 import itertools
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
 import pandas as pd
 
 from ghgs_lit.config.keys import ABLATIONS
-from ghgs_lit.errors import InputError, choice
+from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.evaluation.tables.cells import fill
 from ghgs_lit.evaluation.tables.layouts import (
     Group,
@@ -59,6 +60,9 @@ def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOpt
     if others and layout.rows == "ablation":
         raise InputError(f"others: expected layout=table1, table2 or table3; found {layout.name}")
     ours = sweep.rows
+    if options.subjects is not None:
+        ours = _selected(ours, options.subjects, "the runs")
+        others = [_selected(rows, options.subjects, rows["source"].iloc[0]) for rows in others]
     if options.targets:
         ours = ours[ours["targets"].isin(options.targets)]
     if layout.rows == "ablation":
@@ -79,6 +83,23 @@ def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOpt
         where = theirs.iloc[0]
         raise InputError(f"{where['source']}: expected results on one of {keys}; found {_text(where, same)}")
     return [_table(part, sweep, options) for part in tables]
+
+
+def _selected(rows: pd.DataFrame, names: re.Pattern[str], where: str) -> pd.DataFrame:
+    """Rows of a selection of subjects.
+
+    Args:
+        rows: One for each subject; means, which say no subject, stay.
+        names: Whole names of the selection match.
+        where: The rows are from, for messages.
+
+    Raises:
+        InputError: None matches.
+    """
+    is_kept = [not isinstance(name, str) or names.fullmatch(name) is not None for name in rows["subject"]]
+    expected = f"a match with the whole name of a subject of {where}, such as {rows['subject'].iloc[0]}"
+    require(any(is_kept), "subjects", expected, names.pattern)
+    return rows[is_kept]
 
 
 def _measured(rows: pd.DataFrame) -> list[str]:

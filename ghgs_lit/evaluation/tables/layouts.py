@@ -80,6 +80,7 @@ class TableOptions:
         reported: Whether the paper's figures are shown where the layout has some.
         test: How rows are compared.
         unit: Regular expression whose first group is the person, if subjects are frames of people.
+        subjects: Regular expression of the names of a selection of subjects; None: all.
     """
 
     layout: Layout
@@ -89,6 +90,7 @@ class TableOptions:
     reported: bool = True
     test: PairedTest = field(default_factory=PairedTest)
     unit: re.Pattern[str] | None = None
+    subjects: re.Pattern[str] | None = None
 
 
 def _stem(metric: str) -> str:

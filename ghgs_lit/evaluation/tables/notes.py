@@ -22,7 +22,7 @@ MOSTLY_SHARED = 0.8
 
 
 def write_caption(table: Table) -> str:
-    """Caption of a table in one line: data, protocol, model and number of seeds.
+    """Caption of a table in one line: data, subjects, protocol, model and number of seeds.
 
     Args:
         table: With its cells.
@@ -35,9 +35,12 @@ def write_caption(table: Table) -> str:
     measured = table.measured
     counts = sorted({int(count) for count in measured["count"].dropna()})
     seeds = max(map(len, measured["seeds"]), default=0)
+    subjects = f"{' or '.join(map(str, counts)) or 'no'} subject{'s' * (counts != [1])} of `{first['split']}`"
+    if table.options.subjects is not None:
+        subjects += f" whose name{'s match' if counts != [1] else ' matches'} {_selection(table)}"
     parts = [
         f"Data {' and '.join(f'`{name}`' for name in names)}",
-        f"{' or '.join(map(str, counts)) or 'no'} subjects of `{first['split']}`",
+        subjects,
         f"targets `{first['targets']}`",
         f"metrics `{first['protocol']}`",
     ]
@@ -50,6 +53,11 @@ def write_caption(table: Table) -> str:
     spread = f" ± deviation over {seeds} seeds" if seeds > 1 else ""
     clear = " where it leads by more than the deviation" if seeds > 1 else ""
     return f"{', '.join(parts)}; mean over subjects{spread}, best of the measured methods in bold{clear}."
+
+
+def _selection(table: Table) -> str:
+    """The regular expression of the subjects that are shown, in Markdown."""
+    return f"`{table.options.subjects.pattern}`"
 
 
 def write_notes(table: Table) -> list[str]:
@@ -108,6 +116,8 @@ def _about_others(table: Table) -> list[str]:
     ours = set(_of(table.rows, "model").groupby(["source", "views"]).size())
     for name, rows in _of(table.rows, "other").groupby("variant", sort=False):
         untested = "" if rows["subject"].notna().all() else "; means only where untested"
+        if untested and table.options.subjects is not None:
+            untested += f", of all its subjects, not of {_selection(table)} alone"
         means = rows["count"].dropna()
         subjects = rows[rows["subject"].notna()].groupby(["data", "views", "seed"]).size()
         counts = sorted({int(count) for count in (*means, *subjects)} - ours)

@@ -18,8 +18,8 @@ from ghgs_lit.evaluation.tables.notes import MARK
 COLUMNS = (
     "table", "kind", "method", "model", "encoder", "ablation", "unprojection", "semantic", "extra", "data",
     "split", "targets", "protocol", "views", "metric", "mean", "deviation", "seeds", "seeds_lacking",
-    "subjects", "best", "test_seeds", "test_subjects", "test_difference", "test_low", "test_high", "test_p",
-    "test_p_holm", "test_smallest", "runs",
+    "subjects", "selection", "best", "test_seeds", "test_subjects", "test_difference", "test_low",
+    "test_high", "test_p", "test_p_holm", "test_smallest", "runs",
 )  # fmt: skip
 Write = Callable[[str, str, bool], str]
 """Writes a cell of its number, what follows it, and whether it is best."""
@@ -165,6 +165,7 @@ def _line(number: int, table: Table, cell: Any) -> dict[str, Any]:
     if not reported:
         about |= {"seeds": " ".join(map(str, sorted(cell.seeds))), "subjects": cell.count, "runs": cell.runs}
         about["seeds_lacking"] = " ".join(map(str, cell.lacking))
+        about["selection"] = table.options.subjects and table.options.subjects.pattern
     if cell.test is not None:
         test = asdict(cell.test)
         about |= {"test_p_holm": test.pop("corrected"), **{f"test_{name}": v for name, v in test.items()}}

@@ -2,6 +2,7 @@
 our variants."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -109,6 +110,21 @@ def test_other_methods_join_the_table_that_they_fit(tmp_path):
     assert "seeds" not in release.caption
     assert "GHG" not in to_markdown(midway)
     assert "other,GHG" in to_csv([release])
+
+
+def test_a_selection_of_subjects_is_one_of_other_methods_too(tmp_path):
+    """They were compared over all of theirs."""
+    write_run(tmp_path / "runs" / "0", "full", 20.0)
+    rows = [a_row(subject="a", psnr=24.0), a_row(subject="b", psnr=26.5), a_row(views=5, psnr=27.0)]
+    others = [read_others(others_file(tmp_path, rows))]
+    options = {"layout": "table2", "reported": False, "subjects": re.compile("a")}
+    (table,) = tables_of(tmp_path / "runs", others=others, **options)
+    rows, _ = body(to_markdown(table))
+    assert (rows["GHG"][3], rows["GHG"][6]) == ("**24.00**", "**27.00**")
+    assert "means only where untested, of all its subjects, not of `a` alone." in to_markdown(table)
+    others = [read_others(others_file(tmp_path, [a_row(subject="x")]))]
+    with pytest.raises(InputError, match=r"subjects: expected .* of .*others\.json, such as x; found 'a'"):
+        tables_of(tmp_path / "runs", others=others, **options)
 
 
 def test_the_example_of_the_documentation_is_read(tmp_path):

@@ -3,11 +3,12 @@
 import csv
 import io
 import json
+import re
 
 import pytest
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.tables import read_sweep, to_csv, to_markdown, to_terminal
+from ghgs_lit.evaluation.tables import read_sweep, to_csv, to_latex, to_markdown, to_terminal
 from ghgs_lit.evaluation.tables.notes import FOOTNOTE, NO_SEMANTICS
 from ghgs_lit.runs.results import read_results, summarize, write_results
 from tests.helpers.tables import body, start_run, tables_of, write_run
@@ -184,6 +185,24 @@ def test_csv_has_every_cell_in_full(tmp_path):
     assert float(row["mean"]) == pytest.approx(23 + 1 / 3, abs=1e-12)
     assert (row["seeds"], row["subjects"], row["runs"], row["deviation"]) == ("1", "2", own, "")
     assert sum(r["mean"] == "" for r in rows) == 24 - 3
+
+
+def test_a_table_of_some_subjects_says_of_which(tmp_path):
+    """Nothing but the smaller number of subjects told it from the table of all."""
+    write_run(tmp_path / "0", "full", 20.0, shifts={"a_1": 0.0, "a_2": 2.0, "b_1": 7.0})
+    (whole,) = tables_of(tmp_path)
+    assert "3 subjects of `val`, targets" in whole.caption
+    assert {row["selection"] for row in csv.DictReader(io.StringIO(to_csv([whole])))} == {""}
+    (two,) = tables_of(tmp_path, subjects=re.compile("a_."))
+    assert "2 subjects of `val` whose names match `a_.`," in to_markdown(two)
+    (one,) = tables_of(tmp_path, subjects=re.compile("b.*"))
+    assert "1 subject of val whose name matches b.*," in to_terminal(one)
+    assert r"1 subject of \texttt{val} whose name matches \texttt{b.*}," in to_latex(one, "label")
+    assert one.cells["mean"].max() == 20.0 + 5 + 7
+    rows = list(csv.DictReader(io.StringIO(to_csv([two, one]))))
+    assert {row["selection"] for row in rows if row["mean"]} == {"a_.", "b.*"}
+    with pytest.raises(InputError, match=r"subjects: expected .* of the runs, such as a_1; found 'a'"):
+        tables_of(tmp_path, subjects=re.compile("a"))
 
 
 def test_results_that_are_none_are_refused(tmp_path):
