@@ -159,20 +159,21 @@ class FrameReader(Reader):
     def people(self) -> int:
         return len(self.sequences)
 
-    def existing(self, folder: Path, names: Sequence[str], example: str) -> list[str]:
+    def existing(self, folder: Path, names: Sequence[str], phase: str, example: str) -> list[str]:
         """Existing sequences among names.
 
         Args:
             folder: of the sequences.
             names: of sequences.
+            phase: that they are of, for messages.
             example: name that the message shows where none of them exists, which is a problem.
         """
         there = [name for name in names if (folder / name).is_dir()]
         if 0 < len(there) < len(names):
-            log.warning("%s: %d of %d sequences are there", folder, len(there), len(names))
+            log.warning("%s: %d of %d sequences of %s are there", folder, len(there), len(names), phase)
         if not there:
             some = "such as" if names else "beside those of val, such as"
-            self.problem(f"{folder}: expected sequences {some} {example}; found none of the split")
+            self.problem(f"{folder}: expected sequences {some} {example}; found none of {phase}")
         return there
 
 

@@ -122,7 +122,7 @@ CASES = {
         lambda f: blank(f / MASK),
         r"kinect_mask/kinect_000/000000.png: expected a subject in the mask; found",
     ),
-    "no sequence": (shutil.rmtree, r"expected sequences such as p000455_a000986; found none of the split"),
+    "no sequence": (shutil.rmtree, r"expected sequences such as p000455_a000986; found none of val"),
 }
 
 

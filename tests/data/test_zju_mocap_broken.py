@@ -162,7 +162,7 @@ CASES = {
         r"0.npy: expected an array 6890x3; found a file that cannot",
     ),
     "NaN body": (body(np.full((6890, 3), np.nan)), r"0.npy: expected finite numbers; found NaN or infinity"),
-    "no sequence": (shutil.rmtree, r"expected sequences such as CoreView_386; found none of the split"),
+    "no sequence": (shutil.rmtree, r"expected sequences such as CoreView_386; found none of train"),
 }
 
 

@@ -123,7 +123,7 @@ class HuMManReader(FrameReader):
         if data.smpl_model is not None:
             with self.collecting():
                 self._body = Body(Path(data.smpl_model).expanduser())
-        for name in self.existing(folder, names, "p000455_a000986"):
+        for name in self.existing(folder, names, phase, "p000455_a000986"):
             with self.collecting():
                 self._add(folder / name, range(*data.frames))
         self.subjects = dict(list(self.subjects.items())[: data.limit.of(phase)])

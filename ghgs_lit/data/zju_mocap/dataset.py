@@ -80,7 +80,7 @@ class ZJUMoCapReader(FrameReader):
         wanted = []
         for some in chosen:
             wanted += [(f"CoreView_{s}", some.frames) for s in some.sequences]
-        there = self.existing(folder, [name for name, _ in wanted], wanted[0][0])
+        there = self.existing(folder, [name for name, _ in wanted], phase, wanted[0][0])
         for name, frames in wanted:
             if name in there:
                 with self.collecting():
