@@ -1,6 +1,5 @@
 """Run each verb as a Hydra application of ``conf/<verb>.yaml``."""
 
-import json
 import os
 import re
 import signal
@@ -26,7 +25,7 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import require_no_links, write_text_atomically
 from ghgs_lit.runs.job import register_resolvers
 from ghgs_lit.runs.run import RunDirectory
-from ghgs_lit.runs.signals import Interrupted, interruptible
+from ghgs_lit.runs.signals import interruptible
 from ghgs_lit.runtime.allocation import collect_garbage_again
 from ghgs_lit.runtime.cores import children_sleep
 
@@ -82,6 +81,7 @@ class Verb:
     wants_trace: bool = False
     started: float = field(default_factory=time.time)
 
+    @interruptible()
     def __call__(self, cfg: DictConfig) -> object:
         """Check the configuration and do the work of the verb.
 
@@ -176,10 +176,7 @@ def _print_configuration(name: str, overrides: list[str], values: Namespace) -> 
     Raises:
         InputError: the package is not there, or a node has an unknown key.
     """
-    if values.config_dir is not None:
-        searched = json.dumps([f"file://{Path(values.config_dir).resolve()}"], ensure_ascii=False)
-        overrides = [*overrides, f"hydra.searchpath={searched}"]
-    cfg = compose(name, overrides, with_hydra=True)
+    cfg = compose(name, overrides, with_hydra=True, folder=values.config_dir)
     HydraConfig.instance().set_config(cfg)
     cfg = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
     try:
@@ -213,18 +210,18 @@ def run(verb: str, argv: list[str]) -> int:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     task = Verb(verb, tuple(argv), wants_trace)
     try:
-        flags, overrides, values = messages.parsed(argv[2:])
-        if values.help:
-            return _help(verb, overrides, values.config_dir)
-        messages.check_deletions(overrides)
-        store_defaults(verb)
-        if values.cfg == "job":
-            _print_configuration(values.config_name or verb, _for_hydra(verb, overrides), values)
-            return 0
-        sys.argv = [argv[0], *flags, messages.NO_FILES_OF_HYDRA, *_for_hydra(verb, overrides)]
-        with interruptible():
+        with interruptible():  # before errors are looked at: an interruption may look like one
+            flags, overrides, values = messages.parsed(argv[2:])
+            if values.help:
+                return _help(verb, overrides, values.config_dir)
+            messages.check_deletions(overrides)
+            store_defaults(verb, values.config_dir)
+            if values.cfg == "job":
+                _print_configuration(values.config_name or verb, _for_hydra(verb, overrides), values)
+                return 0
+            sys.argv = [argv[0], *flags, messages.NO_FILES_OF_HYDRA, *_for_hydra(verb, overrides)]
             hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=verb)(task)()
-        sys.stdout.flush()
+            sys.stdout.flush()
     except BrokenPipeError:
         # The reader, such as `head`, has closed the pipe; Python must not flush the rest at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -237,11 +234,4 @@ def run(verb: str, argv: list[str]) -> int:
             raise
         print(f"ghgs {verb}: {messages.one_line(error, verb)}", file=sys.stderr)
         return 1
-    except Interrupted as stop:
-        if not stop.explained:
-            print(f"ghgs {verb}: interrupted ({signal.Signals(stop.number).name})", file=sys.stderr)
-        return stop.code
-    except KeyboardInterrupt:
-        print(f"ghgs {verb}: interrupted", file=sys.stderr)
-        return 130
     return 0

@@ -2,9 +2,11 @@
 
 import gc
 import os
+import signal
 import sys
 import warnings
 
+from ghgs_lit.runs.signals import Interrupted, interruptible
 from ghgs_lit.runtime.allocation import collect_garbage_again, keep_freed_memory
 from ghgs_lit.runtime.cores import spin_if_alone
 
@@ -81,7 +83,16 @@ def main() -> int:
     # Collecting garbage among imported modules takes a third of the start-up time.
     gc.disable()
     try:
-        return _command(argv)
+        with interruptible():
+            return _command(argv)
+    except Interrupted as stop:
+        if not stop.explained:
+            name = signal.Signals(stop.number).name
+            print(f"{' '.join(['ghgs', *argv[1:2]])}: interrupted ({name})", file=sys.stderr)
+        return stop.code
+    except KeyboardInterrupt:  # raised by a library
+        print(f"{' '.join(['ghgs', *argv[1:2]])}: interrupted", file=sys.stderr)
+        return 130
     finally:
         collect_garbage_again()
 

@@ -183,16 +183,17 @@ def run_job(run: "Training", directory: RunDirectory, train: job.Train) -> float
         Interrupted: by Ctrl-C or a signal of a batch system; how to go on is printed.
     """
     is_first = settle_rank(run.trainer) == 0
-    with interruptible():
-        try:
+    try:
+        with interruptible():
             return (job.train_once if is_first else job.train_beside)(directory, run, train)
-        except Interrupted as stop:
-            if rank_zero_only.rank == 0 and not stop.explained:
-                place = f"hydra.run.dir={directory.path}"
-                if job.in_sweep():
-                    place = f"hydra.sweep.dir={HydraConfig.get().sweep.dir}"
-                print_how_to_go_on(stop, str(directory.path), place, queue_again(stop.number))
-            raise
+    except Interrupted as stop:
+        if rank_zero_only.rank == 0 and not stop.explained:
+            place = f"hydra.run.dir={directory.path}"
+            if job.in_sweep():
+                place = f"hydra.sweep.dir={HydraConfig.get().sweep.dir}"
+            how = f"to go on, the same command with {place}"
+            print_how_to_go_on(stop, str(directory.path), how, queue_again(stop.number))
+        raise
 
 
 def train(run: "Train", directory: Path, stats: dict[str, Any]) -> float | None:

@@ -1,7 +1,9 @@
 """Find and compose the Hydra configuration of a verb, and turn it into plain data."""
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from pathlib import Path
 from typing import Any
 
 import hydra
@@ -45,34 +47,43 @@ def _is_own() -> bool:
     return any(entry.path.removeprefix("file://") == str(conf_dir()) for entry in searched)
 
 
-def store_defaults(verb: str) -> None:
+def store_defaults(verb: str, folder: str | None = None) -> None:
     """Give Hydra the configuration of a plug-in's verb: its own keys, at their defaults.
 
-    A file ``<verb>.yaml`` in ``--config-dir`` comes before it, and may add groups.
+    A file ``<verb>.yaml`` in ``--config-dir`` takes its place, and may add groups.
 
     Args:
         verb: name of any verb; those of ``conf`` are left as they are.
+        folder: of ``--config-dir``, if any.
     """
-    if (conf_dir() / f"{verb}.yaml").is_file():
+    store = ConfigStore.instance()
+    store.repo.pop(f"{verb}.yaml", None)  # Hydra refuses a file beside it
+    if any(Path(place, f"{verb}.yaml").is_file() for place in (conf_dir(), folder) if place is not None):
         return
     node = {"defaults": ["_self_", {"override hydra/output": "ghgs"}], "hydra": {"job": {"name": verb}}}
-    ConfigStore.instance().store(name=verb, node=of_verb(verb, node))
+    store.store(name=verb, node=of_verb(verb, node))
 
 
-def compose(verb: str, overrides: Sequence[str] = (), with_hydra: bool = False) -> DictConfig:
+def compose(
+    verb: str, overrides: Sequence[str] = (), with_hydra: bool = False, folder: str | None = None
+) -> DictConfig:
     """The configuration of ``ghgs <verb> <overrides>``, with all defaults.
 
     Args:
         verb: name of a verb, or of another file in ``conf``.
         overrides: as on the command line, such as ``model=paper``.
         with_hydra: whether the node ``hydra`` is part of it.
+        folder: of ``--config-dir``, if any.
 
     Raises:
         HydraException: an override does not fit.
         InputError: a node names a kind that there is not.
     """
     if verb in verbs():
-        store_defaults(verb)
+        store_defaults(verb, folder)
+    if folder is not None:
+        searched = json.dumps([f"file://{Path(folder).resolve()}"], ensure_ascii=False)
+        overrides = [*overrides, f"hydra.searchpath={searched}"]
     with _application():
         return fill(hydra.compose(verb, overrides=list(overrides), return_hydra_config=with_hydra))
 

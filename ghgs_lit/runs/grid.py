@@ -26,7 +26,7 @@ from ghgs_lit.runs.planned import PlannedRun, Rehearse, print_plan, print_result
 from ghgs_lit.runs.processes import queue_again
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import PLAN, SWEPT, RunDirectory, State
-from ghgs_lit.runs.signals import Interrupted, interruptible, print_how_to_go_on
+from ghgs_lit.runs.signals import Interrupted, interruptible, print_how_to_go_on, stop_if_interrupted
 
 
 def _sets_apart(override: str, shared: set[str]) -> bool:
@@ -57,52 +57,69 @@ def sweep(sweeper: BasicSweeper, arguments: Sequence[str], rehearse: Rehearse) -
         Interrupted: Ctrl-C or SIGTERM; no further run is started.
     """
     directory = resolved(str(sweeper.config.hydra.sweep.dir))
-    with interruptible():
-        try:
-            return _sweep(sweeper, arguments, directory, rehearse)
-        except Interrupted as stop:
-            if not stop.explained:
-                print_how_to_go_on(
-                    stop, "the sweep", f"hydra.sweep.dir={directory}", queue_again(stop.number)
-                )
-            raise
+    begun: list[PlannedRun] = []
+    try:
+        with interruptible():
+            planned = _planned(sweeper, arguments, directory)
+            if sweeper.config.get("dry_run"):
+                print_plan(planned, directory, rehearse)
+                return []
+            begun = planned
+            write_plan(planned, sweeper.config, directory)
+            returns = run_all(planned, sweeper.launcher.launch, sweeper.max_batch_size)
+    except Interrupted as stop:
+        if not stop.explained:
+            how = _how_to_go_on(begun, directory)
+            print_how_to_go_on(stop, "the sweep", how, queue_again(stop.number))
+        raise
+    print_results(planned, directory)
+    for result in returns:
+        _ = result.return_value  # raises what the job raised
+    return [returns]
 
 
-def _sweep(
-    sweeper: BasicSweeper, arguments: Sequence[str], directory: Path, rehearse: Rehearse
-) -> list[Sequence[JobReturn]]:
-    """:func:`sweep` in a directory, without the handling of signals.
+def _how_to_go_on(begun: Sequence[PlannedRun], directory: Path) -> str:
+    """What was run of a sweep that is interrupted, and which command goes on.
+
+    Args:
+        begun: All runs of the sweep; none: it was not begun.
+        directory: Of the sweep.
+    """
+    if not begun:
+        return "nothing was run; to begin, the same command"
+    done = sum(item.directory.done for item in begun)
+    return (
+        f"{done} of {len(begun)} runs are done; to go on, the same command with hydra.sweep.dir={directory}"
+    )
+
+
+def _planned(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> list[PlannedRun]:
+    """The runs of a sweep, which are checked as far as that takes no time. Nothing is written.
 
     Args:
         sweeper: Hydra's, with configuration, launcher and parameters.
         arguments: Overrides of the command line.
         directory: Of the sweep.
-        rehearse: Tries what runs need, for ``dry_run``.
 
-    Returns:
-        What the jobs returned.
+    Raises:
+        InputError: As for :func:`sweep`.
     """
     config = sweeper.config
     loader = sweeper.hydra_context.config_loader
     combos = combinations(sweeper.params, arguments, loader)
-    planned = plan(combos, lambda overrides: loader.load_sweep_config(config, overrides), directory)
+    verb = sweeper.verb
+    planned = plan(combos, lambda overrides: loader.load_sweep_config(config, overrides), directory, verb)
     if len(planned) < len(combos):
         print(f"{len(combos)} combinations, {len(planned)} different configurations", flush=True)
     for item in planned:  # an impossible launcher is refused before anything starts
         check_launcher(item.run, config.hydra.runtime.choices["hydra/launcher"])
     check_directories(planned)
     if config.get("dry_run"):
-        print_plan(planned, directory, rehearse)
-        return []
+        return planned
     require(not config.get("overwrite"), "overwrite", "false in a sweep, which goes on with its runs", True)
     for item in planned:
         check_config(item.run)
-    write_plan(planned, config, directory)
-    returns = run_all(planned, sweeper.launcher.launch, sweeper.max_batch_size)
-    print_results(planned, directory)
-    for result in returns:
-        _ = result.return_value  # raises what the job raised
-    return [returns]
+    return planned
 
 
 def combinations(
@@ -127,7 +144,10 @@ def combinations(
 
 
 def plan(
-    combos: Sequence[Sequence[str]], compose: Callable[[list[str]], DictConfig], directory: Path
+    combos: Sequence[Sequence[str]],
+    compose: Callable[[list[str]], DictConfig],
+    directory: Path,
+    verb: str = "train",
 ) -> list[PlannedRun]:
     """Distinct runs of the jobs of a sweep.
 
@@ -135,15 +155,19 @@ def plan(
         combos: Overrides of each job.
         compose: Makes the configuration of a job's overrides, with the node ``hydra``.
         directory: Of the sweep.
+        verb: Name of a verb that trains as ``ghgs train`` does.
 
     Returns:
         Runs in the order of the jobs; jobs of one configuration are one run.
 
     Raises:
-        InputError: A configuration is bad or lacks a value.
+        InputError: A configuration is bad or lacks a value, or the verb does not train.
     """
+    trains = issubclass(verb_class(verb), verb_class("train"))
+    require(trains, "hydra/sweeper", f"basic for ghgs {verb}, which is not derived from ghgs train", "grid")
     planned: dict[str, PlannedRun] = {}
     for overrides in combos:
+        stop_if_interrupted()
         cfg = compose(list(overrides))
         check_ablation(cfg, cfg.hydra)
         with open_dict(cfg):
@@ -151,7 +175,7 @@ def plan(
             subdirectory = str(cfg.hydra.sweep.subdir)
             hydra_node = cfg.hydra
             del cfg["hydra"]
-        run = verb_class("train").of(plain(fill(cfg)))
+        run = verb_class(verb).of(plain(fill(cfg)))
         run = run.replace(chosen=chosen_options(run.plain, hydra_node))
         name = config_hash(run.plain)
         shown = tuple(filter_overrides(overrides))

@@ -49,6 +49,10 @@ class _Handler:
             os.kill(os.getpid(), number)
 
 
+#: Interruptions of the present outermost :func:`interruptible`.
+_received: list[Interrupted] = []
+
+
 def interrupt(number: int) -> None:
     """Raise :class:`Interrupted`.
 
@@ -58,7 +62,21 @@ def interrupt(number: int) -> None:
     Raises:
         Interrupted: Always.
     """
-    raise Interrupted(number)
+    _received.append(Interrupted(number))
+    raise _received[-1]
+
+
+def stop_if_interrupted() -> None:
+    """Raise an interruption again that was lost.
+
+    A signal may arrive while a library restores something in a ``finally``: what it raises then
+    hides the interruption, and whoever expects such an error drops both.
+
+    Raises:
+        Interrupted: A signal has arrived in the present :func:`interruptible`.
+    """
+    if _received:
+        raise _received[-1]
 
 
 def handlers() -> dict[int, Any]:
@@ -84,27 +102,36 @@ def handle(act: Callable[[int], Any], before: Mapping[int, Any]) -> None:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise :class:`Interrupted` on the signals :data:`STOP` unless others handle them."""
+    """Raise :class:`Interrupted` on the signals :data:`STOP` unless others handle them; where it is
+    lost (:func:`stop_if_interrupted`), once more at the end of the block."""
     before = handlers()
+    is_outermost = not any(isinstance(handler, _Handler) for handler in before.values())
     handle(interrupt, before)
     try:
+        stop_if_interrupted()
         yield
+        stop_if_interrupted()
+    except Exception:
+        stop_if_interrupted()
+        raise
     finally:
+        if is_outermost:
+            _received.clear()
         if threading.current_thread() is threading.main_thread():
             for number, handler in before.items():
                 signal.signal(number, handler)
 
 
-def print_how_to_go_on(stop: Interrupted, what: str, place: str, is_queued: bool) -> None:
+def print_how_to_go_on(stop: Interrupted, what: str, how: str, is_queued: bool) -> None:
     """Print to stderr what was stopped, and how it goes on.
 
     Args:
         stop: The interruption; it counts as explained from then on.
         what: What was stopped.
-        place: The key with which the same command goes on.
+        how: Text that says which command goes on.
         is_queued: Whether SLURM will run it again.
     """
     stop.explained = True
     name = signal.Signals(stop.number).name
-    how = "SLURM queues its job again" if is_queued else f"to go on, the same command with {place}"
+    how = "SLURM queues its job again" if is_queued else how
     print(f"ghgs: {what} was interrupted ({name}); {how}", file=sys.stderr)

@@ -1,11 +1,15 @@
 """How commands begin and end: what they do not wait for, and what still happens when they exit."""
 
 import gc
+import os
+import signal
 import sys
 
 import pytest
 
 from ghgs_lit.cli.main import main
+from ghgs_lit.config import registry
+from ghgs_lit.runs.signals import handlers
 from tests.helpers.processes import run_python
 
 _COMMAND = """
@@ -41,6 +45,24 @@ def test_help_and_wrong_paths_do_not_wait_for_pytorch(tmp_path, arguments, code,
     assert int(found) == code
     assert ("nowhere" in done.stderr) == bool(code)
     assert not absent & set(loaded)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_command_that_is_stopped_while_it_starts_says_so(monkeypatch, capsys, number):
+    """Ctrl-C in the seconds of imports ended in a traceback, or in what the library made of it."""
+
+    def interrupted():
+        try:
+            os.kill(os.getpid(), number)
+        finally:
+            raise ImportError("cannot import name 'x' from partially initialized module")
+
+    monkeypatch.setattr(registry, "verbs", interrupted)
+    monkeypatch.setattr(sys, "argv", ["ghgs", "greet", "-m"])
+    before = handlers()
+    assert main() == 128 + number
+    assert capsys.readouterr().err == f"ghgs greet: interrupted ({signal.Signals(number).name})\n"
+    assert handlers() == before
 
 
 _ENDING = """

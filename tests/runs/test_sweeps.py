@@ -1,6 +1,7 @@
 """Sweeps run everything once: when they grow, are interrupted, or are shared by processes."""
 
 import contextlib
+import itertools
 import json
 import os
 import signal
@@ -9,10 +10,11 @@ import time
 import pytest
 from hydra.core.utils import JobReturn, JobStatus
 
+from ghgs_lit.cli import application
 from ghgs_lit.cli import train as train_verb
 from ghgs_lit.config import compose, run_of
 from ghgs_lit.errors import InputError
-from ghgs_lit.runs import job, planned
+from ghgs_lit.runs import grid, job, planned
 from ghgs_lit.runs.grid import combinations, run_all
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.results import read_results
@@ -167,6 +169,67 @@ def test_a_sweep_that_is_stopped_starts_no_further_run(sweep, monkeypatch, numbe
     code, out, _ = sweep("seed=1,2,3")
     assert code == 0
     assert "3 runs: 3 done" in out
+
+
+def stop_in_third_plan(monkeypatch, number, is_lost):
+    """Let a signal arrive while the third configuration of a sweep is looked at.
+
+    OmegaConf restores flags in a ``finally``, where an interruption makes an ``AttributeError``;
+    whoever expects one, as ``hasattr`` does, loses the signal.
+    """
+    whole = grid.config_hash
+    calls = itertools.count(1)
+
+    def interrupted(config):
+        if next(calls) != 3:
+            return whole(config)
+        with contextlib.suppress(AttributeError) if is_lost else contextlib.nullcontext():
+            try:
+                os.kill(os.getpid(), number)
+            finally:
+                raise AttributeError("'NoneType' object has no attribute '_invalidate_flags_cache'")
+        return whole(config)
+
+    monkeypatch.setattr(grid, "config_hash", interrupted)
+    return calls
+
+
+@pytest.mark.parametrize("is_lost", [False, True])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_sweep_that_is_stopped_while_it_is_planned_says_that_nothing_was_run(
+    sweep, monkeypatch, number, is_lost
+):
+    """It named a directory that was not there, or an override that "fits" not, or went on."""
+    calls = stop_in_third_plan(monkeypatch, number, is_lost)
+    code, _, err = sweep("seed=1,2,3,4,5")
+    assert code == 128 + number
+    name = signal.Signals(number).name
+    assert err == (f"ghgs: the sweep was interrupted ({name}); nothing was run; to begin, the same command\n")
+    assert next(calls) == 4
+    assert not sweep.directory.exists()
+    code, out, _ = sweep("seed=1,2", "dry_run=true")
+    assert (code, "2 runs: 2 missing" in out) == (0, True)
+
+
+def test_a_sweep_that_is_stopped_between_two_runs_says_how_many_are_done(sweep, monkeypatch):
+    """The job of the second run fills its configuration when the signal arrives, and fails."""
+
+    def then_stop(run, directory, stats):
+        monkeypatch.setattr(application, "fill", loses_a_signal)
+        return record_execution(run, directory, stats)
+
+    def loses_a_signal(cfg):
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+        finally:
+            raise AttributeError("flags")
+
+    monkeypatch.setattr(train_verb, "train", then_stop)
+    code, _, err = sweep("seed=1,2,3")
+    assert code == 143
+    assert "1 of 3 runs are done; to go on, the same command with hydra.sweep.dir=" in err
+    assert "Traceback" not in err
+    assert len(executed(sweep.directory)) == 1
 
 
 def test_a_failing_run_is_named_and_the_others_are_run(sweep, monkeypatch):
