@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import rich
+import rich.box
 from rich.table import Table
 
 from ghgs_lit.data.check import Phase, Report
@@ -16,6 +17,7 @@ from ghgs_lit.data.overlap import Tile, save_sheet
 _LINE = re.compile(r"(?P<place>.*?): expected (?P<expected>.*); found (?P<found>.*)", re.DOTALL)
 # Rows of a table on the terminal; check.json has all.
 _SHOWN = 30
+_LEGEND = "IoU: of masks and silhouettes of bodies; agree: least share of a mask that the other masks allow"
 
 
 def split_line(line: str) -> tuple[str, str, str]:
@@ -48,7 +50,9 @@ def _light(report: Report) -> str:
 
 def show(report: Report) -> None:
     """Print the report as tables."""
-    table = Table("phase", "people", "subjects", "photos", "broken", "bodies", "mean IoU", "min IoU", "agree")
+    headings = ("phase", "people", "subjects", "photos", "broken", "bodies", "mean IoU", "min IoU", "agree")
+    narrow = {"box": rich.box.SIMPLE_HEAD, "padding": (0, 1, 0, 0)}  # 80 columns hold all headings
+    table = Table(*headings, **narrow, caption=_LEGEND, caption_justify="left")
     for name, phase in report.phases.items():
         iou = phase.known("iou")
         agreement = phase.known("agreement")

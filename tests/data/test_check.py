@@ -174,7 +174,10 @@ def test_lights_of_renders_and_how_bright_they_are_is_said(root, capsys, tmp_pat
     assert not [note for note in lit.notes if "lights" in note]
     show(lit)
     line = f"lights=studio; mean brightness of subjects (1 is white): train {mean:.3f}, val "
-    assert f"rendered with data.render.{line}" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert f"rendered with data.render.{line}" in out
+    for heading in ("subjects", "mean IoU", "agree"):  # none is cut on a terminal of 80 columns
+        assert heading in out
     write(lit, tmp_path / "check")
     content = json.loads((tmp_path / "check" / "check.json").read_text())
     assert content["lights"] == "studio"
