@@ -3,12 +3,15 @@ r"""All that is worth measuring in the first minutes on a GPU: one prepared scri
     python benchmarks/gpu.py --dry first second          # rehearse on the pretend device of the tests
     python benchmarks/gpu.py first                       # 420 s: predictions, steps, graphs, loader
     python benchmarks/gpu.py second                      # 240 s of training after at most 180 of preparation
-    python benchmarks/gpu.py step prediction             # sections by name
+    python benchmarks/gpu.py --seconds 570 step prediction graphs loader training    # within ten minutes
     python benchmarks/gpu.py --table runs/gpu            # the tables again, from the files alone
 
 Each section is a process of its own with a time limit. Findings are lines of JSON in
 ``<out>/<run>.jsonl`` as soon as they are known; a section that fails or takes too long is a
-row with its last lines, and the others go on. In the background gsplat is compiled (its
+row with its last lines, and the others go on. Sections that are named are one run, in their order,
+but that one which must wait for people lets the next one pass; ``--seconds`` ends it. Whether results that
+are played back are those of eager calls, for other inputs than the recorded ones, is a row with a
+verdict; a wrong one is said last, and the exit status is 1. In the background gsplat is compiled (its
 kernels for up to 9 channels, for this GPU) and built-in people are rendered on all cores; they
 pause while a section measures what a busy host would spoil. Both lie in ``--work``, where the
 next call finds them.
@@ -28,6 +31,7 @@ after as many samples (``--beside-samples`` a step).
 
 import argparse
 import importlib.util
+import math
 import os
 import re
 import shutil
@@ -49,6 +53,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.gpu_call import DRY, Call, Rows, Sizes
 from benchmarks.gpu_data import validations
 from benchmarks.gpu_measure import Gpu, reason, rehearsal
+from benchmarks.gpu_replay import WRONG
 from benchmarks.gpu_sections import SECTIONS
 
 GSPLAT, PEOPLE = "gsplat", "people"
@@ -70,8 +75,8 @@ class Plan:
 #: The most valuable first; a section that must wait for its needs lets the next one pass.
 PLANS = {
     "machine": Plan(40),
-    "step": Plan(75, (GSPLAT,), quiet=True),
-    "prediction": Plan(75, (GSPLAT,), quiet=True),
+    "step": Plan(100, (GSPLAT,), quiet=True),
+    "prediction": Plan(100, (GSPLAT,), quiet=True),
     "graphs": Plan(60, (GSPLAT,), quiet=True),
     "paper": Plan(75),
     "frozen": Plan(60, (GSPLAT,)),
@@ -293,6 +298,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--gsplat", type=Path, help="folder of a compiled gsplat")
     parser.add_argument("--dry", action="store_true", help="rehearse without a GPU, with small sizes")
     parser.add_argument("--table", type=Path, metavar="FOLDER", help="print the tables of files, no more")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="limit of a run")
     parser.add_argument("--beside", type=Path, help="csv/metrics.csv of another training")
     parser.add_argument("--beside-samples", type=int, default=2, help="its samples a step")
     parser.add_argument("--section", help=argparse.SUPPRESS)
@@ -303,6 +309,15 @@ def arguments() -> argparse.Namespace:
     if unknown:
         parser.error(f"expected {', '.join([*RUNS, *PLANS])}; found {', '.join(sorted(unknown))}")
     return options
+
+
+def runs_of(names: list[str]) -> dict[str, tuple[list[str], float]]:
+    """Sections and seconds of runs by their names; sections that are named are one run."""
+    runs = {name: RUNS[name] for name in names if name in RUNS}
+    sections = [name for name in names if name in PLANS]
+    if sections:
+        runs["_".join(sections)] = (sections, sum(PLANS[name].seconds for name in sections) + 180)
+    return runs
 
 
 def main() -> None:
@@ -316,15 +331,20 @@ def main() -> None:
             sys.exit("device: expected a CUDA device, or --dry; found none")
         folder.mkdir(parents=True, exist_ok=True)
         options.work.mkdir(parents=True, exist_ok=True)
-        for name in options.names or ["first"]:
-            sections, seconds = RUNS.get(name) or ([name], PLANS[name].seconds + 180)
+        for name, (sections, seconds) in runs_of(options.names or ["first"]).items():
             file = folder / f"{name}.jsonl"
             file.unlink(missing_ok=True)
-            Session(options, Rows(file), {section: PLANS[section] for section in sections}, seconds).run()
+            plans = {section: PLANS[section] for section in sections}
+            Session(options, Rows(file), plans, min(seconds, options.seconds)).run()
     beside = [] if options.beside is None else validations(options.beside)
     beside = [row | {"samples": row["step"] * options.beside_samples} for row in beside]
+    wrong = []
     for file in sorted(folder.glob("*.jsonl")):
-        print(f"\n# {file.stem}\n{report(Rows(file).read(), beside)}")
+        rows = Rows(file).read()
+        print(f"\n# {file.stem}\n{report(rows, beside)}")
+        wrong += [f"{file.stem}: {row['row']}" for row in rows if row.get("verdict") == WRONG]
+    if wrong:
+        sys.exit("\nWRONG, played back is not as eager:\n" + "\n".join(wrong))
 
 
 if __name__ == "__main__":

@@ -21,7 +21,9 @@ from torch.profiler import ProfilerActivity, profile
 from benchmarks.device import drawing_nothing
 from ghgs_lit import model as models
 from ghgs_lit.runtime import precision
-from tests.helpers.pretend_device import DEVICE, Log, pretend_device
+from ghgs_lit.runtime.tape import CudaTape, Tape
+from tests.helpers.pretend_device import DEVICE, pretend_device
+from tests.helpers.tape import OperatorTape
 
 #: Kinds of a trace's events that are work of a GPU; in a rehearsal, operators.
 WORK, REHEARSED_WORK = ("kernel", "gpu_memcpy", "gpu_memset"), ("cpu_op",)
@@ -33,6 +35,10 @@ class Gpu:
 
     def __init__(self, device: torch.device, is_real: bool):
         self.device, self.is_real = device, is_real
+
+    def tape(self) -> Tape:
+        """What records: CUDA graphs; in a rehearsal a stand-in that repeats operators."""
+        return CudaTape() if self.is_real else OperatorTape(self.device.type)
 
     def milliseconds(self, call: Callable[[], Any], repeats: int) -> float:
         """Median time of a call, by events; the host submits as fast as it can."""
@@ -107,8 +113,8 @@ def reason(error: BaseException) -> str:
 def rehearsal() -> Iterator[Gpu]:
     """The pretend device of the tests as a GPU,
     with stand-ins for what PyTorch has for CUDA alone."""
-    with pretend_device() as log, drawing_nothing(), contextlib.ExitStack() as stack:
-        for name, value in _stand_ins(log).items():
+    with pretend_device(), drawing_nothing(), contextlib.ExitStack() as stack:
+        for name, value in _stand_ins().items():
             stack.enter_context(mock.patch.object(torch.cuda, name, value))
         stack.enter_context(mock.patch.object(torch, "compile", lambda function, **_: function))
         stack.enter_context(mock.patch.object(precision, "has_bfloat16", return_value=True))
@@ -131,27 +137,13 @@ class _Event:
         return 1e3 * (end.time - self.time)
 
 
-def _stand_ins(log: Log) -> dict[str, Any]:
-    @contextlib.contextmanager
-    def graph(_, **options):
-        before = log.waits.total()
-        yield
-        if waits := log.waits.total() - before:
-            raise RuntimeError(f"operation not permitted when stream is capturing (waits: {waits})")
-
-    stream = SimpleNamespace(wait_stream=lambda other: None)
+def _stand_ins() -> dict[str, Any]:
     return {
         "Event": _Event,
-        "Stream": lambda: stream,
-        "CUDAGraph": lambda: SimpleNamespace(replay=lambda: None),
-        "current_stream": lambda: stream,
         "empty_cache": lambda: None,
         "get_device_properties": lambda device: SimpleNamespace(name="pretend", total_memory=80 << 30),
-        "graph": graph,
-        "graph_pool_handle": lambda: (0, 1),
         "max_memory_allocated": lambda device=None: 0,
         "reset_peak_memory_stats": lambda device=None: None,
         "set_per_process_memory_fraction": lambda share, device=None: None,
-        "stream": lambda _: contextlib.nullcontext(),
         "synchronize": lambda device=None: None,
     }

@@ -15,6 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from benchmarks.gpu_call import Call
 from benchmarks.gpu_data import loader, people, training
 from benchmarks.gpu_measure import reason
+from benchmarks.gpu_replay import judge_optimizer, judge_prediction, judge_step
 from ghgs_lit.config.run import Run
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL, SecondsProbe, inside, top_level, watched
 from ghgs_lit.diagnostics.doctor.selfcheck import PASSED, selfcheck
@@ -24,11 +25,12 @@ from ghgs_lit.model import GHGS
 from ghgs_lit.playback import Playback
 from ghgs_lit.rendering.capacity import deferred
 from ghgs_lit.runtime.precision import keep_rounded, precision_of
-from ghgs_lit.runtime.recording import CudaTape, Recorder
+from ghgs_lit.runtime.recording import Recorder
 from ghgs_lit.runtime.watching import Inputs, Watcher
 from ghgs_lit.runtime.watching import watched as stages_watched
 from ghgs_lit.stages import STAGES
 from ghgs_lit.training import captured
+from ghgs_lit.training.optimization import hold_rates
 from ghgs_lit.types import Batch, map_tensors
 
 PRECISIONS = ("float32", "tf32", "bfloat16")
@@ -94,16 +96,14 @@ def prediction(call: Call) -> None:
         for capture in ("off", "auto"):
             model.options = model.options.model_copy(update={"capture": capture})
             _predicted(call, f"{call.sizes.side}², batch of {size}, capture={capture}", model, batch)
-        call.add(
-            f"batch of {size}, recorder",
-            reason=model.playback.recorder.reason,
-            **model.playback.recorder.counts,
-        )
+        judge_prediction(call, f"batch of {size}", model, batch)
+        recorder = model.playback.recorder
+        call.add(f"batch of {size}, recorder", reason=recorder.reason, **recorder.counts)
 
 
 def _recording(call: Call, model: GHGS) -> GHGS:
     """The model with recordings on this device."""
-    model.playback = Playback(*(Recorder(tape=CudaTape(call.gpu.device.type)) for _ in range(2)))
+    model.playback = Playback(*(Recorder(tape=call.gpu.tape()) for _ in range(2)))
     return model
 
 
@@ -167,7 +167,7 @@ def _recorded(call: Call, name: str, function: Callable[[Inputs], Any], inputs: 
     """Row of a recording: eager and played back (with copies of inputs and results), or why it cannot be
     recorded."""
     eager = call.gpu.milliseconds(partial(function, inputs), call.sizes.repeats)
-    recorder = Recorder(eager=0, tape=CudaTape(call.gpu.device.type))
+    recorder = Recorder(eager=0, tape=call.gpu.tape())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the row has the reason
         recorder(function, inputs)
@@ -190,6 +190,9 @@ class _Step:
         self.renderer, self.losses = run.renderer.build(), run.loss.build()
         self.options = run.optimizer
         self.optimizer = self.options.optimizer(self.model)
+        hold_rates(self.optimizer)
+        if not call.gpu.is_real and self.options.matrix_scale is not None:  # as Muon does on CUDA
+            self.optimizer.recorder = Recorder(limit=2, tape=call.gpu.tape())
 
     def data(self) -> None:
         self.batch = self.host.to(self.device, non_blocking=True)
@@ -212,12 +215,21 @@ class _Step:
         self.optimizer.step()
         self.optimizer.zero_grad()
 
-    def captured(self) -> None:
-        """The step with stages, rendering, loss and gradients played back."""
-        self.data()
+    def called(self) -> Tensor:
+        """The loss, operator by operator."""
+        for part in (self.forward, self.render, self.loss):
+            part()
+        return self.total
+
+    def played(self) -> Tensor:
+        """The loss, with stages, rendering and gradients played back."""
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast):
-            outcome = captured.played(self.model, self.renderer, self.losses, self.batch)
-        outcome.total.backward()
+            return captured.played(self.model, self.renderer, self.losses, self.batch).total
+
+    def captured(self) -> None:
+        """The step, played back."""
+        self.data()
+        self.played().backward()
         self.optimize()
 
     @property
@@ -240,11 +252,13 @@ def _stepped(call: Call, name: str, step: _Step) -> None:
 
 
 def _captured(call: Call, name: str, step: _Step) -> None:
-    """Row of a step that is played back."""
+    """Rows of a step that is played back: how long it takes, and whether it is as eager."""
     ms = call.gpu.milliseconds(step.captured, call.sizes.repeats)
     recorder = step.model.playback.steps
     work = call.gpu.work(step.captured, 2)
-    call.add(name, ms=ms, reason=recorder.reason, **work, **recorder.counts)
+    call.add(f"{name}, captured", ms=ms, reason=recorder.reason, **work, **recorder.counts)
+    judge_step(call, name, step)
+    judge_optimizer(call, f"{name}, optimizer", step)
 
 
 def step(call: Call) -> None:
@@ -253,7 +267,7 @@ def step(call: Call) -> None:
         made = _Step(call, call.run(*call.shipped), call.batch(size, call.sizes.side))
         with precision_of("tf32", torch.device("cuda")):  # as trainer=gpu
             _stepped(call, f"batch of {size}", made)
-            _captured(call, f"batch of {size}, captured", made)
+            _captured(call, f"batch of {size}", made)
         del made
         gc.collect()
 
@@ -267,7 +281,7 @@ def frozen(call: Call) -> None:
         try:
             made = _Step(call, call.run(*encoder), call.batch(size, call.sizes.large), autocast=True)
             _stepped(call, f"batch of {size}", made)
-            _captured(call, f"batch of {size}, captured", made)
+            _captured(call, f"batch of {size}", made)
         except torch.cuda.OutOfMemoryError as error:
             call.add(f"batch of {size}", refused=reason(error))
         made = None

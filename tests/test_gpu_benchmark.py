@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import sys
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -10,7 +11,11 @@ import torch
 from benchmarks import gpu
 from benchmarks.gpu_call import DRY, Call, Rows
 from benchmarks.gpu_measure import rehearsal
-from benchmarks.gpu_sections import SECTIONS
+from benchmarks.gpu_replay import WRONG, judge_optimizer, judge_prediction, judge_step
+from benchmarks.gpu_sections import SECTIONS, _recording, _Step
+from tests.helpers.models import make_model
+from tests.helpers.pretend_device import DEVICE
+from tests.helpers.tape import OperatorTape, SilentTape
 
 TINY = dataclasses.replace(DRY, side=28, batches=(1,), large_batches=(1,), large=28)
 
@@ -41,8 +46,70 @@ def test_a_section_runs_in_a_rehearsal(section, tmp_path, one_thread):
     if section == "step":
         parts = ("data", "forward", "render", "loss", "backward", "optimize")
         each = [f"batch of 1: {part}" for part in parts]
-        assert names == ["batch of 1", *each, "batch of 1, captured"]
-        assert all(row["ms"] > 0 and row["launches"] > 0 and len(row["longest"]) <= 40 for row in found)
+        judged = [f"batch of 1, {part}replay beside eager" for part in ("", "optimizer, ")]
+        assert names == ["batch of 1", *each, "batch of 1, captured", *judged]
+        assert [row["verdict"] for row in found[-2:]] == ["as eager"] * 2
+        measured = found[:-2]
+        assert all(row["ms"] > 0 and row["launches"] > 0 and len(row["longest"]) <= 40 for row in measured)
+
+
+class Lossy(OperatorTape):
+    """Repeats nothing of what an operator does from its ``first`` call on, as if it were not recorded."""
+
+    def __init__(self, device, operator, first):
+        super().__init__(device)
+        self.operator, self.first = operator, first
+
+    def record(self, call):
+        result, play = super().record(call)
+        calls = play.__self__.calls
+        places = [place for place, each in enumerate(calls) if each[0].name() == self.operator]
+        for place in reversed(places[self.first :]):
+            del calls[place]
+        return result, play
+
+
+TAPES = {
+    "prediction": [None, (SilentTape,), (Lossy, "aten::addmm", 0)],
+    "step": [None, (SilentTape,), (Lossy, "aten::mm", -1)],
+    "optimizer": [None, (SilentTape,), (Lossy, "aten::_foreach_lerp_.Scalar", 0)],
+}
+PLANTED = [(kind, tape) for kind, tapes in TAPES.items() for tape in tapes]
+
+
+@pytest.mark.parametrize(("kind", "planted"), PLANTED)
+def test_a_wrong_replay_is_seen(kind, planted, tmp_path, one_thread, monkeypatch):
+    """One that does nothing, or leaves a single operator out."""
+    with rehearsal() as device:
+        if planted is not None:
+            kept, *options = planted
+            monkeypatch.setattr(device, "tape", lambda: kept(device.device.type, *options))
+        rows = Rows(tmp_path / "rows.jsonl")
+        call = Call(device, rows, "step", TINY, tmp_path)
+        if kind == "prediction":
+            with torch.no_grad():
+                model = _recording(call, make_model("model=hull").eval().to(DEVICE))
+                batch = dataclasses.replace(call.batch(1, 28), targets=None).to(DEVICE)
+                for _ in range(2):
+                    model(batch)
+            judge_prediction(call, kind, model, batch)
+        else:
+            step = _Step(call, call.run(*call.shipped), call.batch(1, 28))
+            for _ in range(4):
+                step.captured()
+            (judge_step if kind == "step" else judge_optimizer)(call, kind, step)
+    [row] = rows.read()
+    assert row["verdict"] == ("as eager" if planted is None else WRONG)
+    monkeypatch.setattr(sys, "argv", ["gpu.py", "--table", str(tmp_path)])
+    with nullcontext() if planted is None else pytest.raises(SystemExit, match="WRONG, played back"):
+        gpu.main()
+
+
+def test_sections_that_are_named_are_one_run():
+    """So that people are rendered beside all of them."""
+    runs = gpu.runs_of(["step", "training", "second"])
+    assert list(runs) == ["second", "step_training"]
+    assert runs["step_training"] == (["step", "training"], 520)
 
 
 def test_a_section_that_fails_or_hangs_stops_no_other(tmp_path, monkeypatch, capsys):

@@ -128,3 +128,25 @@ def test_little_is_asked_for_around_a_step_that_is_played_back(kind, size):
     print(found)
     counted = range(2) if torch.__version__.startswith(_VERSION) else [1]
     assert all(found[number] <= AROUND[kind, size][number] for number in counted)
+
+
+#: Launches around the graphs of a prediction of the shipped weights, and waits, by the batch's size.
+PREDICTED = {1: (59, 2), 8: (87, 2)}
+
+
+@pytest.mark.parametrize("size", PREDICTED)
+@torch.no_grad()
+def test_little_is_asked_for_around_a_prediction_that_is_played_back(size):
+    """Copies of inputs and results, the plan, the room of renderings, and what cuts them to size."""
+    batch = dataclasses.replace(ellipsoid_batch(0.15, 4, 28, size), targets=None)
+    with pretend_device() as log, device.drawing_nothing():
+        model = GHGS.from_checkpoint().to(DEVICE)
+        model.playback = Playback(Recorder(tape=SilentTape()))
+        for _ in range(3):
+            there = batch.to(DEVICE)
+            log.clear()
+            model(there)
+    found = (log.launches, log.waits.total())
+    print(found)
+    counted = range(2) if torch.__version__.startswith(_VERSION) else [1]
+    assert all(found[number] <= PREDICTED[size][number] for number in counted)

@@ -1,0 +1,135 @@
+"""Whether what is played back is what an eager call gives, for inputs that were not recorded."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from benchmarks.gpu_call import Call
+from ghgs_lit.model import GHGS
+from ghgs_lit.runtime.recording import Recorder
+from ghgs_lit.types import Batch
+
+#: Largest distance of two results that differ by rounding, beside ten times that of two eager calls.
+ROUNDING = 1e-3
+WRONG = "WRONG"
+
+
+def other_scene(batch: Batch) -> Batch:
+    """A batch of the same class, with other colours, in a world that is moved by 20 cm."""
+    extrinsics = batch.cameras.extrinsics.clone()
+    extrinsics[..., :3, 3] += 0.2 * extrinsics[..., :3, 0]
+    return replace(batch, images=0.6 * batch.images, cameras=replace(batch.cameras, extrinsics=extrinsics))
+
+
+def apart(found: Sequence[Tensor], wanted: Sequence[Tensor]) -> float:
+    """Largest distance of a tensor from another, as a share of the other's norm, or of a thousandth of
+    the largest norm: small gradients are rounding alone."""
+    sizes = [other.norm().item() for other in wanted]
+    least = 1e-3 * max(sizes)
+    distances = [(one - other).norm() for one, other in zip(found, wanted, strict=True)]
+    shares = [distance / max(size, least) for distance, size in zip(distances, sizes, strict=True)]
+    return float(torch.stack(shares).max())  # a nan stays
+
+
+def judged(call: Call, name: str, recorder: Recorder, run: Callable[[bool], list[Tensor]]) -> None:
+    """Row of a call that is played back, beside two eager ones.
+
+    Args:
+        call: of the section.
+        name: of the row.
+        recorder: that has recorded calls of this class.
+        run: gives the results on the CPU, of a call that may be played back (True) or is eager.
+    """
+    before = recorder.counts["played"]
+    found, wanted, again = (run(may_be_played) for may_be_played in (True, False, False))
+    numbers = {"apart": apart(found, wanted), "noise": apart(again, wanted)}
+    # A number that is none is no small one.
+    holds = numbers["apart"] <= max(ROUNDING, 10 * numbers["noise"])
+    is_played = recorder.counts["played"] > before
+    verdict = ("as eager" if holds else WRONG) if is_played else "not played back"
+    call.add(f"{name}, replay beside eager", verdict=verdict, **numbers)
+
+
+def here(tensors: Iterable[Tensor]) -> list[Tensor]:
+    """Copies on the CPU, in float64."""
+    return [tensor.detach().cpu().double() for tensor in tensors]
+
+
+@torch.no_grad()
+def judge_prediction(call: Call, name: str, model: GHGS, batch: Batch) -> None:
+    """Row of a prediction of another scene.
+
+    Args:
+        call: of the section.
+        name: of the row.
+        model: that has recorded predictions of this class.
+        batch: of the class, on the device.
+    """
+    other, options = other_scene(batch), model.options
+
+    def predicted(may_be_played: bool) -> list[Tensor]:
+        capture = "auto" if may_be_played else "off"
+        model.options = options.model_copy(update={"capture": capture})
+        gaussians = model(other).gaussians
+        values = [getattr(gaussians, field.name) for field in fields(gaussians)]
+        return here(x for x in values if isinstance(x, Tensor) and x.is_floating_point())
+
+    judged(call, name, model.playback.recorder, predicted)
+    model.options = options
+
+
+def judge_step(call: Call, name: str, step: Any) -> None:
+    """Row of the loss and the gradients of a step on another scene.
+
+    Args:
+        call: of the section.
+        name: of the row.
+        step: of :mod:`benchmarks.gpu_sections`, which has recorded steps of this class.
+    """
+    batch, step.host = step.host, other_scene(step.host)
+    step.data()
+
+    def differentiated(may_be_played: bool) -> list[Tensor]:
+        step.optimizer.zero_grad()
+        total = step.played() if may_be_played else step.called()
+        total.backward()
+        slopes = [weight.grad for weight in step.model.parameters() if weight.grad is not None]
+        return here([total, *slopes])
+
+    judged(call, name, step.model.playback.steps, differentiated)
+    step.host = batch
+
+
+@torch.no_grad()
+def judge_optimizer(call: Call, name: str, step: Any) -> None:
+    """Row of what the recorded step of the optimizer changes, along other gradients.
+
+    Args:
+        call: of the section.
+        name: of the row.
+        step: of :mod:`benchmarks.gpu_sections`, whose optimizer has recorded its step.
+    """
+    optimizer, recorder = step.optimizer, getattr(step.optimizer, "recorder", None)
+    if recorder is None:
+        return
+    weights: list[nn.Parameter] = [weight for weight in step.model.parameters() if weight.requires_grad]
+    written = [*weights, *(value for state in optimizer.state.values() for value in state.values())]
+    before = [tensor.clone() for tensor in written]
+    moved = [weight for weight in weights if weight in optimizer.state]
+
+    def stepped(may_be_played: bool) -> list[Tensor]:
+        for number, weight in enumerate(moved):
+            weight.grad = weight.detach().roll(1).mul(0.5 + number % 3)
+        optimizer.recorder = recorder if may_be_played else None
+        optimizer.step()
+        changes = [new - old for new, old in zip(here(weights), here(before[: len(weights)]), strict=True)]
+        for tensor, value in zip(written, before, strict=True):
+            tensor.copy_(value)
+        return changes
+
+    judged(call, name, recorder, stepped)
+    optimizer.recorder = recorder
+    optimizer.zero_grad()
