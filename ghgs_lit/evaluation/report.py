@@ -21,6 +21,8 @@ print_once = cache(print)
 #: Printed metrics and their decimals.
 PRINTED = {"psnr": 2, "psnr_box": 2, "psnr_edge": 2, "ssim": 4, "lpips": 4, "flip": 4}
 PRINTED |= {"spill": 1, "sharpness": 2, "depth_error_mm": 1, "seconds": 2}
+#: Units in the heads of printed metrics whose names do not say them.
+_UNITS = dict.fromkeys(("psnr", "psnr_box", "psnr_edge"), "\ndB") | {"spill": "\n‰"}
 #: Descriptions of splits for readers of the results.
 SPLITS = {
     "train": "the subjects that were trained on",
@@ -97,6 +99,6 @@ def print_summary(rows: list[Row]) -> None:
     for mean in summarize(rows):
         numbers = ("-" if mean[name] is None else f"{mean[name]:.{PRINTED[name]}f}" for name in names)
         lines.append([*(mean[key] for key in about), *numbers])
-    heads = [*about, *(name.replace("_", "\n") for name in names)]
+    heads = [*about, *(name.replace("_", "\n") + _UNITS.get(name, "") for name in names)]
     align = ["left", "right", "left", *["right"] * len(names)]
     print(tabulate(lines, heads, colalign=align, disable_numparse=True), flush=True)
