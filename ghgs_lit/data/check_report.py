@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import rich
 import rich.box
+from rich.markup import escape
 from rich.table import Table
 
 from ghgs_lit.data.check import Phase, Report
@@ -66,7 +67,7 @@ def show(report: Report) -> None:
         if lines:
             table = Table(title, "expected", "found")
             for line in lines[:_SHOWN]:
-                table.add_row(*split_line(line))
+                table.add_row(*map(escape, split_line(line)))
             if len(lines) > _SHOWN:
                 table.add_row(f"... and {len(lines) - _SHOWN} more", "", "")
             rich.print(table)

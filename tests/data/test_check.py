@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ghgs_lit.data.check import inspect
+from ghgs_lit.data.check import Report, inspect
 from ghgs_lit.data.check_report import show, write
 from ghgs_lit.errors import InputError
 from tests.helpers.people import TINY, render_boxes, rendered
@@ -153,6 +153,12 @@ def test_bodies_are_counted_where_photographs_are_missing(root):
     assert len(found.problems) == 4
     assert found.phases["train"].bodies == 2
     assert not any("a body for each" in note for note in found.notes)
+
+
+def test_brackets_in_a_problem_are_no_markup(capsys):
+    """The command that installs an extra has some."""
+    show(Report(problems=["smpl_model: expected smplx (pip install 'ghgs-lit[smpl]'); found none"]))
+    assert "pip install 'ghgs-lit[smpl]'" in capsys.readouterr().out
 
 
 def test_lights_of_renders_and_how_bright_they_are_is_said(root, capsys, tmp_path):
