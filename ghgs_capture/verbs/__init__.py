@@ -82,7 +82,7 @@ class Predict(OfPhotographs, Measured):
     """What is written: ply, html, turntable, depth, points, inputs, splat; with the extra formats:
     compressed_ply, spz, sog, glb; with the extra video: mp4; or all."""
     up: Axis | None = None
-    """Axis that points up in all files; null: they are in the world of the cameras."""
+    """Axis that points up in all files, such as -y for SuperSplat; null: that of the cameras' world."""
     smooth: bool = False
     """Gaussians in files are as large as the photographs' pixels: no gaps on larger screens."""
     turntable: Turntable = Turntable()

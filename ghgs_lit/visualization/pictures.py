@@ -204,10 +204,17 @@ def sheet(
     rows += _depth_rows(batch, element, depth, depth_valid)
     if image is None or batch.targets is None:
         return stack(rows)
+    tiles = []
+    captions = []
     for t, (render, target) in enumerate(zip(image[element], batch.targets.images[element], strict=True)):
         name = batch.targets.names[element][t] if batch.targets.names else str(t)
-        tiles = [to_uint8(target), to_uint8(render), error_map(render, target)]
-        rows.append(row(tiles, [f"target {name}", "render", f"error x{ERROR_GAIN:g}"]))
+        tiles += [to_uint8(target), to_uint8(render), error_map(render, target)]
+        captions += [f"target {name}", "render", f"error x{ERROR_GAIN:g}"]
+    # three tiles for each target; many targets in an about square picture
+    in_row = 3 * max(1, round((len(tiles) / 9) ** 0.5))
+    for first in range(0, len(tiles), in_row):
+        part = slice(first, first + in_row)
+        rows.append(row(tiles[part], captions[part]))
     return stack(rows)
 
 

@@ -3,7 +3,9 @@
 import dataclasses
 
 import numpy as np
+import torch
 
+from ghgs_lit.types import Targets
 from ghgs_lit.visualization.pictures import row, sheet, to_uint8
 from tests.helpers.scenes import make_batch
 
@@ -35,3 +37,18 @@ def test_a_caption_stays_above_its_own_tile():
     assert len(row(tiles, ["its mask green, the hull of the other masks red", ""])) > len(plain)
     large = row([np.zeros((20, 1000, 3), np.uint8)], ["a"])
     assert len(large) - 20 > 2 * (len(plain) - 20)
+
+
+def test_many_targets_make_no_endless_column():
+    """Sixteen targets: six tiles in a row; a single one: three."""
+    batch = dataclasses.replace(make_batch(1, 3, 28, 140), depths=None)
+    for count, rows, tiles in ((1, 1, 3), (16, 8, 6)):
+        images = torch.rand(1, count, 3, 28, 140)
+        masks = torch.ones(1, count, 28, 140, dtype=torch.bool)
+        cameras = batch.cameras[:, [0] * count]
+        targets = Targets(images, masks, cameras)
+        picture = sheet(dataclasses.replace(batch, targets=targets), torch.zeros_like(images))
+        height, width = images.shape[-2:]
+        below = len(picture) - len(sheet(batch, None))
+        assert below in range(rows * height, rows * (height + 2 * 16))
+        assert picture.shape[1] == max(tiles * (width + 2) - 2, 3 * 142 - 2)
