@@ -187,7 +187,10 @@ class Session:
             process.send(signal.SIGSTOP if plan.quiet else signal.SIGCONT)
         begun = time.monotonic()
         section = Background(self.command(name), self.environment)
-        in_time = section.wait(min(self.scale * plan.seconds, self.end - begun))
+        try:
+            in_time = section.wait(min(self.scale * plan.seconds, self.end - begun))
+        finally:  # also where the whole command is ended
+            section.stop()
         status = "done" if section.process.returncode == 0 else "failed" if in_time else "took too long"
         self.note(name, status, time.monotonic() - begun, [] if status == "done" else section.last_lines())
         for process in self.background.values():
@@ -325,17 +328,26 @@ def main() -> None:
     if options.section:
         run_section(options)
         return
-    folder = options.table or options.out
-    if options.table is None:
-        if not options.dry and not torch.cuda.is_available():
-            sys.exit("device: expected a CUDA device, or --dry; found none")
-        folder.mkdir(parents=True, exist_ok=True)
-        options.work.mkdir(parents=True, exist_ok=True)
+    if options.table is not None:
+        show(options.table, options)
+        return
+    if not options.dry and not torch.cuda.is_available():
+        sys.exit("device: expected a CUDA device, or --dry; found none")
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended by a limit of time"))
+    options.out.mkdir(parents=True, exist_ok=True)
+    options.work.mkdir(parents=True, exist_ok=True)
+    try:
         for name, (sections, seconds) in runs_of(options.names or ["first"]).items():
-            file = folder / f"{name}.jsonl"
+            file = options.out / f"{name}.jsonl"
             file.unlink(missing_ok=True)
             plans = {section: PLANS[section] for section in sections}
             Session(options, Rows(file), plans, min(seconds, options.seconds)).run()
+    finally:
+        show(options.out, options)
+
+
+def show(folder: Path, options: argparse.Namespace) -> None:
+    """Print the tables of all files; the exit status is 1 if a verdict is wrong."""
     beside = [] if options.beside is None else validations(options.beside)
     beside = [row | {"samples": row["step"] * options.beside_samples} for row in beside]
     wrong = []

@@ -96,7 +96,8 @@ def prediction(call: Call) -> None:
         for capture in ("off", "auto"):
             model.options = model.options.model_copy(update={"capture": capture})
             _predicted(call, f"{call.sizes.side}², batch of {size}, capture={capture}", model, batch)
-        judge_prediction(call, f"batch of {size}", model, batch)
+        for model.precision in PRECISIONS:
+            judge_prediction(call, f"batch of {size}, {model.precision}", model, batch)
         recorder = model.playback.recorder
         call.add(f"batch of {size}, recorder", reason=recorder.reason, **recorder.counts)
 

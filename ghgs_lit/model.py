@@ -343,7 +343,7 @@ class GHGS(nn.Module):
         Args:
             parts: stages that compute.
         """
-        settings: list[Hashable] = [self.skip.pixels, self.keeps_drafts]
+        settings: list[Hashable] = [self.skip.pixels, self.keeps_drafts, self.precision]
         for name in parts:
             of_stage = getattr(getattr(self, name), "__dict__", {}).items()
             settings += [(name, *item) for item in of_stage if isinstance(item[1], (str, int, float, tuple))]

@@ -151,3 +151,21 @@ def test_a_section_whose_needs_failed_is_not_run(tmp_path, monkeypatch):
     gpu.Session(options, rows, {"step": gpu.Plan(30, ("gsplat",))}, 60).run()
     [row] = rows.read()
     assert (row["status"], row["last_lines"]) == ("gsplat failed", ["nvcc: not found"])
+
+
+def test_a_command_that_is_ended_leaves_no_section_behind(tmp_path, monkeypatch):
+    """Such as by a limit of time: a GPU is not shared with what goes on."""
+    started = []
+
+    def ended(process, _):
+        started.append(process.process)
+        raise SystemExit("ended by a limit of time")
+
+    monkeypatch.setattr(gpu.Background, "wait", ended)
+    monkeypatch.setattr(
+        gpu.Session, "command", lambda *_: [sys.executable, "-c", "import time; time.sleep(60)"]
+    )
+    options = argparse.Namespace(dry=False, gsplat=tmp_path, work=tmp_path, overrides=[])
+    with pytest.raises(SystemExit):
+        gpu.Session(options, Rows(tmp_path / "rows.jsonl"), {"machine": gpu.Plan(30)}, 60).run()
+    assert [process.poll() is not None for process in started] == [True]

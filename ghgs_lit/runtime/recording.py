@@ -163,7 +163,7 @@ class Recorder:
         try:
             return function(inputs)
         except torch.OutOfMemoryError:
-            holders = [recorder for recorder in _recorders if recorder._recordings]
+            holders = [recorder for recorder in list(_recorders) if recorder._recordings]
             if written or not holders:
                 raise
             for recorder in holders:
