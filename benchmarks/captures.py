@@ -2,6 +2,7 @@
 
     python benchmarks/captures.py model.ckpt [model.ckpt ...] --baselines all --out captures.json
     python benchmarks/captures.py shipped --mend --people 12 --first 4
+    python benchmarks/captures.py shipped --mend --people 1 --picture docs/masks.jpg
 
 Each capture has one trouble, the last one all of them; with ``--mend`` they are others, predicted as given
 and as ``ghgs predict`` mends them by itself. Photographs are taken before a background, twice as large as
@@ -21,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 
 from ghgs_capture.capture import Capture
 from ghgs_capture.crops import Photograph
@@ -43,6 +45,7 @@ from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.refinement import CameraRefinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch
+from ghgs_lit.visualization import pictures
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
 _RING, _VIEWS = 16, 4
@@ -266,6 +269,9 @@ def measure_mending(
     renderer, model = build_renderer(run, device), GHGS.from_checkpoint(options.checkpoints[0], device)
     metrics, larger = run.metrics.build().to(device), [_LARGER * side for side in size]
     data = tuple(data_of(Imperfection(), options.people, side, [], larger) for side in (list(size), larger))
+    if options.picture:
+        Image.fromarray(masks_picture(data, model, size, renderer)).save(options.picture, quality=92)
+        return
     results, method = {}, ModelMethod(model, renderer)
     for name, capture in MENDED.items():
         print(name, flush=True)
@@ -286,6 +292,47 @@ def measure_mending(
     write_text_atomically(options.out, json.dumps(results, indent=1))
 
 
+def masks_picture(
+    data: tuple[PhotographsDataModule, PhotographsDataModule],
+    model: GHGS,
+    size: tuple[int, int],
+    renderer: Renderer,
+) -> np.ndarray:
+    """Two inputs, target half-way, rendering and error, with wrong masks as given and as mended.
+
+    Args:
+        data: of the first person, in the size of crops and of photographs.
+        model: predicts.
+        size: (height, width) of the crops in pixels.
+        renderer: draws predictions.
+
+    Returns:
+        Picture [h, w, 3] uint8.
+    """
+    part = slice(None), slice(size[1] // 5, -size[1] // 5)  # a standing person is narrow
+    rows = []
+    for name in ("masks grown by 4 px", "masks eroded by 4 px"):
+        for label, refine in (("as given", 0), ("mended", "auto")):
+            (batch,) = predicted(MENDED[name], data, 0, model, size, renderer, refine)
+            midway = batch.targets.of_protocol("midway")
+            target = midway.images[0, 0]
+            with torch.no_grad():
+                render = renderer(model(batch).gaussians, midway.cameras[:, :1]).image[0, 0].clamp(0, 1)
+            tiles = [
+                *map(pictures.to_uint8, (*batch.images[0, :2], target, render)),
+                pictures.error_map(render, target),
+            ]
+            texts = (
+                f"{name}, {label}",
+                "another input",
+                "target",
+                "rendering",
+                f"error x{pictures.ERROR_GAIN:g}",
+            )
+            rows.append(pictures.row([tile[part] for tile in tiles], texts))
+    return pictures.stack(rows)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("checkpoints", type=Path, nargs="+")
@@ -296,6 +343,7 @@ def main() -> None:
     parser.add_argument("--refine-cameras", type=int, default=0, help="rounds that correct the cameras first")
     parser.add_argument("--mend", action="store_true", help="what predict mends by itself, and nothing else")
     parser.add_argument("--first", type=int, default=0, help="with --mend: people before it take no part")
+    parser.add_argument("--picture", type=Path, help="with --mend: of the first person, and no measurement")
     parser.add_argument("--out", type=Path, default=Path("captures.json"))
     options = parser.parse_args()
     run = run_of("evaluate", ["data=synthetic", "metrics.lpips=off"])
