@@ -1,11 +1,15 @@
 """Checks annotated shapes, composes faster, and limits the threads of each test process."""
 
 import gc
+import logging
 import os
 import signal
 import sys
 import threading
+from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
 
 # Where Python keeps no bytecode, as in many containers, each process that a test starts compiles
 # PyTorch and Lightning anew, which takes longer than most tests.
@@ -39,6 +43,7 @@ if not torch.cuda.is_available():
 
 import tests.helpers.composing  # noqa: E402, F401
 from ghgs_lit.config.registry import load_plugins  # noqa: E402
+from ghgs_lit.runtime.precision import _Rounding  # noqa: E402
 
 load_plugins()  # before any test has a register of its own
 
@@ -47,6 +52,32 @@ torch.set_num_threads(_THREADS)
 # Shells start background jobs with Ctrl-C ignored, and child processes inherit that.
 if threading.current_thread() is threading.main_thread():
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+#: Variables that a verb and Lightning set for the rest of their process.
+_LEFT = ("HYDRA_FULL_ERROR", "PL_GLOBAL_SEED", "PL_SEED_WORKERS")
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left_to_the_next_test() -> Iterator[None]:
+    """A verb may change its process, which ends with it: variables, the precision of products, logs
+    (whose streams are those of one test, and whose files are in its folder)."""
+    variables = {name: os.environ.get(name) for name in _LEFT}
+    rounding = _Rounding.now("cpu")
+    root = logging.getLogger()
+    handlers = list(root.handlers)
+    level = root.level
+    yield
+    for name, value in variables.items():
+        os.environ.pop(name, None)
+        if value is not None:
+            os.environ[name] = value
+    rounding.restore("cpu")
+    root.setLevel(level)
+    for handler in [one for one in root.handlers if one not in handlers]:
+        if type(handler) in (logging.StreamHandler, logging.FileHandler):
+            root.removeHandler(handler)
+            handler.close()
 
 
 def pytest_collection_finish() -> None:

@@ -1,0 +1,23 @@
+"""What a verb leaves in its process does not reach the next test."""
+
+import logging
+import os
+
+import torch
+
+
+def test_a_test_may_leave_what_a_verb_does(tmp_path):
+    """As the last commands of tests of sweeps and of training did."""
+    os.environ |= {"HYDRA_FULL_ERROR": "1", "PL_GLOBAL_SEED": "1"}
+    torch.set_float32_matmul_precision("high")
+    logging.getLogger().addHandler(logging.FileHandler(tmp_path / "train.log", delay=True))
+    logging.getLogger().setLevel(logging.INFO)
+
+
+def test_the_next_test_does_not_find_it():
+    """Products were rounded, errors had tracebacks, and lines went to files of another test."""
+    assert not {"HYDRA_FULL_ERROR", "PL_GLOBAL_SEED"} & os.environ.keys()
+    assert torch.get_float32_matmul_precision() == "highest"
+    root = logging.getLogger()
+    assert not [handler for handler in root.handlers if type(handler) is logging.FileHandler]
+    assert root.level == logging.WARNING
