@@ -86,9 +86,23 @@ def require_free(path: str | Path, key: str, overwrite: bool) -> None:
     _require_replaceable(path)
     taken = os.path.lexists(path) and not overwrite
     require(not taken, key, "a path where there is no file, or overwrite=true", str(path))
-    folder = next(parent for parent in path.absolute().parents if parent.exists())
-    fits = folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
-    require(fits, key, f"a folder that can be written to for {path}", str(folder))
+    require_writable(path.absolute().parent, key, str(path))
+
+
+def require_writable(folder: Path, key: str, what: str) -> None:
+    """Check that a folder can be written to, or made.
+
+    Args:
+        folder: its absolute path.
+        key: dotted key of the command line, for messages.
+        what: will be written, for messages.
+
+    Raises:
+        InputError: it, or the folder above it that exists, cannot.
+    """
+    place = next(path for path in (folder, *folder.parents) if path.exists())
+    fits = place.is_dir() and os.access(place, os.W_OK | os.X_OK)
+    require(fits, key, f"a folder that can be written to for {what}", str(place))
 
 
 @contextlib.contextmanager

@@ -219,7 +219,9 @@ def run(verb: str, argv: list[str]) -> int:
             if values.cfg == "job":
                 _print_configuration(values.config_name or verb, _for_hydra(verb, overrides), values)
                 return 0
-            sys.argv = [argv[0], *flags, messages.NO_FILES_OF_HYDRA, *_for_hydra(verb, overrides)]
+            overrides = _for_hydra(verb, overrides)
+            messages.check_directory(overrides, values.multirun or "hydra.mode=MULTIRUN" in overrides)
+            sys.argv = [argv[0], *flags, messages.NO_FILES_OF_HYDRA, *overrides]
             hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=verb)(task)()
             sys.stdout.flush()
     except BrokenPipeError:

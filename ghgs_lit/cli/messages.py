@@ -22,7 +22,7 @@ from ghgs_lit.config.compose import plain
 from ghgs_lit.config.keys import flatten, is_below
 from ghgs_lit.config.options import UnknownKey, did_you_mean
 from ghgs_lit.config.registry import KINDS, verb_class, verbs
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 
 #: Errors that are bad input, not bugs.
 BAD_INPUT = (InputError, OSError, HydraException, OmegaConfBaseException)
@@ -70,7 +70,11 @@ def _command_line() -> str:
 
 
 def _unread_override(error: OverrideParseException) -> str:
-    key, _, value = str(error.override).partition("=")
+    key, sign, value = str(error.override).partition("=")
+    if not sign:
+        return f"{error.override}: expected key=value or group=option; found no ="
+    if value.endswith(","):
+        return f"{key}: expected values without a space after the comma; found {value!r} and another word"
     if not value or value[0] in "[{\"'":
         return f"{error.override}: expected key=value or group=option; found {error}"
     quoted = shlex.quote(f'{key}="{value}"')
@@ -108,6 +112,9 @@ def _composition(error: HydraException, verb: str) -> str:
     if chosen := re.match(r"In '([^']+)': Could not override 'ablation'", str(error)):
         expected = "no choice of an ablation, which composes last (ablation=... on the command line)"
         return f"{chosen[1]}: expected {expected}; found one"
+    if several := re.match(r"Ambiguous value for argument '([^=']+)=(.*)'\n", str(error)):
+        key, values = several.groups()
+        return f"{key}: expected one value, a list ([{values}]), or -m for a run of each; found {values}"
     named = re.match(r"Could not override '([^']+)'", str(error))
     if named is None:
         return f"{_command_line()}: expected overrides that fit; found {error} {error.__cause__ or ''}"
@@ -264,6 +271,23 @@ def parsed(arguments: Sequence[str]) -> tuple[list[str], list[str], argparse.Nam
     values = parser.parse_intermixed_args(list(arguments))
     flags = [word for word in arguments if word not in values.overrides]
     return flags, values.overrides, values
+
+
+def check_directory(arguments: Sequence[str], sweeps: bool) -> None:
+    """Refuse a directory that Hydra ignores: of a single run in a sweep, or the reverse.
+
+    Args:
+        arguments: overrides of the command line.
+        sweeps: whether the command is a sweep.
+
+    Raises:
+        InputError: the directory of the other mode alone is given.
+    """
+    given = dict(text.lstrip("+").split("=", 1) for text in arguments if "=" in text)
+    names = ["hydra.run.dir", "hydra.sweep.dir"]
+    ignored, read = names if sweeps else names[::-1]
+    expected = f"{read}, where {'a sweep' if sweeps else 'a single run (without -m)'} writes"
+    require(read in given or ignored not in given, ignored, expected, given.get(ignored))
 
 
 def check_deletions(arguments: Sequence[str]) -> None:

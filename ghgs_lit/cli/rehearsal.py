@@ -95,7 +95,11 @@ class _Rehearsed:
         self.attempt(job.check_config, run)
         model = self.attempt(GHGS.from_config, run.plain, empty=True)
         if model is not None and run.init_from is not None:
-            self.attempt(start.initialize, model, run.init_from, run.init_strict, run.allow_random_encoder)
+            options = run.init_strict, run.allow_random_encoder
+            lines = self.attempt(start.initialize, model, run.init_from, *options) or ()
+            if unfit := sum(line.startswith("wrong shape") for line in lines):
+                left = f"{unfit} of {len(lines)} tensors have another shape in {run.init_from}"
+                self.notes[f"init_from: {left}, and stay as initialised"] = None
         if run.resume not in (None, "auto"):
             self.attempt(read_checkpoint, run.resume)
         trainer = self.attempt(build_trainer, run, folder)

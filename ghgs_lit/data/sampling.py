@@ -323,7 +323,8 @@ def evaluation_samples(
     """
     inputs = next((list(listed) for listed in positions if len(listed) == count), even_positions(ring, count))
     expected = f"different positions of a ring of {ring}"
-    require(count > 0 and len(set(inputs)) == count, f"evaluation with {count} views", expected, inputs)
+    found = count if count > ring else inputs
+    require(count > 0 and len(set(inputs)) == count, f"evaluation with {count} views", expected, found)
     specs = []
     for name, available in subjects.items():
         if lacking := sorted(set(inputs) - set(available)):

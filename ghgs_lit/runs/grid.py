@@ -20,11 +20,12 @@ from ghgs_lit.config.defaults import fill
 from ghgs_lit.config.keys import is_hyperparameter, key_of
 from ghgs_lit.config.registry import verb_class
 from ghgs_lit.errors import require
-from ghgs_lit.files import resolved, write_text_atomically
+from ghgs_lit.files import require_writable, resolved, write_text_atomically
+from ghgs_lit.parsing import read_yaml
 from ghgs_lit.runs.job import BUSY, check_config, check_launcher
 from ghgs_lit.runs.planned import PlannedRun, Rehearse, print_plan, print_results, shared_overrides
 from ghgs_lit.runs.processes import queue_again
-from ghgs_lit.runs.provenance import config_hash
+from ghgs_lit.runs.provenance import config_hash, differences
 from ghgs_lit.runs.run import PLAN, SWEPT, RunDirectory, State
 from ghgs_lit.runs.signals import Interrupted, interruptible, print_how_to_go_on, stop_if_interrupted
 
@@ -61,6 +62,8 @@ def sweep(sweeper: BasicSweeper, arguments: Sequence[str], rehearse: Rehearse) -
     try:
         with interruptible():
             planned = _planned(sweeper, arguments, directory)
+            if differing := differing_from_others(planned, directory):
+                print(differing, flush=True)
             if sweeper.config.get("dry_run"):
                 print_plan(planned, directory, rehearse)
                 return []
@@ -114,6 +117,8 @@ def _planned(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -
     for item in planned:  # an impossible launcher is refused before anything starts
         check_launcher(item.run, config.hydra.runtime.choices["hydra/launcher"])
     check_directories(planned)
+    if not all(item.directory.done for item in planned):
+        require_writable(directory, "hydra.sweep.dir", "the runs")
     if config.get("dry_run"):
         return planned
     require(not config.get("overwrite"), "overwrite", "false in a sweep, which goes on with its runs", True)
@@ -208,6 +213,28 @@ def check_directories(planned: Sequence[PlannedRun]) -> None:
         require(other is item, "hydra.sweep.subdir", "a directory for each configuration", shared)
         if not item.directory.done:
             item.directory.start(item.run)
+
+
+def differing_from_others(planned: Sequence[PlannedRun], directory: Path) -> str | None:
+    """What tells the runs of a sweep, if none of them was begun, from others in its directory.
+
+    Whoever means to go on with those has changed a key: nothing of theirs is used.
+
+    Args:
+        planned: All runs of the sweep.
+        directory: Of the sweep.
+
+    Returns:
+        A line with the keys in which the closest of the others differs from the first run;
+        None: a run was begun, or there are no others.
+    """
+    others = [path.with_name("config.yaml") for path in sorted(directory.glob(f"*/{SWEPT}"))]
+    others = [path for path in others if path.is_file()]
+    if not others or any(item.directory.swept for item in planned):
+        return None
+    keys = min((differences(read_yaml(path), planned[0].run.plain) for path in others), key=len)
+    shown = ", ".join(keys[:3]) + (f" and {len(keys) - 3} more" if len(keys) > 3 else "")
+    return f"none of these runs was begun; {len(others)} others in {directory} differ: {shown}"
 
 
 def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Path) -> None:

@@ -12,6 +12,7 @@ import torch
 from ghgs_lit.cli import rehearsal
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import run_of
+from ghgs_lit.model import GHGS
 from ghgs_lit.weights.checkpoint import write_checkpoint
 from tests.cli.test_main import call
 from tests.helpers.models import config
@@ -80,6 +81,20 @@ def test_one_thing_that_is_missing_is_the_one_that_is_said(
     assert len(found.reasons) == 1
     assert re.search(expected, found.reasons[0]), found.reasons
     assert found.step is None
+
+
+def test_weights_of_another_size_are_a_note(tmp_path, rendered):
+    """A training begins with what fits, which may be next to nothing."""
+    small = ["encoder.vit.channels=8", "recalibration.k=8", "recalibration.num_heads=2"]
+    path = tmp_path / "small.ckpt"
+    model = GHGS.from_config(run_of("train", [*SMALL, *small]).plain)
+    write_checkpoint(path, model.state_dict(), config())
+    weights = [f"data.root={rendered}", f"init_from={path}", *small]
+    assert not [note for note in rehearsed(*weights).notes if "init_from" in note]
+    found = rehearsed(*weights, "encoder.width=64")
+    assert not found.reasons
+    (note,) = (note for note in found.notes if note.startswith("init_from"))
+    assert re.fullmatch(rf"init_from: \d+ of \d+ tensors have another shape in {path}, and .*", note)
 
 
 def test_the_room_for_tokens_is_said(rendered):

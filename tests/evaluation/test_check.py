@@ -29,7 +29,10 @@ def check(root, *overrides):
         ("evaluation.views=[1]", "evaluation.views: expected an integer >= 2"),
         ("evaluation.views=[4,4]", "evaluation.views: expected different numbers from 2 on"),
         ("evaluation.views=[4.5]", "evaluation.views: expected an integer >= 2"),
-        ("evaluation.views=[17]", "with 17 views: expected different positions of a ring of 16"),
+        (
+            "evaluation.views=[17]",
+            "with 17 views: expected different positions of a ring of 16; found 17",
+        ),
         ("evaluation.pictures=-1", "evaluation.pictures: expected an integer >= 0"),
         ("targets.per_subject=9", "targets.per_subject: expected at most the 4 inputs"),
         ("metrics.lpips=sometimes", "lpips"),

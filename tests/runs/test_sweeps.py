@@ -80,6 +80,34 @@ def test_directories_of_a_users_own_hold_one_configuration_each(sweep):
     assert executed(sweep.directory) == ["0", "1"]
 
 
+def test_a_sweep_that_goes_on_with_other_keys_says_so(sweep):
+    """All of it was trained anew, without a word of the runs that it was to go on with."""
+    sweep("seed=1,2")
+    changed = f"2 others in {sweep.directory} differ: optimizer.lr: "
+    for words in (["dry_run=true"], []):
+        code, out, _ = sweep("seed=1,2", "optimizer.lr=0.5", *words)
+        assert code == 0
+        assert f"none of these runs was begun; {changed}" in out
+        assert "-> 0.5\n" in out
+    _, out, _ = sweep("seed=1,2,3")  # a grid that grows
+    assert "none of these runs" not in out
+
+
+def test_a_folder_that_cannot_be_written_to_is_refused_by_the_plan(sweep, monkeypatch):
+    """The dry run was green; root may write everywhere, so that the answer of the system is invented."""
+    access = os.access
+    monkeypatch.setattr(
+        os, "access", lambda path, mode: path != sweep.directory.parent and access(path, mode)
+    )
+    for dry in ("true", "false"):
+        code, _, err = sweep("seed=1,2", f"dry_run={dry}")
+        expected = f"expected a folder that can be written to for the runs; found '{sweep.directory.parent}'"
+        assert (code, err) == (1, f"ghgs train: hydra.sweep.dir: {expected}\n")
+    sweep.directory.write_text("no folder")
+    code, _, err = sweep("seed=1,2", "dry_run=true")
+    assert (code, f"for the runs; found '{sweep.directory}'" in err) == (1, True)
+
+
 def test_two_runs_in_one_directory_are_refused_before_any_is_trained(sweep):
     for dry in ("dry_run=true", "dry_run=false"):
         code, _, err = sweep("hydra.sweep.subdir=same", "seed=1,2", dry)

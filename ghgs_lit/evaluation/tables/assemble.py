@@ -67,8 +67,12 @@ def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOpt
         ours = ours[ours["targets"].isin(options.targets)]
     if layout.rows == "ablation":
         ours = ours[[variant.kind == "model" for variant in ours["variant"]]]
-    if ours.empty:
-        raise InputError(f"runs: expected some on targets {list(options.targets or [])}; found others only")
+    if ours.empty and options.targets:
+        expected = (
+            f"some of {', '.join(dict.fromkeys(sweep.rows['targets']))}, on which the runs were measured"
+        )
+        raise InputError(f"evaluation.targets: expected {expected}; found {', '.join(options.targets)}")
+    require(len(ours), "runs", "some of our models", "baselines only")
     rows = pd.concat([ours, *others], ignore_index=True)
     for name in options.metrics or ():
         choice("columns", name, tuple(_measured(rows)))

@@ -188,7 +188,8 @@ def files_below(folders: Sequence[Path], name: str) -> list[Path]:
     """
     for folder in folders:
         if not folder.is_dir():
-            raise FileNotFoundError(f"{folder}: expected a directory of runs; found none")
+            found = "a file" if folder.is_file() else "none"
+            raise FileNotFoundError(f"{folder}: expected a directory of runs; found {found}")
     paths = itertools.chain.from_iterable(sorted(folder.rglob(name)) for folder in folders)
     return [path for path in paths if path.parent.name != ".hydra"]
 

@@ -149,7 +149,7 @@ def test_targets_are_tables_of_their_own_and_can_be_picked(tmp_path):
     ]
     (table,) = tables_of(tmp_path, targets=("midway",))
     assert "targets `midway`" in table.caption
-    with pytest.raises(InputError, match="others only"):
+    with pytest.raises(InputError, match=r"expected some of release, midway, .*; found random"):
         tables_of(tmp_path, targets=("random",))
 
 
@@ -203,6 +203,12 @@ def test_a_table_of_some_subjects_says_of_which(tmp_path):
     assert {row["selection"] for row in rows if row["mean"]} == {"a_.", "b.*"}
     with pytest.raises(InputError, match=r"subjects: expected .* of the runs, such as a_1; found 'a'"):
         tables_of(tmp_path, subjects=re.compile("a"))
+
+
+def test_targets_that_nobody_measured_are_answered_with_those_that_were(tmp_path):
+    write_run(tmp_path / "0", "full", 20.0)
+    with pytest.raises(InputError, match=r"evaluation\.targets: expected some of release, .*; found midway"):
+        tables_of(tmp_path, targets=("midway",))
 
 
 def test_results_that_are_none_are_refused(tmp_path):
