@@ -149,8 +149,8 @@ class GHGS(nn.Module):
             plan: of the batch.
         """
         with self.in_precision(batch.masks.device):
-            prediction = self._predicted(batch, plan, self._coarse(batch))
-        prediction = plan.trimmed(left(around, prediction))
+            prediction = self._predicted(batch, plan, self._coarse(batch), around)
+        prediction = plan.trimmed(prediction)
         return dataclasses.replace(prediction, decisions=plan.decisions)
 
     def in_precision(self, device: torch.device) -> AbstractContextManager[None]:
@@ -220,20 +220,31 @@ class GHGS(nn.Module):
         return plan
 
     def _predicted(
-        self, batch: Batch, plan: Plan, coarse: Coarse | None, keeps_tokens: bool = False
+        self,
+        batch: Batch,
+        plan: Plan,
+        coarse: Coarse | None,
+        around: Sequence[Surrounding] = (),
+        keeps_tokens: bool = False,
     ) -> Prediction:
-        """:meth:`predict`, played back where it can be; renderings have room enough.
+        """:meth:`predict` and what surrounds it, played back where it can be;
+        renderings have room enough.
 
         Args:
             batch: as of :meth:`predict`, as are all others.
             plan: of the batch.
             coarse: what was found in smaller copies.
+            around: layers that the prediction leaves.
             keeps_tokens: whether tokens are asked for.
         """
-        predict = functools.partial(self.predict, keeps_tokens=keeps_tokens)
+
+        def predict(*inputs: Any, around: Sequence[Surrounding]) -> Prediction:
+            return left(around, self.predict(*inputs, keeps_tokens=keeps_tokens))
+
         if self.options.capture == "auto" and not self.training and self.playback.fits(batch, plan):
-            return self.playback(predict, batch, plan, coarse, (keeps_tokens, self.settings()))
-        return settled(lambda: predict(batch, plan, coarse))
+            key = (keeps_tokens, self.settings())
+            return self.playback(predict, batch, plan, coarse, around, key)
+        return settled(lambda: predict(batch, plan, coarse, around=around))
 
     def predict(
         self, batch: Batch, plan: Plan, coarse: Coarse | None = None, keeps_tokens: bool = False

@@ -29,8 +29,8 @@ Entered = tuple[Sequence[Surrounding], Batch, list[Finding], Measured]
 
 
 #: What all stages make of a batch as they see it, of its plan, and of what was found in smaller
-#: copies of the photographs (None: there are none).
-Predict = Callable[[Batch, Plan, Coarse | None], Prediction]
+#: copies of the photographs (None: there are none), outside of the layers ``around``.
+Predict = Callable[..., Prediction]
 
 
 @dataclass(frozen=True)
@@ -143,6 +143,7 @@ class Playback:
         batch: Batch,
         plan: Plan,
         coarse: Coarse | None,
+        around: Sequence[Surrounding],
         key: Hashable,
     ) -> Prediction:
         """The prediction for a batch that :meth:`fits`.
@@ -152,18 +153,19 @@ class Playback:
             batch: as the stages see it.
             plan: of the batch.
             coarse: what was found in smaller copies, if there are any.
+            around: layers that the prediction leaves.
             key: all else that the prediction depends on, but weights that stay where they are.
 
         Returns:
             The prediction; its Gaussians fill their size class.
         """
 
-        def predicted(inputs: tuple[Scene, Coarse | None]) -> tuple[Prediction, Rooms]:
-            scene, coarse = inputs
+        def predicted(inputs: tuple) -> tuple[Prediction, Rooms]:
+            scene, coarse, around = inputs
             with deferred() as rooms:
-                return predict(*scene.read(), coarse), rooms
+                return predict(*scene.read(), coarse, around=around), rooms
 
-        inputs = (Scene.of(batch, plan), coarse)
+        inputs = (Scene.of(batch, plan), coarse, tuple(around))
         prediction, rooms = self.recorder(predicted, inputs, key)
         while not rooms.suffice():
             self.recorder.forget(inputs, key)
