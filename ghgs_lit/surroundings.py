@@ -124,7 +124,11 @@ def _findings_of_values(batch: Batch) -> list[Finding]:
 def _beyond(values: Tensor, highest: float) -> Tensor:
     """Views of ``values`` [B, V, ...] with a NaN or a value outside 0 to ``highest``,
     up to rounding."""
-    low, high = values.flatten(2).aminmax(dim=-1)
+    values = values.flatten(2)
+    if values.device.type == "cpu":  # where aminmax takes twenty times as long
+        low, high = values.amin(-1), values.amax(-1)
+    else:
+        low, high = values.aminmax(dim=-1)
     # Negated, because comparisons with NaN are false.
     return ~((low >= -_ROUNDING) & (high <= highest + _ROUNDING))
 
