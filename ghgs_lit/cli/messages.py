@@ -61,8 +61,29 @@ def one_line(error: Exception, verb: str) -> str:
     elif isinstance(error, InputError):
         text = str(error)
     else:  # an error of Hydra that does not name the override
-        text = f"{_command_line()}: expected overrides that Hydra can apply; found {error}"
+        text = _no_name_of_an_option(error)
+        text = text or f"{_command_line()}: expected overrides that Hydra can apply; found {error}"
     return " ".join(text.split())
+
+
+def _no_name_of_an_option(error: Exception) -> str | None:
+    """Message for the group whose option is given as a number or as null, such as ``views=4``.
+
+    Args:
+        error: of Hydra, which names neither group nor value.
+
+    Returns:
+        The message; None: it is another error.
+    """
+    kinds = {"int": r"\d[\d,]*", "NoneType": "null", "float": r"[\d.,]+"}
+    kind = str(error).rpartition("Got ")[2]
+    for word in sys.argv[1:]:
+        group, _, value = word.partition("=")
+        if (conf_dir() / group).is_dir() and re.fullmatch(kinds.get(kind, "(?!)"), value):
+            known = sorted(path.stem for path in (conf_dir() / group).glob("*.yaml"))
+            hint = did_you_mean(value.partition(",")[0], known)
+            return f"{group}: expected one of {', '.join(known)}; found {value}{hint}"
+    return None
 
 
 def _command_line() -> str:

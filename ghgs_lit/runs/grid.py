@@ -108,6 +108,8 @@ def _planned(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -
         InputError: As for :func:`sweep`.
     """
     config = sweeper.config
+    batch = sweeper.max_batch_size
+    require(batch is None or batch >= 1, "hydra.sweeper.max_batch_size", "a number of at least 1", batch)
     loader = sweeper.hydra_context.config_loader
     combos = combinations(sweeper.params, arguments, loader)
     verb = sweeper.verb
@@ -270,18 +272,14 @@ def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = N
     Args:
         planned: All runs of the sweep; those that are done are not launched.
         launch: Starts jobs, given their overrides and the number of the first.
-        batch: Jobs at once; None: all.
+        batch: Jobs at once, at least 1; None: all.
 
     Returns:
         What the jobs returned, in the order in which they ended.
-
-    Raises:
-        InputError: ``batch`` is less than 1.
     """
     todo = [item for item in planned if not item.directory.done]
     print(f"{len(planned)} runs: {len(planned) - len(todo)} done before, {len(todo)} to do", flush=True)
     returns: list[JobReturn] = []
-    require(batch is None or batch >= 1, "hydra.sweeper.max_batch_size", "a number of at least 1", batch)
     while todo:
         busy = []
         size = batch or len(todo)

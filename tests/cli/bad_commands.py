@@ -61,7 +61,8 @@ MISSPELT = [
     ("export vgt=x.pt", 1, "vgt", "did you mean vggt?"),
     ("table runs={tmp} test.unt=1", 1, "test.unt", "did you mean test.unit?"),
     ("train encoder=vggt_nanoo", 1, "encoder: expected one of vggt_1b", "'vggt_nanoo'", "vggt_nano?"),
-    ("train views=4", 1, "views=4: expected overrides that Hydra can apply", "found"),
+    ("train views=4", 1, "views: expected one of ", "v3, v4, v5", "; found 4 (did you mean v4?)\n"),
+    ("train -m views=3,4", 1, "views: expected one of ", "; found 3,4 (did you mean v3?)\n"),
     ("train sweep=table5", 1, "sweep: expected one of table1", "found 'table5'"),
     ("train hydra/launcher=jobib", 1, "hydra/launcher: expected one of", "did you mean joblib?"),
     ("train hydra/launcher=ray_jobs", 1, "hydra/launcher: expected one of", "the extra ray has it"),
@@ -73,7 +74,7 @@ MISSPELT = [
 MISSING = [
     ("train ~optimizer", 1, "optimizer: expected a value", "~optimizer"),
     ("train ~seed", 1, "seed: expected a value", "~seed"),
-    ("train optimizer=null", 1, "optimizer=null: expected"),
+    ("train optimizer=null", 1, "optimizer: expected one of ", "; found null\n"),
     ("train 'seed=${{foo}}'", 1, "seed: expected a value that can be resolved", "'foo'"),
     ("train seed=", 1, "seed: expected an integer", "found ''"),
     ("train data=thuman2 model.pad=multiple", 1, "data.root: expected", "found null"),
@@ -201,8 +202,7 @@ SYSTEM = [
     (
         "train -m seed=1,2 hydra.sweep.dir=/dev/null/s",
         1,
-        "/dev/null/s/",
-        "found a file in its place or above it",
+        "hydra.sweep.dir: expected a folder that can be written to for the runs; found '/dev/null'\n",
     ),
 ]
 
