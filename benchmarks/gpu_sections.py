@@ -217,9 +217,10 @@ class _Step:
         self.optimizer.zero_grad()
 
     def called(self) -> Tensor:
-        """The loss, operator by operator."""
-        for part in (self.forward, self.render, self.loss):
-            part()
+        """The loss, operator by operator; as in a training, all under autocast."""
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast):
+            for part in (self.forward, self.render, self.loss):
+                part()
         return self.total
 
     def played(self) -> Tensor:
@@ -307,9 +308,11 @@ def kernels(call: Call) -> None:
     """Kernels in Triton, the same eager and compiled, beside the rate of a copy; attention by backend"""
     model = GHGS.from_checkpoint().to(call.gpu.device)
     batch = replace(call.batch(max(call.sizes.batches), call.sizes.side), targets=None).to(call.gpu.device)
+    model.precision = "tf32"
     with _Calls() as calls:
-        means = model(batch).gaussians.means
-        means.sum().backward()
+        with torch.no_grad():
+            model(batch)  # one kernel is of predictions alone
+        model(batch).gaussians.means.sum().backward()
     for name in set(PLAIN) - set(calls.inputs):
         call.add(name, refused="not called")
     moved = {}
