@@ -90,7 +90,10 @@ def _reason(function: Any, given: list[Tensor], args: tuple, kwargs: dict) -> st
         return "a size depends on values"
     types = {tensor.device.type for tensor in given}
     if name in ("aten::_to_copy", "aten::copy_", "aten::_copy_from") and kwargs.get("device") is not None:
-        types.add(torch.device(kwargs["device"]).type)
+        target = torch.device(kwargs["device"]).type
+        types.add(target)
+        if target == "cpu" and len(types) > 1:
+            return "a value is read"
     copies = len(types) > 1 and (name == "aten::_to_copy" or "copy_" in name)
     # What remains to be seen of torch.tensor(list, device=...).
     copies |= name == "aten::lift_fresh" and types != {"cpu"}

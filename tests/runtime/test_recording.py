@@ -198,6 +198,14 @@ def test_what_cannot_be_played_back_stays_eager(function):
     assert recorder.counts["recorded"] == 0
 
 
+def refusal(function, values):
+    """Why a function is not recorded on the pretend device."""
+    recorder = Recorder(tape=OperatorTape(), eager=0)
+    with pytest.warns(UserWarning, match="not recorded"):
+        recorder(function, values)
+    return recorder.reason
+
+
 def test_copies_from_the_host_are_refused():
     """A recording would read memory that holds something else by then;
     a waiting copy fails on CUDA."""
@@ -207,6 +215,7 @@ def test_copies_from_the_host_are_refused():
         recorder(lambda x: x + torch.tensor([1.0, 2.0, 3.0], device=x.device), values)
         with pytest.warns(UserWarning, match=r"the host's memory is copied by aten::\w+"):
             recorder(lambda x: x + torch.tensor([1.0, 2.0, 3.0], device=x.device), values)
+        assert "a value is read" in refusal(lambda x: x + len(x.tolist()), values)
         for _ in range(3):
             found = recorder(lambda x: x + torch.ones(3, device=x.device), values, key="made there")
         assert torch.equal(found.cpu(), numbers(0) + 1)
