@@ -311,7 +311,8 @@ class GHGS(nn.Module):
         first = replaced(activate, self.training) if self.rounds else activate
         state = State(raw, first(raw, batch, points, depth_maps), points, depth_maps)
         step = 1.0 if coarse is None else coarse.step
-        states = self.rounds(state, activate, batch, step, shows_last) if self.rounds else (state,)
+        asked = {} if shows_last else {"shows_last": False}  # rounds of one's own may not know it
+        states = self.rounds(state, activate, batch, step, **asked) if self.rounds else (state,)
         return prediction_of(states, self.keeps_drafts and not self.training)
 
     def _depths(
