@@ -58,22 +58,30 @@ if threading.current_thread() is threading.main_thread():
 _LEFT = ("HYDRA_FULL_ERROR", "PL_GLOBAL_SEED", "PL_SEED_WORKERS")
 
 
-@pytest.fixture(autouse=True)
-def nothing_is_left_to_the_next_test() -> Iterator[None]:
-    """A verb may change its process, which ends with it: variables, the precision of products, logs
-    (whose streams are those of one test, and whose files are in its folder)."""
-    variables = {name: os.environ.get(name) for name in _LEFT}
-    rounding = _Rounding.now("cpu")
-    root = logging.getLogger()
-    handlers = list(root.handlers)
-    level = root.level
-    yield
-    for name, value in variables.items():
+_VARIABLES = {name: os.environ.get(name) for name in _LEFT}
+_ROUNDING = {device: _Rounding.now(device) for device in ("cpu", "cuda")}
+
+
+def _as_at_first() -> None:
+    for name, value in _VARIABLES.items():
         os.environ.pop(name, None)
         if value is not None:
             os.environ[name] = value
-    rounding.restore("cpu")
-    root.setLevel(level)
+    for device, rounding in _ROUNDING.items():
+        rounding.restore(device)
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left_to_the_next_test() -> Iterator[None]:
+    """A verb may change its process, which ends with it: variables, the precision of products, logs
+    (whose streams are those of one test, and whose files are in its folder). A fixture of a whole
+    module may have called one before."""
+    _as_at_first()
+    root = logging.getLogger()
+    handlers = list(root.handlers)
+    yield
+    _as_at_first()
+    root.setLevel(logging.WARNING)
     for handler in [one for one in root.handlers if one not in handlers]:
         if type(handler) in (logging.StreamHandler, logging.FileHandler):
             root.removeHandler(handler)
