@@ -36,6 +36,7 @@ for name in ("bounds", "encoder", "geometry", "heads", "pretext", "recalibration
 check_shapes([f"ghgs_lit.{name}" for name in _CHECKED])
 
 import torch  # noqa: E402
+from hydra.core.hydra_config import HydraConfig  # noqa: E402
 
 # Kernels in Triton run on tensors of the CPU where there is no GPU; read when Triton is imported.
 if not torch.cuda.is_available():
@@ -69,6 +70,7 @@ def _as_at_first() -> None:
             os.environ[name] = value
     for device, rounding in _ROUNDING.items():
         rounding.restore(device)
+    HydraConfig.instance().cfg = None  # by which a job knows that it is one of a sweep
 
 
 @pytest.fixture(autouse=True)

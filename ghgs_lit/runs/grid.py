@@ -1,6 +1,7 @@
 """Grid sweeper of ``conf/hydra/sweeper/grid.yaml``:
 launches those runs of a grid that are not done."""
 
+import contextlib
 import json
 import logging
 import re
@@ -19,7 +20,7 @@ from ghgs_lit.config.compose import check_ablation, chosen_options, plain, saved
 from ghgs_lit.config.defaults import fill
 from ghgs_lit.config.keys import is_hyperparameter, key_of
 from ghgs_lit.config.registry import verb_class
-from ghgs_lit.errors import require
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import require_writable, resolved, write_text_atomically
 from ghgs_lit.parsing import read_yaml
 from ghgs_lit.runs.job import BUSY, check_config, check_launcher
@@ -230,11 +231,15 @@ def differing_from_others(planned: Sequence[PlannedRun], directory: Path) -> str
         A line with the keys in which the closest of the others differs from the first run;
         None: a run was begun, or there are no others.
     """
-    others = [path.with_name("config.yaml") for path in sorted(directory.glob(f"*/{SWEPT}"))]
-    others = [path for path in others if path.is_file()]
-    if not others or any(item.directory.swept for item in planned):
+    if any(item.directory.swept for item in planned):
         return None
-    keys = min((differences(read_yaml(path), planned[0].run.plain) for path in others), key=len)
+    others = []
+    for path in sorted(directory.glob(f"*/{SWEPT}")):
+        with contextlib.suppress(InputError, OSError):  # a damaged one is not of this sweep
+            others.append(differences(read_yaml(path.with_name("config.yaml")), planned[0].run.plain))
+    keys = min(others, key=len, default=[])
+    if not keys:
+        return None
     shown = ", ".join(keys[:3]) + (f" and {len(keys) - 3} more" if len(keys) > 3 else "")
     return f"none of these runs was begun; {len(others)} others in {directory} differ: {shown}"
 

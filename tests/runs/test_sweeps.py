@@ -89,6 +89,10 @@ def test_a_sweep_that_goes_on_with_other_keys_says_so(sweep):
         assert code == 0
         assert f"none of these runs was begun; {changed}" in out
         assert "-> 0.5\n" in out
+    for path in sweep.directory.glob("*/config.yaml"):
+        path.write_text("cut: [")
+    code, out, _ = sweep("seed=7,8")  # what is damaged is not of this sweep
+    assert (code, "none of these runs" in out) == (0, False)
     _, out, _ = sweep("seed=1,2,3")  # a grid that grows
     assert "none of these runs" not in out
 
