@@ -164,11 +164,26 @@ def print_plan(planned: Sequence[PlannedRun], directory: Path, rehearse: Rehears
     print(f"outputs: {directory}/<run>/ with {OUTPUTS}", flush=True)
     for note in rehearsal.notes:
         print(f"note: {note}")
-    for reason in rehearsal.reasons:
+    reasons = [*rehearsal.reasons, *_unreadable(planned, states)]
+    for reason in reasons:
         print(f"would be refused: {reason}", flush=True)
-    count = len(rehearsal.reasons)
+    count = len(reasons)
     if count:
         raise InputError(f"dry_run: expected runs that lack nothing; found {count} missing, as said above")
+
+
+def _unreadable(planned: Sequence[PlannedRun], states: Sequence[State]) -> list[str]:
+    """What is wrong with checkpoints that runs would go on from, a line each."""
+    from ghgs_lit.weights.checkpoint import read_checkpoint  # here: it imports PyTorch
+
+    lines = []
+    for item, state in zip(planned, states, strict=True):
+        if state == State.PARTIAL and item.directory.checkpoint is not None:
+            try:
+                read_checkpoint(item.directory.checkpoint)
+            except (InputError, OSError) as error:
+                lines.append(f"{' '.join(str(error).split())} (without this file the run begins anew)")
+    return lines
 
 
 def print_results(planned: Sequence[PlannedRun], directory: Path) -> None:

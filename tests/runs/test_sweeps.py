@@ -112,6 +112,22 @@ def test_a_folder_that_cannot_be_written_to_is_refused_by_the_plan(sweep, monkey
     assert (code, f"for the runs; found '{sweep.directory}'" in err) == (1, True)
 
 
+def test_a_checkpoint_that_cannot_be_read_is_said_by_the_plan(sweep):
+    """Only the run itself said it, after it was queued; deleting the file was not proposed."""
+    sweep("seed=1,2")
+    (name, _) = executed(sweep.directory)
+    (sweep.directory / name / "metrics.json").unlink()
+    path = sweep.directory / name / "checkpoints" / "last.ckpt"
+    path.parent.mkdir()
+    path.write_bytes(b"cut")
+    code, out, err = sweep("seed=1,2", "dry_run=true")
+    assert (code, err.count("\n")) == (1, 1)
+    assert "2 runs: 1 done, 1 partial" in out
+    assert f"would be refused: {path}: expected weights" in out
+    path.unlink()
+    assert sweep("seed=1,2", "dry_run=true")[0] == 0
+
+
 def test_two_runs_in_one_directory_are_refused_before_any_is_trained(sweep):
     for dry in ("dry_run=true", "dry_run=false"):
         code, _, err = sweep("hydra.sweep.subdir=same", "seed=1,2", dry)
