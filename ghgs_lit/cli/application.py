@@ -99,6 +99,8 @@ class Verb:
         sys.argv = list(self.argv)
         try:
             directory = Path(HydraConfig.get().runtime.output_dir)
+            if HydraConfig.get().mode == RunMode.RUN:  # a file may have said that it is a sweep
+                messages.check_directory(HydraConfig.get().overrides.hydra, sweeps=False)
             check_ablation(cfg, HydraConfig.get())
             verb = verb_class(self.name).begin(plain(cfg))
             if verb.begins_run:
@@ -220,7 +222,8 @@ def run(verb: str, argv: list[str]) -> int:
                 _print_configuration(values.config_name or verb, _for_hydra(verb, overrides), values)
                 return 0
             overrides = _for_hydra(verb, overrides)
-            messages.check_directory(overrides, values.multirun or "hydra.mode=MULTIRUN" in overrides)
+            if values.multirun or "hydra.mode=MULTIRUN" in overrides:
+                messages.check_directory(overrides, sweeps=True)
             sys.argv = [argv[0], *flags, messages.NO_FILES_OF_HYDRA, *overrides]
             hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=verb)(task)()
             sys.stdout.flush()

@@ -10,6 +10,7 @@ import warnings
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from ghgs_lit.cli import application
@@ -214,7 +215,8 @@ def test_the_verb_is_in_argv_while_the_task_runs(monkeypatch):
     monkeypatch.setattr(Train, "run", run)
     monkeypatch.setattr(application, "write_hydra_files", lambda cfg, directory: None)
     monkeypatch.setattr(application, "check_ablation", lambda cfg, hydra_node: None)
-    monkeypatch.setattr(HydraConfig, "get", lambda: OmegaConf.create({"runtime": {"output_dir": "."}}))
+    node = {"runtime": {"output_dir": "."}, "overrides": {"hydra": []}, "mode": RunMode.RUN}
+    monkeypatch.setattr(HydraConfig, "get", lambda: OmegaConf.create(node))
     application.Verb("train", ("ghgs", "train", "seed=1"))(compose("train"))
     assert seen["argv"] == ["ghgs", "train", "seed=1"]
 

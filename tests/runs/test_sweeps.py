@@ -425,6 +425,16 @@ def test_a_named_sweep_needs_no_flag(monkeypatch, capsys, tmp_path):
     assert "4 runs: 4 missing; nothing was run" in out
 
 
+def test_a_file_of_ones_own_may_say_that_it_is_a_sweep(sweep, tmp_path, monkeypatch, capsys):
+    """Its directory is ``hydra.sweep.dir``, without a flag."""
+    (tmp_path / "conf" / "experiment").mkdir(parents=True)
+    own = "# @package _global_\nhydra: {mode: MULTIRUN, sweeper: {params: {seed: '1,2'}}}\n"
+    (tmp_path / "conf" / "experiment" / "mine.yaml").write_text(own)
+    words = ["--config-dir", str(tmp_path / "conf"), "experiment=mine", f"hydra.sweep.dir={sweep.directory}"]
+    code, _, err = call(monkeypatch, capsys, "train", *words)
+    assert (code, len(executed(sweep.directory))) == (0, 2), err
+
+
 def test_tables_share_runs_and_take_other_data(sweep):
     """A run that two tables need must have one hash, and data of the command line another."""
 
