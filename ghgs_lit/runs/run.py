@@ -331,7 +331,9 @@ class RunDirectory:
 
         def is_unused() -> bool:
             paths = list(self.path.glob("*"))
-            return bool(paths) and all(p.name in known and p.lstat().st_mtime >= since for p in paths)
+            if not paths:  # made for this start, if it is as new
+                return self.path.is_dir() and self.path.stat().st_mtime >= since
+            return all(p.name in known and p.lstat().st_mtime >= since for p in paths)
 
         if self.path == Path.cwd() or not is_unused():
             return

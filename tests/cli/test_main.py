@@ -287,6 +287,17 @@ def test_a_run_with_anything_else_stays(monkeypatch, tmp_path):
     assert file.is_file()
 
 
+def test_a_command_that_cannot_begin_leaves_no_folder(tmp_path, monkeypatch, capsys):
+    """Each wrong value left an empty one; what was there before stays."""
+    there = tmp_path / "there"
+    there.mkdir()
+    os.utime(there, (1.0, 1.0))
+    for folder in (there, tmp_path / "run"):
+        code, _, err = call(monkeypatch, capsys, "train", "seed=abc", f"hydra.run.dir={folder}")
+        assert (code, "found 'abc'" in err) == (1, True)
+    assert list(tmp_path.iterdir()) == [there]
+
+
 def test_hydras_files_are_written_and_through_no_link(tmp_path, monkeypatch, capsys):
     """A run's folder of a stranger may hold links to files of the user,
     which Hydra itself would empty."""
