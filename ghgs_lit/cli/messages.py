@@ -119,7 +119,7 @@ def _missing_option(error: MissingConfigException) -> str:
     known = sorted(error.options or ())
     expected = f"one of {', '.join(known)}" if known else "a group that has options"
     extra = next((extra for name, extra in _EXTRAS.items() if option.startswith(name)), None)
-    hint = did_you_mean(option, known) or (f" (the extra {extra} has it)" if extra else "")
+    hint = did_you_mean(option, known) or (f" (pip install 'ghgs-lit[{extra}]')" if extra else "")
     return f"{group}: expected {expected}; found {option!r}{hint}"
 
 

@@ -152,12 +152,14 @@ def _about_test(table: Table) -> list[str]:
     sizes = f"{_range(seeds)} seeds and {_range(subjects)} subjects"
     comparisons = f"{table.comparisons} comparison{'s' if table.comparisons > 1 else ''}"
     others = "; other metrics are not tested" if len(table.tested) < len(table.metrics) else ""
+    shown = _could_show(table)
+    could_show = [f"{sizes} could have shown {'; '.join(shown)} (with {100 * POWER:g} % power)."]
     return [
         f"{MARK} {names} differs beyond chance from {against}: two-sided t test over {sizes} together, the"
         f" variance over seeds pooled over rows, whose deviations may differ by a factor of {RATIO:g}, Holm's"
         f" correction over the {comparisons} of this table, p < {test.alpha:g}{others}."
         f" In brackets the {100 * (1 - test.alpha):g} % interval of the difference, each alone.",
-        f"{sizes} could have shown {'; '.join(_could_show(table))} (with {100 * POWER:g} % power).",
+        *(could_show if shown else ()),
     ]
 
 
@@ -167,8 +169,8 @@ def _could_show(table: Table) -> list[str]:
     texts = []
     for metric in table.tested:
         tests = table.cells["test"].xs(metric, level="metric").dropna()
-        values = [test.smallest for test in tests if test.smallest is not None]
-        if values:
+        values = [round(test.smallest, decimals(metric)) for test in tests if test.smallest is not None]
+        if any(values):  # rows that are equal show nothing
             ends = dict.fromkeys(f"{value:.{decimals(metric)}f}" for value in (min(values), max(values)))
             unit = " dB" if metric.startswith("psnr") else ""
             texts.append(f"{' to '.join(ends)}{unit} of {title(metric)}")

@@ -215,6 +215,9 @@ def test_a_clear_difference_is_marked_and_noise_is_not(tmp_path):
     assert not any("not tested" in n for n in every.notes)
     test = every.cells["test"].iloc[0]
     assert test.corrected == pytest.approx(3 * test.p)
+    equal = table_of(tmp_path / "equal", 0.0, noise=0.0)
+    assert any("beyond chance" in n for n in equal.notes)
+    assert not any("could have shown" in n for n in equal.notes)
     table = table_of(tmp_path / "noise", 0.0, noise=1.0)
     assert "\\* [" not in to_markdown(table)
     assert not table.cells["marked"].any()
