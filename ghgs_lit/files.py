@@ -89,7 +89,7 @@ def require_free(path: str | Path, key: str, overwrite: bool) -> None:
     require_writable(path.absolute().parent, key, str(path))
 
 
-def require_writable(folder: Path, key: str, what: str) -> None:
+def require_writable(folder: Path, key: str, what: str) -> Path:
     """Check that a folder can be written to, or made.
 
     Args:
@@ -97,12 +97,16 @@ def require_writable(folder: Path, key: str, what: str) -> None:
         key: dotted key of the command line, for messages.
         what: will be written, for messages.
 
+    Returns:
+        It, or the folder above it that exists.
+
     Raises:
-        InputError: it, or the folder above it that exists, cannot.
+        InputError: that cannot be written to.
     """
     place = next(path for path in (folder, *folder.parents) if path.exists())
     fits = place.is_dir() and os.access(place, os.W_OK | os.X_OK)
     require(fits, key, f"a folder that can be written to for {what}", str(place))
+    return place
 
 
 @contextlib.contextmanager

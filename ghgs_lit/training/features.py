@@ -17,6 +17,7 @@ from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.encoder.feature_cache import FeatureCache
 from ghgs_lit.encoder.vit import VisionTransformer
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import require_writable
 from ghgs_lit.weights.frozen import digest_of
 
 log = logging.getLogger(__name__)
@@ -104,11 +105,7 @@ class DiskFeatureCache(Options):
             InputError: names the folder.
         """
         key = f"feature_cache.folder: {self._root}"
-        folders = (self._root.absolute(), *self._root.absolute().parents)
-        place = next(folder for folder in folders if folder.exists())
-        can_write = place.is_dir() and os.access(place, os.W_OK)
-        if not can_write:
-            raise InputError(f"{key}: expected a folder that can be written; found {place}, which cannot")
+        place = require_writable(self._root.absolute(), key, "tokens")
         files = self._root.glob(f"{network}-*-{self.dtype}/*/*.npy")
         there = sum(path.stat().st_size for path in files)
         free = shutil.disk_usage(place).free

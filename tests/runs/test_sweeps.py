@@ -1,20 +1,16 @@
 """Sweeps run everything once: when they grow, are interrupted, or are shared by processes."""
 
 import contextlib
-import itertools
 import json
 import os
-import signal
-import time
 
 import pytest
 from hydra.core.utils import JobReturn, JobStatus
 
-from ghgs_lit.cli import application
 from ghgs_lit.cli import train as train_verb
 from ghgs_lit.config import compose, run_of
 from ghgs_lit.errors import InputError
-from ghgs_lit.runs import grid, job, planned
+from ghgs_lit.runs import job, planned
 from ghgs_lit.runs.grid import combinations, run_all
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.results import read_results
@@ -26,27 +22,11 @@ from tests.helpers.jobs import (
     hold_run,
     plan_seeds,
     record_execution,
-    rehearse_nothing,
     work_through,
 )
 from tests.helpers.processes import PREPARED
 
-
-@pytest.fixture(autouse=True)
-def plans_alone(monkeypatch):
-    rehearse_nothing(monkeypatch)
-
-
-@pytest.fixture
-def sweep(monkeypatch, capsys, tmp_path):
-    """``sweep("seed=1,2")`` runs the verb as a sweep in ``tmp_path / "sweep"`` without training."""
-    monkeypatch.setattr(train_verb, "train", record_execution)
-
-    def run(*overrides: str):
-        return call(monkeypatch, capsys, "train", "-m", f"hydra.sweep.dir={tmp_path / 'sweep'}", *overrides)
-
-    run.directory = tmp_path / "sweep"
-    return run
+pytestmark = pytest.mark.usefixtures("plans_alone")
 
 
 def test_a_grid_that_grows_runs_what_is_missing(sweep):
@@ -162,122 +142,6 @@ def test_dry_run_runs_nothing_and_says_what_it_would(sweep):
     assert "0:01:40 (0.5 s a step, measured in 1 finished runs)" in out  # 2 x 100 x 0.5 s
     code, out, _ = sweep("seed=2,3", "dry_run=true", "trainer.max_time=00:00:00:10")
     assert ": 0:00:20 (trainer.max_time; 0.5 s a step" in out  # the budget ends before 5000 x 0.5 s
-
-
-def test_an_interrupted_run_resumes_and_a_failed_one_is_tried_again(sweep, monkeypatch):
-    """After Ctrl-C the same command must resume from the checkpoint and start failed runs again."""
-
-    def bad(run, directory, stats):
-        if run.seed == 1:
-            raise InputError("step 3: expected finite losses; found nan")
-        if run.seed == 2:
-            (directory / "checkpoints").mkdir()
-            (directory / "checkpoints" / "last.ckpt").touch()
-            raise KeyboardInterrupt
-        return record_execution(run, directory, stats)
-
-    monkeypatch.setattr(train_verb, "train", bad)
-    code, _, _ = sweep("seed=3,1,2,4")
-    assert code == 130
-    assert len(executed(sweep.directory)) == 1
-    # tables list planned runs as missing
-    assert len(list(sweep.directory.glob("*/config.yaml"))) == 4
-    _, out, _ = sweep("seed=1,2,3,4", "dry_run=true")
-    assert "4 runs: 1 done, 1 partial, 1 failed, 1 missing" in out
-    monkeypatch.setattr(train_verb, "train", record_execution)
-    code, out, _ = sweep("seed=1,2,3,4")
-    assert code == 0
-    assert "4 runs: 4 done" in out
-    lines = [line.split() for line in (sweep.directory / "executed").read_text().splitlines()]
-    resumed = {name: resume for name, _, resume in lines}
-    assert len(lines) == len(resumed) == 4
-    cut = [name for name, resume in resumed.items() if resume != "None"]
-    assert len(cut) == 1
-    assert resumed[cut[0]] == str(sweep.directory / cut[0] / "checkpoints" / "last.ckpt")
-    outcomes = [s.get("outcome") for s in RunDirectory(sweep.directory / cut[0]).sessions()]
-    assert outcomes == ["interrupted", "done"]
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_sweep_that_is_stopped_starts_no_further_run(sweep, monkeypatch, number):
-    """Batch systems and ``&&`` read the exit code; the line says how the sweep goes on."""
-
-    def stopped(run, directory, stats):
-        (directory / "started").touch()
-        os.kill(os.getpid(), number)
-        time.sleep(10)
-
-    monkeypatch.setattr(train_verb, "train", stopped)
-    code, _, err = sweep("seed=1,2,3")
-    assert code == 128 + number
-    assert len(list(sweep.directory.glob("*/started"))) == 1
-    (line,) = [line for line in err.splitlines() if "to go on" in line]
-    assert f"hydra.sweep.dir={sweep.directory}" in line
-    monkeypatch.setattr(train_verb, "train", record_execution)
-    code, out, _ = sweep("seed=1,2,3")
-    assert code == 0
-    assert "3 runs: 3 done" in out
-
-
-def stop_in_third_plan(monkeypatch, number, is_lost):
-    """Let a signal arrive while the third configuration of a sweep is looked at.
-
-    OmegaConf restores flags in a ``finally``, where an interruption makes an ``AttributeError``;
-    whoever expects one, as ``hasattr`` does, loses the signal.
-    """
-    whole = grid.config_hash
-    calls = itertools.count(1)
-
-    def interrupted(config):
-        if next(calls) != 3:
-            return whole(config)
-        with contextlib.suppress(AttributeError) if is_lost else contextlib.nullcontext():
-            try:
-                os.kill(os.getpid(), number)
-            finally:
-                raise AttributeError("'NoneType' object has no attribute '_invalidate_flags_cache'")
-        return whole(config)
-
-    monkeypatch.setattr(grid, "config_hash", interrupted)
-    return calls
-
-
-@pytest.mark.parametrize("is_lost", [False, True])
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_sweep_that_is_stopped_while_it_is_planned_says_that_nothing_was_run(
-    sweep, monkeypatch, number, is_lost
-):
-    """It named a directory that was not there, or an override that "fits" not, or went on."""
-    calls = stop_in_third_plan(monkeypatch, number, is_lost)
-    code, _, err = sweep("seed=1,2,3,4,5")
-    assert code == 128 + number
-    name = signal.Signals(number).name
-    assert err == (f"ghgs: the sweep was interrupted ({name}); nothing was run; to begin, the same command\n")
-    assert next(calls) == 4
-    assert not sweep.directory.exists()
-    code, out, _ = sweep("seed=1,2", "dry_run=true")
-    assert (code, "2 runs: 2 missing" in out) == (0, True)
-
-
-def test_a_sweep_that_is_stopped_between_two_runs_says_how_many_are_done(sweep, monkeypatch):
-    """The job of the second run fills its configuration when the signal arrives, and fails."""
-
-    def then_stop(run, directory, stats):
-        monkeypatch.setattr(application, "fill", loses_a_signal)
-        return record_execution(run, directory, stats)
-
-    def loses_a_signal(cfg):
-        try:
-            os.kill(os.getpid(), signal.SIGTERM)
-        finally:
-            raise AttributeError("flags")
-
-    monkeypatch.setattr(train_verb, "train", then_stop)
-    code, _, err = sweep("seed=1,2,3")
-    assert code == 143
-    assert "1 of 3 runs are done; to go on, the same command with hydra.sweep.dir=" in err
-    assert "Traceback" not in err
-    assert len(executed(sweep.directory)) == 1
 
 
 def test_a_failing_run_is_named_and_the_others_are_run(sweep, monkeypatch):

@@ -3,7 +3,7 @@
 import copy
 import dataclasses
 import warnings
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from functools import lru_cache
 from weakref import ref
 
@@ -11,9 +11,9 @@ import pytest
 import torch
 from torch import nn
 
-from ghgs_lit.runtime import recording, tape
+from ghgs_lit.runtime import recording
 from ghgs_lit.runtime.precision import precision_of
-from ghgs_lit.runtime.recording import CudaTape, Recorder
+from ghgs_lit.runtime.recording import Recorder
 from ghgs_lit.types import Batch, Cameras
 from tests.helpers.pretend_device import DEVICE, pretend_device
 from tests.helpers.tape import OperatorTape
@@ -297,139 +297,6 @@ def test_a_class_can_be_forgotten():
     recorder.forget((numbers(2), numbers(3)), key=1)
     recorder(work, (numbers(0), numbers(1)), key=1)
     assert recorder.counts == {"eager": 1, "recorded": 2, "played": 1}
-
-
-class Graphs:
-    """Stand-ins for CUDA's streams and graphs, which note what happens to them.
-
-    Args:
-        log: gets what happens.
-        end_fails: ending a recording that failed fails, too, as where CUDA has ended it.
-    """
-
-    def __init__(self, log, end_fails=False):
-        self.log, self.end_fails = log, end_fails
-        self.current = self.main = self.Stream("main")
-        self.pools = 0
-
-    class Stream:
-        def __init__(self, name="side"):
-            self.name = name
-
-        def wait_stream(self, other):
-            pass
-
-    class Graph:
-        def __init__(self, log):
-            self.log = log
-
-        def replay(self):
-            self.log.append("play")
-
-    def new_stream(self, device):
-        self.log.append(f"stream of {device}")
-        return self.Stream()
-
-    @contextmanager
-    def stream(self, stream):
-        before, self.current = self.current, stream
-        self.log.append("warm")
-        yield
-        self.current = before
-
-    @contextmanager
-    def graph(self, graph, pool, stream, capture_error_mode):
-        before, self.current = self.current, stream
-        self.log.append(f"record {capture_error_mode} {pool}")
-        try:
-            yield
-        except Exception as error:
-            if self.end_fails:
-                raise RuntimeError("cannot end") from error
-            self.current = before
-            raise
-        self.current = before
-
-    def new_graph(self):
-        return self.Graph(self.log)
-
-    def new_pool(self):
-        self.pools += 1
-        return self.pools
-
-    def set_stream(self, stream):
-        self.current = stream
-
-    def install(self, patch):
-        tape._side_stream.cache_clear()
-        members = {
-            "Stream": self.new_stream,
-            "current_stream": lambda device=None: self.current,
-            "current_device": lambda: 0,
-            "stream": self.stream,
-            "set_stream": self.set_stream,
-            "graph": self.graph,
-            "graph_pool_handle": self.new_pool,
-            "CUDAGraph": self.new_graph,
-        }
-        for name, value in members.items():
-            patch.setattr(torch.cuda, name, value)
-
-
-@pytest.fixture
-def graphs(monkeypatch):
-    yield lambda *given, **options: Graphs(*given, **options).install(monkeypatch)
-    tape._side_stream.cache_clear()
-
-
-def test_graphs_are_made_as_pytorch_documents(graphs):
-    """A call on a side stream, then the recording there; all on one stream, whose memory they share,
-    and in one pool as long as a graph of it is there."""
-    log = []
-    graphs(log)
-    cuda = CudaTape()
-    (result, play), (_, other) = (cuda.record(lambda: log.append("call") or 5) for _ in range(2))
-    play()
-    assert result == 5
-    once = ["warm", "call", "record thread_local 1", "call"]
-    assert log == ["stream of 0", *once, *once, "play"]
-    del play, other
-    cuda.record(lambda: log.append("call"))
-    assert log[-2] == "record thread_local 2"
-
-
-@pytest.mark.parametrize("end_fails", [True, False])
-def test_a_recording_that_fails_leaves_the_device_as_it_was(monkeypatch, end_fails):
-    """PyTorch's context does not restore the stream where it cannot end a recording. What was cast
-    meanwhile was not computed, and memory that was written is as before."""
-    log, calls, weight = [], [], torch.ones(3)
-    stand_in = Graphs(log, end_fails)
-    stand_in.install(monkeypatch)
-    recorder = Recorder(tape=CudaTape("cpu"))
-    cleared = []
-    monkeypatch.setattr(torch, "clear_autocast_cache", lambda: cleared.append(len(calls)))
-
-    def work(values):
-        calls.append(stand_in.current.name)
-        weight.add_(values)
-        if len(calls) == 3:
-            raise RuntimeError("operation not permitted when stream is capturing")
-        return weight * 2
-
-    expected = weight.clone()
-    for number in range(3):
-        if number == 1:
-            with pytest.warns(UserWarning, match="cannot end" if end_fails else "not permitted"):
-                found = recorder(work, torch.ones(3), written=[weight])
-        else:
-            found = recorder(work, torch.ones(3), written=[weight])
-        expected += 1
-        assert torch.equal(found, 2 * expected)
-        assert stand_in.current is stand_in.main
-    assert calls == ["main", "side", "side", "main", "main"]
-    assert cleared == [1, 2, 3]
-    assert recorder.counts == {"eager": 2, "refused": 1}
-    tape._side_stream.cache_clear()
 
 
 def test_where_memory_is_lacking_recordings_make_room():

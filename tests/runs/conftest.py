@@ -1,0 +1,24 @@
+"""Sweeps without trainings."""
+
+import pytest
+
+from ghgs_lit.cli import train as train_verb
+from tests.cli.test_main import call
+from tests.helpers.jobs import record_execution, rehearse_nothing
+
+
+@pytest.fixture
+def plans_alone(monkeypatch):
+    rehearse_nothing(monkeypatch)
+
+
+@pytest.fixture
+def sweep(monkeypatch, capsys, tmp_path):
+    """``sweep("seed=1,2")`` runs the verb as a sweep in ``tmp_path / "sweep"`` without training."""
+    monkeypatch.setattr(train_verb, "train", record_execution)
+
+    def run(*overrides: str):
+        return call(monkeypatch, capsys, "train", "-m", f"hydra.sweep.dir={tmp_path / 'sweep'}", *overrides)
+
+    run.directory = tmp_path / "sweep"
+    return run
