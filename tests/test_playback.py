@@ -94,6 +94,18 @@ def test_what_changes_a_prediction_is_another_class():
     assert counts(model) == {"recorded": 2, "eager": 6, "played": 2}  # what precedes the plan
 
 
+def test_what_changes_a_recorded_step_is_part_of_its_key():
+    """Steps of training are recorded outside of the model's own playback, with its settings as key."""
+    model = make_model("model=recurrent")
+    keys = {model.settings()}
+    for name, value in (("precision", "bfloat16"), ("keeps_drafts", not model.keeps_drafts)):
+        setattr(model, name, value)
+        keys.add(model.settings())
+    model.rounds.count += 1
+    keys.add(model.settings())
+    assert len(keys) == 4
+
+
 def test_what_is_watched_or_has_a_gradient_is_called():
     """Watchers are told of every stage, and a recording has no gradient."""
     model = recording("model=paper")
