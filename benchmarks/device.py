@@ -26,7 +26,7 @@ from ghgs_lit.config import run_of
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.diagnostics.benchmark.stages import OTHER, TOTAL, top_level, watched
 from ghgs_lit.losses import Losses, LossWeights
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.rendering import api, gsplat_backend
 from ghgs_lit.runtime.watching import Watcher
 from ghgs_lit.training import Optimization

@@ -27,9 +27,9 @@ from ghgs_lit import encoder
 from ghgs_lit.config import compose
 from ghgs_lit.diagnostics.benchmark.scene import random_model
 from ghgs_lit.kernels.linear import linear
-from ghgs_lit.model import GHGS, STAGES
-from ghgs_lit.plan import Plan
-from ghgs_lit.plan.patches import KeptPatches
+from ghgs_lit.method.model import GHGS, STAGES
+from ghgs_lit.method.plan import Plan
+from ghgs_lit.method.plan.patches import KeptPatches
 from ghgs_lit.types import Batch, DepthBounds, Points, Tokens
 from tests.helpers.literal_recalibration import literal_recalibration
 from tests.helpers.scenes import make_batch

@@ -32,7 +32,7 @@ from benchmarks import device
 from ghgs_lit.config import run_of
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.kernels import gpu
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.rendering.intersections import intersections
 from ghgs_lit.runtime.precision import round_products
 

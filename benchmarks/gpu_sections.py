@@ -21,14 +21,14 @@ from ghgs_lit.diagnostics.benchmark.stages import TOTAL, SecondsProbe, inside, t
 from ghgs_lit.diagnostics.doctor.selfcheck import PASSED, selfcheck
 from ghgs_lit.diagnostics.machine import machine_facts
 from ghgs_lit.kernels.gpu import PLAIN
-from ghgs_lit.model import GHGS
-from ghgs_lit.playback import Playback
+from ghgs_lit.method.model import GHGS
+from ghgs_lit.method.playback import Playback
+from ghgs_lit.method.stages import STAGES
 from ghgs_lit.rendering.capacity import deferred
 from ghgs_lit.runtime.precision import keep_rounded, precision_of
 from ghgs_lit.runtime.recording import Recorder
 from ghgs_lit.runtime.watching import Inputs, Watcher
 from ghgs_lit.runtime.watching import watched as stages_watched
-from ghgs_lit.stages import STAGES
 from ghgs_lit.training import captured
 from ghgs_lit.training.optimization import hold_rates
 from ghgs_lit.types import Batch, map_tensors

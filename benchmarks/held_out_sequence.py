@@ -50,11 +50,11 @@ from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import run_of
 from ghgs_lit.data.view import area_image
 from ghgs_lit.files import write_text_atomically
+from ghgs_lit.method.rounds.gains import divided
 from ghgs_lit.metrics.flicker import flicker_in_place
 from ghgs_lit.metrics.functional import decibels, psnr, psnr_box_40
 from ghgs_lit.metrics.regions import box_of, mean_over
 from ghgs_lit.rendering import Renderer
-from ghgs_lit.rounds.gains import divided
 from ghgs_lit.types import Batch, Cameras
 from ghgs_lit.weights.checkpoint import read_config
 

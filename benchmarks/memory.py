@@ -19,7 +19,7 @@ from ghgs_lit.config import run_of
 from ghgs_lit.config.run import Run
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch, random_model
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL, PeakProbe
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.types import Batch
 
 #: Blocks above this size go back to the system when they are freed.

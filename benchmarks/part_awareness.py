@@ -19,10 +19,10 @@ from torch import Tensor
 from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import run_of
-from ghgs_lit.encoder.semantic import SemanticBranch, SemanticOptions
 from ghgs_lit.geometry.masks import patches_around_subject
-from ghgs_lit.plan import planned
-from ghgs_lit.plan.patches import KeptPatches
+from ghgs_lit.method.encoder.semantic import SemanticBranch, SemanticOptions
+from ghgs_lit.method.plan import planned
+from ghgs_lit.method.plan.patches import KeptPatches
 from ghgs_lit.training.pretext.labels import PARTS, part_shares
 from ghgs_lit.training.pretext.module import neighbor_shows_part
 from ghgs_lit.types import Batch, Tokens

@@ -23,7 +23,7 @@ import json, logging, sys, tempfile
 import lightning.pytorch as L
 import torch
 from ghgs_lit.config import run_of
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.training import GHGSModule
 try:
     from ghgs_lit.training.cost import Costs

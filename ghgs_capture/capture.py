@@ -10,7 +10,7 @@ import torch
 from ghgs_capture.crops import Photograph, crop_to_subject
 from ghgs_capture.folder import CaptureFolder
 from ghgs_lit.errors import require
-from ghgs_lit.rounds.gains import divided
+from ghgs_lit.method.rounds.gains import divided
 from ghgs_lit.types import Batch, Cameras
 
 

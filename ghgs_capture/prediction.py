@@ -18,10 +18,10 @@ from ghgs_lit.config.keys import lookup
 from ghgs_lit.config.options import image_size
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.frame import Frame
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
+from ghgs_lit.method.rounds.coarse import FILLED
 from ghgs_lit.refinement import CameraRefinement, Refinement, Report, pixels_moved
 from ghgs_lit.rendering import Renderer
-from ghgs_lit.rounds.coarse import FILLED
 from ghgs_lit.surroundings import side_multiple
 from ghgs_lit.types import Batch, Gaussians, Prediction
 from ghgs_lit.weights.checkpoint import read_config

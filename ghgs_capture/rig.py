@@ -20,10 +20,10 @@ from ghgs_capture.crops import Photograph
 from ghgs_capture.doubts import CORRECTION, doubt_of_cameras, doubt_of_masks
 from ghgs_capture.folder import CaptureFolder
 from ghgs_lit.geometry.frame import Frame
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
+from ghgs_lit.method.rounds.gains import log_gains
 from ghgs_lit.refinement import CameraRefinement, pixels_moved
 from ghgs_lit.rendering import Renderer
-from ghgs_lit.rounds.gains import log_gains
 from ghgs_lit.types import Batch, Cameras
 
 INSTANTS = 8  #: Instants, spread over a sequence, for correcting its cameras

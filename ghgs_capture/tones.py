@@ -9,7 +9,7 @@ import numpy as np
 
 from ghgs_capture.capture import Capture
 from ghgs_capture.crops import Photograph
-from ghgs_lit.rounds.gains import log_gammas
+from ghgs_lit.method.rounds.gains import log_gammas
 from ghgs_lit.types import Batch, Gaussians
 
 #: Log gamma of all channels, beside the median camera's, above which a camera has a tone curve of

@@ -4,12 +4,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ghgs_lit.model import GHGS
+    from ghgs_lit.method.model import GHGS
     from ghgs_lit.rendering import render
     from ghgs_lit.types import Batch, Cameras, Gaussians
 
 _MODULES = {
-    "GHGS": "ghgs_lit.model",
+    "GHGS": "ghgs_lit.method.model",
     "Batch": "ghgs_lit.types",
     "Cameras": "ghgs_lit.types",
     "Gaussians": "ghgs_lit.types",

@@ -88,3 +88,17 @@ def true_places(mask: Bool[Tensor, "..."], count: int, repeats: bool = False) ->
     target = torch.where(flat, flat.cumsum(0) - 1, count)  # all others go to the last place
     places = flat.to(torch.uint8).argmax().repeat(count + 1) if repeats else index.new_empty(count + 1)
     return places.scatter_(0, target, index)[:count]
+
+
+#: Shape buckets of an octave.
+_STEPS = 8
+
+
+def bucket_size(count: int) -> int:
+    """The smallest shape bucket that holds ``count`` rows.
+
+    1 to 16, then eight of equal steps in each octave (18, 20, ..., 32, 36, ...): at most an
+    eighth is added.
+    """
+    step = max((1 << max(count - 1, 0).bit_length()) // (2 * _STEPS), 1)
+    return -(-count // step) * step

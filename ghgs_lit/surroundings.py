@@ -6,7 +6,7 @@ masks follow mattes (:class:`CheckedPhotographs`); the world becomes metres arou
 (:class:`SubjectFrame`); photographs get a black border up to whole patches (:class:`Border`). The
 prediction goes through them in reverse: the border is cut off, and Gaussians, depths and points are
 brought back to the cameras' world. :class:`ModelOptions` (``conf/model``) choose the layers. Checks
-of values are findings, which :meth:`ghgs_lit.model.GHGS.plan` reads together with all else that a
+of values are findings, which :meth:`ghgs_lit.method.model.GHGS.plan` reads together with all else that a
 GPU must be waited for."""
 
 from collections.abc import Sequence

@@ -31,8 +31,15 @@ os.environ |= {"OMP_NUM_THREADS": str(_THREADS), "OMP_WAIT_POLICY": "PASSIVE"}
 _PACKAGE = Path(__file__).parents[1] / "ghgs_lit"
 _CHECKED = ["extents", "types", "losses", "metrics"]
 # Without their folders of kernels: a wrapped function cannot be compiled.
-for name in ("bounds", "encoder", "geometry", "heads", "pretext", "recalibration"):
-    _CHECKED += [f"{name}.{path.stem}" for path in (_PACKAGE / name).glob("*.py")]
+for name in (
+    "method.bounds",
+    "method.encoder",
+    "geometry",
+    "method.heads",
+    "pretext",
+    "method.recalibration",
+):
+    _CHECKED += [f"{name}.{path.stem}" for path in (_PACKAGE / name.replace(".", "/")).glob("*.py")]
 check_shapes([f"ghgs_lit.{name}" for name in _CHECKED])
 
 import torch  # noqa: E402

@@ -4,12 +4,12 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from ghgs_lit.bounds import SubjectBox
 from ghgs_lit.config import compose, conf_dir
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.geometry.unprojection import Unprojection
-from ghgs_lit.heads.depth import BOUNDED, DepthHeadOptions
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.bounds import SubjectBox
+from ghgs_lit.method.heads.depth import BOUNDED, DepthHeadOptions
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.types import Batch, Cameras, DepthMaps, Tokens
 from ghgs_lit.weights import names
 from ghgs_lit.weights.switches import release_switches

@@ -14,7 +14,7 @@ from ghgs_lit.config import compose, registry
 from ghgs_lit.config.keys import ABLATIONS
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
-from ghgs_lit.stages import STAGES
+from ghgs_lit.method.stages import STAGES
 from ghgs_lit.training.pretext.labels import PARTS
 from tests.helpers.scenes import training_batch
 

@@ -12,14 +12,14 @@ from torch.utils.data import DataLoader
 
 from benchmarks import device as device_counts
 from ghgs_capture.verbs import predict
-from ghgs_lit.bounds import box, hull
 from ghgs_lit.config import conf_dir
 from ghgs_lit.config.nodes import PerScene
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.measure import ModelMethod, measure
 from ghgs_lit.kernels import gpu
+from ghgs_lit.method.bounds import box, hull
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.metrics import MetricsOptions
-from ghgs_lit.model import GHGS
 from ghgs_lit.refinement import CameraRefinement, Refinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.training import GHGSModule, Optimization

@@ -5,12 +5,12 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from ghgs_lit.encoder import cpu
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.kernels.compile import processor_features
+from ghgs_lit.method.encoder import cpu
+from ghgs_lit.method.recalibration import SemanticAttention, nearest_neighbors
+from ghgs_lit.method.recalibration.recalibration import neighbor_cosines
 from ghgs_lit.metrics.functional import ssim
-from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
-from ghgs_lit.recalibration.recalibration import neighbor_cosines
 from ghgs_lit.types import DepthBounds
 from tests.helpers.literal_recalibration import literal_recalibration
 from tests.helpers.models import close, make_model

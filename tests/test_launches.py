@@ -14,8 +14,8 @@ import torch
 
 from benchmarks import device
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
-from ghgs_lit.model import GHGS
-from ghgs_lit.playback import Playback
+from ghgs_lit.method.model import GHGS
+from ghgs_lit.method.playback import Playback
 from ghgs_lit.rendering.api import Renderer
 from ghgs_lit.runtime.recording import Recorder
 from ghgs_lit.training import Optimization

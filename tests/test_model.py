@@ -10,16 +10,16 @@ import torch
 from torch import nn
 
 import ghgs_lit
-from ghgs_lit.bounds import NoBounds
 from ghgs_lit.config import conf_dir
 from ghgs_lit.config.keys import ablation_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.unprojection import Unprojection
-from ghgs_lit.heads.depth import DepthHeadOptions
-from ghgs_lit.heads.dpt import DPTHead
-from ghgs_lit.heads.gaussian import GaussianHeadOptions
-from ghgs_lit.model import GHGS
-from ghgs_lit.recalibration import RecalibrationOptions
+from ghgs_lit.method.bounds import NoBounds
+from ghgs_lit.method.heads.depth import DepthHeadOptions
+from ghgs_lit.method.heads.dpt import DPTHead
+from ghgs_lit.method.heads.gaussian import GaussianHeadOptions
+from ghgs_lit.method.model import GHGS
+from ghgs_lit.method.recalibration import RecalibrationOptions
 from ghgs_lit.surroundings import ModelOptions
 from ghgs_lit.types import Batch, Cameras, Tokens
 from ghgs_lit.weights.names import RELEASE, to_ours

@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch import nn
 
-from ghgs_lit.bounds import SubjectBox
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.geometry.projection import pixel_centers, project
+from ghgs_lit.method.bounds import SubjectBox
 from ghgs_lit.types import Batch, DepthBounds
 from tests.helpers.models import ATTRIBUTES, close, make_model
 from tests.helpers.scenes import make_batch, with_soft_rims

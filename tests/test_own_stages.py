@@ -61,7 +61,7 @@ def project(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("group", GROUPS)
 def test_each_stage_can_be_replaced_alone(project, boxes, photographs, monkeypatch, group):
-    """Nothing else of a stage is used than what its protocol says (:mod:`ghgs_lit.stages`).
+    """Nothing else of a stage is used than what its protocol says (:mod:`ghgs_lit.method.stages`).
 
     Weights of a loss are the checkpoint's, too; numbers of a metric are written like all others.
     """

@@ -9,7 +9,7 @@ from torch import nn
 
 from benchmarks.device import drawing_nothing
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
-from ghgs_lit.playback import Playback
+from ghgs_lit.method.playback import Playback
 from ghgs_lit.rendering.capacity import Rooms
 from ghgs_lit.runtime.recording import Recorder
 from ghgs_lit.runtime.watching import Watcher, watched

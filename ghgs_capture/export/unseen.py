@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ghgs_capture.export.subject import ExportedSubject
-from ghgs_lit.rounds.observation import looked_up
+from ghgs_lit.method.rounds.observation import looked_up
 
 #: Metres behind the rendered surface up to which a photograph shows a Gaussian.
 _BEHIND = 0.03

@@ -27,7 +27,7 @@ from ghgs_lit.cli import inputs
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import resolved
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.weights.checkpoint import read_config
 

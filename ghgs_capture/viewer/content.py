@@ -13,10 +13,10 @@ from ghgs_capture.calibration import calibrate
 from ghgs_capture.export.compact import visible_first
 from ghgs_capture.export.subject import AXES
 from ghgs_capture.formats.json_and_toml import read_json
-from ghgs_lit.bounds import VisualHull
 from ghgs_lit.data.images import read_image
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.method.bounds import VisualHull
 from ghgs_lit.metrics import flip_map, psnr
 from ghgs_lit.metrics.regions import box_of, mean_over
 from ghgs_lit.ply import read_ply

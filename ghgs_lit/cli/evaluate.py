@@ -13,7 +13,7 @@ from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.measure import Method, ModelMethod, decisions_of
 from ghgs_lit.evaluation.protocols import check_evaluation
 from ghgs_lit.evaluation.report import measure_and_write
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.refinement import CameraRefinement, Refinement
 from ghgs_lit.runs.results import METHOD, read_results
 from ghgs_lit.weights.checkpoint import read_checkpoint

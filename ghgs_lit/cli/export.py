@@ -8,7 +8,7 @@ from ghgs_lit.cli.runtime import announce, files_to_write, output_dir, write_con
 from ghgs_lit.diagnostics.benchmark.measure import differences as prediction_differences
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.errors import require
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.rendering import render
 from ghgs_lit.weights.checkpoint import read_config
 from ghgs_lit.weights.exporting import export_weights, write_inference

@@ -17,7 +17,7 @@ from ghgs_lit.cli.inputs import build_data, build_renderer, check_size
 from ghgs_lit.cli.train import build_trainer, quiet
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.protocols import check_evaluation
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.runs import job
 from ghgs_lit.runs.planned import Rehearsal
 from ghgs_lit.runs.provenance import config_hash

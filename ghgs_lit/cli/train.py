@@ -23,7 +23,7 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.protocols import check_evaluation
 from ghgs_lit.evaluation.report import measure_and_write
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.runs import job
 from ghgs_lit.runs.processes import in_srun, queue_again, settle_rank
 from ghgs_lit.runs.results import read_results

@@ -3,7 +3,7 @@ never a path of Python code.
 
 A configuration can come from somebody else's checkpoint, so a node such as
 ``depth_head: {kind: dpt, ...}`` can only name a kind listed below or a registered one. Kinds and
-verbs are registered by the files of the group's subpackage, such as ``ghgs_lit/heads``, and by
+verbs are registered by the files of the group's subpackage, such as ``ghgs_lit/method/heads``, and by
 plug-ins: modules in the environment variable ``GHGS_PLUGINS`` (Python files or module names,
 separated as in ``PATH``) or entry points in the group ``ghgs_lit.plugins``. The other packages of
 this distribution, ``ghgs_people`` and ``ghgs_capture``, are such entry points; they offer import
@@ -90,23 +90,23 @@ _C = TypeVar("_C", bound=type[Options])
 #: Import path of the options by group and kind; kind None: nodes of the group have no key ``kind``.
 KINDS: dict[str, dict[str | None, str]] = {
     "bounds": {
-        "box": "ghgs_lit.bounds.SubjectBox",
-        "hull": "ghgs_lit.bounds.VisualHull",
-        "none": "ghgs_lit.bounds.NoBounds",
+        "box": "ghgs_lit.method.bounds.SubjectBox",
+        "hull": "ghgs_lit.method.bounds.VisualHull",
+        "none": "ghgs_lit.method.bounds.NoBounds",
     },
-    "encoder": {"vggt": "ghgs_lit.encoder.VGGTOptions"},
+    "encoder": {"vggt": "ghgs_lit.method.encoder.VGGTOptions"},
     "depth_head": {
-        "dpt": "ghgs_lit.heads.depth.DepthHeadOptions",
-        "stereo": "ghgs_lit.heads.stereo.StereoHeadOptions",
+        "dpt": "ghgs_lit.method.heads.depth.DepthHeadOptions",
+        "stereo": "ghgs_lit.method.heads.stereo.StereoHeadOptions",
     },
     "unprojection": {"pinhole": "ghgs_lit.geometry.unprojection.Unprojection"},
     "recalibration": {
-        "none": "ghgs_lit.recalibration.recalibration.NoRecalibrationOptions",
-        "semantic": "ghgs_lit.recalibration.RecalibrationOptions",
+        "none": "ghgs_lit.method.recalibration.recalibration.NoRecalibrationOptions",
+        "semantic": "ghgs_lit.method.recalibration.RecalibrationOptions",
     },
-    "gaussian_head": {"dpt": "ghgs_lit.heads.gaussian.GaussianHeadOptions"},
-    "rounds": {"recurrent": "ghgs_lit.rounds.RoundsOptions"},
-    "skip": {None: "ghgs_lit.plan.presets.SkipOptions"},
+    "gaussian_head": {"dpt": "ghgs_lit.method.heads.gaussian.GaussianHeadOptions"},
+    "rounds": {"recurrent": "ghgs_lit.method.rounds.RoundsOptions"},
+    "skip": {None: "ghgs_lit.method.plan.presets.SkipOptions"},
     "model": {None: "ghgs_lit.surroundings.ModelOptions"},
     "compat": {None: "ghgs_lit.weights.switches.CompatOptions"},
     "renderer": {"splats": "ghgs_lit.rendering.Renderer"},
@@ -262,7 +262,8 @@ def verb_class(name: str) -> type[Options]:
 @cache
 def _import_room(group: str) -> None:
     """Import all files of the group's subpackage, so that they register their kinds."""
-    room = ".".join(next(iter(KINDS[group].values())).split(".")[:2])
+    parts = next(iter(KINDS[group].values())).split(".")
+    room = ".".join(parts[: 3 if parts[1] == "method" else 2])
     for file in pkgutil.iter_modules(importlib.import_module(room).__path__, f"{room}."):
         importlib.import_module(file.name)
 

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.unprojection import seen_surfaces
+from ghgs_lit.method.recalibration.inspection import Call, neighborhoods, seen_calls
 from ghgs_lit.metrics import ImageMetrics, depth_error_mm, surface_error_mm
-from ghgs_lit.recalibration.inspection import Call, neighborhoods, seen_calls
 from ghgs_lit.refinement import CameraRefinement, Refinement
 from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row

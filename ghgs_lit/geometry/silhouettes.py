@@ -1,7 +1,7 @@
 """Silhouette coherence: how much of each mask lies in the visual hull of the others. With correct
 cameras and masks, the ray of every mask pixel passes a point that all other masks cover (Boyer
 2006; Hernandez, Schmitt and Cipolla 2007). For silhouettes of any sizes, unlike
-:mod:`ghgs_lit.bounds.agreement`."""
+:mod:`ghgs_lit.method.bounds.agreement`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from ghgs_lit.plan.rows import size_class
+from ghgs_lit.extents import bucket_size
 
 T = TypeVar("T")
 Drawn = TypeVar("Drawn")
@@ -132,7 +132,7 @@ def with_room(
     """
     rooms = _rooms.get()
     while True:
-        capacity = size_class(math.ceil(_SPARE * splats * _expected.get(grid, _FIRST)) or 1)
+        capacity = bucket_size(math.ceil(_SPARE * splats * _expected.get(grid, _FIRST)) or 1)
         intersections, needed = find(capacity)
         room = Room(grid, splats, capacity, needed)
         number = Coming(needed) if rooms is None else None

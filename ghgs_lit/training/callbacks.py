@@ -11,7 +11,7 @@ from lightning.pytorch.callbacks import Callback
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from ghgs_lit.config.options import Options
-from ghgs_lit.recalibration.inspection import neighborhoods, seen_calls
+from ghgs_lit.method.recalibration.inspection import neighborhoods, seen_calls
 from ghgs_lit.runs.progress import Lines, clock, on_terminal
 
 

@@ -2,7 +2,7 @@
 
 A step of a small model asks a GPU for thousands of launches, and the host takes longer to ask than
 the GPU to do. What follows a plan depends on sizes alone, in training as in predictions
-(:mod:`ghgs_lit.playback`). So the stages, the rendering, the loss and the gradients of all weights
+(:mod:`ghgs_lit.method.playback`). So the stages, the rendering, the loss and the gradients of all weights
 are one CUDA graph here. What surrounds it is called as always: the plan before it; hooks of
 weights, clipping and the optimizer after it, which find a loss with a gradient as usual."""
 
@@ -16,9 +16,9 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from ghgs_lit.losses import Losses
-from ghgs_lit.model import GHGS
-from ghgs_lit.plan import Plan
-from ghgs_lit.playback import Scene
+from ghgs_lit.method.model import GHGS
+from ghgs_lit.method.plan import Plan
+from ghgs_lit.method.playback import Scene
 from ghgs_lit.rendering.api import Renderer
 from ghgs_lit.rendering.capacity import Rooms, deferred
 from ghgs_lit.runtime.watching import is_watched

@@ -9,7 +9,7 @@ import torch
 from lightning.pytorch.callbacks import Callback
 
 from ghgs_lit.config.options import Options
-from ghgs_lit.model import STAGES
+from ghgs_lit.method.model import STAGES
 from ghgs_lit.runtime.allocation import forget_peak, resident_bytes
 from ghgs_lit.runtime.watching import Inputs, Stopwatch, Watcher, watched
 from ghgs_lit.training.captured import may_be_recorded

@@ -12,7 +12,7 @@ import lightning.pytorch as L
 import torch
 from torch import Tensor
 
-from ghgs_lit.model import STAGES
+from ghgs_lit.method.model import STAGES
 from ghgs_lit.runtime.watching import Inputs, Watcher, watched
 from ghgs_lit.training.optimization import named_weights
 from ghgs_lit.types import Batch, map_tensors

@@ -13,11 +13,11 @@ from torch import Tensor, nn
 from ghgs_lit.config import build
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.unprojection import seen_surfaces
-from ghgs_lit.heads.inspection import offsets_at_limit, seen_attributes
 from ghgs_lit.losses import Losses
+from ghgs_lit.method.heads.inspection import offsets_at_limit, seen_attributes
+from ghgs_lit.method.model import GHGS
+from ghgs_lit.method.plan.presets import KeptTokens, seeing
 from ghgs_lit.metrics import FURTHER, MetricsOptions, depth_error_mm, surface_error_mm
-from ghgs_lit.model import GHGS
-from ghgs_lit.plan.presets import KeptTokens, seeing
 from ghgs_lit.training.base import BudgetedModule, image_mean
 from ghgs_lit.training.captured import Outcome, is_recordable, played
 from ghgs_lit.training.faults import Step

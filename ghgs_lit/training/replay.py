@@ -8,7 +8,7 @@ import torch
 
 from ghgs_lit.config import build
 from ghgs_lit.errors import InputError
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.training.faults import Fault, Step, first_fault
 from ghgs_lit.training.module import GHGSModule
 from ghgs_lit.types import Batch, Cameras, Targets

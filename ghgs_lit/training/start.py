@@ -10,8 +10,8 @@ from torch import nn
 from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, lookup
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import resolved
+from ghgs_lit.method.stages import STAGES
 from ghgs_lit.runs.provenance import differences
-from ghgs_lit.stages import STAGES
 from ghgs_lit.training.restoring import check_optimizer_state, check_schedules, check_training_state
 from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint, require_finite, shape_of
 

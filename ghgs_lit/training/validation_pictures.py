@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ghgs_lit.config.options import Index, Options
 from ghgs_lit.geometry.padding import pad_to_patches
-from ghgs_lit.recalibration import Recalibration
-from ghgs_lit.recalibration.inspection import attention_of, attention_on_other_parts
+from ghgs_lit.method.recalibration import Recalibration
+from ghgs_lit.method.recalibration.inspection import attention_of, attention_on_other_parts
 from ghgs_lit.training.pretext.labels import has_parts, part_shares, token_parts
 from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.attention import attention_sheet, chosen_token

@@ -6,7 +6,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from ghgs_lit.errors import require
-from ghgs_lit.recalibration.inspection import TokenAttention
+from ghgs_lit.method.recalibration.inspection import TokenAttention
 from ghgs_lit.types import Batch, Points, Tokens
 from ghgs_lit.visualization.pictures import palette, row, stack, to_uint8
 

@@ -247,7 +247,7 @@ def write_checkpoint(
 def load_weights(
     model: nn.Module, path: str | Path, dtype: torch.dtype | None = None, device: Any = "cpu"
 ) -> None:
-    """Give a :class:`ghgs_lit.model.GHGS` the weights of a checkpoint, mapped from the file,
+    """Give a :class:`ghgs_lit.method.model.GHGS` the weights of a checkpoint, mapped from the file,
     not copied.
 
     Args:
@@ -284,7 +284,7 @@ def check_preset(model: nn.Module, checkpoint: Mapping[str, Any], path: str | Pa
     weights give a warning.
 
     Args:
-        model: a :class:`ghgs_lit.model.GHGS`, whose ``auto`` may be replaced.
+        model: a :class:`ghgs_lit.method.model.GHGS`, whose ``auto`` may be replaced.
         checkpoint: its content.
         path: of the checkpoint, for messages.
     """

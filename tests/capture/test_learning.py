@@ -14,7 +14,7 @@ from ghgs_capture.verbs import adapt
 from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.frame import HEIGHT, Frame
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from tests.helpers.figures import Figure
 from tests.helpers.verbs import ghgs
 

@@ -11,7 +11,7 @@ import torch
 from ghgs_capture.capture import Capture
 from ghgs_capture.prediction import predict
 from ghgs_capture.temporal import Temporal
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.rendering import Renderer
 from tests.helpers.figures import Figure
 from tests.helpers.verbs import ghgs

@@ -13,7 +13,7 @@ from ghgs_lit.config import compose, run_of
 from ghgs_lit.config.compose import plain
 from ghgs_lit.config.registry import class_of, verb_class
 from ghgs_lit.errors import InputError
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.weights.checkpoint import read_config, write_checkpoint
 from tests.helpers.models import config
 

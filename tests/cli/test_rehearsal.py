@@ -12,7 +12,7 @@ import torch
 from ghgs_lit.cli import rehearsal
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import run_of
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.weights.checkpoint import write_checkpoint
 from tests.cli.test_main import call
 from tests.helpers.models import config

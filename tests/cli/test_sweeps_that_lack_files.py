@@ -15,7 +15,7 @@ import torch
 
 from ghgs_lit.config import run_of
 from ghgs_lit.data.humman import smpl
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.weights.checkpoint import write_checkpoint
 from scripts.miniatures import humman, thuman2, zju_mocap
 from tests.cli.test_main import call

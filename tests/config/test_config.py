@@ -14,7 +14,7 @@ from ghgs_lit.config.compose import read_option
 from ghgs_lit.config.keys import ablation_of, switches_of
 from ghgs_lit.config.registry import verbs
 from ghgs_lit.errors import InputError
-from ghgs_lit.model import GHGS, OPTIONS, STAGES
+from ghgs_lit.method.model import GHGS, OPTIONS, STAGES
 from tests.cli.test_main import call
 from tests.helpers.configs import composed, verb_with
 from tests.helpers.jobs import rehearse_nothing

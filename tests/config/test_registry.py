@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 import ghgs_capture
-import ghgs_lit.heads
+import ghgs_lit.method.heads
 import ghgs_people
 from ghgs_lit.config import build, registry
 from ghgs_lit.config.options import Options
 from ghgs_lit.config.registry import KINDS, NAMED, class_of, read_node, register
 from ghgs_lit.errors import InputError
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from tests.helpers.configs import composed, verb_with
 from tests.helpers.weights import config
 
@@ -132,7 +132,7 @@ def test_a_file_of_a_room_registers_its_kinds(monkeypatch, tmp_path):
         "    metres: float = 2.0\n"
     )
     monkeypatch.setattr(registry, "_REGISTERED", dict(registry._REGISTERED))
-    monkeypatch.setattr("ghgs_lit.heads.__path__", [*ghgs_lit.heads.__path__, str(tmp_path)])
+    monkeypatch.setattr("ghgs_lit.method.heads.__path__", [*ghgs_lit.method.heads.__path__, str(tmp_path)])
     registry._import_room.cache_clear()
     assert read_node({"kind": "flat", "metres": 3}, "depth_head").metres == 3.0
     assert registry.kinds_of("depth_head") == ["dpt", "stereo", "flat"]

@@ -20,8 +20,8 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import BASELINES
 from ghgs_lit.evaluation.measure import ModelMethod, measure_all
 from ghgs_lit.evaluation.protocols import target_protocols
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.metrics import MetricsOptions
-from ghgs_lit.model import GHGS
 from ghgs_lit.ply import read_ply
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import config_hash

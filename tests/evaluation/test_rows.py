@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from ghgs_lit.evaluation.measure import Estimate, ModelMethod, measure, not_finite
+from ghgs_lit.method.recalibration import inspection
 from ghgs_lit.metrics import MetricsOptions, psnr
-from ghgs_lit.recalibration import inspection
 from ghgs_lit.rendering import render
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.types import Targets

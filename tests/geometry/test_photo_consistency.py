@@ -8,14 +8,14 @@ import pytest
 import torch
 from scipy.ndimage import map_coordinates, uniform_filter
 
-from ghgs_lit.bounds import VisualHull
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.photo_consistency import TOLERANCE, photo_consistency
 from ghgs_lit.geometry.projection import unproject_maps
-from ghgs_lit.heads.depth import DepthHeadOptions
+from ghgs_lit.method.bounds import VisualHull
+from ghgs_lit.method.heads.depth import DepthHeadOptions
 from ghgs_lit.types import DepthBounds
-from tests.heads.test_gaussian import make_head, run, shake
 from tests.helpers.scenes import make_batch, ring
+from tests.method.heads.test_gaussian import make_head, run, shake
 
 
 def by_hand(batch, bounds, b, v, row, column, steps):

@@ -6,10 +6,10 @@ import torch
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.geometry.unprojection import Unprojection, subject_tokens
-from ghgs_lit.heads.depth import inverse_linear
+from ghgs_lit.method.heads.depth import inverse_linear
 from ghgs_lit.types import Batch, DepthMaps
-from tests.heads.test_depth import PATCH, assert_points, make_tokens, square_cameras
 from tests.helpers.scenes import CASES, fixture, make_batch
+from tests.method.heads.test_depth import PATCH, assert_points, make_tokens, square_cameras
 
 
 def release_token_points(inverse, cameras, dtype):

@@ -1,6 +1,6 @@
 """Encoders of any size."""
 
-from ghgs_lit.encoder import VGGTEncoder, VGGTOptions
+from ghgs_lit.method.encoder import VGGTEncoder, VGGTOptions
 
 
 def make_encoder(tokens: str = "all", margin: int = 1, **options) -> VGGTEncoder:

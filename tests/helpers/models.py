@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from torch import nn
 
 from ghgs_lit.config import compose
-from ghgs_lit.model import GHGS, STAGES
+from ghgs_lit.method.model import GHGS, STAGES
 
 ATTRIBUTES = ("means", "quaternions", "scales", "opacities", "colors")
 TINY = ["encoder.width=32", "encoder.heads=2", "encoder.vit.channels=8"]

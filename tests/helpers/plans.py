@@ -2,7 +2,7 @@
 
 import torch
 
-from ghgs_lit.plan import planned
+from ghgs_lit.method.plan import planned
 
 
 def plan_of(masks, patch_size=14, pixels="subject", tokens="subject"):

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from ghgs_lit.recalibration import RecalibrationOptions
+from ghgs_lit.method.recalibration import RecalibrationOptions
 from ghgs_lit.types import Points, Tokens
 from tests.helpers.plans import with_plan
 

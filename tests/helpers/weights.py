@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 
 from ghgs_lit.cli.import_ import MODEL_NODES, empty_state
 from ghgs_lit.config import compose
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.weights import importing, names
 
 with gzip.open(Path(__file__).parents[1] / "fixtures" / "published_keys.json.gz") as file:

@@ -16,7 +16,7 @@ from ghgs_lit.kernels.compile import FirstCompilation
 PACKAGE = Path(ghgs_lit.__file__).parent
 ROOMS = sorted(
     path.parent
-    for path in PACKAGE.glob("*/cpu/__init__.py")
+    for path in PACKAGE.glob("**/cpu/__init__.py")
     if any("kernels.compile" in file.read_text() for file in path.parent.glob("*.py"))
 )
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-import ghgs_lit.model  # noqa: F401  (it has all operators)
+import ghgs_lit.method.model  # noqa: F401  (it has all operators)
 from ghgs_lit.kernels import gpu
 from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Gaussians

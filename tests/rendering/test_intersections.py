@@ -4,7 +4,7 @@ and room for them that never is too small."""
 import pytest
 import torch
 
-from ghgs_lit.plan.rows import size_class
+from ghgs_lit.extents import bucket_size
 from ghgs_lit.rendering import RasterSettings, capacity, gsplat_backend, reference
 from ghgs_lit.rendering.capacity import deferred, settled
 from ghgs_lit.rendering.intersections import TILE, intersections
@@ -91,7 +91,7 @@ def test_an_image_is_drawn_again_where_splats_lacked_room(capacities):
     found, wanted = drawn()
     torch.testing.assert_close(found.image, wanted.image, rtol=1e-3, atol=1e-4)
     assert len(capacities) == 2
-    assert capacities[0] == size_class(5 * 2 * 2 * 35) < capacities[1]
+    assert capacities[0] == bucket_size(5 * 2 * 2 * 35) < capacities[1]
     drawn()
     assert capacities[2:] == capacities[1:2]
     drawn(size=0.01)

@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 
 from benchmarks.device import drawing_nothing
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
-from ghgs_lit.playback import Playback
+from ghgs_lit.method.playback import Playback
 from ghgs_lit.rendering import capacity
 from ghgs_lit.rendering.api import Renderer
 from ghgs_lit.runtime.recording import Recorder

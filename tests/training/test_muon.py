@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.runtime.recording import Recorder
 from ghgs_lit.training import Optimization, muon
 from ghgs_lit.training.muon import Muon, is_matrix, orthogonalized

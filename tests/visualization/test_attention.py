@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.recalibration.inspection import attention_of, attention_on_other_parts
+from ghgs_lit.method.recalibration.inspection import attention_of, attention_on_other_parts
 from ghgs_lit.visualization.attention import attention_sheet, chosen_token
 from ghgs_lit.visualization.clouds import clouds
 from tests.helpers.models import make_model

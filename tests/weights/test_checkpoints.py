@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 from ghgs_lit.cli.inputs import with_trained_data
 from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION, read_config, write_checkpoint
 from ghgs_lit.weights.frozen import SHARING

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO
 from ghgs_lit.training.start import check_resume, initialize
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION, read_checkpoint

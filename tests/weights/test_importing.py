@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 
 from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.training import start
 from ghgs_lit.weights import importing, names
 from ghgs_lit.weights.checkpoint import model_state, read_checkpoint, write_checkpoint

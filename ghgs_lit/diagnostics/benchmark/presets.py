@@ -15,7 +15,7 @@ from ghgs_lit.config.keys import flatten, is_below
 from ghgs_lit.diagnostics.benchmark.scene import random_model
 from ghgs_lit.errors import require
 from ghgs_lit.evaluation.measure import Renderer
-from ghgs_lit.model import GHGS, STAGES
+from ghgs_lit.method.model import GHGS, STAGES
 from ghgs_lit.weights.checkpoint import check_preset, load_weights, read_checkpoint, require_fit
 
 YARDSTICK = "none"  #: Preset that all others are compared with

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from ghgs_lit.errors import require
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.types import Batch, Cameras, Targets
 
 #: Width over height of the silhouette, as of a standing person,

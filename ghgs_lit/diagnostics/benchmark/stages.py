@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, sdpa_flop_count
 
-from ghgs_lit.encoder import cpu
 from ghgs_lit.evaluation.measure import Renderer
-from ghgs_lit.model import GHGS, STAGES
+from ghgs_lit.method.encoder import cpu
+from ghgs_lit.method.model import GHGS, STAGES
 from ghgs_lit.runtime.allocation import can_forget_peak, forget_peak, resident_bytes, return_free_memory
 from ghgs_lit.runtime.watching import Inputs, Stopwatch, Watcher, inside
 from ghgs_lit.runtime.watching import watched as stages_watched

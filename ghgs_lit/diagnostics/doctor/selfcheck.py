@@ -10,7 +10,7 @@ from ghgs_lit.config.run import Run
 from ghgs_lit.diagnostics.benchmark.measure import ATTRIBUTES
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch, random_model
 from ghgs_lit.errors import InputError
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.rendering import RasterSettings, render
 from ghgs_lit.rendering.api import resolve_backend
 from ghgs_lit.runtime.precision import exact, has_bfloat16, rounds_products

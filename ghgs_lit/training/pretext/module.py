@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
-from ghgs_lit.encoder.semantic import SemanticBranch, features_of
 from ghgs_lit.geometry.rotations import unit
-from ghgs_lit.plan.patches import KeptPatches
+from ghgs_lit.method.encoder.semantic import SemanticBranch, features_of
+from ghgs_lit.method.plan.patches import KeptPatches
 from ghgs_lit.training.base import BudgetedModule
 from ghgs_lit.training.guard import DivergedError
 from ghgs_lit.training.optimization import Optimization

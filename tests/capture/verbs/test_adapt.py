@@ -14,7 +14,7 @@ from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import compose, run_of
 from ghgs_lit.data.view import half_centers
 from ghgs_lit.errors import InputError
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.parsing import read_yaml
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.weights.checkpoint import read_checkpoint

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from ghgs_lit.heads import dpt
+from ghgs_lit.method.heads import dpt
 from ghgs_lit.weights.checkpoint import write_checkpoint
 from tests.helpers.models import TINY, config, make_model
 from tests.helpers.people import render_boxes

@@ -21,8 +21,8 @@ from ghgs_lit.diagnostics.doctor.selfcheck import (
     table,
 )
 from ghgs_lit.geometry.unprojection import Unprojection
-from ghgs_lit.model import GHGS
-from ghgs_lit.recalibration import Recalibration
+from ghgs_lit.method.model import GHGS
+from ghgs_lit.method.recalibration import Recalibration
 from ghgs_lit.rendering.cpu import backend as cpu
 from ghgs_lit.runtime.precision import rounds_products
 from tests.helpers.models import TINY

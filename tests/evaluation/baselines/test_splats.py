@@ -9,7 +9,7 @@ from ghgs_lit.config import run_of
 from ghgs_lit.evaluation.baselines.splats import discs_at, splats_at, splatted, true_depth
 from ghgs_lit.geometry.masks import with_matte
 from ghgs_lit.geometry.projection import unproject_maps
-from ghgs_lit.heads.attributes import RawGaussians
+from ghgs_lit.method.heads.attributes import RawGaussians
 from ghgs_lit.metrics import psnr
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, DepthMaps, Points, Targets

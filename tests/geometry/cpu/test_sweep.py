@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from ghgs_lit.bounds import VisualHull
 from ghgs_lit.geometry.photo_consistency import photo_consistency
+from ghgs_lit.method.bounds import VisualHull
 from ghgs_lit.types import DepthBounds
 from tests.helpers.scenes import make_batch
 

@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 import torch
 
-from ghgs_lit.bounds import VisualHull
 from ghgs_lit.geometry import photo_consistency as stage
 from ghgs_lit.geometry.photo_consistency import photo_consistency
+from ghgs_lit.method.bounds import VisualHull
 from ghgs_lit.types import DepthBounds
 from tests.helpers.kernels import DEVICE, kernels
 from tests.helpers.scenes import in_dtype, make_batch

@@ -10,7 +10,7 @@ import torch
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.masks import patches_around_subject
-from ghgs_lit.plan.patches import KeptPatches
+from ghgs_lit.method.plan.patches import KeptPatches
 from ghgs_lit.training.pretext.labels import PARTS, part_shares, parts_of_points
 from ghgs_lit.training.validation_pictures import PicturesOptions
 from ghgs_people.figures.body import BODY_VERTICES, load_body

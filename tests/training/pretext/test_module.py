@@ -3,7 +3,7 @@
 import torch
 import torch.nn.functional as F
 
-from ghgs_lit.encoder.semantic import SemanticOptions
+from ghgs_lit.method.encoder.semantic import SemanticOptions
 from ghgs_lit.training.pretext.labels import PARTS
 from ghgs_lit.training.pretext.module import Pretext, cross_entropy
 from tests.helpers.bodies import body_batch

@@ -4,8 +4,6 @@ photo-consistency."""
 import torch
 from torch import Generator, Tensor
 
-from ghgs_lit.bounds import VisualHull
-from ghgs_lit.bounds.rays import depths_in_box, ray_directions
 from ghgs_lit.diagnostics.stress import inputs
 from ghgs_lit.diagnostics.stress.stage import Stage, Values
 from ghgs_lit.geometry.frame import Frame, to_world
@@ -14,6 +12,8 @@ from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import project, sample, unproject, world_to_camera
 from ghgs_lit.geometry.unprojection import subject_tokens
+from ghgs_lit.method.bounds import VisualHull
+from ghgs_lit.method.bounds.rays import depths_in_box, ray_directions
 from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds, DepthMaps
 

@@ -11,10 +11,10 @@ from ghgs_lit.diagnostics.stress.stage import FAMILIES, Stage, Values, case_by_c
 from ghgs_lit.diagnostics.stress.stages.geometry import batch_of, cameras_of, scene
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.geometry.undistortion import undistorting_grid
+from ghgs_lit.method.rounds.gains import log_gains
 from ghgs_lit.metrics.functional import ssim
 from ghgs_lit.refinement.refinement import Refinement
 from ghgs_lit.rendering import Renderer, render
-from ghgs_lit.rounds.gains import log_gains
 from ghgs_lit.types import Batch, Gaussians
 
 _LENS = 17  #: Side of a photograph with a lens, in pixels

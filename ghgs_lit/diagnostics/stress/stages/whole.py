@@ -13,7 +13,7 @@ from ghgs_lit.diagnostics.stress import inputs
 from ghgs_lit.diagnostics.stress.stage import Stage, Values, case_by_case
 from ghgs_lit.diagnostics.stress.stages.geometry import batch_of, scene
 from ghgs_lit.losses import Losses
-from ghgs_lit.model import GHGS
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Batch, Cameras, DepthBounds, Prediction, Targets
 from ghgs_lit.weights.reading import SHIPPED

@@ -1,6 +1,0 @@
-"""The bounds stage (not in the paper): near and far of each pixel's ray, from masks and cameras."""
-
-from ghgs_lit.bounds.box import NoBounds, SubjectBox
-from ghgs_lit.bounds.hull import VisualHull
-
-__all__ = ["NoBounds", "SubjectBox", "VisualHull"]

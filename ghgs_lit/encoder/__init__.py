@@ -1,5 +1,0 @@
-"""The encode stage: VGGT's aggregator of any size over patch tokens."""
-
-from ghgs_lit.encoder.encoder import VGGTEncoder, VGGTOptions
-
-__all__ = ["VGGTEncoder", "VGGTOptions"]

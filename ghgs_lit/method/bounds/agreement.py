@@ -1,0 +1,95 @@
+"""Agreement of the masks: a view whose mask contradicts all others does not vote. In silhouettes of
+one subject, each ray has a point that all the other silhouettes cover (silhouette coherence;
+Hernandez et al., PAMI 2007). Nothing here has a gradient."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ghgs_lit.geometry.constants import constant, middles
+from ghgs_lit.geometry.frame import in_cameras
+from ghgs_lit.method.bounds.rays import (
+    NEAREST,
+    Silhouettes,
+    dilate,
+    look_up,
+    projection_matrices,
+    ray_directions,
+    votes_outside,
+)
+
+#: Cells along the longer side of the masks, and depths along each ray: enough to find gross errors.
+RESOLUTION = 32
+_SAMPLES = 24
+
+#: Masks agree if the others explain at least this share of the rays of each.
+_SHARE = 0.95
+
+
+def trusted_views(
+    coarse: Silhouettes, center: Float[Tensor, "B 3"], reach: Float[Tensor, " B"], tolerance: int
+) -> Bool[Tensor, "B V"]:
+    """Views that vote about the hull: those that show the subject,
+    except one that contradicts the others.
+
+    A mask that is cut leaves rays of the other views unexplained; a mask that is too large has
+    unexplained rays itself. If the masks do not agree (:data:`_SHARE`), the view without which
+    less than half of the unexplained share is left does not vote. With two views both vote: either
+    could be wrong.
+
+    Args:
+        coarse: masks of at most :data:`RESOLUTION` cells along the longer side, and their cameras.
+        center: of the subject in the world, in metres.
+        reach: a generous radius of the subject about ``center``, in metres.
+        tolerance: how many views may say "outside" of a point that is kept.
+
+    Returns:
+        Which views vote.
+    """
+    masks = coarse.masks
+    voting = masks.flatten(2).any(-1)
+    votes = _votes(coarse, voting, center, reach)
+    count = votes.sum(2, keepdim=True)
+    # Votes of all views, then without each single one.
+    counts = torch.cat((count, count - votes), 2)
+    hit = (counts <= tolerance).any(-1) & masks[:, :, None]
+    explained = hit.flatten(3).sum(-1) / masks.flatten(2).sum(-1).clamp(min=1)[..., None]
+    # A view that has no vote need not be explained.
+    silent = constant(torch.eye, masks.shape[1] + 1, like=masks)[1:] | ~voting[..., None]
+    agreement = torch.where(silent, 1.0, explained).amin(1)
+    best, suspect = agreement[:, 1:].max(1, keepdim=True)
+    by_all = agreement[:, :1]
+    wrong = (by_all < _SHARE) & (2 * (1 - best) < 1 - by_all) & (voting.sum(1, keepdim=True) > 2)
+    return voting & ~torch.zeros_like(voting).scatter(1, suspect, wrong)
+
+
+def _votes(coarse: Silhouettes, voting: Tensor, center: Tensor, reach: Tensor) -> Tensor:
+    """Votes of each view about points on the rays of all views.
+
+    Args:
+        coarse: masks and their cameras.
+        voting: [B, V], views that may say "outside".
+        center: [B, 3], middle of the depths that are looked at, in metres.
+        reach: [B], half of their range, in metres.
+
+    Returns:
+        Votes [B, v, o, h, w, S]: 1 where view ``o`` sees a point on a ray of view ``v``
+        outside its mask.
+    """
+    masks = coarse.masks
+    cameras = coarse.cameras
+    b, v = voting.shape
+    # At least one cell: the rays of a cell's pixels run beside the ray of its centre.
+    outside = votes_outside(dilate(masks, max(coarse.dilation, 1)), voting, coarse.cut)
+    matrices = projection_matrices(cameras)
+    middle = in_cameras(center, cameras.extrinsics)[..., 2]
+    steps = 2 * constant(middles, _SAMPLES, like=center) - 1
+    depth = (middle[..., None] + reach[:, None, None] * steps).clamp(min=NEAREST)
+    turn = matrices[..., :3]
+    along = torch.einsum("boij,bvhwj->ibvohw", turn, ray_directions(cameras))
+    origin = (
+        torch.einsum("boij,bvj->ibvo", turn, cameras.centers) + matrices[..., 3].movedim(2, 0)[:, :, None]
+    )
+    pixels = origin[..., None, None, None] + along[..., None] * depth[:, :, None, None, None]
+    image = constant(torch.arange, b * v, like=center, dtype=torch.long).view(b, 1, v, 1, 1, 1)
+    return look_up(outside.flatten(0, 1), image, pixels)

@@ -1,0 +1,213 @@
+"""Near and far of each pixel from the visual hull of the other views. The rays of the subject's
+pixels are marched through the subject's box; depths that the masks of the *other* views allow are
+kept: the image-based visual hull (Matusik et al. 2000). Nothing here has a gradient."""
+
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from pydantic import Field
+from torch import Tensor
+
+from ghgs_lit.extents import bucket_size, true_places
+from ghgs_lit.geometry.constants import constant, middles, other_images
+from ghgs_lit.kernels import gpu
+from ghgs_lit.kernels.pool import at_once, even_parts
+from ghgs_lit.method.bounds import cpu
+from ghgs_lit.method.bounds.box import SubjectBox
+from ghgs_lit.method.bounds.rays import (
+    Silhouettes,
+    cut_sides,
+    depths_in_box,
+    dilate,
+    look_up,
+    projection_matrices,
+    ray_directions,
+    votes_outside,
+)
+from ghgs_lit.types import Batch, Cameras, DepthBounds
+
+#: Depths in memory at once, on a CPU and elsewhere.
+_DEPTHS = 1 << 18, 1 << 23
+
+
+class VisualHull(SubjectBox):
+    """``bounds(batch) -> DepthBounds``: where each ray of the subject enters and leaves the visual
+    hull. Other pixels, and rays that miss the hull, have the bounds of the box."""
+
+    samples: int = Field(48, ge=2, le=4096)
+    """Depths that are tried along each ray"""
+
+    def _within(
+        self, batch: Batch, coarse: Silhouettes, voting: Tensor, lower: Tensor, upper: Tensor
+    ) -> DepthBounds:
+        """As of :class:`SubjectBox`, and for the subject's pixels within the hull.
+
+        Args:
+            batch: masks and cameras at full resolution.
+            coarse: the same at a lower one, at which rays are marched.
+            voting: [B, V], views that may say "outside".
+            lower: [B, 3], the corner of the box with the smallest coordinates, in metres.
+            upper: [B, 3], that with the largest.
+        """
+        box = self._valid(depths_in_box(batch.cameras, lower, upper))
+        start = box if coarse.stride == 1 else self._valid(depths_in_box(coarse.cameras, lower, upper))
+        # At least one cell: the rays of a cell's pixels run beside the ray of its centre.
+        radius = max(coarse.dilation, 1)
+        rays = batch.pixels if coarse.stride == 1 else None
+        count = bucket_size(sum(extent.cells(coarse.stride) for extent in batch.extents))
+        seen = (coarse.masks, coarse.cameras, start, radius)
+        hull = hull_bounds(*seen, self.tolerance, self.samples, rays, voting, count, coarse.cut)
+        near, far = (_enlarge(x, coarse.stride, batch.masks.shape[-2:]) for x in (hull.near, hull.far))
+        return self._valid(DepthBounds(torch.maximum(box.near, near), torch.minimum(box.far, far)))
+
+
+def hull_bounds(
+    masks: Bool[Tensor, "B V h w"],
+    cameras: Cameras,
+    start: DepthBounds,
+    radius: int,
+    tolerance: int = 0,
+    samples: int = 48,
+    rays: Int[Tensor, " r"] | None = None,
+    voting: Bool[Tensor, "B V"] | None = None,
+    count: int | None = None,
+    cut: Bool[Tensor, "B V 4"] | None = None,
+) -> DepthBounds:
+    """First and last depth within ``start`` that the dilated masks of the other views allow.
+
+    Pixels beside the subject, and rays that miss the hull, keep the bounds of ``start``.
+
+    Args:
+        masks: the subject's pixels, whose rays are marched.
+        cameras: [B, V], whose pixels are those of the masks.
+        start: bounds [B, V, h, w] in metres, between which depths are tried.
+        radius: dilation of the masks in pixels.
+        tolerance: how many other views may say "outside" of a depth that is allowed.
+        samples: depths that are tried along each ray.
+        rays: indices of the masks' pixels, if known.
+        voting: views that may say "outside"; None: those whose mask is not empty.
+        count: the masks have no more pixels than this, so that a GPU need not be asked;
+            None: unknown.
+        cut: sides of the frame that cut the subject; None: those that the masks touch.
+
+    Returns:
+        Bounds [B, V, h, w] in metres, half a step outside the depths that were tried.
+    """
+    voting = masks.flatten(2).any(-1) if voting is None else voting
+    cut = cut_sides(masks) if cut is None else cut
+    outside = votes_outside(dilate(masks, radius), voting, cut)
+    directions = ray_directions(cameras)
+    matrices = projection_matrices(cameras)
+    if gpu.is_supported(start.near, directions, matrices):
+        tables = (outside, masks, matrices, directions, cameras.centers)
+        return DepthBounds(*_marching(*tables, start.near, start.far, samples, tolerance))
+    steps = constant(middles, samples, like=start.near)
+    if cpu.fits(start.near, directions, matrices):
+        return cpu.march(outside, masks, matrices, directions, cameras.centers, start, steps, tolerance)
+    near, far = (bound.clone(memory_format=torch.contiguous_format) for bound in (start.near, start.far))
+    if rays is None:
+        known = count is not None
+        rays = true_places(masks, count, repeats=True) if known else masks.flatten().nonzero()[:, 0]
+    most = at_once(near.device, *_DEPTHS) // (samples * (masks.shape[1] - 1))
+    for part in even_parts(len(rays), most):
+        _march(rays[part], outside, matrices, directions, cameras.centers, start, near, far, steps, tolerance)
+    return DepthBounds(near, far)
+
+
+def _march(
+    rays: Int[Tensor, " r"],
+    outside: UInt8[Tensor, "B V h w"],
+    matrices: Float[Tensor, "B V 3 4"],
+    directions: Float[Tensor, "B V h w 3"],
+    centers: Float[Tensor, "B V 3"],
+    start: DepthBounds,
+    near: Float[Tensor, "B V h w"],
+    far: Float[Tensor, "B V h w"],
+    steps: Float[Tensor, " s"],
+    tolerance: int,
+) -> None:
+    """Replace the bounds of some pixels by the first and the last depth that the other views allow;
+    unchanged where there is none.
+
+    Args:
+        rays: indices of pixels; one may be listed more than once, so that ``start`` is read.
+        outside: 1 where a view says "outside".
+        matrices: of projection.
+        directions: of the rays.
+        centers: of the cameras.
+        start: the depths in metres between which others are tried.
+        near: written; contiguous, as is ``far``.
+        far: written.
+        steps: fractions of the way from near to far that are tried.
+        tolerance: votes that an allowed depth may have.
+    """
+    views = outside.shape[1]
+    samples = len(steps)
+    image = rays // outside[0, 0].numel()
+    begin, end = (bound.reshape(-1)[rays] for bound in (start.near, start.far))
+    length = end - begin
+    depth = begin[:, None] + steps * length[:, None]
+    direction = directions.reshape(-1, 1, 3)[rays]
+    center = centers.reshape(-1, 1, 3)[image]
+    other = constant(other_images, len(outside), views, like=image)[image]
+    matrix = matrices.flatten(0, 1).movedim(1, 0)[:, other]
+    along = (matrix[..., :3] * direction).sum(-1)
+    origin = (matrix[..., :3] * center).sum(-1) + matrix[..., 3]
+    pixels = torch.addcmul(origin[..., None], depth[:, None], along[..., None])
+    votes = look_up(outside.flatten(0, 1), other[..., None], pixels)
+    inside = (votes.sum(1) <= tolerance).to(torch.uint8)
+    hit = inside.amax(1).bool()
+    half = length / (2 * samples)
+    first = depth.gather(1, inside.argmax(1, keepdim=True))[:, 0] - half
+    last = depth.gather(1, samples - 1 - inside.flip(1).argmax(1, keepdim=True))[:, 0] + half
+    near.view(-1)[rays] = torch.where(hit, first, begin)
+    far.view(-1)[rays] = torch.where(hit, last, end)
+
+
+def _marched(
+    outside: UInt8[Tensor, "B V h w"],
+    masks: Bool[Tensor, "B V h w"],
+    matrices: Float[Tensor, "B V 3 4"],
+    directions: Float[Tensor, "B V h w 3"],
+    centers: Float[Tensor, "B V 3"],
+    near: Float[Tensor, "B V h w"],
+    far: Float[Tensor, "B V h w"],
+    samples: int,
+    tolerance: int,
+) -> tuple[Float[Tensor, "B V h w"], Float[Tensor, "B V h w"]]:
+    """:func:`_march` for all pixels of ``masks``: new bounds within ``near`` and ``far``.
+
+    Args:
+        outside: 1 where a view says "outside".
+        masks: the subject's pixels, whose rays are marched.
+        matrices: of projection.
+        directions: of the rays.
+        centers: of the cameras.
+        near: depth in metres from which others are tried.
+        far: depth to which they are.
+        samples: number of depths that are tried.
+        tolerance: votes that an allowed depth may have.
+
+    Returns:
+        Near and far.
+    """
+    start = DepthBounds(near, far)
+    new_bounds = [bound.clone(memory_format=torch.contiguous_format) for bound in (near, far)]
+    steps = (torch.arange(samples, device=near.device, dtype=near.dtype) + 0.5) / samples
+    rays = masks.flatten().nonzero()[:, 0]
+    _march(rays, outside, matrices, directions, centers, start, *new_bounds, steps, tolerance)
+    return tuple(new_bounds)
+
+
+_marching = gpu.operator(
+    "marched(Tensor outside, Tensor masks, Tensor matrices, Tensor directions, Tensor centers, Tensor near, "
+    "Tensor far, int samples, int tolerance) -> (Tensor, Tensor)",
+    _marched,
+    "ghgs_lit.method.bounds.cuda",
+)
+
+
+def _enlarge(values: Tensor, stride: int, size: tuple[int, int]) -> Tensor:
+    """Values of cells for their ``stride`` x ``stride`` pixels each,
+    cropped to ``size`` (height, width)."""
+    values = values.repeat_interleave(stride, -2).repeat_interleave(stride, -1)
+    return values[..., : size[0], : size[1]]

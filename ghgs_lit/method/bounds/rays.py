@@ -1,0 +1,242 @@
+"""Rays of pixels, and masks as silhouettes: dilated, and looked up at projected points. A ray is a
+function of z-depth: ``point(z) = center + z * direction``."""
+
+from dataclasses import dataclass
+from itertools import product
+from math import ceil
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from torch import Tensor
+
+from ghgs_lit.geometry.constants import constant
+from ghgs_lit.geometry.projection import (
+    at_least_float32,
+    homogeneous_centers,
+    inverse_intrinsics,
+    pixel_centers,
+    world_to_camera,
+)
+from ghgs_lit.kernels import gpu
+from ghgs_lit.types import Cameras, DepthBounds
+
+
+def ray_directions(cameras: Cameras) -> Float[Tensor, "*batch h w 3"]:
+    """Direction of each pixel's ray: displacement in the world, in metres, per metre of z-depth."""
+    intrinsics = at_least_float32(cameras.intrinsics)
+    extrinsics = at_least_float32(cameras.extrinsics)
+    centers = homogeneous_centers(cameras.height, cameras.width, intrinsics)
+    to_world = extrinsics[..., :3, :3].mT @ inverse_intrinsics(intrinsics)
+    return torch.einsum("...ij,hwj->...hwi", to_world, centers)
+
+
+def projection_matrices(cameras: Cameras) -> Float[Tensor, "*batch 3 4"]:
+    """``K [R t]``, which maps homogeneous world points to homogeneous pixels."""
+    return at_least_float32(cameras.intrinsics) @ at_least_float32(cameras.extrinsics)[..., :3, :]
+
+
+def pixel_axes(cameras: Cameras) -> tuple[Float[Tensor, " w"], Float[Tensor, " h"]]:
+    """Coordinates of the pixel centres along a row (columns + 0.5) and along a column
+    (rows + 0.5)."""
+    centers = pixel_centers(cameras.height, cameras.width, at_least_float32(cameras.intrinsics))
+    return centers[0, :, 0], centers[:, 0, 1]
+
+
+def depths_in_box(cameras: Cameras, lower: Float[Tensor, "B 3"], upper: Float[Tensor, "B 3"]) -> DepthBounds:
+    """Depths at which the ray of each pixel enters and leaves an axis-aligned box.
+
+    By slabs (Kay and Kajiya, SIGGRAPH 1986).
+
+    Args:
+        cameras: [B, V].
+        lower: the corner with the smallest coordinates, in metres.
+        upper: that with the largest.
+
+    Returns:
+        Bounds [B, V, h, w] in metres, perhaps behind the camera; for a ray that misses the box, the
+        range of depths of the whole box.
+    """
+    directions = ray_directions(cameras)
+    centers = cameras.centers[:, :, None, None]
+    # A ray along a face: 1e-12 instead of 0 gives the right infinities without 0 / 0.
+    directions = torch.where(directions.abs() < 1e-12, 1e-12, directions)
+    faces = [(face[:, None, None, None] - centers) / directions for face in (lower, upper)]
+    near = torch.minimum(*faces).amax(-1)
+    far = torch.maximum(*faces).amin(-1)
+    is_upper = constant(torch.tensor, _CORNERS, like=lower, dtype=torch.bool)
+    corners = torch.where(is_upper, upper[:, None], lower[:, None])
+    corners = corners[:, None].expand(-1, cameras.shape[1], -1, -1)
+    depth = world_to_camera(corners, cameras.extrinsics[:, :, None])[..., 2]
+    misses = near >= far
+    return DepthBounds(
+        torch.where(misses, depth.amin(-1)[..., None, None], near),
+        torch.where(misses, depth.amax(-1)[..., None, None], far),
+    )
+
+
+#: Which faces meet in each corner of a box.
+_CORNERS = tuple(product((False, True), repeat=3))
+
+#: The smallest depth in metres at which masks are looked up;
+#: points behind the camera are moved there.
+NEAREST = 1e-4
+
+
+@dataclass(frozen=True)
+class Silhouettes:
+    """Masks at a lower resolution.
+
+    Attributes:
+        masks: of cells.
+        cameras: whose pixels are the cells.
+        stride: side of a cell in pixels.
+        dilation: of the masks, in cells.
+        cut: sides of the frame that cut the subject, as of :func:`cut_sides`.
+    """
+
+    masks: Bool[Tensor, "B V h w"]
+    cameras: Cameras
+    stride: int
+    dilation: int
+    cut: Bool[Tensor, "B V 4"]
+
+
+def cut_sides(masks: Bool[Tensor, "*batch h w"]) -> Bool[Tensor, "*batch 4"]:
+    """Whether masks touch the first and the last row,
+    the first and the last column of their frames."""
+    sides = [_ends(masks, axis).any(-3 - axis) for axis in (-2, -1)]
+    return torch.cat([side.expand(*side.shape[:-1], 2) for side in sides], -1)
+
+
+def _ends(values: Tensor, axis: int) -> Tensor:
+    """The first and the last line of values along an axis, of a single line that one.
+
+    Args:
+        values: [..., h, w].
+        axis: -2 or -1.
+
+    Returns:
+        A view: a list of places would be copied to a GPU.
+    """
+    places = slice(None, None, max(values.shape[axis] - 1, 1))
+    return values[..., places, :] if axis == -2 else values[..., places]
+
+
+def silhouettes(
+    masks: Bool[Tensor, "B V H W"],
+    cameras: Cameras,
+    resolution: int,
+    dilation: float,
+    cut: Bool[Tensor, "B V 4"] | None = None,
+) -> Silhouettes:
+    """Masks at a lower resolution, to limit the cost of a search.
+
+    Args:
+        masks: a cell is part of the subject if one of its pixels is.
+        cameras: [B, V], of the masks.
+        resolution: largest number of cells along the image's longer side.
+        dilation: fraction of the image's longer side; that of the result is in cells, rounded up.
+        cut: sides of the frame that cut the subject; None: those that the masks touch.
+    """
+    cut = cut_sides(masks) if cut is None else cut
+    stride = ceil(max(masks.shape[-2:]) / resolution)
+    if stride > 1:
+        masks = F.max_pool2d(masks.float(), stride, stride, ceil_mode=True).bool()
+    height, width = masks.shape[-2:]
+    # Whole cells: the last row and column may extend beyond the image.
+    matrices = map(at_least_float32, (cameras.intrinsics, cameras.extrinsics))
+    full = Cameras(*matrices, height * stride, width * stride)
+    return Silhouettes(masks, full.resized(height, width), stride, ceil(dilation * max(height, width)), cut)
+
+
+def dilate(
+    masks: Bool[Tensor, "*batch h w"], radius: int, more: Int[Tensor, " b"] | None = None
+) -> Bool[Tensor, "*batch h w"]:
+    """Masks grown along both axes, by squares.
+
+    Args:
+        masks: of elements along the first dimension.
+        radius: pixels by which all masks grow.
+        more: pixels by which those of each element grow more; None: 0.
+    """
+    along = _grow if gpu.is_supported(masks, more) else _grown
+    return along(along(masks, radius, more, -2), radius, more, -1)
+
+
+def _grown(masks: Tensor, radius: int, more: Tensor | None, axis: int) -> Tensor:
+    """:func:`dilate` along one axis, at a cost that does not depend on the radius.
+
+    Args:
+        masks: bool [..., h, w].
+        radius: in pixels.
+        more: [b], further pixels of each element; None: 0.
+        axis: -2 or -1.
+    """
+    if more is not None:
+        radius = radius + more.view(-1, *[1] * (masks.dim() - 1))
+    size = masks.shape[axis]
+    index = constant(torch.arange, size, like=masks, dtype=torch.long)
+    index = index[:, None] if axis == -2 else index
+    counts = F.pad(masks.cumsum(axis, dtype=torch.int32), (0, 0, 1, 0) if axis == -2 else (1, 0))
+    high = (index + radius + 1).clamp(max=size)
+    low = (index - radius).clamp(min=0)
+    high, low = (counts.gather(axis, ends.long().expand(masks.shape)) for ends in (high, low))
+    return high > low
+
+
+_grow = gpu.operator(
+    "dilated(Tensor masks, int radius, Tensor? more, int axis) -> Tensor",
+    _grown,
+    "ghgs_lit.method.bounds.cuda",
+)
+
+
+def votes_outside(
+    dilated: Bool[Tensor, "B V h w"], voting: Bool[Tensor, "B V"], cut: Bool[Tensor, "B V 4"]
+) -> UInt8[Tensor, "B V h w"]:
+    """1 where a voting view says "outside the subject".
+
+    Beyond a side of the frame that cuts the subject nothing was seen. Points there are looked up
+    at the nearest border pixel (:func:`look_up`), so that the border of such a side says
+    "outside" nowhere.
+
+    Args:
+        dilated: masks, grown because real ones are noisy.
+        voting: the others say "outside" nowhere.
+        cut: sides that cut the subject, as of :func:`cut_sides`.
+    """
+    outside = dilated < voting[..., None, None]
+    whole = ~cut
+    for axis, sides in ((-2, whole[..., :2]), (-1, whole[..., 2:])):
+        ends = _ends(outside, axis)
+        known = sides if ends.shape[axis] == 2 else sides.all(-1, keepdim=True)
+        ends &= known.unsqueeze(-3 - axis)
+    return outside.view(torch.uint8)
+
+
+def look_up(
+    tables: Shaped[Tensor, "n h w"], image: Int[Tensor, "..."], pixels: Float[Tensor, "3 ..."]
+) -> Tensor:
+    """Entries of tables at homogeneous pixels.
+
+    Points outside the frame take the entry of the nearest border pixel: a mask that does not
+    touch the border has the whole subject in its frame, and :func:`votes_outside` says what the
+    others know. Points behind the camera land far outside the frame.
+
+    Args:
+        tables: of votes or other values.
+        image: which table; broadcasts with the pixels.
+        pixels: the three coordinates of each; overwritten.
+
+    Returns:
+        Entries of the shape that ``image`` and the pixels broadcast to.
+    """
+    height, width = tables.shape[1:]
+    inverse = pixels[2].clamp_(min=NEAREST).reciprocal_()
+    # Cameras of absurd sizes overflow to NaN, which has no index.
+    places = pixels[:2].mul_(inverse).nan_to_num_().clamp_(min=0)
+    last = constant(torch.tensor, (width - 1, height - 1), like=pixels)
+    column, row = torch.minimum(places, last.view(2, *[1] * (pixels.dim() - 1))).int()
+    place = torch.add(column, row, alpha=width)
+    return tables.flatten().take(torch.add(place, image, alpha=height * width))

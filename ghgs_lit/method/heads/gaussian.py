@@ -1,0 +1,275 @@
+"""The Gaussian stage: one Gaussian for each pixel of the subject (paper, section 3.3)."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Int
+from pydantic import model_validator
+from torch import Tensor, nn
+
+from ghgs_lit.config.options import Amount, Options, Positive, Share, Width
+from ghgs_lit.geometry.masks import relative_depth, surface_colors
+from ghgs_lit.geometry.photo_consistency import photo_consistency
+from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.kernels.linear import Linear
+from ghgs_lit.method.heads import cpu, cuda
+from ghgs_lit.method.heads.activations import (
+    activated,
+    footprint_gaussians,
+)
+from ghgs_lit.method.heads.attributes import (
+    OFFSET_UNIT,
+    FootprintAttributes,
+    RawGaussians,
+    release_attributes,
+)
+from ghgs_lit.method.heads.dense import Part, decode
+from ghgs_lit.method.heads.dpt import DPTHead
+from ghgs_lit.method.heads.guide import PHOTO_CHANNELS, Guide, photo_guide
+from ghgs_lit.method.plan import Plan
+from ghgs_lit.method.plan.rows import Rows
+from ghgs_lit.runtime.precision import exact, without_float16
+from ghgs_lit.types import (
+    Batch,
+    DepthBounds,
+    DepthMaps,
+    Gaussians,
+    Points,
+    Tokens,
+)
+
+
+def _mlp(sizes: Sequence[int], activation: type[nn.Module]) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(sizes):
+        layers += [Linear(inputs, outputs), activation()]
+    return nn.Sequential(*layers[:-1])
+
+
+def float32_last(mlp: nn.Sequential, x: Tensor) -> Tensor:
+    """``mlp(x)`` with its last projection in float32 under autocast:
+    offsets of millimetres depend on it.
+
+    Under float16 autocast all of it is in float32.
+
+    Args:
+        mlp: layers, the last one linear.
+        x: rows.
+    """
+    with without_float16(x.device.type):
+        hidden = mlp[:-1](x)
+        last = mlp[-1]
+    with exact(x.device.type):
+        return at_least_float32(last(hidden.to(last.weight.dtype)))
+
+
+class GaussianHeadOptions(Options):
+    """Recalibrated tokens to one Gaussian for each pixel of the subject."""
+
+    group = "gaussian_head"
+    rectified_skip: bool = True
+    """Residual units add what they rectified, as published weights expect;
+    in training it can die."""
+    guide: bool = False
+    """The dense head also sees photographs, masks and depths at full resolution;
+    the paper: false."""
+    photo_consistency: bool = False
+    """The guide shows photo-consistency at the predicted depth: a splat off the surface can become
+    transparent; the paper: false."""
+    color_limit: Share = 0.0
+    """Largest change of a colour from its pixel's, in each channel, which makes up for the blur of
+    splats and for dark rims; 0: none (the paper)."""
+    offset_limit: Positive | None = OFFSET_UNIT
+    """Largest offset of a Gaussian from its pixel's point along each axis, in metres; null: none,
+    as published. With parameterization=footprint; release has none."""
+    low_pass: Amount = 0.3
+    """px^2 that splats are made to be widened by when they are drawn; gsplat's default."""
+    antialiased: bool = False
+    """Splats are made to lose the opacity that this adds (Mip-Splatting)."""
+    channels: Width = 32
+    """Width of the descriptor of a pixel (32 as published)."""
+    hidden: tuple[Width, Width] = (128, 32)
+    """Widths inside the networks of the attributes (as published)."""
+    parameterization: Literal["footprint", "release"] = "footprint"
+    """footprint: attributes in units of a pixel's footprint, raw values start at 0; release:
+    offsets and scales in metres, without bound, PyTorch's initialisation."""
+    axes: Literal["world", "surface"] = "world"
+    """Axes of offsets, scales and rotations: the world's, or normal and tangents of the predicted
+    depth, which look alike from every camera (not the paper's)."""
+    attributes: FootprintAttributes = FootprintAttributes()
+    """With parameterization=footprint."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "GaussianHeadOptions":
+        allowed = self.guide or not self.photo_consistency
+        self.require(allowed, "photo_consistency", "false where there is no guide")
+        return self
+
+    def build(self, dim_latent: int) -> "GaussianHead":
+        """The stage for tokens of width ``dim_latent``."""
+        return GaussianHead(self, dim_latent)
+
+
+class GaussianHead(nn.Module):
+    """A dense head over the recalibrated tokens, then small networks for each pixel of the subject.
+    Colours are those of the input pixels, unless ``color_limit`` lets them change. The names of the
+    networks and their linear layers 0, 2 and 4 are the published ones."""
+
+    def __init__(self, options: GaussianHeadOptions, dim_latent: int):
+        super().__init__()
+        self.options = options
+        self.channels = options.channels
+        channels = options.channels
+        hidden = options.hidden
+        guided = PHOTO_CHANNELS + 1 + options.photo_consistency if options.guide else 0
+        self.decoder = DPTHead(dim_latent, channels, options.rectified_skip, guided)
+        self.offset_header = _mlp((channels, *hidden, 3), nn.Tanh)
+        self.scale_header = _mlp((channels, *hidden, 3), nn.ReLU)
+        self.rot_header = _mlp((channels, *hidden, 4), nn.ReLU)
+        self.opacity_header = _mlp((channels, *hidden, 1), nn.ReLU)
+        headers = [self.offset_header, self.scale_header, self.rot_header, self.opacity_header]
+        from_zero = []
+        if options.color_limit > 0:
+            self.color_header = _mlp((channels, *hidden, 3), nn.ReLU)
+            headers.append(self.color_header)
+            from_zero.append(self.color_header)
+        self.attributes = release_attributes
+        if options.parameterization == "footprint":
+            self.attributes = options.attributes
+            from_zero = headers
+        for header in from_zero:
+            nn.init.zeros_(header[-1].weight)
+            nn.init.zeros_(header[-1].bias)
+
+    @property
+    def has_offset_limit(self) -> bool:
+        """Whether offsets are limited; those of the authors' release never are."""
+        return self.attributes is not release_attributes and self.options.offset_limit is not None
+
+    def forward(
+        self,
+        tokens: Tokens,
+        batch: Batch,
+        points: Points,
+        depth_maps: DepthMaps,
+        plan: Plan,
+    ) -> RawGaussians:
+        """Raw attributes of the subject's pixels with a valid point, by element, view, row, column.
+
+        Args:
+            tokens: recalibrated ones.
+            batch: photographs, masks and cameras are read.
+            points: which pixels have a valid point.
+            depth_maps: in metres, read by a guide.
+            plan: its ``windows`` and the subject's pixels are computed; with ``pixels="all"`` every
+                pixel, to select afterwards: the result is the same.
+        """
+        views, height, width = points.valid.shape[1:]
+        rows = plan.subject.only(points.valid)
+        image = rows.index // (height * width)
+        pixel = rows.index % (height * width)
+        guide = self._guide(batch, points, depth_maps)
+        parts = decode(self.decoder, tokens, guide, plan.windows, plan.together)
+        of_part = self._of_subject if plan.pixels == "subject" else self._of_all
+        raw = zip(*(of_part(part, image, pixel, rows) for part in parts), strict=True)
+        values = [torch.cat(of_parts) for of_parts in raw]
+        color = values[5] if len(values) > 5 else None
+        return RawGaussians(*values[:5], color, image, pixel, rows.splits(views), rows.real)
+
+    def activate(self, raw: RawGaussians, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
+        """Gaussians from raw attributes, at the points of their pixels.
+
+        Args:
+            raw: of :meth:`forward`; rounds change them.
+            batch: photographs, mattes and cameras are read.
+            points: of pixels in the world, in metres.
+            depth_maps: in metres, of these points.
+        """
+        numbers = (raw.offset, raw.scale, raw.rotation, raw.opacity, raw.color)
+        photo = batch.once(surface_colors)
+        share = batch.alpha
+        options = self.options
+        inputs = (*numbers, photo, share, depth_maps.depth, points.pixels, batch.cameras.extrinsics)
+        given = (numbers, raw.image, raw.pixel, depth_maps, points.pixels, photo, share, batch.cameras)
+        on_surface = options.axes == "surface"
+        if not isinstance(self.attributes, FootprintAttributes):
+            fields = activated(*given, self.attributes, options.color_limit, on_surface)
+        else:
+            constants = self.attributes.constants(options.offset_limit, options.color_limit)
+            if cuda.is_supported(*inputs, fixed=(photo, share, batch.cameras.intrinsics)):
+                activate = cuda.activate
+            else:
+                activate = cpu.activate if cpu.is_supported(*inputs) else footprint_gaussians
+            fields = activate(*given, constants, on_surface)
+        if raw.real is not None:
+            fields = (*fields[:3], fields[3] * raw.real, *fields[4:])
+        constants = {"low_pass": options.low_pass, "antialiased": options.antialiased}
+        return Gaussians(*fields, raw.splits, raw.image, raw.pixel, **constants)
+
+    def _guide(self, batch: Batch, points: Points, depth_maps: DepthMaps) -> Guide | None:
+        """The guide, with relative depths and perhaps photo-consistency; None without one."""
+        if self.decoder.guide is None:
+            return None
+        maps = [relative_depth(at_least_float32(depth_maps.depth), points.valid)]
+        if self.options.photo_consistency:
+            depth = at_least_float32(depth_maps.depth.detach())
+            maps.append(photo_consistency(batch, DepthBounds(depth, depth), 1))
+        return photo_guide(batch, *maps)
+
+    def _of_subject(
+        self, part: Part, image: Int[Tensor, " N"], pixel: Int[Tensor, " N"], rows: Rows
+    ) -> Sequence[Tensor]:
+        """Descriptors and raw values (:meth:`_raw`) of the pixels in a part.
+
+        Args:
+            part: decoded maps of consecutive images.
+            image: numbers of the images (``b * V + v``) of all pixels of the subject.
+            pixel: their row-major indices.
+            rows: the same pixels by image.
+        """
+        row, column, within = _in_part(part, pixel, rows)
+        chosen = part.maps.permute(0, 2, 3, 1)[image[within] - part.images.start, row, column]
+        return chosen, *self._raw(chosen)
+
+    def _of_all(
+        self, part: Part, image: Int[Tensor, " N"], pixel: Int[Tensor, " N"], rows: Rows
+    ) -> Sequence[Tensor]:
+        """:meth:`_of_subject`, but computed for every pixel of the part.
+
+        Args:
+            part: decoded maps of consecutive images.
+            image: numbers of the images (``b * V + v``) of all pixels of the subject.
+            pixel: their row-major indices.
+            rows: the same pixels by image.
+        """
+        row, column, within = _in_part(part, pixel, rows)
+        maps = part.maps.permute(0, 2, 3, 1)
+        if rows.real is not None:
+            index = (image[within] - part.images.start, row, column)
+            return [values[index] for values in (maps, *self._raw(maps))]
+        # One image at a time, to save memory: hidden layers are wider than the maps.
+        of_images = zip(*(values.split(rows.counts[part.images]) for values in (row, column)), strict=True)
+        each = []
+        for own, index in zip(maps, of_images, strict=True):
+            each.append([values[index] for values in (own, *self._raw(own))])
+        return [torch.cat(values) for values in zip(*each, strict=True)]
+
+    def _raw(self, descriptors: Float[Tensor, "*n c"]) -> tuple[Tensor, ...]:
+        """Raw offset, scale, rotation, opacity and, with a ``color_limit``, color."""
+        headers = [self.offset_header, self.scale_header, self.rot_header, self.opacity_header]
+        if self.options.color_limit > 0:
+            headers.append(self.color_header)
+        offset, scale, rotation, opacity, *color = (float32_last(header, descriptors) for header in headers)
+        return offset, scale, rotation, opacity[..., 0], *color
+
+
+def _in_part(
+    part: Part, pixel: Int[Tensor, " N"], rows: Rows
+) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"], slice]:
+    """Rows and columns in a part's maps of the pixels that lie in it,
+    and the slice of these pixels."""
+    within = rows.within(part.images)
+    (top, _, _), (left, _, width) = part.window
+    return pixel[within] // width - top, pixel[within] % width - left, within

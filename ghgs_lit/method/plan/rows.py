@@ -1,0 +1,132 @@
+"""Rows that count: the pixels or tokens of a batch that a stage works on,
+as indices of known number."""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from ghgs_lit.extents import bucket_size, true_places
+
+
+def rounds_up(device: torch.device) -> bool:
+    """Whether numbers of rows are size classes: a GPU repeats shapes,
+    a CPU computes what counts."""
+    return device.type != "cpu"
+
+
+def rows_of_group(counts: Sequence[int], most: int) -> int:
+    """The number of rows of each group where rows are filled.
+
+    Args:
+        counts: how many rows of each group are wanted.
+        most: rows that a group has.
+    """
+    return min(bucket_size(max(max(counts, default=0), 1)), most)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of each group (an image, or an element of the batch), one group after another.
+
+    Exact rows (``real`` is None) are those that count. Filled ones have the same number in each
+    group, a size class: what counts comes first, then its last row is repeated, or the group's
+    first row if none counts.
+
+    Attributes:
+        index: places of the rows among all pixels or tokens, ascending within a group.
+        counts: number of rows of each group.
+        images: number of images of a group.
+        real: which rows count; None: all."""
+
+    index: Int[Tensor, " n"]
+    counts: tuple[int, ...]
+    images: int = 1
+    real: Bool[Tensor, " n"] | None = None
+
+    @classmethod
+    def exact(cls, wanted: Bool[Tensor, "..."], counts: Sequence[int], images: int) -> "Rows":
+        """The rows that are wanted.
+
+        Args:
+            wanted: pixels or tokens, group by group.
+            counts: how many of each group are wanted.
+            images: number of images of a group.
+        """
+        return cls(true_places(wanted, sum(counts)), tuple(counts), images)
+
+    @classmethod
+    def filled(cls, wanted: Bool[Tensor, "g m"], counts: Sequence[int], images: int) -> "Rows":
+        """The rows that are wanted, filled up to the size class of the largest group.
+
+        Args:
+            wanted: m pixels or tokens of each of g groups.
+            counts: how many of each group are wanted.
+            images: number of images of a group.
+        """
+        groups, of_group = wanted.shape
+        size = rows_of_group(counts, of_group)
+        number = torch.arange(of_group, device=wanted.device)
+        # One long sum: a GPU sums rows of a table with a block of threads each.
+        ranks = wanted.flatten().cumsum(0).view_as(wanted)
+        if groups > 1:
+            ranks = ranks - (ranks[:, :1] - wanted[:, :1].long())
+        # The n-th row that counts goes to place n from 1 on, and 0 for all others to place 0.
+        places = number.new_zeros(groups, size + 1).scatter_(1, ranks * wanted, number * wanted)
+        total = ranks[:, -1:]
+        order = torch.arange(1, size + 1, device=wanted.device)
+        index = places.gather(1, torch.minimum(order, total))
+        if groups > 1:
+            index = index + torch.arange(0, wanted.numel(), of_group, device=wanted.device)[:, None]
+        return cls(index.flatten(), (size,) * groups, images, (order <= total).flatten())
+
+    def only(self, valid: Bool[Tensor, "..."]) -> "Rows":
+        """The rows that are valid: others are left out, or no longer real where rows are filled.
+
+        Args:
+            valid: of all pixels or tokens, in any shape.
+        """
+        stays = valid.flatten()[self.index]
+        if self.real is not None:
+            return dataclasses.replace(self, real=self.real & stays)
+        if bool(stays.all()):
+            return self
+        counts = tuple(int(part.sum()) for part in stays.split(self.counts))
+        return dataclasses.replace(self, index=self.index[stays], counts=counts)
+
+    def places(self, total: int) -> tuple[Bool[Tensor, " t"], Int[Tensor, " t"]]:
+        """Where pixels or tokens are among the rows.
+
+        Args:
+            total: number of pixels or tokens.
+
+        Returns:
+            Which of them are rows that count, and the number of each one's row; 0 for others.
+        """
+        numbers = torch.arange(len(self.index), device=self.index.device)
+        # Rows that do not count go to one place more, which is cut off.
+        target = self.index if self.real is None else torch.where(self.real, self.index, total)
+        row_of = numbers.new_full((total + 1,), -1).scatter_(0, target, numbers)[:total]
+        return row_of >= 0, row_of.clamp(min=0)
+
+    def within(self, images: slice) -> slice:
+        """The rows of consecutive images.
+
+        Args:
+            images: their numbers ``b * V + v``; whole groups.
+        """
+        first = images.start // self.images
+        last = images.stop // self.images
+        return slice(sum(self.counts[:first]), sum(self.counts[:last]))
+
+    def splits(self, images: int) -> tuple[int, ...]:
+        """The number of rows of each element.
+
+        Args:
+            images: number of images of an element; whole groups.
+        """
+        step = images // self.images
+        return tuple(sum(self.counts[first : first + step]) for first in range(0, len(self.counts), step))

@@ -1,0 +1,316 @@
+"""Coarse to fine: what is found in smaller copies of the photographs is where the rounds at
+full size start.
+
+The stages judge a pixel by what they see around it, in pixels. Where a person is taller than in
+training they see less of it and place it worse. So the whole method runs once on copies in which
+the subject has the height that the weights know. Its depths are refined at full size, as in
+cascades of cost volumes (CasMVSNet, Gu et al., CVPR 2020), and its tokens are those of the encoder
+at full size, which does not run there. What is decided here depends on an element's own masks and
+the size of the photographs alone.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from omegaconf import OmegaConf
+from torch import Tensor
+
+from ghgs_lit.config.keys import lookup
+from ghgs_lit.geometry.constants import constant
+from ghgs_lit.geometry.masks import coverage
+from ghgs_lit.geometry.padding import PaddedBatch
+from ghgs_lit.geometry.projection import at_least_float32, pixel_centers
+from ghgs_lit.method.plan import Plan
+from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Prediction, Tokens, map_tensors
+
+#: Share of a photograph's side that a person fills in training.
+#: In photographs of that size nothing changes.
+FILLED = 0.8
+#: First step of the rounds in depth, in those of rounds after a depth head:
+#: a coarse depth is nearly right.
+STEP = 0.5
+#: Share of a pixel that a mask without a matte must cover in a smaller copy.
+_COVERED = 0.5
+
+#: Height and width in pixels.
+Size = tuple[int, int]
+
+
+def with_known_height(nodes: Mapping[str, Any], trained: Mapping[str, Any]) -> dict[str, Any]:
+    """Nodes of a model whose ``rounds.height`` is a number where it was ``auto``.
+
+    Args:
+        nodes: of the model, by name, with or without rounds.
+        trained: configuration of its training,
+            whose ``data.size`` and ``augmentation.sizes`` are read.
+
+    Returns:
+        The nodes; without known sizes ``rounds.height`` is null.
+    """
+    rounds = nodes.get("rounds")
+    rounds = OmegaConf.to_container(rounds, resolve=True) if OmegaConf.is_config(rounds) else rounds
+    # not a user's own kind
+    is_known = isinstance(rounds, Mapping) and rounds.get("kind") == "recurrent"
+    if not is_known or rounds.get("height", "auto") != "auto":
+        return dict(nodes)
+    sides: list[int] = []
+    for size in (lookup(trained, "data.size"), *(lookup(trained, "augmentation.sizes") or ())):
+        sides += [size] if isinstance(size, int) else size or ()
+    return {**nodes, "rounds": {**rounds, "height": math.ceil(FILLED * max(sides)) if sides else None}}
+
+
+@dataclass(frozen=True)
+class CoarseDepths:
+    """Depths that coarse predictions found for some elements of a batch.
+
+    Attributes:
+        depth: in metres; meaningless in other elements.
+        confidence: of the coarse depth head.
+        elements: which elements have depths.
+    """
+
+    depth: Float[Tensor, "B V H W"]
+    confidence: Float[Tensor, "B V H W"]
+    elements: tuple[bool, ...]
+
+    @property
+    def are_all(self) -> bool:
+        """Whether all elements have depths, so that no depth head is needed."""
+        return all(self.elements)
+
+    @property
+    def step(self) -> float | Float[Tensor, " B"]:
+        """Size of the first step in depth of the rounds in each element, or in all."""
+        if self.are_all:
+            return STEP
+        steps = tuple(STEP if known else 1.0 for known in self.elements)
+        return constant(torch.tensor, steps, like=self.depth)
+
+    @property
+    def known(self) -> Bool[Tensor, " B"]:
+        """Which elements have depths, on their device."""
+        return constant(torch.tensor, self.elements, like=self.depth, dtype=torch.bool)
+
+    def maps(self, batch: Batch, bounds: DepthBounds, others: DepthMaps | None = None) -> DepthMaps:
+        """The depths within bounds, in the middle where nothing is known.
+
+        Args:
+            batch: its masks say which pixels are valid.
+            bounds: in metres.
+            others: depths of the elements without coarse ones; None: all elements have some.
+        """
+        depth = torch.where(self.depth > 0, self.depth, (bounds.near + bounds.far) / 2)
+        depth = torch.minimum(torch.maximum(depth, bounds.near), bounds.far)
+        coarse = DepthMaps(depth, batch.masks, self.confidence, bounds)
+        if others is None:
+            return coarse
+        known = self.known[:, None, None, None]
+        parts = {
+            name: torch.where(known, getattr(coarse, name), getattr(others, name))
+            for name in ("depth", "valid", "confidence")
+        }
+        return DepthMaps(**parts, bounds=bounds)
+
+
+@dataclass(frozen=True)
+class Coarse:
+    """What predictions of smaller copies give to those at full size.
+
+    Attributes:
+        depths: of the elements that have copies.
+        tokens: of every patch at full size, from the encoder's of the copies;
+            meaningless in other elements.
+    """
+
+    depths: CoarseDepths
+    tokens: Tokens
+
+    def encoded(self, plan: Plan, encode: Callable[[], Tokens]) -> Tokens:
+        """Tokens of the patches that a plan keeps, those of the copies where there are any.
+
+        Args:
+            plan: of the batch at full size.
+            encode: gives the encoder's tokens of these patches; called if an element has no copy.
+        """
+        kept = plan.kept
+        tokens = self.tokens
+        if not kept.is_whole:
+            tokens = dataclasses.replace(tokens.select(kept.index), real=kept.real)
+        if self.depths.are_all:
+            return tokens
+        others = encode()
+        known = self.depths.known[others.image // others.grid[1], None]
+        pairs = zip((*tokens.latent, tokens.semantic), (*others.latent, others.semantic), strict=True)
+        *latent, semantic = (torch.where(known, own, other) for own, other in pairs)
+        return dataclasses.replace(others, latent=tuple(latent), semantic=semantic)
+
+
+def coarse_of(
+    batch: Batch,
+    height: int,
+    patch_size: int,
+    least_matte: float | None,
+    predict: Callable[[Batch], Prediction],
+) -> Coarse | None:
+    """What is found in smaller copies of the photographs;
+    None where no subject is so tall as to need them.
+
+    Args:
+        batch: as the stages see it, with or without a border around the photographs.
+        height: pixels of the subject's height, or of its width if larger, that the weights know.
+        patch_size: of the encoder, in pixels; sides of the copies are its multiples.
+        least_matte: share of a pixel above which it belongs to the subject, 0 to 0.5; None:
+            there are none.
+        predict: gives the prediction of a batch, with the tokens of the encoder.
+
+    Returns:
+        Depths in metres and tokens at the size of ``batch``.
+    """
+    photographs = batch.photographs if isinstance(batch, PaddedBatch) else batch
+    sizes = coarse_sizes(photographs, height, patch_size)
+    wanted = sorted({size for size in sizes if size is not None})
+    if not wanted:
+        return None
+    full = tuple(photographs.masks.shape[2:])
+    depths = at_least_float32(photographs.images).new_zeros(2, *photographs.masks.shape)
+    rows = None
+    for size in wanted:
+        numbers = tuple(i for i, own in enumerate(sizes) if own == size)
+        chosen = constant(torch.tensor, numbers, like=depths, dtype=torch.long)
+        prediction = predict(shrunk(_elements(photographs, chosen), size, least_matte))
+        maps = prediction.depth_maps
+        grown = torch.stack((enlarged(maps, full), _resized(maps.confidence, full)))
+        depths = depths.index_copy(1, chosen, grown.to(depths.dtype))
+        spread = spread_tokens(prediction.tokens, batch, patch_size)
+        rows = spread.new_zeros(len(sizes), *spread.shape[1:]) if rows is None else rows
+        rows = rows.index_copy(0, chosen, spread)
+    if isinstance(batch, PaddedBatch):
+        depths = torch.stack([batch.padding.pad(each) for each in depths])
+    of_elements = tuple(size is not None for size in sizes)
+    return Coarse(CoarseDepths(*depths, of_elements), _packed(rows, prediction.tokens))
+
+
+def coarse_sizes(batch: Batch, height: int, patch_size: int) -> list[Size | None]:
+    """The size of each element's smaller copy; None for elements that need none.
+
+    Those do whose subject is taller than the weights know, in photographs larger than those of the
+    training, which subjects may fill: the decision of each element depends on no other.
+
+    Args:
+        batch: photographs of one size, with or without a border.
+        height: pixels of the subject that the weights know.
+        patch_size: sides are its multiples, in pixels.
+    """
+    photographs = batch.photographs if isinstance(batch, PaddedBatch) else batch
+    views, *full = photographs.masks.shape[1:]
+    sizes: list[Size | None] = []
+    for first in range(0, len(photographs.extents), views):
+        seen = [extent for extent in photographs.extents[first : first + views] if extent.count]
+        tallest = max((max(e.bottom - e.top, e.right - e.left) for e in seen), default=0)
+        scale = height / max(tallest, 1)
+        size = tuple(max(round(side * scale / patch_size), 1) * patch_size for side in full)
+        is_known = FILLED * max(full) <= height or tallest <= height
+        sizes.append(None if is_known or max(size) >= max(full) else size)
+    return sizes
+
+
+def spread_tokens(tokens: Tokens, batch: Batch, patch_size: int) -> Float[Tensor, "b V h w c"]:
+    """Tokens of smaller copies for every patch at full size, bilinear among those that are there.
+
+    Args:
+        tokens: of the copies of some elements.
+        batch: at full size, with or without a border.
+        patch_size: of the encoder, in pixels.
+
+    Returns:
+        The layers and the semantic features, one after another; 0 where no token is near.
+    """
+    ones = torch.ones_like(tokens.semantic[:, :1])
+    rows = torch.cat((*tokens.latent, tokens.semantic, ones), -1)
+    maps = at_least_float32(dataclasses.replace(tokens, latent=(rows,)).maps(0))
+    top, left = (batch.padding.top, batch.padding.left) if isinstance(batch, PaddedBatch) else (0, 0)
+    photographs = batch.photographs if isinstance(batch, PaddedBatch) else batch
+    height, width = photographs.masks.shape[2:]
+    grid = [side // patch_size for side in batch.masks.shape[2:]]
+    places = patch_size * pixel_centers(*grid, maps) + constant(torch.tensor, (left, top), like=maps)
+    places = 2 / constant(torch.tensor, (width, height), like=maps) * places - 1
+    places = places.expand(len(maps), -1, -1, -1)
+    values = F.grid_sample(maps, places, padding_mode="border", align_corners=False)
+    values, weight = values[:, :-1], values[:, -1:]
+    values = values / torch.where(weight > 0, weight, 1)
+    return values.permute(0, 2, 3, 1).unflatten(0, tokens.grid[:2])
+
+
+def _packed(rows: Float[Tensor, "B V h w c"], like: Tokens) -> Tokens:
+    """Tokens of every patch.
+
+    Args:
+        rows: layers and semantic features, one after another.
+        like: has widths, dtypes and the patch size.
+    """
+    grid = tuple(rows.shape[:4])
+    parts = (*like.latent, like.semantic)
+    split = rows.flatten(0, 3).split([part.shape[1] for part in parts], -1)
+    *latent, semantic = (own.to(part.dtype) for own, part in zip(split, parts, strict=True))
+    number = torch.arange(len(semantic), device=rows.device)
+    image = number // (grid[2] * grid[3])
+    row = number // grid[3] % grid[2]
+    return Tokens(tuple(latent), semantic, image, row, number % grid[3], grid, like.patch_size)
+
+
+def shrunk(batch: Batch, size: Size, least_matte: float | None) -> Batch:
+    """The batch with smaller photographs, mattes and masks, and their cameras.
+
+    Args:
+        batch: photographs without a border; true depths and targets are left out.
+        size: height and width of the copies, in pixels.
+        least_matte: share of a pixel above which it belongs to the subject, with mattes."""
+    images = _resized(at_least_float32(batch.images).flatten(0, 1), size).unflatten(0, batch.masks.shape[:2])
+    shares = _resized(coverage(batch), size).clamp(0, 1)
+    has_matte = batch.alpha is not None
+    return dataclasses.replace(
+        batch,
+        images=images.clamp(0, 1),
+        masks=shares > least_matte if has_matte else shares >= _COVERED,
+        alpha=shares if has_matte else None,
+        cameras=batch.cameras.resized(*size),
+        depths=None,
+        targets=None,
+    )
+
+
+def enlarged(maps: DepthMaps, size: Size) -> Float[Tensor, "B V H W"]:
+    """Depths at another size. Inverse depths are interpolated, which is exact for planes.
+
+    Args:
+        maps: depths in metres, and where they are valid.
+        size: height and width in pixels.
+
+    Returns:
+        Depths in metres, 0 where nothing near is known.
+    """
+    depth = at_least_float32(maps.depth)
+    inverse = torch.where(maps.valid, 1 / torch.where(maps.valid, depth, 1), 0)
+    # One pixel around what is known: a finger may lie within the photograph's mask and
+    # outside the copy's.
+    weight, around = (F.avg_pool2d(values, 3, 1, 1) for values in (maps.valid.to(depth.dtype), inverse))
+    inverse = torch.where(maps.valid, inverse, around / torch.where(weight > 0, weight, 1))
+    weight = _resized((weight > 0).to(depth.dtype), size)
+    inverse = _resized(inverse, size)
+    return torch.where(inverse > 0, weight / torch.where(inverse > 0, inverse, 1), 0)
+
+
+def _resized(maps: Float[Tensor, "B c H W"], size: Size) -> Float[Tensor, "B c h w"]:
+    return F.interpolate(maps, size, mode="bilinear", antialias=True)
+
+
+def _elements(batch: Batch, chosen: Tensor) -> Batch:
+    """Photographs of some elements, without targets and true depths."""
+    alone = dataclasses.replace(batch, targets=None, depths=None, body_vertices=None, subjects=(), views=())
+    return map_tensors(alone, lambda values: values[chosen])

@@ -1,0 +1,200 @@
+"""What differs between cameras: gains, of their exposure or white balance, and gammas. A point on
+the surface has the same colour in all views that see it, up to a gain of each camera and channel
+(as for panoramas: Brown and Lowe, IJCV 2007)."""
+
+import dataclasses
+import itertools
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ghgs_lit.geometry.constants import constant
+from ghgs_lit.geometry.masks import coverage, surface_colors
+from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.method.rounds.observation import looked_up
+from ghgs_lit.rendering import render
+from ghgs_lit.runtime.precision import exact
+from ghgs_lit.types import Batch, Gaussians
+
+#: Distance in metres from a view's rendered surface at which a Gaussian's weight in that
+#: view is 1 / e.
+_NEAR = 0.02
+#: Colours closer than this to black or white have less weight: they say little about a gain.
+_DARK = 0.05
+#: Deviation of log colours from the gains at which a Gaussian has half its weight: wrong depths,
+#: shadows.
+_OUTLIER = 0.15
+#: Log gains well below this are probably errors of the estimate, and shrunk towards 0.
+_LEAST = 0.02
+#: Weight of the prior, gains of 1, in Gaussians; views that share nothing get these. For gammas it
+#: is one whose brightness is a tenth from the mean.
+_PRIOR = 1.0
+_PRIOR_OF_SLOPES = 0.1**2
+#: One Gaussian in this many is compared: a third is enough and takes a third of the time.
+_EVERY = 3
+#: Steps of reweighting, and of that of slopes, which begins farther away.
+_STEPS = 5
+_STEPS_OF_SLOPES = 15
+
+#: Which rows are Gaussians; None: all.
+Real = Bool[Tensor, " N"] | None
+
+
+def equalized(gaussians: Gaussians, batch: Batch, real: Real = None) -> tuple[Gaussians, Batch]:
+    """Gaussians and their photographs, divided by the gains of their cameras.
+
+    Args:
+        gaussians: of the batch, with the pixels that they belong to.
+        batch: whose photographs are compared.
+        real: which rows are Gaussians; None: all.
+
+    Returns:
+        Gaussians with other colours, and the batch with other photographs and its ``log_gains``.
+    """
+    logs = log_gains(gaussians, batch, real)
+    colors = gaussians.colors * torch.exp(-logs).flatten(0, 1)[gaussians.image]
+    return dataclasses.replace(gaussians, colors=colors), divided(batch, logs)
+
+
+def divided(batch: Batch, logs: Float[Tensor, "B V 3"]) -> Batch:
+    """The batch with photographs divided by gains, within [0, 1].
+
+    Args:
+        batch: with photographs as they were taken.
+        logs: natural logarithms of the gains of each camera and channel.
+    """
+    images = (at_least_float32(batch.images) * torch.exp(-logs)[..., None, None]).clamp(0, 1)
+    return batch.recolored(images=images, log_gains=logs)
+
+
+@torch.no_grad()
+def log_gains(gaussians: Gaussians, batch: Batch, real: Real = None) -> Float[Tensor, "B V 3"]:
+    """Natural logarithms of each camera's gains; 0 if views share nothing.
+
+    Their mean is about 0, as photographs do not tell which camera is right. Pairs of views are
+    compared at the Gaussians that both see, with Cauchy weights, so that wrong depths matter little
+    (gain compensation; Brown and Lowe, IJCV 2007).
+
+    Args:
+        gaussians: of the batch, with the pixels that they belong to.
+        batch: whose photographs are compared.
+        real: which rows are Gaussians; None: all.
+    """
+    with exact(gaussians.means.device.type):
+        own, logs, theirs, weights = _compared(gaussians, batch, real)
+        ratios = logs - theirs
+        b, views = batch.masks.shape[:2]
+        gains = ratios.new_zeros(b, views, 3)
+        for _ in range(_STEPS):
+            between = (gains[:, None] - gains[:, :, None]).flatten(0, 1)[own]
+            counted = weights / (1 + ((ratios - between) / _OUTLIER).square())
+            sums = _summed(own, b * views, counted, counted * ratios)
+            gains = _solved(*sums.view(2, b, views, views, 3))
+        return gains * gains.square() / (gains.square() + _LEAST**2)
+
+
+@torch.no_grad()
+def log_gammas(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
+    """Natural logarithms of cameras' gammas beside the median camera's;
+    about 0 if views share nothing.
+
+    A gamma is the exponent of a camera's colours. Where those of two views differ, log ratios of
+    their colours change as much with log brightness, while gains only shift them: lines are fitted
+    to these, with Cauchy weights.
+
+    Args:
+        gaussians: of the batch, with the pixels that they belong to.
+        batch: whose photographs are compared.
+    """
+    with exact(gaussians.means.device.type):
+        own, logs, theirs, weights = _compared(gaussians, batch)
+        ratios = logs - theirs
+        levels = (logs + theirs) / 2
+        b, views = batch.masks.shape[:2]
+        fitted = torch.zeros_like(ratios)
+        for _ in range(_STEPS_OF_SLOPES):
+            counted = weights / (1 + ((ratios - fitted) / _OUTLIER).square())
+            total, *sums = _summed(own, b * views, counted, counted * ratios, counted * levels)
+            ratio, level = (each / total.clamp(min=_PRIOR) for each in sums)
+            away = levels - level[own]
+            moments = _summed(own, b * views, counted * away.square(), counted * away * ratios)
+            gammas = _solved(*moments.view(2, b, views, views, 3), _PRIOR_OF_SLOPES)
+            between = (gammas[:, None] - gammas[:, :, None]).flatten(0, 1)[own]
+            fitted = ratio[own] + between * away
+        return gammas - gammas.quantile(0.5, 1, keepdim=True)
+
+
+def _summed(own: Int[Tensor, " N"], images: int, *values: Float[Tensor, "N V 3"]) -> Float[Tensor, "k I V 3"]:
+    """Sums of values over the Gaussians of each image.
+
+    Args:
+        own: number of the image (``b * V + v``) of each Gaussian.
+        images: number I of images.
+        values: k tensors.
+    """
+    stacked = torch.stack(values)
+    return stacked.new_zeros(len(values), images, *stacked.shape[2:]).index_add_(1, own, stacked)
+
+
+def _thinned(gaussians: Gaussians) -> tuple[Gaussians, Int[Tensor, " n"]]:
+    """One of :data:`_EVERY` Gaussians of each element, and their indices."""
+    device = gaussians.means.device
+    splits = gaussians.splits
+    ends = list(itertools.accumulate(splits))
+    kept = [torch.arange(end - n, end, _EVERY, device=device) for n, end in zip(splits, ends, strict=True)]
+    index = torch.cat(kept)
+    return gaussians.select(index, tuple(map(len, kept))), index
+
+
+def _compared(
+    gaussians: Gaussians, batch: Batch, real: Real = None
+) -> tuple[Int[Tensor, " N"], Float[Tensor, "N V 3"], Float[Tensor, "N V 3"], Float[Tensor, "N V 3"]]:
+    """Colours of some Gaussians in the views that see them.
+
+    Args:
+        gaussians: of the batch, with the pixels that they belong to.
+        batch: whose photographs are compared.
+        real: which rows are Gaussians; None: all.
+
+    Returns:
+        Number of the own photograph of each, logs of their colours in each view and in their own,
+        and weights from 0 to 1.
+    """
+    depth = render(gaussians, batch.cameras).depth
+    views = batch.masks.shape[1]
+    gaussians, index = _thinned(gaussians)
+    shares = coverage(batch)[:, :, None]
+    maps = torch.cat((batch.once(surface_colors) * shares, shares, depth), 2).to(batch.cameras.extrinsics)
+    values, z, can_see = looked_up(gaussians, batch.cameras, maps)
+    color, share, depth = values.split((3, 1, 1), -1)
+    color = color / torch.where(share > 0, share, 1)
+    near = _NEAR if gaussians.metre is None else _NEAR * gaussians.metre[gaussians.image // views, None, None]
+    weights = torch.where(can_see, torch.exp(-((z - depth) / near).square()), 0)
+    weights = weights * (10 * share - 9).clamp(0, 1)
+    if real is not None:
+        weights = weights * real[index, None, None]
+    weights = weights * (torch.minimum(color, 1 - color) / _DARK).clamp(0, 1)
+    own = (gaussians.image % views)[:, None, None].expand(-1, 1, 3)
+    logs = color.clamp(min=_DARK / 8).log()
+    return gaussians.image, logs, logs.gather(1, own), weights * weights.gather(1, own)
+
+
+def _solved(
+    counts: Float[Tensor, "B V V 3"], differences: Float[Tensor, "B V V 3"], prior: float = _PRIOR
+) -> Float[Tensor, "B V 3"]:
+    """Logs of each view that best fit the differences of pairs of views.
+
+    Args:
+        counts: sums of weights at the Gaussians of own views (first V) in other views (last V).
+        differences: weighted sums of the logs of views (last V) less those of own views (first V).
+        prior: weight of logs of 0.
+    """
+    counts = counts.movedim(-1, 1)
+    differences = differences.movedim(-1, 1)
+    both = counts + counts.mT
+    identity = constant(torch.eye, both.shape[-1], like=both)
+    laplacian = torch.add(identity * both.sum(-1, keepdim=True) - both, identity, alpha=prior)
+    right = differences.sum(-2) - differences.sum(-1)
+    # Never singular; linalg.solve would check that and wait for a GPU.
+    return torch.linalg.solve_ex(laplacian, right).result.mT

@@ -1,0 +1,405 @@
+"""Rounds: render the inputs, compare them with the photographs, correct the Gaussians.
+
+A single forward pass never checks its depths and attributes, although the rasterizer draws the
+inputs in milliseconds. In each round every Gaussian is compared with the photographs at its present
+position (:mod:`ghgs_lit.method.rounds.observation`), and a small network, the same in all rounds, moves it
+along its ray and changes its raw attributes. Learned optimizers of splats also use the errors of
+re-rendered inputs (G3R, Chen et al., ECCV 2024; ReSplat, Xu et al., 2025)."""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Annotated, Literal, NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from pydantic import Field
+from torch import Tensor, nn
+
+from ghgs_lit.config.options import Options, Width
+from ghgs_lit.geometry.photo_consistency import consistency_of
+from ghgs_lit.geometry.projection import at_least_float32, focal_lengths
+from ghgs_lit.kernels.linear import Linear
+from ghgs_lit.kernels.pool import at_once, even_parts, multiplies
+from ghgs_lit.method.bounds.rays import ray_directions
+from ghgs_lit.method.heads.activations import bounded_tanh
+from ghgs_lit.method.heads.attributes import RAW_VALUES, RawGaussians
+from ghgs_lit.method.heads.gaussian import float32_last
+from ghgs_lit.method.rounds import cpu
+from ghgs_lit.method.rounds.exchange import Exchange, Windows
+from ghgs_lit.method.rounds.gains import equalized
+from ghgs_lit.method.rounds.memory import fits, remembered, remembered_plainly
+from ghgs_lit.method.rounds.observation import CHANNELS, SLOPES, observe, slopes
+from ghgs_lit.runtime.precision import exact
+from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Prediction
+
+#: Gaussians that go through the network at once on a CPU.
+_AT_ONCE = 2048
+#: Largest distance of the depths that the first round compares from the current one, as a share of
+#: the way from near to far.
+REACH = 0.25
+#: Channels of ``Search.place``: position between near and far (0 to 1), and far - near.
+_PLACE = 2
+
+
+@dataclass(frozen=True)
+class Search:
+    """Depths around the current one of each Gaussian.
+
+    Attributes:
+        matches: photo-consistency at depths from ``down`` metres in front of it to ``up``
+            metres behind it.
+        place: position between near and far (0 to 1), and far - near in metres.
+        down: metres.
+        up: metres.
+    """
+
+    matches: Float[Tensor, "N s"]
+    place: Float[Tensor, "N 2"]
+    down: Float[Tensor, " N"]
+    up: Float[Tensor, " N"]
+
+
+class Rays(NamedTuple):
+    """Indices of the Gaussians' pixels among all images', and displacements per metre of depth."""
+
+    place: Int[Tensor, " N"]
+    direction: Float[Tensor, "N 3"]
+
+    @classmethod
+    def of(cls, raw: RawGaussians, batch: Batch) -> "Rays":
+        """The rays of the pixels that the Gaussians belong to."""
+        place = raw.image * batch.masks[0, 0].numel() + raw.pixel
+        with exact(raw.pixel.device.type):
+            return cls(place, ray_directions(batch.cameras).flatten(0, 3)[place])
+
+
+@dataclass(frozen=True)
+class State:
+    """Input and output of a round; the first state is the prediction of the stages."""
+
+    raw: RawGaussians
+    gaussians: Gaussians
+    points: Points
+    depth_maps: DepthMaps
+
+
+def prediction_of(states: Sequence[State], keeps_drafts: bool) -> Prediction:
+    """The prediction of the last state.
+
+    Args:
+        states: before the first round and after each.
+        keeps_drafts: include the Gaussians before each round.
+    """
+    last = states[-1]
+    maps = tuple(state.depth_maps for state in states)
+    drafts = tuple(state.gaussians for state in states[:-1]) if keeps_drafts else ()
+    depth = maps[-1].depth
+    valid = maps[-1].valid
+    return Prediction(last.gaussians, depth, valid, last.points, maps[-1], rounds=maps, drafts=drafts)
+
+
+#: Gaussians from raw attributes at points: ``GaussianHead.activate``.
+Activate = Callable[[RawGaussians, Batch, Points, DepthMaps], Gaussians]
+
+
+def replaced(activate: Activate, training: bool) -> Activate:
+    """``activate`` for Gaussians that the next round replaces.
+
+    Args:
+        activate: gives Gaussians from their raw attributes.
+        training: whether these are made without a gradient, which the loss would not need.
+    """
+    return torch.no_grad()(activate) if training else activate
+
+
+#: A number of rounds.
+Number = Annotated[int, Field(ge=1, le=32)]
+
+
+class RoundsOptions(Options):
+    """Rounds that render the inputs, compare them with the photographs and correct the
+    Gaussians."""
+
+    group = "rounds"
+    count: Number = 2
+    """Number of rounds; in prediction any up to 32, where halving has left nothing to change."""
+    training_counts: Annotated[tuple[Number, ...], Field(min_length=1)] = (1, 2, 3)
+    """Numbers of rounds, of which each training step draws one, so that any number works."""
+    hidden: Width = 48
+    """Width of the network."""
+    depths: int = Field(8, ge=1, le=4096)
+    """Number of depths around the current one at which a round compares the photographs; 4096 are
+    finer than their pixels."""
+    gains: bool = True
+    """Photographs of cameras whose exposure differs are made alike first,
+    where a rig does not know them."""
+    exchange: Width | None = 16
+    """Channels in which Gaussians of neighbouring pixels tell each other what they know;
+    null: none."""
+
+    slopes: bool = False
+    """Whether a round is shown the gradient of the inputs' error with respect to each Gaussian."""
+    height: Literal["auto"] | Annotated[int, Field(ge=14, le=16384)] | None = "auto"
+    """Pixels of the subject's height, or of its width if larger, that the weights know; auto: four
+    fifths of the largest side of the photographs of the training. In larger photographs of taller
+    subjects, stages run on smaller copies, whose depths and tokens start the rounds at full size
+    (:mod:`ghgs_lit.method.rounds.coarse`); null: never."""
+
+    def build(self, channels: int) -> "Rounds":
+        """The rounds after a Gaussian head with descriptors of width ``channels``."""
+        return Rounds(self, channels)
+
+
+def _two_layers(inputs: int, wide: int, outputs: int) -> nn.Sequential:
+    first = nn.Linear(inputs, wide)
+    second = nn.Linear(wide, outputs)
+    return nn.Sequential(first, nn.ReLU(inplace=True), second, nn.ReLU(inplace=True))
+
+
+class Rounds(nn.Module):
+    """Corrects Gaussians several times with the same weights; untrained, it changes nothing.
+
+    Each round can change half as much as the one before, depths stay between near and far,
+    attributes within the bounds of their activations: more rounds than in training do not diverge.
+    The attribute ``count``, the number of rounds outside of training, may be changed at any time.
+
+    Args:
+        options: of the rounds.
+        channels: width of the Gaussian head's descriptors.
+    """
+
+    def __init__(self, options: RoundsOptions, channels: int):
+        super().__init__()
+        self.options = options
+        self.count = options.count
+        self._known_count: int | None = None
+        hidden = options.hidden
+        depths = options.depths
+        self.view = _two_layers(CHANNELS, hidden, hidden)
+        self.start = Linear(channels, hidden)
+        inputs = 4 * hidden + depths + _PLACE + 3 + (SLOPES if options.slopes else 0)
+        self.update = _two_layers(inputs, 2 * hidden, hidden)
+        self.memory = nn.Linear(hidden, hidden)
+        self.exchange = None if options.exchange is None else Exchange(hidden, options.exchange)
+        self.change = nn.Sequential(Linear(hidden, 1 + RAW_VALUES))
+        nn.init.zeros_(self.change[-1].weight)
+        nn.init.zeros_(self.change[-1].bias)
+
+    @property
+    def height(self) -> int | None:
+        """Pixels of the subject's height that the weights know;
+        None: any, or no training said it."""
+        known = self.options.height
+        return None if known == "auto" else known
+
+    def forward(
+        self,
+        state: State,
+        activate: Activate,
+        batch: Batch,
+        step: float | Float[Tensor, " B"] = 1.0,
+        shows_last: bool = True,
+    ) -> tuple[State, ...]:
+        """The states before the first round and after each.
+
+        Args:
+            state: the prediction of the stages, with bounds of depths.
+            activate: gives Gaussians from their raw attributes.
+            batch: photographs, masks and cameras are read.
+            step: size of the first step in depth, in those after a depth head; one for all elements
+                or for each. Attributes take whole steps.
+            shows_last: whether the last Gaussians are wanted; the last state has those before it
+                otherwise.
+
+        Returns:
+            As many states as there are rounds, and one more.
+        """
+        if self.options.gains and batch.log_gains is None:
+            gaussians, batch = equalized(state.gaussians, batch, state.raw.real)
+            state = dataclasses.replace(state, gaussians=gaussians)
+        states = [state]
+        memory = torch.tanh(self.start(state.raw.descriptors))
+        windows = None if self.exchange is None else Windows.of(state.raw, batch)
+        rays = Rays.of(state.raw, batch)
+        if isinstance(step, Tensor):
+            step = step[state.raw.image // batch.masks.shape[1]]
+        count = (self._known_count or self._drawn()) if self.training else self.count
+        for number in range(count):
+            share = 0.5**number
+            change, memory = self._round(states[-1], batch, rays, memory, windows, share, step * share)
+            shown = replaced(activate, self.training)
+            if number == count - 1:
+                shown = activate if shows_last else None
+            states.append(_moved(states[-1], shown, batch, rays, *change))
+        return tuple(states)
+
+    @contextmanager
+    def drawn(self, count: int | None = None) -> Iterator[None]:
+        """Fix the number of rounds of a training step for all that is called inside.
+
+        Args:
+            count: the number; None: the one that is fixed already, or one that is drawn now.
+        """
+        before = self._known_count
+        self._known_count = count or before or self._drawn()
+        try:
+            yield
+        finally:
+            self._known_count = before
+
+    def _drawn(self) -> int:
+        """The number of rounds of a training step."""
+        counts = self.options.training_counts
+        return counts[int(torch.randint(len(counts), ()))]
+
+    def _round(
+        self,
+        state: State,
+        batch: Batch,
+        rays: Rays,
+        memory: Float[Tensor, "N h"],
+        windows: Windows | None,
+        share: float,
+        size: float | Float[Tensor, " N"],
+    ) -> tuple[tuple[Tensor, Tensor], Tensor]:
+        """What a round changes.
+
+        Args:
+            state: before the round.
+            batch: photographs, masks and cameras are read.
+            rays: of the Gaussians' pixels.
+            memory: of the rounds before.
+            windows: places of the Gaussians in maps; None: nothing is exchanged.
+            share: of the largest change of attributes.
+            size: of the step in depth, as a share of the largest one;
+                one for all Gaussians or one for each.
+
+        Returns:
+            Changes of depths in metres [N] and of raw attributes [N, c],
+            and the memory for the next round.
+        """
+        gaussians = state.gaussians.detach()
+        drawn = None
+        steep = []
+        if self.options.slopes:
+            drawn, *steep = slopes(gaussians, batch, rays.direction, _footprints(state, batch, rays))
+        each = observe(gaussians, batch, drawn)
+        search = self._search(state, batch, rays, size * REACH)
+        rows = (each, torch.cat((search.matches, search.place, gaussians.colors, *steep), -1), memory)
+        memory, change = self._looked(*rows, windows)
+        step = bounded_tanh(change[:, 0])
+        moved = torch.where(step > 0, search.up, search.down) * step
+        return (moved, share * change[:, 1:]), memory
+
+    def _looked(
+        self,
+        each: Float[Tensor, "N V c"],
+        known: Float[Tensor, "N k"],
+        memory: Float[Tensor, "N h"],
+        windows: Windows | None,
+    ) -> tuple[Float[Tensor, "N h"], Float[Tensor, "N c"]]:
+        """The memory after observation and exchange, and the change computed from it.
+
+        Args:
+            each: observations of each view, the own one first.
+            known: what is known of each Gaussian beside them.
+            memory: of the rounds before.
+            windows: places of the Gaussians in maps; None: nothing is exchanged.
+        """
+        if fits(each, known, memory, self.memory.weight):
+            memory = remembered(self._layers, each, known, memory)
+        elif multiplies(each, known, memory, self.memory.weight):
+            memory = cpu.remembered(self.view, self.update, self.memory, each, known, memory)
+        else:
+            memory = self._remembered_in_parts(each, known, memory)
+        memory = memory if windows is None else self.exchange(memory, windows)
+        return memory, float32_last(self.change, memory)
+
+    def _remembered_in_parts(self, *rows: Tensor) -> Float[Tensor, "N h"]:
+        """:meth:`_remembered` in parts that fit a CPU's cache, in half the time;
+        at once with a gradient."""
+        count = len(rows[0])
+        device = rows[0].device
+        parts = even_parts(count, count if torch.is_grad_enabled() else at_once(device, _AT_ONCE, count))
+        return torch.cat([self._remembered(*(row[part] for row in rows)) for part in parts])
+
+    def _remembered(self, *rows: Tensor) -> Float[Tensor, "n h"]:
+        """The new memory from observations, what is known beside them, and the memory before."""
+        return remembered_plainly(self._layers, *rows)
+
+    @property
+    def _layers(self) -> tuple[nn.Linear, ...]:
+        """What :func:`ghgs_lit.method.rounds.memory.remembered` multiplies with."""
+        return self.view[0], self.view[2], self.update[0], self.update[2], self.memory
+
+    @torch.no_grad()
+    def _search(self, state: State, batch: Batch, rays: Rays, reach: float | Tensor) -> Search:
+        """Photo-consistency of depths around the current ones, within their bounds.
+
+        Args:
+            state: before the round.
+            batch: photographs, masks and cameras are read.
+            rays: of the Gaussians' pixels.
+            reach: largest distance, as a share of the way from near to far; one, or [N].
+        """
+        maps = state.depth_maps
+        depth, near, far = (
+            at_least_float32(values).detach().flatten()[rays.place]
+            for values in (maps.depth, maps.bounds.near, maps.bounds.far)
+        )
+        thickness = far - near
+        half = reach * thickness
+        share = (depth - near) / torch.where(thickness > 0, thickness, 1)
+        # By rounding a depth may lie slightly outside its bounds.
+        low = torch.minimum(torch.maximum(depth - half, near), depth)
+        high = torch.minimum(depth + half, far)
+        high = torch.maximum(high, depth)
+        matches = consistency_of(batch, rays.place, low, high, self.options.depths)
+        return Search(matches, torch.stack((share, thickness), -1), depth - low, high - depth)
+
+
+@torch.no_grad()
+def _footprints(state: State, batch: Batch, rays: Rays) -> Tensor:
+    """Sizes [N, 1] of a pixel at the Gaussians' depths, in the unit of depth.
+
+    Args:
+        state: depths and images of the Gaussians.
+        batch: cameras are read.
+        rays: of the Gaussians' pixels.
+    """
+    focal = focal_lengths(batch.cameras).prod(-1).sqrt().flatten()
+    depth = at_least_float32(state.depth_maps.depth).flatten()[rays.place]
+    return (depth / focal[state.raw.image])[:, None]
+
+
+def _moved(
+    state: State,
+    activate: Activate | None,
+    batch: Batch,
+    rays: Rays,
+    moved: Float[Tensor, " N"],
+    change: Float[Tensor, "N c"],
+) -> State:
+    """The state after a round.
+
+    Args:
+        state: before it.
+        activate: gives Gaussians from their raw attributes; None: those before the round stay.
+        batch: photographs, mattes and cameras are read.
+        rays: of the Gaussians' pixels, along which they move.
+        moved: changes of depths in metres.
+        change: of raw attributes.
+    """
+    raw = state.raw.changed(change)
+    maps = state.depth_maps
+    pixels = state.points.pixels
+    if raw.real is not None:
+        moved = moved * raw.real
+    depth = maps.depth.flatten().index_add(0, rays.place, moved).view_as(maps.depth)
+    maps = dataclasses.replace(maps, depth=depth)
+    pixels = pixels.flatten(0, 3).index_add(0, rays.place, moved[:, None] * rays.direction).view_as(pixels)
+    points = dataclasses.replace(state.points, pixels=pixels)
+    gaussians = state.gaussians if activate is None else activate(raw, batch, points, maps)
+    return State(raw, gaussians, points, maps)

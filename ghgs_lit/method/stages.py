@@ -1,0 +1,254 @@
+"""Interfaces of the stages of the method (paper, Figure 2), which a replacement must offer.
+
+To replace a stage, register the options of a class under a new kind
+(:func:`ghgs_lit.config.register`). Stages with weights are modules (``torch.nn.Module``)."""
+
+from typing import Any, Protocol
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ghgs_lit.errors import require
+from ghgs_lit.method.plan import Plan
+from ghgs_lit.types import (
+    Batch,
+    Cameras,
+    DecodedPixels,
+    DepthBounds,
+    DepthMaps,
+    Gaussians,
+    Points,
+    Prediction,
+    Rendering,
+    Tokens,
+)
+
+#: The nodes of a configuration that a model needs, in the order of the data flow.
+STAGES = ("bounds", "encoder", "depth_head", "unprojection", "recalibration", "gaussian_head")
+
+#: Stages with weights whose widths follow the encoder's.
+HEADS = ("depth_head", "recalibration", "gaussian_head")
+
+#: Nodes that a model may have beside its stages.
+OPTIONS = ("rounds", "skip", "model")
+
+
+class Bounds(Protocol):
+    """Near and far of each pixel's ray; options: ``build()``.
+
+    Attributes:
+        is_bounded: false for a stage that gives None; it needs a depth head without bounds.
+    """
+
+    is_bounded: bool
+
+    def __call__(self, batch: Batch) -> DepthBounds | None:
+        """Bounds of all pixels.
+
+        Args:
+            batch: masks and cameras; photographs may have any size.
+
+        Returns:
+            Near and far [B, V, H, W] in metres; None where ``is_bounded`` is false.
+        """
+
+
+class Encoder(Protocol):
+    """Photographs to tokens; options: ``build(tokens, margin)``,
+    which choose the patches (``conf/skip``).
+
+    Attributes:
+        dim_latent: width of a layer of the tokens.
+        patch_size: side of a patch in pixels.
+        bounds_input: whether bounds are read.
+        tokens: which patches have tokens; can be set later, as can ``margin``,
+            and changes :meth:`keeps`.
+        margin: patches around these that have some, too.
+    """
+
+    dim_latent: int
+    patch_size: int
+    bounds_input: bool
+    tokens: str
+    margin: int
+
+    def __call__(
+        self,
+        images: Float[Tensor, "B V 3 H W"],
+        masks: Bool[Tensor, "B V H W"],
+        bounds: DepthBounds | None,
+        plan: Plan,
+    ) -> Tokens:
+        """Tokens of the patches ``plan.kept``, in the order of image, row, column.
+
+        Args:
+            images: photographs in [0, 1]; sides are divisible by ``patch_size``.
+            masks: the subject's pixels.
+            bounds: of all pixels, read where ``bounds_input``; None for stages without bounds.
+            plan: which patches become tokens.
+        """
+
+    def keeps(self, masks: Bool[Tensor, "B V H W"]) -> Bool[Tensor, "B V h w"]:
+        """Patches that have tokens.
+
+        Args:
+            masks: the subject's pixels; sides are divisible by ``patch_size``.
+        """
+
+
+class DepthHead(Protocol):
+    """Tokens to depths; options: ``build(dim_latent)``.
+
+    Attributes:
+        is_bounded: whether depths lie between bounds, which are then needed.
+    """
+
+    is_bounded: bool
+
+    def __call__(self, tokens: Tokens, batch: Batch, bounds: DepthBounds | None, plan: Plan) -> DepthMaps:
+        """Depths of all pixels; those within ``plan.depth_windows`` at least have a meaning.
+
+        Args:
+            tokens: of the encoder.
+            batch: photographs, masks and cameras.
+            bounds: of all pixels; None where ``is_bounded`` is false.
+            plan: where depths are needed.
+
+        Returns:
+            Depths [B, V, H, W] in metres, between the bounds if there are any,
+            and which pixels are valid.
+        """
+
+
+class Unprojection(Protocol):
+    """Depths to points in the world; options: ``build()``."""
+
+    def __call__(self, depth_maps: DepthMaps, tokens: Tokens, batch: Batch) -> Points:
+        """Points of all pixels and of all tokens.
+
+        Args:
+            depth_maps: in metres.
+            tokens: whose patches have points, too.
+            batch: cameras.
+        """
+
+
+class Recalibration(Protocol):
+    """Tokens to tokens; options: ``build(dim_latent)``.
+
+    Attributes:
+        tokens: ``all`` with background tokens, for which all pixels need a depth; else ``subject``.
+    """
+
+    tokens: DecodedPixels
+
+    def __call__(self, tokens: Tokens, points: Points, plan: Plan) -> Tokens:
+        """The same tokens with recalibrated layers.
+
+        Args:
+            tokens: of the encoder.
+            points: of pixels and tokens in the world, in metres.
+            plan: its ``peers`` whose points are valid are recalibrated.
+        """
+
+
+class GaussianHead(Protocol):
+    """Tokens to Gaussians in two steps; options: ``build(dim_latent)``.
+
+    The first step may give any type, but rounds need
+    :class:`ghgs_lit.method.heads.attributes.RawGaussians`.
+
+    Attributes:
+        channels: width of the descriptors of these.
+    """
+
+    channels: int
+
+    def __call__(
+        self, tokens: Tokens, batch: Batch, points: Points, depth_maps: DepthMaps, plan: Plan
+    ) -> Any:
+        """Raw attributes of the pixels ``plan.subject`` that are valid.
+
+        Args:
+            tokens: recalibrated ones.
+            batch: photographs, masks and cameras.
+            points: of pixels in the world, in metres.
+            depth_maps: in metres.
+            plan: which pixels become Gaussians, and the windows to decode.
+
+        Returns:
+            What :meth:`activate` takes.
+        """
+
+    def activate(self, raw: Any, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
+        """Gaussians from raw attributes.
+
+        Args:
+            raw: result of the first step; rounds change it.
+            batch: photographs, mattes and cameras.
+            points: of pixels in the world, in metres; rounds move them.
+            depth_maps: in metres, of these points.
+
+        Returns:
+            Gaussians with the pixels that they belong to.
+        """
+
+
+class Renderer(Protocol):
+    """Gaussians to images; options: ``build()``."""
+
+    def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
+        """Images of the Gaussians.
+
+        Args:
+            gaussians: of B elements, in the world of the cameras.
+            cameras: [B, T].
+
+        Returns:
+            Images [B, T, C, h, w], with alpha and depth [B, T, 1, h, w].
+        """
+
+
+class Loss(Protocol):
+    """The training objective; options: ``build()``.
+
+    Attributes:
+        reads_depths: whether true depths must be loaded.
+    """
+
+    reads_depths: bool
+
+    def __call__(
+        self, prediction: Prediction, rendering: Rendering, batch: Batch
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The value that training minimises, and its terms by name.
+
+        Args:
+            prediction: of the model.
+            rendering: of its Gaussians from the targets' cameras.
+            batch: photographs, targets and what the data knows of bodies and depths.
+
+        Returns:
+            The value, a scalar, and each term.
+        """
+
+
+def require_bounds(bounds: Bounds, encoder: Encoder, depth_head: DepthHead, rounds: Any) -> None:
+    """Refuse stages that need bounds without them, and the reverse.
+
+    Args:
+        bounds: stage of the bounds.
+        encoder: may read bounds.
+        depth_head: gives depths between bounds, or without.
+        rounds: need bounds; None: there are none.
+
+    Raises:
+        InputError: names the option that does not fit.
+    """
+    head = f"a depth head {'between' if depth_head.is_bounded else 'without'} bounds"
+    expected = "none with depth_head.parameterization=inverse_linear, box or hull with all others"
+    fits = bounds.is_bounded == depth_head.is_bounded
+    require(fits, "bounds", expected, f"{type(bounds).__name__} with {head}")
+    sees = encoder.bounds_input and not bounds.is_bounded
+    require(not sees, "encoder.bounds_input", "false where bounds is none", True)
+    require(rounds is None or bounds.is_bounded, "rounds", "a model with bounds", "bounds=none")

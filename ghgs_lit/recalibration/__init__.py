@@ -1,7 +1,0 @@
-"""The recalibration stage: attention across views between tokens that are close in space."""
-
-from ghgs_lit.recalibration.attention import SemanticAttention
-from ghgs_lit.recalibration.neighbors import nearest_neighbors
-from ghgs_lit.recalibration.recalibration import Recalibration, RecalibrationOptions
-
-__all__ = ["Recalibration", "RecalibrationOptions", "SemanticAttention", "nearest_neighbors"]

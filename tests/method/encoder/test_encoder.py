@@ -1,0 +1,276 @@
+"""Properties of the encoder that no single number shows."""
+
+from pathlib import Path
+
+import pytest
+import torch
+import torch.nn.functional as F
+from omegaconf import OmegaConf
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.method.encoder import VGGTEncoder
+from ghgs_lit.method.encoder.block import rotary_tables, rotate
+from ghgs_lit.method.plan.patches import KeptPatches
+from tests.helpers.configs import composed
+from tests.helpers.encoders import make_encoder
+
+CONF = Path(__file__).parents[3] / "conf"
+SMALL = {"width": 32, "heads": 2, "depth": 2, "layers": (0, 1), "vit": {"kind": "stem", "channels": 8}}
+
+
+def _encoder(seed: int = 0, **options) -> VGGTEncoder:
+    """A small encoder whose special tokens and LayerScales are large enough to matter."""
+    torch.manual_seed(seed)
+    encoder = make_encoder(**{**SMALL, **options})
+    with torch.no_grad():
+        for name, parameter in encoder.named_parameters():
+            if "gamma" in name or "token" in name:
+                parameter.normal_()
+    return encoder
+
+
+def _views(b: int, v: int, height: int, width: int, seed: int = 1):
+    g = torch.Generator().manual_seed(seed)
+    masks = torch.rand(b, v, height, width, generator=g) > 0.5
+    return torch.rand(b, v, 3, height, width, generator=g), masks
+
+
+def _options(name: str) -> dict:
+    options = OmegaConf.to_container(composed("train", f"encoder={name}", "model=paper")["encoder"])
+    assert options.pop("kind") == "vggt"
+    return options
+
+
+@pytest.mark.parametrize(("name", "most"), [("vggt_nano", 1.2e6), ("vggt_small", 6.5e6)])
+def test_small_encoders_fit_their_size(name, most):
+    """The small encoders must stay small and train in every parameter."""
+    encoder = make_encoder(**_options(name))
+    assert sum(p.numel() for p in encoder.parameters()) < most
+    assert len(encoder.aggregator.layers) == 4
+    tokens = encoder(*_views(1, 2, 28, 42))
+    assert all(latent.shape == (2 * 2 * 3, encoder.dim_latent) for latent in tokens.latent)
+    torch.autograd.backward(tokens.latent, [torch.ones_like(x) for x in tokens.latent])
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in encoder.parameters())
+
+
+def test_every_shipped_size_builds():
+    """Every option of conf/encoder must be a valid encoder."""
+    names = sorted(path.stem for path in (CONF / "encoder").glob("*.yaml"))
+    assert names == ["vggt_1b", "vggt_nano", "vggt_small"]
+    with torch.device("meta"):
+        for name in names:
+            make_encoder(**_options(name))
+
+
+@pytest.mark.parametrize("patch_size", [7, 8, 10, 14])
+@pytest.mark.parametrize("mask_input", [False, True])
+def test_any_patch_size_and_shape(patch_size, mask_input):
+    """Tokens must be complete, in order, and see the mask only with mask_input."""
+    encoder = _encoder(patch_size=patch_size, mask_input=mask_input)
+    images, masks = _views(2, 3, 2 * patch_size, 3 * patch_size)
+    tokens = encoder(images, masks)
+    assert tokens.grid == (2, 3, 2, 3)
+    assert tokens.is_dense
+    assert tokens.patch_size == patch_size
+    order = (tokens.image * 2 + tokens.row) * 3 + tokens.column
+    assert torch.equal(order, torch.arange(2 * 3 * 2 * 3))
+    seen = encoder(images, ~masks).latent[0]
+    assert torch.equal(seen, tokens.latent[0]) is not mask_input
+
+
+def test_batch_elements_are_independent():
+    """A result must not depend on the other subjects of its batch."""
+    encoder = _encoder().double()
+    images, masks = _views(2, 3, 28, 42)
+    images = images.double()
+    both = encoder(images, masks)
+    for b in range(2):
+        one = encoder(images[b : b + 1], masks[b : b + 1])
+        part = slice(b * 3 * 6, (b + 1) * 3 * 6)
+        for x, y in zip(one.latent, both.latent, strict=True):
+            torch.testing.assert_close(x, y[part], rtol=1e-9, atol=1e-9)
+
+
+def test_images_that_are_wider_than_the_weights_are_named():
+    """They would end in a convolution of one of the heads."""
+    images, masks = _views(1, 2, 28, 28)
+    with pytest.raises(InputError, match=r"images: expected float32 .*; found torch\.float64"):
+        _encoder()(images.double(), masks)
+
+
+def test_only_the_first_view_is_special():
+    """The order of the later views must not change their tokens."""
+    encoder = _encoder().double()
+    images, masks = _views(1, 3, 28, 42)
+    images = images.double()
+    latent = encoder(images, masks).latent[1].view(3, 6, -1)
+    tail = encoder(images[:, [0, 2, 1]], masks[:, [0, 2, 1]]).latent[1].view(3, 6, -1)
+    torch.testing.assert_close(tail, latent[[0, 2, 1]], rtol=1e-9, atol=1e-9)
+    head = encoder(images[:, [1, 0, 2]], masks[:, [1, 0, 2]]).latent[1].view(3, 6, -1)
+    assert (head - latent[[1, 0, 2]]).abs().max() > 0.05
+
+
+def test_one_view_sees_only_itself():
+    """Frame attention must stay within a view; global attention must not."""
+    encoder = _encoder().double()
+    images, masks = _views(1, 3, 28, 28)
+    images = images.double()
+    alone = encoder(images[:, :1], masks[:, :1]).latent[0]
+    among = encoder(images, masks).latent[0][:4]
+    frame, across = slice(0, 32), slice(32, 64)
+    torch.testing.assert_close(alone[:, frame], among[:, frame], rtol=1e-9, atol=1e-9)
+    assert (alone[:, across] - among[:, across]).abs().max() > 0.01
+
+
+def test_semantic_features_carry_no_gradient():
+    """Semantic features weight the attention; they are not trained through it."""
+    tokens = _encoder()(*_views(1, 2, 28, 28))
+    assert not tokens.semantic.requires_grad
+    assert tokens.latent[0].requires_grad
+
+
+def test_checkpointing_changes_nothing():
+    """Saving memory must not change a gradient."""
+    gradients = []
+    for checkpointing in (False, True):
+        encoder = _encoder(
+            checkpointing=checkpointing, vit={"kind": "dinov2", "depth": 1, "heads": 2}, image_size=28
+        )
+        sum(latent.square().mean() for latent in encoder(*_views(1, 2, 28, 28)).latent).backward()
+        gradients.append([p.grad for p in encoder.parameters() if p.requires_grad])
+    for kept, recomputed in zip(*gradients, strict=True):
+        torch.testing.assert_close(kept, recomputed)
+
+
+@pytest.mark.parametrize(("trainable", "pairs"), [("none", 0), ("last_1", 1), ("all", 2)])
+def test_trainable_part(trainable, pairs):
+    """Exactly the named blocks may be trained."""
+    encoder = _encoder(trainable=trainable)
+    for blocks in (encoder.aggregator.frame_blocks, encoder.aggregator.global_blocks):
+        trained = [all(p.requires_grad for p in block.parameters()) for block in blocks]
+        assert trained == [False] * (2 - pairs) + [True] * pairs
+    assert encoder.aggregator.camera_token.requires_grad is (trainable == "all")
+    assert encoder(*_views(1, 2, 28, 28)).latent[1].requires_grad is (pairs > 0)
+
+
+def test_low_precision_stays_near_float32():
+    """Angles, norms and the residual stream are wide: bfloat16 loses what its products lose,
+    no more."""
+    encoder = _encoder(depth=4, layers=(3,))
+    images, masks = _views(1, 3, 140, 140)
+    with torch.no_grad():
+        exact = encoder(images, masks).latent[0]
+        with torch.autocast("cpu", torch.bfloat16):
+            low = encoder(images, masks).latent[0]
+    assert low.dtype == torch.float32
+    assert (low - exact).square().mean().sqrt() < 0.02 * exact.std()
+
+
+def test_rotation_depends_on_differences_of_positions():
+    """Rotary positions must be relative."""
+    g = torch.Generator().manual_seed(0)
+    q, k = torch.randn(2, 1, 16, generator=g, dtype=torch.float64)
+
+    def score(a, b):
+        turned = rotate(torch.cat((q, k)), rotary_tables(torch.tensor([a, b]), 16, q))
+        return turned[0] @ turned[1]
+
+    torch.testing.assert_close(score((3, 5), (1, 9)), score((13, 25), (11, 29)), rtol=1e-5, atol=1e-5)
+    assert (score((3, 5), (1, 9)) - score((3, 5), (9, 1))).abs() > 1e-2
+    torch.testing.assert_close(score((0, 0), (0, 0)), (q * k).sum(), rtol=1e-12, atol=1e-12)
+
+
+def test_angles_are_float32_whatever_the_tokens():
+    """Angles in half precision would shift positions."""
+    kept = KeptPatches(torch.ones(1, 1, 37, 37, dtype=torch.bool), torch.device("cpu"))
+    positions = kept.positions(special=5)
+    exact = rotary_tables(positions, 64, torch.zeros(1))
+    for dtype in (torch.bfloat16, torch.float16):
+        tables = rotary_tables(positions, 64, torch.zeros(1, dtype=dtype))
+        assert tables.cosine.dtype == torch.float32
+        assert torch.equal(tables.cosine, exact.cosine)
+        assert torch.equal(tables.sine, exact.sine)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(rotary_tables(positions, 64, torch.zeros(1)).sine, exact.sine)
+
+
+def test_half_precision_weights_run():
+    """An encoder with bfloat16 weights must give finite tokens in bfloat16."""
+    encoder = _encoder().bfloat16()
+    tokens = encoder(*_views(1, 2, 28, 28))
+    assert tokens.latent[0].dtype == torch.bfloat16
+    assert tokens.latent[0].isfinite().all()
+
+
+def test_weights_can_be_assigned_to_a_model_without_storage():
+    """Checkpoints are loaded without a second copy of the weights."""
+    encoder = _encoder()
+    with torch.device("meta"):
+        empty = make_encoder(**SMALL)
+    empty.load_state_dict(encoder.state_dict(), assign=True)
+    images, masks = _views(1, 2, 28, 28)
+    assert torch.equal(empty(images, masks).latent[1], encoder(images, masks).latent[1])
+
+
+@pytest.mark.parametrize(
+    "vit", [SMALL["vit"], {"kind": "dinov2", "depth": 1, "heads": 2}], ids=["stem", "dinov2"]
+)
+def test_special_tokens_are_drawn_near_zero(vit):
+    """As published, and the semantic branch's token as wide as the weights of its blocks."""
+    semantic = {"width": 32, "depth": 1, "heads": 2, "channels": 8}
+    torch.manual_seed(0)
+    encoder = make_encoder(**{**SMALL, "vit": vit, "semantic": semantic})
+    tokens = {
+        name: p for name, p in encoder.named_parameters() if "token" in name and "mask_token" not in name
+    }
+    assert len(tokens) == (5 if vit["kind"] == "dinov2" else 3)
+    for name, token in tokens.items():
+        std = 0.02 if "semantic" in name else 1e-6
+        assert 0.5 * std < token.std() < 1.5 * std, name
+
+
+def test_normalisation_is_no_part_of_a_checkpoint():
+    """Published weights have no such tensors."""
+    assert all(key.startswith("aggregator.") for key in _encoder().state_dict())
+
+
+def test_stored_positions_serve_any_grid():
+    """Other image sizes must resample the stored positions as published."""
+    encoder = _encoder(vit={"kind": "dinov2", "depth": 1, "heads": 2}, image_size=56)
+    vit = encoder.aggregator.patch_embed
+    assert vit.positions(4, 4, torch.float32) is vit.pos_embed
+    resampled = vit.positions(6, 5, torch.float32)
+    grid = vit.pos_embed[:, 1:].unflatten(1, (4, 4)).permute(0, 3, 1, 2)
+    expected = F.interpolate(grid, (6, 5), mode="bicubic", antialias=True).flatten(2).mT
+    assert torch.equal(resampled[:, 1:], expected)
+    assert torch.equal(resampled[:, :1], vit.pos_embed[:, :1])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"heads": 5}, "encoder.width"),
+        ({"layers": (1, 0)}, "encoder.layers"),
+        ({"layers": (0, 2)}, "encoder.layers"),
+        ({"layers": (0,)}, "encoder.layers"),
+        ({"vit": {"kind": "resnet"}}, "encoder.vit.kind: expected one of conv, stem, dinov2; found 'resnet'"),
+        (
+            {"vit": {"kind": "stem", "chanels": 8}},
+            "encoder.vit key: .*found 'chanels'",
+        ),
+        ({"vit": {"kind": "stem"}}, "encoder.vit.channels: expected a number with kind=stem; found None"),
+        ({"vit": {"kind": "conv", "heads": 2}}, "encoder.vit.heads: expected null with kind=conv; found 2"),
+        ({"vit": {"kind": "dinov2", "depth": 1, "heads": 2}, "image_size": 100}, "encoder.image_size"),
+        (
+            {"vit": {"kind": "dinov2", "depth": 1, "heads": 3}},
+            "a multiple of vit.heads=3; found 32",
+        ),
+        ({"patch_size": 0}, "encoder.patch_size: expected an integer >= 1 and <= 1024; found 0"),
+        ({"trainable": "last_3"}, "encoder.trainable"),
+        ({"trainable": "some"}, "encoder.trainable"),
+    ],
+)
+def test_impossible_options_are_refused(options, message):
+    """A bad value is found when the configuration is read, by its key."""
+    with pytest.raises(InputError, match=message):
+        make_encoder(**{**SMALL, **options})

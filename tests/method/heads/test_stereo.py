@@ -1,0 +1,218 @@
+"""Stereo between neighbouring views, and the peers that are built of it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from omegaconf import OmegaConf
+from scipy.ndimage import map_coordinates
+from torch.autograd import gradcheck
+
+from ghgs_lit import GHGS
+from ghgs_lit.config import compose
+from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.method.bounds import SubjectBox
+from ghgs_lit.method.heads import stereo
+from ghgs_lit.method.heads.depth import BOUNDED
+from ghgs_lit.method.stages import STAGES
+from ghgs_lit.weights.checkpoint import FORMAT_VERSION
+from tests.helpers.models import close
+from tests.helpers.scenes import ellipsoid, make_batch, ring, stack
+from tests.method.heads.test_depth import make_tokens
+
+SMALL = ["encoder.width=32", "encoder.heads=2", "encoder.vit.channels=8"]
+PEERS = ["gps", "pixel"]
+
+
+def peer(name, *overrides):
+    """A small one that has left its initial state, in which depths are constant."""
+    config = OmegaConf.masked_copy(
+        compose("train", [f"model={name}", *SMALL, *overrides]), [*STAGES, "model"]
+    )
+    torch.manual_seed(0)
+    model = GHGS.from_config(OmegaConf.to_container(config, resolve=True)).eval()
+    head = model.depth_head
+    last = head.update.change[-1] if name == "gps" else head.dpt.scratch.output_conv2[-1]
+    torch.nn.init.normal_(last.weight, std=0.5)
+    return model
+
+
+def painted(count=4, size=112, spread=360.0):
+    """Features of cells that a random function of the place on an ellipsoid paints, cameras,
+    true depths."""
+    cameras = ring(1, count, size, size, spread=spread)
+    masks, depths = ellipsoid(cameras)
+    g = torch.Generator().manual_seed(2)
+    waves, phases = 25 * torch.randn(3, 32, generator=g), 6.28 * torch.rand(32, generator=g)
+    maps = torch.sin(unproject_maps(depths, cameras) @ waves + phases) * masks[..., None]
+    cells = size // stereo.CELL
+    features = F.avg_pool2d(maps.flatten(0, 1).movedim(-1, 1), stereo.CELL)
+    whole = F.avg_pool2d(masks.flatten(0, 1).float(), stereo.CELL) == 1
+    mean = F.avg_pool2d(depths.flatten(0, 1), stereo.CELL)
+    return F.normalize(features, dim=1).unflatten(0, (1, count)), cameras.resized(cells, cells), whole, mean
+
+
+def limits(depth, whole):
+    near, far = depth[whole].min() - 0.2, depth[whole].max() + 0.2
+    return (bound.expand(1, len(depth), 1, 1) for bound in (near, far))
+
+
+def test_the_correlation_is_largest_at_the_true_depth():
+    """Where a neighbour sees the surface: nearly everywhere, with neighbours 22 degrees away.
+
+    Half a cell in the neighbour's image is 5 cm of depth here.
+    """
+    features, cameras, whole, depth = painted(3, 224, spread=67.5)
+    near, far = limits(depth, whole)
+    cells = whole.flatten().nonzero()[:, 0]
+    found = stereo.correlations(features, cameras, cells, near, far, 64)
+    share = torch.linspace(0, 1, 64)
+    best = BOUNDED["bounded_inverse"](share, near[0, 0, 0], far[0, 0, 0])[found.argmax(1)]
+    error = (best - depth.flatten()[cells]).abs()
+    assert (error < 0.05).float().mean() > 0.95
+    assert found.max() <= 1 / 32**0.5 + 1e-5  # cosines over the square root of the channels
+
+
+def test_correlations_are_those_of_a_literal_loop():
+    """Matrices of NumPy and SciPy's interpolation, in float64, cell by cell;
+    5 cameras have 2 neighbours."""
+    features, cameras, whole, depth = painted(5, 56)
+    near, far = limits(depth, whole)
+    cells = whole.flatten().nonzero()[::7, 0]
+    found = stereo.correlations(features, cameras, cells, near, far, 9)
+    k, e = cameras.intrinsics[0].double().numpy(), cameras.extrinsics[0].double().numpy()
+    maps, (height, width) = features[0].double().numpy(), features.shape[-2:]
+    inverse = np.linspace(1 / near[0, 0].item(), 1 / far[0, 0].item(), 9)
+    for cell, row in zip(cells.tolist(), found.numpy(), strict=True):
+        view, v, u = np.unravel_index(cell, (5, height, width))
+        expected = []
+        for z in 1 / inverse:
+            at_camera = z * np.linalg.solve(k[view], [u + 0.5, v + 0.5, 1])
+            point = np.linalg.solve(e[view], [*at_camera, 1])
+            values = []
+            for other in ((view + 1) % 5, (view - 1) % 5):
+                x, y, w = k[other] @ (e[other] @ point)[:3]
+                place = np.array([[y / w - 0.5], [x / w - 0.5]])
+                there = [map_coordinates(m, place, order=1, mode="constant")[0] for m in maps[other]]
+                values.append(maps[view, :, v, u] @ there / 32**0.5)
+            expected.append(max(values))
+        np.testing.assert_allclose(row, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("views", "expected"), [(2, [[1], [0]]), (4, [[1, 3], [0, 2], [1, 3], [0, 2]])])
+def test_neighbors_stand_on_either_side(views, expected):
+    """Of all elements, numbered on."""
+    found = stereo.neighboring_views(ring(2, views, 28, 28))
+    expected = torch.tensor([expected, (torch.tensor(expected) + views).tolist()]).flatten(0, 1)
+    assert torch.equal(found.sort(1).values, expected)
+
+
+def test_looking_up_is_linear_interpolation():
+    """As ``grid_sample`` between the centres of the steps; the ends are repeated."""
+    level = torch.rand(2, 12, 3, 4, generator=torch.Generator().manual_seed(1))
+    fraction = torch.rand(2, 1, 3, 4, generator=torch.Generator().manual_seed(2))
+    found = stereo.look_up(level, fraction)
+    for i, offset in enumerate(range(-stereo.RADIUS, stereo.RADIUS + 1)):
+        along = (2 * (fraction[:, 0] * 11 + offset) / 11 - 1).flatten()
+        column = level.movedim(1, -1).reshape(-1, 1, 12, 1)  # a picture of one column for each cell
+        grid = torch.stack((torch.zeros_like(along), along), -1)[:, None, None]
+        expected = F.grid_sample(column, grid, padding_mode="border", align_corners=True)
+        torch.testing.assert_close(found[:, i].flatten(), expected.flatten())
+
+
+def test_upsampled_maps_are_convex_combinations():
+    """With all weight on the own cell it is repeated;
+    with equal weights it is the mean of 3 x 3."""
+    maps = torch.rand(2, 1, 3, 5)
+    weights = torch.zeros(2, 9, 16, 3, 5)
+    weights[:, 4] = 1e4
+    found = stereo.upsampled(maps, weights.flatten(1, 2))
+    assert torch.equal(found, F.interpolate(maps, scale_factor=4, mode="nearest")[:, 0])
+    mean = F.avg_pool2d(F.pad(maps, (1, 1, 1, 1), mode="replicate"), 3, 1)
+    found = stereo.upsampled(maps, torch.zeros(2, 144, 3, 5))
+    torch.testing.assert_close(found, F.interpolate(mean, scale_factor=4, mode="nearest")[:, 0])
+
+
+def test_gradients_are_those_of_finite_differences():
+    """Of correlations by the features, of an update by all that it sees, of upsampling by both."""
+    torch.manual_seed(3)
+    features, cameras, whole, depth = painted(2, 40)
+    near, far = (bound.double() for bound in limits(depth, whole))
+    cells = whole.flatten().nonzero()[::9, 0]
+    features = features[:, :, :4].double().requires_grad_()
+    assert gradcheck(lambda x: stereo.correlations(x, cameras, cells, near, far, 4), (features,))
+    update = stereo.Update(2).double()
+    torch.nn.init.normal_(update.change[-1].weight)
+    levels = [torch.rand(1, 8 // 2**i, 2, 1, dtype=torch.float64, requires_grad=True) for i in range(3)]
+    maps = [torch.rand(1, n, 2, 1, dtype=torch.float64, requires_grad=True) for n in (2, 2, 1)]
+    assert gradcheck(lambda *x: update(x[0], x[1], list(x[3:]), x[2]), (*maps, *levels))
+    weights = torch.rand(1, 144, 2, 1, dtype=torch.float64, requires_grad=True)
+    assert gradcheck(stereo.upsampled, (maps[2], weights))
+
+
+@pytest.mark.parametrize("name", PEERS)
+@pytest.mark.parametrize(("views", "size"), [(2, (42, 70)), (3, (56, 28)), (5, (28, 42))])
+def test_batch_mates_change_nothing(name, views, size):
+    """Sides that are no multiples of a cell; a view that shows nobody."""
+    model, batches = peer(name), [make_batch(1, views, *size), make_batch(1, views, *size, zoom=0.6)]
+    masks = batches[0].masks.clone()
+    masks[:, 0] = False
+    batches[0] = dataclasses.replace(batches[0], masks=masks)
+    both = model(stack(batches))
+    assert both.depth.isfinite().all()
+    assert both.depth.shape == (2, views, *size)
+    assert both.gaussians.splits == tuple(int(batch.masks.sum()) for batch in batches)
+    for element, batch in enumerate(batches):
+        alone = model(batch)
+        close(both.gaussians[element], alone.gaussians)
+        torch.testing.assert_close(both.depth[element], alone.depth[0])
+
+
+def test_depths_lie_between_the_bounds_of_the_subject():
+    """Of the nearest and the farthest of its pixels; far off, a gradient leads back."""
+    batch, model = make_batch(1, 3, 56, 56), peer("gps")
+    bounds = SubjectBox()(batch)
+    for change in (-1e4, 1e4):
+        torch.nn.init.constant_(model.depth_head.update.change[-1].bias, change)
+        model.zero_grad()
+        depth = model.depth_head(make_tokens(batch), batch, bounds).depth
+        near, far = stereo.subject_range(bounds, batch)
+        assert ((depth >= near * (1 - 1e-6)) & (depth <= far * (1 + 1e-6))).all()
+        (depth * change).sum().backward()
+        assert (model.depth_head.update.change[-1].bias.grad * change > 0).all()
+
+
+def test_half_precision_stays_near():
+    """Correlations and the estimate stay in float32 under autocast; gradients stay finite."""
+    batch, model = make_batch(1, 3, 56, 56), peer("gps")
+    expected = model(batch).depth
+    with torch.autocast("cpu", torch.bfloat16):
+        found = model(batch).depth
+    assert found.dtype == torch.float32
+    error = (found - expected)[batch.masks].abs().mean() / expected[batch.masks].std()
+    assert 0 < error < 0.1
+    found[batch.masks].square().sum().backward()
+    assert all(p.grad.isfinite().all() for p in model.depth_head.parameters() if p.grad is not None)
+
+
+@pytest.mark.parametrize("name", PEERS)
+def test_every_weight_learns(name):
+    """Of the depth head, from the Gaussians."""
+    model = peer(name).train()
+    gaussians = model(make_batch(1, 3, 42, 56)).gaussians
+    sum(getattr(gaussians, name).square().sum() for name in ("means", "scales", "opacities")).backward()
+    still = [key for key, p in model.depth_head.named_parameters() if p.grad is None or not p.grad.any()]
+    assert still == []
+
+
+@pytest.mark.parametrize("name", PEERS)
+def test_weights_come_back_from_their_file(name, tmp_path):
+    """The file says what to build."""
+    model, batch = peer(name), make_batch(1, 3, 42, 42)
+    state = {f"model.{key}": value for key, value in model.state_dict().items()}
+    content = {"state_dict": state, "config": model.config, "format_version": FORMAT_VERSION}
+    torch.save(content, tmp_path / "last.ckpt")
+    found = GHGS.from_checkpoint(tmp_path / "last.ckpt")(batch)
+    assert torch.equal(found.gaussians.means, model(batch).gaussians.means)

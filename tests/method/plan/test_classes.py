@@ -1,0 +1,144 @@
+"""Numbers of rows rounded up to size classes, as on a GPU, change nothing beyond rounding."""
+
+import pytest
+import torch
+
+from ghgs_lit.extents import bucket_size
+from ghgs_lit.method.plan import plan, planned
+from ghgs_lit.method.plan.rows import Rows
+from ghgs_lit.rendering import render
+from tests.helpers.losses import losses_of
+from tests.helpers.models import close, make_model
+from tests.helpers.scenes import hard_subjects, make_batch, stack, training_batch
+
+#: A share of the tokens as neighbours: their number differs between the elements of a batch.
+KINDS = [("model=paper",), ("model=hull", "recalibration.k=0.3"), ("model=recurrent", "recalibration.k=0.3")]
+PRESETS = ["none", "exact", "balanced", "fast", "auto"]
+WEIGHTS = {"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 0.01, "depth": 0.5}
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Images this small gain nothing from threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def rounding(monkeypatch):
+    """Turns size classes on and off."""
+
+    def switched(on):
+        monkeypatch.setattr(plan, "rounds_up", lambda device: on)
+
+    return switched
+
+
+def test_size_classes_add_an_eighth_at_most_and_are_few():
+    """Each holds its count; of 100,000 counts there are about eight in an octave."""
+    classes = [bucket_size(count) for count in range(1, 100_001)]
+    assert all(count <= size <= count * 9 / 8 for count, size in enumerate(classes, start=1))
+    assert len(set(classes)) == 117
+    assert classes == sorted(classes)
+
+
+def test_filled_rows_repeat_a_row_that_counts():
+    """Against a loop; a group without any has the first of its pixels."""
+    wanted = torch.rand(4, 50, generator=torch.Generator().manual_seed(0)) < 0.4
+    wanted[2] = False
+    rows = Rows.filled(wanted, wanted.sum(1).tolist(), 1)
+    size = bucket_size(int(wanted.sum(1).max()))
+    assert rows.counts == (size,) * 4
+    for group, (index, real) in enumerate(zip(rows.index.view(4, -1), rows.real.view(4, -1), strict=True)):
+        own = (50 * group + wanted[group].nonzero()[:, 0]).tolist()
+        last = own[-1] if own else 50 * group
+        assert index.tolist() == own + [last] * (size - len(own))
+        assert real.tolist() == [True] * len(own) + [False] * (size - len(own))
+    counts, number = rows.places(200)
+    assert torch.equal(counts, wanted.flatten())
+    assert torch.equal(rows.index[number[counts]], wanted.flatten().nonzero()[:, 0])
+
+
+def test_shapes_repeat_where_subjects_differ_a_little():
+    """Of photographs of another instant: a recorded graph needs the same shapes."""
+    masks = make_batch(2, 3, 112, 112).masks
+    other = masks & (torch.rand(masks.shape, generator=torch.Generator().manual_seed(0)) < 0.995)
+    counted = [planned(each, 14, [kept_of(each)], classes=False) for each in (masks, other)]
+    rounded = [planned(each, 14, [kept_of(each)], classes=True) for each in (masks, other)]
+    assert counted[0].subject.counts != counted[1].subject.counts
+    assert rounded[0].subject.counts == rounded[1].subject.counts
+    assert rounded[0].peers.counts == rounded[1].peers.counts
+    assert rounded[0].windows == rounded[1].windows
+    for window, hull in zip(counted[0].windows, rounded[0].windows, strict=True):
+        assert hull.hull(window) == hull
+
+
+def kept_of(masks):
+    """All patches of 14 pixels."""
+    return torch.ones(*masks.shape[:2], masks.shape[2] // 14, masks.shape[3] // 14, dtype=torch.bool)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("skip", PRESETS)
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind[0])
+def test_predictions_are_the_same(kind, skip, rounding):
+    """Of subjects of very different sizes, one of them a single pixel, in one batch."""
+    model, batch = make_model(*kind, f"skip={skip}").eval(), stack(list(hard_subjects().values()))
+    rounding(False)
+    expected = model(batch)
+    rounding(True)
+    filled = model.plan(batch)
+    assert filled.subject.real is not None
+    assert not filled.subject.real.all()
+    found = model(batch)
+    assert found.gaussians.splits == expected.gaussians.splits
+    assert torch.equal(found.gaussians.pixel, expected.gaussians.pixel)
+    close(found.gaussians, expected.gaussians)
+    torch.testing.assert_close(found.depth[batch.masks], expected.depth[batch.masks], rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("kind", [*KINDS, ("model=hull", "skip=fast")], ids=str)
+def test_gradients_are_the_same(kind, rounding):
+    """A row that is repeated must not be learned from twice."""
+    model, batch, found = make_model(*kind).train(), training_batch(2, 56), []
+    if model.rounds is not None:
+        model.rounds._drawn = lambda: 2
+    for on in (False, True):
+        rounding(on)
+        model.zero_grad()
+        prediction = model(batch)
+        rendering = render(prediction.gaussians, batch.targets.cameras)
+        loss = losses_of(WEIGHTS)(prediction, rendering, batch)[0]
+        loss.backward()
+        slopes = {n: p.grad.clone() for n, p in model.named_parameters() if p.grad is not None}
+        found.append((loss.detach(), slopes))
+    (loss, slopes), (filled_loss, filled) = found
+    torch.testing.assert_close(filled_loss, loss)
+    assert slopes.keys() == filled.keys()
+    for name, slope in slopes.items():
+        assert (filled[name] - slope).norm() <= 1e-4 * slope.norm() + 1e-9, name
+
+
+@torch.no_grad()
+def test_a_pixel_without_a_finite_depth_is_transparent(rounding):
+    """A CPU leaves it out; where sizes are known beforehand its Gaussian has opacity 0."""
+    model, batch = make_model("model=hull").eval(), stack(list(hard_subjects().values())[:2])
+    head = model.depth_head.forward
+
+    def spoiled(*inputs):
+        maps = head(*inputs)
+        maps.valid[0, 0, 28] = False
+        return maps
+
+    model.depth_head.forward = spoiled
+    missing = int(batch.masks[0, 0, 28].sum())
+    rounding(False)
+    exact = model(batch).gaussians
+    rounding(True)
+    filled = model(batch).gaussians
+    assert len(filled) == len(exact) + missing == int(batch.masks.sum())
+    shown = filled.opacities > 0
+    assert int((~shown).sum()) == missing
+    close(filled.select(shown, exact.splits), exact)

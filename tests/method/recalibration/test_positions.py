@@ -1,0 +1,167 @@
+"""Relative positions in the values of attention (``recalibration.positions=relative``)."""
+
+import dataclasses
+
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.method.plan import planned
+from ghgs_lit.method.recalibration import SemanticAttention
+from ghgs_lit.method.recalibration.recalibration import places_around
+from tests.helpers.tokens import literal_neighbors, make_stage, scene
+
+
+def relative_stage(**options):
+    """A stage in float64 whose values know of places, as after some training."""
+    stage = make_stage(positions="relative", **options).double()
+    torch.nn.init.normal_(stage.block.place_proj.weight)
+    return stage
+
+
+def double(tokens):
+    return dataclasses.replace(tokens, latent=tuple(layer.double() for layer in tokens.latent))
+
+
+def at(points, places):
+    return dataclasses.replace(points, tokens=places)
+
+
+def literal_values(stage, x, points):
+    """Outputs of one element, one query, head and neighbour at a time, for s = 1."""
+    block = stage.block
+    around = points - points.mean(0)
+    places = around / around.square().sum(1).mean().sqrt()
+    normed = block.norm1(x)
+    q, k, v = (
+        layer(normed).unflatten(1, (block.num_heads, -1))
+        for layer in (block.q_proj, block.k_proj, block.v_proj)
+    )
+    maps = block.place_proj.weight.unflatten(0, (block.num_heads, -1))
+    rows = []
+    for i in range(len(x)):
+        near = literal_neighbors(points, i, stage.k)
+        heads = []
+        for a in range(block.num_heads):
+            weights = torch.stack([q[i, a] @ k[j, a] for j in near]).div(q.shape[-1] ** 0.5).softmax(0)
+            values = [v[j, a] + maps[a] @ (places[j] - places[i]) for j in near]
+            heads.append(sum(weight * value for weight, value in zip(weights, values, strict=True)))
+        rows.append(torch.cat(heads))
+    x = x + block.o_proj(torch.stack(rows))
+    return x + block.mlp(block.norm2(x))
+
+
+def test_a_neighbour_says_where_it_lies():
+    """Against a loop over queries, heads and neighbours."""
+    tokens, points = scene()
+    tokens = double(tokens)
+    points = at(points, points.tokens.double())
+    stage = relative_stage(similarity="none")
+    found = stage(tokens, points)
+    for element in range(2):
+        chosen = (points.tokens_valid & (tokens.image // 3 == element)).nonzero()[:, 0]
+        expected = literal_values(stage, tokens.latent[1][chosen], points.tokens[chosen])
+        torch.testing.assert_close(found.latent[1][chosen], expected, atol=1e-12, rtol=0)
+
+
+def test_training_starts_as_without():
+    """The map of places starts at 0, and learns from the first step on."""
+    tokens, points = scene()
+    off = make_stage()
+    on = make_stage(positions="relative")
+    assert on.state_dict().keys() - off.state_dict().keys() == {"block.place_proj.weight"}
+    found = on(tokens, points)
+    for layer, expected in zip(found.latent, off(tokens, points).latent, strict=True):
+        torch.testing.assert_close(layer, expected)
+    found.latent[0].square().sum().backward()
+    assert (on.block.place_proj.weight.grad.abs() > 0).all()
+
+
+def test_neither_the_origin_nor_the_unit_of_the_world_matters():
+    """A person 100 m away, in millimetres; and only differences of places are told."""
+    tokens, points = scene()
+    tokens = double(tokens)
+    stage = relative_stage()
+    here = stage(tokens, at(points, points.tokens.double()))
+    away = stage(tokens, at(points, 1000 * (points.tokens.double() + torch.tensor([100.0, -50.0, 7.0]))))
+    other = stage(tokens, at(points, points.tokens.double() * torch.tensor([1.0, 1.0, -1.0])))
+    torch.testing.assert_close(away.latent, here.latent, atol=1e-9, rtol=0)
+    assert (other.latent[0] - here.latent[0])[points.tokens_valid].abs().max() > 0.1
+
+
+def test_the_order_of_neighbours_does_not_matter():
+    torch.manual_seed(0)
+    block = relative_stage().block
+    x = torch.randn(9, 32, dtype=torch.float64)
+    places = torch.randn(9, 3, dtype=torch.float64)
+    near = torch.stack([torch.randperm(9)[:5] for _ in range(9)])
+    cosines = torch.rand(9, 5, dtype=torch.float64)
+    order = torch.randperm(5)
+    found = block(x, [near[:, order]], [cosines[:, order]], places=[places])
+    torch.testing.assert_close(found, block(x, [near], [cosines], places=[places]))
+
+
+@pytest.mark.parametrize("scores", [1 << 26, 0], ids=["product", "gathered"])
+def test_the_gradient_is_that_of_finite_differences(scores, monkeypatch):
+    """With respect to tokens, places and their map."""
+    monkeypatch.setattr("ghgs_lit.method.recalibration.attention._SCORES", scores)
+    torch.manual_seed(0)
+    block = SemanticAttention(16, 2, has_places=True).double()
+    near = torch.stack([torch.randperm(6)[:3] for _ in range(6)])
+    cosines = torch.rand(6, 3, dtype=torch.float64)
+    x = torch.randn(6, 16, dtype=torch.float64, requires_grad=True)
+    places = torch.randn(6, 3, dtype=torch.float64, requires_grad=True)
+    weight = torch.randn(4, 3, dtype=torch.float64, requires_grad=True)
+
+    def attend(x, places, weight):
+        arguments = (x, [near], [cosines], None, [places])
+        return torch.func.functional_call(block, {"place_proj.weight": weight}, arguments)
+
+    assert gradcheck(attend, (x, places, weight), fast_mode=True)
+
+
+@pytest.mark.parametrize("options", [{}, {"k": 0.3}], ids=["number", "share"])
+def test_rows_that_fill_up_a_size_class_say_nothing(options):
+    """As on a GPU, where elements have equally many rows; one point is not finite."""
+    tokens, points = scene(((16, 9, 3), (6, 2, 5)))
+    tokens = double(tokens)
+    places = points.tokens.double()
+    places[points.tokens_valid.nonzero()[20, 0]] = torch.nan
+    points = at(points, places)
+    stage = relative_stage(**options)
+    kept = torch.ones(2, 3, 4, 4, dtype=torch.bool)
+    plan = planned(points.valid, tokens.patch_size, [kept], classes=True)
+    assert plan.peers.real is not None
+    found, expected = stage(tokens, points, plan), stage(tokens, points)
+    torch.testing.assert_close(found.latent[0], expected.latent[0], atol=1e-12, rtol=0)
+    assert found.latent[0].isfinite().all()
+
+
+def test_places_are_in_units_of_the_subject():
+    """Background tokens, which take part with tokens=all, change neither middle nor unit."""
+    points = torch.tensor([[1.0, 0.0, 0.0], [3.0, 0.0, 0.0], [50.0, 0.0, 0.0], [torch.inf, 0.0, 0.0]])
+    found = places_around(points, torch.tensor([True, True, False, True]))
+    assert found[:, 0].tolist() == [-1.0, 1.0, 48.0, 0.0]
+    assert places_around(points[:1], torch.tensor([True])).tolist() == [[0.0, 0.0, 0.0]]
+    assert places_around(points[:0], torch.tensor([], dtype=torch.bool)).shape == (0, 3)
+
+
+def test_half_precision_keeps_places_exact():
+    """What places add is computed in float32 under autocast."""
+    tokens, points = scene()
+    stage = make_stage(positions="relative")
+    torch.nn.init.normal_(stage.block.place_proj.weight)
+    seen = []
+    stage.block.o_proj.register_forward_pre_hook(lambda layer, inputs: seen.append(inputs[0]))
+    moved = stage.block._moved
+    stage.block._moved = lambda *inputs: seen.append(moved(*inputs)) or seen[-1]
+    with torch.autocast("cpu", torch.bfloat16):
+        found = stage(tokens, points)
+    assert {value.dtype for value in seen} == {torch.float32}
+    assert found.latent[0].dtype == torch.float32
+
+
+def test_image_planes_have_no_places():
+    with pytest.raises(InputError, match=r"recalibration.positions: expected none with neighborhood=image_"):
+        make_stage(positions="relative", neighborhood="image_plane")

@@ -1,0 +1,115 @@
+"""What neighbouring pixels exchange, against SciPy's correlation of whole images."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from scipy.signal import correlate
+
+from ghgs_lit.extents import extents
+from ghgs_lit.method.rounds.exchange import SIDE, Exchange, Windows
+
+HEIGHT, WIDTH, KNOWN, CHANNELS = 13, 17, 6, 3
+
+
+def scene(masks):
+    """The Gaussians of some of the subject's pixels, as a skip leaves them, and their batch."""
+    image, row, column = torch.nonzero(masks, as_tuple=True)
+    raw = SimpleNamespace(image=image, pixel=row * WIDTH + column, real=None)
+    batch = SimpleNamespace(masks=masks[None], extents=extents(masks))
+    return raw, batch
+
+
+def blobs(seed=0):
+    """Subjects of unequal sizes, one in a corner and one at the opposite border."""
+    masks = torch.zeros(3, HEIGHT, WIDTH, dtype=torch.bool)
+    masks[0, :5, :4] = masks[1, 3:, 9:] = masks[2, 5:8, 2:15] = True
+    return masks & (torch.rand(masks.shape, generator=torch.Generator().manual_seed(seed)) < 0.8)
+
+
+def trained(seed=0):
+    torch.manual_seed(seed)
+    exchange = Exchange(KNOWN, CHANNELS).double()
+    torch.nn.init.normal_(exchange.hear.weight)
+    return exchange
+
+
+def expected(exchange, raw, known):
+    """By definition: maps of whole images, SciPy's correlation, no windows."""
+    with torch.no_grad():
+        told = exchange.tell(known).numpy()
+    maps = np.zeros((3, HEIGHT * WIDTH, CHANNELS))
+    maps[raw.image.numpy(), raw.pixel.numpy()] = told
+    maps = maps.reshape(3, HEIGHT, WIDTH, CHANNELS)
+    kernels, biases = (x.detach().numpy() for x in (exchange.across.weight, exchange.across.bias))
+    found = np.stack(
+        [
+            [
+                sum(correlate(m[..., c], kernel[c], "same", "direct") for c in range(CHANNELS)) + bias
+                for kernel, bias in zip(kernels, biases, strict=True)
+            ]
+            for m in maps
+        ]
+    )
+    rows = found[raw.image.numpy(), :, raw.pixel.numpy() // WIDTH, raw.pixel.numpy() % WIDTH]
+    hear = exchange.hear.weight.detach().numpy(), exchange.hear.bias.detach().numpy()
+    return known.numpy() + np.maximum(rows, 0) @ hear[0].T + hear[1]
+
+
+def test_windows_give_what_whole_images_give():
+    raw, batch = scene(blobs())
+    known, exchange = torch.randn(len(raw.image), KNOWN, dtype=torch.float64), trained()
+    windows = Windows.of(raw, batch)
+    assert windows.shape == (3, 10, 13)
+    found = exchange(known, windows)
+    assert np.allclose(found.detach().numpy(), expected(exchange, raw, known), rtol=0, atol=1e-12)
+
+
+def test_nothing_comes_from_farther_away_or_from_another_image():
+    raw, batch = scene(blobs())
+    known = torch.randn(len(raw.image), KNOWN, dtype=torch.float64, requires_grad=True)
+    one = int((raw.image == 2).nonzero()[4])
+    trained()(known, Windows.of(raw, batch))[one].sum().backward()
+    row, column = raw.pixel // WIDTH, raw.pixel % WIDTH
+    near = (row - row[one]).abs().maximum((column - column[one]).abs()) <= SIDE // 2
+    heard = known.grad.abs().sum(1) > 0
+    assert torch.equal(heard, near & (raw.image == raw.image[one]))
+
+
+def test_gradients_in_float64():
+    masks = torch.zeros(1, HEIGHT, WIDTH, dtype=torch.bool)
+    masks[0, 2:4, 5:8] = True
+    raw, batch = scene(masks)
+    windows, exchange = Windows.of(raw, batch), trained()
+    known = torch.randn(len(raw.image), KNOWN, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: exchange(x, windows), (known,))
+
+
+@pytest.mark.parametrize("filled", [[], [1]])
+def test_images_without_a_subject(filled):
+    masks = torch.zeros(3, HEIGHT, WIDTH, dtype=torch.bool)
+    masks[filled] = blobs()[filled]
+    raw, batch = scene(masks)
+    known, exchange = torch.randn(len(raw.image), KNOWN, dtype=torch.float64), trained()
+    windows = Windows.of(raw, batch)
+    assert windows.shape == ((3, 10, 8) if filled else (3, 1, 1))
+    found = exchange(known, windows).detach().numpy()
+    assert found.shape == known.shape
+    assert np.allclose(found, expected(exchange, raw, known), rtol=0, atol=1e-12)
+
+
+def test_a_batch_mate_of_another_size_changes_nothing_beyond_rounding():
+    masks = blobs()
+    raw, batch = scene(masks)
+    known, exchange = torch.randn(len(raw.image), KNOWN, dtype=torch.float64), trained()
+    together = exchange(known, Windows.of(raw, batch))
+    chosen = raw.image == 0
+    alone_raw, alone = scene(masks[:1])
+    assert torch.allclose(together[chosen], exchange(known[chosen], Windows.of(alone_raw, alone)))
+
+
+def test_untrained_it_adds_nothing():
+    raw, batch = scene(blobs())
+    known = torch.randn(len(raw.image), KNOWN)
+    assert torch.equal(Exchange(KNOWN, CHANNELS)(known, Windows.of(raw, batch)), known)

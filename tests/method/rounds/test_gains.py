@@ -1,0 +1,200 @@
+"""Cameras whose exposure differs: their gains are found, and divided out."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from ghgs_lit.data.imperfections import color_gains
+from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.method.rounds.gains import divided, equalized, log_gains, log_gammas
+from ghgs_lit.types import Gaussians
+from tests.helpers.models import make_model
+from tests.helpers.scenes import CENTER, RADII, ellipsoid, make_batch, with_soft_rims
+
+
+def waves(points):
+    return 0.5 + 0.3 * torch.sin(points * torch.tensor([9.0, 5.0, 7.0]))
+
+
+def halves(points):
+    """A little darker before than behind."""
+    return torch.where(points[..., 2:] > CENTER[2], 0.46, 0.4).expand(points.shape)
+
+
+def painted(batch=1, views=4, spread=40.0, paint=waves, radii=RADII):
+    """A surface whose colour is a function of the place in the world,
+    so that all views agree about it."""
+    batch = make_batch(batch, views, spread=spread)
+    masks, depths = ellipsoid(batch.cameras, radii=radii)
+    batch = dataclasses.replace(batch, masks=masks, depths=depths)
+    colors = paint(unproject_maps(batch.depths, batch.cameras)).movedim(-1, 2)
+    return dataclasses.replace(batch, images=colors * batch.masks[:, :, None])
+
+
+def splats(batch):
+    """Discs at the true points."""
+    image, pixel = batch.masks.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
+    n, counts = len(image), tuple(batch.masks.flatten(1).sum(1).tolist())
+    means = unproject_maps(batch.depths, batch.cameras).flatten(0, 1).flatten(1, 2)[image, pixel]
+    colors = batch.images.flatten(0, 1).flatten(2).mT[image, pixel]
+    turn = torch.tensor([1.0, 0, 0, 0]).expand(n, 4)
+    sizes = torch.full((n, 3), 0.01)
+    return Gaussians(means, turn, sizes, torch.full((n,), 0.95), colors, counts, image, pixel)
+
+
+def seen_with(batch, gains):
+    return dataclasses.replace(batch, images=batch.images * torch.as_tensor(gains)[..., None, None].float())
+
+
+def drawn(batch, seed=0, stops=0.5):
+    rng = np.random.default_rng(seed)
+    return np.stack([color_gains(batch.masks.shape[1], stops, stops / 2, rng) for _ in batch.masks])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_gains_are_found(seed):
+    """Half a stop between cameras, to 3 %; photographs that are divided by them agree again."""
+    batch = painted(2)
+    gains = drawn(batch, seed)
+    dark = seen_with(batch, gains)
+    found = log_gains(splats(dark), dark)
+    assert np.abs(np.log(gains)).max() > 0.1
+    np.testing.assert_allclose(found, np.log(gains), atol=0.03)
+    before, after = ((x.images - batch.images).abs().mean() for x in (dark, equalized(splats(dark), dark)[1]))
+    assert after < 0.2 * before
+
+
+def test_equal_cameras_stay_as_they_are():
+    """The estimate's own error is not taken for a gain."""
+    batch = painted(2)
+    assert log_gains(splats(batch), batch).abs().max() < 2e-3
+
+
+def test_differences_below_the_error_of_the_estimate_are_left():
+    """Half a percent between cameras is as likely an error of the depths."""
+    batch = painted()
+    found = log_gains(splats(batch), seen_with(batch, np.exp(drawn(batch, stops=0.02) - 1)))
+    assert 0 < found.abs().max() < 1e-3
+
+
+def test_highlights_do_not_decide():
+    """A camera sees a third of the surface twice as dark as all others do."""
+    batch = painted()
+    gains = drawn(batch)
+    dark = seen_with(batch, gains)
+    images = dark.images.clone()
+    first, last = dark.masks[0, 0].nonzero()[:, 1].float().quantile(torch.tensor([0.3, 0.6])).int()
+    images[:, 0, :, :, first:last] *= 0.5
+    found = log_gains(splats(dark), dataclasses.replace(dark, images=images))
+    np.testing.assert_allclose(found, np.log(gains), atol=0.03)
+
+
+def test_what_a_view_does_not_see_does_not_count():
+    """Cameras all around a surface that is a little darker before than behind."""
+    batch = painted(views=6, spread=360.0, paint=halves)
+    gains = drawn(batch)
+    dark = seen_with(batch, gains)
+    np.testing.assert_allclose(log_gains(splats(dark), dark), np.log(gains), atol=0.02)
+
+
+def test_dark_rims_do_not_count():
+    """Half-covered pixels at the outline of a narrow board are darker in one view than their
+    matte says."""
+    sharp = painted(views=3, spread=20.0, radii=torch.tensor([0.1, 0.8, 0.01]))
+    soft = with_soft_rims(sharp)
+    soft = dataclasses.replace(soft, images=sharp.images * soft.alpha[:, :, None])
+    gains = drawn(soft)
+    dark = seen_with(soft, gains)
+    images = dark.images.clone()
+    images[:, 0] *= torch.where(dark.alpha[:, 0] < 0.9, 0.8, 1.0)[:, None]
+    found = log_gains(splats(soft), dataclasses.replace(dark, images=images))
+    np.testing.assert_allclose(found, np.log(gains), atol=0.03)
+
+
+@pytest.mark.parametrize("kind", ["white", "black"])
+def test_colours_without_a_ratio_do_not_count(kind):
+    """Clipped highlights, and shadows that lie on a sensor's black level,
+    on most of the surface."""
+    value = {"white": 0.97, "black": 0.01}[kind]
+    batch = painted(paint=lambda p: torch.where(p[..., 1:2] > 1.1, 0.4, value).expand(p.shape))
+    gains = drawn(batch)
+    dark = seen_with(batch, gains)
+    level = torch.tensor([0.0025 * (kind == "black"), 0, 0, 0])[:, None, None, None]
+    images = (dark.images + level).clamp(max=1) * batch.masks[:, :, None]
+    found = log_gains(splats(batch), dataclasses.replace(dark, images=images))
+    np.testing.assert_allclose(found, np.log(gains), atol=0.03)
+
+
+def test_batch_mates_change_nothing():
+    both = painted(2)
+    dark = seen_with(both, drawn(both))
+    together = log_gains(splats(dark), dark)
+    for b in range(2):
+        parts = {name: getattr(dark, name)[[b]] for name in ("images", "masks", "cameras", "depths")}
+        alone = dataclasses.replace(dark, **parts)
+        torch.testing.assert_close(log_gains(splats(alone), alone), together[[b]], atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_photographs_that_say_nothing_have_no_gains(value):
+    """Black or white all over; and no Gaussians at all."""
+    batch = painted()
+    flat = dataclasses.replace(batch, images=torch.full_like(batch.images, value))
+    assert not log_gains(splats(flat), flat).any()
+    nothing = splats(batch).select(slice(0, 0), (0,))
+    assert not log_gains(nothing, batch).any()
+
+
+def test_the_model_equalizes_before_its_rounds():
+    """Colours of the Gaussians are those of the equalized photographs;
+    without the option they are not."""
+    batch = painted()
+    dark = seen_with(batch, drawn(batch))
+    models = [make_model("model=recurrent", "skip=exact", f"rounds.gains={on}") for on in ("false", "true")]
+    models[1].keeps_drafts = True
+    with torch.no_grad():
+        plain, equal = (model.eval()(dark) for model in models)
+    photos = dark.images.flatten(0, 1).flatten(2).mT
+    own = photos[plain.gaussians.image, plain.gaussians.pixel]
+    torch.testing.assert_close(plain.gaussians.colors, own)
+    assert (equal.gaussians.colors - own).abs().max() > 0.02
+    torch.testing.assert_close(equal.drafts[0].colors, equal.gaussians.colors)
+
+
+def test_photographs_that_are_divided_already_are_not_equalized_again():
+    """To the bit what a model without the option predicts of them, also of some views alone."""
+    batch = painted()
+    dark, logs = seen_with(batch, drawn(batch)), torch.zeros(1, 4, 3)
+    logs[0, 1], logs[0, 3] = 0.1, -2.0
+    known = divided(dark, logs)
+    torch.testing.assert_close(known.images[0, 1], dark.images[0, 1] * math.exp(-0.1))
+    assert torch.equal(known.images[0, 2], dark.images[0, 2])
+    torch.testing.assert_close(known.images[0, 3], (dark.images[0, 3] * math.exp(2)).clamp(max=1))
+    plain, equal = (
+        make_model("model=recurrent", "skip=exact", f"rounds.gains={on}").eval() for on in ("false", "true")
+    )
+    with torch.no_grad():
+        for views in (range(4), (3, 1, 2)):
+            some = known.of_views(views)
+            assert torch.equal(some.log_gains, logs[:, list(views)])
+            without = dataclasses.replace(some, log_gains=None)
+            expected, found = plain(without).gaussians.colors, equal(some).gaussians.colors
+            assert torch.equal(found, expected)
+            assert not torch.equal(equal(without).gaussians.colors, expected)
+
+
+@pytest.mark.parametrize("gamma", [0.8, 1.2])
+@pytest.mark.parametrize("view", range(4))
+def test_the_gamma_of_each_camera_is_found(view, gamma):
+    """In all channels, whatever its exposure; the others have none."""
+    batch = painted(2)
+    gains = drawn(batch)
+    images = (0.6 * batch.images * torch.as_tensor(gains)[..., None, None].float()).clone()
+    images[1, view] **= gamma
+    wrong = dataclasses.replace(batch, images=images)
+    expected = torch.zeros(2, 4, 3)
+    expected[1, view] = math.log(gamma)
+    torch.testing.assert_close(log_gammas(splats(wrong), wrong), expected, atol=0.04, rtol=0)

@@ -1,0 +1,206 @@
+"""Rounds: where they start, that they stay within bounds, that they learn."""
+
+import dataclasses
+import itertools
+
+import lightning.pytorch as L
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from ghgs_lit.config import run_of
+from ghgs_lit.errors import InputError
+from ghgs_lit.losses import terms
+from ghgs_lit.method.model import GHGS
+from ghgs_lit.method.rounds import RoundsOptions
+from ghgs_lit.rendering import render
+from ghgs_lit.training import GHGSModule, Optimization
+from ghgs_lit.types import Targets
+from tests.helpers.losses import losses_of
+from tests.helpers.models import ATTRIBUTES, close, config, make_model
+from tests.helpers.scenes import make_batch
+
+RECURRENT = ("model=recurrent", "skip=exact", "rounds.hidden=16", "rounds.depths=4")
+
+
+def model(*overrides, kick=0.0, seed=0):
+    found = make_model(*RECURRENT, *overrides, seed=seed).eval()
+    found.keeps_drafts = True
+    if kick:
+        torch.nn.init.normal_(found.rounds.change[-1].weight, std=kick)
+        torch.nn.init.normal_(found.rounds.exchange.hear.weight, std=kick)
+    return found
+
+
+def test_untrained_rounds_change_nothing():
+    batch, recurrent = make_batch(2, 3), model("rounds.gains=false")
+    with torch.no_grad():
+        found = recurrent(batch)
+        recurrent.rounds = None
+        expected = recurrent(batch)
+    assert torch.equal(found.depth, expected.depth)
+    for name in ATTRIBUTES:
+        assert torch.equal(getattr(found.gaussians, name), getattr(expected.gaussians, name)), name
+    assert len(found.rounds) == 3
+    assert len(found.drafts) == 2
+    assert not model("rounds.gains=false").train()(batch).drafts  # nothing reads them
+    assert torch.equal(found.depth, found.rounds[-1].depth)
+
+
+@pytest.mark.parametrize("count", [1, 8])
+def test_more_rounds_than_trained_stay_within_bounds(count):
+    """Whatever the weights are: depths between near and far, everything finite."""
+    batch = make_batch(1, 4)
+    wild = model(kick=30.0)
+    wild.rounds.count = count
+    with torch.no_grad():
+        found = wild(batch)
+    assert len(found.rounds) == count + 1
+    for maps in found.rounds[1:]:
+        depth, bounds = maps.depth[maps.valid], maps.bounds
+        slack = 1e-5 * depth
+        assert (depth >= bounds.near[maps.valid] - slack).all()
+        assert (depth <= bounds.far[maps.valid] + slack).all()
+    for name in ATTRIBUTES:
+        assert getattr(found.gaussians, name).isfinite().all(), name
+    assert (found.rounds[-1].depth != found.rounds[0].depth)[batch.masks].float().mean() > 0.9
+
+
+def test_gaussians_that_are_replaced_need_no_gradient():
+    """Training, which computes none for them, has the gradients of evaluation, which does."""
+    batch, kicked = make_batch(1, 4), model("rounds.training_counts=[2]", kick=0.1)
+    learned, found = [p for p in kicked.parameters() if p.requires_grad], []
+    for is_training in (False, True):
+        gaussians = kicked.train(is_training)(batch).gaussians
+        loss = sum(getattr(gaussians, name).square().mean() for name in ATTRIBUTES)
+        slopes = torch.autograd.grad(loss, learned, allow_unused=True, materialize_grads=True)
+        found.append(torch.cat([slope.flatten() for slope in slopes]))
+    assert found[0].norm() > 0
+    assert (found[1] - found[0]).norm() < 1e-3 * found[0].norm()
+
+
+def test_a_batch_equals_its_elements_and_the_order_of_other_views_does_not_matter():
+    batch, kicked = make_batch(2, 4), model(kick=0.5)
+    with torch.no_grad():
+        together = kicked(batch)
+        alone = [
+            kicked(
+                dataclasses.replace(
+                    batch,
+                    images=batch.images[b : b + 1],
+                    masks=batch.masks[b : b + 1],
+                    cameras=batch.cameras[b : b + 1],
+                    depths=None,
+                )
+            )
+            for b in range(2)
+        ]
+    for b in range(2):
+        close(together.gaussians[b], alone[b].gaussians, 2e-4)
+
+
+def test_gradients_reach_every_weight_and_every_round_is_supervised():
+    batch = make_batch(1, 3)
+    kicked = model(kick=0.1).train()
+    prediction = kicked(batch)
+    rendering = render(prediction.gaussians, batch.cameras)
+    loss = (rendering.image - batch.images).abs().mean() + terms.depth(prediction, rendering, batch)
+    loss.backward()
+    for name, parameter in kicked.rounds.named_parameters():
+        assert parameter.grad.isfinite().all(), name
+        assert parameter.grad.any(), name
+    assert any(p.grad is not None and p.grad.any() for p in kicked.encoder.parameters())
+    error = [
+        (m.depth - batch.depths).abs()[batch.masks & (batch.depths > 0)].mean() for m in prediction.rounds
+    ]
+    assert torch.isclose(terms.depth(prediction, rendering, batch), torch.stack(error).sum(), rtol=1e-5)
+
+
+def test_half_precision_gives_finite_values():
+    batch, kicked = make_batch(1, 3), model(kick=0.5)
+    with torch.no_grad(), torch.autocast("cpu", dtype=torch.bfloat16):
+        found = kicked(batch)
+    for name in ATTRIBUTES:
+        value = getattr(found.gaussians, name)
+        assert value.dtype == torch.float32, name
+        assert value.isfinite().all(), name
+
+
+def test_options_are_checked():
+    with pytest.raises(InputError, match=r"rounds\.exchange: expected an integer >= 1 and <= 65536 or null"):
+        RoundsOptions(exchange=0)
+    run_of("train", ["model=recurrent", "encoder=vggt_nano", "rounds.exchange=null"])
+    assert model("rounds.exchange=null").rounds.exchange is None
+    with pytest.raises(InputError, match=r"rounds: expected .* bounds"):
+        GHGS.from_config(
+            config(
+                *RECURRENT,
+                "bounds=none",
+                "depth_head.parameterization=inverse_linear",
+                "depth_head.consistency_depths=0",
+                "encoder.bounds_input=false",
+            )
+        )
+
+
+def test_what_padding_added_is_cut_off_every_round():
+    batch = make_batch(1, 2, 50, 50)
+    with torch.no_grad():
+        found = model("model.pad=multiple", "model.frame=world", kick=0.1)(batch)
+    assert torch.equal(found.rounds[-1].depth, found.depth)
+    assert {maps.depth.shape for maps in found.rounds} == {batch.masks.shape}
+    assert found.drafts
+    for draft in found.drafts:
+        assert torch.equal(draft.pixel, found.gaussians.pixel)
+
+
+def test_validation_shows_what_each_round_is_worth():
+    """PSNR and depth error before each round:
+    those of the whole model where rounds change nothing."""
+    batch = make_batch(1, 3)
+    batch = dataclasses.replace(batch, targets=Targets(batch.images, batch.masks, batch.cameras))
+    trained = GHGSModule(
+        model("rounds.gains=false"), render, losses_of({"render_l1": 1.0}), Optimization(lr=1.0), {}
+    )
+    trainer = L.Trainer(
+        accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False
+    )
+    (found,) = trainer.validate(trained, DataLoader([batch], batch_size=None), verbose=False)
+    for name in ("psnr", "depth_error_mm"):
+        before = [found[f"val/{name}_before_round_{number}"] for number in (1, 2)]
+        assert before == pytest.approx([found[f"val/{name}"]] * 2, rel=1e-4)
+
+
+def test_each_round_changes_half_as_much_as_the_one_before():
+    """Raw attributes, and how far depths may move:
+    with the same output of the network each round."""
+    batch, recurrent = make_batch(1, 3), model("rounds.gains=false")
+    recurrent.rounds.count = 3
+    torch.nn.init.constant_(recurrent.rounds.change[-1].bias, 0.01)
+    states = []
+    recurrent.rounds.register_forward_hook(lambda module, inputs, found: states.extend(found))
+    with torch.no_grad():
+        recurrent(batch)
+    for name in ("offset", "scale", "rotation", "opacity"):
+        values = [getattr(state.raw, name) for state in states]
+        for number, (before, after) in enumerate(itertools.pairwise(values)):
+            expected = torch.full_like(after, 0.01 * 0.5**number)
+            torch.testing.assert_close(after - before, expected, rtol=0, atol=1e-5)
+    depths = [state.depth_maps.depth[batch.masks] for state in states]
+    moved = [(after - before).mean() for before, after in itertools.pairwise(depths)]
+    assert moved[0] > 0
+    assert float(moved[1] / moved[0]) == pytest.approx(0.5, rel=0.05)
+    assert float(moved[2] / moved[0]) == pytest.approx(0.25, rel=0.05)
+
+
+def test_depths_are_compared_between_near_and_far_only(monkeypatch):
+    """However far a round may search."""
+    monkeypatch.setattr("ghgs_lit.method.rounds.rounds.REACH", 1.0)
+    batch, wild = make_batch(1, 4), model(kick=30.0)
+    wild.rounds.count = 1
+    with torch.no_grad():
+        maps = wild(batch).rounds[1]
+    depth, near, far = (x[maps.valid] for x in (maps.depth, maps.bounds.near, maps.bounds.far))
+    assert (depth >= near - 1e-5 * depth).all()
+    assert (depth <= far + 1e-5 * depth).all()
+    assert ((depth > far - 1e-3) | (depth < near + 1e-3)).any()  # it went as far as it may
