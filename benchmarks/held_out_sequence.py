@@ -5,17 +5,17 @@
 
 Cameras are corrected with all photographs (the calibration is theirs), once, as `ghgs predict`
 does; so are colour gains, with a mean of 1 over those that predict. All ways are measured against
-the same masks: those of the sequence, tested by leaving each view out and cut anew where they fail;
-photographs whose mask still fails are not measured, and counted. Prints over all instants and
-cameras PSNR of the photograph on black, whole and in the box of the subject; there of images scaled
-to one brightness; and there of the photograph as it is, the render before the background, which
-asks no mask. Flicker in place (thousandths of white) of the first and of the last; the share of
-instants that were predicted anew; CPU seconds of an instant without the rig's. A black render has
-the flicker of the photographs. Generated people stand in the same rig, with exact masks, cameras
-and exposures: what the protocol leaves of sound data. What is done stays in --out, and is not done
-again: a run that was stopped goes on. Each instant is said, and in --out/results.json at once.
-Weights that learned from the odd instants predict the even ones, and the other way round:
-`--adapted odd.ckpt even.ckpt`.
+the same masks: those of the sequence, cut anew where they fail. Photographs whose mask still fails, by
+the hull of the others or by the background (`is_contradicted`), are counted and not measured. Prints
+over all instants and cameras PSNR of the photograph on black, whole and in the box of the subject;
+there of images scaled to one brightness; and there of the photograph as it is, the render before the
+background, which asks no mask. Flicker in place (thousandths of white) of the first and of the
+last; the share of instants that were predicted anew; CPU seconds of an instant without the rig's. A
+black render has the flicker of the photographs. Generated people stand in the same rig, with exact
+masks, cameras and exposures: what the protocol leaves of sound data. What is done stays in --out,
+and is not done again: a run that was stopped goes on. Each instant is said, and in
+--out/results.json at once. Weights that learned from the odd instants predict the even ones, and
+the other way round: `--adapted odd.ckpt even.ckpt`.
 """
 
 import argparse
@@ -32,12 +32,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy import ndimage
 from torch import Tensor
 
-from ghgs_capture.agreement import Agreement
-from ghgs_capture.backgrounds import BACKGROUND_INSTANTS, Backgrounds
+from ghgs_capture.agreement import MISSED, Agreement, reach_of
+from ghgs_capture.backgrounds import BACKGROUND_INSTANTS, UNLIKE, Background, Backgrounds
 from ghgs_capture.capture import Capture
-from ghgs_capture.crops import Photograph
+from ghgs_capture.crops import Photograph, shrunk
 from ghgs_capture.doubts import CORRECTION, doubt_of_masks
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.prediction import crop_size, in_frame
@@ -68,6 +69,8 @@ WAYS = {
 }
 COLUMNS = ("whole", "box", "box_40", "photograph", "flicker", "flicker_photograph", "anew", "seconds")
 BOX = COLUMNS.index("box")
+#: Levels of 255 below which a pixel shows the background, and above which it does not.
+SAME, DIFFERENT = 8, 40
 
 
 class Measured:
@@ -138,10 +141,16 @@ class Measured:
         """Of each camera: photographs on black and as they are, verified masks, halved."""
         backgrounds = self.shared[0]
         capture = backgrounds.applied(Capture(name, self.folder.photographs(name)))
-        agreement = Agreement.of(capture)
-        failed = [False] * len(capture.photographs) if agreement is None else agreement.failed
-        both = zip(capture.photographs, failed, strict=True)
-        return [_truth(p, backgrounds.cameras[p.name], bool(fails)) for p, fails in both]
+        small = tuple(shrunk(p, backgrounds.factors[p.name]) for p in capture.photographs)
+        agreement = Agreement.of(Capture(name, small))
+        truths = []
+        for view, photograph in enumerate(capture.photographs):
+            behind = backgrounds.cameras[photograph.name]
+            fails = agreement.failed[view] or is_contradicted(
+                small[view], behind, agreement.depth_in_others(view)
+            )
+            truths.append(_truth(photograph, behind, bool(fails)))
+        return truths
 
     @torch.no_grad()
     def drawn(self, way: str, name: str, view: int, temporal: Temporal) -> tuple[Tensor, int, float]:
@@ -215,6 +224,23 @@ class Measured:
         return rows
 
 
+def is_contradicted(photograph: Photograph, behind: Background, inside: np.ndarray) -> bool:
+    """Whether a mask shows the background, or lacks what differs from it inside the others' hull, in
+    thick parts of more than ``MISSED`` of its area: the hull alone passes half a head.
+
+    Args:
+        photograph: of the background's size.
+        inside: pixels by which each pixel lies inside the hull of the other masks [h, w].
+    """
+    mask = photograph.mask
+    off = ndimage.uniform_filter(np.abs(photograph.image - behind.image).max(-1), 3)
+    odds = ndimage.uniform_filter(behind.odds_of(photograph.image), 3)
+    keeps = mask & np.where(behind.known, off < SAME, odds < UNLIKE)
+    lacks = ~mask & behind.known & (off > DIFFERENT) & (inside > 0)
+    parts = (ndimage.binary_opening(part, iterations=reach_of(mask.shape)) for part in (keeps, lacks))
+    return max(part.sum() for part in parts) > MISSED * mask.sum()
+
+
 def with_gains_of(rig: Rig | None, batch: Batch) -> Batch:
     """Photographs divided by the rig's gains, whose mean over these cameras is 1; as they are where
     it has none."""
@@ -260,7 +286,7 @@ def _halved(lens: np.ndarray, batch: Batch, view: int, truth: dict[str, Tensor])
     return Cameras(lens.to(pose)[None, None], pose[None, None], *truth["mask"].shape)
 
 
-def _truth(photograph: Photograph, behind: Any, fails: bool) -> dict[str, Any]:
+def _truth(photograph: Photograph, behind: Background, fails: bool) -> dict[str, Any]:
     sides = [side // 2 for side in photograph.mask.shape]
 
     def halved(image: np.ndarray) -> Tensor:

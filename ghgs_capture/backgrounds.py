@@ -37,7 +37,7 @@ _SHADED = (0.4, 1.0)  #: Share of the light that a shadow leaves
 _BINS = 16  #: Levels of a channel that a histogram of colours counts together
 #: Correlation of brightness above which a part shows the background: a grey shirt is no grey wall.
 _ALIKE = 0.9
-_UNLIKE = -1.0  #: Mean odds of colours below which a part is not the subject's
+UNLIKE = -1.0  #: Mean odds of colours below which a part is not the subject's
 # Energies of a pixel, in those of a pixel of the background: what the background says at least and
 # at most; what colours do where it is not known; the given mask; a place inside and outside of the
 # others' hull, and outside of two of them.
@@ -56,7 +56,7 @@ _ROUNDS = 3  #: Masks mended in one round are the others' hulls in the next
 
 
 @dataclass(frozen=True)
-class _Background:
+class Background:
     """The background of one camera."""
 
     image: np.ndarray  #: [h, w, 3] float32, levels from 0 to 255
@@ -66,7 +66,7 @@ class _Background:
     @classmethod
     def of(
         cls, photographs: Sequence[Photograph], covered: Sequence[np.ndarray], trusted: Sequence[Photograph]
-    ) -> "_Background":
+    ) -> "Background":
         """The background that photographs of one camera share.
 
         At each pixel it is the mean of a quarter of them (at least three), those that agree best.
@@ -145,11 +145,11 @@ class _Background:
         noise = max(1.4826 * float(np.median(outside)), _NOISE) if len(outside) else np.inf
         away = ndimage.uniform_filter(off, 3) / (_DEVIATIONS / 2 * noise)
         seen = (away**2 / 2 - 2).clip(*_FROM_BACKGROUND)
-        colors = self._odds_of(image)
+        colors = self.odds_of(image)
         evidence = np.where(known, seen + colors / 2, colors)
         return evidence + np.where(mask, _FROM_MASK, -_FROM_MASK)
 
-    def _odds_of(self, image: np.ndarray) -> np.ndarray:
+    def odds_of(self, image: np.ndarray) -> np.ndarray:
         """:attr:`odds` of the colours of pixels [..., 3] uint8."""
         return self.odds[tuple(np.moveaxis(image // (256 // _BINS), -1, 0))]
 
@@ -189,7 +189,7 @@ class _Background:
         far = np.zeros_like(mask) if hull is None else hull < -reach
 
         def is_background(part: np.ndarray) -> bool:
-            shows_it = _is_alike(image[part], behind[part]) or self._odds_of(image[part]).mean() < _UNLIKE
+            shows_it = _is_alike(image[part], behind[part]) or self.odds_of(image[part]).mean() < UNLIKE
             return far[part].mean() > 0.5 or (known[part].mean() > 0.5 and shows_it)
 
         gone = _parts(_large(mask & ~cut, mask, reach), is_background)
@@ -247,7 +247,7 @@ def _large(parts: np.ndarray, mask: np.ndarray, reach: int) -> np.ndarray:
 class Backgrounds:
     """The backgrounds of a rig that stands still, by camera."""
 
-    cameras: Mapping[str, _Background]
+    cameras: Mapping[str, Background]
     #: Pixels of photographs along a side of one of the backgrounds
     factors: Mapping[str, int] = field(default_factory=dict)
 
@@ -282,7 +282,7 @@ class Backgrounds:
         for name, of_camera in photographs.items():
             shapes = {photograph.mask.shape for photograph in of_camera}
             if len(of_camera) >= _MIN_BACKGROUND and len(shapes) == 1:
-                cameras[name] = _Background.of(of_camera, covered[name], trusted.get(name, of_camera))
+                cameras[name] = Background.of(of_camera, covered[name], trusted.get(name, of_camera))
         return cls(cameras, factors)
 
     def applied(self, capture: Capture) -> Capture:
