@@ -10,7 +10,7 @@ from pydantic import Field
 
 from ghgs_lit.cli.verb import Budgets, Device, Measured, Training, Verb
 from ghgs_lit.config.nodes import SequenceOptions, Texts, Turntable
-from ghgs_lit.config.options import CropSize, Index, PathText, Positive, Seed, Text, Words
+from ghgs_lit.config.options import CropSize, Index, PathText, Positive, Seed, Text
 
 Axis = Literal["y", "-y", "z"]
 
@@ -106,9 +106,6 @@ class View(Predict):
     opens = ()
     reads_data = False
 
-    images: PathText | Annotated[dict, Words("a folder or a mapping of cameras to devices")] | None = None
-    """As for ``ghgs predict``; with live also {camera: number of a device, or address of a stream},
-    which OpenCV opens."""
     path: PathText | None = None
     """A directory of ``ghgs predict`` (its formats ply and inputs), or a PLY;
     null: predict first."""
@@ -123,13 +120,6 @@ class View(Predict):
     """The next free one is taken where it is in use."""
     seconds: Positive | None = None
     """The page is closed after so long; null: never."""
-    live: bool = False
-    """Show the newest instant of images again and again: of a folder that is being written, of
-    videos at their rate, or of cameras. Their calibration is not checked, auto refines nothing, and
-    out gets sequence/0000.ply and so on."""
-    delay: Positive | None = None
-    """Of live: seconds between an instant and its picture after which it is dropped;
-    null: none is."""
 
     def reads_at_once(self) -> bool:
         return False

@@ -17,12 +17,8 @@ from ghgs_lit.data.images import read_image
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.method.bounds import VisualHull
-from ghgs_lit.metrics import flip_map, psnr
-from ghgs_lit.metrics.regions import box_of, mean_over
 from ghgs_lit.ply import read_ply
-from ghgs_lit.rendering import render
 from ghgs_lit.types import Batch, Cameras, Gaussians
-from ghgs_lit.visualization.pictures import colorize, to_uint8
 from ghgs_lit.visualization.turntable import center_of, subject_points, up_direction
 
 _HULL_POINTS = 50_000
@@ -64,30 +60,6 @@ class Content:
         near = VisualHull(dilation=0.0)(self.batch).near
         points = unproject_maps(near, self.batch.cameras)[self.batch.masks]
         return points[:: -(-max(len(points), 1) // _HULL_POINTS)].numpy()
-
-    @torch.no_grad()
-    def comparison(self, view: int) -> dict[str, np.ndarray | float]:
-        """Compare one view with its photograph.
-
-        Args:
-            view: index of the photograph.
-
-        Returns:
-            Pictures [H, W, 3] uint8 ``render``, ``photograph`` and ``FLIP``, and in the subject's
-            box ``psnr`` (dB) and ``flip``, nan where the mask is empty.
-        """
-        camera = self.batch.cameras[:, view : view + 1]
-        target = self.batch.images[:, view]
-        image = render(self.gaussians, camera).image[:, 0].clamp(0, 1)
-        difference = flip_map(image, target)
-        box = box_of(self.batch.masks[:, view])
-        return {
-            "render": to_uint8(image[0]),
-            "photograph": to_uint8(target[0]),
-            "FLIP": colorize(difference[0], 0, 1, "magma"),
-            "psnr": float(psnr(image, target, box)),
-            "flip": float(mean_over(difference, box)),
-        }
 
 
 def read_content(path: str | Path, up: str | None) -> Content:

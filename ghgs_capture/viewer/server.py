@@ -19,8 +19,6 @@ from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.visualization.pictures import to_uint8
 from ghgs_lit.visualization.turntable import pixel_size
 
-PICTURES = ("render", "photograph", "FLIP")
-
 
 def _require_address(host: str) -> None:
     """Refuse an address that is not this machine's: viser would wait for it silently."""
@@ -61,16 +59,15 @@ class Viewer:
     """A running page.
 
     Args:
-        content: what it shows first.
+        content: what it shows.
         host: the address to listen at; ``127.0.0.1`` is seen by this machine alone.
         port: the first one to try.
-        layers: also show cameras, photographs, point cloud and hull, of the first content alone.
 
     Raises:
         InputError: viser is not installed, or this machine has no such address.
     """
 
-    def __init__(self, content: Content, host: str = "127.0.0.1", port: int = 8080, layers: bool = True):
+    def __init__(self, content: Content, host: str = "127.0.0.1", port: int = 8080):
         viser = installed("viser", "viewer", "ghgs view")
         _require_address(host)
         self.content = content
@@ -82,14 +79,10 @@ class Viewer:
         self._prepare()
         with self.server.gui.add_folder("Gaussians"):
             self._add_splat_controls()
-        if layers:
-            self._add_points()
+        self._add_points()
         if content.batch is not None:
             self._place_visitors()
-        if content.batch is not None and layers:
             self._add_cameras()
-            with self.server.gui.add_folder("Photographs"):
-                self._add_comparison()
         self.show_splats()
 
     @property
@@ -100,17 +93,6 @@ class Viewer:
     def stop(self) -> None:
         """Close the page."""
         self.server.stop()
-
-    def show(self, content: Content) -> None:
-        """Show other Gaussians; visitors stay where they are.
-
-        Args:
-            content: the new ones.
-        """
-        with self._lock:
-            self.content = content
-            self._prepare()
-        self.show_splats()
 
     def _prepare(self) -> None:
         """Compute what viser draws of the Gaussians: covariances, colours and opacities."""
@@ -136,8 +118,7 @@ class Viewer:
     def show_splats(self) -> None:
         """Show the Gaussians with the count and the opacity of the controls."""
         with self._lock:
-            # The slider's end means all, also where the first content had fewer.
-            n = None if self.count.value == self.count.max else self.count.value
+            n = self.count.value
             self.splats = self.server.scene.add_gaussian_splats(
                 "/gaussians",
                 self.content.points[0][:n],
@@ -169,11 +150,9 @@ class Viewer:
             node.visible = box.value
 
     def _show_frustums(self) -> None:
-        """Show the cameras; that of the visitors hides its photograph unless ``picture``
-        chooses it."""
+        """Show the cameras but that of the visitors, whose photograph would hide the subject."""
         for view, frustum in enumerate(self._frustums):
-            is_clear = view != self._at or self._shown == "photograph"
-            frustum.visible = self.cameras.value and is_clear
+            frustum.visible = self.cameras.value and view != self._at
 
     def _add_cameras(self) -> None:
         """Add the cameras with their photographs; a click puts the visitors there."""
@@ -232,39 +211,5 @@ class Viewer:
                 client.camera.wxyz = pose["wxyz"]
                 client.camera.position = pose["position"]
                 client.camera.fov = fov
-        self.view.value = self.content.batch.views[0][view]
         self._at = view
         self._show_frustums()
-
-    def _add_comparison(self) -> None:
-        """Add a render and its photograph, with their PSNR and FLIP."""
-        gui = self.server.gui
-        views = self.content.batch.views[0]
-        self.view = gui.add_dropdown("view", views)
-        self.picture = gui.add_button_group("picture", PICTURES, hint="one after the other at one place")
-        self.text = gui.add_markdown("")
-        self._shown = PICTURES[0]
-        self._comparison = self.content.comparison(0)
-        self.image = gui.add_image(self._comparison[self._shown])
-        go = gui.add_button("go to this camera")
-        go.on_click(lambda _: self.go_to(views.index(self.view.value)))
-
-        def show() -> None:
-            self._show_frustums()
-            self.image.image = self._comparison[self._shown]
-            quality = "FLIP {flip:.4f}, PSNR {psnr:.2f} dB".format(**self._comparison)
-            self.text.content = f"{self._shown} of {self.view.value}; in the subject's box: {quality}"
-
-        @self.view.on_update
-        def _(_) -> None:
-            with self._lock:
-                self._comparison = self.content.comparison(views.index(self.view.value))
-                show()
-
-        @self.picture.on_click
-        def _(_) -> None:
-            with self._lock:
-                self._shown = self.picture.value
-                show()
-
-        show()

@@ -38,19 +38,6 @@ def directory(tmp_path_factory):
     return path
 
 
-def test_photographs_are_compared_with_their_own_views(directory):
-    """Each photograph is met within its 8 bits, but not by the Gaussians turned upside down."""
-    content = read_content(directory, None)
-    for view in range(3):
-        found = content.comparison(view)
-        assert found["psnr"] > 45
-        assert found["flip"] < 0.02
-        assert found["render"].shape == found["photograph"].shape == found["FLIP"].shape == (50, 60, 3)
-    gaussians = dataclasses.replace(content.gaussians, means=-content.gaussians.means)
-    assert dataclasses.replace(content, gaussians=gaussians).comparison(1)["psnr"] < 25
-    assert torch.allclose(content.up.float(), torch.tensor([0.0, -1.0, 0.0]), atol=1e-5)
-
-
 def test_the_hull_lies_on_the_silhouettes(directory):
     """Points of the hull are seen inside the (dilated) mask of every view."""
     content = read_content(directory, None)
@@ -84,7 +71,6 @@ def test_the_page_is_served_on_this_machine_and_its_controls_work(directory):
         viewer.show_splats()
         assert viewer.splats.buffer.shape[0] == 7
         assert all(frustum.visible for frustum in viewer._frustums)
-        viewer.view.value = "2"
         viewer.go_to(0)
         assert [frustum.visible for frustum in viewer._frustums] == [False, True, True]
     finally:
@@ -93,7 +79,7 @@ def test_the_page_is_served_on_this_machine_and_its_controls_work(directory):
 
 @pytest.mark.parametrize("up", ["y", "-y", "z"])
 def test_a_ply_alone_is_shown(up, tmp_path):
-    """Without cameras there is neither a hull nor a comparison."""
+    """Without cameras there is no hull."""
     write_ply(body(50, 60), tmp_path / "a.ply")
     content = read_content(tmp_path / "a.ply", up)
     assert content.batch is None
