@@ -113,8 +113,7 @@ def _swept(
 
 def _pairs(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
     cameras = [at_least_float32(x) for x in (batch.cameras.intrinsics, batch.cameras.extrinsics)]
-    relate = _relate if gpu.is_supported(*cameras) else _relations
-    turn, shift, facing = relate(*cameras)
+    turn, shift, facing = _relations(*cameras)
     return turn, shift, ~(facing < WIDEST)
 
 
@@ -192,8 +191,7 @@ def _match(
 
 
 def _smooth(batch: Batch) -> Tensor:
-    images = batch.once(surface_colors)
-    return (_smoothing if gpu.is_supported(images) else _smoothed)(images, batch.masks)
+    return _smoothed(batch.once(surface_colors), batch.masks)
 
 
 def _smoothed(
@@ -248,14 +246,9 @@ def _relations(
     return turn, shift[..., 0], relative[..., 2, 2].clone()
 
 
-_KERNELS = "ghgs_lit.geometry.cuda"
-_relate = gpu.operator(
-    "relations(Tensor intrinsics, Tensor extrinsics) -> (Tensor, Tensor, Tensor)", _relations, _KERNELS
-)
-_smoothing = gpu.operator("smoothed(Tensor images, Tensor masks) -> Tensor", _smoothed, _KERNELS)
 _sweep = gpu.operator(
     "swept(Tensor pixels, Tensor near, Tensor far, Tensor colors, Tensor turn, Tensor shift, "
     "Tensor compared, int steps, float tolerance) -> Tensor",
     _swept,
-    _KERNELS,
+    "ghgs_lit.geometry.cuda",
 )

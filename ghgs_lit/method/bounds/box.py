@@ -5,7 +5,7 @@ has a gradient."""
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 from pydantic import Field
 from torch import Tensor
 
@@ -14,7 +14,6 @@ from ghgs_lit.geometry.constants import constant
 from ghgs_lit.geometry.frame import in_cameras, subject_center
 from ghgs_lit.geometry.masks import first_and_last
 from ghgs_lit.geometry.projection import focal_lengths, project
-from ghgs_lit.kernels import gpu
 from ghgs_lit.method.bounds import agreement
 from ghgs_lit.method.bounds.rays import (
     NEAREST,
@@ -176,24 +175,6 @@ def _carve(
     steps = constant(torch.arange, CELLS, like=lower) + 0.5
     position = lower[..., None] + cell[..., None] * steps
     matrices = projection_matrices(cameras)
-    carve = _carving if gpu.is_supported(matrices, position) else _carved
-    return carve(outside, matrices, position, tolerance)
-
-
-def _carved(
-    outside: UInt8[Tensor, "B V h w"],
-    matrices: Float[Tensor, "B V 3 4"],
-    position: Float[Tensor, "B 3 n"],
-    tolerance: int,
-) -> Bool[Tensor, "B n n n"]:
-    """Cells of a grid that at most ``tolerance`` views place outside; see :func:`subject_box`.
-
-    Args:
-        outside: 1 where a view says "outside".
-        matrices: of projection.
-        position: centres of the cells along each axis, in metres.
-        tolerance: votes that a cell may have.
-    """
     columns = matrices.movedim(2, 0)[..., None]
     x, y, z = (columns[..., :3, :] * position[:, None]).unbind(3)
     z = z + columns[..., 3, :]
@@ -201,13 +182,6 @@ def _carved(
     count = outside.shape[0] * outside.shape[1]
     image = constant(torch.arange, count, like=outside, dtype=torch.long).view(*outside.shape[:2], 1, 1, 1)
     return look_up(outside.flatten(0, 1), image, pixels).sum(1) <= tolerance
-
-
-_carving = gpu.operator(
-    "carved(Tensor outside, Tensor matrices, Tensor position, int tolerance) -> Tensor",
-    _carved,
-    "ghgs_lit.method.bounds.cuda",
-)
 
 
 def _reach(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Float[Tensor, "B 3"]) -> Tensor:

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from ghgs_lit.extents import bucket_size, true_places
 from ghgs_lit.geometry.constants import constant, middles, other_images
-from ghgs_lit.kernels import gpu
 from ghgs_lit.kernels.pool import at_once, even_parts
 from ghgs_lit.method.bounds import cpu
 from ghgs_lit.method.bounds.box import SubjectBox
@@ -97,9 +96,6 @@ def hull_bounds(
     outside = votes_outside(dilate(masks, radius), voting, cut)
     directions = ray_directions(cameras)
     matrices = projection_matrices(cameras)
-    if gpu.is_supported(start.near, directions, matrices):
-        tables = (outside, masks, matrices, directions, cameras.centers)
-        return DepthBounds(*_marching(*tables, start.near, start.far, samples, tolerance))
     steps = constant(middles, samples, like=start.near)
     if cpu.fits(start.near, directions, matrices):
         return cpu.march(outside, masks, matrices, directions, cameras.centers, start, steps, tolerance)
@@ -161,49 +157,6 @@ def _march(
     last = depth.gather(1, samples - 1 - inside.flip(1).argmax(1, keepdim=True))[:, 0] + half
     near.view(-1)[rays] = torch.where(hit, first, begin)
     far.view(-1)[rays] = torch.where(hit, last, end)
-
-
-def _marched(
-    outside: UInt8[Tensor, "B V h w"],
-    masks: Bool[Tensor, "B V h w"],
-    matrices: Float[Tensor, "B V 3 4"],
-    directions: Float[Tensor, "B V h w 3"],
-    centers: Float[Tensor, "B V 3"],
-    near: Float[Tensor, "B V h w"],
-    far: Float[Tensor, "B V h w"],
-    samples: int,
-    tolerance: int,
-) -> tuple[Float[Tensor, "B V h w"], Float[Tensor, "B V h w"]]:
-    """:func:`_march` for all pixels of ``masks``: new bounds within ``near`` and ``far``.
-
-    Args:
-        outside: 1 where a view says "outside".
-        masks: the subject's pixels, whose rays are marched.
-        matrices: of projection.
-        directions: of the rays.
-        centers: of the cameras.
-        near: depth in metres from which others are tried.
-        far: depth to which they are.
-        samples: number of depths that are tried.
-        tolerance: votes that an allowed depth may have.
-
-    Returns:
-        Near and far.
-    """
-    start = DepthBounds(near, far)
-    new_bounds = [bound.clone(memory_format=torch.contiguous_format) for bound in (near, far)]
-    steps = (torch.arange(samples, device=near.device, dtype=near.dtype) + 0.5) / samples
-    rays = masks.flatten().nonzero()[:, 0]
-    _march(rays, outside, matrices, directions, centers, start, *new_bounds, steps, tolerance)
-    return tuple(new_bounds)
-
-
-_marching = gpu.operator(
-    "marched(Tensor outside, Tensor masks, Tensor matrices, Tensor directions, Tensor centers, Tensor near, "
-    "Tensor far, int samples, int tolerance) -> (Tensor, Tensor)",
-    _marched,
-    "ghgs_lit.method.bounds.cuda",
-)
 
 
 def _enlarge(values: Tensor, stride: int, size: tuple[int, int]) -> Tensor:

@@ -18,7 +18,6 @@ from ghgs_lit.geometry.projection import (
     pixel_centers,
     world_to_camera,
 )
-from ghgs_lit.kernels import gpu
 from ghgs_lit.types import Cameras, DepthBounds
 
 
@@ -160,8 +159,7 @@ def dilate(
         radius: pixels by which all masks grow.
         more: pixels by which those of each element grow more; None: 0.
     """
-    along = _grow if gpu.is_supported(masks, more) else _grown
-    return along(along(masks, radius, more, -2), radius, more, -1)
+    return _grown(_grown(masks, radius, more, -2), radius, more, -1)
 
 
 def _grown(masks: Tensor, radius: int, more: Tensor | None, axis: int) -> Tensor:
@@ -183,13 +181,6 @@ def _grown(masks: Tensor, radius: int, more: Tensor | None, axis: int) -> Tensor
     low = (index - radius).clamp(min=0)
     high, low = (counts.gather(axis, ends.long().expand(masks.shape)) for ends in (high, low))
     return high > low
-
-
-_grow = gpu.operator(
-    "dilated(Tensor masks, int radius, Tensor? more, int axis) -> Tensor",
-    _grown,
-    "ghgs_lit.method.bounds.cuda",
-)
 
 
 def votes_outside(

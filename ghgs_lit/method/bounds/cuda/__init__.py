@@ -1,1 +1,0 @@
-"""Bounds for GPUs: each search of a hull is one kernel."""
