@@ -27,7 +27,7 @@ from ghgs_lit.runs.job import BUSY, check_config, check_launcher
 from ghgs_lit.runs.planned import PlannedRun, Rehearse, print_plan, print_results, shared_overrides
 from ghgs_lit.runs.processes import queue_again
 from ghgs_lit.runs.provenance import config_hash, differences
-from ghgs_lit.runs.run import PLAN, SWEPT, RunDirectory, State
+from ghgs_lit.runs.run import PLAN, SWEPT, RunDirectory, State, runs_in_order
 from ghgs_lit.runs.signals import Interrupted, interruptible, print_how_to_go_on, stop_if_interrupted
 
 
@@ -250,7 +250,7 @@ def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Pat
 
     Args:
         planned: All runs of the sweep.
-        config: Configuration of the command, for ``multirun.yaml``.
+        config: Configuration of the command, for ``multirun.yaml``, which also lists the runs.
         directory: Of the sweep.
     """
     titles = {RunDirectory(path.parent).title for path in directory.glob(f"*/{SWEPT}")}
@@ -265,7 +265,9 @@ def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Pat
             if item.directory.title in titles:  # of a grid with other settings in the same folder
                 write_text_atomically(item.directory.path / SWEPT, json.dumps([*swept, f"run={item.name}"]))
             titles.add(item.directory.title)
-    write_text_atomically(directory / PLAN, OmegaConf.to_yaml(config))
+    names = dict.fromkeys([*(item.directory.path.name for item in planned), *runs_in_order(directory)])
+    runs = OmegaConf.to_yaml({"runs": list(names)})
+    write_text_atomically(directory / PLAN, OmegaConf.to_yaml(config) + runs)
 
 
 def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = None) -> list[JobReturn]:

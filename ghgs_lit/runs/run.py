@@ -74,6 +74,22 @@ class Identity(BaseModel):
 SWEPT = "swept.json"
 
 
+def runs_in_order(sweep: Path) -> list[str]:
+    """Names of the folders of a sweep's runs, those of its last command first.
+
+    Args:
+        sweep: Directory of the sweep.
+
+    Returns:
+        Names in the order in which the commands list them; empty where no file does.
+    """
+    with contextlib.suppress(InputError, OSError):
+        names = lookup(read_yaml(sweep / PLAN), "runs")
+        if isinstance(names, list):
+            return list(map(str, names))
+    return []
+
+
 class State(StrEnum):
     """State of a run."""
 

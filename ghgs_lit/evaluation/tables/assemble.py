@@ -2,7 +2,7 @@
 
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import pandas as pd
@@ -24,8 +24,6 @@ from ghgs_lit.evaluation.tables.notes import write_caption, write_notes
 from ghgs_lit.evaluation.tables.records import SETTING, Planned, Sweep
 from ghgs_lit.evaluation.tables.variants import Variant
 
-NO_FIGURE = "-"
-"""Where there is no figure, as the paper prints it."""
 BASELINES = {
     "black": "Black image",
     "nearest_view": "Nearest input view",
@@ -59,20 +57,18 @@ def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOpt
     layout = options.layout
     if others and layout.rows == "ablation":
         raise InputError(f"others: expected layout=table1, table2 or table3; found {layout.name}")
+    sweep = _runs_of_layout(sweep, options)
     ours = sweep.rows
     if options.subjects is not None:
         ours = _selected(ours, options.subjects, "the runs")
         others = [_selected(rows, options.subjects, rows["source"].iloc[0]) for rows in others]
     if options.targets:
         ours = ours[ours["targets"].isin(options.targets)]
-    if layout.rows == "ablation":
-        ours = ours[[variant.kind == "model" for variant in ours["variant"]]]
     if ours.empty and options.targets:
         expected = (
             f"some of {', '.join(dict.fromkeys(sweep.rows['targets']))}, on which the runs were measured"
         )
         raise InputError(f"evaluation.targets: expected {expected}; found {', '.join(options.targets)}")
-    require(len(ours), "runs", "some of our models", "baselines only")
     rows = pd.concat([ours, *others], ignore_index=True)
     for name in options.metrics or ():
         choice("columns", name, tuple(_measured(rows)))
@@ -87,6 +83,37 @@ def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOpt
         where = theirs.iloc[0]
         raise InputError(f"{where['source']}: expected results on one of {keys}; found {_text(where, same)}")
     return [_table(part, sweep, options) for part in tables]
+
+
+def _runs_of_layout(sweep: Sweep, options: TableOptions) -> Sweep:
+    """The runs that a layout shows, of those of all layouts in a folder: with its numbers of views; on
+    the paper's data, if any are; no baselines among ablations, and none of the paper's ablations
+    among methods.
+
+    Raises:
+        InputError: There are none.
+    """
+    layout = options.layout
+    views = options.views or layout.views
+    rows = sweep.rows[sweep.rows["views"].isin(views)]
+    known = ", ".join(map(str, sorted(set(sweep.rows["views"]))))
+    expected = f"some of {known}, with which the runs were measured"
+    require(len(rows), "evaluation.views", expected, list(views))
+    on_paper = reported_table(layout.reported)[0].split(" and ") if layout.reported else []
+    has_papers = any(data_title(name) in on_paper for name in rows["data"])
+
+    def belongs(variant: Variant, data: str) -> bool:
+        if has_papers and data_title(data) not in on_paper:
+            return False
+        if layout.rows == "ablation":
+            return variant.kind == "model"
+        return variant.kind != "model" or variant.ablation == "full" or variant.is_own
+
+    rows = rows[list(map(belongs, rows["variant"], rows["data"]))]
+    require(len(rows), "runs", f"runs of layout={layout.name}", "baselines or the paper's ablations only")
+    planned = [p for p in sweep.planned if belongs(p.variant, p.data)]
+    planned = [p for p in planned if p.views is None or set(p.views) & set(views)]
+    return replace(sweep, rows=rows, planned=planned)
 
 
 def _selected(rows: pd.DataFrame, names: re.Pattern[str], where: str) -> pd.DataFrame:
@@ -107,7 +134,8 @@ def _selected(rows: pd.DataFrame, names: re.Pattern[str], where: str) -> pd.Data
 
 
 def _measured(rows: pd.DataFrame) -> list[str]:
-    facts = {*SETTING, "variant", "views", "seed", "source", "run", "git", "subject", "count", "said"}
+    facts = {*SETTING, "variant", "views", "trained_views", "seed", "source", "run", "git", "subject"}
+    facts |= {"count", "said", "trained"}
     return [name for name in rows if name not in facts and rows[name].notna().any()]
 
 
@@ -117,15 +145,15 @@ def _text(row: pd.Series, names: list[str]) -> str:
 
 def _table(rows: pd.DataFrame, sweep: Sweep, options: TableOptions) -> Table:
     layout = options.layout
-    planned = _planned_here(rows, sweep, layout)
+    planned = _planned_here(rows, sweep.planned, layout)
     reported = layout.reported if options.reported else None
     groups = _groups(rows, planned, options)
-    variants = list(dict.fromkeys(rows["variant"]))
     models = rows[[v.kind == "model" for v in rows["variant"]]]
     models = rows if models.empty else models
     lpips = "lpips" in models and models.groupby("source")["lpips"].count().all()
     metrics = list(options.metrics or ("psnr", "ssim", "lpips" if lpips else "flip"))
-    lines = _measured_lines(variants, planned, layout)
+    begun = dict.fromkeys([*rows["variant"], *(p.variant for p in planned if not p.done)])
+    lines = _measured_lines(sorted(begun, key=_place_in(sweep.order)), layout)
     figures: list[dict] = []
     if reported:
         names, figures = _reported(layout, reported, groups)
@@ -136,16 +164,21 @@ def _table(rows: pd.DataFrame, sweep: Sweep, options: TableOptions) -> Table:
         lines = [replace(line, stub=(line.variant.ablation, *line.stub)) for line in lines]
     on = reported_table(reported)[0] if reported else None
     table = Table(options, rows, planned, sweep.configs, stub, groups, metrics, lines, reported_on=on)
+    table.others = len(sweep.configs.keys() - set(sweep.rows["source"]))
     fill(table, figures)
     table.caption = write_caption(table)
     table.notes = write_notes(table)
     return table
 
 
-def _planned_here(rows: pd.DataFrame, sweep: Sweep, layout: Layout) -> list[Planned]:
+def _place_in(order: list[Variant]) -> Callable[[Variant], int]:
+    return lambda variant: order.index(variant) if variant in order else len(order)
+
+
+def _planned_here(rows: pd.DataFrame, planned: list[Planned], layout: Layout) -> list[Planned]:
     models = {variant.trained for variant in rows["variant"]}
     data = set(rows["data"])
-    planned = [p for p in sweep.planned if layout.columns == "data" or p.data in data]
+    planned = [p for p in planned if layout.columns == "data" or p.data in data]
     return [p for p in planned if layout.rows != "ablation" or p.variant.trained in models]
 
 
@@ -178,7 +211,7 @@ def _reported(layout: Layout, reported: str, groups: list[Group]) -> tuple[list[
                 cells.append({"line": len(lines), "group": number, "metric": metric, "mean": figure})
         ablation = "" if pair is None else method
         variant = Variant("reported", method, ablation=ablation, switches=pair)
-        lines.append(Line(variant, stub, absent=NO_FIGURE))
+        lines.append(Line(variant, stub))
     return lines, cells
 
 
@@ -186,21 +219,17 @@ def _signs(switches: tuple[bool, bool]) -> tuple[str, str]:
     return tuple("✓" if on else "✗" for on in switches)
 
 
-def _measured_lines(variants: list[Variant], planned: list[Planned], layout: Layout) -> list[Line]:
+def _measured_lines(begun: list[Variant], layout: Layout) -> list[Line]:
     """Rows of all four ablations, then of a user's own; or of baselines, other methods and ours, in
     this order."""
-    begun = list(dict.fromkeys([*variants, *(p.variant for p in planned if not p.done)]))
     if layout.rows == "ablation":
-        first = variants[0]
+        first = begun[0]
         papers = [replace(first, ablation=name, switches=pair) for pair, name in ABLATIONS.items()]
         own = [variant for variant in begun if variant.is_own]
         return [_ablation_line(variant) for variant in (*papers, *own)]
     order = ("baseline", "other", "model")
     models = [v for v in begun if v.kind == "model"]
-    return [
-        Line(v, (_label(v, models),), absent="missing" if v.kind == "model" else NO_FIGURE)
-        for v in sorted(begun, key=lambda v: order.index(v.kind))
-    ]
+    return [Line(v, (_label(v, models),)) for v in sorted(begun, key=lambda v: order.index(v.kind))]
 
 
 def _ablation_line(variant: Variant) -> Line:
@@ -217,7 +246,7 @@ def _label(variant: Variant, models: list[Variant]) -> str:
         return variant.name
 
     def parts(v: Variant) -> list[str]:
-        return [v.model, v.encoder, v.ablation, *(f"{key}={value}" for key, value in v.extra)]
+        return [v.model, v.encoder, v.ablation, *v.titles]
 
     different = [len(set(values)) > 1 for values in zip(*map(parts, models), strict=True)]
     titles = [p for p, differs in zip(parts(variant), different, strict=True) if differs and p not in PEERS]

@@ -129,15 +129,16 @@ def _rivals(
 
 
 def _lacking(table: Table, cell: Any) -> tuple[int, ...]:
-    """Seeds of planned runs that a cell of ours, which has other seeds, still lacks."""
+    """Seeds of planned runs without results that would fill a cell."""
     line, group, _ = cell.Index
-    line = table.lines[line]
     group = table.groups[group]
-    if not line.is_ours or not isinstance(cell.seeds, tuple):
-        return ()
-    planned = (p for p in table.planned if p.variant == line.variant)
-    seeds = {p.seed for p in planned if group.data in (None, data_title(p.data))}
-    return tuple(sorted(seeds - set(cell.seeds)))
+    seeds = set()
+    for planned in table.planned:
+        is_of_cell = planned.variant == table.lines[line].variant and not planned.done
+        is_of_cell &= planned.views is None or group.views in planned.views
+        if is_of_cell and group.data in (None, data_title(planned.data)):
+            seeds.add(planned.seed)
+    return tuple(sorted(seeds.difference(cell.seeds if isinstance(cell.seeds, tuple) else ())))
 
 
 def _competing(table: Table, column: tuple) -> pd.Series:

@@ -148,12 +148,10 @@ class Group:
 
 @dataclass(frozen=True)
 class Line:
-    """A row of a table: a variant, its texts in the first columns,
-    and the text of cells without a number."""
+    """A row of a table: a variant and its texts in the first columns."""
 
     variant: Variant
     stub: tuple[str, ...]
-    absent: str = "missing"
 
     @property
     def is_ours(self) -> bool:
@@ -198,6 +196,7 @@ class Table:
         notes: Below the table.
         reported_on: Data of the reported figures, if any.
         comparisons: Number of comparisons that are corrected together.
+        others: Number of runs that the table does not show.
     """
 
     options: TableOptions
@@ -213,6 +212,7 @@ class Table:
     notes: list[str] = field(default_factory=list)
     reported_on: str | None = None
     comparisons: int = 0
+    others: int = 0
 
     @property
     def layout(self) -> Layout:

@@ -46,7 +46,7 @@ def write_caption(table: Table) -> str:
     ]
     if table.layout.rows == "ablation":
         parts += [f"model `{first['variant'].model}`", f"encoder `{first['variant'].encoder}`"]
-        parts += [f"`{key}={value}`" for key, value in first["variant"].extra]
+        parts += first["variant"].titles
     views = {group.views for group in table.groups}
     if table.layout.heading != "views" and len(views) == 1:
         parts.append(f"{views.pop()} input views")
@@ -78,13 +78,24 @@ def write_notes(table: Table) -> list[str]:
     for name, sets in own_ablations(table).items():
         notes.append(f"`{name}`: {', '.join(f'`{key}={value}`' for key, value in sets.items())}.")
     if "flip" in table.metrics and "lpips" not in table.metrics:
-        notes.append("FLIP replaces the paper's LPIPS, which at least one run could not compute.")
+        notes.append(
+            "FLIP replaces the paper's LPIPS, which at least one run could not compute: `ghgs evaluate`"
+            " measures its checkpoint again where the extra `lpips` and its weights are installed."
+        )
     if table.reported_on:
         notes.append(
             f"Reported: figures that {reported_source()}, prints for {table.reported_on}, measured"
             " by its authors on their data, split and views. They were not measured here, and are"
             " not comparable with figures on other data or protocols."
         )
+    if len(table.groups) > 1 and table.rows["trained_views"].nunique() > 1:
+        notes.append(
+            "Each column shows the model that was trained with as many input views;"
+            " `by=[views.training_counts]` gives each model a row."
+        )
+    if table.others:
+        runs = "runs" if table.others > 1 else "run"
+        notes.append(f"{table.others} further {runs} in the folder: of other data, views or ablations.")
     notes += _about_others(table)
     notes += _about_test(table)
     return notes + _about_neighbors(table) + _about_training(table) + _about_runs(table)

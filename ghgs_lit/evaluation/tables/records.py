@@ -5,7 +5,7 @@ A run is identified by its configuration, never by the name of its directory.
 
 import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,17 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.evaluation.tables.variants import Variant, keys_of_rows, variants_of
+from ghgs_lit.evaluation.tables.variants import (
+    TRAINING_COUNTS,
+    Variant,
+    keys_of_rows,
+    variants_of,
+    views_of_columns,
+    with_views_of_column,
+)
 from ghgs_lit.parsing import read_yaml
 from ghgs_lit.runs.results import KEYS, METHOD, read_results, validated
+from ghgs_lit.runs.run import runs_in_order
 
 SETTING = ["data", "split", "targets", "protocol"]
 """What numbers in one column must have in common."""
@@ -35,12 +43,14 @@ class Planned:
     Attributes:
         variant: Row of its cells.
         data: Name of its data set.
+        views: Numbers of input views of its columns; None: not known.
         seed: Of the run.
         done: Whether it has results.
     """
 
     variant: Variant
     data: str
+    views: tuple[int, ...] | None
     seed: int
     done: bool
 
@@ -53,14 +63,17 @@ class Sweep:
         rows: One for each run, method, number of views, target protocol and subject, with
             ``variant``, ``SETTING``, ``views``, ``seed``, ``source`` (the file), ``run`` (the
             configuration's hash), ``git`` (in words), ``subject``, and the metrics, averaged over
-            the subject's targets.
+            the subject's targets; and ``trained_views``, the number of views of models that share a
+            row because each was trained with another one.
         planned: Training runs, finished or not.
         configs: Configuration of our model by ``source``.
+        order: Variants of our models in the order of rows.
     """
 
     rows: pd.DataFrame = field(default_factory=pd.DataFrame)
     planned: list[Planned] = field(default_factory=list)
     configs: dict[str, Mapping[str, Any]] = field(default_factory=dict)
+    order: list[Variant] = field(default_factory=list)
 
 
 class _Strict(BaseModel):
@@ -143,13 +156,17 @@ def _read_run(path: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
     return rows.assign(**facts), config
 
 
-def _with_variants(rows: pd.DataFrame, model: Variant | None) -> pd.DataFrame:
+def _with_variants(rows: pd.DataFrame, model: Variant | None, views: int | None) -> pd.DataFrame:
     """Rows of a run whose ``method`` is replaced by their ``variant``.
 
     Args:
         rows: Of one run.
         model: Variant of the model's rows; None: there are none.
+        views: Number of views, with which alone the model is shown; None: with all.
     """
+    is_model = rows["method"] == METHOD
+    rows = rows.assign(trained_views=float("nan") if views is None else float(views))
+    rows = rows[~is_model | (views is None) | (rows["views"] == views)]
     variants = {name: model if name == METHOD else Variant("baseline", name) for name in rows["method"]}
     return rows.drop(columns="method").assign(variant=[variants[name] for name in rows["method"]])
 
@@ -168,9 +185,40 @@ def _training_config(path: Path) -> dict[str, Any] | None:
     return config
 
 
-def _planned(path: Path, config: Mapping[str, Any], variant: Variant) -> Planned:
+def _planned(path: Path, config: Mapping[str, Any], variant: Variant, views: int | None) -> Planned:
+    measured = lookup(config, "evaluation.views")
+    measured = [measured] if isinstance(measured, int) else measured
+    columns = None if measured is None else tuple(measured)
     done = (path.parent / "metrics.json").exists()
-    return Planned(variant, str(lookup(config, "data.name")), config.get("seed", 0), done)
+    data = str(lookup(config, "data.name"))
+    return Planned(variant, data, (views,) if views else columns, config.get("seed", 0), done)
+
+
+def _in_order(paths: Iterable[str], folders: Sequence[Path], variants: Mapping[str, Variant]) -> list[str]:
+    """Files of runs in the order of folders, then of the sweep's command, then of their rows' names."""
+    planned = {sweep: runs_in_order(sweep) for sweep in {Path(path).parent.parent for path in paths}}
+
+    def place(path: str) -> tuple:
+        run = Path(path).parent
+        folder = next(i for i, folder in enumerate(folders) if run.is_relative_to(folder))
+        names = planned[run.parent]
+        number = names.index(run.name) if run.name in names else len(names)
+        return folder, natural(str(run.parent)), number, natural(str(variants.get(path))), natural(path)
+
+    return sorted(paths, key=place)
+
+
+def natural(text: str) -> list[str | float]:
+    """Key that sorts texts by the numbers in them.
+
+    Args:
+        text: Such as ``k=10``, which comes after ``k=9``.
+
+    Returns:
+        Parts of the text, every other one a number.
+    """
+    parts = re.split(r"(\d+(?:\.\d+)?(?:e[-+]?\d+)?)", text)
+    return [float(part) if i % 2 else part for i, part in enumerate(parts)]
 
 
 def files_below(folders: Sequence[Path], name: str) -> list[Path]:
@@ -221,11 +269,16 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
     known = set().union(*(flatten(config) for _, config in runs.values()))
     for key in by:
         require(any(is_below(k, [key]) for k in known), "by", "keys of the runs' configurations", key)
-    by = list(dict.fromkeys([*by, *keys_of_rows([*models.values(), *trainings.values()])]))
-    variants = variants_of({**models, **trainings}, by)
-    rows = pd.concat([_with_variants(rows, variants.get(path)) for path, (rows, _) in runs.items()])
-    planned = [_planned(Path(path), config, variants[path]) for path, config in trainings.items()]
-    return Sweep(rows.reset_index(drop=True), planned, models)
+    configs = {**models, **trainings}
+    views = {} if TRAINING_COUNTS in by else views_of_columns(configs)
+    configs |= {path: with_views_of_column(configs[path]) for path in views}
+    by = list(dict.fromkeys([*by, *keys_of_rows(configs.values())]))
+    variants = variants_of(configs, by)
+    paths = _in_order({**runs, **trainings}, folders, variants)
+    rows = [_with_variants(runs[p][0], variants.get(p), views.get(p)) for p in paths if p in runs]
+    planned = [_planned(Path(p), trainings[p], variants[p], views.get(p)) for p in paths if p in trainings]
+    order = list(dict.fromkeys(variants[path] for path in paths if path in variants))
+    return Sweep(pd.concat(rows).reset_index(drop=True), planned, models, order)
 
 
 def person_of(subject: str, unit: re.Pattern[str] | None) -> str:

@@ -21,6 +21,19 @@ from ghgs_lit.errors import require
 from ghgs_lit.parsing import read_yaml
 from ghgs_lit.runs.provenance import config_hash
 
+TRAINING_COUNTS = "views.training_counts"
+"""Key of the numbers of input views that a model is trained with."""
+#: Titles of keys that tell rows apart without being named by the user.
+_KEY_TITLES = {
+    TRAINING_COUNTS: "trained with {} views",
+    "views.training": "input views in training: {}",
+    "targets.training_views": "target views in training: {}",
+    "targets.per_step": "targets a step: {}",
+    "targets.kind": "targets: {}",
+    "targets.view": "target view {}",
+    "targets.positions": "positions of targets: {}",
+    "targets.per_subject": "targets a subject: {}",
+}
 # Keys that identify an encoder of conf/encoder; models change its other keys.
 _ENCODER_KEYS = ("width", "heads", "depth", "layers", "vit")
 
@@ -56,6 +69,11 @@ class Variant:
     def is_own(self) -> bool:
         """Whether this is a row of a user's own ablation."""
         return bool(self.ablation) and is_own_ablation(self.ablation)
+
+    @property
+    def titles(self) -> list[str]:
+        """What distinguishes the row beside model, encoder and ablation, in words."""
+        return [_KEY_TITLES.get(key, key + "={}").format(value.strip("[]")) for key, value in self.extra]
 
     @property
     def trained(self) -> tuple:
@@ -154,6 +172,33 @@ def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()
         has_semantics=bool(lookup(config, "encoder.weights")),
         extra=tuple((key, str(lookup(config, key))) for key in by),
     )
+
+
+def views_of_columns(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
+    """Numbers of views of models that fill one column each, where models on the same data were
+    trained with one number of views each, and not all with the same one.
+
+    Args:
+        configs: Of models, by file.
+
+    Returns:
+        Number of views by file; without models that fill all columns in which they were measured.
+    """
+    counts: dict[str, dict[str, int]] = {}
+    for path, config in configs.items():
+        trained = lookup(config, TRAINING_COUNTS)
+        if isinstance(trained, list | tuple) and len(trained) == 1:
+            counts.setdefault(str(lookup(config, "data.name")), {})[path] = trained[0]
+    views: dict[str, int] = {}
+    for of_data in counts.values():
+        if len(set(of_data.values())) > 1:
+            views |= of_data
+    return views
+
+
+def with_views_of_column(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration that differs from others no more by the number of views in training."""
+    return {**config, "views": {**config["views"], "training_counts": "as many"}}
 
 
 def keys_of_rows(configs: Iterable[Mapping[str, Any]]) -> list[str]:

@@ -12,7 +12,7 @@ from typing import Any
 import pandas as pd
 from tabulate import tabulate
 
-from ghgs_lit.evaluation.tables.layouts import Line, Table, arrow, data_title, decimals, title
+from ghgs_lit.evaluation.tables.layouts import Table, arrow, data_title, decimals, title
 from ghgs_lit.evaluation.tables.notes import MARK
 
 COLUMNS = (
@@ -21,15 +21,19 @@ COLUMNS = (
     "subjects", "selection", "best", "test_seeds", "test_subjects", "test_difference", "test_low",
     "test_high", "test_p", "test_p_holm", "test_smallest", "runs",
 )  # fmt: skip
+NO_FIGURE = "-"
+"""Where there is no figure, as the paper prints it."""
+BEST = " ◂"
+"""Mark of the best value in a terminal."""
 Write = Callable[[str, str, bool], str]
 """Writes a cell of its number, what follows it, and whether it is best."""
 
 
-def _cell(cell: Any, line: Line, write: Write) -> str:
+def _cell(cell: Any, write: Write) -> str:
     """A cell as printed: number, deviation over seeds, mark, interval of its difference,
     missing seeds."""
     if pd.isna(cell.mean):
-        return write(line.absent, "", False)
+        return write("missing" if cell.lacking else NO_FIGURE, "", False)
     digits = decimals(cell.Index[2])
     tail = ""
     if pd.notna(cell.deviation):
@@ -37,7 +41,8 @@ def _cell(cell: Any, line: Line, write: Write) -> str:
     if cell.marked:
         tail += MARK
     if cell.test is not None and cell.test.low is not None:
-        tail += f" [{cell.test.low:+.{digits}f}, {cell.test.high:+.{digits}f}]"
+        ends = [f"{end:+z.{digits}f}" for end in (cell.test.low, cell.test.high)]
+        tail += f" [{', '.join(ends)}]" if any(map(float, ends)) else ""  # equal rows differ by nothing
     if cell.lacking:
         tail += f" ({len(cell.seeds)}/{len(cell.seeds) + len(cell.lacking)})"
     return write(f"{cell.mean:.{digits}f}", tail, cell.best)
@@ -53,7 +58,7 @@ def texts(table: Table, write: Write) -> pd.DataFrame:
     Returns:
         A row for each line, columns by group and metric.
     """
-    cells = [_cell(cell, table.lines[cell.Index[0]], write) for cell in table.cells.itertuples()]
+    cells = [_cell(cell, write) for cell in table.cells.itertuples()]
     return pd.Series(cells, table.cells.index).unstack(["group", "metric"])
 
 
@@ -111,7 +116,7 @@ def to_terminal(table: Table) -> str:
     Returns:
         Plain text with caption and notes.
     """
-    numbers = texts(table, lambda number, tail, best: _bold(number + tail, best))
+    numbers = texts(table, lambda number, tail, best: number + tail + BEST * best)
     rows = []
     for line in itertools.chain.from_iterable(table.blocks):
         first, *more = table.lines[line].stub
@@ -120,7 +125,8 @@ def to_terminal(table: Table) -> str:
             rows.append([mark + first, *more, group.title, *numbers.loc[line][number]])
     names = [*table.stub, "", *(f"{title(metric)} {arrow(metric)}" for metric in table.metrics)]
     text = tabulate(rows, names, disable_numparse=True)
-    paragraphs = (each.replace("`", "").replace("**", "") for each in (table.caption, *table.notes))
+    caption = table.caption.replace("in bold", f"marked{BEST}")
+    paragraphs = (each.replace("`", "").replace("**", "") for each in (caption, *table.notes))
     return "\n\n".join((next(paragraphs), text, *paragraphs)) + "\n"
 
 

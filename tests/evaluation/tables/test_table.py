@@ -15,20 +15,21 @@ from tests.helpers.tables import body, start_run, tables_of, write_run
 
 
 def test_rows_columns_best_and_missing(tmp_path):
-    """All combinations and numbers of views appear, missing ones too,
-    and only a real best is bold."""
+    """All combinations and numbers of views appear; missing are planned ones alone, and only a real
+    best is bold."""
     write_run(tmp_path / "0", "full", 20.0)
     write_run(tmp_path / "1" / "deep", "no_semantic", 21.0, views=(4,))
     write_run(tmp_path / "2", "no_unprojection", 19.0)
+    start_run(tmp_path / "3", "no_semantic", 2, evaluation={"views": [5]})
     (table,) = tables_of(tmp_path)
     rows, header = body(to_markdown(table))
     assert header[2:5] == ["3-view PSNR ↑", "3-view SSIM ↑", "3-view FLIP ↓"]
     assert header[5] == "4-view PSNR ↑"
     assert list(rows) == [("✗", "✗"), ("✗", "✓"), ("✓", "✗"), ("✓", "✓")]
-    assert rows["✗", "✗"] == ["missing"] * 9
+    assert rows["✗", "✗"] == ["-"] * 9
     assert rows["✓", "✓"][0] == "**23.00**"
     assert rows["✓", "✓"][3] == "24.00"
-    assert rows["✓", "✗"] == ["missing"] * 3 + ["**25.00**", "0.9000", "0.1000"] + ["missing"] * 3
+    assert rows["✓", "✗"] == ["-"] * 3 + ["**25.00**", "0.9000", "0.1000"] + ["missing"] * 3
     assert rows["✗", "✓"][6] == "24.00"
     # Equal numbers are not the best of anything.
     assert rows["✓", "✓"][1] == "0.9000"
@@ -93,7 +94,7 @@ def test_a_row_is_told_by_what_was_trained(tmp_path):
     (table,) = tables_of(tmp_path, views=(4,))
     rows, _ = body(to_markdown(table))
     assert rows["✓", "✗"][0] == "24.00"
-    assert rows["✗", "✗"][0] == "missing"
+    assert rows["✗", "✗"][0] == "-"
 
 
 def test_lpips_is_shown_when_every_run_has_it(tmp_path):
@@ -163,8 +164,8 @@ def test_two_runs_of_one_cell_are_refused_and_can_be_told_apart(tmp_path):
     with pytest.raises(InputError, match=expected):
         tables_of(tmp_path)
     first, second = tables_of(tmp_path, by=["optimizer.lr"])
-    assert "`optimizer.lr=0.1`" in first.caption
-    assert "`optimizer.lr=0.2`" in second.caption
+    assert "optimizer.lr=0.1" in first.caption
+    assert "optimizer.lr=0.2" in second.caption
 
 
 def test_the_same_numbers_twice_are_one_run(tmp_path):
@@ -262,12 +263,15 @@ def test_a_table_fits_a_terminal(tmp_path):
         for seed in (1, 2):
             write_run(tmp_path / f"{ablation}{seed}", ablation, psnr + seed / 10, seed=seed)
     start_run(tmp_path / "going", "neither", seed=3)
-    lines = to_terminal(tables_of(tmp_path)[0]).splitlines()
+    text = to_terminal(tables_of(tmp_path)[0])
+    lines = text.splitlines()
     shown = [line for line in lines if line.startswith(("✗", "✓"))]
     assert len(shown) == 4 * 3
     assert sum("(2/3)" in line for line in shown) == 3
     assert max(map(len, shown)) <= 120
-    assert "**23.15 ± 0.07**" in shown[-3]
+    assert "23.15 ± 0.07 ◂ " in shown[-3]
+    assert "best of the measured methods marked ◂ where" in text
+    assert "**" not in text
 
 
 def test_a_row_can_be_told_by_the_checkpoint_that_was_measured(tmp_path):
@@ -290,54 +294,73 @@ def test_a_row_can_be_told_by_the_checkpoint_that_was_measured(tmp_path):
         tables_of(tmp_path, "table2", by=["chekpoint"])
 
 
-def test_a_table_of_numbers_of_views_that_nobody_measured_says_so(tmp_path):
-    """Every cell is missing, in every format."""
-    write_run(tmp_path / "0", "full", 20.0)
-    for layout in ("ablation", "table2"):
-        (table,) = tables_of(tmp_path, layout, views=(7,), reported=False)
-        rows, _ = body(to_markdown(table))
-        assert {cell for row in rows.values() for cell in row} == {"missing"}
-        assert "no subjects" in table.caption
-        assert "missing" in to_terminal(table)
-        assert to_csv([table]).count("\n") == 1 + 3 * len(rows)
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"views": (7,)}, r"evaluation\.views: expected some of 3, 4, 5, with which .*; found .7"),
+        ({"layout": "table3"}, "runs of layout=table3; found .baselines or the paper"),
+    ],
+)
+def test_a_table_of_what_nobody_measured_is_refused(tmp_path, options, message):
+    """No table of empty cells."""
+    write_run(tmp_path / "0", "neither", 20.0)
+    with pytest.raises(InputError, match=message):
+        tables_of(tmp_path, **options)
 
 
 def views(*counts, **changes) -> dict:
     return {"training_counts": list(counts), "training": "any", "evaluation_count": counts[0], **changes}
 
 
-def test_models_trained_with_other_views_have_rows_of_their_own(tmp_path):
-    """Seed 1 of three views and seed 2 of four were averaged as two seeds of one model."""
+def test_each_column_is_of_the_model_that_was_trained_with_so_many_views(tmp_path):
+    """Whatever else it was measured with. `by` gives each a row, as a model of several numbers has."""
     for number, (count, seed) in enumerate([(3, 1), (4, 2), (4, 1)]):
-        write_run(
-            tmp_path / str(number), "full", 20.0 + number, seed, views=(count,), nodes={"views": views(count)}
-        )
-    start_run(tmp_path / "9", "full", 2, views=views(3))
-    (table,) = tables_of(tmp_path, "table2", reported=False, metrics=("psnr",))
-    rows, _ = body(to_markdown(table))
-    assert rows == {
-        "Ours (views.training_counts=[3])": ["23.00 (1/2)", "missing", "missing"],
-        "Ours (views.training_counts=[4])": ["missing", "25.50 ± 0.71", "missing"],
-    }
+        run = tmp_path / str(number)
+        write_run(run, "full", 20.0 + number, seed, views=(3, 4), nodes={"views": views(count)})
+    start_run(tmp_path / "8", "full", 2, views=views(3), evaluation={"views": 3})
+    start_run(tmp_path / "9", "full", 1, views=views(5), evaluation={"views": [5]})
+    options = {"reported": False, "metrics": ("psnr",)}
+    (table,) = tables_of(tmp_path, "table2", **options)
+    assert body(to_markdown(table))[0] == {"Ours": ["23.00 (1/2)", "25.50 ± 0.71", "missing"]}
+    assert any("trained with as many input views" in note for note in table.notes)
     assert not any("differ also" in note for note in table.notes)
-    three, four = tables_of(tmp_path, views=(3, 4), metrics=("psnr",))
-    assert "`views.training_counts=[3]`" in three.caption
-    assert body(to_markdown(four))[0]["✓", "✓"] == ["missing", "25.50 ± 0.71"]
+    (table,) = tables_of(tmp_path, **options)
+    assert body(to_markdown(table))[0]["✓", "✓"] == ["23.00 (1/2)", "25.50 ± 0.71", "missing"]
+    write_run(tmp_path / "several", "full", 20.0, views=(3, 4), nodes={"views": views(3, 4)})
+    (table,) = tables_of(tmp_path, "table2", **options)
+    assert body(to_markdown(table))[0] == {
+        "Ours (trained with as many views)": ["23.00 (1/2)", "**25.50 ± 0.71**", "missing"],
+        "Ours (trained with 3, 4 views)": ["23.00", "24.00", "-"],
+    }
+    (table,) = tables_of(tmp_path, "table2", by=["views.training_counts"], **options)
+    assert body(to_markdown(table))[0]["Ours (trained with 3 views)"] == ["23.00 (1/2)", "24.00", "-"]
+
+
+@pytest.mark.parametrize("planned", [["c", "a", "b"], None])
+def test_rows_stand_in_the_order_of_the_command_else_in_that_of_numbers(tmp_path, planned):
+    """Folders are called by hashes."""
+    for name, rate in (("a", 10), ("b", 9), ("c", 0.25)):
+        write_run(tmp_path / name, "full", 20.0, optimizer={"lr": rate})
+    if planned:
+        (tmp_path / "multirun.yaml").write_text(f"seed: 1\nruns: {planned}\n")
+    (table,) = tables_of(tmp_path, "table2", by=["optimizer.lr"], reported=False)
+    rates = ["0.25", "10", "9"] if planned else ["0.25", "9", "10"]
+    assert [line.stub for line in table.lines] == [(f"Ours (optimizer.lr={rate})",) for rate in rates]
 
 
 @pytest.mark.parametrize(
-    ("key", "values"),
+    ("key", "values", "title"),
     [
-        ("views.training", ["any", "even"]),
-        ("targets.training_views", [[0], [2, 3]]),
-        ("targets.per_step", [1, 2]),
-        ("targets.view", [3, 2]),
-        ("targets.per_subject", [1, "all"]),
+        ("views.training", ["any", "even"], "input views in training: {}"),
+        ("targets.training_views", [[0], [2, 3]], "target views in training: {}"),
+        ("targets.per_step", [1, 2], "targets a step: {}"),
+        ("targets.view", [2, 3], "target view {}"),
+        ("targets.per_subject", [1, "all"], "targets a subject: {}"),
     ],
 )
 @pytest.mark.parametrize("seeds", [(1, 2), (1, 1)])
 @pytest.mark.parametrize("verb", ["train", "evaluate"])
-def test_other_views_and_targets_of_a_training_are_other_rows(tmp_path, key, values, seeds, verb):
+def test_other_views_and_targets_of_a_training_are_other_rows(tmp_path, key, values, title, seeds, verb):
     """They change the model, or what its protocol measures, as much as another learning rate."""
     group, _, name = key.partition(".")
     for number, value in enumerate(values):
@@ -348,7 +371,7 @@ def test_other_views_and_targets_of_a_training_are_other_rows(tmp_path, key, val
         write_run(tmp_path / str(number), "full", 20.0 + number, verb=verb, **about)
     (table,) = tables_of(tmp_path, "table2", reported=False, metrics=("psnr",))
     rows, _ = body(to_markdown(table))
-    assert list(rows) == [f"Ours ({key}={value})" for value in values]
+    assert list(rows) == [f"Ours ({title.format(str(value).strip('[]'))})" for value in values]
     assert [row[0].strip("*") for row in rows.values()] == ["23.00", "24.00"]
 
 

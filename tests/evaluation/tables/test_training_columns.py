@@ -28,7 +28,7 @@ def test_steps_seconds_and_memory_can_be_columns(tmp_path):
     rows, header = body(to_markdown(table))
     assert header[3:] == ["4-view Training steps", "4-view Training (s) ↓", "4-view Training memory (GB) ↓"]
     assert rows["✓", "✓"] == ["**24.00**", "300", "61", "2.5"]
-    assert rows["✗", "✗"] == ["23.00", "300", "**50**", "missing"]
+    assert rows["✗", "✗"] == ["23.00", "300", "**50**", "-"]
     assert "different numbers of steps" not in to_markdown(table)
 
 
@@ -63,7 +63,7 @@ def test_a_row_is_what_the_model_does(tmp_path):
     (table,) = tables_of(tmp_path, views=(4,))
     rows, _ = body(to_markdown(table))
     assert rows["✗", "✓"][0] == "24.00"
-    assert rows["✓", "✓"][0] == "missing"
+    assert rows["✓", "✓"][0] == "-"
 
 
 def test_a_checkpoint_that_was_changed_is_another_row(tmp_path):
