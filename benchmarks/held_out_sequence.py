@@ -9,11 +9,9 @@ the same masks: those of the sequence, cut anew where they fail. Photographs who
 the hull of the others or by the background (`is_contradicted`), are counted and not measured. Prints
 over all instants and cameras PSNR of the photograph on black, whole and in the box of the subject;
 there of images scaled to one brightness; and there of the photograph as it is, the render before the
-background, which asks no mask. Flicker in place (thousandths of white) of the first and of the
-last; the share of instants that were predicted anew; CPU seconds of an instant without the rig's. A
-black render has the flicker of the photographs. Generated people stand in the same rig, with exact
-masks, cameras and exposures: what the protocol leaves of sound data. What is done stays in --out,
-and is not done again: a run that was stopped goes on. Each instant is said, and in
+background, which asks no mask; CPU seconds of an instant without the rig's. Generated people stand in
+the same rig, with exact masks, cameras and exposures: what the protocol leaves of sound data. What is
+done stays in --out, and is not done again: a run that was stopped goes on. Each instant is said, and in
 --out/results.json at once. Weights that learned from the odd instants predict the even ones, and
 the other way round: `--adapted odd.ckpt even.ckpt`.
 """
@@ -43,7 +41,6 @@ from ghgs_capture.doubts import CORRECTION, doubt_of_masks
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.prediction import crop_size, in_frame
 from ghgs_capture.rig import INSTANTS, Rig, corrected_rig, spread
-from ghgs_capture.temporal import Temporal
 from ghgs_capture.verbs import Adapt
 from ghgs_capture.verbs.adapt import with_rig
 from ghgs_lit import GHGS
@@ -52,22 +49,19 @@ from ghgs_lit.config import run_of
 from ghgs_lit.data.view import area_image
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.method.rounds.gains import divided
-from ghgs_lit.metrics.flicker import flicker_in_place
 from ghgs_lit.metrics.functional import decibels, psnr, psnr_box_40
 from ghgs_lit.metrics.regions import box_of, mean_over
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Cameras
 from ghgs_lit.weights.checkpoint import read_config
 
-#: Which masks, cameras and colour gains, whose weights,
-#: and of how many instants one is predicted anew.
+#: Which masks, cameras and colour gains, and whose weights.
 WAYS = {
-    "as given": ("given", "given", "each", "shipped", 1),
-    "auto": ("mended", "once", "once", "shipped", 1),
-    "auto, temporal": ("mended", "once", "once", "shipped", 8),
-    "adapted to the capture": ("mended", "once", "once", "adapted", 1),
+    "as given": ("given", "given", "each", "shipped"),
+    "auto": ("mended", "once", "once", "shipped"),
+    "adapted to the capture": ("mended", "once", "once", "adapted"),
 }
-COLUMNS = ("whole", "box", "box_40", "photograph", "flicker", "flicker_photograph", "anew", "seconds")
+COLUMNS = ("whole", "box", "box_40", "photograph", "seconds")
 BOX = COLUMNS.index("box")
 #: Levels of 255 below which a pixel shows the background, and above which it does not.
 SAME, DIFFERENT = 8, 40
@@ -153,50 +147,43 @@ class Measured:
         return truths
 
     @torch.no_grad()
-    def drawn(self, way: str, name: str, view: int, temporal: Temporal) -> tuple[Tensor, int, float]:
+    def drawn(self, way: str, name: str, view: int) -> tuple[Tensor, float]:
         """A held-out camera: colours and alpha [4, h, w] of the photograph's half size as bytes,
-        how many instants were predicted anew, and CPU seconds."""
-        masks, cameras, gains, weights, _ = WAYS[way]
+        and CPU seconds."""
+        masks, cameras, gains, weights = WAYS[way]
         rig = self.shared[1]
         truth = self.kept(f"truth_{name}", partial(self.truth, name))[view]
         read = self.kept(f"batch_{masks}_{cameras}_{name}", partial(self.batch, masks, cameras, name))
         batch, lenses, before = read
         models = self.models[weights]
         model = models[self.folder.instants.index(name) % len(models)]
-        temporal.predict = partial(in_frame, model)
-        anew, begin = temporal.anew, time.process_time()
+        begin = time.process_time()
         seen = batch.of_views([other for other in range(len(lenses)) if other != view])
-        gaussians = temporal(with_gains_of(rig, seen) if gains == "once" else seen).gaussians
+        gaussians = in_frame(model, with_gains_of(rig, seen) if gains == "once" else seen).gaussians
         seconds = time.process_time() - begin + before
         shown = self.renderer(gaussians, _halved(lenses[view], batch, view, truth))
         image = torch.cat([shown.image[0, 0], shown.alpha[0, 0]]).clamp(0, 1)
-        return (255 * image).round().byte(), temporal.anew - anew, seconds
+        return (255 * image).round().byte(), seconds
 
     def rows(self, way: str) -> np.ndarray:
-        """The columns [cameras, n, 8] of each camera held out; ``black`` draws nothing."""
-        every = 1 if way == "black" else WAYS[way][-1]
-        temporals = [Temporal(partial(in_frame, None), every, self.renderer) for _ in self.cameras]
+        """The columns [cameras, n, 5] of each camera held out; ``black`` draws nothing."""
         found: list[list[list[float]]] = []
-        last: list[Any] = [None] * len(self.cameras)
         for name in self.names:
             found.append([])
             truths = self.kept(f"truth_{name}", partial(self.truth, name))
-            for view, (truth, temporal) in enumerate(zip(truths, temporals, strict=True)):
+            for view, truth in enumerate(truths):
                 image = torch.zeros(4, *truth["mask"].shape, dtype=torch.uint8)
-                costs = [np.nan, np.nan]
+                seconds = np.nan
                 if way != "black":
                     of_weights = "_".join(Path(path).stem for path in self.weights[WAYS[way][3]])
                     place = f"drawn_{way}_{of_weights}_{name}_{self.cameras[view]}"
-                    image, *costs = self.kept(place, partial(self.drawn, way, name, view, temporal))
-                values, pair = compared(*(image.float() / 255).split([3, 1]), truth)
-                now = *pair, truth["mask"]
-                found[-1].append([*values, *flicker_between(last[view], now), *costs])
-                last[view] = now
+                    image, seconds = self.kept(place, partial(self.drawn, way, name, view))
+                found[-1].append([*compared(*(image.float() / 255).split([3, 1]), truth), seconds])
             self.say(way, name, found[-1])
         return np.array(found).swapaxes(0, 1)
 
     def control(self, run: Adapt, weights: str) -> np.ndarray:
-        """Columns [cameras, people, 8] of generated people in the rig, each camera held out."""
+        """Columns [cameras, people, 5] of generated people in the rig, each camera held out."""
         data = build_data(run)
         data.prepare_data(["val"])
         found = []
@@ -220,7 +207,7 @@ class Measured:
             target, mask = batch.images[0, view : view + 1], batch.masks[0, view : view + 1]
             pair = psnr(image, target), psnr(image, target, box_of(mask))
             values = [value.item() for value in (*pair, psnr_box_40(image, target, mask))]
-            rows.append([*values, np.nan, np.nan, np.nan, 1.0, seconds])
+            rows.append([*values, np.nan, seconds])
         return rows
 
 
@@ -250,9 +237,8 @@ def with_gains_of(rig: Rig | None, batch: Batch) -> Batch:
     return divided(batch, torch.from_numpy(logs - logs.mean(0)).to(batch.images)[None])
 
 
-def compared(image: Tensor, alpha: Tensor, truth: dict[str, Tensor]) -> tuple[list[float], tuple]:
-    """PSNR of four kinds, nan where the mask fails;
-    errors on black and before the background [3, h, w]."""
+def compared(image: Tensor, alpha: Tensor, truth: dict[str, Tensor]) -> list[float]:
+    """PSNR of four kinds, nan where the mask fails."""
     composed = image + (1 - alpha) * truth["behind"]
     off = (composed - truth["photograph"]) * truth["known"]
     box = box_of(truth["mask"][None])
@@ -262,17 +248,7 @@ def compared(image: Tensor, alpha: Tensor, truth: dict[str, Tensor]) -> tuple[li
         psnr_box_40(image[None], truth["subject"][None], truth["mask"][None]),
         decibels(mean_over(off.square().mean(0)[None], box & truth["known"])),
     ]
-    values = [np.nan if truth["fails"] else value.item() for value in found]
-    return values, (image - truth["subject"], off)
-
-
-def flicker_between(last: tuple | None, now: tuple) -> list[float]:
-    """Flicker of the errors on black and before the background since the instant before;
-    nan at the first."""
-    if last is None:
-        return [np.nan, np.nan]
-    *both, masks = (torch.stack(parts)[:, None] for parts in zip(last, now, strict=True))
-    return [1e3 * flicker_in_place(each, masks).item() for each in both]
+    return [np.nan if truth["fails"] else value.item() for value in found]
 
 
 def _model(path: str) -> GHGS:

@@ -127,7 +127,7 @@ def main() -> None:
         print(f"| {name} | {found[0] / count:.1%} | {found[1] / count:.1%} |")
     torch.set_num_threads(1)
     encoder = run.encoder.build().eval()
-    plan = planned(batch.masks, patch_size, [encoder.keeps(batch.masks)])
+    plan = planned(batch.masks, patch_size, encoder.keeps(batch.masks))
     branch = fastest(lambda: encoder.semantic(batch.images, batch.masks, plan))
     whole = fastest(lambda: encoder(batch.images, batch.masks))
     size = tuple(batch.images.shape)

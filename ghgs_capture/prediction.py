@@ -12,7 +12,6 @@ import torch
 
 from ghgs_capture.capture import Capture
 from ghgs_capture.doubts import CORRECTION, doubt_of_cameras, doubt_of_masks
-from ghgs_capture.temporal import Temporal
 from ghgs_capture.tones import own_tones, without_tones
 from ghgs_lit.config.keys import lookup
 from ghgs_lit.config.options import image_size
@@ -60,7 +59,6 @@ def predict(
     refine_masks: int | Literal["auto"] = "auto",
     refine: int = 0,
     renderer: Renderer | None = None,
-    temporal: Temporal | None = None,
     tones: Mapping[str, float] | Literal["auto"] = "auto",
 ) -> TimedPrediction:
     """The Gaussians of a capture, in the user's world.
@@ -79,7 +77,6 @@ def predict(
             4 where photographs show other outlines.
         refine: steps that bring the Gaussians nearer to the photographs, such as 15; 0: none.
         renderer: what refining draws with; None: that of the device.
-        temporal: the predictor of the instants before, in their order; None: no sequence.
         tones: gammas of cameras, by name, that are undone first; ``auto``: of those that have one
             of their own beside the others, by a first prediction.
 
@@ -95,15 +92,13 @@ def predict(
         size = crop_size(size, read_config(path), model)
     require(size is not None, "size", "a size in pixels beside a model that is no checkpoint", size)
     refining = refine_cameras, refine_masks, refine
-    keys = model, image_size("size", size), *refining, renderer or Renderer(), temporal
+    keys = model, image_size("size", size), *refining, renderer or Renderer()
     result = _predicted(capture if tones == "auto" else without_tones(capture, tones), *keys)
     if tones != "auto":
         return replace(result, tones=dict(tones))
     tones = own_tones(result.batch, result.gaussians)
     if not tones:
         return result
-    if temporal is not None:
-        temporal.reset()
     again = _predicted(without_tones(capture, tones), *keys)
     seconds = again.seconds | {"tones": sum(result.seconds.values())}
     return replace(again, seconds=seconds, tones=tones)
@@ -117,7 +112,6 @@ def _predicted(
     refine_masks: int | Literal["auto"],
     refine: int,
     renderer: Renderer,
-    temporal: Temporal | None,
 ) -> TimedPrediction:
     """:func:`predict` of photographs with their colours as they are.
 
@@ -129,7 +123,6 @@ def _predicted(
         refine_masks: as for :func:`predict`.
         refine: as for :func:`predict`.
         renderer: what refining draws with.
-        temporal: as for :func:`predict`.
 
     Returns:
         As of :func:`predict`, without ``tones``.
@@ -145,7 +138,7 @@ def _predicted(
         refine_cameras = CORRECTION if why["refine_cameras"] else 0
     batch = batch.to(next(model.parameters()).device)
     forward = functools.partial(in_frame, model)
-    result = predict_batch(batch, model, renderer, refine_cameras, refine, forward, temporal)
+    result = predict_batch(batch, model, renderer, refine_cameras, refine, forward)
     why = {name: doubt for name, doubt in why.items() if doubt}
     return replace(result, seconds=seconds | result.seconds, changed=changed, why=why)
 
@@ -172,7 +165,6 @@ def predict_batch(
     refine_cameras: int = 0,
     refine: int = 0,
     forward: Callable[[Batch], Prediction] | None = None,
-    temporal: Temporal | None = None,
 ) -> TimedPrediction:
     """The Gaussians of a batch of one subject, which keeps its targets.
 
@@ -184,7 +176,6 @@ def predict_batch(
         refine_cameras: most rounds of ``CameraRefinement``; 0: none.
         refine: steps of ``Refinement``; 0: none.
         forward: predicts a batch without targets; None: the model.
-        temporal: takes the place of ``forward`` where instants before are known.
 
     Returns:
         The prediction, with the batch as corrected and the seconds of each stage.
@@ -199,7 +190,7 @@ def predict_batch(
         moved = tuple(pixels_moved(given, batch)[0])
         seconds["refine_cameras"] = time.perf_counter() - start
         start = time.perf_counter()
-    prediction = (temporal or forward)(replace(batch, targets=None))
+    prediction = forward(replace(batch, targets=None))
     if batch.images.device.type == "cuda":
         torch.cuda.synchronize()
     seconds["predict"] = time.perf_counter() - start

@@ -394,19 +394,9 @@ class Gaussians(TensorStruct):
 
 
 @dataclass(frozen=True)
-class Decision:
-    """The preset that ``skip=auto`` gave a subject, and the FLOPs of the encoder's blocks as a
-    share of those of the most accurate preset."""
-
-    preset: str
-    products: float
-
-
-@dataclass(frozen=True)
 class Prediction(TensorStruct):
     """The result of ``model(batch)``, in the world and the unit of its cameras. ``depth``
-    has a meaning where ``depth_valid``. ``decisions``: one for each element with
-    ``skip=auto``. ``rounds``: depths before the first round and after each (the last is
+    has a meaning where ``depth_valid``. ``rounds``: depths before the first round and after each (the last is
     ``depth_maps``). ``drafts``: Gaussians before each, if kept. ``tokens``: of the encoder,
     inside the model alone."""
 
@@ -415,7 +405,6 @@ class Prediction(TensorStruct):
     depth_valid: Bool[Tensor, "B V H W"]
     points: Points
     depth_maps: DepthMaps
-    decisions: tuple[Decision, ...] = ()
     rounds: tuple[DepthMaps, ...] = ()
     drafts: tuple[Gaussians, ...] = ()
     tokens: Tokens | None = None

@@ -227,7 +227,7 @@ def test_predict_runs_there(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     "overrides",
-    [["model=hull"], ["model=paper"], ["model=hull", "skip=fast"], ["model=hull", "skip=auto"]],
+    [["model=hull"], ["model=paper"], ["model=hull", "skip=fast"]],
     ids=" ".join,
 )
 def test_the_host_waits_once(overrides):

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,9 +16,8 @@ from ghgs_capture.backgrounds import BACKGROUND_INSTANTS, Backgrounds
 from ghgs_capture.capture import Capture
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.formats.json_and_toml import json_text
-from ghgs_capture.prediction import TimedPrediction, crop_size, in_frame, predict, predict_batch
+from ghgs_capture.prediction import TimedPrediction, crop_size, predict, predict_batch
 from ghgs_capture.rig import INSTANTS, Rig, corrected_rig, spread
-from ghgs_capture.temporal import Temporal
 from ghgs_capture.tones import without_tones
 from ghgs_capture.verbs.advice import advice_of, moved_line, rig_advice
 from ghgs_capture.verbs.photographs import capture_folder, check_cameras
@@ -112,7 +110,6 @@ def predict_photographs(run: "Predict", directory: Path) -> None:
         "refine": run.refine,
         "tones": run.refine_tones or {},
     }
-    temporal = Temporal(partial(in_frame, model), model.skip.every, renderer)
     totals: Counter[str] = Counter()
     count = 0
     rig = None
@@ -125,7 +122,7 @@ def predict_photographs(run: "Predict", directory: Path) -> None:
     for given, waited in captures_of(folder):
         capture = mended_by(backgrounds, given)
         capture = rig.applied(capture) if rig else capture
-        result = predict(capture, model, size, **refining, renderer=renderer, temporal=temporal)
+        result = predict(capture, model, size, **refining, renderer=renderer)
         result.seconds["read"] = waited
         place = directories[capture.name]
         seconds = write_result(
@@ -147,8 +144,6 @@ def predict_photographs(run: "Predict", directory: Path) -> None:
         total = time.perf_counter() - begin
         stages = ", ".join(f"{stage} {value / count:.3g} s" for stage, value in totals.items())
         print(f"{count} instants, {count / total:.3g} a second (each: {stages})", flush=True)
-        if model.skip.every > 1:
-            print(f"skip.every={model.skip.every}: {temporal.anew} instants predicted anew", flush=True)
     if left_out:
         print(f"left out: {left_out} of {len(folder.instants)} instants", flush=True)
 
@@ -320,9 +315,6 @@ def write_result(
         facts["gains"] = dict(zip(result.batch.views[0], gains, strict=True))
     if result.tones:
         facts["tones"] = result.tones
-    if model.auto is not None:
-        facts["skip"] = model.auto.report(prediction.decisions)
-        print(facts["skip"], flush=True)
     if result.refined is not None:
         facts["refine"] = asdict(result.refined)
         print(result.refined, flush=True)

@@ -19,7 +19,6 @@ from ghgs_lit.diagnostics.benchmark.presets import KNOBS, YARDSTICK, Case, Sourc
 from ghgs_lit.diagnostics.machine import machine_facts
 from ghgs_lit.diagnostics.output import print_tables
 from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.measure import decisions_of
 from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import read_config
@@ -49,7 +48,6 @@ def run(verb: "Benchmark") -> None:
         content = {"machine": machine_facts(device), **content}
     tables = report.tables_of(content["rows"])
     print_tables(tables)
-    print(*content["decisions"], sep="\n", flush=True)
     source = provenance(verb.plain, seed=verb.seed, verb="benchmark", choices=choices())
     announce(report.write_numbers(directory, {**content, "provenance": source}, tables))
     if content["broken"]:
@@ -109,8 +107,7 @@ def _presets(cases: list[Case], run: "Benchmark", device: torch.device) -> dict[
 
     Returns:
         Content of ``benchmark.json`` without machine and provenance: ``about``, ``random_weights``,
-        ``rows`` (:func:`report.rows_of`), ``broken`` budgets, ``decisions`` of ``skip=auto``, and
-        ``subjects``: the metrics of every picture.
+        ``rows`` (:func:`report.rows_of`), ``broken`` budgets, and ``subjects``: the metrics of every picture.
 
     Raises:
         InputError: the data has no target photographs, or is wrong.
@@ -131,16 +128,10 @@ def _presets(cases: list[Case], run: "Benchmark", device: torch.device) -> dict[
     weights = run.checkpoint or f"{choices().get('encoder', 'encoder')}, random weights"
     weights = f"{weights} ({number:.1f} M parameters, precision {run.precision})"
     photographs = f"{subjects} subjects of {data.dataset.name}, {views} views of {height} x {width}"
-    decisions = []
-    for record in records:
-        auto = record.case.model.auto
-        if auto is not None:
-            decisions.append(f"{record.case.label}: {auto.report(decisions_of(record.metrics))}")
     return {
         "about": f"{weights}; {photographs}",
         "random_weights": run.checkpoint is None,
         "rows": rows,
         "broken": report.broken_budgets(rows),
-        "decisions": decisions,
         "subjects": list(itertools.chain.from_iterable(record.metrics for record in records)),
     }

@@ -8,14 +8,13 @@ import torch
 
 from ghgs_lit.cli import inputs
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
-from ghgs_lit.evaluation.measure import Method, ModelMethod, decisions_of
+from ghgs_lit.evaluation.measure import Method, ModelMethod
 from ghgs_lit.evaluation.protocols import check_evaluation
 from ghgs_lit.evaluation.report import measure_and_write
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.refinement import CameraRefinement, Refinement
-from ghgs_lit.runs.results import METHOD, read_results
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
 if TYPE_CHECKING:
@@ -76,7 +75,7 @@ def _methods(run: "Evaluate", device: torch.device) -> tuple[dict[str, Method], 
     """The methods to measure by name, and facts about the model.
 
     Raises:
-        InputError: there is neither checkpoint nor baseline, or ``skip.every`` is not 1.
+        InputError: there is neither checkpoint nor baseline.
     """
     path = run.checkpoint
     if path is None and not run.baselines:
@@ -85,9 +84,6 @@ def _methods(run: "Evaluate", device: torch.device) -> tuple[dict[str, Method], 
     facts: dict[str, Any] = {"checkpoint": path}
     if path is not None:
         methods["model"], model_facts = trained_method(run, device)
-        model = methods["model"].model
-        expected = "1: ghgs evaluate measures each subject by itself (skip=temporal is of ghgs predict)"
-        require(model.skip.every == 1, "skip.every", expected, model.skip.every)
         facts |= model_facts
     methods |= baselines_of(run.baselines, run, device)
     return methods, facts
@@ -117,7 +113,4 @@ def run(verb: "Evaluate") -> None:
     check_evaluation(verb, data)
     facts |= {"verb": "evaluate", "choices": inputs.choices()}
     path = measure_and_write(methods, data, verb, directory, device, **facts)
-    if "model" in methods and (auto := methods["model"].model.auto) is not None:
-        rows = (row for row in read_results(path)["rows"] if row["method"] == METHOD)
-        print(auto.report(decisions_of(rows)), flush=True)
     announce(path)

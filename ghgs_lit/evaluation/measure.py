@@ -19,7 +19,7 @@ from ghgs_lit.metrics import ImageMetrics, depth_error_mm, surface_error_mm
 from ghgs_lit.refinement import CameraRefinement, Refinement
 from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
-from ghgs_lit.types import Batch, Cameras, Decision, Gaussians, Prediction, Rendering
+from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
 from ghgs_lit.visualization.pictures import save_png, sheet
 
 Renderer = Callable[[Gaussians, Cameras], Rendering]
@@ -35,7 +35,6 @@ class Estimate:
         depth_valid: where ``depth`` is defined, [B, V, H, W] bool.
         gaussians: what was drawn.
         not_finite: number of Gaussians and subject depths of each element that are not finite.
-        decisions: of ``skip=auto``, for each element.
         recalibrated: the recalibration with its inputs, where it has neighbours.
     """
 
@@ -44,7 +43,6 @@ class Estimate:
     depth_valid: Tensor | None = None
     gaussians: Gaussians | None = None
     not_finite: tuple[int, ...] | None = None
-    decisions: tuple[Decision, ...] = ()
     recalibrated: Call | None = None
 
 
@@ -84,7 +82,7 @@ class ModelMethod:
         lost = not_finite(batch, prediction)
         # Smaller copies of photographs (coarse to fine) go through the stages first.
         last = seen[-1] if seen else None
-        return Estimate(image, depth, valid, gaussians, lost, prediction.decisions, last)
+        return Estimate(image, depth, valid, gaussians, lost, last)
 
 
 def not_finite(batch: Batch, prediction: Prediction) -> tuple[int, ...]:
@@ -147,27 +145,11 @@ def _rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[Row]:
             shared["tokens"] = around[element].tokens
             shared["neighbors"] = around[element].neighbors
             shared["shared_neighbors"] = around[element].shared
-        if estimate.decisions:
-            about["skip"] = estimate.decisions[element].preset
-            shared["encoder_products"] = estimate.decisions[element].products
         names = targets.names[element] if targets.names else [str(k) for k in range(t)]
         for k in range(t):
             about |= {"targets": targets.protocols[k], "target": names[k]}
             rows.append({**about, **{name: value[element][k] for name, value in values.items()}, **shared})
     return rows
-
-
-def decisions_of(rows: Iterable[Row]) -> list[Decision]:
-    """Choices of ``skip=auto`` in the rows of a measurement.
-
-    Args:
-        rows: As of :func:`measure`.
-
-    Returns:
-        One for each method, subject and number of views; empty without ``skip=auto``.
-    """
-    chosen = {(row["method"], row["subject"], row["views"]): row for row in rows if "skip" in row}
-    return [Decision(row["skip"], row["encoder_products"]) for row in chosen.values()]
 
 
 def _draw(batch: Batch, estimate: Estimate, element: int, pictures: Path, name: str) -> None:

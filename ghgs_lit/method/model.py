@@ -81,7 +81,6 @@ class GHGS(nn.Module):
         self.gaussian_head = gaussian_head
         self.skip = skip or SkipOptions()
         self.options = options or ModelOptions()
-        self.auto = self.skip.build()
         #: The nodes that :meth:`from_config` built the model from; empty if the stages were given.
         self.config: dict[str, Any] = {}
         #: Predictions that were recorded; nothing of it is part of a checkpoint.
@@ -150,8 +149,7 @@ class GHGS(nn.Module):
         """
         with self.in_precision(batch.masks.device):
             prediction = self._predicted(batch, plan, self._coarse(batch), around)
-        prediction = plan.trimmed(prediction)
-        return dataclasses.replace(prediction, decisions=plan.decisions)
+        return plan.trimmed(prediction)
 
     def in_precision(self, device: torch.device) -> AbstractContextManager[None]:
         """The precision of the stages' products on a device, while the context lasts."""
@@ -175,9 +173,8 @@ class GHGS(nn.Module):
         """
         encoder = self.encoder
         masks = batch.masks
-        choices = [encoder.keeps(masks)] if self.auto is None else self.auto.choices(encoder, masks)
         flags = [batch.cameras.any_skew, *([any_bad(findings)] if findings else [])]
-        return Measured.of(masks, encoder.patch_size, choices, flags)
+        return Measured.of(masks, encoder.patch_size, encoder.keeps(masks), flags)
 
     def plan(
         self,
@@ -197,7 +194,6 @@ class GHGS(nn.Module):
         Raises:
             InputError: the batch violates one of the checks.
         """
-        auto = self.auto
         encoder = self.encoder
         targets = [] if batch.targets is None else [batch.targets.cameras]
         plan = planned(
@@ -206,7 +202,6 @@ class GHGS(nn.Module):
             measured or self.measured(batch, findings),
             self.skip.pixels,
             self.recalibration.tokens,
-            None if auto is None else functools.partial(auto.choose, encoder),
             [cameras.any_skew for cameras in targets],
             least=least,
         )

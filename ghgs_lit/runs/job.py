@@ -163,9 +163,8 @@ def check_config(run: "TrainVerb") -> None:
         run: Its configuration.
 
     Raises:
-        InputError: It has ``skip=auto``, or a frozen encoder without weights.
+        InputError: It has a frozen encoder without weights.
     """
-    require(not run.skip.presets, "skip", "the preset to train with, or one and token_budgets=[...]", "auto")
     if run.init_from is not None or run.resume not in (None, AUTO) or run.allow_random_encoder:
         return
     if getattr(run.encoder, "semantic", None) is not None:  # a plug-in's may have none

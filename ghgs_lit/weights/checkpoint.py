@@ -280,18 +280,15 @@ def load_weights(
 def check_preset(model: nn.Module, checkpoint: Mapping[str, Any], path: str | Path) -> None:
     """Compare the model's token preset with those that the checkpoint was trained with.
 
-    ``skip=auto`` drops presets that were not trained; fewer than all tokens with the authors'
-    weights give a warning.
+    Fewer than all tokens with the authors' weights give a warning.
 
     Args:
-        model: a :class:`ghgs_lit.method.model.GHGS`, whose ``auto`` may be replaced.
+        model: a :class:`ghgs_lit.method.model.GHGS`.
         checkpoint: its content.
         path: of the checkpoint, for messages.
     """
     is_release = "release" in (checkpoint.get("imported") or {})
-    if model.auto is not None:
-        model.auto = model.auto.trained_by({} if is_release else checkpoint["config"])
-    elif is_release and model.skip.tokens != "all":
+    if is_release and model.skip.tokens != "all":
         expected = "all, as in the training of the authors' weights"
         found = f"{model.skip.tokens}, whose error is not known for them"
         warnings.warn(f"{path}: skip.tokens: expected {expected}; found {found}", stacklevel=3)

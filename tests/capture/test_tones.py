@@ -10,9 +10,6 @@ import torch
 
 from ghgs_capture.capture import Capture
 from ghgs_capture.prediction import predict
-from ghgs_capture.temporal import Temporal
-from ghgs_lit.method.model import GHGS
-from ghgs_lit.rendering import Renderer
 from tests.helpers.figures import Figure
 from tests.helpers.verbs import ghgs
 
@@ -69,16 +66,6 @@ def test_any_unit_and_origin_tell_the_same(tmp_path):
 def test_two_photographs_do_not_tell_which_one_it_is(taken):
     two = seen_with(dataclasses.replace(taken, photographs=taken.photographs[:2]), [1.2, 1.0])
     assert predict(two, **KEYS).tones == {}
-
-
-def test_what_was_predicted_before_a_look_is_no_instant_of_a_sequence(taken):
-    """With and without a look the instant is the first one."""
-    model, wrong = GHGS.from_checkpoint(), seen_with(taken, but(1, 0.8))
-    found, told = (Temporal(model, 4, Renderer()) for _ in range(2))
-    first = predict(wrong, **KEYS, temporal=found)
-    second = predict(wrong, **KEYS, temporal=told, tones=first.tones)
-    assert torch.equal(first.gaussians.colors, second.gaussians.colors)
-    assert torch.equal(first.batch.images, second.batch.images)
 
 
 @pytest.fixture

@@ -123,26 +123,6 @@ def test_what_is_said_of_a_checkpoints_model_acts_and_is_recorded(trained, tmp_p
     assert not (tmp_path / "r" / "metrics.json").exists()
 
 
-def test_what_skip_auto_chose_is_said_and_recorded(trained, tmp_path, capsys):
-    """A score says with which preset its subject was predicted, and a reader why."""
-    run = [f"checkpoint={trained / 'checkpoints' / 'last.ckpt'}", "skip=auto"]
-    where = tmp_path / "run"
-    evaluation = ["targets=midway", "evaluation.views=[3]", "evaluation.pictures=0"]
-    assert ghgs("evaluate", *run, *evaluation, f"hydra.run.dir={where}") == 0
-    line = "skip=auto: exact for 2 of 2 (100%), the fewest products in the encoder within skip.budget_db=0.1"
-    assert line in capsys.readouterr().out
-    content = json.loads((where / "metrics.json").read_text())
-    assert {row["skip"] for row in content["rows"]} == {"exact"}
-    assert content["provenance"]["model_config"]["skip"]["name"] == "auto"
-    with open(where / "metrics.csv", newline="") as file:
-        assert {row["skip"] for row in csv.DictReader(file)} == {"exact"}
-    assert ghgs("predict", *run, "subject=0", "formats=[ply]", f"hydra.run.dir={tmp_path / 'one'}") == 0
-    report = json.loads((tmp_path / "one" / "report.json").read_text())
-    assert report["skip"].startswith("skip=auto: exact (100%)")
-    assert "not fast: not shown in training" in report["skip"]
-    assert report["skip"] in capsys.readouterr().out
-
-
 def test_an_evaluation_that_cannot_be_is_refused_before_training(boxes, tmp_path, capsys):
     """Settings of the end must not fail after days of training."""
     where = f"hydra.run.dir={tmp_path / 'run'}"

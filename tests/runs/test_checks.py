@@ -65,12 +65,6 @@ def test_a_semantic_branch_needs_weights():
     check_config(run(branch, "allow_random_encoder=true"))
 
 
-def test_training_needs_a_preset():
-    """What ``skip=auto`` chooses depends on what the training has shown."""
-    with pytest.raises(InputError, match=r"skip: expected the preset to train with.*token_budgets.*auto"):
-        check_config(run("skip=auto"))
-
-
 def test_a_sweep_overwrites_nothing(verb, tmp_path):
     """Sweeps go on with their own runs; ``overwrite`` would train all of them again."""
     code, _, err = verb("-m", f"hydra.sweep.dir={tmp_path}", "seed=1,2", "overwrite=true")

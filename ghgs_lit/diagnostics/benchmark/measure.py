@@ -316,8 +316,7 @@ def record_cases(
             # The error against the truth, as `ghgs evaluate` measures it; its time does not count.
             prediction, rendering = result
             depth = (prediction.depth, prediction.depth_valid)
-            decisions = prediction.decisions
-            estimate = Estimate(rendering.image, *depth, decisions=decisions)
+            estimate = Estimate(rendering.image, *depth)
             measured = measure(lambda _, known=estimate: known, record.case.label, [batch], metrics, device)
             for row in measured:
                 record.metrics.append({name: value for name, value in row.items() if name != "seconds"})

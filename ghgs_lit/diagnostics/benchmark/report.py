@@ -181,7 +181,7 @@ def notes_of(content: Mapping[str, Any]) -> list[str]:
     notes = [f"Machine: {in_words(content['machine'])}.", content["about"]]
     if content["random_weights"]:
         notes.append("The weights are random: PSNR says nothing, only run times and differences do.")
-    return notes + content.get("decisions", []) + [f"Budget broken: {line}." for line in content["broken"]]
+    return notes + [f"Budget broken: {line}." for line in content["broken"]]
 
 
 def write_numbers(directory: Path, content: Mapping[str, Any], tables: Tables) -> Path:

@@ -283,7 +283,7 @@ class VGGTEncoder(nn.Module):
         """
         narrow = images.dtype != torch.float64 or self.aggregator.camera_token.dtype == torch.float64
         require(narrow, "images", "float32 where the weights are no float64", images.dtype)
-        plan = planned(masks, self.patch_size, [self.keeps(masks)]) if plan is None else plan
+        plan = planned(masks, self.patch_size, self.keeps(masks)) if plan is None else plan
         kept = plan.kept
         with bfloat16_where_possible(images.device) if self.precision == "bfloat16" else nullcontext():
             pairs, patches = self.aggregator(self._normalized(images, masks, bounds), kept)

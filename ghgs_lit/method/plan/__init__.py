@@ -7,8 +7,7 @@ once, so that the host waits for a GPU a single time, and gives a :class:`Plan`:
 counts. Stages are functions of tensors of known size: they take the plan, and decide nothing of
 the kind themselves.
 
-* :mod:`ghgs_lit.method.plan.presets`: the presets, and the choice of ``skip=auto``.
-  A new preset is a value here.
+* :mod:`ghgs_lit.method.plan.presets`: the presets. A new one is a file in ``conf/skip``.
 * :mod:`ghgs_lit.method.plan.plan`: the plan, and the one place where masks are read.
 * :mod:`ghgs_lit.method.plan.patches`: patches that become tokens, and their places among packed ones.
 * :mod:`ghgs_lit.method.plan.rows`: rows of tokens or pixels that count, and size classes of their number.

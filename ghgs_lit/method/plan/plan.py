@@ -4,13 +4,13 @@ masks hold."""
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from ghgs_lit.extents import Extent, bucket_size, extent_numbers, true_places
@@ -18,11 +18,7 @@ from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.method.plan.patches import KeptPatches
 from ghgs_lit.method.plan.rows import Rows, rounds_up, rows_of_group
 from ghgs_lit.method.plan.window import Span, Window, subject_windows
-from ghgs_lit.types import Decision, DecodedPixels, Prediction
-
-#: From the numbers of patches [B, V] that each of several presets keeps: each element's decision,
-#: and the number of its preset.
-Choose = Callable[[Sequence[Float[Tensor, "B V"]]], tuple[tuple[Decision, ...], Sequence[int]]]
+from ghgs_lit.types import DecodedPixels, Prediction
 
 
 @dataclass(frozen=True)
@@ -75,7 +71,6 @@ class Plan:
         tokens: tokens that are recalibrated;
             ``all``: with those of the background, which need depths, too.
         classes: numbers of rows, and windows, are size classes (:mod:`ghgs_lit.method.plan.rows`).
-        decisions: what ``skip=auto`` chose for each element.
         flags: values of further tensors that were read with the masks.
         least: sizes that are kept as long as they are enough.
         is_least: sizes are these, whatever the scene."""
@@ -89,7 +84,6 @@ class Plan:
     pixels: DecodedPixels = "subject"
     tokens: DecodedPixels = "subject"
     classes: bool = False
-    decisions: tuple[Decision, ...] = ()
     flags: tuple[bool, ...] = ()
     least: Sizes = _NOTHING
     is_least: bool = False
@@ -260,14 +254,14 @@ class Measured:
 
     Attributes:
         shown: patches with a pixel of the subject.
-        choices: patches that become tokens, of each preset.
+        kept: patches that become tokens.
         numbers: of the patches ``shown``, then :func:`ghgs_lit.extents.extent_numbers` of the masks
-            and of each choice.
+            and of ``kept``.
         flags: further values that are read with them.
     """
 
     shown: Bool[Tensor, "B V h w"]
-    choices: tuple[Bool[Tensor, "B V h w"], ...]
+    kept: Bool[Tensor, "B V h w"]
     numbers: tuple[Int[Tensor, "..."], ...]
     flags: tuple[Bool[Tensor, ""], ...] = ()
 
@@ -276,7 +270,7 @@ class Measured:
         cls,
         masks: Bool[Tensor, "B V H W"],
         patch_size: int,
-        choices: Sequence[Bool[Tensor, "B V h w"]],
+        kept: Bool[Tensor, "B V h w"],
         flags: Sequence[Bool[Tensor, ""]] = (),
     ) -> "Measured":
         """What these masks say.
@@ -284,22 +278,21 @@ class Measured:
         Args:
             masks: the subject's pixels; sides are divisible by the patch size.
             patch_size: in pixels.
-            choices: patches that become tokens, of each preset.
+            kept: patches that become tokens.
             flags: further values that are read with them.
         """
         shown = patches_around_subject(masks, patch_size, 0)
         numbers = [shown.flatten(2).sum(-1)]
-        numbers += [extent_numbers(each.flatten(0, 1)) for each in (masks, *choices)]
-        return cls(shown, tuple(choices), tuple(numbers), tuple(flags))
+        numbers += [extent_numbers(each.flatten(0, 1)) for each in (masks, kept)]
+        return cls(shown, kept, tuple(numbers), tuple(flags))
 
 
 def planned(
     masks: Bool[Tensor, "B V H W"],
     patch_size: int,
-    choices: Sequence[Bool[Tensor, "B V h w"]] | Measured,
+    kept: Bool[Tensor, "B V h w"] | Measured,
     pixels: DecodedPixels = "subject",
     tokens: DecodedPixels = "subject",
-    choose: Choose | None = None,
     flags: Sequence[Bool[Tensor, ""]] = (),
     classes: bool | None = None,
     least: Sizes | None = None,
@@ -309,37 +302,25 @@ def planned(
     Args:
         masks: the subject's pixels; sides are divisible by the patch size.
         patch_size: in pixels.
-        choices: patches that become tokens, of several presets if ``choose`` is there; or all that
-            is measured of them and the masks.
+        kept: patches that become tokens; or all that is measured of them and the masks.
         pixels: of the preset.
         tokens: which ones the recalibration works on.
-        choose: gives each element one of the ``choices``; None: all get the first.
         flags: tensors whose values are to be read with those that are measured, and after them.
         classes: whether numbers of rows are size classes; None: as the masks' device needs it.
         least: as of :class:`Plan`; None: nothing is held.
     """
     least = least or _NOTHING
-    b, v = masks.shape[:2]
-    measured = choices if isinstance(choices, Measured) else Measured.of(masks, patch_size, choices)
+    measured = kept if isinstance(kept, Measured) else Measured.of(masks, patch_size, kept)
     shown = measured.shown
-    choices = measured.choices
+    kept = measured.kept
     flags = (*measured.flags, *flags)
     counts, *values = _read([*measured.numbers, *([torch.stack(flags)] if flags else [])])
     of_masks = []
-    for rows in values[: 1 + len(choices)]:
+    for rows in values[:2]:
         firsts = range(0, len(rows), 5)
         of_masks.append(tuple(Extent(*rows[first : first + 5]) for first in firsts))
-    extents, *of_choices = of_masks
+    extents, kept_extents = of_masks
     shown_extents = tuple(e.coarser(patch_size, n) for e, n in zip(extents, counts, strict=True))
-    decisions = ()
-    kept = choices[0]
-    kept_extents = of_choices[0]
-    if choose is not None:
-        sizes = [torch.tensor([e.count for e in each], device="cpu").view(b, v) for each in of_choices]
-        decisions, best = choose(sizes)
-        kept = torch.stack([choices[number][element].to(masks.device) for element, number in enumerate(best)])
-        each = [of_choices[best[image // v]][image] for image in range(b * v)]
-        kept_extents = tuple(each)
     known = tuple(map(bool, values[-1])) if flags else ()
     classes = rounds_up(masks.device) if classes is None else classes
     is_whole = sum(extent.count for extent in kept_extents) == kept.numel()
@@ -347,7 +328,7 @@ def planned(
     if classes and not is_whole:
         size = _of_image(least.held("kept", max(1, *(extent.count for extent in kept_extents))), kept)
     patches = KeptPatches(kept, masks.device, kept_extents, size)
-    facts = (extents, shown_extents, patch_size, pixels, tokens, classes, decisions, known, least)
+    facts = (extents, shown_extents, patch_size, pixels, tokens, classes, known, least)
     return Plan(masks, shown, patches, *facts)
 
 

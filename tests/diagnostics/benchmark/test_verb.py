@@ -38,7 +38,7 @@ def totals(content):
 def measured(data, tmp_path_factory):
     directory = tmp_path_factory.mktemp("benchmark") / "run"
     code = ghgs(
-        "benchmark", *data, *TINY, *QUICK, "presets=[exact,balanced,auto]", "subjects=2", "skip=auto",
+        "benchmark", *data, *TINY, *QUICK, "presets=[exact,balanced]", "subjects=2",
         f"hydra.run.dir={directory}",
     )  # fmt: skip
     assert code == 0
@@ -54,14 +54,14 @@ def test_the_json_has_one_row_for_each_preset_and_stage(measured):
         "bounds", "encoder.patch_tokens", "encoder", "depth_head", "unprojection", "recalibration",
         "gaussian_head", "render", "other", "total",
     ]  # fmt: skip
-    for preset in ("none", "exact", "balanced", "auto"):
+    for preset in ("none", "exact", "balanced"):
         assert [row["stage"] for row in content["rows"] if row["preset"] == preset] == stages, preset
-    assert len(content["rows"]) == 4 * len(stages)
+    assert len(content["rows"]) == 3 * len(stages)
     for row in content["rows"]:
         assert row["seconds"] >= 0
         assert (row["psnr"] is not None) == (row["stage"] == "total"), row
     whole = totals(content)
-    assert list(whole) == ["none", "exact", "balanced", "auto"]
+    assert list(whole) == ["none", "exact", "balanced"]
     assert whole["none"]["max_rel_diff"] == whole["none"]["psnr_loss_db"] == 0
     assert whole["exact"]["budget_db"] is not None
     assert whole["balanced"]["tokens"] < whole["exact"]["tokens"] == 27
@@ -69,20 +69,8 @@ def test_the_json_has_one_row_for_each_preset_and_stage(measured):
     assert whole["balanced"]["flops"] < whole["exact"]["flops"] < whole["none"]["flops"]
     assert content["random_weights"]
     assert content["broken"] == []
-    assert len(content["subjects"]) == 4 * 2
+    assert len(content["subjects"]) == 3 * 2
     assert content["provenance"]["verb"] == "benchmark"
-
-
-def test_what_auto_chose_and_why_is_said(measured):
-    """Its row is that of the presets that ran, so a reader must learn which these were."""
-    content = json.loads((measured / "benchmark.json").read_text())
-    chosen = {row["subject"]: row["skip"] for row in content["subjects"] if row["method"] == "auto"}
-    whole, [line] = totals(content), content["decisions"]
-    assert set(chosen.values()) == {"balanced"}
-    assert line.startswith("auto: skip=auto: balanced for 2 of 2")
-    assert line in (measured / "benchmark.md").read_text()
-    for name in ("tokens", "psnr", "flops"):
-        assert whole["auto"][name] == whole["balanced"][name]
 
 
 def test_exact_is_exact(measured):
@@ -112,7 +100,7 @@ def test_a_halo_that_is_a_pixel_too_small_breaks_exact(model, data, tmp_path, mo
 def test_the_stages_add_up_to_the_total(measured):
     """With one round the seconds of the stages without a dot are those of the whole pass."""
     rows = json.loads((measured / "benchmark.json").read_text())["rows"]
-    for preset in ("none", "exact", "balanced", "auto"):
+    for preset in ("none", "exact", "balanced"):
         own = {row["stage"]: row["seconds"] for row in rows if row["preset"] == preset}
         total = own.pop("total")
         assert sum(v for stage, v in own.items() if "." not in stage) == pytest.approx(total)

@@ -165,10 +165,10 @@ def test_a_window_is_the_smallest_rectangle_and_its_margin(margin):
 
 @torch.no_grad()
 def test_kept_patches_that_are_given_take_part():
-    """``skip=auto`` gives each subject patches of its own: the encoder's choice must not act."""
+    """Patches of the plan, not the encoder's own choice, become tokens."""
     encoder, (images, masks) = _encoder(VITS[2]), _people()
     kept = torch.stack((patches_in_window(masks, PATCH, 0)[0], patches_around_subject(masks, PATCH, 1)[1]))
-    found = encoder(images, masks, plan=planned(masks, PATCH, [kept]))
+    found = encoder(images, masks, plan=planned(masks, PATCH, kept))
     for b, tokens in enumerate(("window", "subject")):
         own = slice(b, b + 1)
         expected = _encoder(VITS[2], tokens=tokens, margin=b)(images[own], masks[own])

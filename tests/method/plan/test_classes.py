@@ -13,7 +13,7 @@ from tests.helpers.scenes import hard_subjects, make_batch, stack, training_batc
 
 #: A share of the tokens as neighbours: their number differs between the elements of a batch.
 KINDS = [("model=paper",), ("model=hull", "recalibration.k=0.3"), ("model=recurrent", "recalibration.k=0.3")]
-PRESETS = ["none", "exact", "balanced", "fast", "auto"]
+PRESETS = ["none", "exact", "balanced", "fast"]
 WEIGHTS = {"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 0.01, "depth": 0.5}
 
 
@@ -65,8 +65,8 @@ def test_shapes_repeat_where_subjects_differ_a_little():
     """Of photographs of another instant: a recorded graph needs the same shapes."""
     masks = make_batch(2, 3, 112, 112).masks
     other = masks & (torch.rand(masks.shape, generator=torch.Generator().manual_seed(0)) < 0.995)
-    counted = [planned(each, 14, [kept_of(each)], classes=False) for each in (masks, other)]
-    rounded = [planned(each, 14, [kept_of(each)], classes=True) for each in (masks, other)]
+    counted = [planned(each, 14, kept_of(each), classes=False) for each in (masks, other)]
+    rounded = [planned(each, 14, kept_of(each), classes=True) for each in (masks, other)]
     assert counted[0].subject.counts != counted[1].subject.counts
     assert rounded[0].subject.counts == rounded[1].subject.counts
     assert rounded[0].peers.counts == rounded[1].peers.counts

@@ -131,7 +131,7 @@ def test_rows_that_fill_up_a_size_class_say_nothing(options):
     points = at(points, places)
     stage = relative_stage(**options)
     kept = torch.ones(2, 3, 4, 4, dtype=torch.bool)
-    plan = planned(points.valid, tokens.patch_size, [kept], classes=True)
+    plan = planned(points.valid, tokens.patch_size, kept, classes=True)
     assert plan.peers.real is not None
     found, expected = stage(tokens, points, plan), stage(tokens, points)
     torch.testing.assert_close(found.latent[0], expected.latent[0], atol=1e-12, rtol=0)
