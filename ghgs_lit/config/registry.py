@@ -30,10 +30,11 @@ from ghgs_lit.errors import InputError, shown
 
 VARIABLE = "GHGS_PLUGINS"
 GROUP = "ghgs_lit.plugins"
-#: Groups of what plug-ins register that no configuration names: verbs,
-#: and body models whose parts are known.
+#: Groups of what plug-ins register that are no groups of a configuration: verbs,
+#: body models whose parts are known, and terms of the loss, which ``loss.weights`` names.
 _VERBS = "verb"
 PARTS = "parts"
+TERM = "term"
 
 
 def load_plugins() -> None:
@@ -85,7 +86,7 @@ def _module_of(entry: str) -> str:
     return path.stem
 
 
-_C = TypeVar("_C", bound=type[Options])
+_C = TypeVar("_C", bound=Callable)
 
 #: Import path of the options by group and kind; kind None: nodes of the group have no key ``kind``.
 KINDS: dict[str, dict[str | None, str]] = {
@@ -154,6 +155,19 @@ VERBS: dict[str, str] = {
     "export": "ghgs_lit.cli.verbs.Export",
 }
 
+#: Import path of each term of the loss, a function or a class.
+TERMS: dict[str, str] = {
+    "chamfer": "ghgs_lit.losses.terms.chamfer",
+    "depth": "ghgs_lit.losses.terms.depth",
+    "lpips": "ghgs_lit.losses.terms.Perceptual",
+    "render_l1": "ghgs_lit.losses.terms.render_l1",
+    "render_ssim": "ghgs_lit.losses.terms.render_ssim",
+    "silhouette": "ghgs_lit.losses.terms.silhouette",
+}
+
+#: All tables by group.
+_SHIPPED: dict[str, Mapping[str | None, str]] = {**KINDS, _VERBS: VERBS, PARTS: {}, TERM: TERMS}
+
 #: Groups of named nodes: ``callbacks.<name>: {kind: ...}``.
 NAMED = ("callbacks", "logger")
 
@@ -162,10 +176,11 @@ _REGISTERED: dict[tuple[str, str], type[Options] | str] = {}
 
 
 def register(group: str, kind: str) -> Callable[[_C], _C]:
-    """Class decorator that registers options as ``<group>: {kind: <kind>, ...}``.
+    """Decorator that registers options as ``<group>: {kind: <kind>, ...}``, or, with the group
+    ``term``, a function or class as the term of the loss that ``loss.weights.<kind>`` weighs.
 
     Args:
-        group: one of :data:`KINDS`, or :data:`PARTS`.
+        group: one of :data:`KINDS`, :data:`TERM` or :data:`PARTS`.
         kind: a new one of the group.
 
     Raises:
@@ -220,9 +235,9 @@ def offer_verbs(**paths: str) -> None:
 
 
 def _keep(group: str, kind: str, what: type[Options] | str) -> None:
-    if group not in (*KINDS, _VERBS, PARTS):
-        raise InputError(f"register: expected one of {', '.join(KINDS)}; found {group!r}")
-    known = VERBS if group == _VERBS else KINDS.get(group, {})
+    if group not in _SHIPPED:
+        raise InputError(f"register: expected one of {', '.join([*KINDS, TERM])}; found {group!r}")
+    known = _SHIPPED[group]
     before = _REGISTERED.get((group, kind), what)
     if kind in known or _path_of(before) != _path_of(what):
         raise InputError(f"register: expected a new kind of {group}; found {kind!r}")
@@ -277,7 +292,7 @@ def _load(group: str) -> None:
 def kinds_of(group: str) -> list[str | None]:
     """All kinds of a group, including registered ones; None: the group has no kinds."""
     _load(group)
-    return [*KINDS.get(group, {}), *(kind for of, kind in _REGISTERED if of == group)]
+    return [*_SHIPPED[group], *(kind for of, kind in _REGISTERED if of == group)]
 
 
 def class_of(group: str, kind: Any, key: str) -> type[Options]:
@@ -291,7 +306,7 @@ def class_of(group: str, kind: Any, key: str) -> type[Options]:
     Raises:
         InputError: there is no such kind; names the known ones.
     """
-    known = KINDS.get(group, {})
+    known = _SHIPPED[group]
     if isinstance(kind, str) and kind not in known:
         _load(group)
         if (group, kind) in _REGISTERED:
@@ -300,8 +315,8 @@ def class_of(group: str, kind: Any, key: str) -> type[Options]:
         names = sorted(name for name in kinds_of(group) if name)
         expected = "one of " * (len(names) > 1) + ", ".join(names)
         raise InputError(
-            f"{key}.kind: expected {expected}; found {shown(kind)}{did_you_mean(kind, names)}"
-            f" ({VARIABLE}=file.py adds kinds of your own)"
+            f"{key}{'.kind' * (group in KINDS)}: expected {expected}; found {shown(kind)}"
+            f"{did_you_mean(kind, names)} ({VARIABLE}=file.py adds kinds of your own)"
         )
     return _imported(known[kind])
 

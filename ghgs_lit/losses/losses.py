@@ -1,17 +1,23 @@
 """The weighted sum of the loss terms of a configuration."""
 
-from pydantic import model_validator
+from collections.abc import Callable
+from functools import cached_property, partial
+from typing import Any
+
+from pydantic import ConfigDict, model_validator
 from torch import Tensor
 
 from ghgs_lit.config.options import Amount, Count, Options
-from ghgs_lit.errors import InputError
-from ghgs_lit.losses import terms
+from ghgs_lit.config.registry import TERM, class_of
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.types import Batch, Prediction, Rendering
 
 
 class LossWeights(Options):
-    """Weight of each term; a term of weight 0 is not computed."""
+    """Weight of each term, by its name; a term of weight 0 is not computed. Terms that a plug-in
+    registers have a key, too."""
 
+    model_config = ConfigDict(extra="allow")
     group = "loss.weights"
     render_l1: Amount = 0.8
     """Mean |render - photograph| (paper: 0.8)."""
@@ -22,36 +28,48 @@ class LossWeights(Options):
     depth: Amount = 0.0
     """|z - true z| in metres, the sum over rounds (not in the paper);
     the data must have depth maps."""
-
     silhouette: Amount = 0.0
     """Mean |alpha - mask| of the target views (not in the paper)."""
-
-    @property
-    def used(self) -> dict[str, float]:
-        """The weights above 0 by name."""
-        return {name: weight for name, weight in self if weight > 0}
+    lpips: Amount = 0.0
+    """LPIPS of render and photograph (not in the paper); extra lpips."""
 
 
 class Losses(Options):
-    """The weighted sum of the terms of :mod:`ghgs_lit.losses.terms` whose weight is above 0."""
+    """The weighted sum of the terms whose weight is above 0."""
 
     group = "loss"
     weights: LossWeights = LossWeights()
-    """Weights of the terms."""
+    """Weight of each term, by its name; register("term", name) adds a term."""
     chamfer_points: Count | None = None
     """Points of each set that the Chamfer term matches in a step, chosen at random;
     null: all (paper)."""
 
+    @cached_property
+    def terms(self) -> dict[str, Callable[[Prediction, Rendering, Batch], Tensor]]:
+        """The terms whose weight is above 0, by name.
+
+        Raises:
+            InputError: a term is not registered, or lacks a package or weights of its own."""
+        terms: dict[str, Any] = {}
+        for name, weight in self.weights:
+            term = class_of(TERM, name, f"weights.{name}")
+            require(type(weight) in (int, float) and weight >= 0, f"weights.{name}", "a number >= 0", weight)
+            if weight > 0:
+                terms[name] = term() if isinstance(term, type) else term
+        if "chamfer" in terms:
+            terms["chamfer"] = partial(terms["chamfer"], points=self.chamfer_points)
+        return terms
+
     @model_validator(mode="after")
     def _has_a_term(self) -> "Losses":
-        if not self.weights.used:
+        if not self.terms:
             raise InputError("weights: expected at least one weight above 0; found none")
         return self
 
     @property
     def reads_depths(self) -> bool:
-        """Whether a term compares with true depths."""
-        return self.weights.depth > 0
+        """Whether a term compares with true depths; a plug-in's may."""
+        return self.weights.depth > 0 or bool(self.weights.model_extra)
 
     def __call__(
         self, prediction: Prediction, rendering: Rendering, batch: Batch
@@ -68,19 +86,6 @@ class Losses(Options):
 
         Raises:
             InputError: the data has no body vertices or depth maps for a term that reads them."""
-        values = {name: self._term(name, prediction, rendering, batch) for name in self.weights.used}
-        total = sum(self.weights.used[name] * value for name, value in values.items())
+        values = {name: term(prediction, rendering, batch) for name, term in self.terms.items()}
+        total = sum(getattr(self.weights, name) * value for name, value in values.items())
         return total, values
-
-    def _term(self, name: str, prediction: Prediction, rendering: Rendering, batch: Batch) -> Tensor:
-        """A term before its weight.
-
-        Args:
-            name: a field of :class:`LossWeights`.
-            prediction: of the model for the batch.
-            rendering: its Gaussians from the target cameras.
-            batch: with what the term reads.
-        """
-        if name == "chamfer":
-            return terms.chamfer(prediction, rendering, batch, self.chamfer_points)
-        return getattr(terms, name)(prediction, rendering, batch)

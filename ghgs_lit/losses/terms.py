@@ -1,7 +1,8 @@
 """The terms of the training loss.
 
 Every term takes a prediction, its Gaussians rendered from the batch's target cameras, and the
-batch, and returns a scalar without dimensions, in float32 or wider."""
+batch, and returns a scalar without dimensions, in float32 or wider. It is a function, or a class
+that is made without arguments and called; :mod:`ghgs_lit.config.registry` lists them by name."""
 
 import torch
 import torch.nn.functional as F
@@ -16,6 +17,7 @@ from ghgs_lit.geometry.masks import coverage
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.kernels.pool import have_values
 from ghgs_lit.metrics.functional import SSIM_WINDOW, ssim_map
+from ghgs_lit.metrics.protocol import LPIPS
 from ghgs_lit.types import Batch, Prediction, Rendering
 
 Scalar = Float[Tensor, ""]
@@ -151,3 +153,21 @@ def silhouette(prediction: Prediction, rendering: Rendering, batch: Batch) -> Sc
     Returns:
         The mean over all pixels, from 0 to 1."""
     return (at_least_float32(rendering.alpha)[:, :, 0] - batch.targets.masks.float()).abs().mean()
+
+
+class Perceptual:
+    """LPIPS of the target images, as of the metric; raises InputError without its package or weights."""
+
+    def __init__(self) -> None:
+        self.metric = LPIPS(key="weights.lpips")
+
+    def __call__(self, prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
+        """The mean over the images.
+
+        Args:
+            prediction: not used.
+            rendering: images [B, T, 3, h, w]; values outside [0, 1] are clamped.
+            batch: with targets of that shape."""
+        image = rendering.image.flatten(0, 1)
+        self.metric.network.to(image.device)
+        return self.metric(image, batch.targets.images.flatten(0, 1)).mean()

@@ -41,21 +41,22 @@ class LPIPS:
     Args:
         signed: map [0, 1] to [-1, 1], for which the network was calibrated;
             the authors' evaluation does not.
+        key: begins the message of an error.
 
     Raises:
         InputError: torchvision or the weights are not available."""
 
-    def __init__(self, signed: bool = True):
-        installed("torchvision", "lpips", "LPIPS")
+    def __init__(self, signed: bool = True, key: str = "LPIPS"):
+        installed("torchvision", "lpips", key)
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                self.network = LearnedPerceptualImagePatchSimilarity(net_type=NETWORK, normalize=signed)
+                self.network = LearnedPerceptualImagePatchSimilarity(net_type=NETWORK).net
         except Exception as error:  # a download can fail in many ways
             reason = " ".join(str(error).split())
-            raise InputError(f"LPIPS: the weights of {NETWORK!r} could not be loaded: {reason}") from error
+            raise InputError(f"{key}: the weights of {NETWORK!r} could not be loaded: {reason}") from error
         self.signed = signed
 
     def __call__(
@@ -73,7 +74,9 @@ class LPIPS:
         low, high = (0, 1) if self.signed else (-1, None)
         images = image.float().clamp(low, high).split(1)
         targets = target.float().clamp(low, high).split(1)
-        return torch.stack([self.network(*pair) for pair in zip(images, targets, strict=True)])
+        pairs = zip(images, targets, strict=True)
+        # not as torchmetrics' Metric, which keeps the values of all calls
+        return torch.cat([self.network(*pair, normalize=self.signed) for pair in pairs]).flatten()
 
 
 class MetricsOptions(Options):

@@ -101,6 +101,7 @@ def may_be_recorded(model: nn.Module, renderer: Callable, losses: Callable, devi
         device: its type.
     """
     known = isinstance(model, GHGS) and isinstance(renderer, Renderer) and isinstance(losses, Losses)
+    known = known and not losses.weights.model_extra  # terms of a plug-in may do likewise
     return known and model.options.capture == "auto" and device == model.playback.steps.tape.device
 
 

@@ -160,7 +160,7 @@ NUMBERS = [
 
 NAMES = [
     ("train depth_head.parameterization=inverse_linear", 1, "expected", "found"),
-    ("train +loss.weights.lpips=1", 1, "loss.weights key: expected one of", "'lpips'"),
+    ("train loss.weights.render_l2=1", 1, "loss.weights.render_l2: expected one of", "mean render_l1?"),
     ("train trainer.accelerator=abacus", 1, "trainer", "abacus"),
     ("train data.kind=os.system", 1, "data.kind: expected one of humman", "'os.system'"),
     ("evaluate data=synthetic baselines=[white]", 1, "baselines: expected one of black", "'white'"),

@@ -280,7 +280,11 @@ def test_subsampled_chamfer_is_unbiased():
 @pytest.mark.parametrize(
     ("arguments", "key"),
     [
-        ({"weights": {"render_l2": 1.0}}, "loss.weights key: .*did you mean render_l1"),
+        (
+            {"weights": {"render_l2": 1.0}},
+            r"loss\.weights\.render_l2: expected one of chamfer, .*mean render_l1",
+        ),
+        ({"weights": {"mine": 0.0}}, r"loss\.weights\.mine: expected one of"),
         ({"weights": {"render_l1": -1.0}}, r"loss\.weights\.render_l1"),
         ({"weights": {"render_l1": 0.0}}, r"loss\.weights: expected at least one weight above 0"),
         (

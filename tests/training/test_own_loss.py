@@ -208,3 +208,33 @@ def test_a_saved_step_has_its_weights(tmp_path, monkeypatch):
     number, _, fault = replay(tmp_path / "step.pt")
     assert number == 7
     assert (fault.where, fault.place) == ("weights of", "losses.mixing")
+
+
+def test_terms_join_by_registration(tmp_path):
+    """A function and a class: both are trained for, next to a term of the package, and logged."""
+    weights = {"edges": 0.5, "light": 2.0, "render_l1": 0.8, "render_ssim": 0.0, "chamfer": 0.0}
+    losses = run_of("train", [f"loss.weights.{name}={value}" for name, value in weights.items()]).loss.build()
+    subject = GHGSModule(Standin(), flat_renderer, losses, Optimization(lr=0.05))
+    before = subject.model.shift.clone()
+    run = trainer(tmp_path, 3)
+    run.fit(subject, StepData())
+    logged = {name.removeprefix("loss/"): float(value) for name, value in run.callback_metrics.items()}
+    parts = {name: logged[name] for name in ("edges", "light", "render_l1")}
+    assert min(parts.values()) > 0
+    assert logged["total"] == pytest.approx(sum(weights[name] * part for name, part in parts.items()))
+    assert losses.terms["light"].calls == 3
+    assert not torch.equal(subject.model.shift, before)
+    assert losses.reads_depths
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("edge=1", r"edge: expected one of chamfer, .*edges.*; found 'edge' \(did you mean edges\?\)"),
+        ("edges=-1", r"edges: expected a number >= 0; found -1"),
+        ("edges=much", r"edges: expected a number >= 0; found 'much'"),
+    ],
+)
+def test_weights_of_terms_are_checked(override, message):
+    with pytest.raises(InputError, match=rf"loss\.weights\.{message}"):
+        run_of("train", [f"loss.weights.{override}"])
