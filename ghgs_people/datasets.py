@@ -12,7 +12,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from ghgs_lit.config import options
-from ghgs_lit.config.options import Index, Options, Share, Size, Text, Words, Workers
+from ghgs_lit.config.options import Options, Share, Size, Text, Words, Workers
 from ghgs_lit.data.dataset import DataSet, Limit
 from ghgs_lit.data.layout import Completeness, Layout, Rendered
 from ghgs_lit.data.options import required_folder
@@ -248,7 +248,7 @@ class Scans(DataSet, _OnRing):
     render: RenderOptions = RenderOptions(lights="none")
     source: options.PathText | None = None
     """Folder of textured meshes, <id>/<id>.obj or .glb; only for rendering."""
-    split: options.PathText | dict[str, tuple[Text | Index, ...] | None] | None = None
+    split: options.PathText | dict[str, tuple[Text, ...] | None] | None = None
     """Which subjects are train and val: a folder with split_train.txt and split_val.txt, or
     {train: [0000-0425], val: [0426-0525]}. Null: the folders train and val of root; when rendering,
     the split files in source, else a fraction."""

@@ -1,5 +1,5 @@
-"""glTF and GLB files with the vertices where skins and morph targets put them:
-trimesh reads neither."""
+"""glTF and GLB files with the vertices where skins and morph targets put them, and coordinates where
+the transform of a texture does: trimesh reads none of these."""
 
 import base64
 import copy
@@ -21,11 +21,13 @@ _JSON = 0x4E4F534A
 _BIN = 0x004E4942
 # Extensions without which a reader would see another mesh or texture,
 # though a file may require them.
-_READ = ("EXT_texture_webp", "KHR_lights_punctual", "KHR_materials_")
+_READ = ("EXT_texture_webp", "KHR_lights_punctual", "KHR_materials_", "KHR_texture_transform")
+_REPEAT = 10497  # how textures go on outside of their image, if nothing is said
 
 
 def posed(path: Path) -> dict[str, Any] | None:
-    """Read a file with all vertices where its skins, joints and weights of morph targets put them.
+    """Read a file with all vertices where its skins, joints and weights of morph targets put them,
+    and with the coordinates at which its textures are read as the first ones.
 
     Section 3.7.3 of the specification of glTF 2.0: a vertex of a skinned mesh is the mean, by its
     weights, of where its joints put it, in the world of the scene.
@@ -34,7 +36,7 @@ def posed(path: Path) -> dict[str, Any] | None:
         path: of a ``.gltf`` or ``.glb`` file.
 
     Returns:
-        The content of a ``.gltf`` file with its buffers inside; None where nothing moves vertices.
+        The content of a ``.gltf`` file with its buffers inside; None where nothing moves either.
 
     Raises:
         InputError: the file cannot be read, or requires an extension that is not read.
@@ -44,7 +46,7 @@ def posed(path: Path) -> dict[str, Any] | None:
         _check_extensions(path, tree)
         nodes = [(i, node) for i, node in enumerate(tree.get("nodes", [])) if "mesh" in node]
         moved = [(i, node) for i, node in nodes if "skin" in node or any(_morphs(tree, node))]
-        if not moved:
+        if not _place_textures(path, tree, buffers) and not moved:
             return None
         worlds = _worlds(tree)
         shown = _shown(tree)
@@ -95,6 +97,52 @@ def _check_extensions(path: Path, tree: dict[str, Any]) -> None:
         " compression, or export it uncompressed)"
     )
     require(not required, str(path), expected, ", ".join(required))
+
+
+def _place_textures(path: Path, tree: dict[str, Any], buffers: list[bytes]) -> bool:
+    """Give primitives the coordinates at which their texture is read as ``TEXCOORD_0``: those of
+    another set, of whole numbers, or transformed (KHR_texture_transform).
+
+    Args:
+        path: of the file, for messages.
+        tree: content of the file; accessors are added, primitives changed.
+        buffers: of the file; those of the coordinates are added.
+
+    Returns:
+        Whether anything was changed.
+
+    Raises:
+        InputError: a texture that does not repeat is read outside of its image.
+    """
+    changed = False
+    for primitive in (each for mesh in tree.get("meshes", []) for each in mesh["primitives"]):
+        material = tree["materials"][primitive["material"]] if "material" in primitive else {}
+        texture = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
+        transform = texture.get("extensions", {}).get("KHR_texture_transform", {})
+        chosen = f"TEXCOORD_{transform.get('texCoord', texture.get('texCoord', 0))}"
+        index = primitive["attributes"].get(chosen)
+        if not texture or index is None:
+            if texture:  # never those of another set
+                primitive["attributes"].pop("TEXCOORD_0", None)
+                changed = True
+            continue
+        uv = _values(tree, buffers, index)
+        sampler = tree["textures"][texture["index"]].get("sampler")
+        wraps = {} if sampler is None else tree["samplers"][sampler]
+        is_plain = chosen == "TEXCOORD_0" and not transform and uv.dtype == np.float32
+        if uv.dtype != np.float32:
+            uv = uv / np.iinfo(uv.dtype).max
+        angle = transform.get("rotation", 0)
+        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        uv = (uv * transform.get("scale", [1, 1])) @ turn.T + transform.get("offset", [0, 0])
+        for axis, wrap in enumerate(("wrapS", "wrapT")):
+            is_inside = uv[:, axis].min() > -1e-3 and uv[:, axis].max() < 1 + 1e-3
+            found = f"{wrap} {wraps.get(wrap)} and coordinates outside of the image"
+            require(is_inside or wraps.get(wrap, _REPEAT) == _REPEAT, str(path), "repeated textures", found)
+        if not is_plain:
+            primitive["attributes"]["TEXCOORD_0"] = _add(tree, buffers, uv)
+            changed = True
+    return changed
 
 
 def _morphs(tree: dict[str, Any], node: dict[str, Any]) -> list[float]:
@@ -248,12 +296,12 @@ def _values(tree: dict[str, Any], buffers: list[bytes], index: int) -> np.ndarra
 
 
 def _add(tree: dict[str, Any], buffers: list[bytes], vertices: np.ndarray) -> int:
-    """Store vertices in a buffer of their own.
+    """Store vertices or coordinates of a texture in a buffer of their own.
 
     Args:
         tree: content of the file, to which accessor, view and buffer are added.
         buffers: of the file, to which the bytes are added.
-        vertices: [n, 3].
+        vertices: [n, 3] or [n, 2].
 
     Returns:
         Index of their accessor.
@@ -261,7 +309,8 @@ def _add(tree: dict[str, Any], buffers: list[bytes], vertices: np.ndarray) -> in
     buffers.append(vertices.astype("<f4").tobytes())
     tree["buffers"].append({})
     tree["bufferViews"].append({"buffer": len(buffers) - 1, "byteLength": len(buffers[-1])})
-    accessor = {"bufferView": len(tree["bufferViews"]) - 1, "componentType": 5126, "type": "VEC3"}
+    accessor = {"bufferView": len(tree["bufferViews"]) - 1, "componentType": 5126}
+    accessor["type"] = f"VEC{vertices.shape[1]}"
     tree["accessors"].append({**accessor, "count": len(vertices)})
     return len(tree["accessors"]) - 1
 

@@ -4,6 +4,7 @@ or as ``.glb`` with several parts."""
 import io
 import json
 import logging
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import unquote
@@ -22,6 +23,8 @@ from ghgs_people.gltf import posed
 log = logging.getLogger(__name__)
 
 _MESH_SUFFIXES = (".glb", ".gltf", ".obj")
+#: Options of map_Kd that say where an image is read, but for those that change nothing.
+_MOVES = r"(-\w+ \S+ )*-(s(?! 1(\.0*)? 1(\.0*)? )|o(?! 0(\.0*)? 0(\.0*)? )|t|clamp on) "
 _IMAGE_SUFFIXES = (".jpeg", ".jpg", ".png")
 
 
@@ -93,7 +96,10 @@ def _has_meshes(folder: Path) -> bool:
 
 
 class _Beside(trimesh.resolvers.FilePathResolver):
-    """Files that a mesh names, as any system spells them: an MTL file, textures, buffers."""
+    """Files that a mesh names, as any system spells them: an MTL file, textures, buffers;
+    and ``moved``, a texture that its MTL file moves, scales or does not repeat."""
+
+    moved = ""
 
     def get(self, key: str) -> bytes:
         """Read a file; one that is named with folders of another machine lies beside the mesh.
@@ -105,6 +111,7 @@ class _Beside(trimesh.resolvers.FilePathResolver):
             FileNotFoundError: there is none.
         """
         name = str(key).strip().strip('"')
+        self.moved = self.moved or (name if re.match(_MOVES, name) else "")
         folder = Path(self.parent)
         # Escapes of a URI, folders of another machine, and options of map_Kd,
         # which stand before the name.
@@ -133,9 +140,11 @@ def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
         with listed_formats():
             file = io.BytesIO(content)
             kind = kind if tree is None else "gltf"
-            scene = trimesh.load_scene(file, kind, _Beside(str(path)), process=False)
+            beside = _Beside(str(path))
+            scene = trimesh.load_scene(file, kind, beside, process=False)
     except Exception as error:  # trimesh raises whatever its parsers raise
         raise InputError(f"{path}: expected a readable mesh; found {error!r}") from error
+    require(not beside.moved, str(path), "map_Kd without -s, -o, -t and -clamp", beside.moved)
     parts = []
     for node in sorted(scene.graph.nodes_geometry):
         transform, geometry = scene.graph[node]

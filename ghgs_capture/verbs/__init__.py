@@ -10,7 +10,7 @@ from pydantic import Field
 
 from ghgs_lit.cli.verb import Budgets, Device, Measured, Training, Verb
 from ghgs_lit.config.nodes import SequenceOptions, Texts, Turntable
-from ghgs_lit.config.options import CropSize, Index, PathText, Positive, Seed, Text
+from ghgs_lit.config.options import CropSize, PathText, Positive, Seed, Text
 
 Axis = Literal["y", "-y", "z"]
 
@@ -74,7 +74,7 @@ class Predict(OfPhotographs, Measured):
     """Steps of optimisation towards the photographs after the prediction, such as 15; 0: none."""
     out: PathText | None = None
     """Folder for the results; null: that of this run."""
-    subject: Text | Index = 0
+    subject: Text = "0"
     """Without images: name of the subject, or its number in the split."""
     split: Literal["train", "val"] = "val"
     """Without images: where the subject is."""

@@ -69,10 +69,10 @@ def predict_subject(run: "Predict", directory: Path) -> None:
     write_config(run, directory)
     data.prepare_data([run.split])
     names = list(data.subjects(run.split))
-    is_number = isinstance(run.subject, int) and 0 <= run.subject < len(names)
-    subject = names[run.subject] if is_number else run.subject
+    numbers = {str(number): name for number, name in enumerate(names)}
+    subject = run.subject if run.subject in names else numbers.get(run.subject)
     expected = f"0 to {len(names) - 1} or a name such as {names[0]}"
-    require(subject in names, "subject", expected, subject)
+    require(subject is not None, "subject", expected, run.subject)
     batch = data.evaluation_batch(subject, run.split, targets=run.targets).to(device)
     rounds = 0 if run.refine_cameras == "auto" else run.refine_cameras
     result = predict_batch(batch, model, renderer, rounds, run.refine)

@@ -10,6 +10,7 @@ import difflib
 import inspect
 import itertools
 import os
+import re
 import textwrap
 import types
 from collections.abc import Iterable, Mapping, Sequence
@@ -105,14 +106,19 @@ _T = TypeVar("_T", bound="Options")
 
 
 def _text(value: Any) -> Any:
-    return os.fspath(value) if isinstance(value, os.PathLike) else value
+    """A path as text, and a name that spells a number: ``100846``. Of other numbers, such as 2024.10,
+    the spelling is lost."""
+    if isinstance(value, float):
+        raise ValueError("a text (in quotes where it spells a number: '\"2024.10\"')")
+    is_number = isinstance(value, int) and not isinstance(value, bool)
+    return str(value) if is_number else os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
 def _pair(size: int | tuple[int, int]) -> tuple[int, int]:
     return (size, size) if isinstance(size, int) else size
 
 
-Text = Annotated[str, Field(min_length=1)]
+Text = Annotated[str, Field(min_length=1), BeforeValidator(_text)]
 PathText = Annotated[str, Field(min_length=1), BeforeValidator(_text), Words("a path")]
 Count = Annotated[int, Field(ge=1)]
 Index = Annotated[int, Field(ge=0)]
@@ -198,6 +204,9 @@ class Options(BaseModel, metaclass=_Checked):
             default = cls.model_fields[name].default if name in cls.model_fields else None
             if isinstance(value, dict) and isinstance(default, Options):
                 given[name] = {**dict(default), **value}
+            elif isinstance(value, str) and re.fullmatch(r"[+-]?\d[\d_]*", value):
+                words = expected(cls.model_fields[name]) if name in cls.model_fields else ""
+                given[name] = value if re.search("text|path|mapping", words) else int(value)
         return given
 
     @classmethod

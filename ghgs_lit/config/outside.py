@@ -23,6 +23,7 @@ from ghgs_lit.config.defaults import of_verb, open_nodes
 from ghgs_lit.config.folder import conf_dir
 from ghgs_lit.config.keys import flatten, is_below, require_plain
 from ghgs_lit.config.registry import verbs
+from ghgs_lit.config.spelling import keep_spelling, spelling_is_kept
 from ghgs_lit.errors import InputError
 
 #: Of launchers: names and numbers for the queue and the processes, no commands.
@@ -76,7 +77,9 @@ class FileConfigSource(file_config_source.FileConfigSource):
 
 
 def check_outside_files() -> None:
-    """Let all later applications of this process read files as :class:`FileConfigSource` does."""
+    """Let all later applications of this process read files as :class:`FileConfigSource` does,
+    and keep the spelling of names."""
+    keep_spelling()
     SourcesRegistry.instance().types["file"] = FileConfigSource
 
 
@@ -86,9 +89,10 @@ def files_are_read() -> Iterator[None]:
     Plugins.instance()  # registers Hydra's own
     types = SourcesRegistry.instance().types
     before = types["file"]
-    check_outside_files()
     try:
-        yield
+        with spelling_is_kept():
+            check_outside_files()
+            yield
     finally:
         types["file"] = before
 

@@ -76,9 +76,9 @@ def read_split(split: Split, names: Sequence[str]) -> dict[str, list[str]]:
     return chosen
 
 
-def _expand(entry: str | int, names: Sequence[str]) -> list[str]:
+def _expand(entry: str, names: Sequence[str]) -> list[str]:
     """The id, or all of ``names`` in a range of ids of equal length."""
-    first, dash, last = str(entry).partition("-")
+    first, dash, last = entry.partition("-")
     if not dash:
-        return [str(entry)]
+        return [entry]
     return [name for name in names if len(name) == len(first) and first <= name <= last]

@@ -74,8 +74,8 @@ def register_resolvers() -> None:
         place.parent.mkdir(parents=True, exist_ok=True)  # SQLite does not
         return f"sqlite:///{place}"
 
-    def folder(first: str | None, second: str) -> str:
-        return second if first is None else str(Path(first).expanduser())
+    def folder(first: str | float | None, second: str) -> str:
+        return second if first is None else str(Path(str(first)).expanduser())
 
     is_old = omegaconf.__version__.startswith("2.3")
     register = OmegaConf.register_new_resolver if is_old else OmegaConf.register_resolver

@@ -130,7 +130,7 @@ NUMBERS = [
     ("train seed=-1", 1, "seed: expected an integer >= 0", "found -1"),
     ("evaluate seed=null data=synthetic", 1, "seed: expected an integer", "found None"),
     ("train data.batch_size=0", 1, "data.batch_size: expected an integer >= 1 and <= 1024; found 0"),
-    ("predict checkpoint=x subject=1.5", 1, "subject: expected a text or an integer", "found 1.5"),
+    ("predict checkpoint=x subject=1.5", 1, "subject: expected a text (in quotes", "found 1.5"),
     ("import out=x dtype=float8", 1, "dtype: expected one of float32, bfloat16, float16; found 'float8'"),
     ("table runs={tmp} test.alpha=2", 1, "test.alpha: expected", "< 1", "found 2"),
     ("table runs={tmp} columns=[psnr,psnr]", 1, "columns: expected different values; found ['psnr', 'psnr']"),

@@ -55,7 +55,7 @@ class Outer(Options):
             "stage.inner.channels: expected a list of 2 values (each an integer >= 1",
         ),
         ({"size": [1, 2, 3]}, "or a list of 2 values (each an integer >= 1 and <= 8192); found [1, 2, 3]"),
-        ({"path": 7}, "stage.path: expected a path or null; found 7"),
+        ({"path": True}, "stage.path: expected a path or null; found True"),
         ({"per": "some"}, "stage.per: expected an integer >= 1 or all; found 'some'"),
         ({"name": ""}, "stage.name: expected a text; found ''"),
         (

@@ -1,11 +1,13 @@
 """Rigged meshes: vertices are where joints and morph targets put them, by a slow reference."""
 
 import base64
+import io
 import json
 import struct
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from ghgs_lit.errors import InputError
@@ -189,4 +191,76 @@ def test_broken_rigs_are_named(tmp_path, spoil, line):
     spoil(file.tree)
     file.write(tmp_path / "g" / "g.glb", True)
     with pytest.raises(InputError, match=rf"g\.glb: .*{line}"):
+        ScanSource(tmp_path).load("g")
+
+
+UV = RNG.uniform(0, 1, (9, 2)).astype("<f4")
+TURN = np.array([[0.6, 0.8], [-0.8, 0.6]])  # counter-clockwise, while v points down
+
+
+@pytest.mark.parametrize(
+    ("array", "texture", "expected"),
+    [
+        (UV, {"texCoord": 1}, UV),
+        (np.round(UV * 255).astype("u1"), {"texCoord": 1}, np.round(UV * 255) / 255),
+        (UV, {"texCoord": 0, "extensions": {"KHR_texture_transform": {"texCoord": 1}}}, UV),
+        (
+            UV,
+            {
+                "texCoord": 1,
+                "extensions": {
+                    "KHR_texture_transform": {
+                        "offset": [0.1, 0.2],
+                        "rotation": float(np.arctan2(0.8, 0.6)),
+                        "scale": [0.5, 2],
+                    }
+                },
+            },
+            (UV * [0.5, 2]) @ TURN.T + [0.1, 0.2],
+        ),
+    ],
+)
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_texture_is_read_where_its_material_puts_it(tmp_path, array, texture, expected, moved):
+    file, _ = textured(array, texture, moved)
+    file.write(tmp_path / "g" / "g.glb", True)
+    (part,) = ScanSource(tmp_path).load("g").parts
+    np.testing.assert_allclose(part.uv, np.stack((expected[:, 0], 1 - expected[:, 1]), 1), atol=1e-6)
+
+
+def textured(array: np.ndarray, texture: dict, moved: bool = False) -> tuple[File, dict]:
+    """A file with a second set of coordinates, and its tree."""
+    file, _ = rigged(morphs=[0.3, 0.7] if moved else None, skinned=False)
+    image = io.BytesIO()
+    Image.new("RGB", (2, 2)).save(image, "PNG")
+    content = np.frombuffer(image.getvalue(), "u1")
+    view = file.tree["accessors"][file.add(content, "SCALAR")]["bufferView"]
+    index = file.add(array, "VEC2")
+    file.tree["accessors"][index]["normalized"] = array.dtype.kind == "u"
+    file.tree["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_1"] = index
+    file.tree |= {
+        "images": [{"bufferView": view, "mimeType": "image/png"}],
+        "textures": [{"source": 0, "sampler": 0}],
+        "samplers": [{}],
+        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, **texture}}}],
+    }
+    return file, file.tree
+
+
+@pytest.mark.parametrize(
+    ("texture", "sampler", "line"),
+    [
+        ({"texCoord": 2}, {}, "expected texture coordinates"),
+        (
+            {"extensions": {"KHR_texture_transform": {"scale": [3, 1]}}},
+            {"wrapS": 33071},
+            "expected repeated textures; found 'wrapS 33071",
+        ),
+    ],
+)
+def test_what_of_a_texture_cannot_be_applied_is_named(tmp_path, texture, sampler, line):
+    file, tree = textured(UV, texture)
+    tree["samplers"] = [sampler]
+    file.write(tmp_path / "g" / "g.glb", True)
+    with pytest.raises(InputError, match=line):
         ScanSource(tmp_path).load("g")

@@ -58,6 +58,10 @@ def test_names_of_windows_programs(tmp_path):
         (folder / "Material0.MTL").write_text(f"newmtl material0\nmap_Kd {said}\n")
         assert np.abs(ScanSource(tmp_path).load("a").parts[0].texture[0, 0] - [200.0, 90, 30]).max() < 3
     assert ScanSource(tmp_path).names() == ["a"]
+    for said in ("-s 2 1 1 skin.jpeg", "-blendu on -o 0.5 0 0 skin.jpeg", "-clamp on skin.jpeg"):
+        (folder / "Material0.MTL").write_text(f"newmtl material0\nmap_Kd {said}\n")
+        with pytest.raises(InputError, match="expected map_Kd without -s, -o, -t and -clamp; found '-"):
+            ScanSource(tmp_path).load("a")
 
 
 def test_folders_with_meshes_of_other_names_are_named(tmp_path, caplog):
