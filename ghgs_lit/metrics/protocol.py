@@ -1,8 +1,8 @@
 """A measuring protocol: which metrics are computed, how, and under which names."""
 
 import warnings
-from collections.abc import Iterable
-from typing import Literal
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -101,6 +101,9 @@ class MetricsOptions(Options):
     """auto: left out, with a message, where torchvision or its weights are missing;
     require: an error."""
 
+    beside: Literal["correct", "release", "files"] | None = None
+    """Another protocol, measured too: names of its metrics end in its own, such as psnr_correct."""
+
     @property
     def is_release(self) -> bool:
         """Whether the metrics are computed as in the authors' code."""
@@ -129,6 +132,7 @@ class ImageMetrics:
     Attributes:
         protocol: its name, which is reported with every number.
         left_out: the reason for each missing metric.
+        beside: the metrics of another protocol; None: none.
 
     Raises:
         InputError: LPIPS is required, and is not available."""
@@ -145,17 +149,25 @@ class ImageMetrics:
                 if options.lpips == "require":
                     raise
                 self.left_out["lpips"] = str(error)
+        self.beside: ImageMetrics | None = None
+        if options.beside not in (None, options.protocol):
+            self.beside = MetricsOptions(protocol=options.beside, lpips=options.lpips).build()
 
     def to(self, device: torch.device | str) -> "ImageMetrics":
         """Move the network of LPIPS; returns these metrics."""
         if self.lpips is not None:
             self.lpips.network = self.lpips.network.to(device)
+        if self.beside is not None:
+            self.beside.to(device)
         return self
 
     @property
     def names(self) -> list[str]:
         """The names of the values of a call, in order."""
-        return self._of_protocol
+        return [*self._of_protocol, *self._beside(dict.fromkeys(self.beside.names if self.beside else ()))]
+
+    def _beside(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        return {f"{name}_{self.options.beside}": value for name, value in values.items()}
 
     @property
     def _of_protocol(self) -> list[str]:
@@ -200,6 +212,8 @@ class ImageMetrics:
             text["sharpness"] = f"energy of the Laplacian over the target's, {INNER} pixels inside the mask"
         if self.lpips is not None:
             text["lpips"] = f"{NETWORK} on {'[0, 1]' if options.is_release else '[-1, 1]'}, whole image"
+        if self.beside is not None:
+            text |= self._beside(self.beside.definitions)
         return text
 
     def __call__(
@@ -219,7 +233,10 @@ class ImageMetrics:
 
         Returns:
             One value per image by each of :attr:`names`; nan where a region is empty."""
-        return self.measure(image, target, mask, self._of_protocol, depth)
+        values = self.measure(image, target, mask, self._of_protocol, depth)
+        if self.beside is not None:
+            values |= self._beside(self.beside(image, target, mask, depth))
+        return values
 
     @torch.no_grad()
     def measure(

@@ -68,7 +68,7 @@ CASES = {
     "weights": ("vggt.ckpt", "table2", [r"vggt\.ckpt: expected a file of weights; found none"]),
     "weights and data": ("[tv]*", "table4", [r"vggt\.ckpt: expected", rf"thuman2: {FOLDER}"]),
     "import": ("", "table3 init_from=null", [r"init_from: expected a checkpoint with the encoder's weights"]),
-    "LPIPS": ("", "table3 metrics=release", [r"LPIPS: expected the package torchvision"]),
+    "LPIPS": ("", "table3 metrics.lpips=require", [r"LPIPS: expected the package torchvision"]),
     "cache": (
         "",
         "table3 feature_cache=disk feature_cache.folder=vggt.ckpt/cache",

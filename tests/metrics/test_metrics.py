@@ -250,6 +250,24 @@ def test_means_are_over_images():
         assert not mean.state_dict()
 
 
+def test_two_protocols_are_measured_side_by_side():
+    """Each as alone; names of the second end in its own."""
+    images = torch.rand(2, 2, 3, 24, 24, generator=torch.Generator().manual_seed(0)) * 1.2
+    mask = torch.zeros(2, 24, 24, dtype=torch.bool)
+    mask[:, 4:20, 6:18] = True
+    options = {"protocol": "release", "regions": ("image",), "lpips": "off"}
+    both = MetricsOptions(**options, beside="correct").build()
+    values = both(*images, mask)
+    assert list(values) == both.names
+    first = MetricsOptions(**options).build()(*images, mask)
+    second = MetricsOptions(lpips="off").build()(*images, mask)
+    expected = first | {f"{name}_correct": value for name, value in second.items()}
+    torch.testing.assert_close(values, expected, rtol=0, atol=0, equal_nan=True)
+    assert values["psnr"].ne(values["psnr_correct"]).all()  # the release does not clamp
+    assert both.definitions["ssim_correct"] != both.definitions["ssim"]
+    assert MetricsOptions(lpips="off", beside="correct").build().names == [*second]
+
+
 def test_a_protocol_reports_its_metrics_by_name():
     """Each protocol reports its own names, and clamps only if it says so."""
     image, target = _images(2)
