@@ -17,12 +17,12 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from ghgs_lit.cli.inputs import build_data, check_size, choices, given_keys, overrides
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
-from ghgs_lit.config.compose import chosen_options
+from ghgs_lit.config.compose import chosen_options, saved_text
 from ghgs_lit.config.run import Run
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.protocols import check_evaluation
-from ghgs_lit.evaluation.report import measure_and_write
+from ghgs_lit.evaluation.report import measure_and_write, table_of
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.runs import job
 from ghgs_lit.runs.processes import in_srun, queue_again, settle_rank
@@ -272,8 +272,7 @@ def fit(
     Raises:
         InputError: options of the Trainer do not fit the data.
     """
-    if step is not None:
-        loggers.resume(trainer.loggers, step)
+    loggers.begin(trainer.loggers, saved_text(module.config), step)
     started = time.perf_counter()
     try:
         trainer.fit(module, data, ckpt_path=resume)
@@ -330,6 +329,7 @@ def measure_last(
     summary = read_results(path)["summary"]
     changes = RunDirectory(directory).swept or overrides()
     values = loggers.hyperparameters(run.plain, choices(), changes)
-    loggers.log_results(trainer.loggers, values, summary, trainer.global_step)
+    table = table_of(summary, "github")
+    loggers.log_results(trainer.loggers, values, summary, table, trainer.global_step)
     announce(path)
     return summary[0]["psnr"]

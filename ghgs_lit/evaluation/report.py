@@ -1,6 +1,6 @@
 """A configured evaluation: measure methods, print means, write the results of the run."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from ghgs_lit.config.run import Run
 from ghgs_lit.evaluation.measure import Method, measure_all
 from ghgs_lit.evaluation.protocols import target_protocols
 from ghgs_lit.runs.provenance import provenance
-from ghgs_lit.runs.results import METHOD, Row, metric_names, summarize, write_results
+from ghgs_lit.runs.results import METHOD, Row, summarize, write_results
 
 #: Print a line once per process: all runs of a sweep lack the same.
 print_once = cache(print)
@@ -83,22 +83,25 @@ def measure_and_write(
         },
         **facts,
     )
-    print_summary(rows)
+    print(table_of(summarize(rows)), flush=True)
     return write_results(directory, rows, source)
 
 
-def print_summary(rows: list[Row]) -> None:
-    """Print means over subjects as a table.
+def table_of(summary: Sequence[Row], form: str = "simple") -> str:
+    """Means over subjects as a table for readers.
 
     Args:
-        rows: As of :func:`ghgs_lit.evaluation.measure.measure`.
+        summary: Rows of :func:`ghgs_lit.runs.results.summarize`.
+        form: Of tabulate; ``github``: Markdown.
     """
-    names = [name for name in PRINTED if name in metric_names(rows)]
+    names = [name for name in PRINTED if name in summary[0]]
     about = ["method", "views", "targets"]
     lines = []
-    for mean in summarize(rows):
+    for mean in summary:
         numbers = ("-" if mean[name] is None else f"{mean[name]:.{PRINTED[name]}f}" for name in names)
         lines.append([*(mean[key] for key in about), *numbers])
     heads = [*about, *(name.replace("_", "\n") + _UNITS.get(name, "") for name in names)]
     align = ["left", "right", "left", *["right"] * len(names)]
-    print(tabulate(lines, heads, colalign=align, disable_numparse=True), flush=True)
+    if form == "github":
+        heads = [head.replace("\n", " ") for head in heads]
+    return tabulate(lines, heads, form, colalign=align, disable_numparse=True)

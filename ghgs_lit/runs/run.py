@@ -12,6 +12,7 @@ import contextlib
 import datetime
 import json
 import os
+import re
 import shutil
 import socket
 import uuid
@@ -176,8 +177,9 @@ class RunDirectory:
 
     @property
     def title(self) -> str:
-        """:attr:`swept` as the name of a folder; of a long one the end."""
-        return ",".join(self.swept).replace(os.sep, "_")[-200:]
+        """:attr:`swept` as the name of a folder, without the groups of keys; of a long one the end."""
+        changes = (re.sub(r"^[^=]*\.", "", change) for change in self.swept)
+        return ",".join(changes).replace(os.sep, "_")[-200:]
 
     @property
     def curves(self) -> Path:

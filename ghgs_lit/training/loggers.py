@@ -8,7 +8,6 @@ from typing import Any
 
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, WandbLogger
 from lightning.pytorch.utilities import rank_zero_only
-from tabulate import tabulate
 from torch.utils.tensorboard.summary import hparams
 
 from ghgs_lit.config.keys import is_hyperparameter, key_of, lookup
@@ -18,10 +17,12 @@ from ghgs_lit.files import write_atomically
 from ghgs_lit.parsing import read_rows
 from ghgs_lit.runs.run import RunDirectory
 
-#: Final values by which runs are compared; ``metrics.json`` has all.
-COMPARED = ("depth_error_mm", "flip", "lpips", "psnr", "psnr_box", "psnr_edge", "sharpness", "spill", "ssim")
+#: Values of the measurement by which runs are compared; ``metrics.json`` has all.
+COMPARED = ("psnr", "ssim", "depth_error_mm")
+#: Number of input views at which HParams compares runs, of those that were measured at several.
+_VIEWS = 4
 #: Groups of tags that TensorBoard shows first: it sorts them by name.
-_FIRST = ("loss", "val", "values", "view")
+_FIRST = ("loss", "measured", "val", "values", "view")
 #: Settings that compare runs even where all have the same.
 _ALWAYS = ("seed", "views")
 Value = str | int | float | bool
@@ -84,19 +85,23 @@ class TensorBoardLog(_StepsTaken, TensorBoardLogger):
         super().log_metrics(shown, step)
         self.experiment.flush()
 
-    def log_results(self, values: Mapping[str, Value], summary: Sequence[Mapping[str, Any]]) -> None:
-        """Describe the run for the tab HParams, which shows its last validation beside its
-        settings, and write the measurement to the tab Text: as scalars, its numbers would be
-        charts of one point.
+    def log_results(
+        self, values: Mapping[str, Value], summary: Sequence[Mapping[str, Any]], table: str, step: int
+    ) -> None:
+        """Describe the run for the tab HParams, which shows the measurement at one number of views
+        beside the settings, and write the whole measurement to the tab Text.
 
         Args:
             values: of :func:`hyperparameters`.
-            summary: of ``metrics.json``."""
-        validated = [name for name in COMPARED if name != "flip" and summary[0].get(name) is not None]
-        compared = [f"val/{name}" for name in validated]
-        for part in hparams(dict(values), dict.fromkeys(compared, 0.0)):
+            summary: of ``metrics.json``.
+            table: the same in Markdown.
+            step: of Lightning."""
+        row = next((row for row in summary if row["views"] == _VIEWS), summary[0])
+        numbers = final_numbers([row])
+        for part in hparams(dict(values), numbers):
             self.experiment._get_file_writer().add_summary(part)
-        self.experiment.add_text("measurement", tabulate(summary, "keys", "github"))
+        self.experiment.add_text("measurement", table, step + 1)
+        self.log_metrics(numbers, step)  # HParams reads scalars alone
 
 
 def _sorted_last(name: str) -> str:
@@ -165,20 +170,27 @@ class WandbOptions(Options):
 
 
 @rank_zero_only
-def resume(loggers: Sequence[Logger], step: int) -> None:
-    """Continue the logs of a run in the same folder.
+def begin(loggers: Sequence[Logger], config: str, step: int | None) -> None:
+    """Begin the logs of a run, or continue those in the same folder.
 
     Args:
         loggers: of the run.
-        step: number of steps taken, from where it goes on."""
+        config: its resolved configuration as YAML, for the tab Text of TensorBoard.
+        step: number of steps taken, from where it goes on; None: a new run."""
     for logger in loggers:
-        if isinstance(logger, (CsvLog, TensorBoardLog)):
+        if step is not None and isinstance(logger, (CsvLog, TensorBoardLog)):
             logger.resume(step)
+        if isinstance(logger, TensorBoardLog):
+            logger.experiment.add_text("configuration", f"```yaml\n{config}```", step or 0)
 
 
 @rank_zero_only
 def log_results(
-    loggers: Sequence[Logger], values: Mapping[str, Value], summary: Sequence[Mapping[str, Any]], step: int
+    loggers: Sequence[Logger],
+    values: Mapping[str, Value],
+    summary: Sequence[Mapping[str, Any]],
+    table: str,
+    step: int,
 ) -> None:
     """Log what sets a run apart, which CSV has in ``config.yaml``, and its final numbers.
 
@@ -186,11 +198,12 @@ def log_results(
         loggers: of the run.
         values: of :func:`hyperparameters`.
         summary: of ``metrics.json``.
+        table: the same in Markdown.
         step: number of steps after which the weights were measured."""
     results = final_numbers(summary)
     for logger in loggers:
         if isinstance(logger, TensorBoardLog):
-            logger.log_results(values, summary)
+            logger.log_results(values, summary, table, step - 1)
             continue
         if not isinstance(logger, CSVLogger):
             logger.log_hyperparams(dict(values))
@@ -218,14 +231,12 @@ def final_numbers(summary: Sequence[Mapping[str, Any]]) -> dict[str, float]:
         summary: of ``metrics.json``, a row for each protocol.
 
     Returns:
-        ``hparam/psnr`` of the first protocol, ``hparam_v4_midway/psnr`` of others;
-        only defined values."""
+        Such as ``measured/psnr_v4_release``; only defined values."""
     numbers = {}
-    for number, row in enumerate(summary):
-        prefix = f"hparam_v{row['views']}_{row['targets']}" if number else "hparam"
+    for row in summary:
         for name in COMPARED:
             if row.get(name) is not None:
-                numbers[f"{prefix}/{name}"] = float(row[name])
+                numbers[f"measured/{name}_v{row['views']}_{row['targets']}"] = float(row[name])
     return numbers
 
 

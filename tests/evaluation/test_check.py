@@ -9,7 +9,7 @@ from ghgs_lit.config import run_of
 from ghgs_lit.data.reader import PhotographCache
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.protocols import check_evaluation
-from ghgs_lit.evaluation.report import print_summary
+from ghgs_lit.evaluation.report import table_of
 
 
 def check(root, *overrides):
@@ -65,7 +65,7 @@ def test_no_name_is_cut_on_a_narrow_terminal(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "40")
     about = {"views": 4, "targets": "release", "subject": "a"}
     values = dict.fromkeys(("psnr", "psnr_box", "ssim", "flip", "depth_error_mm"), 1.0)
-    print_summary([{"method": "nearest_view", **about, **values}])
+    print(table_of([{"method": "nearest_view", **about, **values}]))
     said = capsys.readouterr().out
     assert "nearest_view" in said
     assert all(word in said for word in ("depth", "error", "mm"))

@@ -28,7 +28,7 @@ def test_runs_of_a_grid_have_the_names_of_what_differs(tmp_path):
     """TensorBoard's files lie in folders of these names, below the sweep's;
     a seed is always said."""
     runs = planned(tmp_path, "ablation=full seed=1", "ablation=neither seed=1", "+optimizer.lr=0.1 seed=1")
-    expected = ["ablation=full,seed=1", "ablation=neither,seed=1", "+optimizer.lr=0.1,seed=1"]
+    expected = ["ablation=full,seed=1", "ablation=neither,seed=1", "lr=0.1,seed=1"]
     assert [run.title for run in runs] == expected
     logs = [TensorBoardOptions().build(str(run.path)).log_dir for run in runs]
     assert [Path(folder) for folder in logs] == [tmp_path / "tensorboard" / name for name in expected]

@@ -24,11 +24,11 @@ from ghgs_lit.training.cost import Costs
 from ghgs_lit.training.loggers import (
     CsvLog,
     TensorBoardLog,
+    begin,
     close,
     final_numbers,
     hyperparameters,
     log_results,
-    resume,
 )
 from ghgs_lit.training.validation_pictures import PicturesOptions, distributions
 from tests.helpers.losses import losses_of
@@ -95,7 +95,11 @@ def run(tmp_path_factory):
     log_results(
         trainer.loggers,
         values,
-        [{"views": 4, "targets": "release", "psnr": 30.0, "ssim": None, "flip": 0.1}],
+        [
+            {"views": 3, "targets": "release", "psnr": 29.0, "ssim": 0.8},
+            {"views": 4, "targets": "release", "psnr": 30.0, "ssim": None, "flip": 0.1},
+        ],
+        "| PSNR |",
         8,
     )
     return folder, subject
@@ -111,7 +115,8 @@ def test_tags_are_grouped_by_what_they_are(run):
         "work/train/budget", "work/train/gaussians", "work/train/gradient_norm", "work/train/learning_rate",
         "work/train/skipped_steps",
         "val/psnr", "val/psnr_box", "val/ssim", "val/depth_error_mm", "val/lpips",
-        "val/surface_mm", "val/psnr_box_40", "val/psnr_edge", "val/spill", "val/sharpness",
+        "measured/psnr_v4_release", "val/surface_mm", "val/psnr_box_40", "val/psnr_edge", "val/spill",
+        "val/sharpness",
     }  # fmt: skip
 
 
@@ -119,15 +124,15 @@ def test_losses_and_validations_come_first(run):
     """TensorBoard sorts groups of tags by name, those of pictures and distributions among them."""
     found = events(run[0] / "tensorboard").Tags()
     tags = [*found["scalars"], *found["images"], *found["histograms"]]
-    assert sorted({tag.split("/")[0] for tag in tags}) == ["loss", "val", "values", "view", "work"]
+    groups = sorted({tag.split("/")[0] for tag in tags})
+    assert groups == ["loss", "measured", "val", "values", "view", "work"]
 
 
 def test_no_chart_has_a_single_point(run):
-    """Of eight steps, logged every second, and two validations."""
+    """Of eight steps, logged every second, and two validations; but for what HParams reads."""
     found = events(run[0] / "tensorboard")
-    assert {
-        tag: len(found.Scalars(tag)) for tag in found.Tags()["scalars"] if len(found.Scalars(tag)) < 2
-    } == {}
+    single = [tag for tag in found.Tags()["scalars"] if len(found.Scalars(tag)) < 2]
+    assert single == ["measured/psnr_v4_release"]
 
 
 def test_distributions_are_of_the_predicted_gaussians(run):
@@ -197,9 +202,11 @@ def test_the_session_says_what_the_run_is_and_that_it_ended(run):
     assert start.hparams["lr"].number_value == 0.1
     assert hparams(folder, "_hparams_/session_end_info").session_end_info.status == 1
     columns = hparams(folder, "_hparams_/experiment").experiment.metric_infos
-    assert [column.name.tag for column in columns] == ["val/psnr"]
-    (written,) = events(folder).Tensors("measurement/text_summary")
-    assert "| release   |     30 |        |    0.1 |" in written.tensor_proto.string_val[0].decode()
+    assert [column.name.tag for column in columns] == ["measured/psnr_v4_release"]
+    found = events(folder)
+    assert [(event.step, event.value) for event in found.Scalars("measured/psnr_v4_release")] == [(8, 30)]
+    (written,) = found.Tensors("measurement/text_summary")
+    assert (written.step, written.tensor_proto.string_val[0]) == (8, b"| PSNR |")
 
 
 def test_nothing_of_the_clock_stays(run):
@@ -224,7 +231,7 @@ def test_logs_resume_where_the_checkpoint_was(tmp_path):
     second = loggers(tmp_path)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # Lightning's that files will be deleted, which is not so
-        resume(second, 6)
+        begin(second, "seed: 1\n", 6)
     for logger in second:
         for step in range(6, 8):
             logger.log_metrics({"a": 100 + step, "c": 2}, step)
@@ -279,7 +286,7 @@ def test_runs_of_a_sweep_leave_no_threads(tmp_path):
         for logger in of_run:
             logger.log_metrics({"a": 1.0}, 0)
             logger.finalize("success")  # as Lightning does when training ends
-        log_results(of_run, {"seed": number}, [{"views": 4, "targets": "release", "psnr": 30.0}], 1)
+        log_results(of_run, {"seed": number}, [{"views": 4, "targets": "release", "psnr": 30.0}], "", 1)
         close(of_run)
         assert events(tmp_path / str(number) / "tensorboard").Tensors("measurement/text_summary")
     assert threading.active_count() == before
@@ -311,7 +318,8 @@ def test_final_numbers_name_their_protocol():
         {"method": "model", "views": 4, "targets": "release", "subjects": 2, "psnr": 30, "seconds": 1.0},
         {"method": "model", "views": 4, "targets": "midway", "subjects": 2, "psnr": 28, "lpips": None},
     ]
-    assert final_numbers(summary) == {"hparam/psnr": 30.0, "hparam_v4_midway/psnr": 28.0}
+    expected = {"measured/psnr_v4_release": 30.0, "measured/psnr_v4_midway": 28.0}
+    assert final_numbers(summary) == expected
 
 
 def test_memory_is_that_of_this_process():
