@@ -187,7 +187,7 @@ class RunDirectory:
         beside the runs, called :attr:`title`. ``.run`` in it says whose it is."""
         if not (self.title and (self.path.parent / PLAN).is_file()):
             return self.path / "tensorboard"
-        folder = self.path.parent / "tensorboard" / self.title
+        folder = self.path.parent / "tb" / self.title
         marker = self.marker
         is_free = marker is None or _owner_of(folder) in (None, marker.id)
         return folder if is_free else folder.with_name(f"{self.title},run={marker.id}")

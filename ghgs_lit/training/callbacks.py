@@ -8,7 +8,7 @@ from typing import Any
 
 import lightning.pytorch as L
 from lightning.pytorch.callbacks import Callback
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
 from ghgs_lit.config.options import Options
 from ghgs_lit.method.recalibration.inspection import neighborhoods, seen_calls
@@ -31,36 +31,38 @@ class RunProgress(Callback):
         """Open the log and the bar."""
         has_bar = on_terminal()
         self._lines = Lines(Path(trainer.default_root_dir) / "train.log", printed=not has_bar)
-        columns = (BarColumn(), TaskProgressColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+        columns = (BarColumn(), TaskProgressColumn(), TextColumn("{task.description}"))
         self._bar = Progress(*columns, disable=not (has_bar and trainer.is_global_zero))
         self._task = self._bar.add_task("training", total=1.0)
         self._bar.start()
-        self._first = None  # time, step and used budget of the first line, then of the last one
-        self._last = (time.monotonic(), trainer.global_step, pl_module.used_budget)
+        self._first = None  # time, step and used budget after the first step
+        self._written = trainer.global_step
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
         """Show or write how far the run is, if it is due."""
-        if not self._bar.disable:  # numbers of a step make the host wait for a GPU
-            text = "  ".join([f"step {trainer.global_step}", *_numbers(trainer)])
-            self._bar.update(self._task, completed=pl_module.used_budget, description=text)
+        step = trainer.global_step
         # Nothing is new between two parts of an accumulated step.
-        if trainer.is_global_zero and trainer.global_step > self._last[1] and self._lines.due():
-            self._say(trainer, pl_module)
+        is_due = trainer.is_global_zero and step > self._written and self._lines.due()
+        if is_due or not self._bar.disable:  # numbers of a step make the host wait for a GPU
+            text = self._text(trainer, pl_module.used_budget)
+            self._bar.update(self._task, completed=pl_module.used_budget, description=text)
+        if is_due:
+            self._lines.say(text)
+            self._written = step
 
-    def _say(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Write a line: step, values, seconds a step and the time that is left."""
-        now = (time.monotonic(), trainer.global_step, pl_module.used_budget)
+    def _text(self, trainer: L.Trainer, used: float) -> str:
+        """Step, values, steps a second and the time that is left."""
+        now, step = time.monotonic(), trainer.global_step
         total = f" of {trainer.max_steps}" if trainer.max_steps > 0 else ""
-        parts = [f"step {now[1]}{total}", *_numbers(trainer)]
-        if self._first is None:  # the first step compiles and fills caches: its time is not typical
-            self._first = now
-        else:
-            parts.append(f"{(now[0] - self._last[0]) / (now[1] - self._last[1]):.3g} s a step")
-            used = now[2] - self._first[2]
-            if used > 0:
-                parts.append(f"{clock((now[0] - self._first[0]) * (1 - now[2]) / used)} left")
-        self._lines.say("  ".join(parts))
-        self._last = now
+        values = trainer.progress_bar_metrics.items()
+        parts = [f"step {step}{total}", *(f"{name} {value:.4g}" for name, value in values)]
+        if self._first is None and step > self._written:  # it compiles and fills caches
+            self._first = now, step, used
+        elif self._first is not None and used > self._first[2]:
+            seconds = now - self._first[0]
+            parts.append(f"{(step - self._first[1]) / seconds:.3g} steps/s")
+            parts.append(f"{clock(seconds * (1 - used) / (used - self._first[2]))} left")
+        return "  ".join(parts)
 
     def on_train_end(self, *args: Any) -> None:
         """Close the bar."""
@@ -70,11 +72,6 @@ class RunProgress(Callback):
         """Close the bar, so that the terminal is whole."""
         if hasattr(self, "_bar"):  # training had begun
             self._bar.stop()
-
-
-def _numbers(trainer: L.Trainer) -> list[str]:
-    """Values that are shown beside the bar; waits for the device."""
-    return [f"{name} {value:.4g}" for name, value in trainer.progress_bar_metrics.items()]
 
 
 class NeighborsAtStart(Callback):

@@ -135,7 +135,7 @@ class CsvOptions(Options):
 
 class TensorBoardOptions(Options):
     """TensorBoard's files in ``<run>/tensorboard``; of a run of a grid in
-    ``<sweep>/tensorboard/<what sets it apart>``, since TensorBoard names runs by their folders."""
+    ``<sweep>/tb/<what sets it apart>``, since TensorBoard names runs by their folders."""
 
     def build(self, save_dir: str) -> TensorBoardLog:
         """The logger of the run in ``save_dir``."""

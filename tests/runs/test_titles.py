@@ -31,7 +31,7 @@ def test_runs_of_a_grid_have_the_names_of_what_differs(tmp_path):
     expected = ["ablation=full,seed=1", "ablation=neither,seed=1", "lr=0.1,seed=1"]
     assert [run.title for run in runs] == expected
     logs = [TensorBoardOptions().build(str(run.path)).log_dir for run in runs]
-    assert [Path(folder) for folder in logs] == [tmp_path / "tensorboard" / name for name in expected]
+    assert [Path(folder) for folder in logs] == [tmp_path / "tb" / name for name in expected]
 
 
 def test_a_run_keeps_its_name_when_the_grid_grows(tmp_path):
