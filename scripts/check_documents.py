@@ -10,6 +10,14 @@ document gets an empty folder with links to what a checkout has. Three tables sa
 text: NOT_RUN (left out, with the reason), SMALL (small settings, and stand-ins for files of the reader) and
 BEFORE (what a document expects to be there). One line is printed for each command; the exit code is 1 if one
 fails.
+
+Above a table of figures, in its section, stands what they are of (`none`: they depend on no such thing):
+
+    <!-- figures: ghgs evaluate checkpoint=shipped; commit 96ee19c1; weights ce8df77b3fbf; people 2 -->
+
+The commit is the one that measured them, or at which they entered the documents; weights are the first
+digits of their digest, people the version of the frozen ones. Where one is not today's, the section must
+call them "older weights" or "older people", and lie in docs/evidence.
 """
 
 import argparse
@@ -27,8 +35,25 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+
+from ghgs_lit.weights.frozen import digest_of
+from ghgs_lit.weights.reading import SHIPPED_FILE
+from ghgs_people.bench import definition
+
 ROOT = Path(__file__).resolve().parents[1]
 LIMIT = 600  # seconds for one command
+
+#: What figures of today are of.
+TODAY = {
+    "weights": digest_of(torch.load(SHIPPED_FILE, weights_only=True)["state_dict"])[:12],
+    "people": str(definition("sealed")["version"]),
+}
+STAMP = r"<!-- figures: .+; commit (?P<commit>\w+); weights (?P<weights>\w+); people (?P<people>\w+) -->\n"
+#: Commits, one a line; empty where the history is not whole.
+HISTORY = subprocess.run("git rev-list HEAD", shell=True, cwd=ROOT, capture_output=True, text=True).stdout
+HISTORY *= (ROOT / ".git").exists() and not (ROOT / ".git" / "shallow").exists()
+LEAST = 4  #: cells that begin with a decimal: the least of a table of figures
 
 PUBLISHED = "needs published weights"
 NETWORK = "needs a package index"
@@ -174,7 +199,6 @@ BEFORE = {
     ),
     "docs/encoder.md": _CHECKPOINTS,
     "docs/evidence/benchmark.md": _RENDERED,
-    "docs/evidence/models.md": _RENDERED,
     "docs/evidence/photographs.md": _RENDERED,
     "docs/evidence/rounds.md": _RENDERED,
     "docs/first_week.md": (
@@ -295,10 +319,46 @@ def _in_blocks(document: str, text: str) -> Iterator[Command]:
 def _in_prose(document: str, text: str) -> Iterator[Command]:
     """Code spans that begin like a command and have an argument;
     names of verbs alone are not run."""
-    prose = re.sub(r"^```.*?^```", lambda block: "\n" * block[0].count("\n"), text, flags=re.M | re.S)
+    prose = _without_blocks(text)
     program = r"(?:ghgs --help|ghgs\s\w+\s\S*(?:=|--help)|python \w+/|make \w|pip install|tensorboard )"
     for span in re.finditer(rf"(?<!`)`((?:\w+=\S+ )?{program}[^`]*)`(?!`)", prose):
         yield Command(document, prose.count("\n", 0, span.start()) + 1, " ".join(span[1].split()))
+
+
+def _without_blocks(text: str) -> str:
+    return re.sub(r"^```.*?^```", lambda block: "\n" * block[0].count("\n"), text, flags=re.M | re.S)
+
+
+def stale_figures(document: str) -> list[str]:
+    """Find tables of figures that are not of today's weights and people, and commits that do not exist.
+
+    Args:
+        document: relative to the repository.
+
+    Returns:
+        A line for each fault.
+    """
+    text = _without_blocks((ROOT / document).read_text())
+    named = re.findall(r"\b(?!a\d{7})(?=\d*[a-f])(?=[a-f]*\d)[0-9a-f]{7,8}\b", text)
+    missing = [c for c in named if HISTORY and not re.search(f"^{c}", HISTORY, re.M)]
+    faults = [f"{commit}: expected a commit of this repository" for commit in missing]
+    for section in re.split(r"^(?=#)", text, flags=re.M):
+        stamp = None
+        for part in re.finditer(rf"^{STAMP}|^(?:\|.*\n)+", section, re.M):
+            if part["commit"]:
+                stamp = part
+            elif len(re.findall(r"\| [*+-]*\d+\.\d", part[0])) >= LEAST:
+                title = part[0].splitlines()[0]
+                faults += [f"{title}: {fault}" for fault in _faults_of(stamp, section, document)]
+    return [f"{document}: {fault}" for fault in faults]
+
+
+def _faults_of(stamp: re.Match | None, section: str, document: str) -> list[str]:
+    if stamp is None:
+        return ["expected `<!-- figures: ... -->` above it"]
+    old = [kind for kind, today in TODAY.items() if stamp[kind] not in (today, "none")]
+    labelled = [k for k in old if f"older {k}" in section.lower() and document.startswith("docs/evidence/")]
+    return [f"{kind}: expected {TODAY[kind]}; found {stamp[kind]}" for kind in old if kind not in labelled]
 
 
 class Reader:
@@ -400,7 +460,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     unknown = sorted(set(given.documents) - set(documents()))
     if unknown:
         parser.error(f"expected documents of {', '.join(documents())}; found {unknown[0]}")
-    total: Counter = Counter()
+    faults = [fault for document in given.documents or documents() for fault in stale_figures(document)]
+    print(*faults, sep="\n", end="\n" if faults else "")
+    total: Counter = Counter(failed=len(faults))
     with tempfile.TemporaryDirectory(prefix="documents") as temporary:
         folder = (given.folder or Path(temporary)).resolve()
         for document in given.documents or documents():

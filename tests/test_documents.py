@@ -162,6 +162,40 @@ def test_options_and_keys_exist():
     assert not wrong
 
 
+def test_figures_are_of_todays_weights_and_people():
+    assert [fault for document in DOCUMENTS for fault in check_documents.stale_figures(document)] == []
+
+
+@pytest.mark.parametrize(
+    ("document", "change", "expected"),
+    [
+        ("README.md", {}, []),
+        ("README.md", {"weights WEIGHTS": "weights none"}, []),
+        ("README.md", {"weights WEIGHTS": "weights da9733ed32f3"}, ["weights"]),
+        ("README.md", {"people PEOPLE": "people 1", "Text": "Older people"}, ["people"]),
+        ("docs/evidence/a.md", {"people PEOPLE": "people 1"}, ["people"]),
+        ("docs/evidence/a.md", {"people PEOPLE": "people 1", "Text": "Older people"}, []),
+        ("README.md", {"HEAD": "abcdef12"}, ["abcdef12"]),
+        ("README.md", {"<!--": "<!-- no"}, ["expected `<!-- figures"]),
+        ("README.md", {"-->\n": "-->\n# Next\n"}, ["expected `<!-- figures"]),
+    ],
+)
+def test_stale_figures_are_found(document, change, expected, tmp_path, monkeypatch):
+    text = "# A\nText\n\n<!-- figures: ghgs evaluate; commit HEAD; weights WEIGHTS; people PEOPLE -->\n"
+    text += "| a | b |\n|---|---|\n| 1.5 | **2.5** |\n| -3.5 | 4.5 / 5.5 |\n"
+    for old, new in change.items():
+        text = text.replace(old, new)
+    for kind, today in check_documents.TODAY.items():
+        text = text.replace(kind.upper(), today)
+    (tmp_path / document).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / document).write_text(text)
+    monkeypatch.setattr(check_documents, "ROOT", tmp_path)
+    monkeypatch.setattr(check_documents, "HISTORY", "0123456789\n")
+    faults = check_documents.stale_figures(document)
+    assert len(faults) == len(expected)
+    assert all(part in fault for part, fault in zip(expected, faults, strict=True))
+
+
 def test_promised_pythons_agree():
     """README, package, linter and the script that tests them must promise the same
     versions of Python."""
