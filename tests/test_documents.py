@@ -62,7 +62,8 @@ DOCUMENTS = check_documents.documents()
 def code(document: str) -> list[str]:
     """Code of a document, each span on one line: in running text, and in blocks except Python."""
     text = (REPOSITORY / document).read_text()
-    blocks = re.findall(r"^```(?!python)\w*\n(.*?)^```", text, re.M | re.S)
+    named = re.findall(r"^```(\w*)\n(.*?)^```", text, re.M | re.S)
+    blocks = [block for language, block in named if language != "python"]
     prose = re.sub(r"^```.*?^```", "", text, flags=re.M | re.S)
     # what made a table, and is not needed any more
     prose = re.sub(r"`[^`]*` of commit \w+", "", prose)
