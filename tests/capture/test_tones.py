@@ -57,6 +57,12 @@ def test_equal_tones_stay_as_they_are_whatever_the_exposures(taken, gains):
     assert torch.equal(found.gaussians.means, plain.gaussians.means)
 
 
+def test_channels_that_go_different_ways_are_no_tone_curve(taken):
+    """Coloured light or a wrong white balance, which the other cameras contradict."""
+    tinted = seen_with(taken, [1.0, np.array([1.2, 1.2, 1 / 1.2]), 1.0, 1.0])
+    assert predict(tinted, **KEYS).tones == {}
+
+
 def test_any_unit_and_origin_tell_the_same(tmp_path):
     figure = Figure(scale=1000.0, origin=(3e6, 0, 0))
     far = Capture.read(tmp_path, figure.write(tmp_path))

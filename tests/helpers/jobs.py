@@ -26,10 +26,10 @@ from ghgs_lit.runs.run import RunDirectory
 register_resolvers()
 
 
-def write_finished_run(directory: Path, config: dict[str, Any], psnr: float = 20.0) -> float:
-    """Write the results of a run."""
+def write_finished_run(directory: Path, config: dict[str, Any], psnr: float = 20.0, **facts: Any) -> float:
+    """Write the results of a run, with facts of its provenance."""
     row = {"method": "model", "subject": "p0", "views": 4, "targets": "release", "target": "0", "inputs": []}
-    write_results(directory, [{**row, "psnr": psnr}], provenance(config, seed=config["seed"]))
+    write_results(directory, [{**row, "psnr": psnr}], provenance(config, seed=config["seed"], **facts))
     return psnr
 
 

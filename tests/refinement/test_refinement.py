@@ -62,6 +62,7 @@ def test_a_view_that_nobody_saw_gets_better():
 def test_changes_are_bounded():
     """What no photograph shows must stay near the prediction, however long it is refined."""
     splats, inputs, _ = scene(size=42)
+    splats.opacities[:2] = torch.tensor((0.0, 1.0))  # which no step of their logit could leave
     noise = dataclasses.replace(inputs, images=torch.rand(inputs.images.shape) * inputs.masks[:, :, None])
     refined = Refinement(70, RENDERER)(splats, noise)
     depth = world_to_camera(splats.means, inputs.cameras.extrinsics[0][splats.image])[:, 2]

@@ -9,6 +9,7 @@ import time
 import pytest
 
 from ghgs_lit.errors import InputError
+from ghgs_lit.runs.planned import step_seconds
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory, State
 from tests.helpers.jobs import (
@@ -28,6 +29,28 @@ def test_results_that_are_not_whole_are_no_results(tmp_path):
     write_finished_run(run.path, {"seed": 1})
     assert run.state == State.DONE
     assert run.metric == 20.0
+
+
+def test_results_of_a_completed_configuration_are_those_of_its_command(tmp_path):
+    """``ghgs adapt`` trains with what it finds in its photographs, beside the keys of the command."""
+    write_finished_run(tmp_path, {"seed": 1}, run={"config_hash": "a"})
+    assert RunDirectory(tmp_path, "a").done
+    assert not RunDirectory(tmp_path, "b").done
+
+
+def test_a_step_is_as_long_as_in_all_sessions_of_finished_runs(tmp_path):
+    for name, sessions in (
+        ("a", [(100, 30.0), (50, 10.0)]),
+        ("b", [(50, 20.0)]),
+        ("unfinished", [(9, 900.0)]),
+    ):
+        run = RunDirectory(tmp_path / name)
+        for steps, seconds in sessions:
+            with run.session() as stats:
+                stats |= {"steps": steps, "seconds": seconds}
+        if name != "unfinished":
+            write_finished_run(run.path, {"seed": 1})
+    assert step_seconds(tmp_path) == (0.3, 2)
 
 
 def test_results_whose_configuration_was_changed_are_refused(tmp_path):

@@ -47,6 +47,19 @@ def test_a_run_keeps_its_name_when_the_grid_grows(tmp_path):
     assert third.title == f"seed=2,run={third.path.name}"
 
 
+def test_two_runs_of_one_title_keep_their_curves_apart(tmp_path):
+    """A run that another command has called the same does not write into the files of the first."""
+    runs = planned(tmp_path, "seed=1", "seed=2", shared=())
+    for run in runs:
+        (run.path / "swept.json").write_text('["seed=1"]')
+        with run.claim():
+            run.begin(run_of("train"))
+    first, second = (run.curves for run in runs)
+    assert first == tmp_path / "tensorboard" / "seed=1"
+    assert second == tmp_path / "tensorboard" / f"seed=1,run={runs[1].marker.id}"
+    assert [(folder / ".run").read_text() for folder in (first, second)] == [run.marker.id for run in runs]
+
+
 def test_a_run_of_its_own_has_its_files_in_its_folder(tmp_path):
     logger = TensorBoardOptions().build(str(tmp_path / "mine"))
     assert Path(logger.log_dir) == tmp_path / "mine" / "tensorboard"

@@ -159,8 +159,9 @@ def test_a_run_with_an_average_goes_on(tmp_path):
     for path in (None, middle):
         subject = module()
         saving = [Save(middle, 2)] if path is None else []
-        run = trainer(tmp_path, 4, AveragingOptions(decay=0.75).build(), *saving)
-        run.fit(subject, StepData(), ckpt_path=path)
+        average = AveragingOptions(decay=0.75).build()
+        trainer(tmp_path, 4, average, *saving).fit(subject, StepData(), ckpt_path=path)
+        assert average._average_model.n_averaged == 4
         results.append(subject)
     for name, value in results[0].named_parameters():
         assert torch.equal(value, dict(results[1].named_parameters())[name]), name

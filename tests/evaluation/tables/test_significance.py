@@ -245,6 +245,18 @@ def test_the_reference_can_be_the_best_or_none(tmp_path):
             PairedTest(**wrong)
 
 
+def test_the_best_row_of_errors_is_the_lowest(tmp_path):
+    for name, lpips in (("full", 0.2), ("neither", 0.1)):
+        for seed in (1, 2):
+            write_run(tmp_path / f"{name}{seed}", name, 20.0, seed, views=(4,), lpips=lpips)
+    (table,) = tables_of(
+        tmp_path, views=(4,), metrics=("lpips",), test={"against": "best", "metrics": "lpips"}
+    )
+    rows, _ = body(to_markdown(table))
+    assert rows["✗", "✗"][0] == "**0.1000 ± 0.0000**"
+    assert rows["✓", "✓"][0].startswith("0.2000 ± 0.0000\\* [+0.1000")
+
+
 def test_every_pair_counts_where_the_reference_is_the_best(tmp_path):
     """The best of several equal rows is best by chance."""
     for name in ("full", "no_semantic", "neither"):

@@ -243,14 +243,16 @@ def test_undefined_values_are_null_and_left_out_of_means(tmp_path):
         {**about, "subject": "a", "psnr": 30.0, "psnr_box": 10.0, "depth_error_mm": None},
         {**about, "subject": "b", "psnr": 40.0, "psnr_box": float("inf"), "depth_error_mm": None},
     ]
-    (means,) = summarize(rows[:2])
+    rows.insert(2, {**about, "subject": "a", "psnr": 34.0, "psnr_box": float("nan"), "depth_error_mm": None})
+    (means,) = summarize(rows[:3])
     assert means["psnr_box"] == 10
     assert means["depth_error_mm"] is None
     # Each subject counts once, however many targets it has.
-    assert summarize(rows)[0]["psnr"] == pytest.approx((25 + 40) / 2)
+    (means,) = summarize(rows)
+    assert (means["psnr"], means["subjects"]) == ((28 + 40) / 2, 2)
     content = read_results(write_results(tmp_path, rows, {"seed": 1}))
     assert content["rows"][0]["psnr_box"] is None
-    assert content["rows"][2]["psnr_box"] is None
+    assert content["rows"][3]["psnr_box"] is None
     lines = (tmp_path / "metrics.csv").read_text().splitlines()
     assert lines[0].startswith("method,subject,views,targets,target,inputs,psnr,psnr_box,depth_error_mm")
     assert lines[1].startswith("model,a,3,release,t,a b,20.0,,")

@@ -1,5 +1,7 @@
 """Windows: dense heads compute a part of their result as if they computed all of it."""
 
+import itertools
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -7,6 +9,7 @@ import torch.nn.functional as F
 from ghgs_lit.extents import extents
 from ghgs_lit.method.heads import dense, dpt
 from ghgs_lit.method.heads.dense import decode
+from ghgs_lit.method.plan.rows import size_class
 from ghgs_lit.method.plan.window import Span, Window, subject_windows
 from tests.method.heads.test_dpt import _head, _tokens
 
@@ -162,6 +165,14 @@ def test_windows_hold_the_subject_and_no_more():
     whole = _windows(CASES["full"])[0]
     assert whole == Window.whole((70, 56))
     assert whole.is_whole
+
+
+@pytest.mark.parametrize("full", [1, 9, 40])
+def test_a_widened_span_stays_within_its_map(full):
+    for start, stop in itertools.combinations(range(full + 1), 2):
+        span = Span(start, stop, full).widened()
+        assert 0 <= span.start <= start < stop <= span.stop <= full
+        assert span.stop - span.start == min(size_class(stop - start), full)
 
 
 @pytest.mark.parametrize("guided", [False, True], ids=["tokens", "guide"])
