@@ -222,16 +222,16 @@ def _plain_yaml(text: str) -> Any:
     return content
 
 
-def check_yaml(text: str, aliases: bool = True) -> None:
+def check_yaml(text: str, aliases: bool = True, most: int = 1_000_000) -> None:
     """Refuse YAML that is unsafe to load.
 
     Args:
         text: the YAML.
         aliases: whether aliases (``*name``) are allowed.
+        most: largest number of values, of aliases as often as they are used.
 
     Raises:
-        ValueError: more than :data:`DEEPEST` levels, a forbidden alias, or aliases that expand to
-            more than a million values.
+        ValueError: more than :data:`DEEPEST` levels or ``most`` values, or a forbidden alias.
         yaml.YAMLError: no YAML.
     """
     sizes: dict[str | None, int] = {}
@@ -257,8 +257,8 @@ def check_yaml(text: str, aliases: bool = True) -> None:
                 continue
         sizes[anchor] = size
         unfinished[-1][1] += size
-        if unfinished[-1][1] > 1e6:
-            raise ValueError("aliases (*name) of more than a million values")
+        if unfinished[-1][1] > most:
+            raise ValueError(f"more than {most} values")
 
 
 def read_parsed(path: Path, expected: str, parse: Callable[[str], Any]) -> Any:

@@ -14,6 +14,7 @@ from ghgs_lit.config import compose, conf_dir
 from ghgs_lit.config.options import did_you_mean, expected, meanings, options_of
 from ghgs_lit.config.registry import KINDS, class_of, kinds_of, verb_class
 from ghgs_lit.errors import InputError
+from ghgs_lit.parsing import read_text
 
 _WIDTH = 100
 
@@ -96,7 +97,7 @@ def print_group(verb: str, group: str, folders: Sequence[Path] = ()) -> None:
 
 
 def _purpose(path: Path) -> str:
-    lines = takewhile(lambda line: line.startswith("#"), path.read_text().splitlines())
+    lines = takewhile(lambda line: line.startswith("#"), read_text(path).splitlines())
     return " ".join(line.removeprefix("# ") for line in lines if "@package" not in line)
 
 

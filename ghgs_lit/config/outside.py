@@ -1,30 +1,33 @@
-"""Files of ``--config-dir`` and ``hydra.searchpath``, and what they may say to Hydra.
+"""Files of ``--config-dir`` and ``hydra.searchpath``, and what they may set in Hydra.
 
-Such files can come from somebody else. What they say of the package's groups are options, which are
+Such files can come from somebody else. Their keys of the package's groups are options, which are
 checked as all options are; but the node ``hydra`` can set environment variables, call functions and
-write shell scripts. Of it these files may set :data:`SETTABLE`; the command line may set all of it.
+write shell scripts, and resolvers such as ``${oc.env:...}`` read secrets. In such a file the only
+interpolations are references to keys, and of ``hydra`` it may set :data:`SETTABLE`; the command line
+may set all of it.
 """
 
-import itertools
+import io
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import yaml
 from hydra._internal.core_plugins import file_config_source
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.config.defaults import of_verb, open_nodes
 from ghgs_lit.config.folder import conf_dir
-from ghgs_lit.config.keys import flatten, is_below, require_plain
+from ghgs_lit.config.keys import flatten, is_below
 from ghgs_lit.config.registry import verbs
 from ghgs_lit.config.spelling import keep_spelling, spelling_is_kept
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.parsing import check_yaml, read_parsed
 
 #: Of launchers: names and numbers for the queue and the processes, no commands.
 _LAUNCHER = """
@@ -49,6 +52,10 @@ _CLASSES = {
     "sweeper._target_": r"(hydra_plugins|hydra\._internal\.core_plugins)\.[\w.]+",
     "sweeper.sampler._target_": r"optuna\.samplers\.\w+Sampler",
 }
+#: An interpolation that calls no resolver.
+_REFERENCE = re.compile(r"\$\{[\w.\[\]-]+\}")
+#: More values than any configuration has.
+_MOST_VALUES = 100_000
 
 
 class FileConfigSource(file_config_source.FileConfigSource):
@@ -58,22 +65,24 @@ class FileConfigSource(file_config_source.FileConfigSource):
 
     def load_config(self, config_path: str) -> ConfigResult:
         file = Path(self.path, self._normalize_file_name(config_path))
-        is_outside = Path(self.path) != conf_dir()
-        if is_outside and file.is_file():
-            with file.open(encoding="utf-8") as stream:  # references are not written out yet
-                require_plain(yaml.load(stream, yaml.BaseLoader), str(file))
-        result = super().load_config(config_path)
-        if not OmegaConf.is_dict(result.config):
-            return result
-        package = result.header.get("package") or ""
-        content = OmegaConf.to_container(result.config)
-        if is_outside:
-            check_file(file, config_path, package, content)
-        name = config_path.removesuffix(".yaml")
-        if name in verbs():
-            result.config = OmegaConf.create(of_verb(name, content))
-        open_nodes(name, package, result.config)
+        if Path(self.path) == conf_dir() or not file.is_file():
+            result = super().load_config(config_path)
+        else:
+            header, config = read_parsed(file, "YAML", _parsed)
+            result = ConfigResult(self.provider, f"file://{self.path}", config, header)
+            check_file(file, config_path, header.get("package") or "", config)
+        if OmegaConf.is_dict(result.config):
+            name = config_path.removesuffix(".yaml")
+            if name in verbs():
+                result.config = OmegaConf.create(of_verb(name, OmegaConf.to_container(result.config)))
+            open_nodes(name, result.header.get("package") or "", result.config)
         return result
+
+
+def _parsed(text: str) -> tuple[dict[str, str | None], DictConfig]:
+    """The header of a file as Hydra reads it, and the content."""
+    check_yaml(text, most=_MOST_VALUES)
+    return FileConfigSource._get_header_dict(text[:512]), OmegaConf.load(io.StringIO(text))
 
 
 def check_outside_files() -> None:
@@ -97,40 +106,43 @@ def files_are_read() -> Iterator[None]:
         types["file"] = before
 
 
-def check_file(file: Path, name: str, package: str, content: Mapping[str, Any]) -> None:
+def check_file(file: Path, name: str, package: str, config: Any) -> None:
     """Check a configuration file that is not the package's.
 
     Args:
         file: its path, for messages.
         name: the group and its option, such as ``hydra/launcher/mine``.
-        package: what its line ``@package`` says; empty: its group.
-        content: its keys, unresolved.
+        package: of its line ``@package``; empty: its group.
+        config: its content, unresolved.
 
     Raises:
-        InputError: it says something to Hydra that is not in :data:`SETTABLE`; names file and key.
+        InputError: it has an interpolation that is no reference to a key, or sets something of Hydra
+            that is not in :data:`SETTABLE`; names file and key.
     """
-    group = ".".join(name.split("/")[:-1])
-    parts = (package or group).replace("_group_", group).removeprefix("_global_").strip(".").split(".")
-    entries = [key for key in _defaults(content.get("defaults")) if "@" in key]
-    moves = [key for key in entries if parts[0] == "hydra" or "hydra" in key.partition("@")[2]]
-    if moves:
-        raise InputError(f"{file}: defaults: expected nothing that is moved into hydra; found {moves[0]!r}")
-    nodes = [content.get("hydra", {})]
-    if parts[0] == "hydra":
-        node: Any = {key: value for key, value in content.items() if key != "defaults"}
-        for part in reversed(parts[1:]):
-            node = {part: node}
-        nodes.append(node)
-    for key, value in itertools.chain.from_iterable(flatten(node).items() for node in nodes):
-        if not _may_set(key, value):
+    content = OmegaConf.to_container(config)
+    require(isinstance(content, dict), str(file), "keys with values", content)
+    for key, value in flatten(content).items():
+        # Hydra drops backslashes of the values of a grid.
+        others = _REFERENCE.sub("", f"{key}={value}".replace("\\", ""))
+        require("${" not in others, f"{file}: {key}", "no interpolations but references to keys", value)
+    *groups, _ = name.split("/")
+    is_of_hydra = groups[:1] == ["hydra"]
+    # The packages of files add up along their lists of defaults.
+    require("hydra" not in package, f"{file}: @package", "a package outside of hydra", package)
+    for entry in chain(*map(_groups, content.pop("defaults", None) or ())):
+        moves = "hydra" in entry.partition("@")[2] or (is_of_hydra and re.search("@|^/", entry))
+        require(not moves, f"{file}: defaults", "nothing that is moved into hydra", entry)
+    prefix = ".".join(groups) if is_of_hydra and package != "_global_" else ""
+    for key, value in flatten(content, prefix).items():
+        below = key.removeprefix("hydra").removeprefix(".")
+        if is_below(key, ["hydra"]) and not _may_set(below, value):
             expected = f"keys of {', '.join(SETTABLE[:8])}, and names and numbers of launcher and sweeper"
-            raise InputError(f"{file}: hydra: expected {expected}; found hydra.{key}={value!r}")
+            raise InputError(f"{file}: hydra: expected {expected}; found {key}={value!r}")
 
 
-def _defaults(entries: Any) -> Iterator[str]:
-    """Groups and packages that a list of defaults names."""
-    for entry in entries or ():
-        yield from entry if isinstance(entry, Mapping) else [str(entry)]
+def _groups(entry: Any) -> list[str]:
+    """Groups and packages of an entry of a list of defaults."""
+    return list(entry) if isinstance(entry, dict) else [str(entry)]
 
 
 def _may_set(key: str, value: Any) -> bool:
@@ -142,12 +154,11 @@ def _may_set(key: str, value: Any) -> bool:
     """
     if key in _CLASSES:
         return isinstance(value, str) and re.fullmatch(_CLASSES[key], value) is not None
-    if any(part.startswith("_") for part in key.split(".")):  # a word of Hydra's instantiate
+    # Hydra's instantiate has words such as _target_; a key of a grid is an override.
+    if re.search(r"(^|\.)_|hydra", key):
         return False
-    if value == {}:
-        return True
     values = value if isinstance(value, list) else [value]
-    return is_below(key, SETTABLE) and all(_is_plain(item, key) for item in values)
+    return value == {} or (is_below(key, SETTABLE) and all(_is_plain(item, key) for item in values))
 
 
 def _is_plain(value: Any, key: str) -> bool:
@@ -160,5 +171,5 @@ def _is_plain(value: Any, key: str) -> bool:
     """
     if not isinstance(value, str):
         return value is None or isinstance(value, bool | int | float)
-    refers = re.match(r"\s*\$\{(?!hydra\.|sqlite:|now:)", value) and is_below(key, ["launcher", "sweeper"])
+    refers = re.match(r"\s*\$\{(?!hydra\.)", value) and is_below(key, ["launcher", "sweeper"])
     return value.isprintable() and not refers

@@ -10,6 +10,7 @@ from tests.cli.test_main import call
 from tests.helpers.jobs import rehearse_nothing
 
 GLOBAL = "# @package _global_\n"
+REFERENCES = "expected no interpolations but references to keys; found "
 #: Hydra's own words that call, by the file that says them: {file: text}, and what is named.
 REFUSED = {
     "environment": ({"experiment/x": GLOBAL + "hydra: {job: {env_set: {A: b}}}"}, "hydra.job.env_set.A='b'"),
@@ -47,7 +48,43 @@ REFUSED = {
         "hydra.launcher.partition=",
     ),
     "a search path": ({"experiment/x": GLOBAL + "hydra: {searchpath: [pkg://x]}"}, "hydra.searchpath="),
-    "a package": ({"experiment/x": "# @package hydra.job\nenv_set: {A: b}"}, "hydra.job.env_set.A="),
+    "a package": (
+        {"experiment/x": "# @package hydra.job\nenv_set: {A: b}"},
+        "@package: expected a package outside of hydra; found 'hydra.job'",
+    ),
+    "a group below a package": (
+        {"experiment/x": "# @package hydra.job\ndefaults: [{/env_set: y}]", "env_set/y": "A: b"},
+        "@package: expected a package outside of hydra; found 'hydra.job'",
+    ),
+    "a group below a group of Hydra": (
+        {
+            "experiment/x": GLOBAL + "defaults: [{override /hydra/job_logging: y}]",
+            "hydra/job_logging/y": "defaults: [{/handlers: z}]",
+            "handlers/z": "a: {(): CALL}",
+        },
+        "defaults: expected nothing that is moved into hydra; found '/handlers'",
+    ),
+    "an override of the grid": (
+        {"experiment/x": GLOBAL + "hydra: {sweeper: {params: {+hydra.job.env_set.A: b}}}"},
+        "hydra.sweeper.params.+hydra.job.env_set.A='b'",
+    ),
+    "a secret": ({"experiment/x": GLOBAL + "data: {root: '${oc.env:HOME}'}"}, f"data.root: {REFERENCES}"),
+    "a secret by a name that is put together": (
+        {"experiment/x": GLOBAL + "trainer: {x: ['${${seed}:HOME}']}"},
+        f"trainer.x: {REFERENCES}",
+    ),
+    "a secret behind backslashes, which a grid drops": (
+        {"experiment/x": GLOBAL + "hydra: {sweeper: {params: {data.root: '$\\{oc.env:HOME\\}'}}}"},
+        f"hydra.sweeper.params.data.root: {REFERENCES}",
+    ),
+    "a folder": (
+        {"experiment/x": GLOBAL + "hydra: {sweep: {subdir: '${sqlite:CALLED/a.db}'}}"},
+        f"hydra.sweep.subdir: {REFERENCES}",
+    ),
+    "a folder by a group": (
+        {"experiment/x": GLOBAL + "defaults: [{/views: '${sqlite:CALLED/a.db}'}]"},
+        f"defaults: {REFERENCES}",
+    ),
     "a group of Hydra": (
         {
             "experiment/x": GLOBAL + "defaults: [{override /hydra/callbacks: y}]",
@@ -139,20 +176,35 @@ def test_a_searched_folder_is_a_file_from_outside_too(monkeypatch, capsys, tmp_p
     [
         (
             "a: &a {b: *a}",
-            "x.yaml, line 2: expected YAML of plain data; found found unconstructable recursive",
+            "x.yaml: expected YAML; found an alias (*name)",
         ),
         (
             "a0: &a0 [1]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 30)),
-            "expected less than 32 levels and 100000 values, no loops; found 'more'",
+            "x.yaml: expected YAML; found more than 100000 values",
         ),
+        ("a: " + "[" * 700 + "]" * 700, "x.yaml: expected YAML; found more than 64 levels"),
+        ("a: b\na: c", "x.yaml: expected YAML; found while constructing a mapping"),
+        ("a: !!set {b}", "x.yaml: expected YAML; found Value 'set' is not a supported primitive type"),
+        ("# Köpfe".encode("latin-1"), "x.yaml: expected YAML; found 'utf-8' codec can't decode byte"),
+        ("a: b".encode("utf-16"), "x.yaml: expected YAML; found 'utf-8' codec can't decode byte"),
+        ("- a", "x.yaml: expected keys with values; found ['a']"),
     ],
 )
-def test_a_file_without_end_is_refused(monkeypatch, capsys, tmp_path, text, message):
-    """References of YAML to themselves, and some hundred bytes that are a billion values."""
-    flags = written(tmp_path, {"experiment/x": GLOBAL + text})
+def test_a_file_that_is_no_plain_yaml_is_refused(monkeypatch, capsys, tmp_path, text, message):
+    """References of YAML to themselves, some hundred bytes that are a billion values, other encodings."""
+    flags = written(tmp_path, {"experiment/x": GLOBAL})
+    with open(tmp_path / "conf" / "experiment" / "x.yaml", "ab") as file:
+        file.write(text if isinstance(text, bytes) else text.encode())
     code, _, err = call(
         monkeypatch, capsys, "train", *flags, "experiment=x", f"hydra.run.dir={tmp_path / 'r'}"
     )
     assert code == 1
     assert message in err
     assert err.count("\n") == 1
+
+
+def test_a_byte_order_mark_is_no_part_of_a_file(monkeypatch, capsys, tmp_path):
+    """Windows' editors write one, before the line ``@package`` too."""
+    flags = written(tmp_path, {"experiment/x": "\ufeff" + GLOBAL + "seed: 7"})
+    code, out, _ = call(monkeypatch, capsys, "train", *flags, "experiment=x", "--cfg", "job")
+    assert (code, OmegaConf.create(out).seed) == (0, 7)
