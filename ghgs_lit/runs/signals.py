@@ -10,8 +10,9 @@ from collections.abc import Callable, Iterator, Mapping
 from types import FrameType
 from typing import Any
 
-#: SIGUSR1 and SIGUSR2 are what ``sbatch --signal`` is asked to send before the end of a job's time.
-STOP = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
+#: What ``sbatch --signal`` is asked to send before the end of a job's time.
+ANNOUNCED = (signal.SIGUSR1, signal.SIGUSR2)
+STOP = (signal.SIGINT, signal.SIGTERM, *ANNOUNCED)
 
 
 class Interrupted(SystemExit):
@@ -85,19 +86,40 @@ def handlers() -> dict[int, Any]:
     return {number: handler for number, handler in present.items() if handler is not None}
 
 
-def handle(act: Callable[[int], Any], before: Mapping[int, Any]) -> None:
+def handle(act: Callable[[int], Any], before: Mapping[int, Any], announced: bool = False) -> None:
     """Let a function handle signals, except those that others handle. Handlers of submitit and
     ``nohup`` stay: under submitit SIGTERM does not end a job.
 
     Args:
         act: Gets the number of the signal.
         before: Handlers by signal, as of :func:`handlers`.
+        announced: Also handle :data:`ANNOUNCED` where others do; :func:`pass_on` calls them.
     """
     if threading.current_thread() is not threading.main_thread():
         return  # signals belong to the main thread
     for number, handler in before.items():
-        free = handler in (signal.SIG_DFL, signal.default_int_handler) or isinstance(handler, _Handler)
-        signal.signal(number, _Handler(act) if free else handler)
+        is_lent = announced and number in ANNOUNCED and callable(handler)
+        signal.signal(number, _Handler(act) if is_lent or _is_free(handler) else handler)
+
+
+def _is_free(handler: Any) -> bool:
+    return handler in (signal.SIG_DFL, signal.default_int_handler) or isinstance(handler, _Handler)
+
+
+def pass_on(number: int, before: Mapping[int, Any]) -> None:
+    """Call the handler that others have set for a signal.
+
+    Args:
+        number: Of the signal.
+        before: Handlers by signal, as of :func:`handlers`.
+
+    Raises:
+        Interrupted: There is none.
+    """
+    handler = before.get(number, signal.SIG_DFL)
+    if _is_free(handler):
+        raise Interrupted(number)
+    handler(number, None)
 
 
 @contextlib.contextmanager

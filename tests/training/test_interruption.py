@@ -1,5 +1,6 @@
 """Ctrl-C and SIGTERM while training: a checkpoint after the step, exit codes, and the same end."""
 
+import contextlib
 import functools
 import os
 import signal
@@ -12,7 +13,7 @@ import torch
 from ghgs_lit.runs import signals
 from ghgs_lit.runs.signals import Interrupted, handlers, interruptible
 from ghgs_lit.training.checkpoints import StopAtStep
-from tests.training.test_resume import Cut, fit, rows
+from tests.training.test_resume import STEPS, Cut, fit, rows
 
 
 class Signal(L.Callback):
@@ -108,19 +109,30 @@ def test_a_batch_system_that_announces_and_then_asks_gets_a_checkpoint(tmp_path,
     assert torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)["global_step"] == 5
 
 
-def test_signals_that_a_batch_system_handles_stay_its_own(tmp_path):
-    """submitit ignores SIGTERM and requeues on SIGUSR2: neither must end the run here,
-    nor be replaced."""
+@pytest.mark.parametrize("ends", [False, True])
+def test_signals_that_a_batch_system_handles_stay_its_own(tmp_path, ends):
+    """submitit ignores SIGTERM and requeues on SIGUSR2, before which the step is saved; its handler
+    ends the process, or returns where it is not the job's first."""
     seen = []
-    own = {n: signal.signal(n, lambda n, _: seen.append(n)) for n in (signal.SIGTERM, signal.SIGUSR2)}
+
+    def requeue(number, _):
+        last = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)
+        seen.append((number, last["global_step"]))
+        if ends:
+            raise SystemExit(255)
+
+    own = {signal.SIGTERM: lambda number, _: seen.append(number), signal.SIGUSR2: requeue}
+    before = {number: signal.signal(number, handler) for number, handler in own.items()}
+    cut = Cut()
     try:
-        with interruptible():
-            senders = [Signal(3, signal.SIGTERM), Signal(4, signal.SIGUSR2)]
-            fit(tmp_path, Cut(), more=[*senders, StopAtStep()])
+        with interruptible(), pytest.raises(SystemExit) if ends else contextlib.nullcontext():
+            fit(tmp_path, cut, more=[Signal(3, signal.SIGTERM), Signal(5, signal.SIGUSR2), StopAtStep()])
+        assert handlers()[signal.SIGUSR2] is requeue
     finally:
-        for number, handler in own.items():
+        for number, handler in before.items():
             signal.signal(number, handler)
-    assert seen == [signal.SIGTERM, signal.SIGUSR2]
+    assert seen == [signal.SIGTERM, (signal.SIGUSR2, 5)]
+    assert max(int(row["step"]) for row in rows(tmp_path)) == (5 if ends else STEPS)
 
 
 def test_forked_workers_do_not_act_for_their_parent():
