@@ -68,7 +68,6 @@ NOT_RUN = [
     (r"ghgs \w+ checkpoint=release\.ckpt", PUBLISHED),
     (r"ghgs train (?!.*dry_run).*encoder=vggt_1b", PUBLISHED),
     (r"ghgs train .*hydra/launcher=slurm", "needs a cluster"),
-    (r"ghgs train .*hydra/launcher=ray", "needs the extra `ray`"),
     (r"ghgs train .*hydra/sweeper=optuna", "needs the extra `optuna`"),
     (r"ghgs adapt (cameras=<|data\.size=518)", "renders the people of a rig, for minutes"),
     (r"ghgs stress dump=", "needs a training step that was not finite"),

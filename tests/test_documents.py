@@ -40,7 +40,7 @@ OPTIONS = {
     "ablation": {"one_neighbor", "residual", "shuffled", "relative"},
     "sweep": {"controls"},
     "data": {"my_people"},
-    "hydra/launcher": {"joblib", "ray", "submitit_local"},
+    "hydra/launcher": {"joblib", "submitit_local"},
     "hydra/sweeper": {"optuna"},
 }
 # a group of entry points, and the format of a file

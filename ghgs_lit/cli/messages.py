@@ -27,7 +27,7 @@ from ghgs_lit.errors import InputError, require
 #: Errors that are bad input, not bugs.
 BAD_INPUT = (InputError, OSError, HydraException, OmegaConfBaseException)
 
-_EXTRAS = {"joblib": "cluster", "submitit": "cluster", "ray": "ray", "optuna": "optuna"}
+_EXTRAS = {"joblib": "cluster", "submitit": "cluster", "optuna": "optuna"}
 
 #: Hydra would write .hydra through links;
 #: :func:`ghgs_lit.cli.application.write_hydra_files` does not.

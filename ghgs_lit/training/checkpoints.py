@@ -182,8 +182,9 @@ _SAME = 1.0
 class StopAtStep(Checkpoint):
     """On Ctrl-C or a signal of a batch system: finishes the step and its validation, writes
     ``last.ckpt`` and stops. The same signal again, or Ctrl-C, stops at once. Several processes stop
-    after the same step. Where submitit handles the signal, it then queues the job again. As the last ``Checkpoint``, Lightning calls it after all other callbacks,
-    whose state is saved.
+    after the same step. Where submitit handles the signal, it then queues the job
+    again. As the last ``Checkpoint``, Lightning calls it after all other callbacks, whose state is
+    saved.
 
     Attributes:
         received: number of the signal; 0: none."""

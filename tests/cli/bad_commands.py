@@ -65,7 +65,12 @@ MISSPELT = [
     ("train -m views=3,4", 1, "views: expected one of ", "; found 3,4 (did you mean v3?)\n"),
     ("train sweep=table5", 1, "sweep: expected one of table1", "found 'table5'"),
     ("train hydra/launcher=jobib", 1, "hydra/launcher: expected one of", "did you mean joblib?"),
-    ("train hydra/launcher=ray_jobs", 1, "hydra/launcher: expected one of", "(pip install 'ghgs-lit[ray]')"),
+    (
+        "train hydra/sweeper=optuna_of_a_far_lab",
+        1,
+        "hydra/sweeper: expected",
+        "install 'ghgs-lit[optuna]')",
+    ),
     ("train +optimizer.lrr=1", 1, "optimizer", "lrr"),
     ("train +seed=3", 1, "+seed=3: expected", "already at 'seed'"),
     ("train ~sed", 1, "sed: expected a value", "~sed"),

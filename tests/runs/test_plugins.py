@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
+from ghgs_lit.errors import InputError
 from ghgs_lit.runs.run import RunDirectory, State
 from tests.helpers.jobs import executed, hydra_app
 
@@ -17,7 +18,6 @@ SETTINGS = {
         "cluster",
         ["hydra.launcher.cpus_per_task=1", "hydra.launcher.timeout_min=5"],
     ),
-    "ray": ("hydra_plugins.hydra_ray_launcher", "ray", ["+hydra.launcher.ray.init.num_cpus=2"]),
 }
 
 
@@ -84,18 +84,55 @@ exec "$@"
 }
 
 
-def test_the_slurm_example_submits_what_is_missing(monkeypatch, tmp_path):
-    """The shipped example must produce valid jobs that run each run once."""
+@pytest.fixture
+def slurm(monkeypatch, tmp_path):
+    """``slurm(sbatch=...)`` puts :data:`FAKES` on the path, some with another text."""
     pytest.importorskip(
         "hydra_plugins.hydra_submitit_launcher",
         reason="the extra cluster is not installed",
         exc_type=ImportError,
     )
-    for name, text in FAKES.items():
-        (tmp_path / "bin").mkdir(exist_ok=True)
-        (tmp_path / "bin" / name).write_text(text)
-        (tmp_path / "bin" / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
+    (tmp_path / "bin").mkdir()
+
+    def replace(**texts: str) -> None:
+        for name, text in (FAKES | texts).items():
+            (tmp_path / "bin" / name).write_text(text)
+            (tmp_path / "bin" / name).chmod(0o755)
+
+    return replace
+
+
+@pytest.mark.parametrize(
+    ("setting", "said", "where"),
+    [
+        ("partition=nope", "invalid partition specified: nope", "hydra.launcher.partition=nope"),
+        ("gres=unicorn:1", "Invalid generic resource (gres) specification", "hydra.launcher.gres=unicorn:1"),
+        ("mem_gb=9", "Memory specification can not be satisfied", "hydra.launcher.mem_gb=9"),
+        ("mem_gb=9", "Invalid generic resource (gres) specification", "hydra.launcher.gpus_per_node=1"),
+        ("mem_gb=9", "slurmctld: down", "hydra.launcher"),
+    ],
+)
+def test_what_sbatch_refuses_is_one_line(slurm, monkeypatch, capsys, tmp_path, setting, said, where):
+    """It was a traceback; a cluster without accounting is said once."""
+    import submitit
+
+    monkeypatch.setattr(submitit.SlurmJob.watcher, "_make_command", lambda: 1 / 0)
+    slurm(
+        sbatch=f"#!/bin/bash\necho 'sbatch: error: {said}' >&2\nexit 1\n",
+        sacct="#!/bin/bash\necho 'accounting storage is disabled' >&2\nexit 1\n",
+    )
+    place = f"hydra.sweep.dir={tmp_path / 'sweep'}"
+    with pytest.raises(InputError) as error:
+        hydra_app(monkeypatch, "-m", "hydra/launcher=slurm", f"hydra.launcher.{setting}", place, "seed=1,2")
+    assert str(error.value) == f"{where}: expected what sbatch accepts; found {said}"
+    assert capsys.readouterr().out.count("accounting storage is disabled") == 1
+    assert submitit.SlurmJob.watcher._make_command() is None
+
+
+def test_the_slurm_example_submits_what_is_missing(slurm, monkeypatch, tmp_path):
+    """The shipped example must produce valid jobs that run each run once."""
+    slurm()
     sweep = tmp_path / "sweep"
     hydra_app(monkeypatch, "-m", "hydra/launcher=slurm", f"hydra.sweep.dir={sweep}", "seed=1,2")
     names = executed(sweep)
