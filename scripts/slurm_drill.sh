@@ -6,7 +6,7 @@
 #
 # Needs the extra `cluster` and SLURM's programs (Debian: apt-get install slurm-wlm munge). It starts a SLURM of one
 # node with its own configuration and key in the new directory, beside any that is there, and stops it at the end.
-# STEPS (default 200) must take longer than the 60 to 120 seconds after which a job's time is up.
+# STEPS (default 200) must take longer than the 1 to 2 minutes after which a job's time is up.
 set -euo pipefail
 out=$(realpath -m "${1:?expected a new directory}")
 shift
@@ -93,8 +93,8 @@ step "sweep by hydra/launcher=slurm"
 tail -n 2 "$out/log/sweep"
 grep -ci sacct "$out/log/sweep" | sed "s/^/lines about sacct: /" || true
 
-step "the same with 2 minutes for a job, and a signal 60 s before"
-"${train[@]}" -m seed=1,2 "${slurm[@]}" hydra.launcher.timeout_min=2 hydra.launcher.signal_delay_s=60 \
+step "the same with 3 minutes for a job, and a signal 60 s before"
+"${train[@]}" -m seed=1,2 "${slurm[@]}" hydra.launcher.timeout_min=3 hydra.launcher.signal_delay_s=60 \
     "hydra.sweep.dir=$out/timed" > "$out/log/timed" 2>&1
 tail -n 2 "$out/log/timed"
 

@@ -4,6 +4,7 @@ which end a process with 128 + their number."""
 import contextlib
 import os
 import signal
+import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -86,19 +87,18 @@ def handlers() -> dict[int, Any]:
     return {number: handler for number, handler in present.items() if handler is not None}
 
 
-def handle(act: Callable[[int], Any], before: Mapping[int, Any], announced: bool = False) -> None:
-    """Let a function handle signals, except those that others handle. Handlers of submitit and
-    ``nohup`` stay: under submitit SIGTERM does not end a job.
+def handle(act: Callable[[int], Any], before: Mapping[int, Any]) -> None:
+    """Let a function handle signals, except those that others handle and that do not announce an
+    end: under submitit SIGTERM does not end a job.
 
     Args:
         act: Gets the number of the signal.
         before: Handlers by signal, as of :func:`handlers`.
-        announced: Also handle :data:`ANNOUNCED` where others do; :func:`pass_on` calls them.
     """
     if threading.current_thread() is not threading.main_thread():
         return  # signals belong to the main thread
     for number, handler in before.items():
-        is_lent = announced and number in ANNOUNCED and callable(handler)
+        is_lent = number in ANNOUNCED and callable(handler)
         signal.signal(number, _Handler(act) if is_lent or _is_free(handler) else handler)
 
 
@@ -106,26 +106,11 @@ def _is_free(handler: Any) -> bool:
     return handler in (signal.SIG_DFL, signal.default_int_handler) or isinstance(handler, _Handler)
 
 
-def pass_on(number: int, before: Mapping[int, Any]) -> None:
-    """Call the handler that others have set for a signal.
-
-    Args:
-        number: Of the signal.
-        before: Handlers by signal, as of :func:`handlers`.
-
-    Raises:
-        Interrupted: There is none.
-    """
-    handler = before.get(number, signal.SIG_DFL)
-    if _is_free(handler):
-        raise Interrupted(number)
-    handler(number, None)
-
-
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
     """Raise :class:`Interrupted` on the signals :data:`STOP` unless others handle them; where it is
-    lost (:func:`stop_if_interrupted`), once more at the end of the block."""
+    lost (:func:`stop_if_interrupted`), once more at the end of the block. Handlers of others for an
+    announced end, as submitit's, which queues the job again, are called at the end of the block."""
     before = handlers()
     is_outermost = not any(isinstance(handler, _Handler) for handler in before.values())
     handle(interrupt, before)
@@ -137,11 +122,21 @@ def interruptible() -> Iterator[None]:
         stop_if_interrupted()
         raise
     finally:
-        if is_outermost:
-            _received.clear()
         if threading.current_thread() is threading.main_thread():
             for number, handler in before.items():
                 signal.signal(number, handler)
+        if is_outermost and _received:
+            number = _received.pop().number
+            _received.clear()
+            _pass_on(number, before[number])
+
+
+def _pass_on(number: int, handler: Any) -> None:
+    """Call the handler that others have set for a signal, if any."""
+    if not _is_free(handler):
+        # The program that queues a job again may be ended with it before it returns.
+        with contextlib.suppress(subprocess.CalledProcessError):
+            handler(number, None)
 
 
 def print_how_to_go_on(stop: Interrupted, what: str, how: str, is_queued: bool) -> None:

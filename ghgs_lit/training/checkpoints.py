@@ -16,7 +16,7 @@ from pydantic import Field
 
 from ghgs_lit.config.options import Index, Options, Text, Words
 from ghgs_lit.files import write_atomically
-from ghgs_lit.runs.signals import handle, handlers, pass_on
+from ghgs_lit.runs.signals import handle, handlers, interrupt
 from ghgs_lit.training.restoring import check_restored
 from ghgs_lit.weights import frozen
 from ghgs_lit.weights.reading import open_file
@@ -182,9 +182,8 @@ _SAME = 1.0
 class StopAtStep(Checkpoint):
     """On Ctrl-C or a signal of a batch system: finishes the step and its validation, writes
     ``last.ckpt`` and stops. The same signal again, or Ctrl-C, stops at once. Several processes stop
-    after the same step. Where submitit handles the signal, it then queues the job
-    again. As the last ``Checkpoint``, Lightning calls it after all other callbacks, whose state is
-    saved.
+    after the same step. As the last ``Checkpoint``, Lightning calls it after all other callbacks,
+    whose state is saved.
 
     Attributes:
         received: number of the signal; 0: none."""
@@ -206,7 +205,7 @@ class StopAtStep(Checkpoint):
         """Replace Lightning's signal handlers, which save no checkpoint;
         it restores all at the end."""
         self._step = trainer.global_step
-        handle(self._note, self._before, announced=True)
+        handle(self._note, self._before)
 
     def _note(self, number: int) -> None:
         """Handle a signal."""
@@ -214,7 +213,7 @@ class StopAtStep(Checkpoint):
         # not from somebody who does not.
         insists = number in (self.received, signal.SIGINT)
         if self.received and insists and time.monotonic() - self._since > _SAME:
-            pass_on(number, self._before)
+            interrupt(number)
         if not self.received:
             self.received, self._since = number, time.monotonic()
             print("stopping after this step; again: at once", flush=True)
@@ -246,8 +245,7 @@ class StopAtStep(Checkpoint):
     def on_train_batch_start(self, *args: Any) -> None:
         """Stop here, since the values of a step are logged after all its other hooks."""
         if self._saved:
-            pass_on(self._saved, self._before)
-            self.received = self._saved = 0  # the handler of others goes on
+            interrupt(self._saved)
 
     def on_train_epoch_end(self, *args: Any) -> None:
         """Stop here if no batch follows."""

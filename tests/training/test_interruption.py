@@ -1,10 +1,10 @@
 """Ctrl-C and SIGTERM while training: a checkpoint after the step, exit codes, and the same end."""
 
-import contextlib
 import functools
 import os
 import signal
 import threading
+from subprocess import CalledProcessError
 
 import lightning.pytorch as L
 import pytest
@@ -13,7 +13,7 @@ import torch
 from ghgs_lit.runs import signals
 from ghgs_lit.runs.signals import Interrupted, handlers, interruptible
 from ghgs_lit.training.checkpoints import StopAtStep
-from tests.training.test_resume import STEPS, Cut, fit, rows
+from tests.training.test_resume import Cut, fit, rows
 
 
 class Signal(L.Callback):
@@ -38,7 +38,7 @@ class Signal(L.Callback):
 
 def stopped(folder, sender: Signal) -> int:
     """Train until the signal; returns the exit code."""
-    with interruptible(), pytest.raises(Interrupted) as stop:
+    with pytest.raises(Interrupted) as stop, interruptible():
         fit(folder, Cut(), more=[sender, StopAtStep()])
     return stop.value.code
 
@@ -76,7 +76,7 @@ def test_a_run_that_is_stopped_goes_on_as_if_it_had_not_been(
     folder, expected, validations = whole(accumulate)
     before = handlers()
     first = Cut()
-    with interruptible(), pytest.raises(Interrupted) as stop:
+    with pytest.raises(Interrupted) as stop, interruptible():
         fit(tmp_path / "cut", first, more=[Signal(at, number, validating), StopAtStep()], **options)
     assert stop.value.code == 128 + number
     assert handlers() == before
@@ -109,30 +109,30 @@ def test_a_batch_system_that_announces_and_then_asks_gets_a_checkpoint(tmp_path,
     assert torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)["global_step"] == 5
 
 
-@pytest.mark.parametrize("ends", [False, True])
-def test_signals_that_a_batch_system_handles_stay_its_own(tmp_path, ends):
+@pytest.mark.parametrize("error", [None, SystemExit(255), CalledProcessError(-15, "scontrol")])
+def test_a_batch_system_that_handles_signals_gets_a_checkpoint(tmp_path, error):
     """submitit ignores SIGTERM and requeues on SIGUSR2, before which the step is saved; its handler
-    ends the process, or returns where it is not the job's first."""
+    ends the process, returns where it is not the job's first, or fails as the job is ended."""
     seen = []
 
     def requeue(number, _):
         last = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)
         seen.append((number, last["global_step"]))
-        if ends:
-            raise SystemExit(255)
+        if error is not None:
+            raise error
 
     own = {signal.SIGTERM: lambda number, _: seen.append(number), signal.SIGUSR2: requeue}
     before = {number: signal.signal(number, handler) for number, handler in own.items()}
-    cut = Cut()
+    senders = [Signal(3, signal.SIGTERM), Signal(5, signal.SIGUSR2)]
     try:
-        with interruptible(), pytest.raises(SystemExit) if ends else contextlib.nullcontext():
-            fit(tmp_path, cut, more=[Signal(3, signal.SIGTERM), Signal(5, signal.SIGUSR2), StopAtStep()])
+        with pytest.raises(SystemExit) as stop, interruptible():
+            fit(tmp_path, Cut(), more=[*senders, StopAtStep()])
         assert handlers()[signal.SIGUSR2] is requeue
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
     assert seen == [signal.SIGTERM, (signal.SIGUSR2, 5)]
-    assert max(int(row["step"]) for row in rows(tmp_path)) == (5 if ends else STEPS)
+    assert stop.value.code == (255 if isinstance(error, SystemExit) else 128 + signal.SIGUSR2)
 
 
 def test_forked_workers_do_not_act_for_their_parent():
