@@ -16,8 +16,7 @@ from ghgs_lit.runs.provenance import differences
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO, CheckpointOptions
 from ghgs_lit.training.cost import TrainingCost
-from ghgs_lit.training.loggers import CsvLog, TensorBoardLog
-from ghgs_lit.training.loggers import resume as resume_logs
+from ghgs_lit.training.loggers import CsvLog, TensorBoardLog, begin
 from ghgs_lit.training.start import check_resume, check_start
 from ghgs_lit.training.validation_pictures import PicturesOptions
 from ghgs_lit.weights import frozen
@@ -71,7 +70,7 @@ def fit(folder, cut: Cut, resume=None, every=3, more=(), subject=None, **options
         **options,
     )  # fmt: skip
     if resume is not None:
-        resume_logs(trainer.loggers, torch.load(resume, weights_only=True)["global_step"])
+        begin(trainer.loggers, "", torch.load(resume, weights_only=True)["global_step"])
     subject = subject or module()
     trainer.fit(subject, StepData(), ckpt_path=resume)
     return subject
