@@ -34,7 +34,7 @@ def write_caption(table: Table) -> str:
     names = dict.fromkeys(table.rows["data"])
     measured = table.measured
     counts = sorted({int(count) for count in measured["count"].dropna()})
-    seeds = max(map(len, measured["seeds"]), default=0)
+    seeds = [len(seeds) for seeds in measured["seeds"]]
     subjects = f"{' or '.join(map(str, counts)) or 'no'} subject{'s' * (counts != [1])} of `{first['split']}`"
     if table.options.subjects is not None:
         subjects += f" whose name{'s match' if counts != [1] else ' matches'} {_selection(table)}"
@@ -50,8 +50,9 @@ def write_caption(table: Table) -> str:
     views = {group.views for group in table.groups}
     if table.layout.heading != "views" and len(views) == 1:
         parts.append(f"{views.pop()} input views")
-    spread = f" ± deviation over {seeds} seeds" if seeds > 1 else ""
-    clear = " where it leads by more than the deviation" if seeds > 1 else ""
+    has_several = max(seeds, default=0) > 1
+    spread = f" ± deviation over {_range(seeds)} seeds" if has_several else ""
+    clear = " where it leads by more than the deviation" if has_several else ""
     return f"{', '.join(parts)}; mean over subjects{spread}, best of the measured methods in bold{clear}."
 
 
