@@ -5,21 +5,18 @@ Each camera is the target in turn. Masks and cameras are those that a prediction
 would have; instants with a mask that still fails are left out."""
 
 import functools
-from collections import ChainMap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
-from pydantic import Field
 
 from ghgs_capture.agreement import Agreement
 from ghgs_capture.capture import Capture
 from ghgs_capture.doubts import CORRECTION, doubt_of_masks
-from ghgs_lit.config.options import PathText, Text, Words
-from ghgs_lit.config.registry import read_node
+from ghgs_lit.config.options import PathText, Size, Text
 from ghgs_lit.data.dataset import DataOptions
-from ghgs_lit.data.reader import PHASES, Reader
+from ghgs_lit.data.reader import Reader
 from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically
@@ -85,7 +82,7 @@ def _save(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 class InstantReader(Reader):
-    """Instants, and training people beside them.
+    """Instants of a capture.
 
     In validation each camera of an instant is the target once: a subject ``<instant>/<camera>`` has
     it at its last position.
@@ -95,15 +92,11 @@ class InstantReader(Reader):
         names: of those of the phase.
         cameras: names of the cameras, in the order of the crops.
         phase: ``train`` or ``val``.
-        beside: reader of people; None: there are none.
     """
 
-    def __init__(
-        self, folder: Path, names: Sequence[str], cameras: Sequence[str], phase: str, beside: Reader | None
-    ) -> None:
+    def __init__(self, folder: Path, names: Sequence[str], cameras: Sequence[str], phase: str) -> None:
         super().__init__()
         self._folder = folder
-        self._beside = beside
         self._first: dict[str, tuple[str, int]] = {}
         for name in names:
             if phase == "train":
@@ -111,9 +104,7 @@ class InstantReader(Reader):
                 continue
             for target, camera in enumerate(cameras):
                 self._first[f"{name}/{camera}"] = name, target + 1
-        own = dict.fromkeys(self._first, tuple(range(len(cameras))))
-        # A view of the people's, which grow while they are rendered.
-        self.subjects = own if beside is None else ChainMap(own, beside.subjects)
+        self.subjects = dict.fromkeys(self._first, tuple(range(len(cameras))))
 
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
         """See :meth:`Reader.read_view`.
@@ -121,24 +112,21 @@ class InstantReader(Reader):
         Args:
             name: of the subject.
             position: number of the camera, from that of the subject on.
-            view: 0, but of people.
-            depth: also read the depth map; those of instants are not known, and 0 beside people.
+            view: 0.
+            depth: no effect: depths are not known.
         """
-        if name not in self._first:
-            return self._beside.read_view(name, position, view, depth)
         instant, first = self._first[name]
         stored = _stored(self._folder / f"{instant}.npz")
         camera = (first + position) % len(stored["images"])
         matte = stored["mattes"][camera]
-        unknown = np.zeros(matte.shape, np.uint16) if depth and self._beside is not None else None
         matrices = (stored[key][camera] for key in ("intrinsics", "extrinsics"))
-        return View(stored["images"][camera], matte > 127, unknown, *matrices, matte)
+        return View(stored["images"][camera], matte > 127, None, *matrices, matte)
 
     def read_body(self, name: str) -> np.ndarray | None:
-        return None if name in self._first else self._beside.read_body(name)
+        return None
 
     def views_at(self, name: str, position: int) -> list[int]:
-        return [0] if name in self._first else self._beside.views_at(name, position)
+        return [0]
 
 
 @functools.lru_cache(maxsize=64)
@@ -154,33 +142,18 @@ class Instants(DataOptions):
 
     static_cameras: ClassVar[bool] = True
     name: Text = "instants"
+    size: Size = 252
     root: PathText | None = None
     """Folder of the instants, which the verb writes."""
     cameras: tuple[Text, ...] = ()
     """Names of the cameras, in their order."""
-    beside: Annotated[dict, Words("options of a data set")] | None = Field(None)
-    """People in the same rig that training also shows; null: none."""
 
     @property
     def ring(self) -> int:
         return len(self.cameras)
 
-    @functools.cached_property
-    def _people(self) -> Any:
-        return None if self.beside is None else read_node(self.beside, "data.beside")
-
-    def prepare(self, splits: Sequence[str] = PHASES) -> None:
-        """Render the people beside the instants, where training will show them.
-
-        Args:
-            splits: names of splits.
-        """
-        if self._people is not None and "train" in splits:
-            self._people.prepare(["train"])
-
     def reader(self, phase: str, strict: bool = True) -> InstantReader:
         listing = self.folder / LISTING
         if not listing.exists():
             raise InputError(f"{listing}: expected the instants that ghgs adapt has written; found none")
-        beside = self._people.reader(phase, strict) if self._people is not None and phase == "train" else None
-        return InstantReader(self.folder, read_json(listing)[phase], self.cameras, phase, beside)
+        return InstantReader(self.folder, read_json(listing)[phase], self.cameras, phase)

@@ -12,7 +12,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from ghgs_capture.calibration import MOST_GAIN, Calibration, calibrate
 from ghgs_capture.capture import Capture
@@ -179,29 +178,6 @@ def shared_gains(batch: Batch, model: GHGS) -> np.ndarray | None:
     logs = (logs - logs.mean(0)).double()
     scale = (math.log(MOST_GAIN) / logs.abs().amax(0)).clamp(max=1)
     return torch.exp(logs * scale).clamp(1 / MOST_GAIN, MOST_GAIN).cpu().numpy()
-
-
-def turned_from(rig: np.ndarray, cameras: np.ndarray) -> float:
-    """How far cameras are turned from those of a rig, whatever the world's axes.
-
-    Quarter turns about the optical axis do not count: photographs may be turned upright.
-
-    Args:
-        rig: world to camera [R, 4, 4] of all cameras of the rig.
-        cameras: world to camera [n, 4, 4], in any order.
-
-    Returns:
-        Greatest angle in degrees between a camera and the nearest of the rig, after the rotation of
-        the world that makes it least; 0 for cameras of the rig.
-    """
-    quarters = Rotation.from_euler("z", [[0], [90], [180], [270]], degrees=True).as_matrix()
-    known = (quarters[:, None] @ rig[:, :3, :3]).reshape(-1, 1, 3, 3)
-    taken = cameras[:, :3, :3]
-    worlds = known.mT @ taken[0]
-    between = known[:, None] @ worlds[None] @ taken.mT
-    cosines = (np.trace(between, axis1=-2, axis2=-1) - 1) / 2
-    angles = np.degrees(np.arccos(cosines.clip(-1, 1)))
-    return float(angles.min(0).max(-1).min())
 
 
 def _names(capture: Capture) -> tuple[str, ...]:

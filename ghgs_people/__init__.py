@@ -8,7 +8,6 @@ from ghgs_lit.config.registry import PARTS, offer
 
 offer(
     "data",
-    people_in_rig="ghgs_people.datasets.PeopleInRig",
     scans="ghgs_people.datasets.Scans",
     synthetic="ghgs_people.datasets.Synthetic",
     thuman2="ghgs_people.thuman2.THuman2",

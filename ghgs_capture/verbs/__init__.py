@@ -131,17 +131,13 @@ class View(Predict):
 
 
 class Adapt(OfPhotographs, Training):
-    """Train the weights of the package further for your own cameras, in minutes."""
+    """Train the weights of the package further on the instants of your capture, in minutes."""
 
     example = "ghgs adapt cameras=cameras.json images=photographs masks=masks out=mine.ckpt"
     opens = ("checkpoint",)
 
     checkpoint: PathText = "shipped"
     """The weights to start from."""
-    learn: Literal["auto", "people", "instants", "both"] = "auto"
-    """From what: people who are built in and stand in the rig; instants of images, of whose cameras
-    each in turn is the target of the others; both; auto: instants where images has several of three
-    cameras or more, else people."""
     minutes: float = Field(3, gt=0, le=1440)
     """Minutes of training."""
     out: PathText | None = None

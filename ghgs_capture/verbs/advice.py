@@ -1,23 +1,16 @@
 """What ``ghgs predict`` says beside its files: why a prediction may be poor, and what may help."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from statistics import geometric_mean
-from typing import Any
-
-import numpy as np
 
 from ghgs_capture.export.reports import REPORT
 from ghgs_capture.export.unseen import GUESSED
-from ghgs_capture.rig import turned_from
 from ghgs_capture.tones import tone_lines
-from ghgs_lit.types import Batch
 
 #: PSNR in dB, in the subject's box, below which the render of an input counts as poor.
 LOW_PSNR = 25.0
-#: Degrees that a camera is turned by, from which weights for one rig are said to be for another.
-OTHER_RIG = 5.0
 
 
 def advice_of(directory: Path) -> Iterator[str]:
@@ -55,29 +48,6 @@ def advice_of(directory: Path) -> Iterator[str]:
             f"photographs come back at {low:.1f} to {high:.1f} dB only, sound ones at 30 or more:"
             f" mostly cameras or masks are off{hint}; sheet.png shows where"
         )
-
-
-def rig_advice(trained: Mapping[str, Any], batch: Batch) -> Iterator[str]:
-    """Say where photographs are not of the rig that ``ghgs adapt`` trained weights for.
-
-    Args:
-        trained: configuration of the weights.
-        batch: the photographs, of one element.
-
-    Yields:
-        Lines; none for weights that are for any rig.
-    """
-    data = trained.get("data", {})
-    count = len(batch.views[0])
-    if data.get("kind") != "people_in_rig":
-        return
-    hint = "checkpoint=shipped, or ghgs adapt with these cameras, may predict them better"
-    if count not in (counts := trained["views"]["training_counts"]):
-        yield f"the weights were adapted to {' or '.join(map(str, counts))} photographs, not {count}; {hint}"
-    rig = np.array([camera["extrinsics"] for camera in data["cameras"].values()])
-    turned = turned_from(rig, batch.cameras.extrinsics[0].double().cpu().numpy())
-    if turned > OTHER_RIG:
-        yield f"the weights were adapted to another rig: a camera is {turned:.0f} degrees off; {hint}"
 
 
 def moved_line(moved: dict[str, float]) -> str:

@@ -19,7 +19,7 @@ from ghgs_capture.formats.json_and_toml import json_text
 from ghgs_capture.prediction import TimedPrediction, crop_size, predict, predict_batch
 from ghgs_capture.rig import INSTANTS, Rig, corrected_rig, spread
 from ghgs_capture.tones import without_tones
-from ghgs_capture.verbs.advice import advice_of, moved_line, rig_advice
+from ghgs_capture.verbs.advice import advice_of, moved_line
 from ghgs_capture.verbs.photographs import capture_folder, check_cameras
 from ghgs_lit.cli import inputs
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
@@ -101,8 +101,7 @@ def predict_photographs(run: "Predict", directory: Path) -> None:
     device = inputs.pick_device(run.device)
     renderer = inputs.build_renderer(run, device)
     model = inputs.load_model(run.plain, run.checkpoint, device, run.precision)
-    trained = read_config(run.checkpoint)
-    size = crop_size(run.size, trained, model)
+    size = crop_size(run.size, read_config(run.checkpoint), model)
     write_config(run, directory)
     refining: dict[str, Any] = {
         "refine_cameras": run.refine_cameras,
@@ -133,7 +132,7 @@ def predict_photographs(run: "Predict", directory: Path) -> None:
             together.add(place, result.batch, result.prediction, renderer)
         count += 1
         if count == 1:
-            for line in (*advice_of(place), *rig_advice(trained, result.batch)):
+            for line in advice_of(place):
                 print(line, flush=True)
         totals.update(seconds)
     left_out = len(folder.instants) - count

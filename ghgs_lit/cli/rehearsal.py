@@ -127,7 +127,7 @@ class _Rehearsed:
         if model is not None:
             self.attempt(check_size, data, model)
         split = self.run.evaluation.split
-        if hasattr(data.dataset, "render_first") and not _is_rendered(data, {"train", "val", split}):
+        if hasattr(data.dataset, "cache_dir") and not _is_rendered(data, {"train", "val", split}):
             self.notes[f"data={data.dataset.name}: people are rendered before the first step"] = None
             return False
         before = len(self.reasons)

@@ -104,42 +104,20 @@ def test_some_instants_are_only_measured():
 
 
 @pytest.mark.parametrize(
-    ("instants", "views", "masks", "learn", "message"),
+    ("instants", "views", "masks", "message"),
     [
-        (1, 4, True, "instants", "images: expected folders of two instants or more (learn=people"),
-        (3, 2, True, "instants", "cameras: expected three cameras or more: one is the target (learn=people"),
-        (3, 4, False, "auto", "expected a mask of the subject: masks=<folder>"),
+        (1, 4, True, "images: expected folders of two instants or more; found 1"),
+        (3, 2, True, "cameras: expected three to eight cameras, of which one is the target; found 2"),
+        (2, 9, True, "cameras: expected three to eight cameras, of which one is the target; found 9"),
+        (3, 4, False, "expected a mask of the subject: masks=<folder>"),
     ],
 )
-def test_what_cannot_be_learned_from_is_refused(tmp_path, capsys, instants, views, masks, learn, message):
+def test_what_cannot_be_learned_from_is_refused(tmp_path, capsys, instants, views, masks, message):
     said = sequence(tmp_path, instants, views, masks)
-    assert ghgs("adapt", *said, f"learn={learn}", f"hydra.run.dir={tmp_path / 'run'}") == 1
+    assert ghgs("adapt", *said, f"hydra.run.dir={tmp_path / 'run'}") == 1
     printed = capsys.readouterr().err
     assert message in printed
     assert len(printed.splitlines()) == 1
-
-
-@pytest.mark.parametrize(("instants", "views"), [(1, 4), (3, 2)])
-def test_where_instants_are_too_few_people_are_learned_from(tmp_path, monkeypatch, instants, views):
-    seen = []
-    monkeypatch.setattr(adapt, "run_job", lambda run, *_: seen.append(run.plain["data"]["kind"]))
-    assert ghgs("adapt", *sequence(tmp_path, instants, views), f"hydra.run.dir={tmp_path / 'run'}") == 0
-    assert seen == ["people_in_rig"]
-
-
-def test_people_stand_beside_the_instants(tmp_path, monkeypatch):
-    """With true depths, which instants lack."""
-    seen = []
-    monkeypatch.setattr(adapt, "run_job", lambda run, *_: seen.append(run))
-    said = sequence(tmp_path)
-    for learn in ("auto", "both"):
-        assert ghgs("adapt", *said, f"learn={learn}", f"hydra.run.dir={tmp_path / 'run'}") == 0
-    alone, both = (run.plain["data"] for run in seen)
-    assert alone["kind"] == both["kind"] == "instants"
-    assert alone["beside"] is None
-    assert both["beside"]["kind"] == "people_in_rig"
-    assert [run.loss.weights.depth for run in seen] == [0.0, 0.5]
-    assert {run.views.training_counts for run in seen} == {(3,)}
 
 
 def test_weights_learn_from_instants_and_an_interrupted_run_goes_on(tmp_path, monkeypatch, capsys):
@@ -168,3 +146,13 @@ def test_instants_whose_masks_fail_are_left_out(tmp_path):
     assert agrees(capture)
     capture.photographs[1].matte[:, :48] = 0
     assert not agrees(capture)
+
+
+def test_no_file_is_replaced(tmp_path, capsys):
+    """The calibration, given as the place for the weights by mistake, stays as it is."""
+    images, cameras = sequence(tmp_path)
+    path = tmp_path / "cameras.json"
+    before = path.read_text()
+    assert ghgs("adapt", images, cameras, f"out={path}", f"hydra.run.dir={tmp_path / 'run'}") == 1
+    assert "out: expected a path where there is no file, or overwrite=true" in capsys.readouterr().err
+    assert path.read_text() == before

@@ -58,7 +58,7 @@ def test_no_option_restates_a_default(group):
         for key, node in nodes_of({group: content}):
             if "kind" in node or None in KINDS[group]:
                 wrong += restated(node, with_defaults({}, class_of_node(node, key)), path.stem)
-    referred = ("synthetic: size", "people_in_rig: size", "random: evaluation_count")
+    referred = ("synthetic: size", "random: evaluation_count")
     assert [key for key in wrong if key not in referred and not key.endswith(": name")] == []
 
 

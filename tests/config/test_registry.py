@@ -147,12 +147,12 @@ def test_a_node_without_a_kind_names_those_that_there_are():
 
 def test_a_node_is_read_once_and_taken_for_no_other():
     """The order of cameras is that of the views; printed arrays leave out their middle."""
-    node = {"kind": "people_in_rig", "cameras": {"left": {}, "right": {}}}
-    options = read_node(node, "data")
-    assert read_node(dict(node), "data") is options
-    turned = read_node({**node, "cameras": {"right": {}, "left": {}}}, "data")
-    assert (list(options.cameras), list(turned.cameras)) == (["left", "right"], ["right", "left"])
+    node = {"names": {"left": "a", "right": "b"}}
+    options = read_node(node, "calibration")
+    assert read_node(dict(node), "calibration") is options
+    turned = read_node({"names": {"right": "b", "left": "a"}}, "calibration")
+    assert (list(options.names), list(turned.names)) == (["left", "right"], ["right", "left"])
     arrays = [np.zeros(2000), np.zeros(2000)]
     arrays[1][1000] = 1
-    read = [read_node({**node, "cameras": {"left": array}}, "data").cameras["left"] for array in arrays]
+    read = [read_node({"names": {"left": array}}, "calibration").names["left"] for array in arrays]
     assert [array.sum() for array in read] == [0, 1]

@@ -73,13 +73,11 @@ def test_the_people_are_different_ones(split, count):
     assert apart[~np.eye(count, dtype=bool)].min() > 1.3 * bench.OTHER_SIZE
 
 
-@pytest.mark.parametrize("name", ["synthetic", "people_in_rig"])
-def test_nobody_trains_on_them(name):
+def test_nobody_trains_on_them():
     """The greatest numbers of people that a configuration allows reach neither set,
     nor one set the other."""
     most = datasets.FIRST_VAL - 1
-    data = datasets.Synthetic if name == "synthetic" else datasets.PeopleInRig
-    data = data.model_construct(
+    data = datasets.Synthetic.model_construct(
         people=datasets.People(train=most, val=1),
         active=datasets.ActivePeople(train=1, val=most),
         motion=0,

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.planted_defects import CODE, change_code, found
 from ghgs_lit.diagnostics.stress.measure import measure
 from ghgs_lit.diagnostics.stress.stages import STAGES, heads
 from ghgs_lit.rendering.cpu import backend
+from tests.helpers.planting import CODE, change_code, found
 
-#: As those of ``benchmarks/planted_defects.json``, with the stage, family and dtype that show them.
+#: What is wrong, where, the change, and the stage, family and dtype that show it.
 DEFECTS = json.loads(Path(__file__).with_name("planted.json").read_text())
 
 
