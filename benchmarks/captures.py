@@ -39,6 +39,7 @@ from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.imperfections import backgrounds
 from ghgs_lit.data.sampling import even_positions, subject_rng
 from ghgs_lit.evaluation.measure import Method, ModelMethod, measure
+from ghgs_lit.execution import Predictor
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.geometry.masks import signed_distance
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
@@ -255,7 +256,7 @@ def methods_of(options: argparse.Namespace, run: Run, device: torch.device) -> I
     """Every checkpoint, one in memory at a time, and every baseline."""
     renderer, rounds = build_renderer(run, device), options.refine_cameras
     for path in options.checkpoints:
-        model = GHGS.from_checkpoint(path, device)
+        model = Predictor.from_checkpoint(path, device)
         cameras = CameraRefinement(rounds, model, renderer) if rounds else None
         yield str(path), ModelMethod(model, renderer, cameras=cameras)
     names = "all" if options.baselines == ["all"] else options.baselines
@@ -266,7 +267,7 @@ def measure_mending(
     options: argparse.Namespace, size: tuple[int, int], run: Run, device: torch.device
 ) -> None:
     """Print what captures lose as given, and what is left of it where ``predict`` decides."""
-    renderer, model = build_renderer(run, device), GHGS.from_checkpoint(options.checkpoints[0], device)
+    renderer, model = build_renderer(run, device), Predictor.from_checkpoint(options.checkpoints[0], device)
     metrics, larger = run.metrics.build().to(device), [_LARGER * side for side in size]
     data = tuple(data_of(Imperfection(), options.people, side, [], larger) for side in (list(size), larger))
     if options.picture:

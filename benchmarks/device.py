@@ -25,6 +25,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from ghgs_lit.config import run_of
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.diagnostics.benchmark.stages import OTHER, TOTAL, top_level, watched
+from ghgs_lit.execution import Predictor
 from ghgs_lit.losses import Losses, LossWeights
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.rendering import api, gsplat_backend
@@ -61,11 +62,11 @@ class CountingProbe(Watcher):
         return self.log.calls.total(), self.log.launches, self.log.waits.total()
 
 
-def forward(model: GHGS, batch: Batch, log: Log) -> Counts:
+def forward(predictor: Predictor, batch: Batch, log: Log) -> Counts:
     """Counts of one prediction without a gradient."""
     probe = CountingProbe(log)
-    with torch.no_grad(), watched(model, probe), probe.of(TOTAL):
-        model(batch)
+    with torch.no_grad(), watched(predictor.model, probe), probe.of(TOTAL):
+        predictor(batch)
     stages = [probe.counts[name] for name in top_level(probe.counts)]
     rest = (sum(numbers) for numbers in zip(*stages, strict=True))
     probe.counts[OTHER] = tuple(a - b for a, b in zip(probe.counts[TOTAL], rest, strict=True))
@@ -122,7 +123,7 @@ def step(
         CountingProbe(log),
     )
     with probe.of("forward"):
-        prediction = model(batch)
+        prediction = Predictor(model)(batch)
     with probe.of("render"):
         rendering = api.render(prediction.gaussians, batch.targets.cameras)
     with probe.of("loss"):
@@ -159,7 +160,7 @@ def main() -> None:
             depths = 2.0 * batch.masks
             batch = Batch(batch.images, batch.masks, batch.cameras, batch.targets, depths=depths).to(DEVICE)
             log.clear()
-            predictions.append(forward(model, batch, log))
+            predictions.append(forward(Predictor(model), batch, log))
             if options.lines:
                 for (reason, line), count in log.waits.most_common():
                     print(f"batch {size}: {count:4} {reason:20} {line}")

@@ -16,11 +16,11 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import run_of
 from ghgs_lit.config.compose import read_option
 from ghgs_lit.evaluation.measure import ModelMethod
+from ghgs_lit.execution import Predictor
 from ghgs_lit.metrics.functional import psnr, sharpness, spill
 from ghgs_lit.refinement import Refinement
 from ghgs_lit.rendering import render
@@ -90,7 +90,7 @@ def main() -> None:
     refinement = Refinement(options.refine, render) if options.refine else None
     methods = {}
     for name in options.checkpoints:
-        methods[name] = ModelMethod(GHGS.from_checkpoint(name), render, refinement)
+        methods[name] = ModelMethod(Predictor.from_checkpoint(name), render, refinement)
     for subject in options.subjects:
         batch = data.evaluation_batch(subject, "sealed", 4, read_option("targets", "midway"))
         target = batch.targets.images[0]

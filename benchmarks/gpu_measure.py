@@ -19,9 +19,9 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.device import drawing_nothing
+from ghgs_lit.execution.tape import CudaTape, Tape
 from ghgs_lit.method import model as models
 from ghgs_lit.runtime import precision
-from ghgs_lit.runtime.tape import CudaTape, Tape
 from tests.helpers.pretend_device import DEVICE, pretend_device
 from tests.helpers.tape import OperatorTape
 

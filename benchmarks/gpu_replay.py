@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from benchmarks.gpu_call import Call
-from ghgs_lit.method.model import GHGS
-from ghgs_lit.runtime.recording import Recorder
+from ghgs_lit.execution import Predictor
+from ghgs_lit.execution.graphs import GraphCache
 from ghgs_lit.types import Batch
 
 #: Largest distance of two results that differ by rounding, beside ten times that of two eager calls.
@@ -34,21 +34,21 @@ def apart(found: Sequence[Tensor], wanted: Sequence[Tensor]) -> float:
     return float(torch.stack(shares).max())  # a nan stays
 
 
-def judged(call: Call, name: str, recorder: Recorder, run: Callable[[bool], list[Tensor]]) -> None:
+def judged(call: Call, name: str, cache: GraphCache, run: Callable[[bool], list[Tensor]]) -> None:
     """Row of a call that is played back, beside two eager ones.
 
     Args:
         call: of the section.
         name: of the row.
-        recorder: that has recorded calls of this class.
+        cache: that has captured calls of this bucket.
         run: gives the results on the CPU, of a call that may be played back (True) or is eager.
     """
-    before = recorder.counts["played"]
+    before = cache.counts["replayed"]
     found, wanted, again = (run(may_be_played) for may_be_played in (True, False, False))
     numbers = {"apart": apart(found, wanted), "noise": apart(again, wanted)}
     # A number that is none is no small one.
     holds = numbers["apart"] <= max(ROUNDING, 10 * numbers["noise"])
-    is_played = recorder.counts["played"] > before
+    is_played = cache.counts["replayed"] > before
     verdict = ("as eager" if holds else WRONG) if is_played else "not played back"
     call.add(f"{name}, replay beside eager", verdict=verdict, **numbers)
 
@@ -59,26 +59,26 @@ def here(tensors: Iterable[Tensor]) -> list[Tensor]:
 
 
 @torch.no_grad()
-def judge_prediction(call: Call, name: str, model: GHGS, batch: Batch) -> None:
+def judge_prediction(call: Call, name: str, predictor: Predictor, batch: Batch) -> None:
     """Row of a prediction of another scene.
 
     Args:
         call: of the section.
         name: of the row.
-        model: that has recorded predictions of this class.
+        predictor: that has captured predictions of this bucket.
         batch: of the class, on the device.
     """
-    other, options = other_scene(batch), model.options
+    other, options = other_scene(batch), predictor.options
 
     def predicted(may_be_played: bool) -> list[Tensor]:
         capture = "auto" if may_be_played else "off"
-        model.options = options.model_copy(update={"capture": capture})
-        gaussians = model(other).gaussians
+        predictor.options = options.replace(capture=capture)
+        gaussians = predictor(other).gaussians
         values = [getattr(gaussians, field.name) for field in fields(gaussians)]
         return here(x for x in values if isinstance(x, Tensor) and x.is_floating_point())
 
-    judged(call, name, model.playback.recorder, predicted)
-    model.options = options
+    judged(call, name, predictor.graphs, predicted)
+    predictor.options = options
 
 
 def judge_step(call: Call, name: str, step: Any) -> None:
@@ -99,7 +99,7 @@ def judge_step(call: Call, name: str, step: Any) -> None:
         slopes = [weight.grad for weight in step.model.parameters() if weight.grad is not None]
         return here([total, *slopes])
 
-    judged(call, name, step.model.playback.steps, differentiated)
+    judged(call, name, step.captured_step.graphs, differentiated)
     step.host = batch
 
 
@@ -112,8 +112,8 @@ def judge_optimizer(call: Call, name: str, step: Any) -> None:
         name: of the row.
         step: of :mod:`benchmarks.gpu_sections`, whose optimizer has recorded its step.
     """
-    optimizer, recorder = step.optimizer, getattr(step.optimizer, "recorder", None)
-    if recorder is None:
+    optimizer, cache = step.optimizer, getattr(step.optimizer, "graphs", None)
+    if cache is None:
         return
     weights: list[nn.Parameter] = [weight for weight in step.model.parameters() if weight.requires_grad]
     written = [*weights, *(value for state in optimizer.state.values() for value in state.values())]
@@ -123,13 +123,13 @@ def judge_optimizer(call: Call, name: str, step: Any) -> None:
     def stepped(may_be_played: bool) -> list[Tensor]:
         for number, weight in enumerate(moved):
             weight.grad = weight.detach().roll(1).mul(0.5 + number % 3)
-        optimizer.recorder = recorder if may_be_played else None
+        optimizer.graphs = cache if may_be_played else None
         optimizer.step()
         changes = [new - old for new, old in zip(here(weights), here(before[: len(weights)]), strict=True)]
         for tensor, value in zip(written, before, strict=True):
             tensor.copy_(value)
         return changes
 
-    judged(call, name, recorder, stepped)
-    optimizer.recorder = recorder
+    judged(call, name, cache, stepped)
+    optimizer.graphs = cache
     optimizer.zero_grad()

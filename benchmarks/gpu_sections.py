@@ -20,16 +20,17 @@ from ghgs_lit.config.run import Run
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL, SecondsProbe, inside, top_level, watched
 from ghgs_lit.diagnostics.doctor.selfcheck import PASSED, selfcheck
 from ghgs_lit.diagnostics.machine import machine_facts
+from ghgs_lit.execution import Predictor
+from ghgs_lit.execution.graphs import GraphCache
+from ghgs_lit.execution.step import CapturedStep
 from ghgs_lit.kernels.gpu import PLAIN
 from ghgs_lit.method.model import GHGS
-from ghgs_lit.method.playback import Playback
+from ghgs_lit.method.rounds import NoRounds
 from ghgs_lit.method.stages import STAGES
 from ghgs_lit.rendering.capacity import deferred
 from ghgs_lit.runtime.precision import keep_rounded, precision_of
-from ghgs_lit.runtime.recording import Recorder
 from ghgs_lit.runtime.watching import Inputs, Watcher
 from ghgs_lit.runtime.watching import watched as stages_watched
-from ghgs_lit.training import captured
 from ghgs_lit.training.optimization import hold_rates
 from ghgs_lit.types import Batch, map_tensors
 
@@ -72,16 +73,16 @@ def _built(call: Call, run: Run) -> GHGS:
 
 
 def _predicted(
-    call: Call, name: str, model: GHGS, batch: Batch, precisions: Sequence[str] = PRECISIONS
+    call: Call, name: str, predictor: Predictor, batch: Batch, precisions: Sequence[str] = PRECISIONS
 ) -> None:
     """Rows of a prediction in each precision."""
     for precision in precisions:
-        model.precision = precision
+        predictor.precision = precision
         with torch.no_grad():
-            run = partial(model, batch)
+            run = partial(predictor, batch)
             ms = call.gpu.milliseconds(run, call.sizes.repeats)
             probe = SecondsProbe(call.gpu.device)
-            with watched(model, probe), inside(TOTAL, probe):
+            with watched(predictor.model, probe), inside(TOTAL, probe):
                 run()
             seconds = probe.seconds()
             stages = {f"{stage}_ms": 1e3 * seconds[stage] for stage in top_level(seconds)}
@@ -90,35 +91,36 @@ def _predicted(
 
 def prediction(call: Call) -> None:
     """A prediction of the weights that come with the package, eager and played back"""
-    model = _recording(call, GHGS.from_checkpoint().to(call.gpu.device))
+    predictor = _capturing(call, Predictor.from_checkpoint(map_location=call.gpu.device))
     for size in call.sizes.batches:
         batch = replace(call.batch(size, call.sizes.side), targets=None).to(call.gpu.device)
         for capture in ("off", "auto"):
-            model.options = model.options.model_copy(update={"capture": capture})
-            _predicted(call, f"{call.sizes.side}², batch of {size}, capture={capture}", model, batch)
-        for model.precision in PRECISIONS:
-            judge_prediction(call, f"batch of {size}, {model.precision}", model, batch)
-        recorder = model.playback.recorder
-        call.add(f"batch of {size}, recorder", reason=recorder.reason, **recorder.counts)
+            predictor.options = predictor.options.replace(capture=capture)
+            _predicted(call, f"{call.sizes.side}², batch of {size}, capture={capture}", predictor, batch)
+        for predictor.precision in PRECISIONS:
+            judge_prediction(call, f"batch of {size}, {predictor.precision}", predictor, batch)
+        cache = predictor.graphs
+        call.add(f"batch of {size}, graphs", reason="; ".join(cache.reasons), **cache.counts)
 
 
-def _recording(call: Call, model: GHGS) -> GHGS:
-    """The model with recordings on this device."""
-    model.playback = Playback(*(Recorder(tape=call.gpu.tape()) for _ in range(2)))
-    return model
+def _capturing(call: Call, predictor: Predictor) -> Predictor:
+    """The predictor with graphs of this device."""
+    predictor.graphs = GraphCache(tape=call.gpu.tape())
+    return predictor
 
 
 def paper(call: Call) -> None:
     """A prediction of a large encoder, model=paper"""
     model = _built(call, call.run(f"encoder={call.sizes.encoder}", "model=paper")).eval()
+    predictor = Predictor(model)
     batch = replace(call.batch(1, call.sizes.large), targets=None).to(call.gpu.device)
     name = f"{call.sizes.encoder}, {call.sizes.large}²"
-    _predicted(call, name, model, batch)
+    _predicted(call, name, predictor, batch)
     if call.gpu.is_real:  # a rehearsal has no autocast
         keep_rounded(model.encoder, torch.bfloat16)
-    _predicted(call, f"{name}, rounded weights", model, batch, ("bfloat16",))
+    _predicted(call, f"{name}, rounded weights", predictor, batch, ("bfloat16",))
     with sdpa_kernel([SDPBackend.CUDNN_ATTENTION, *ATTENTION], set_priority=True):
-        _predicted(call, f"{name}, rounded weights, cuDNN's attention first", model, batch, ("bfloat16",))
+        _predicted(call, f"{name}, rounded weights, cuDNN's attention first", predictor, batch, ("bfloat16",))
 
 
 class _FirstInputs(Watcher):
@@ -138,19 +140,20 @@ PIECES = (*STAGES, "gaussian_head.activate", "rounds")
 @torch.no_grad()
 def graphs(call: Call) -> None:
     """CUDA graphs: each piece of a prediction, then the whole"""
-    model = GHGS.from_checkpoint().to(call.gpu.device)
-    model.options = model.options.model_copy(update={"capture": "off"})
+    predictor = Predictor.from_checkpoint(map_location=call.gpu.device)
+    predictor.options = predictor.options.replace(capture="off")
+    model = predictor.model
     for size in call.sizes.batches:
         batch = replace(call.batch(size, call.sizes.side), targets=None).to(call.gpu.device)
         seen = _FirstInputs()
         with stages_watched(model, {piece: piece for piece in PIECES}, seen):
-            model(batch)
+            predictor(batch)
         for piece, (arguments, options) in seen.inputs.items():
             stage = model
             for name in piece.split("."):
                 stage = getattr(stage, name)
             _recorded(call, f"batch of {size}, {piece}", _Called(stage), (arguments, options))
-        _recorded(call, f"batch of {size}, all", _Called(model), ((batch,), {}))
+        _recorded(call, f"batch of {size}, all", _Called(predictor), ((batch,), {}))
 
 
 class _Called:
@@ -168,14 +171,14 @@ def _recorded(call: Call, name: str, function: Callable[[Inputs], Any], inputs: 
     """Row of a recording: eager and played back (with copies of inputs and results), or why it cannot be
     recorded."""
     eager = call.gpu.milliseconds(partial(function, inputs), call.sizes.repeats)
-    recorder = Recorder(eager=0, tape=call.gpu.tape())
+    cache = GraphCache(eager=0, tape=call.gpu.tape())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the row has the reason
-        recorder(function, inputs)
-    if recorder.reason:
-        call.add(name, eager_ms=eager, refused=recorder.reason)
+        cache(function, inputs)
+    if cache.reasons:
+        call.add(name, eager_ms=eager, refused=cache.reasons[-1])
         return
-    play = partial(recorder, function, inputs)
+    play = partial(cache, function, inputs)
     ms = call.gpu.milliseconds(play, call.sizes.repeats)
     call.add(name, eager_ms=eager, graph_ms=ms, busy_ms=call.gpu.work(play)["busy_ms"])
 
@@ -185,22 +188,25 @@ class _Step:
 
     def __init__(self, call: Call, run: Run, batch: Batch, autocast: bool = False):
         self.device, self.host, self.autocast = call.gpu.device, batch, autocast
-        self.model = _recording(call, _built(call, run)).train()
-        if self.model.rounds is not None:
-            self.model.rounds._drawn = lambda: 2
+        self.model = _built(call, run).train()
+        if not isinstance(self.model.rounds, NoRounds):
+            self.model.rounds.options = self.model.rounds.options.replace(training_counts=(2,))
         self.renderer, self.losses = run.renderer.build(), run.loss.build()
+        self.predictor = _capturing(call, Predictor(self.model))
+        self.captured_step = CapturedStep(self.predictor, self.renderer, self.losses)
+        self.captured_step.graphs = GraphCache(tape=call.gpu.tape())
         self.options = run.optimizer
         self.optimizer = self.options.optimizer(self.model)
         hold_rates(self.optimizer)
         if not call.gpu.is_real and self.options.matrix_scale is not None:  # as Muon does on CUDA
-            self.optimizer.recorder = Recorder(limit=2, tape=call.gpu.tape())
+            self.optimizer.graphs = GraphCache(limit=2, tape=call.gpu.tape())
 
     def data(self) -> None:
         self.batch = self.host.to(self.device, non_blocking=True)
 
     def forward(self) -> None:
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast):
-            self.prediction = self.model(self.batch)
+            self.prediction = self.predictor(self.batch)
 
     def render(self) -> None:
         self.rendering = self.renderer(self.prediction.gaussians, self.batch.targets.cameras)
@@ -226,7 +232,7 @@ class _Step:
     def played(self) -> Tensor:
         """The loss, with stages, rendering and gradients played back."""
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast):
-            return captured.played(self.model, self.renderer, self.losses, self.batch).total
+            return self.captured_step(self.batch).total
 
     def captured(self) -> None:
         """The step, played back."""
@@ -256,9 +262,9 @@ def _stepped(call: Call, name: str, step: _Step) -> None:
 def _captured(call: Call, name: str, step: _Step) -> None:
     """Rows of a step that is played back: how long it takes, and whether it is as eager."""
     ms = call.gpu.milliseconds(step.captured, call.sizes.repeats)
-    recorder = step.model.playback.steps
+    cache = step.captured_step.graphs
     work = call.gpu.work(step.captured, 2)
-    call.add(f"{name}, captured", ms=ms, reason=recorder.reason, **work, **recorder.counts)
+    call.add(f"{name}, captured", ms=ms, reason="; ".join(cache.reasons), **work, **cache.counts)
     judge_step(call, name, step)
     judge_optimizer(call, f"{name}, optimizer", step)
 
@@ -306,13 +312,13 @@ class _Calls(TorchDispatchMode):
 
 def kernels(call: Call) -> None:
     """Kernels in Triton, the same eager and compiled, beside the rate of a copy; attention by backend"""
-    model = GHGS.from_checkpoint().to(call.gpu.device)
+    predictor = Predictor.from_checkpoint(map_location=call.gpu.device)
     batch = replace(call.batch(max(call.sizes.batches), call.sizes.side), targets=None).to(call.gpu.device)
-    model.precision = "tf32"
+    predictor.precision = "tf32"
     with _Calls() as calls:
         with torch.no_grad():
-            model(batch)  # one kernel is of predictions alone
-        model(batch).gaussians.means.sum().backward()
+            predictor(batch)  # one kernel is of predictions alone
+        predictor(batch).gaussians.means.sum().backward()
     for name in set(PLAIN) - set(calls.inputs):
         call.add(name, refused="not called")
     moved = {}

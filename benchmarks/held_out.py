@@ -17,13 +17,13 @@ import torch
 
 from ghgs_capture import Capture
 from ghgs_capture.prediction import trained_size
-from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_renderer, pick_device
 from ghgs_lit.config import run_of
 from ghgs_lit.config.options import image_size
 from ghgs_lit.evaluation.baselines import nearest_view, splatted
 from ghgs_lit.evaluation.baselines.splats import hull_depth
 from ghgs_lit.evaluation.measure import Method, ModelMethod, measure
+from ghgs_lit.execution import Predictor
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.refinement import CameraRefinement, Refinement
 from ghgs_lit.types import Batch, Targets
@@ -71,7 +71,7 @@ def main() -> None:
     }
     refinement = Refinement(options.refine, renderer) if options.refine else None
     for path in options.checkpoints:
-        methods[str(path)] = ModelMethod(GHGS.from_checkpoint(path, device), renderer, refinement)
+        methods[str(path)] = ModelMethod(Predictor.from_checkpoint(path, device), renderer, refinement)
     # by the first checkpoint, from all photographs: the calibration is theirs
     if options.refine_cameras:
         model = methods[str(options.checkpoints[0])].model

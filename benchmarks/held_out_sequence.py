@@ -43,10 +43,10 @@ from ghgs_capture.prediction import crop_size, in_frame
 from ghgs_capture.rig import INSTANTS, Rig, corrected_rig, spread
 from ghgs_capture.verbs import Adapt
 from ghgs_capture.verbs.adapt import with_rig
-from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import run_of
 from ghgs_lit.data.view import area_image
+from ghgs_lit.execution import Predictor
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.method.rounds.gains import divided
 from ghgs_lit.metrics.functional import decibels, psnr, psnr_box_40
@@ -195,7 +195,7 @@ class Measured:
         return np.array(found).swapaxes(0, 1)
 
     @torch.no_grad()
-    def person(self, model: GHGS, batch: Batch) -> list[list[float]]:
+    def person(self, model: Predictor, batch: Batch) -> list[list[float]]:
         """The columns of each camera held out of a person whose cameras and masks are exact."""
         rows = []
         for view in range(len(self.cameras)):
@@ -251,8 +251,8 @@ def compared(image: Tensor, alpha: Tensor, truth: dict[str, Tensor]) -> list[flo
     return [np.nan if truth["fails"] else value.item() for value in found]
 
 
-def _model(path: str) -> GHGS:
-    return GHGS.from_checkpoint(path).eval()
+def _model(path: str) -> Predictor:
+    return Predictor.from_checkpoint(path)
 
 
 def _halved(lens: np.ndarray, batch: Batch, view: int, truth: dict[str, Tensor]) -> Cameras:

@@ -19,6 +19,7 @@ from ghgs_lit.config import run_of
 from ghgs_lit.config.run import Run
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch, random_model
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL, PeakProbe
+from ghgs_lit.execution import Predictor
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.types import Batch
 
@@ -28,7 +29,7 @@ _AT_ONCE = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536"
 
 def measured_prediction(run: Run, batch: Batch, device: torch.device) -> int:
     """Peak bytes of a second prediction in addition to the weights."""
-    model = random_model(run.plain).to(device)
+    model = Predictor(random_model(run.plain).to(device))
     batch = dataclasses.replace(batch, targets=None).to(device)
     with torch.no_grad():
         model(batch)
@@ -50,7 +51,7 @@ def measured_training(run: Run, batch: Batch, device: torch.device) -> int:
         optimizer.zero_grad()
         probe = PeakProbe(device)
         probe.begin(TOTAL)
-        prediction = model(batch)
+        prediction = Predictor(model)(batch)
         total = losses(prediction, renderer(prediction.gaussians, batch.targets.cameras), batch)[0]
         del prediction
         total.backward()

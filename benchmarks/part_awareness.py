@@ -19,6 +19,7 @@ from torch import Tensor
 from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import run_of
+from ghgs_lit.execution import Predictor
 from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.method.encoder.semantic import SemanticBranch, SemanticOptions
 from ghgs_lit.method.plan import planned
@@ -55,7 +56,7 @@ def of_model(model: GHGS) -> Features:
     def of(batch: Batch, kept: KeptPatches) -> Tensor:
         found: list[Tokens] = []
         hook = model.encoder.register_forward_hook(lambda module, inputs, tokens: found.append(tokens))
-        model(batch)
+        Predictor(model)(batch)
         hook.remove()
         _, _, h, w = found[0].grid
         flat = (found[0].image * h + found[0].row) * w + found[0].column
@@ -69,7 +70,7 @@ def of_checkpoint(path: str) -> Features:
     checkpoint = read_checkpoint(path)
     encoder = checkpoint["config"]["encoder"]
     if "bounds" in checkpoint["config"]:
-        return of_model(GHGS.from_checkpoint(path))
+        return of_model(Predictor.from_checkpoint(path).model)
     branch = SemanticOptions(**encoder["semantic"]).build(encoder["patch_size"])
     prefix, state = "encoder.semantic.", model_state(checkpoint)
     branch.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})

@@ -16,12 +16,11 @@ from ghgs_capture.tones import own_tones, without_tones
 from ghgs_lit.config.keys import lookup
 from ghgs_lit.config.options import image_size
 from ghgs_lit.errors import require
+from ghgs_lit.execution import Predictor
 from ghgs_lit.geometry.frame import Frame
-from ghgs_lit.method.model import GHGS
 from ghgs_lit.method.rounds.coarse import FILLED
 from ghgs_lit.refinement import CameraRefinement, Refinement, Report, pixels_moved
 from ghgs_lit.rendering import Renderer
-from ghgs_lit.surroundings import side_multiple
 from ghgs_lit.types import Batch, Gaussians, Prediction
 from ghgs_lit.weights.checkpoint import read_config
 from ghgs_lit.weights.reading import SHIPPED, file_of
@@ -53,7 +52,7 @@ class TimedPrediction:
 @torch.no_grad()
 def predict(
     capture: Capture,
-    model: GHGS | str | Path = SHIPPED,
+    model: Predictor | str | Path = SHIPPED,
     size: int | tuple[int, int] | None = None,
     refine_cameras: int | Literal["auto"] = "auto",
     refine_masks: int | Literal["auto"] = "auto",
@@ -65,8 +64,8 @@ def predict(
 
     Args:
         capture: photographs of one instant with masks and cameras, in any unit of length.
-        model: a model in evaluation mode, or a checkpoint (kept in memory for further calls): a
-            path, or the one that comes with the package.
+        model: a predictor in evaluation mode, or a checkpoint (kept in memory for further calls): a path,
+            or the one that comes with the package.
         size: side or (height, width) of the crops that the model sees, in pixels; None: as it was
             trained (checkpoints only).
         refine_cameras: most rounds that correct the cameras until the photographs agree
@@ -86,7 +85,7 @@ def predict(
     Raises:
         InputError: the checkpoint cannot be used, or the size does not fit the model.
     """
-    if not isinstance(model, GHGS):
+    if not isinstance(model, Predictor):
         path = file_of(model)
         model = _model(path, path.stat().st_mtime_ns)
         size = crop_size(size, read_config(path), model)
@@ -106,7 +105,7 @@ def predict(
 
 def _predicted(
     capture: Capture,
-    model: GHGS,
+    model: Predictor,
     size: tuple[int, int],
     refine_cameras: int | Literal["auto"],
     refine_masks: int | Literal["auto"],
@@ -136,14 +135,14 @@ def _predicted(
     if refine_cameras == "auto":
         why["refine_cameras"] = doubt_of_cameras(capture, batch)
         refine_cameras = CORRECTION if why["refine_cameras"] else 0
-    batch = batch.to(next(model.parameters()).device)
+    batch = batch.to(next(model.model.parameters()).device)
     forward = functools.partial(in_frame, model)
     result = predict_batch(batch, model, renderer, refine_cameras, refine, forward)
     why = {name: doubt for name, doubt in why.items() if doubt}
     return replace(result, seconds=seconds | result.seconds, changed=changed, why=why)
 
 
-def in_frame(model: GHGS, batch: Batch) -> Prediction:
+def in_frame(model: Predictor, batch: Batch) -> Prediction:
     """Predict in the subject's frame, whatever the weights, so that a capture may have any unit.
 
     Args:
@@ -160,7 +159,7 @@ def in_frame(model: GHGS, batch: Batch) -> Prediction:
 
 def predict_batch(
     batch: Batch,
-    model: GHGS,
+    model: Predictor,
     renderer: Renderer,
     refine_cameras: int = 0,
     refine: int = 0,
@@ -253,7 +252,9 @@ def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:
     return side if side < min(image_size("size", size)) else size
 
 
-def crop_size(size: int | tuple[int, int] | None, config: Mapping[str, Any], model: GHGS) -> tuple[int, int]:
+def crop_size(
+    size: int | tuple[int, int] | None, config: Mapping[str, Any], model: Predictor
+) -> tuple[int, int]:
     """Size of the crops that a checkpoint's model sees.
 
     Warns of sizes larger than in training, which make results worse, not sharper, where the model
@@ -271,12 +272,12 @@ def crop_size(size: int | tuple[int, int] | None, config: Mapping[str, Any], mod
         InputError: the model cannot take this size.
     """
     trained = image_size("size", trained_size(config))
-    patch = model.encoder.patch_size
+    patch = model.model.encoder.patch_size
     height, width = trained if size is None else image_size("size", size)
-    multiple = side_multiple(model.options, patch)
+    multiple = model.side_multiple
     expected = f"sides divisible by the patch size {multiple}"
     require(height % multiple == width % multiple == 0, "size", expected, (height, width))
-    is_coarse_to_fine = model.rounds is not None and model.rounds.height is not None
+    is_coarse_to_fine = model.model.rounds.height is not None
     if not is_coarse_to_fine and (height > trained[0] or width > trained[1]):
         below = ", ".join(str(n * patch) for n in range(max(trained) // patch, 0, -3)[:3])
         warnings.warn(
@@ -288,5 +289,5 @@ def crop_size(size: int | tuple[int, int] | None, config: Mapping[str, Any], mod
 
 
 @functools.lru_cache(maxsize=1)
-def _model(path: Path, changed: int) -> GHGS:
-    return GHGS.from_checkpoint(path)
+def _model(path: Path, changed: int) -> Predictor:
+    return Predictor.from_checkpoint(path)

@@ -18,8 +18,9 @@ from ghgs_capture.capture import Capture
 from ghgs_capture.crops import Photograph
 from ghgs_capture.doubts import CORRECTION, doubt_of_cameras, doubt_of_masks
 from ghgs_capture.folder import CaptureFolder
+from ghgs_lit.execution import Predictor
 from ghgs_lit.geometry.frame import Frame
-from ghgs_lit.method.model import GHGS
+from ghgs_lit.method.rounds import NoRounds
 from ghgs_lit.method.rounds.gains import log_gains
 from ghgs_lit.refinement import CameraRefinement, pixels_moved
 from ghgs_lit.rendering import Renderer
@@ -106,7 +107,7 @@ class Rig:
 
 def corrected_rig(
     captures: Sequence[Capture],
-    model: GHGS,
+    model: Predictor,
     size: tuple[int, int],
     rounds: int | Literal["auto"],
     refine_masks: int | Literal["auto"],
@@ -141,7 +142,7 @@ def corrected_rig(
         if 2 * len(contradicted) < len(captures):
             return None
         rounds = CORRECTION
-    batch = _together(batches).to(next(model.parameters()).device)
+    batch = _together(batches).to(next(model.model.parameters()).device)
     corrected = CameraRefinement(rounds, model, renderer, shared=True)(batch)
     before = batch.cameras
     after = corrected.cameras
@@ -157,7 +158,7 @@ def corrected_rig(
 
 
 @torch.no_grad()
-def shared_gains(batch: Batch, model: GHGS) -> np.ndarray | None:
+def shared_gains(batch: Batch, model: Predictor) -> np.ndarray | None:
     """Colour gains of cameras: the median over instants, with a geometric mean of 1 over cameras.
 
     Args:
@@ -168,7 +169,8 @@ def shared_gains(batch: Batch, model: GHGS) -> np.ndarray | None:
         [V, 3] from ``1 / MOST_GAIN`` to ``MOST_GAIN``; None: exposures change between instants,
         photographs are divided by gains already, or the model uses none.
     """
-    if model.rounds is None or not model.rounds.options.gains or batch.log_gains is not None:
+    rounds = model.model.rounds
+    if isinstance(rounds, NoRounds) or not rounds.options.gains or batch.log_gains is not None:
         return None
     batch = Frame.of(batch).enter(batch)
     each = log_gains(model(batch).gaussians, batch)

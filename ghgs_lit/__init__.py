@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from ghgs_lit.execution import Predictor
     from ghgs_lit.method.model import GHGS
     from ghgs_lit.rendering import render
     from ghgs_lit.types import Batch, Cameras, Gaussians
@@ -13,9 +14,10 @@ _MODULES = {
     "Batch": "ghgs_lit.types",
     "Cameras": "ghgs_lit.types",
     "Gaussians": "ghgs_lit.types",
+    "Predictor": "ghgs_lit.execution",
     "render": "ghgs_lit.rendering",
 }
-__all__ = ["GHGS", "Batch", "Cameras", "Gaussians", "render"]
+__all__ = ["GHGS", "Batch", "Cameras", "Gaussians", "Predictor", "render"]
 
 
 def __getattr__(name: str):

@@ -203,14 +203,18 @@ class Batch(TensorStruct):
             known[function] = function(self)
         return known[function]
 
-    def note(self, extents: Sequence[Extent], pixels: Callable[[], Int[Tensor, " n"]]) -> None:
-        """Keep what a plan read of the masks.
+    def note(
+        self, extents: Sequence[Extent], pixels: Callable[[], Int[Tensor, " n"]], has_skew: bool
+    ) -> None:
+        """Keep what a plan read of the masks and cameras.
 
         Args:
             extents: :attr:`extents`.
             pixels: gives :attr:`pixels` in ascending order, when they are first asked for.
+            has_skew: :attr:`Cameras.has_skew` of the input cameras.
         """
         self.__dict__.update(extents=list(extents), _pixels=pixels)
+        self.cameras.__dict__.update(has_skew=has_skew)
 
     @cached_property
     def extents(self) -> list[Extent]:

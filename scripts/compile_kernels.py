@@ -10,8 +10,10 @@ from multiprocessing import get_context
 import torch
 
 from ghgs_capture.prediction import predict_batch
-from ghgs_lit import GHGS, Gaussians
+from ghgs_lit import Gaussians
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
+from ghgs_lit.execution import Predictor
+from ghgs_lit.method.rounds import NoRounds
 from ghgs_lit.rendering import Renderer
 
 BATCH = ellipsoid_batch(0.15, 4, 56, 1)
@@ -27,10 +29,11 @@ def draw() -> None:
 if __name__ == "__main__":
     drawing = get_context("spawn").Process(target=draw)
     drawing.start()
-    model = GHGS.from_checkpoint()
-    rounds, model.rounds = model.rounds, None  # they draw
+    predictor = Predictor.from_checkpoint()
+    model = predictor.model
+    rounds, model.rounds = model.rounds, NoRounds()  # they draw
     with torch.no_grad():
-        model(BATCH)
+        predictor(BATCH)
     model.rounds = rounds
     drawing.join()
-    predict_batch(BATCH, model, Renderer(), refine=1)
+    predict_batch(BATCH, predictor, Renderer(), refine=1)

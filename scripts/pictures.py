@@ -16,10 +16,10 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio
 
-from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import run_of
 from ghgs_lit.data.datamodule import PhotographsDataModule
+from ghgs_lit.execution import Predictor
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Gaussians, Prediction
 from ghgs_lit.visualization.pictures import ERROR_GAIN, colorize, error_map, row, stack, to_uint8
@@ -147,7 +147,7 @@ def main() -> None:
     parser.add_argument("--hero", type=int, default=1, help="number in the split val")
     parser.add_argument("--shown", type=int, nargs=2, default=(0, 2), help="numbers in the split val")
     options = parser.parse_args()
-    model = GHGS.from_checkpoint(options.checkpoint)
+    model = Predictor.from_checkpoint(options.checkpoint)
     data = people(options.people, options.size)
     results, compared = [], []
     for number, name in enumerate(data.subjects("val")):

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.surroundings import findings_of, refuse
+from ghgs_lit.execution import Predictor
+from ghgs_lit.execution.checks import findings_of, refuse
 from ghgs_lit.types import Batch
-from tests.helpers.models import make_model
+from tests.helpers.models import make_model, predict
 from tests.helpers.scenes import make_batch
 
 
@@ -78,7 +79,7 @@ def test_broken_values_are_refused_where_they_are(changes, message):
         object.__setattr__(batch, name, value)  # the types' own checks run in tests only
     model = make_model("model=paper")
     with pytest.raises(InputError, match=message):
-        model(batch)
+        predict(model, batch)
 
 
 def test_checks_of_values_can_be_left_out():
@@ -86,9 +87,8 @@ def test_checks_of_values_can_be_left_out():
     bad = dataclasses.replace(make_batch(1, 2), **spoiled("images", (0, 1, 2, 0, 0), torch.nan))
     model = make_model("model=paper")
     with pytest.raises(InputError, match=r"batch\.images: expected finite values within \[0, 1\]"):
-        model(bad)
-    model.checks_values = False
-    model(bad)
+        predict(model, bad)
+    Predictor(model, checks_values=False)(bad)
 
 
 @pytest.mark.parametrize("message", list(bad_batches()))

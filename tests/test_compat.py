@@ -13,7 +13,7 @@ from ghgs_lit.method.model import GHGS
 from ghgs_lit.types import Batch, Cameras, DepthMaps, Tokens
 from ghgs_lit.weights import names
 from ghgs_lit.weights.switches import release_switches
-from tests.helpers.models import config, make_model
+from tests.helpers.models import config, make_model, predict
 from tests.helpers.plans import plan_of
 from tests.helpers.scenes import make_batch
 from tests.helpers.weights import PUBLISHED
@@ -138,7 +138,7 @@ def test_a_fresh_model_of_the_release_may_look_behind_the_camera_and_ours_not():
         for name in behind:
             overrides = ["model=paper"] + ["compat=release"] * (name == "release")
             with torch.no_grad():
-                depth = make_model(*overrides, seed=seed)(batch).depth[batch.masks]
+                depth = predict(make_model(*overrides, seed=seed), batch).depth[batch.masks]
             behind[name] += bool((depth <= 0).any())
     assert behind["paper"] == 0
     assert behind["release"] > 0
@@ -153,7 +153,7 @@ def test_background_tokens_take_part_by_a_switch():
         calls = []
         model.recalibration.block.register_forward_hook(lambda _, args, out, c=calls: c.append(len(args[0])))
         with torch.no_grad():
-            model(batch)
+            predict(model, batch)
         touched[tokens] = calls[0]
     assert touched["all"] == 3 * 16
     assert touched["subject"] < touched["all"]

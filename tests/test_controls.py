@@ -16,6 +16,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.method.stages import STAGES
 from ghgs_lit.training.pretext.labels import PARTS
+from tests.helpers.models import predict
 from tests.helpers.scenes import training_batch
 
 FOLDER = Path(__file__).parents[1] / "examples" / "controls"
@@ -57,7 +58,7 @@ def calls_of(model, batch):
     calls = []
     hook = model.recalibration.register_forward_hook(lambda stage, inputs, out: calls.append((*inputs, out)))
     with torch.no_grad():
-        model(batch)
+        predict(model, batch)
     hook.remove()
     ((tokens, points, _, result),) = calls
     return tokens, points, result

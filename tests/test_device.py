@@ -16,8 +16,8 @@ from ghgs_lit.config import conf_dir
 from ghgs_lit.config.nodes import PerScene
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.measure import ModelMethod, measure
+from ghgs_lit.execution import Predictor
 from ghgs_lit.method.bounds import box, hull
-from ghgs_lit.method.model import GHGS
 from ghgs_lit.metrics import MetricsOptions
 from ghgs_lit.refinement import CameraRefinement, Refinement
 from ghgs_lit.rendering import Renderer
@@ -28,7 +28,8 @@ from ghgs_lit.training.validation_pictures import PicturesOptions
 from ghgs_lit.types import Targets
 from ghgs_lit.weights.checkpoint import write_checkpoint
 from tests.helpers.losses import losses_of
-from tests.helpers.models import close, config, make_model
+from tests.helpers.models import close, config, load_model, make_model
+from tests.helpers.models import predict as predicted
 from tests.helpers.people import render_boxes
 from tests.helpers.pretend_device import DEVICE, pretend_device
 from tests.helpers.scenes import make_batch
@@ -67,7 +68,7 @@ def test_every_stage_runs_there_and_predicts_the_same(kind, skip):
     """A tensor made on the wrong device fails at its line."""
     model, batch = make_model(kind, f"skip={skip}").eval(), make_batch(2, 3, 28, 42)
     with torch.no_grad():
-        expected = model(batch)
+        expected = predicted(model, batch)
         with pretend_device():
             found = model.to(DEVICE)(batch.to(DEVICE))
             assert found.gaussians.means.device == found.points.tokens.device == DEVICE
@@ -154,14 +155,14 @@ def test_training_there_changes_the_weights_alike_and_its_checkpoint_loads_anywh
         of_step = [value for name, value in logged.items() if name.startswith(("train/", "loss/"))]
         assert len(of_step) > 4
         assert all(isinstance(value, torch.Tensor) and value.device == DEVICE for value in of_step)
-        again = GHGS.from_checkpoint(path, map_location=DEVICE)
+        again = load_model(path, map_location=DEVICE)
         with torch.no_grad():
-            found = again(batch.to(DEVICE)).to("cpu")
+            found = predicted(again, batch.to(DEVICE)).to("cpu")
         trained.to("cpu")
     for (name, a), b in zip(trained.named_parameters(), expected.named_parameters(), strict=True):
         torch.testing.assert_close(a, b[1], atol=1e-4, rtol=1e-3, msg=name)
     with torch.no_grad():
-        close(GHGS.from_checkpoint(path)(batch).gaussians, found.gaussians)
+        close(predicted(load_model(path), batch).gaussians, found.gaussians)
 
 
 def test_batches_are_copied_there_without_a_wait():
@@ -184,13 +185,13 @@ def test_everything_is_measured_there(tmp_path, monkeypatch):
 
     def rows(device):
         def build():
-            return make_model("model=paper").to(device)
+            return Predictor(make_model("model=paper").to(device).eval())
 
         per_scene = PerScene(steps=1)
         methods = {name: baseline(name, REFERENCE, build, per_scene) for name in BASELINES}
-        methods["model"] = ModelMethod(build().eval(), REFERENCE)
-        methods["refined"] = ModelMethod(build().eval(), REFERENCE, Refinement(1, REFERENCE))
-        refined = build().eval()
+        methods["model"] = ModelMethod(build(), REFERENCE)
+        methods["refined"] = ModelMethod(build(), REFERENCE, Refinement(1, REFERENCE))
+        refined = build()
         cameras = CameraRefinement(1, refined, REFERENCE)
         methods["cameras"] = ModelMethod(refined, REFERENCE, cameras=cameras)
         found = []
@@ -238,7 +239,7 @@ def test_the_host_waits_once(overrides):
         with torch.no_grad(), pretend_device(True) as log:
             model, batch = make_model(*overrides).eval().to(DEVICE), make_batch(size, 4, 56, 42).to(DEVICE)
             log.clear()
-            model(batch)
+            predicted(model, batch)
         waits.append(log.waits.total())
         assert waits[-1] == 1, log.waits.most_common()
 
@@ -300,11 +301,11 @@ def test_a_planted_defect_is_caught(defect, said):
     model, batch = make_model("model=paper").eval(), make_batch(1, 3, 28, 42)
     model.unprojection = Planted(model.unprojection, defect)
     with torch.no_grad():
-        model(batch)
+        predicted(model, batch)
         with pretend_device():
             model, batch = model.to(DEVICE), batch.to(DEVICE)
             with pytest.raises((RuntimeError, TypeError), match=said):
-                model(batch)
+                predicted(model, batch)
 
 
 def test_calls_and_waits_are_counted_by_stage(monkeypatch, capsys):

@@ -12,7 +12,8 @@ from benchmarks import gpu
 from benchmarks.gpu_call import DRY, Call, Rows
 from benchmarks.gpu_measure import rehearsal
 from benchmarks.gpu_replay import WRONG, judge_optimizer, judge_prediction, judge_step
-from benchmarks.gpu_sections import SECTIONS, _recording, _Step
+from benchmarks.gpu_sections import SECTIONS, _capturing, _Step
+from ghgs_lit.execution import Predictor
 from tests.helpers.models import make_model
 from tests.helpers.pretend_device import DEVICE
 from tests.helpers.tape import OperatorTape, SilentTape
@@ -88,11 +89,11 @@ def test_a_wrong_replay_is_seen(kind, planted, tmp_path, one_thread, monkeypatch
         call = Call(device, rows, "step", TINY, tmp_path)
         if kind == "prediction":
             with torch.no_grad():
-                model = _recording(call, make_model("model=hull").eval().to(DEVICE))
+                predictor = _capturing(call, Predictor(make_model("model=hull").eval().to(DEVICE)))
                 batch = dataclasses.replace(call.batch(1, 28), targets=None).to(DEVICE)
                 for _ in range(2):
-                    model(batch)
-            judge_prediction(call, kind, model, batch)
+                    predictor(batch)
+            judge_prediction(call, kind, predictor, batch)
         else:
             step = _Step(call, call.run(*call.shipped), call.batch(1, 28))
             for _ in range(4):

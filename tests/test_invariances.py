@@ -13,7 +13,7 @@ from ghgs_lit.method.recalibration.recalibration import neighbor_cosines
 from ghgs_lit.metrics.functional import ssim
 from ghgs_lit.types import DepthBounds
 from tests.helpers.literal_recalibration import literal_recalibration
-from tests.helpers.models import close, make_model
+from tests.helpers.models import close, make_model, predict
 from tests.helpers.scenes import make_batch
 
 
@@ -30,7 +30,7 @@ def test_two_threads_predict_what_one_does(name):
         for threads in (1, 2):
             torch.set_num_threads(threads)
             with torch.no_grad():
-                found.append(model(batch))
+                found.append(predict(model, batch))
     finally:
         torch.set_num_threads(before)
     close(found[1].gaussians, found[0].gaussians)

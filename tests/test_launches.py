@@ -14,16 +14,16 @@ import torch
 
 from benchmarks import device
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
+from ghgs_lit.execution import Predictor
+from ghgs_lit.execution.graphs import GraphCache
+from ghgs_lit.execution.step import CapturedStep
 from ghgs_lit.method.model import GHGS
-from ghgs_lit.method.playback import Playback
 from ghgs_lit.rendering.api import Renderer
-from ghgs_lit.runtime.recording import Recorder
 from ghgs_lit.training import Optimization
-from ghgs_lit.training.captured import played
 from ghgs_lit.training.optimization import hold_rates
 from ghgs_lit.types import Batch
 from tests.helpers.losses import losses_of
-from tests.helpers.models import make_model
+from tests.helpers.models import load_model, make_model
 from tests.helpers.pretend_device import DEVICE, pretend_device
 from tests.helpers.tape import SilentTape
 
@@ -60,19 +60,25 @@ def one_thread():
     torch.set_num_threads(before)
 
 
+def two_rounds(kind: str) -> GHGS:
+    """A model whose training steps have two rounds where there are any."""
+    model = load_model() if kind == "shipped" else make_model(kind)
+    if model.rounds.height is not None or kind == "model=recurrent":
+        model.rounds.options = model.rounds.options.replace(training_counts=(2,))
+    return model
+
+
 def asked(kind: str, size: int) -> Asked:
     """Counts for four views of 28 x 28 pixels,
     or 56 x 56 with the weights that come with the package."""
-    model = GHGS.from_checkpoint() if kind == "shipped" else make_model(kind)
+    model = two_rounds(kind)
     batch = ellipsoid_batch(0.15, 4, 28, size)
     batch = Batch(batch.images, batch.masks, batch.cameras, batch.targets, depths=2.0 * batch.masks)
     with pretend_device() as log, device.drawing_nothing():
         model, batch = model.to(DEVICE), batch.to(DEVICE)
         for _ in range(2):  # the first fills caches, which depend on the size of photographs alone
             log.clear()
-            _, launches, waits = device.forward(model.eval(), batch, log)["total"]
-        if model.rounds is not None:
-            model.rounds._drawn = lambda: 2
+            _, launches, waits = device.forward(Predictor(model.eval()), batch, log)["total"]
         parts = device.second_step(model.train(), Optimization(lr=1e-3, matrix_scale=1.0), batch, log)
     step = [sum(numbers) for numbers in zip(*parts.values(), strict=True)]
     return Asked(launches, waits, *step[1:])
@@ -107,20 +113,18 @@ def test_little_is_asked_for_around_a_step_that_is_played_back(kind, size):
     weights = {"chamfer": 1.0} if kind == "model=paper" else {"depth": 0.2}
     losses = losses_of({"render_l1": 0.8, **weights})
     with pretend_device() as log, device.drawing_nothing():
-        model = GHGS.from_checkpoint() if kind == "shipped" else make_model(kind)
-        model = model.to(DEVICE).train()
-        model.playback = Playback(*(Recorder(tape=SilentTape()) for _ in range(2)))
-        if model.rounds is not None:
-            model.rounds._drawn = lambda: 2
+        model = two_rounds(kind).to(DEVICE).train()
+        captured = CapturedStep(Predictor(model), Renderer(), losses)
+        captured.graphs, captured.predictor.graphs = (GraphCache(tape=SilentTape()) for _ in range(2))
         options = Optimization(lr=1e-3, matrix_scale=1.0)
         optimizer = options.optimizer(model)
-        optimizer.recorder = Recorder(tape=SilentTape())
+        optimizer.graphs = GraphCache(tape=SilentTape())
         hold_rates(optimizer)
         for _ in range(4):
             depths = 2.0 * batch.masks
             there = dataclasses.replace(batch, depths=depths, body_vertices=bodies).to(DEVICE)
             log.clear()
-            played(model, Renderer(), losses, there).total.backward()
+            captured(there).total.backward()
             options.clip_gradients(model)
             optimizer.step()
             optimizer.zero_grad()
@@ -140,12 +144,12 @@ def test_little_is_asked_for_around_a_prediction_that_is_played_back(size):
     """Copies of inputs and results, the plan, the room of renderings, and what cuts results to size."""
     batch = dataclasses.replace(ellipsoid_batch(0.15, 4, 28, size), targets=None)
     with pretend_device() as log, device.drawing_nothing():
-        model = GHGS.from_checkpoint().to(DEVICE)
-        model.playback = Playback(Recorder(tape=SilentTape()))
+        predictor = Predictor.from_checkpoint(map_location=DEVICE)
+        predictor.graphs = GraphCache(tape=SilentTape())
         for _ in range(3):
             there = batch.to(DEVICE)
             log.clear()
-            model(there)
+            predictor(there)
     found = (log.launches, log.waits.total())
     print(found)
     counted = range(2) if torch.__version__.startswith(_VERSION) else [1]

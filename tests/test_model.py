@@ -13,6 +13,7 @@ import ghgs_lit
 from ghgs_lit.config import conf_dir
 from ghgs_lit.config.keys import ablation_of
 from ghgs_lit.errors import InputError
+from ghgs_lit.execution import ModelOptions, Predictor
 from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.method.bounds import NoBounds
 from ghgs_lit.method.heads.depth import DepthHeadOptions
@@ -20,11 +21,10 @@ from ghgs_lit.method.heads.dpt import DPTHead
 from ghgs_lit.method.heads.gaussian import GaussianHeadOptions
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.method.recalibration import RecalibrationOptions
-from ghgs_lit.surroundings import ModelOptions
 from ghgs_lit.types import Batch, Cameras, Tokens
 from ghgs_lit.weights.names import RELEASE, to_ours
 from tests.helpers.configs import composed
-from tests.helpers.models import ATTRIBUTES, close, config, make_model
+from tests.helpers.models import ATTRIBUTES, close, config, make_model, predict
 from tests.helpers.scenes import CASES, fixture, hard_subjects, in_dtype, make_batch, stack
 
 PRESETS = sorted(path.stem for path in (conf_dir() / "skip").glob("*.yaml"))
@@ -80,7 +80,7 @@ def test_the_pipeline_matches_the_release(dtype):
     # the model does so itself.
     batch = Batch(inputs["image"][..., 3:-3, 3:-3], masks, Cameras(inputs["intr"], extrinsics, 64, 64))
     model = release_model(inputs, dtype)
-    prediction = model(batch)
+    prediction = predict(model, batch)
     found = {
         "inv_depth": 1 / prediction.depth,
         "offset_free_points": prediction.points.pixels[masks],
@@ -121,10 +121,10 @@ def test_a_batch_equals_its_elements_one_by_one(kind, skip, dtype, limit):
     singles = [in_dtype(batch, dtype) for batch in hard_subjects().values()]
     model = make_model(kind, f"skip={skip}").eval().to(dtype)
     with torch.no_grad():
-        together = model(stack(singles))
+        together = predict(model, stack(singles))
         tokens = []
         for b, single in enumerate(singles):
-            alone = model(single)
+            alone = predict(model, single)
             tokens.append(alone.points.tokens)
             close(together.gaussians[b], alone.gaussians, limit)
             assert torch.equal(together.gaussians[b].image - 3 * b, alone.gaussians.image)
@@ -146,7 +146,7 @@ def test_extreme_masks_give_one_finite_gaussian_for_each_pixel(name, skip):
     nothing is lost or NaN."""
     batch = hard_subjects()[name]
     with torch.no_grad():
-        prediction = make_model(f"skip={skip}")(batch)
+        prediction = predict(make_model(f"skip={skip}"), batch)
         gaussians = prediction.gaussians
         assert gaussians.splits == (batch.masks.sum().item(),)
         assert all(getattr(gaussians, field).isfinite().all() for field in ATTRIBUTES)
@@ -155,7 +155,7 @@ def test_extreme_masks_give_one_finite_gaussian_for_each_pixel(name, skip):
         assert torch.equal(gaussians.image, image)
         assert torch.equal(gaussians.pixel, pixel)
         if skip == "exact":
-            close(gaussians, make_model("skip=none")(batch).gaussians)
+            close(gaussians, predict(make_model("skip=none"), batch).gaussians)
 
 
 @pytest.mark.parametrize(
@@ -166,7 +166,7 @@ def test_every_parameter_gets_a_finite_gradient(overrides):
     """A parameter without a gradient would never be trained."""
     batch = make_batch(2, 3, 42, 56)
     model = make_model(*overrides)
-    prediction = model(batch)
+    prediction = predict(model, batch)
     g = prediction.gaussians
     assert len(g) == batch.masks.sum()
     loss = g.means.square().mean() + g.scales.mean() + g.opacities.mean() + g.quaternions[:, 1].mean()
@@ -183,7 +183,7 @@ def test_every_parameter_gets_a_finite_gradient(overrides):
 def test_shapes(size, views):
     """Any number of views and any shape must give complete maps."""
     batch = make_batch(1, views, *size)
-    prediction = make_model()(batch)
+    prediction = predict(make_model(), batch)
     assert prediction.depth.shape == prediction.depth_valid.shape == batch.masks.shape
     assert prediction.points.pixels.shape == (*batch.masks.shape, 3)
     assert prediction.gaussians.splits == (batch.masks.sum().item(),)
@@ -194,7 +194,7 @@ def test_a_view_with_an_empty_mask_gives_no_gaussians():
     batch = make_batch(1, 3)
     masks = batch.masks.clone()
     masks[0, 1] = False
-    gaussians = make_model()(dataclasses.replace(batch, masks=masks)).gaussians
+    gaussians = predict(make_model(), dataclasses.replace(batch, masks=masks)).gaussians
     assert set(gaussians.image.tolist()) == {0, 2}
     assert gaussians.means.isfinite().all()
 
@@ -207,7 +207,7 @@ def test_ablations_differ_and_say_what_they_leave_out():
         cfg = config("model=paper", f"ablation={name}")
         assert ablation_of(cfg) == name
         with torch.no_grad():
-            outputs[name] = make_model("model=paper", f"ablation={name}")(batch).gaussians.means
+            outputs[name] = predict(make_model("model=paper", f"ablation={name}"), batch).gaussians.means
     names = list(outputs)
     for i, a in enumerate(names):
         for b in names[i + 1 :]:
@@ -242,7 +242,7 @@ def test_order_of_later_views_does_not_matter(skip, ablation):
     # On the image plane ties at the last distance are broken by the order of views: leave none out.
     model = make_model(f"skip={skip}", f"ablation={ablation}", "recalibration.k=1000").double()
     with torch.no_grad():
-        a, b = (model(in_dtype(x, torch.float64)).gaussians for x in (batch, swapped))
+        a, b = (predict(model, in_dtype(x, torch.float64)).gaussians for x in (batch, swapped))
     parts = [(b.image == i).nonzero()[:, 0] for i in (0, 2, 3, 1)]
     close(a, b.select(torch.cat(parts), b.splits), 2e-5)
 
@@ -252,8 +252,8 @@ def test_geometry_is_wide_under_autocast():
     batch = make_batch(1, 3)
     model = make_model("model=hull")
     with torch.autocast("cpu", torch.bfloat16):
-        prediction = model(batch)
-    expected = model(batch)
+        prediction = predict(model, batch)
+    expected = predict(model, batch)
     assert prediction.depth.dtype == prediction.points.pixels.dtype == prediction.gaussians.means.dtype
     assert prediction.depth.dtype == torch.float32
     assert torch.equal(prediction.depth_maps.bounds.near, expected.depth_maps.bounds.near)
@@ -305,8 +305,7 @@ def test_an_unknown_precision_is_refused_when_it_is_set():
     """A typing error must not wait for the first forward pass."""
     model = make_model("model=paper")
     with pytest.raises(InputError, match="precision: expected one of inherit"):
-        model.precision = "half"
-    assert model.precision == "inherit"
+        Predictor(model, precision="half")
 
 
 def test_importing_the_package_does_not_import_torch():

@@ -11,7 +11,7 @@ from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.geometry.projection import pixel_centers, project
 from ghgs_lit.method.bounds import SubjectBox
 from ghgs_lit.types import Batch, DepthBounds
-from tests.helpers.models import ATTRIBUTES, close, make_model
+from tests.helpers.models import ATTRIBUTES, close, make_model, predict
 from tests.helpers.scenes import make_batch, with_soft_rims
 
 PADS = ["model.pad=multiple"]
@@ -25,8 +25,8 @@ def test_photographs_of_any_size_are_padded_and_come_back(size, name, skip):
     batch = make_batch(2, 3, *size)
     overrides = [f"model={name}", f"skip={skip}"]
     with pytest.raises(InputError, match=r"model\.pad=multiple"):
-        make_model(*overrides)(batch)
-    found = make_model(*overrides, *PADS)(batch)
+        predict(make_model(*overrides), batch)
+    found = predict(make_model(*overrides, *PADS), batch)
     assert found.depth.shape == found.depth_maps.confidence.shape == batch.masks.shape
     assert found.points.pixels.shape == (*batch.masks.shape, 3)
     assert torch.equal(found.depth_valid, batch.masks)
@@ -51,24 +51,24 @@ def test_padding_is_what_a_black_border_does_by_hand():
     masks = nn.functional.pad(batch.masks, (3, 3, 3, 3))
     by_hand = Batch(border, masks, batch.cameras.cropped(-3, -3, 56, 70))
     model = make_model("model=paper", *PADS)
-    found = model(batch)
+    found = predict(model, batch)
     # The box is carved from the photographs: a border would say that nothing lies beyond them.
     bounds = model.bounds(Frame.of(batch).enter(batch))
     near, far = (nn.functional.pad(bound, (3, 3, 3, 3), value=1.0) for bound in (bounds.near, bounds.far))
     model.bounds = lambda _: DepthBounds(near, far)
-    expected = model(by_hand)
+    expected = predict(model, by_hand)
     model.bounds = SubjectBox()
     close(found.gaussians, expected.gaussians, 1e-6)
     torch.testing.assert_close(found.depth, expected.depth[..., 3:-3, 3:-3], rtol=1e-6, atol=0)
     torch.testing.assert_close(found.points.tokens, expected.points.tokens, rtol=0, atol=2e-6)
-    assert model(make_batch(1, 3, 56, 70)).depth.shape[-2:] == (56, 70)
+    assert predict(model, make_batch(1, 3, 56, 70)).depth.shape[-2:] == (56, 70)
 
 
 def test_without_the_option_mattes_are_ignored():
     """model=paper knows masks alone."""
     soft = with_soft_rims(make_batch())
     model = make_model("model=paper").eval()
-    found, expected = (model(b).gaussians for b in (soft, dataclasses.replace(soft, alpha=None)))
+    found, expected = (predict(model, b).gaussians for b in (soft, dataclasses.replace(soft, alpha=None)))
     for name in ATTRIBUTES:
         assert torch.equal(getattr(found, name), getattr(expected, name)), name
 
@@ -79,13 +79,13 @@ def test_pixels_that_show_a_part_of_the_subject_become_gaussians(kind):
     both = with_soft_rims(make_batch(2, 3))
     options = (f"model={kind}", "model.matte=0.125")
     model = make_model(*options).eval()
-    prediction = model(both)
+    prediction = predict(model, both)
     shown = (both.alpha > 0.125).flatten(0, 1).flatten(1)
     gaussians = prediction.gaussians
     assert torch.equal(torch.stack((gaussians.image, gaussians.pixel), 1), shown.nonzero())
     assert (gaussians.opacities <= both.alpha.flatten(0, 1).flatten(1)[shown]).all()
     assert prediction.depth_valid.sum() == shown.sum() > both.masks.sum()
-    close(gaussians, make_model(*options, "skip=none").eval()(both).gaussians, 2e-5)
+    close(gaussians, predict(make_model(*options, "skip=none").eval(), both).gaussians, 2e-5)
     part = slice(1, 2)
     alone = dataclasses.replace(
         both,
@@ -95,13 +95,15 @@ def test_pixels_that_show_a_part_of_the_subject_become_gaussians(kind):
         cameras=both.cameras[part],
         depths=None,
     )
-    close(model(alone).gaussians, gaussians[1], 2e-5)
+    close(predict(model, alone).gaussians, gaussians[1], 2e-5)
 
 
 def test_photographs_of_any_size_keep_their_mattes():
     """The black border of model.pad=multiple is no part of the subject."""
     soft = with_soft_rims(make_batch(1, 2, 50, 60))
-    gaussians = make_model("model=hull", "model.matte=0.125", "model.pad=multiple").eval()(soft).gaussians
+    gaussians = predict(
+        make_model("model=hull", "model.matte=0.125", "model.pad=multiple").eval(), soft
+    ).gaussians
     shown = (soft.alpha > 0.125).flatten(0, 1).flatten(1)
     assert torch.equal(torch.stack((gaussians.image, gaussians.pixel), 1), shown.nonzero())
 

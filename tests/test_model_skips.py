@@ -8,7 +8,7 @@ import torch
 
 from ghgs_lit.geometry.projection import pixel_centers, project, world_to_camera
 from ghgs_lit.types import Batch
-from tests.helpers.models import close, make_model
+from tests.helpers.models import close, make_model, predict
 from tests.helpers.scenes import make_batch
 
 
@@ -23,7 +23,7 @@ def test_skip_fast_gives_the_gaussians_of_skip_exact_where_nothing_is_background
     batch = make_batch(2, 3)
     batch = dataclasses.replace(batch, masks=torch.ones_like(batch.masks))
     with torch.no_grad():
-        fast, exact = (make_model(f"skip={skip}")(batch).gaussians for skip in ("fast", "exact"))
+        fast, exact = (predict(make_model(f"skip={skip}"), batch).gaussians for skip in ("fast", "exact"))
     close(fast, exact)
 
 
@@ -38,14 +38,14 @@ def test_skip_fast_with_few_pixels_and_with_mates(margin):
     batch.masks[0, 1, 20, 33] = True
     batch.masks[1, 2, :4, :4] = batch.masks[1, 2, -3:, -3:] = True
     model = make_model("skip=fast", f"skip.margin={margin}").eval()
-    together = model(batch)
+    together = predict(model, batch)
     assert torch.equal(together.depth_valid, batch.masks)
     assert len(together.gaussians) == batch.masks.sum()
     for name in ("means", "quaternions", "scales", "opacities", "colors"):
         assert getattr(together.gaussians, name).isfinite().all()
     assert len(together.points.tokens) < 2 * 4 * 4 * 4
     for b in range(2):
-        close(together.gaussians[b], model(element(batch, b)).gaussians)
+        close(together.gaussians[b], predict(model, element(batch, b)).gaussians)
 
 
 def test_only_windows_around_the_subject_are_decoded():
@@ -56,12 +56,12 @@ def test_only_windows_around_the_subject_are_decoded():
     decoded = []
     for head in (model.depth_head.dpt, model.gaussian_head.decoder):
         head.register_forward_hook(lambda _, args, maps: decoded.append((len(maps), *maps.shape[2:])))
-    model(batch)
+    predict(model, batch)
     assert [count for count, *_ in decoded] == [3, 2, 3, 2]
     assert all(max(size) < 56 for _, *size in decoded)
     decoded.clear()
     model.recalibration.tokens = "all"
-    model(batch)
+    predict(model, batch)
     assert decoded == [(6, 56, 56), *decoded[1:]]
     assert [count for count, *_ in decoded[1:]] == [3, 2]
 
@@ -75,7 +75,9 @@ def test_skip_exact_gives_the_gaussians_of_skip_none(size, overrides):
     batch.masks[0, 1] = False
     batch.masks[1, 2, :5, -9:] = True
     with torch.no_grad():
-        exact, none = (make_model(f"skip={skip}", *overrides)(batch).gaussians for skip in ("exact", "none"))
+        exact, none = (
+            predict(make_model(f"skip={skip}", *overrides), batch).gaussians for skip in ("exact", "none")
+        )
     close(exact, none)
 
 
@@ -83,7 +85,7 @@ def test_skip_exact_gives_the_gaussians_of_skip_none(size, overrides):
 def test_tokens_of_windows_give_gaussians_of_the_same_pixels(size):
     """The encoder sees less background, the geometry is that of the whole photographs."""
     batch = make_batch(2, 3, *size, zoom=0.5)
-    whole, part = (make_model(f"skip={name}")(batch) for name in ("exact", "balanced"))
+    whole, part = (predict(make_model(f"skip={name}"), batch) for name in ("exact", "balanced"))
     assert len(part.points.tokens) < len(whole.points.tokens)
     assert part.depth.shape == whole.depth.shape
     assert torch.equal(part.depth_valid, batch.masks)

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from ghgs_lit import GHGS
 from ghgs_lit.config import registry
 from ghgs_lit.errors import InputError
 from ghgs_lit.ply import read_ply
 from ghgs_lit.training import GHGSModule
 from tests.helpers.figures import Figure
-from tests.helpers.models import TINY
+from tests.helpers.models import TINY, load_model, predict
 from tests.helpers.people import render_boxes
 from tests.helpers.scenes import make_batch
 from tests.helpers.verbs import ghgs
@@ -77,7 +76,7 @@ def test_each_stage_can_be_replaced_alone(project, boxes, photographs, monkeypat
     before = json.loads(Path("run/metrics.json").read_text())
     assert before["provenance"]["training"]["steps"] == 2
     with torch.no_grad():
-        prediction = GHGS.from_checkpoint(checkpoint)(make_batch(1, 3, 28, 28))
+        prediction = predict(load_model(checkpoint), make_batch(1, 3, 28, 28))
     assert len(prediction.gaussians) == int(prediction.depth_valid.sum()) > 0
     assert prediction.gaussians.is_finite.all()
     assert torch.isfinite(prediction.depth).all()
@@ -101,4 +100,4 @@ def test_each_stage_can_be_replaced_alone(project, boxes, photographs, monkeypat
         monkeypatch.delenv(registry.VARIABLE)
         registry._REGISTERED.clear()
         with pytest.raises(InputError, match=rf"{group}\.kind: expected .*{registry.VARIABLE}"):
-            GHGS.from_checkpoint(checkpoint)
+            load_model(checkpoint)

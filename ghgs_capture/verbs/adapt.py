@@ -21,7 +21,7 @@ from ghgs_lit.cli.inputs import (
     build_data,
     build_renderer,
     choices,
-    load_model,
+    load_predictor,
     model_of,
     pick_device,
 )
@@ -116,7 +116,7 @@ def prepare_instants(run: Adapt) -> None:
     root.mkdir(parents=True, exist_ok=True)
     folder = capture_folder(run)
     device = _device(run)
-    model = load_model(run.plain, run.checkpoint, device)
+    model = load_predictor(run.plain, run.checkpoint, device)
     size = run.data.size
     refining = dict.fromkeys(("refine_cameras", "refine_masks", "tones"), "auto")
     tones, backgrounds, rig, _ = shared_by(folder, model, size, refining, build_renderer(run, device))
@@ -159,7 +159,7 @@ def adapt(run: Adapt, directory: Path, stats: dict[str, Any]) -> float | None:
     data.prepare_data()
     rendered = time.perf_counter() - begin
     device = _device(run)
-    method = ModelMethod(load_model(run.plain, run.checkpoint, device), build_renderer(run, device))
+    method = ModelMethod(load_predictor(run.plain, run.checkpoint, device), build_renderer(run, device))
     place = directory / "before"
     path = measure_and_write({"model": method}, data, run, place, device, verb="adapt", choices=choices())
     before = read_results(path)["summary"][0]["psnr"]

@@ -24,8 +24,8 @@ from ghgs_capture.verbs.photographs import capture_folder, check_cameras
 from ghgs_lit.cli import inputs
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.execution import Predictor
 from ghgs_lit.files import resolved
-from ghgs_lit.method.model import GHGS
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.weights.checkpoint import read_config
 
@@ -63,7 +63,7 @@ def predict_subject(run: "Predict", directory: Path) -> None:
     output = export.output_options(run)
     device = inputs.pick_device(run.device)
     renderer = inputs.build_renderer(run, device)
-    model = inputs.load_model(run.plain, run.checkpoint, device, run.precision)
+    model = inputs.load_predictor(run.plain, run.checkpoint, device, run.precision)
     data = inputs.build_data(run)
     inputs.check_size(data, model)
     write_config(run, directory)
@@ -76,7 +76,7 @@ def predict_subject(run: "Predict", directory: Path) -> None:
     batch = data.evaluation_batch(subject, run.split, targets=run.targets).to(device)
     rounds = 0 if run.refine_cameras == "auto" else run.refine_cameras
     result = predict_batch(batch, model, renderer, rounds, run.refine)
-    write_result(directory, result, model, renderer, run.checkpoint, output)
+    write_result(directory, result, renderer, run.checkpoint, output)
 
 
 def predict_photographs(run: "Predict", directory: Path) -> None:
@@ -100,7 +100,7 @@ def predict_photographs(run: "Predict", directory: Path) -> None:
         check_cameras(folder)
     device = inputs.pick_device(run.device)
     renderer = inputs.build_renderer(run, device)
-    model = inputs.load_model(run.plain, run.checkpoint, device, run.precision)
+    model = inputs.load_predictor(run.plain, run.checkpoint, device, run.precision)
     size = crop_size(run.size, read_config(run.checkpoint), model)
     write_config(run, directory)
     refining: dict[str, Any] = {
@@ -124,9 +124,7 @@ def predict_photographs(run: "Predict", directory: Path) -> None:
         result = predict(capture, model, size, **refining, renderer=renderer)
         result.seconds["read"] = waited
         place = directories[capture.name]
-        seconds = write_result(
-            place, result, model, renderer, run.checkpoint, output, lists_files=not together
-        )
+        seconds = write_result(place, result, renderer, run.checkpoint, output, lists_files=not together)
         if together:
             print(place, flush=True)
             together.add(place, result.batch, result.prediction, renderer)
@@ -178,7 +176,11 @@ def _free_places(
 
 
 def shared_by(
-    folder: CaptureFolder, model: GHGS, size: tuple[int, int], refining: Mapping[str, Any], renderer: Renderer
+    folder: CaptureFolder,
+    model: Predictor,
+    size: tuple[int, int],
+    refining: Mapping[str, Any],
+    renderer: Renderer,
 ) -> tuple[Mapping[str, float], Backgrounds, Rig | None, bytes]:
     """Estimate what the instants of a sequence share, from a few of them.
 
@@ -278,7 +280,6 @@ def captures_of(folder: CaptureFolder) -> Iterator[tuple[Capture, float]]:
 def write_result(
     directory: Path,
     result: TimedPrediction,
-    model: GHGS,
     renderer: Renderer,
     checkpoint: str,
     options: export.OutputOptions,
@@ -289,7 +290,6 @@ def write_result(
     Args:
         directory: where files are written.
         result: the prediction of one subject.
-        model: its report on skipping is written, too.
         renderer: draws pictures of the files.
         checkpoint: name of the weights, for the report.
         options: formats and choices for them.

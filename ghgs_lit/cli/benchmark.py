@@ -124,7 +124,7 @@ def _presets(cases: list[Case], run: "Benchmark", device: torch.device) -> dict[
     rows = report.rows_of(records)
     _, views, _, height, width = batches[0].images.shape
     subjects = sum(len(batch.images) for batch in batches)
-    number = sum(p.numel() for p in cases[0].model.parameters()) / 1e6
+    number = sum(p.numel() for p in cases[0].predictor.model.parameters()) / 1e6
     weights = run.checkpoint or f"{choices().get('encoder', 'encoder')}, random weights"
     weights = f"{weights} ({number:.1f} M parameters, precision {run.precision})"
     photographs = f"{subjects} subjects of {data.dataset.name}, {views} views of {height} x {width}"

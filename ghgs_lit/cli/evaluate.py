@@ -13,6 +13,7 @@ from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.measure import Method, ModelMethod
 from ghgs_lit.evaluation.protocols import check_evaluation
 from ghgs_lit.evaluation.report import measure_and_write
+from ghgs_lit.execution import Predictor
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.refinement import CameraRefinement, Refinement
 from ghgs_lit.weights.checkpoint import read_checkpoint
@@ -37,18 +38,18 @@ def trained_method(run: "Evaluate", device: torch.device) -> tuple[ModelMethod, 
     """
     config = run.plain
     renderer = inputs.build_renderer(run, device)
-    model = inputs.load_model(config, run.checkpoint, device, run.precision)
+    predictor = inputs.load_predictor(config, run.checkpoint, device, run.precision)
     checkpoint = read_checkpoint(run.checkpoint)
     facts: dict[str, Any] = {
         "checkpoint_config": checkpoint["config"],
         "model_config": {node: config[node] for node in inputs.MODEL_NODES if node in config},
-        "parameters": {"total": sum(p.numel() for p in model.parameters())},
+        "parameters": {"total": sum(p.numel() for p in predictor.model.parameters())},
     }
     if "global_step" in checkpoint:
         facts["training"] = {"steps": checkpoint["global_step"]}
     refinement = Refinement(run.refine, renderer) if run.refine else None
-    cameras = CameraRefinement(run.refine_cameras, model, renderer) if run.refine_cameras else None
-    return ModelMethod(model, renderer, refinement, cameras), facts
+    cameras = CameraRefinement(run.refine_cameras, predictor, renderer) if run.refine_cameras else None
+    return ModelMethod(predictor, renderer, refinement, cameras), facts
 
 
 def baselines_of(names: str | Sequence[str], run: "Evaluate", device: torch.device) -> dict[str, Method]:
@@ -65,8 +66,8 @@ def baselines_of(names: str | Sequence[str], run: "Evaluate", device: torch.devi
     names = BASELINES if names == "all" else [names] if isinstance(names, str) else names
     renderer = inputs.build_renderer(run, device)
 
-    def untrained() -> GHGS:
-        return GHGS.from_config(run.plain).to(device)
+    def untrained() -> Predictor:
+        return Predictor(GHGS.from_config(run.plain).to(device).eval())
 
     return {name: baseline(name, renderer, untrained, run.per_scene) for name in names}
 
@@ -109,7 +110,7 @@ def run(verb: "Evaluate") -> None:
     data = inputs.build_data(verb)
     for method in methods.values():
         if isinstance(method, ModelMethod):
-            inputs.check_size(data, method.model)
+            inputs.check_size(data, method.predict)
     check_evaluation(verb, data)
     facts |= {"verb": "evaluate", "choices": inputs.choices()}
     path = measure_and_write(methods, data, verb, directory, device, **facts)

@@ -8,7 +8,7 @@ from ghgs_lit.cli.runtime import announce, files_to_write, output_dir, write_con
 from ghgs_lit.diagnostics.benchmark.measure import differences as prediction_differences
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.errors import require
-from ghgs_lit.method.model import GHGS
+from ghgs_lit.execution import Predictor
 from ghgs_lit.rendering import render
 from ghgs_lit.weights.checkpoint import read_config
 from ghgs_lit.weights.exporting import export_weights, write_inference
@@ -35,12 +35,12 @@ def parity(checkpoint: str, exported: str) -> dict[str, float]:
     results = []
     batch = None
     for path in (exported, checkpoint):  # one model in memory at a time
-        model = GHGS.from_checkpoint(path).eval()
+        predictor = Predictor.from_checkpoint(path)
         if batch is None:
-            batch = ellipsoid_batch(0.15, 4, _PATCHES * model.encoder.patch_size, 1)
-        prediction = model(batch)
+            batch = ellipsoid_batch(0.15, 4, _PATCHES * predictor.model.encoder.patch_size, 1)
+        prediction = predictor(batch)
         results.append((prediction, render(prediction.gaussians, batch.targets.cameras)))
-        del model
+        del predictor
     return prediction_differences(*results, batch.masks)
 
 

@@ -16,13 +16,13 @@ from ghgs_lit.config.registry import read_node
 from ghgs_lit.config.run import Run
 from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.execution import Predictor
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.method.rounds import with_known_height
 from ghgs_lit.method.stages import OPTIONS, STAGES
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.rendering.api import resolve_backend
 from ghgs_lit.runtime.precision import half_precision, keep_rounded
-from ghgs_lit.surroundings import side_multiple
 from ghgs_lit.weights.checkpoint import load_weights, read_config
 from ghgs_lit.weights.reading import SHIPPED
 
@@ -72,8 +72,10 @@ def build_renderer(run: Run, device: torch.device) -> Renderer:
     return renderer
 
 
-def load_model(nodes: Mapping[str, Any], checkpoint: str, device: torch.device, precision="inherit") -> GHGS:
-    """The model of a checkpoint in evaluation mode.
+def load_predictor(
+    nodes: Mapping[str, Any], checkpoint: str, device: torch.device, precision: str = "inherit"
+) -> Predictor:
+    """The predictor of a checkpoint, in evaluation mode.
 
     Args:
         nodes: of the model by name as plain data, such as those of :func:`model_of`.
@@ -87,25 +89,24 @@ def load_model(nodes: Mapping[str, Any], checkpoint: str, device: torch.device, 
     """
     model = GHGS.from_config(nodes, empty=True)
     load_weights(model, checkpoint, device=device)
-    model.precision = precision
-    half = half_precision(model.precision, device)
+    half = half_precision(precision, device)
     if half is not None and device.type == "cuda":
         keep_rounded(model.encoder, half)  # a verb never changes its precision
-    return model.to(device).eval()
+    return Predictor(model.to(device).eval(), precision=precision)
 
 
-def check_size(data: "PhotographsDataModule", model: GHGS) -> None:
+def check_size(data: "PhotographsDataModule", predictor: Predictor) -> None:
     """Check the size of photographs before any is read.
 
     Args:
         data: has the size that its photographs are cropped to.
-        model: has the size of a patch, and how it pads.
+        predictor: has the size of a patch, and how it pads.
 
     Raises:
         InputError: a side is no multiple of the patch.
     """
     size = data.dataset.size
-    multiple = side_multiple(model.options, model.encoder.patch_size)
+    multiple = predictor.side_multiple
     expected = f"sides divisible by the patch size {multiple} (or model.pad=multiple)"
     require(not any(side % multiple for side in size), "data.size", expected, list(size))
 

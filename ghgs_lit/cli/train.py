@@ -216,11 +216,11 @@ def train(run: "Train", directory: Path, stats: dict[str, Any]) -> float | None:
     L.seed_everything(run.seed, workers=True, verbose=False)
     data = build_data(run)
     model = GHGS.from_config(run.plain)
-    check_size(data, model)
     renderer = run.renderer.build()
     losses = run.loss.build()
     data.trains_on_depths &= getattr(losses, "reads_depths", True)  # a plug-in's may not say
     module = GHGSModule(model, renderer, losses, run.optimizer.build(), run.plain, run.token_budgets)
+    check_size(data, module.predictor)
     step = prepare_start(run, module, directory)
     if run.feature_cache is not None:  # of verbs that train the whole model
         run.feature_cache.attach(model, data)
@@ -306,11 +306,12 @@ def measure_last(
     Returns:
         Mean PSNR of the first protocol in dB.
     """
-    model = module.model
+    model = module.model.eval()
     device = trainer.strategy.root_device
+    model.to(device)
     identity = RunDirectory(directory).marker
     path = measure_and_write(
-        {"model": ModelMethod(model.to(device).eval(), module.renderer)},
+        {"model": ModelMethod(module.predictor, module.renderer)},
         data,
         run,
         directory,

@@ -108,7 +108,7 @@ KINDS: dict[str, dict[str | None, str]] = {
     "gaussian_head": {"dpt": "ghgs_lit.method.heads.gaussian.GaussianHeadOptions"},
     "rounds": {"recurrent": "ghgs_lit.method.rounds.RoundsOptions"},
     "skip": {None: "ghgs_lit.method.plan.presets.SkipOptions"},
-    "model": {None: "ghgs_lit.surroundings.ModelOptions"},
+    "model": {None: "ghgs_lit.execution.options.ModelOptions"},
     "compat": {None: "ghgs_lit.weights.switches.CompatOptions"},
     "renderer": {"splats": "ghgs_lit.rendering.Renderer"},
     "loss": {"weighted": "ghgs_lit.losses.Losses"},

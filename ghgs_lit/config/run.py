@@ -13,12 +13,12 @@ if TYPE_CHECKING:  # libraries come with them
     from ghgs_lit.data.augmentation import Augmentation
     from ghgs_lit.data.dataset import DataOptions
     from ghgs_lit.data.sampling import TargetProtocol, ViewProtocol
+    from ghgs_lit.execution.options import ModelOptions
     from ghgs_lit.losses import Losses
     from ghgs_lit.method.encoder import VGGTOptions
     from ghgs_lit.method.plan import SkipOptions
     from ghgs_lit.metrics import MetricsOptions
     from ghgs_lit.rendering import Renderer
-    from ghgs_lit.surroundings import ModelOptions
     from ghgs_lit.training import Optimization
     from ghgs_lit.training.features import DiskFeatureCache
     from ghgs_lit.training.trainer import TrainerOptions

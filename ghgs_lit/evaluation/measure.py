@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 from lightning.pytorch import LightningDataModule
-from torch import Tensor, nn
+from torch import Tensor
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.unprojection import seen_surfaces
@@ -56,13 +56,13 @@ class ModelMethod:
     Refined Gaussians leave the predicted depths, so there is no depth estimate then.
 
     Args:
-        model: predicts a batch.
+        predict: gives the prediction of a batch.
         renderer: draws Gaussians from the target cameras.
         refinement: of the predicted Gaussians; None: none.
         cameras: refinement of the input cameras before the prediction; None: none.
     """
 
-    model: nn.Module
+    predict: Callable[[Batch], Prediction]
     renderer: Renderer
     refinement: Refinement | None = None
     cameras: CameraRefinement | None = None
@@ -70,8 +70,9 @@ class ModelMethod:
     def __call__(self, batch: Batch) -> Estimate:
         if self.cameras is not None:
             batch = self.cameras(batch)
-        with seen_calls(getattr(self.model, "recalibration", None)) as seen:
-            prediction = self.model(batch)
+        model = getattr(self.predict, "model", None)
+        with seen_calls(getattr(model, "recalibration", None)) as seen:
+            prediction = self.predict(batch)
         gaussians = prediction.gaussians
         depth = prediction.depth
         if self.refinement is not None:

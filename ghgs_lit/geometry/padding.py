@@ -93,9 +93,11 @@ class Padding:
         return image * (self.full[0] * self.full[1]) + self._cut_pixel(pixel)
 
     def cut_extent(self, extent: Extent) -> Extent:
-        """The extent of a mask without its border."""
-        count, top, bottom, left, right = extent
-        return Extent(count, top + self.top, bottom + self.top, left + self.left, right + self.left)
+        """The extent of a mask, or of a window around it, without its border."""
+        height, width = self.full
+        rows = (min(max(row + self.top, 0), height) for row in extent[1:3])
+        columns = (min(max(column + self.left, 0), width) for column in extent[3:])
+        return Extent(extent.count, *rows, *columns)
 
     def _sides(self, maps: Tensor) -> list[int]:
         """Widths of the border in the order of ``F.pad``: last axis first, before and after."""
@@ -111,11 +113,13 @@ class PaddedBatch(Batch):
     photographs: Batch | None = None
     padding: Padding | None = None
 
-    def note(self, extents: Sequence[Extent], pixels: Callable[[], Int[Tensor, " n"]]) -> None:
+    def note(
+        self, extents: Sequence[Extent], pixels: Callable[[], Int[Tensor, " n"]], has_skew: bool
+    ) -> None:
         """Keep them for the photographs, too, in their own pixels."""
-        super().note(extents, pixels)
+        super().note(extents, pixels, has_skew)
         inner = [self.padding.cut_extent(extent) for extent in extents]
-        self.photographs.note(inner, lambda: self.padding.cut_pixels(self.pixels))
+        self.photographs.note(inner, lambda: self.padding.cut_pixels(self.pixels), has_skew)
 
 
 def bounds_of(stage: Callable[[Batch], DepthBounds | None], batch: Batch) -> DepthBounds | None:

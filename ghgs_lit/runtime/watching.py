@@ -41,14 +41,6 @@ class Watcher:
         """
 
 
-_watchers: list[Watcher] = []
-
-
-def is_watched() -> bool:
-    """Whether the stages of a model are watched now, so that each must be called."""
-    return bool(_watchers)
-
-
 @contextmanager
 def watched(model: nn.Module, stages: Mapping[str, str], watcher: Watcher) -> Iterator[None]:
     """Call a watcher at every call of stages while the context lasts.
@@ -60,8 +52,6 @@ def watched(model: nn.Module, stages: Mapping[str, str], watcher: Watcher) -> It
         watcher: is called.
     """
     with ExitStack() as stack:
-        _watchers.append(watcher)
-        stack.callback(_watchers.remove, watcher)
         for name, path in stages.items():
             parent, _, attribute = path.rpartition(".")
             owner = attrgetter(parent)(model) if parent else model
@@ -70,7 +60,7 @@ def watched(model: nn.Module, stages: Mapping[str, str], watcher: Watcher) -> It
                 for hook in _hooks(stage, name, watcher):
                     stack.callback(hook.remove)
             elif stage is not None:
-                setattr(owner, attribute, _Wrapped(stage, name, watcher))
+                setattr(owner, attribute, Wrapped(stage, name, watcher))
                 stack.callback(setattr, owner, attribute, stage)
         yield
 
@@ -95,7 +85,7 @@ def _hooks(stage: nn.Module, name: str, watcher: Watcher) -> tuple:
     )
 
 
-class _Wrapped:
+class Wrapped:
     """A stage that is no module, with a watcher of its calls."""
 
     def __init__(self, stage: Any, name: str, watcher: Watcher):

@@ -12,7 +12,6 @@ from ghgs_lit.config.options import Options
 from ghgs_lit.method.model import STAGES
 from ghgs_lit.runtime.allocation import forget_peak, resident_bytes
 from ghgs_lit.runtime.watching import Inputs, Stopwatch, Watcher, watched
-from ghgs_lit.training.captured import may_be_recorded
 
 #: Parts of a step in their order.
 PARTS = ("data", *STAGES, "rounds", "render", "loss", "backward", "optimizer")
@@ -31,7 +30,7 @@ class Costs(Callback, Watcher):
     """Logs milliseconds of a step and of its parts, means since the last log, and memory in MiB, on
     CUDA the peak of all tensors since the last log. ``time_ms/01_data`` is the wait for data.
     Validation, other callbacks and writing of checkpoints and logs do not count. Steps that are
-    played back as one CUDA graph (:mod:`ghgs_lit.training.captured`) have no stages:
+    replayed as one CUDA graph (:mod:`ghgs_lit.execution.step`) have no stages:
     ``time_ms/forward`` is loss and gradients."""
 
     def __init__(self):
@@ -40,10 +39,10 @@ class Costs(Callback, Watcher):
         self._has_stages = True
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Watch all stages, unless this would keep steps from being played back."""
+        """Watch all stages, unless this would keep steps from being captured."""
         self._begin_interval(pl_module)
-        parts = [getattr(pl_module, name, None) for name in ("model", "renderer", "losses")]
-        self._has_stages = not may_be_recorded(*parts, pl_module.device.type)
+        step = getattr(pl_module, "captured_step", None)
+        self._has_stages = step is None or not step.may_capture(pl_module.device.type)
         if not self._has_stages:
             return
         places = {name: f"model.{name}" for name in (*STAGES, "rounds")}

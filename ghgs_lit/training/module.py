@@ -12,14 +12,16 @@ from torch import Tensor, nn
 
 from ghgs_lit.config import build
 from ghgs_lit.errors import require
+from ghgs_lit.execution.predictor import Predictor
+from ghgs_lit.execution.step import CapturedStep, Outcome
 from ghgs_lit.geometry.unprojection import seen_surfaces
 from ghgs_lit.losses import Losses
 from ghgs_lit.method.heads.inspection import offsets_at_limit, seen_attributes
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.method.plan.presets import KeptTokens, seeing
+from ghgs_lit.method.rounds import Rounds
 from ghgs_lit.metrics import FURTHER, MetricsOptions, depth_error_mm, surface_error_mm
 from ghgs_lit.training.base import BudgetedModule, image_mean
-from ghgs_lit.training.captured import Outcome, is_recordable, played
 from ghgs_lit.training.faults import Step
 from ghgs_lit.training.guard import Guard
 from ghgs_lit.training.optimization import Optimization
@@ -121,6 +123,9 @@ class GHGSModule(BudgetedModule):
         self.metrics = MetricsOptions(lpips="off").build()
         self.means = nn.ModuleDict({name: image_mean() for name in VALIDATED})
         model.keeps_drafts = True  # validation measures each round
+        #: What gives the model its batches; None: the model is no :class:`GHGS` and takes them itself.
+        self.predictor = Predictor(model) if isinstance(model, GHGS) else None
+        self.captured_step = self.predictor and CapturedStep(self.predictor, renderer, losses)
 
     @classmethod
     def load_from_checkpoint(
@@ -148,7 +153,7 @@ class GHGSModule(BudgetedModule):
                 parts[name] = build(config[group], group)
             if state := model_state(checkpoint, f"{name}."):  # a loss with weights of its own
                 load_strictly(parts[name], state, checkpoint_path)
-        model = GHGS.from_checkpoint(checkpoint_path, map_location or "cpu")
+        model = Predictor.from_checkpoint(checkpoint_path, map_location or "cpu").model
         return cls(model.train(), config=config, **parts)
 
     def forward(self, batch: Batch) -> tuple[Prediction, Rendering]:
@@ -160,7 +165,7 @@ class GHGSModule(BudgetedModule):
         Returns:
             The prediction for the batch, and its Gaussians rendered from the batch's
             target cameras."""
-        prediction = self.model(batch)
+        prediction = (self.predictor or self.model)(batch)
         return prediction, self.renderer(prediction.gaussians, batch.targets.cameras)
 
     def forward_losses(self, step: Step) -> tuple[Prediction, Tensor, dict[str, Tensor]]:
@@ -182,16 +187,16 @@ class GHGSModule(BudgetedModule):
         prediction, total, values = self.forward_losses(step)
         return Outcome(total, values, len(prediction.gaussians))
 
-    def _played(self, step: Step) -> Outcome | None:
-        """The forward pass of a step, played back; None where it must be called."""
-        parts = (self.model, self.renderer, self.losses, step.batch)
+    def _captured(self, step: Step) -> Outcome | None:
+        """The forward pass of a step, captured; None where it must be called eagerly."""
+        captured = self.captured_step
         scaler = self._scaler
-        if not is_recordable(*parts, scaler is not None):
+        if captured is None or not captured.captures(step.batch, scaler is not None):
             return None
         scale = None if scaler is None else scaler.scale(torch.ones((), device=self.device))
         torch.manual_seed(step.seed)
         with token_budget(self.model, step.budget), number_of_rounds(self.model, step.rounds):
-            return played(*parts, scale)
+            return captured(step.batch, scale)
 
     def _step(self, batch: Batch, batch_idx: int) -> Step:
         """All inputs of a training step."""
@@ -202,7 +207,7 @@ class GHGSModule(BudgetedModule):
         # the same in all processes, so that none waits for another
         if self.token_budgets is not None:
             budget = drawn_budget(self.token_budgets, shared or self.step_numbers(batch_idx))
-        if shared and getattr(self.model, "rounds", None) is not None:
+        if shared and isinstance(getattr(self.model, "rounds", None), Rounds):
             count = drawn_budget(self.model.rounds.options.training_counts, shared, stream=2)
         return Step(batch, self.step_seed(batch_idx), budget, autocast, rounds=count)
 
@@ -216,7 +221,7 @@ class GHGSModule(BudgetedModule):
         Returns:
             The total loss, without dimensions."""
         step = self._step(batch, batch_idx)
-        total, values, gaussians = self._played(step) or self._called(step)
+        total, values, gaussians = self._captured(step) or self._called(step)
         self.guard.note(step, total)
         size = len(batch.images)
         self.log("loss/total", total.detach(), prog_bar=True, batch_size=size)
@@ -297,10 +302,14 @@ class GHGSModule(BudgetedModule):
         self.guard.accept()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the number of skipped steps to what :class:`BudgetedModule` adds."""
+        """Add the number of skipped steps and shape buckets to what :class:`BudgetedModule` adds."""
         super().on_save_checkpoint(checkpoint)
         checkpoint["skipped_steps"] = self.guard.skipped
+        if self.captured_step is not None:
+            checkpoint["shape_buckets"] = self.captured_step.state_dict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Go on counting skipped steps."""
+        """Go on counting skipped steps, and with the same shape buckets."""
         self.guard.skipped = checkpoint.get("skipped_steps", 0)
+        if self.captured_step is not None:
+            self.captured_step.load_state_dict(checkpoint.get("shape_buckets", ()))

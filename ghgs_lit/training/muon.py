@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ghgs_lit.runtime.recording import Recorder
+from ghgs_lit.execution.graphs import GraphCache
 
 #: Newton-Schulz: odd polynomials that take singular values in (0, 1] close to 1 (Jordan et al.).
 COEFFICIENTS = (3.4445, -4.7750, 2.0315)
@@ -195,7 +195,7 @@ class Muon(torch.optim.AdamW):
         groups.append({"params": matrices, "orthogonal": True, "lr": matrix_lr})
         super().__init__([group for group in groups if group["params"]], **options)
         on_gpu = any(parameter.is_cuda for parameter in matrices)
-        self.recorder = Recorder(limit=2) if records and on_gpu else None
+        self.graphs = GraphCache(limit=2) if records and on_gpu else None
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Tensor] | None = None) -> Tensor | None:
@@ -212,13 +212,13 @@ class Muon(torch.optim.AdamW):
                 loss = closure()
         moved = [p for group in self.param_groups for p in group["params"] if p.grad is not None]
         gradients = [parameter.grad for parameter in moved]
-        if self.recorder is None:
+        if self.graphs is None:
             self._move(moved, gradients)
         else:
             written = [*moved, *self._states(moved)]
             numbers = [item for group in self.param_groups for item in group.items() if item[0] != "params"]
             key = tuple((name, _place(value)) for name, value in numbers), tuple(map(_place, written))
-            self.recorder(partial(self._move, moved), gradients, key, written)
+            self.graphs(partial(self._move, moved), gradients, key, written)
         for parameter, gradient in zip(moved, gradients, strict=True):
             parameter.grad = None if is_matrix(parameter) else gradient
         return loss

@@ -16,7 +16,7 @@ from ghgs_capture.formats.json_and_toml import json_text
 from ghgs_capture.prediction import predict
 from ghgs_capture.rig import Rig, corrected_rig, shared_gains
 from ghgs_lit.errors import InputError
-from ghgs_lit.method.model import GHGS
+from ghgs_lit.execution import Predictor
 from ghgs_lit.rendering import Renderer
 from tests.helpers.cameras import camera_ring
 from tests.helpers.figures import Figure
@@ -100,7 +100,7 @@ def asked(monkeypatch):
 
 @pytest.fixture(scope="module")
 def model():
-    return GHGS.from_checkpoint()
+    return Predictor.from_checkpoint()
 
 
 @pytest.mark.parametrize(("doubted", "corrected"), [(1, False), (2, True)])
@@ -161,7 +161,7 @@ def seen_with(path, gains, seed=0):
 
 def test_gains_are_found_once_written_and_used_by_the_next_capture(tmp_path, asked, monkeypatch):
     """Of three instants one has other exposures, which does not count."""
-    model = GHGS.from_checkpoint()
+    model = Predictor.from_checkpoint()
     for instant, gains in enumerate((GAINS, GAINS, GAINS[::-1])):
         cameras = seen_with(tmp_path / "images" / str(instant), gains, seed=instant)
     folder = CaptureFolder(tmp_path / "images", cameras)

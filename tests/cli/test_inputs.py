@@ -15,7 +15,7 @@ from ghgs_lit.config.registry import class_of, verb_class
 from ghgs_lit.errors import InputError
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.weights.checkpoint import read_config, write_checkpoint
-from tests.helpers.models import config
+from tests.helpers.models import config, load_model
 
 TRAINED = ("model=hull", "skip=balanced")
 
@@ -172,11 +172,11 @@ def test_a_strange_size_of_rounds_takes_no_memory(tmp_path):
     state = GHGS.from_config(settings).state_dict()
     write_checkpoint(path, state, {**settings, "rounds": {**settings["rounds"], "hidden": 65536}})
     with pytest.raises(InputError, match=r"a\.ckpt: rounds\..*: expected shape \(65536, .* found \("):
-        inputs.load_model(read_config(path), path, "cpu")
+        inputs.load_predictor(read_config(path), path, "cpu")
     with pytest.raises(InputError, match=r"a\.ckpt: rounds\..*: expected shape"):
-        GHGS.from_checkpoint(path)
+        load_model(path)
     write_checkpoint(path, state, settings)
-    model = GHGS.from_checkpoint(path)
+    model = load_model(path)
     assert not any(tensor.is_meta for tensor in (*model.parameters(), *model.buffers()))
 
 

@@ -197,7 +197,7 @@ def test_a_prediction_goes_where_out_says():
 def test_a_prediction_does_not_wait_for_what_training_needs():
     """Lightning, torchmetrics and PyTorch's compiler take seconds to import."""
     imports = "import sys, ghgs_capture.verbs.predict, ghgs_lit"
-    code = f"{imports}; ghgs_lit.GHGS.from_checkpoint(); print(*sys.modules)"
+    code = f"{imports}; ghgs_lit.Predictor.from_checkpoint(); print(*sys.modules)"
     loaded = set(run_python(code).stdout.split())
     assert {"torch", "ghgs_lit.refinement"} <= loaded
     assert not {"lightning", "torchmetrics", "torch._dynamo", "trimesh", "matplotlib.pyplot"} & loaded

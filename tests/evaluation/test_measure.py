@@ -20,11 +20,11 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import BASELINES
 from ghgs_lit.evaluation.measure import ModelMethod, measure_all
 from ghgs_lit.evaluation.protocols import target_protocols
-from ghgs_lit.method.model import GHGS
 from ghgs_lit.metrics import MetricsOptions
 from ghgs_lit.ply import read_ply
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import config_hash
+from tests.helpers.models import load_model
 from tests.helpers.people import rendered
 from tests.helpers.training import Standin
 from tests.helpers.verbs import ghgs
@@ -323,7 +323,7 @@ def test_two_processes_train_together_and_write_once(boxes, tmp_path):
     training = content["provenance"]["training"]
     assert (training["steps"], training["processes"]) == (2, 2)
     assert min(training["seconds"], training["peak_bytes"]) > 0
-    assert GHGS.from_checkpoint(directory / "checkpoints" / "last.ckpt") is not None
+    assert load_model(directory / "checkpoints" / "last.ckpt") is not None
 
 
 def test_two_seeds_of_an_evaluation_differ_and_one_repeats(boxes, tmp_path):

@@ -6,12 +6,13 @@ import pytest
 import torch
 
 from ghgs_lit.evaluation.measure import Estimate, ModelMethod, measure, not_finite
+from ghgs_lit.execution import Predictor
 from ghgs_lit.method.recalibration import inspection
 from ghgs_lit.metrics import MetricsOptions, psnr
 from ghgs_lit.rendering import render
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.types import Targets
-from tests.helpers.models import make_model
+from tests.helpers.models import make_model, predict
 from tests.helpers.scenes import make_batch
 from tests.helpers.training import Standin, example_batch, flat_renderer
 
@@ -63,7 +64,7 @@ def test_what_is_not_finite_is_counted_and_named():
     """No renderer draws it, and no depth error counts it."""
     batch = dataclasses.replace(make_batch(2, 3), subjects=("anna", "ben"))
     with torch.no_grad():
-        prediction = make_model("model=hull").eval()(batch)
+        prediction = predict(make_model("model=hull").eval(), batch)
     assert not_finite(batch, prediction) == (0, 0)
     prediction.gaussians.scales[-2:, 0] = torch.nan
     prediction.depth_valid[1][batch.masks[1]] &= torch.arange(int(batch.masks[1].sum())) > 2
@@ -79,7 +80,7 @@ def test_a_model_without_any_finite_depth_is_measured(model):
     for parameter in broken.depth_head.parameters():
         parameter.data.fill_(torch.nan)
     with pytest.warns(UserWarning, match="not finite: anna: "):
-        [row, *_] = measure(ModelMethod(broken, render), "model", [batch], OFF)
+        [row, *_] = measure(ModelMethod(Predictor(broken), render), "model", [batch], OFF)
     assert row["gaussians"] == 0
     assert row["psnr"] > 0
     assert row["not_finite"] == int(batch.masks.sum())
@@ -135,7 +136,7 @@ def test_what_is_timed_searches_no_neighbors_of_the_other_setting(monkeypatch):
     batch = make_batch(1, 3)
     own = Targets(batch.images[:, :1], batch.masks[:, :1], batch.cameras[:, :1], (("a",),), ("midway",))
     batch = dataclasses.replace(batch, targets=own, subjects=("p0",))
-    method = ModelMethod(make_model("model=paper").eval(), render)
+    method = ModelMethod(Predictor(make_model("model=paper").eval()), render)
     with torch.no_grad():
         method(batch)
     assert not searched

@@ -13,7 +13,7 @@ from ghgs_lit.geometry.frame import HEIGHT, Frame
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Batch
-from tests.helpers.models import make_model
+from tests.helpers.models import make_model, predict
 from tests.helpers.scenes import CENTER, ellipsoid, make_batch, ring
 
 
@@ -34,7 +34,7 @@ def original(name):
     model, batch = make_model(f"model={name}").eval(), make_batch(1, 3)
     batch = dataclasses.replace(batch, cameras=moved(batch.cameras))
     with torch.no_grad():
-        prediction = model(batch)
+        prediction = predict(model, batch)
     return model, batch, prediction, render(prediction.gaussians, batch.cameras)
 
 
@@ -52,7 +52,7 @@ def test_a_moved_world_moves_the_gaussians_and_no_render(name, scale, turn, away
     shift = (away * scale, -0.3 * away * scale, 0.1 * away * scale)
     views = moved(batch.cameras, scale, turn, shift)
     with torch.no_grad():
-        found = model(dataclasses.replace(batch, cameras=views))
+        found = predict(model, dataclasses.replace(batch, cameras=views))
         shown = render(found.gaussians, views)
     assert found.gaussians.splits == expected.gaussians.splits
     # float64 rounds to 1e-11 m at 100 km, which can change the last digit of a camera in float32.
@@ -82,7 +82,7 @@ def test_the_order_of_the_views_after_the_first_does_not_matter(name):
         batch, images=batch.images[:, order], masks=batch.masks[:, order], cameras=batch.cameras[:, order]
     )
     with torch.no_grad():
-        found = model(changed)
+        found = predict(model, changed)
     assert (found.depth[:, order] - expected.depth).abs().max() < 1e-4
     for view, place in enumerate(order):
         one = found.gaussians.means[found.gaussians.image == view]
@@ -201,7 +201,7 @@ def test_each_element_has_its_own_unit():
     mixed = dataclasses.replace(batch, cameras=dataclasses.replace(batch.cameras, extrinsics=extrinsics))
     model = make_model("model=hull").eval()
     with torch.no_grad():
-        found, expected = model(mixed), model(batch)
+        found, expected = predict(model, mixed), predict(model, batch)
     unit = torch.tensor([1.0, 1000.0])[:, None, None, None]
     torch.testing.assert_close(found.depth / unit, expected.depth, rtol=1e-4, atol=0)
     for bound in ("near", "far"):

@@ -8,6 +8,7 @@ from omegaconf import OmegaConf
 from torch import nn
 
 from ghgs_lit.config import compose
+from ghgs_lit.execution import Predictor
 from ghgs_lit.method.model import GHGS, STAGES
 
 ATTRIBUTES = ("means", "quaternions", "scales", "opacities", "colors")
@@ -41,6 +42,16 @@ def make_model(*overrides, seed=0):
     ):
         nn.init.normal_(last.weight, std=0.5)
     return model
+
+
+def predict(model, batch):
+    """The prediction of a model for a batch in its own world."""
+    return Predictor(model)(batch)
+
+
+def load_model(*arguments, **options):
+    """The model of a checkpoint."""
+    return Predictor.from_checkpoint(*arguments, **options).model
 
 
 def close(a, b, limit=1e-5):

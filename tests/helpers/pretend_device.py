@@ -173,6 +173,16 @@ class PretendTensor(torch.Tensor):
     def tolist(self):
         return self.cpu().tolist()
 
+    def data_ptr(self):
+        return self.inner.data_ptr()
+
+    def __deepcopy__(self, memo):
+        """PyTorch's would copy the storage, which is empty."""
+        copied = memo[id(self)] = self.detach().clone().requires_grad_(self.requires_grad)
+        if hasattr(self, "_is_param"):
+            copied._is_param = True
+        return copied
+
     def numpy(self, *, force: bool = False):
         raise TypeError(f"can't convert a tensor on {DEVICE} to numpy ({_line()}): copy it with cpu() first")
 

@@ -18,7 +18,7 @@ from ghgs_lit.runtime.precision import (
     rounds_products,
 )
 from ghgs_lit.training.trainer import TrainerOptions
-from tests.helpers.models import make_model
+from tests.helpers.models import make_model, predict
 from tests.helpers.scenes import make_batch
 
 CUDA = torch.device("cuda")
@@ -135,7 +135,7 @@ def test_rounded_weights_give_the_same_numbers_as_rounding_at_each_call(kind):
     found, casts = [], []
     for _ in range(2):
         with torch.no_grad(), torch.autocast("cpu", torch.bfloat16), Casts() as seen:
-            found.append(model(batch))
+            found.append(predict(model, batch))
         casts.append(seen.count)
         keep_rounded(model.encoder, torch.bfloat16)
     for name in ("means", "scales", "opacities", "colors"):

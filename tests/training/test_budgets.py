@@ -13,7 +13,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.module import drawn_budget, number_of_rounds, token_budget
 from tests.helpers.losses import losses_of
-from tests.helpers.models import close, make_model
+from tests.helpers.models import close, make_model, predict
 from tests.helpers.scenes import make_batch
 from tests.helpers.training import Standin, StepData, example_batch, flat_renderer
 
@@ -33,10 +33,10 @@ def test_a_budget_is_a_preset_while_it_lasts(configured, budget, preset):
     expected = make_model(*preset)
     expected.load_state_dict(model.state_dict())
     with torch.no_grad():
-        before = model(batch).gaussians
+        before = predict(model, batch).gaussians
         with token_budget(model, budget):
-            close(model(batch).gaussians, expected(batch).gaussians)
-        assert torch.equal(model(batch).gaussians.means, before.means)
+            close(predict(model, batch).gaussians, predict(expected, batch).gaussians)
+        assert torch.equal(predict(model, batch).gaussians.means, before.means)
 
 
 def test_the_draw_is_even_and_depends_on_all_numbers():
@@ -117,7 +117,7 @@ def test_without_budgets_the_model_stays_as_it_is_configured():
     """The default must not change what training sees."""
     model = Watched()
     with token_budget(model, None):
-        model(example_batch())
+        predict(model, example_batch())
     assert model.trained == [("subject", 7)]
 
 

@@ -16,7 +16,6 @@ from torch.utils.data import DataLoader
 
 from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
-from ghgs_lit.method.model import GHGS
 from ghgs_lit.runtime.precision import exact
 from ghgs_lit.training import DivergedError, GHGSModule, Optimization
 from ghgs_lit.training.callbacks import RunProgress
@@ -27,7 +26,7 @@ from ghgs_lit.training.validation_pictures import PicturesOptions
 from ghgs_lit.types import Targets
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION, write_checkpoint
 from tests.helpers.losses import losses_of
-from tests.helpers.models import config, make_model
+from tests.helpers.models import config, load_model, make_model
 from tests.helpers.scenes import make_batch
 from tests.helpers.training import (
     CONFIG,
@@ -317,7 +316,7 @@ def test_a_trainer_of_ones_own_needs_no_configuration(tmp_path):
     again = GHGSModule.load_from_checkpoint(tmp_path / "mine.ckpt", renderer=flat_renderer, **parts)
     assert again.model.training
     assert again.config == subject.config
-    for model in (again.model, GHGS.from_checkpoint(tmp_path / "mine.ckpt")):
+    for model in (again.model, load_model(tmp_path / "mine.ckpt")):
         for name, value in subject.model.state_dict().items():
             assert torch.equal(model.state_dict()[name], value), name
 

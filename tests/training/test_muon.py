@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch import nn
 
-from ghgs_lit.method.model import GHGS
-from ghgs_lit.runtime.recording import Recorder
+from ghgs_lit.execution.graphs import GraphCache
 from ghgs_lit.training import Optimization, muon
 from ghgs_lit.training.muon import Muon, is_matrix, orthogonalized
 from ghgs_lit.training.optimization import hold_rates, plain_rates
 from ghgs_lit.training.restoring import check_optimizer_state, check_schedules
+from tests.helpers.models import load_model
 from tests.helpers.pretend_device import DEVICE, pretend_device
 from tests.helpers.tape import OperatorTape
 
@@ -121,7 +121,7 @@ def test_padding_and_company_change_nothing(kind, monkeypatch):
 def test_a_gpu_is_asked_for_a_tenth_of_pytorchs_launches(ours, most):
     """Of a step with the weights that come with the package: 134 matrices,
     of which PyTorch's takes 61."""
-    model = GHGS.from_checkpoint()
+    model = load_model()
     with pretend_device() as log:
         trained = [p for p in model.to(DEVICE).parameters() if p.requires_grad]
         options = Optimization(lr=1e-3, matrix_scale=1.0)
@@ -251,7 +251,7 @@ def stepped(tape, capturable=True, steps=5):
     model = Small().to(DEVICE)
     model.conv.data = model.conv.data.contiguous(memory_format=torch.channels_last)
     optimizer = Muon(model.parameters(), matrix_lr=0.02, capturable=capturable, **OPTIONS)
-    optimizer.recorder = tape and Recorder(tape=tape)
+    optimizer.graphs = tape and GraphCache(tape=tape)
     hold_rates(optimizer)
     for seed in range(steps):
         for number, parameter in enumerate(model.parameters()):
@@ -262,7 +262,7 @@ def stepped(tape, capturable=True, steps=5):
             group["lr"].mul_(0.9)
         assert {name for name, p in model.named_parameters() if p.grad is None} == MATRICES
     weights = [parameter.detach().cpu() for parameter in model.parameters()]
-    return weights, tape and dict(optimizer.recorder.counts)
+    return weights, tape and dict(optimizer.graphs.counts)
 
 
 MATRICES = {"conv", "square", "tall", "wide"}
@@ -278,5 +278,5 @@ def test_steps_that_are_played_back_are_the_same(capturable):
             found, counts = stepped(OperatorTape(), capturable)
     for one, other in zip(wanted, found, strict=True):
         assert torch.equal(one, other)
-    wanted = {"eager": 2, "recorded": 1, "played": 2} if capturable else {"eager": 4, "refused": 1}
+    wanted = {"eager": 2, "captured": 1, "replayed": 2} if capturable else {"eager": 4, "refused": 1}
     assert counts == wanted

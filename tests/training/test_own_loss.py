@@ -11,7 +11,6 @@ import lightning.pytorch as L
 import pytest
 import torch
 
-from ghgs_lit import GHGS
 from ghgs_lit.config import build, registry, run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.training import GHGSModule, Optimization
@@ -21,7 +20,7 @@ from ghgs_lit.training.faults import Fault, Step
 from ghgs_lit.training.guard import _write
 from ghgs_lit.training.replay import replay
 from ghgs_lit.training.start import check_resume
-from tests.helpers.models import config, make_model
+from tests.helpers.models import config, load_model, make_model, predict
 from tests.helpers.scenes import make_batch, training_batch
 from tests.helpers.training import Standin, StepData, flat_renderer
 
@@ -182,9 +181,9 @@ def test_a_checkpoint_brings_the_loss_and_does_without_it(tmp_path, monkeypatch)
         assert torch.equal(again.losses.mixing, subject.losses.mixing)
     monkeypatch.delenv(registry.VARIABLE)
     registry._REGISTERED.pop(("loss", "balanced"))
-    model = GHGS.from_checkpoint(tmp_path / "last.ckpt")
+    model = load_model(tmp_path / "last.ckpt")
     with torch.no_grad():
-        assert len(model(make_batch(1, 3, 28, 28)).gaussians) > 0
+        assert len(predict(model, make_batch(1, 3, 28, 28)).gaussians) > 0
 
 
 def test_a_fault_in_its_weights_is_found(tmp_path):

@@ -11,7 +11,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.method.recalibration.inspection import attention_of, attention_on_other_parts
 from ghgs_lit.visualization.attention import attention_sheet, chosen_token
 from ghgs_lit.visualization.clouds import clouds
-from tests.helpers.models import make_model
+from tests.helpers.models import make_model, predict
 from tests.helpers.scenes import make_batch
 
 
@@ -22,7 +22,7 @@ def seen(model, batch):
         lambda _, inputs, output: kept.append((inputs[:2], output))
     )
     with torch.no_grad():
-        prediction = model(batch)
+        prediction = predict(model, batch)
     hook.remove()
     return *kept[0], prediction
 

@@ -13,11 +13,10 @@ from safetensors.torch import save_file
 from ghgs_lit.cli.inputs import with_trained_data
 from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
-from ghgs_lit.method.model import GHGS
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION, read_config, write_checkpoint
 from ghgs_lit.weights.frozen import SHARING
-from tests.helpers.models import close, config, make_model
+from tests.helpers.models import close, config, load_model, make_model, predict
 from tests.helpers.scenes import make_batch
 
 
@@ -36,11 +35,11 @@ def checkpoint(path, **changes):
 def test_a_checkpoint_rebuilds_its_model(tmp_path):
     """A checkpoint alone must give the same Gaussians, without any YAML."""
     model = checkpoint(tmp_path / "a.ckpt").eval()
-    loaded = GHGS.from_checkpoint(tmp_path / "a.ckpt")
+    loaded = load_model(tmp_path / "a.ckpt")
     assert not loaded.training
     batch = make_batch(1, 3)
     with torch.no_grad():
-        close(loaded(batch).gaussians, model(batch).gaussians, 0)
+        close(predict(loaded, batch).gaussians, predict(model, batch).gaussians, 0)
 
 
 def test_a_checkpoint_that_does_not_fit_names_key_and_shapes(tmp_path):
@@ -50,10 +49,10 @@ def test_a_checkpoint_that_does_not_fit_names_key_and_shapes(tmp_path):
     with pytest.raises(
         InputError, match=r"a\.ckpt: gaussian_head\.\w+_header\.0\.weight.*\(64, 16\).*\(32, 16\)"
     ):
-        GHGS.from_checkpoint(path)
+        load_model(path)
     checkpoint(path, state_dict={})
     with pytest.raises(InputError, match=r"a\.ckpt: encoder.*expected a tensor of shape"):
-        GHGS.from_checkpoint(path)
+        load_model(path)
 
 
 class Foreign:
@@ -83,7 +82,7 @@ def test_a_foreign_file_is_refused_by_its_path(tmp_path, changes, message):
     path = tmp_path / "b.ckpt"
     checkpoint(path, **changes)
     with pytest.raises(InputError, match=message) as error:
-        GHGS.from_checkpoint(path)
+        load_model(path)
     assert "b.ckpt" in str(error.value) or "bounds" in message or "encoder" in message
 
 
@@ -167,7 +166,7 @@ def test_every_bad_file_is_answered_by_one_line(tmp_path, name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(InputError, match=message) as error:
-            GHGS.from_checkpoint(path)
+            load_model(path)
     text = str(error.value)
     assert text.startswith(f"{path}: ")
     assert "expected" in text
@@ -178,9 +177,9 @@ def test_every_bad_file_is_answered_by_one_line(tmp_path, name):
 def test_a_path_without_a_file_is_refused(tmp_path):
     """A wrong path must be named in one line."""
     with pytest.raises(FileNotFoundError, match=r"c\.ckpt: expected a file of weights; found none"):
-        GHGS.from_checkpoint(tmp_path / "c.ckpt")
+        load_model(tmp_path / "c.ckpt")
     with pytest.raises(InputError, match="found a directory"):
-        GHGS.from_checkpoint(tmp_path)
+        load_model(tmp_path)
 
 
 def test_weights_are_mapped_and_can_be_trained(tmp_path):
@@ -188,7 +187,7 @@ def test_weights_are_mapped_and_can_be_trained(tmp_path):
     path = tmp_path / "a.ckpt"
     checkpoint(path)
     before = path.read_bytes()
-    model = GHGS.from_checkpoint(path)
+    model = load_model(path)
     assert not any(t.is_meta for t in (*model.parameters(), *model.buffers()))
     mapped = Path("/proc/self/maps")
     if mapped.exists():
@@ -206,11 +205,11 @@ def test_a_loaded_model_trains_what_its_encoder_says(tmp_path, trainable):
     """``encoder.trainable`` must decide which parameters get gradients and are in the optimizer."""
     path = tmp_path / "a.ckpt"
     checkpoint(path, config=config(f"encoder.trainable={trainable}"))
-    model = GHGS.from_checkpoint(path).train()
+    model = load_model(path).train()
     optimizer = Optimization(lr=1e-3).optimizer(model)
     held = {id(p) for group in optimizer.param_groups for p in group["params"]}
     before = {name: p.detach().clone() for name, p in model.named_parameters()}
-    g = model(make_batch(1, 3)).gaussians
+    g = predict(model, make_batch(1, 3)).gaussians
     (g.means.square().mean() + g.scales.mean() + g.opacities.mean() + g.quaternions[:, 1].mean()).backward()
     depth = len(model.encoder.aggregator.frame_blocks)
     count = {"none": 0, "all": depth}.get(trainable) or int("0" + trainable[5:])

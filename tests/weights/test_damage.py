@@ -8,13 +8,12 @@ import pytest
 import torch
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.method.model import GHGS
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO
 from ghgs_lit.training.start import check_resume, initialize
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION, read_checkpoint
 from ghgs_lit.weights.exporting import export_weights, write_inference
 from ghgs_lit.weights.reading import SHIPPED_FILE, open_file
-from tests.helpers.models import config, make_model
+from tests.helpers.models import config, load_model, make_model
 from tests.helpers.training import held
 
 TRAINING = {"global_step": 5, "optimizer_states": [], "lr_schedulers": [], "loops": {}, "callbacks": {}}
@@ -33,7 +32,7 @@ def flip(path, near):
 
 
 READERS = {
-    "predict and evaluate": lambda path: GHGS.from_checkpoint(path),
+    "predict and evaluate": lambda path: load_model(path),
     "init_from": lambda path: initialize(make_model(), path),
     "resume": lambda path: check_resume(path, held(make_model()), config()),
     "export": lambda path: export_weights(path, None, path.with_name("release.pth")),
@@ -69,7 +68,7 @@ def test_the_shipped_file_has_checksums(tmp_path):
         path.write_bytes(SHIPPED_FILE.read_bytes())
         flip(path, data[len(data) // 2 :][:256])
         with pytest.raises(InputError, match=r"shipped\.ckpt: expected"):
-            GHGS.from_checkpoint(path)
+            load_model(path)
 
 
 def packed_again(path, compression):
@@ -103,7 +102,7 @@ def test_compressed_records_are_refused_by_every_reader(tmp_path, reader):
     path = tmp_path / "a.ckpt"
     torch.save(content(), path)
     packed_again(path, zipfile.ZIP_STORED)
-    assert GHGS.from_checkpoint(path)
+    assert load_model(path)
     kinds = (zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
     for compression in kinds if reader == "any file of weights" else kinds[:1]:
         packed_again(path, compression)
@@ -135,7 +134,7 @@ def test_weights_in_double_precision_are_read_in_single(tmp_path):
     made = content()
     double = {key: value.double() for key, value in made["state_dict"].items() if value.is_floating_point()}
     torch.save({**made, "state_dict": {**made["state_dict"], **double}}, tmp_path / "a.ckpt")
-    model = GHGS.from_checkpoint(tmp_path / "a.ckpt")
+    model = load_model(tmp_path / "a.ckpt")
     assert {p.dtype for p in model.parameters()} == {torch.float32}
     for key, value in model.state_dict().items():
         assert torch.equal(value, made["state_dict"][f"model.{key}"])
@@ -144,7 +143,7 @@ def test_weights_in_double_precision_are_read_in_single(tmp_path):
     too_large = {**double, next(iter(double)): next(iter(double.values())) + 1e300}
     torch.save({**made, "state_dict": {**made["state_dict"], **too_large}}, tmp_path / "a.ckpt")
     with pytest.raises(InputError, match=r"a\.ckpt: .*: expected finite numbers"):
-        GHGS.from_checkpoint(tmp_path / "a.ckpt")
+        load_model(tmp_path / "a.ckpt")
 
 
 TENSOR = torch.ones(2, 2)
@@ -177,7 +176,7 @@ TENSOR = torch.ones(2, 2)
 def test_what_no_checkpoint_holds_is_named(tmp_path, changes, message):
     torch.save(content(**changes), tmp_path / "a.ckpt")
     with pytest.raises(InputError, match=rf"a\.ckpt: {message}"):
-        GHGS.from_checkpoint(tmp_path / "a.ckpt")
+        load_model(tmp_path / "a.ckpt")
 
 
 FOREIGN_STATES = [

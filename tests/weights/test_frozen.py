@@ -8,19 +8,19 @@ import pytest
 import torch
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.method.model import GHGS
+from ghgs_lit.execution import Predictor
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO
 from ghgs_lit.training.start import check_resume, initialize
 from ghgs_lit.weights import frozen
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION, read_checkpoint
 from ghgs_lit.weights.exporting import export_weights, write_inference
-from tests.helpers.models import config, make_model
+from tests.helpers.models import config, load_model, make_model
 from tests.helpers.training import held
 
 FROZEN = "encoder.trainable=none"
 TRAINING = {"global_step": 5, "optimizer_states": [], "lr_schedulers": [], "loops": {}, "callbacks": {}}
 READERS = {
-    "predict and evaluate": GHGS.from_checkpoint,
+    "predict and evaluate": Predictor.from_checkpoint,
     "init_from": lambda path: initialize(make_model(FROZEN), path),
     "resume": lambda path: check_resume(path, held(make_model(FROZEN)), config(FROZEN)),
     "export": lambda path: export_weights(path, path.with_name("vggt.pt"), None),
@@ -78,11 +78,11 @@ def test_every_reader_puts_them_together(run, tmp_path, reader):
     moved = tmp_path / "elsewhere"
     shutil.move(folder, moved)
     READERS[reader](moved / "last.ckpt")
-    again = GHGS.from_checkpoint(moved / "last.ckpt").state_dict()
+    again = load_model(moved / "last.ckpt").state_dict()
     assert all(torch.equal(value, again[key]) for key, value in model.state_dict().items())
     if reader == "inference":
         frozen_file(moved).unlink()
-        half = GHGS.from_checkpoint(moved / "half.ckpt").state_dict()
+        half = load_model(moved / "half.ckpt").state_dict()
         assert all(torch.equal(value.half().float(), half[key]) for key, value in model.state_dict().items())
 
 
@@ -141,7 +141,7 @@ def test_runs_of_a_sweep_share_one_copy(tmp_path, monkeypatch, links):
     first, second = (frozen_file(path.parent).stat() for path in paths)
     assert (first.st_ino == second.st_ino) == links
     shutil.rmtree(paths[0].parent)
-    GHGS.from_checkpoint(paths[1])
+    load_model(paths[1])
 
 
 def test_weights_that_changed_are_another_file(run):
@@ -153,7 +153,7 @@ def test_weights_that_changed_are_another_file(run):
         next(model.encoder.parameters()).add_(1)
     files.save_checkpoint(content(model), folder / "last.ckpt")
     assert len(list(folder.glob(frozen.PATTERN))) == 2
-    again = GHGS.from_checkpoint(folder / "last.ckpt").state_dict()
+    again = load_model(folder / "last.ckpt").state_dict()
     assert all(torch.equal(value, again[key]) for key, value in model.state_dict().items())
 
 
@@ -162,4 +162,4 @@ def test_small_ones_stay_in_the_checkpoint(tmp_path, monkeypatch):
     monkeypatch.undo()
     AtomicCheckpointIO().save_checkpoint(content(make_model(FROZEN)), tmp_path / "last.ckpt")
     assert [path.name for path in tmp_path.iterdir()] == ["last.ckpt"]
-    GHGS.from_checkpoint(tmp_path / "last.ckpt")
+    load_model(tmp_path / "last.ckpt")

@@ -19,7 +19,7 @@ from ghgs_lit.weights.importing import Source, match_files
 from ghgs_lit.weights.reading import cast
 from ghgs_lit.weights.switches import differences
 from tests.cli.test_main import call
-from tests.helpers.models import close
+from tests.helpers.models import close, load_model, predict
 from tests.helpers.scenes import make_batch
 from tests.helpers.weights import (
     OTHER_HEADS,
@@ -95,7 +95,7 @@ def test_the_checkpoint_is_the_published_model_and_says_so(tmp_path, files):
     assert checkpoint["config"]["compat"]["name"] == "release"
     assert checkpoint["imported"]["release"]["tensors"] == len(network)
     assert re.fullmatch("[0-9a-f]{64}", checkpoint["imported"]["vggt"]["sha256"])
-    model = GHGS.from_checkpoint(out)
+    model = load_model(out)
     assert not any(tensor.is_meta for tensor in (*model.parameters(), *model.buffers()))
     expected = GHGS.from_config(config())
     renamed = {names.to_ours(name, names.VGGT): value for name, value in agg.items()}
@@ -103,7 +103,7 @@ def test_the_checkpoint_is_the_published_model_and_says_so(tmp_path, files):
     expected.load_state_dict({name: value for name, value in renamed.items() if name is not None})
     batch = make_batch(1, 3, 50, 64)  # padded to 56 x 70
     with torch.no_grad():
-        close(model(batch).gaussians, expected(batch).gaussians, 0)
+        close(predict(model, batch).gaussians, predict(expected, batch).gaussians, 0)
 
 
 def test_without_the_release_the_file_holds_the_encoder_alone(tmp_path, files):
@@ -160,18 +160,18 @@ def test_the_encoders_precision_is_a_choice(tmp_path, files, dtype):
     import_weights(config(), out, vggt, release, dtype)
     half = getattr(torch, dtype)
     assert model_state(read_checkpoint(out))["encoder.aggregator.camera_token"].dtype == half
-    model = GHGS.from_checkpoint(out, dtype=half)
+    model = load_model(out, dtype=half)
     assert {p.dtype for p in model.encoder.parameters()} == {half}
     assert {p.dtype for p in (*model.depth_head.parameters(), *model.gaussian_head.parameters())} == {
         torch.float32
     }
     token = agg["aggregator.camera_token"]
     assert torch.equal(model.encoder.aggregator.camera_token, token.to(half))
-    wide = GHGS.from_checkpoint(out, dtype=torch.float32)
+    wide = load_model(out, dtype=torch.float32)
     assert {p.dtype for p in wide.parameters()} == {torch.float32}
     batch = make_batch(1, 3)
     with torch.no_grad():
-        found, expected = model(batch), wide(batch)
+        found, expected = predict(model, batch), predict(wide, batch)
     assert found.gaussians.means.dtype == torch.float32
     mask = batch.masks
     inverse = [1 / prediction.depth[mask] for prediction in (found, expected)]
@@ -305,11 +305,11 @@ def test_fewer_tokens_with_the_authors_weights_give_a_warning(tmp_path, skip, to
     out = tmp_path / "out.ckpt"
     import_weights(config(f"skip={skip}"), out, str(vggt), str(release))
     with pytest.warns(UserWarning, match=rf"out\.ckpt: skip\.tokens: expected all, .*; found {tokens}"):
-        GHGS.from_checkpoint(out)
+        load_model(out)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         import_weights(config(), out, str(vggt), str(release))
-        GHGS.from_checkpoint(out)
+        load_model(out)
 
 
 def test_switches_that_differ_from_the_releases_are_listed():

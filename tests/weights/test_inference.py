@@ -6,11 +6,10 @@ import pytest
 import torch
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.method.model import GHGS
 from ghgs_lit.runtime import precision
 from ghgs_lit.weights.checkpoint import model_state, read_checkpoint, write_checkpoint
 from ghgs_lit.weights.exporting import write_inference
-from tests.helpers.models import config, make_model
+from tests.helpers.models import config, load_model, make_model
 from tests.helpers.verbs import ghgs
 
 
@@ -36,7 +35,7 @@ def test_weights_and_configuration_alone_are_written(checkpoint, tmp_path, dtype
         assert torch.equal(after["state_dict"][name], tensor.to(getattr(torch, dtype)))
     share = (tmp_path / "b.ckpt").stat().st_size / checkpoint.stat().st_size
     assert share < (0.4 if dtype == "float32" else 0.25)
-    GHGS.from_checkpoint(tmp_path / "b.ckpt")
+    load_model(tmp_path / "b.ckpt")
 
 
 def test_the_verb_prints_how_far_predictions_are(checkpoint, tmp_path, capsys):
@@ -75,10 +74,10 @@ def test_half_precision_is_computed_where_the_processor_has_it(
     monkeypatch.setattr(precision, "has_bfloat16", lambda _: has_bfloat16)
     write_inference(checkpoint, tmp_path / "b.ckpt", str(stored).removeprefix("torch."))
     kept = stored == torch.bfloat16 and has_bfloat16
-    model, asked = (GHGS.from_checkpoint(tmp_path / "b.ckpt", dtype=dtype) for dtype in (None, stored))
+    model, asked = (load_model(tmp_path / "b.ckpt", dtype=dtype) for dtype in (None, stored))
     assert {p.dtype for p in model.encoder.parameters()} == {stored if kept else torch.float32}
     assert {p.dtype for p in asked.encoder.parameters()} == {stored}
-    elsewhere = GHGS.from_checkpoint(tmp_path / "b.ckpt", map_location="meta")
+    elsewhere = load_model(tmp_path / "b.ckpt", map_location="meta")
     assert {p.dtype for p in elsewhere.encoder.parameters()} == {stored}
     for name, tensor in model_state(read_checkpoint(tmp_path / "b.ckpt")).items():
         assert torch.equal(model.state_dict()[name].float(), tensor.float())

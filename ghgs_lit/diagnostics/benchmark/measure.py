@@ -133,7 +133,9 @@ def amplification(case: Case, batch: Batch, result: Result) -> dict[str, float]:
     for seed in range(_ROUNDINGS):
         signs = 1 - 2 * torch.randint(2, batch.images.shape, generator=torch.Generator().manual_seed(seed))
         images = (batch.images * (1 + eps * signs.to(batch.images))).clamp(0, 1)
-        moved = forward(case.model, case.renderer, replace(batch, images=images), SecondsProbe(images.device))
+        moved = forward(
+            case.predictor, case.renderer, replace(batch, images=images), SecondsProbe(images.device)
+        )
         for name, value in differences(moved, result, batch.masks, MOST).items():
             largest[name] = max(largest.get(name, 1.0), value / eps)
     return largest
@@ -232,7 +234,7 @@ def time_cases(
             case = cases[number]
             probe = SecondsProbe(device)
             for batch in batches:
-                forward(case.model, case.renderer, batch, probe)
+                forward(case.predictor, case.renderer, batch, probe)
             for stage, value in probe.seconds().items() if turn >= 0 else ():
                 seconds[number].setdefault(stage, []).append(value / len(batches))
     times = []
@@ -268,9 +270,9 @@ def inspect(case: Case, batch: Batch, device: torch.device) -> tuple[Work, Predi
         The cost, the prediction and the render.
     """
     with FlopsProbe() as counted:
-        forward(case.model, case.renderer, batch, counted)
+        forward(case.predictor, case.renderer, batch, counted)
     memory = PeakProbe(device)
-    prediction, rendering = forward(case.model, case.renderer, batch, memory)
+    prediction, rendering = forward(case.predictor, case.renderer, batch, memory)
     return Work(counted.flops, memory.peaks, _counts(prediction)), prediction, rendering
 
 

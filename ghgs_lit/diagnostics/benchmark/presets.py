@@ -15,6 +15,7 @@ from ghgs_lit.config.keys import flatten, is_below
 from ghgs_lit.diagnostics.benchmark.scene import random_model
 from ghgs_lit.errors import require
 from ghgs_lit.evaluation.measure import Renderer
+from ghgs_lit.execution import Predictor
 from ghgs_lit.method.model import GHGS, STAGES
 from ghgs_lit.weights.checkpoint import check_preset, load_weights, read_checkpoint, require_fit
 
@@ -40,7 +41,7 @@ class Case:
 
     preset: str
     knobs: Mapping[str, Any]  #: changed values by key
-    model: GHGS  #: in evaluation mode, on its device
+    predictor: Predictor  #: with a model in evaluation mode, on its device
     renderer: Renderer
     budget_db: float | None  #: PSNR that the preset may lose against the yardstick; None: no budget
     max_rel_diff: float | None  #: allowed difference over its condition; None: any
@@ -137,12 +138,12 @@ def cases_of(
         config = case_config(source, skip, change, shared)
         model = _model(source, config, state, seed, device).to(device).eval()
         state = state or model.state_dict()
-        model.precision = config["precision"]
+        predictor = Predictor(model, precision=config["precision"])
         # Budgets hold for presets without knobs.
         budget_db, max_rel_diff = (None if change else skip.get(key) for key in ("budget_db", "max_rel_diff"))
         renderer = build(config["renderer"], "renderer")
         is_trained = source.checkpoint is not None
-        cases.append(Case(name, change, model, renderer, budget_db, max_rel_diff, is_trained))
+        cases.append(Case(name, change, predictor, renderer, budget_db, max_rel_diff, is_trained))
     return cases
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, sdpa_flop_count
 
 from ghgs_lit.evaluation.measure import Renderer
+from ghgs_lit.execution import Predictor
 from ghgs_lit.method.encoder import cpu
 from ghgs_lit.method.model import GHGS, STAGES
 from ghgs_lit.runtime.allocation import can_forget_peak, forget_peak, resident_bytes, return_free_memory
@@ -54,17 +55,19 @@ def watched(model: GHGS, probe: Watcher) -> AbstractContextManager[None]:
 
 
 @torch.inference_mode()
-def forward(model: GHGS, renderer: Renderer, batch: Batch, probe: Watcher) -> tuple[Prediction, Rendering]:
+def forward(
+    predictor: Predictor, renderer: Renderer, batch: Batch, probe: Watcher
+) -> tuple[Prediction, Rendering]:
     """Predict the Gaussians of a batch and render its targets under a probe.
 
     Args:
-        model: in evaluation mode.
+        predictor: with a model in evaluation mode.
         renderer: draws the targets.
         batch: with targets, which the model does not see.
         probe: is called when stages, rendering and the whole begin and end.
     """
-    with watched(model, probe), inside(TOTAL, probe):
-        prediction = model(replace(batch, targets=None))
+    with watched(predictor.model, probe), inside(TOTAL, probe):
+        prediction = predictor(replace(batch, targets=None))
         with inside(RENDER, probe):
             rendering = renderer(prediction.gaussians, batch.targets.cameras)
     return prediction, rendering

@@ -10,6 +10,7 @@ from ghgs_lit.config.run import Run
 from ghgs_lit.diagnostics.benchmark.measure import ATTRIBUTES
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch, random_model
 from ghgs_lit.errors import InputError
+from ghgs_lit.execution import Predictor
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.rendering import RasterSettings, render
 from ghgs_lit.rendering.api import resolve_backend
@@ -211,21 +212,41 @@ def stages(run: Run, device: torch.device) -> Iterator[Outcome]:
         An outcome for each stage and precision; one alone for a precision that the device lacks.
     """
     batch = _small_batch(run)
-    expected = _results(random_model(run.plain).double(), _in_float64(batch))
+    expected = _results(Predictor(random_model(run.plain).double()), _in_float64(batch))
     for precision in PRECISIONS:
         reason = _unsupported(precision, device)
         if reason is not None:
             yield Outcome(f"model, {precision}", SKIPPED, reason)
             continue
-        model = random_model(run.plain).to(device)
-        model.precision = precision
-        found = _results(model, batch.to(device))
+        predictor = Predictor(random_model(run.plain).to(device), precision=precision)
+        found = _results(predictor, batch.to(device))
         inherited = "tf32" if rounds_products(device.type) else "float32"
         limit = LIMITS[inherited if precision == "inherit" else precision]
         for stage, value in expected.items():
             # Geometry is always float32.
             allowed = LIMITS["float32"] if stage == "bounds" else limit
             yield compared(f"model, {precision}: {stage}", found[stage], value, allowed)
+
+
+@torch.no_grad()
+def capture(run: Run, device: torch.device) -> Iterator[Outcome]:
+    """Check a prediction that is replayed as a CUDA graph against an eager one.
+
+    Args:
+        run: as of ``ghgs train``; its model gets random weights.
+        device: what is checked.
+
+    Yields:
+        One outcome, with the reason where nothing is captured.
+    """
+    predictor = Predictor(random_model(run.plain).to(device), precision="float32")
+    batch = _small_batch(run).to(device)
+    expected, _, found = (predictor(batch).gaussians.means for _ in range(3))
+    if predictor.graphs.counts["replayed"]:
+        yield compared("captured prediction", found, expected, LIMITS["float32"])
+        return
+    off = "model.capture=off" if predictor.options.capture == "off" else f"no graphs on {device.type}"
+    yield Outcome("captured prediction", SKIPPED, "; ".join(predictor.graphs.reasons) or off)
 
 
 def gradient(run: Run, device: torch.device) -> Iterator[Outcome]:
@@ -250,7 +271,7 @@ def gradient(run: Run, device: torch.device) -> Iterator[Outcome]:
     yield outcomes[-1]
 
 
-CHECKS = (renderer, stages, gradient)
+CHECKS = (renderer, stages, capture, gradient)
 
 
 def _small_batch(run: Run) -> Batch:
@@ -271,11 +292,11 @@ def _unsupported(precision: str, device: torch.device) -> str | None:
 
 
 @torch.no_grad()
-def _results(model: GHGS, batch: Batch) -> dict[str, Tensor]:
+def _results(predictor: Predictor, batch: Batch) -> dict[str, Tensor]:
     """What the stages give for the subject, by the name of the stage, on the CPU."""
     seen = Results()
-    with watched(model, {name: name for name in ("encoder", "recalibration")}, seen):
-        prediction = model(batch).to("cpu")
+    with watched(predictor.model, {name: name for name in ("encoder", "recalibration")}, seen):
+        prediction = predictor(batch).to("cpu")
     encoder, recalibration = (torch.stack(tokens.latent).cpu() for tokens in seen.results.values())
     bounds = prediction.depth_maps.bounds
     points = prediction.points
@@ -294,7 +315,7 @@ def _results(model: GHGS, batch: Batch) -> dict[str, Tensor]:
 def _gradients(model: GHGS, batch: Batch) -> Tensor:
     """Gradient of a number that depends on all attributes by all weights [n],
     in float64 on the CPU."""
-    gaussians = model.requires_grad_(True)(batch).gaussians
+    gaussians = Predictor(model.requires_grad_(True))(batch).gaussians
     sum(_waves(getattr(gaussians, name)).mean() for name in ATTRIBUTES).backward()
     rows = [torch.zeros_like(p) if p.grad is None else p.grad for p in model.parameters()]
     return torch.cat([row.cpu().double().flatten() for row in rows])

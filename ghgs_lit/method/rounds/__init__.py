@@ -1,17 +1,17 @@
 """Rounds of refinement: Gaussians are compared with the photographs and corrected."""
 
 from ghgs_lit.method.rounds.coarse import Coarse, CoarseDepths, coarse_of, coarse_sizes, with_known_height
-from ghgs_lit.method.rounds.rounds import Rounds, RoundsOptions, State, prediction_of, replaced
+from ghgs_lit.method.rounds.rounds import NoRounds, Rounds, RoundsOptions, State, prediction_of
 
 __all__ = [
     "Coarse",
     "CoarseDepths",
+    "NoRounds",
     "Rounds",
     "RoundsOptions",
     "State",
     "coarse_of",
     "coarse_sizes",
     "prediction_of",
-    "replaced",
     "with_known_height",
 ]

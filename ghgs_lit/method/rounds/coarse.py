@@ -10,6 +10,7 @@ the size of the photographs alone.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -131,20 +132,48 @@ class Coarse:
     depths: CoarseDepths
     tokens: Tokens
 
-    def encoded(self, plan: Plan, encode: Callable[[], Tokens]) -> Tokens:
-        """Tokens of the patches that a plan keeps, those of the copies where there are any.
+    def encoder(self, encoder: Callable[..., Tokens]) -> Callable[..., Tokens]:
+        """An encoder that gives the tokens of the copies where there are any.
 
         Args:
-            plan: of the batch at full size.
-            encode: gives the encoder's tokens of these patches; called if an element has no copy.
+            encoder: gives those of elements without a copy; called if there are any.
         """
+        return functools.partial(self._encoded, encoder)
+
+    def depth_head(self, head: Callable[..., DepthMaps]) -> Callable[..., DepthMaps]:
+        """A depth head that gives the depths of the copies where there are any.
+
+        Args:
+            head: gives those of elements without a copy; called if there are any.
+        """
+        return functools.partial(self._decoded, head)
+
+    def _decoded(
+        self,
+        head: Callable[..., DepthMaps],
+        tokens: Tokens,
+        batch: Batch,
+        bounds: DepthBounds | None,
+        plan: Plan,
+    ) -> DepthMaps:
+        others = None if self.depths.are_all else head(tokens, batch, bounds, plan)
+        return self.depths.maps(batch, bounds, others)
+
+    def _encoded(
+        self,
+        encoder: Callable[..., Tokens],
+        images: Tensor,
+        masks: Tensor,
+        bounds: DepthBounds | None,
+        plan: Plan,
+    ) -> Tokens:
         kept = plan.kept
         tokens = self.tokens
         if not kept.is_whole:
             tokens = dataclasses.replace(tokens.select(kept.index), real=kept.real)
         if self.depths.are_all:
             return tokens
-        others = encode()
+        others = encoder(images, masks, bounds, plan)
         known = self.depths.known[others.image // others.grid[1], None]
         pairs = zip((*tokens.latent, tokens.semantic), (*others.latent, others.semantic), strict=True)
         *latent, semantic = (torch.where(known, own, other) for own, other in pairs)

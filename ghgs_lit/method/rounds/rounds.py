@@ -8,7 +8,7 @@ re-rendered inputs (G3R, Chen et al., ECCV 2024; ReSplat, Xu et al., 2025)."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
 
@@ -32,7 +32,7 @@ from ghgs_lit.method.rounds.gains import equalized
 from ghgs_lit.method.rounds.memory import fits, remembered, remembered_plainly
 from ghgs_lit.method.rounds.observation import CHANNELS, SLOPES, observe, slopes
 from ghgs_lit.runtime.precision import exact
-from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Prediction
+from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Prediction, Tokens
 
 #: Gaussians that go through the network at once on a CPU.
 _AT_ONCE = 2048
@@ -77,27 +77,34 @@ class Rays(NamedTuple):
 
 @dataclass(frozen=True)
 class State:
-    """Input and output of a round; the first state is the prediction of the stages."""
+    """Input and output of a round; the first state is what the stages predict, whose Gaussians are
+    not activated yet."""
 
     raw: RawGaussians
-    gaussians: Gaussians
+    gaussians: Gaussians | None
     points: Points
     depth_maps: DepthMaps
 
+    def activated(self, activate: "Activate", batch: Batch) -> "State":
+        """The state with the Gaussians of its raw attributes."""
+        gaussians = activate(self.raw, batch, self.points, self.depth_maps)
+        return dataclasses.replace(self, gaussians=gaussians)
 
-def prediction_of(states: Sequence[State], keeps_drafts: bool) -> Prediction:
+
+def prediction_of(states: Sequence[State], keeps_drafts: bool, tokens: Tokens) -> Prediction:
     """The prediction of the last state.
 
     Args:
         states: before the first round and after each.
         keeps_drafts: include the Gaussians before each round.
+        tokens: of the encoder.
     """
     last = states[-1]
     maps = tuple(state.depth_maps for state in states)
     drafts = tuple(state.gaussians for state in states[:-1]) if keeps_drafts else ()
     depth = maps[-1].depth
     valid = maps[-1].valid
-    return Prediction(last.gaussians, depth, valid, last.points, maps[-1], rounds=maps, drafts=drafts)
+    return Prediction(last.gaussians, depth, valid, last.points, maps[-1], maps, drafts, tokens)
 
 
 #: Gaussians from raw attributes at points: ``GaussianHead.activate``.
@@ -152,6 +159,20 @@ class RoundsOptions(Options):
         return Rounds(self, channels)
 
 
+class NoRounds(nn.Module):
+    """The stage of a model without rounds: the Gaussians of the Gaussian head are the prediction's."""
+
+    height = None
+
+    def forward(self, state: State, activate: Activate, batch: Batch, step: float = 1.0) -> tuple[State, ...]:
+        """The only state, with its Gaussians; arguments as of :meth:`Rounds.forward`."""
+        return (state.activated(activate, batch),)
+
+    def drawn(self, count: int | None = None) -> AbstractContextManager[None]:
+        """Nothing is drawn."""
+        return nullcontext()
+
+
 def _two_layers(inputs: int, wide: int, outputs: int) -> nn.Sequential:
     first = nn.Linear(inputs, wide)
     second = nn.Linear(wide, outputs)
@@ -200,7 +221,6 @@ class Rounds(nn.Module):
         activate: Activate,
         batch: Batch,
         step: float | Float[Tensor, " B"] = 1.0,
-        shows_last: bool = True,
     ) -> tuple[State, ...]:
         """The states before the first round and after each.
 
@@ -210,12 +230,13 @@ class Rounds(nn.Module):
             batch: photographs, masks and cameras are read.
             step: size of the first step in depth, in those after a depth head; one for all elements
                 or for each. Attributes take whole steps.
-            shows_last: whether the last Gaussians are wanted; the last state has those before it
-                otherwise.
 
         Returns:
             As many states as there are rounds, and one more.
         """
+        draft = replaced(activate, self.training)
+        if state.gaussians is None:
+            state = state.activated(draft, batch)
         if self.options.gains and batch.log_gains is None:
             gaussians, batch = equalized(state.gaussians, batch, state.raw.real)
             state = dataclasses.replace(state, gaussians=gaussians)
@@ -229,9 +250,7 @@ class Rounds(nn.Module):
         for number in range(count):
             share = 0.5**number
             change, memory = self._round(states[-1], batch, rays, memory, windows, share, step * share)
-            shown = replaced(activate, self.training)
-            if number == count - 1:
-                shown = activate if shows_last else None
+            shown = activate if number == count - 1 else draft
             states.append(_moved(states[-1], shown, batch, rays, *change))
         return tuple(states)
 
@@ -376,7 +395,7 @@ def _footprints(state: State, batch: Batch, rays: Rays) -> Tensor:
 
 def _moved(
     state: State,
-    activate: Activate | None,
+    activate: Activate,
     batch: Batch,
     rays: Rays,
     moved: Float[Tensor, " N"],
@@ -386,7 +405,7 @@ def _moved(
 
     Args:
         state: before it.
-        activate: gives Gaussians from their raw attributes; None: those before the round stay.
+        activate: gives Gaussians from their raw attributes.
         batch: photographs, mattes and cameras are read.
         rays: of the Gaussians' pixels, along which they move.
         moved: changes of depths in metres.
@@ -401,5 +420,4 @@ def _moved(
     maps = dataclasses.replace(maps, depth=depth)
     pixels = pixels.flatten(0, 3).index_add(0, rays.place, moved[:, None] * rays.direction).view_as(pixels)
     points = dataclasses.replace(state.points, pixels=pixels)
-    gaussians = state.gaussians if activate is None else activate(raw, batch, points, maps)
-    return State(raw, gaussians, points, maps)
+    return State(raw, activate(raw, batch, points, maps), points, maps)

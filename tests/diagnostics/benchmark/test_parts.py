@@ -7,7 +7,6 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from ghgs_lit import encoder
 from ghgs_lit.diagnostics.benchmark import measure
 from ghgs_lit.diagnostics.benchmark.measure import (
     ATTRIBUTES,
@@ -36,6 +35,8 @@ from ghgs_lit.diagnostics.benchmark.stages import (
     watched,
 )
 from ghgs_lit.errors import InputError
+from ghgs_lit.execution import Predictor
+from ghgs_lit.method import encoder
 from ghgs_lit.rendering import Renderer
 from tests.helpers.models import close, make_model
 
@@ -49,7 +50,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def model():
-    return make_model().eval()
+    return Predictor(make_model().eval())
 
 
 def case(model, name, renderer):
@@ -92,16 +93,16 @@ def test_stages_and_the_rest_add_up_to_the_total(model, scene):
 
 def test_a_probe_leaves_the_model_and_its_prediction_as_they_were(model, scene):
     """A model that was measured must not stay slower, or become another one."""
-    bounds = model.bounds
+    bounds = model.model.bounds
     with torch.no_grad():  # as it is measured: kernels round otherwise than PyTorch
         before = model(scene)
     found, _ = forward(model, Renderer(), scene, SecondsProbe(CPU))
     close(found.gaussians, before.gaussians, 0)
-    with watched(model, SecondsProbe(CPU)):
-        assert model.bounds is not bounds
-        assert model.bounds.samples == bounds.samples
-    assert model.bounds is bounds
-    assert not any(m._forward_hooks or m._forward_pre_hooks for m in model.modules())
+    with watched(model.model, SecondsProbe(CPU)):
+        assert model.model.bounds is not bounds
+        assert model.model.bounds.samples == bounds.samples
+    assert model.model.bounds is bounds
+    assert not any(m._forward_hooks or m._forward_pre_hooks for m in model.model.modules())
 
 
 def test_quartiles_of_one_round_are_its_value():

@@ -20,8 +20,8 @@ from ghgs_lit.diagnostics.doctor.selfcheck import (
     stages,
     table,
 )
+from ghgs_lit.execution import Predictor
 from ghgs_lit.geometry.unprojection import Unprojection
-from ghgs_lit.method.model import GHGS
 from ghgs_lit.method.recalibration import Recalibration
 from ghgs_lit.rendering.cpu import backend as cpu
 from ghgs_lit.runtime.precision import rounds_products
@@ -75,14 +75,14 @@ def test_it_runs_on_the_pretend_device():
 def test_it_checks_what_a_user_has(monkeypatch):
     """``inherit`` leaves the process as it is, with convolutions in TF32, and may round as much;
     the gradient is that of a training in float32."""
-    right, seen = GHGS.predict, []
+    right, seen = Predictor.finish, []
 
-    def noted(self, batch, kept, coarse=None, keeps_tokens=False):
-        if batch.images.dtype == torch.float32:
-            seen.append((self.precision, self.training, rounds_products("cuda")))
-        return right(self, batch, kept, coarse, keeps_tokens)
+    def noted(self, prepared):
+        if prepared.batch.images.dtype == torch.float32:
+            seen.append((self.precision, self.model.training, rounds_products("cuda")))
+        return right(self, prepared)
 
-    monkeypatch.setattr(GHGS, "predict", noted)
+    monkeypatch.setattr(Predictor, "finish", noted)
     # PyTorch's default, which trainings change
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)
     with pretend_device():

@@ -10,7 +10,7 @@ from torch.utils.data import DataLoader
 from ghgs_lit.method.heads.inspection import offsets_at_limit, seen_attributes
 from ghgs_lit.training import GHGSModule, Optimization
 from tests.helpers.losses import losses_of
-from tests.helpers.models import make_model
+from tests.helpers.models import make_model, predict
 from tests.helpers.scenes import make_batch
 from tests.helpers.training import example_batch, flat_renderer
 
@@ -21,7 +21,7 @@ def saturating(batch, *overrides):
     """A model that moves half of a batch's Gaussians to their limit."""
     model = make_model(*overrides).eval()
     with torch.no_grad(), seen_attributes(model.gaussian_head) as seen:
-        model(batch)
+        predict(model, batch)
     last = model.gaussian_head.offset_header[-1]
     middle = seen[-1].offset.abs().amax(-1).median()
     for parameter in (last.weight, last.bias):
@@ -34,7 +34,7 @@ def test_the_share_is_that_of_the_gaussians_of_the_prediction():
     batch = make_batch(2, 3)
     model = saturating(batch, "model=paper", "model.frame=world")
     with torch.no_grad(), seen_attributes(model.gaussian_head) as seen:
-        prediction = model(batch)
+        prediction = predict(model, batch)
     gaussians = prediction.gaussians
     points = prediction.points.pixels.flatten(0, 1).flatten(1, 2)[gaussians.image, gaussians.pixel]
     moved = (gaussians.means.double() - points.double()).abs()
@@ -45,7 +45,7 @@ def test_the_share_is_that_of_the_gaussians_of_the_prediction():
     assert 0.05 < expected < 0.95
     unsure = float((~sure).double().mean())
     assert offsets_at_limit(seen[-1]).item() == pytest.approx(expected.item(), abs=unsure + 1e-6)
-    model(batch)
+    predict(model, batch)
     assert len(seen) == 1
 
 
@@ -55,7 +55,7 @@ def test_rounds_are_seen_one_after_another():
     for parameter in model.rounds.parameters():  # rounds that have learned nothing change nothing
         parameter.data.add_(0.01)
     with torch.no_grad(), seen_attributes(model.gaussian_head) as seen:
-        prediction = model(batch)
+        prediction = predict(model, batch)
     assert len(seen) == 3
     assert not torch.equal(seen[0].offset, seen[-1].offset)
     assert len(seen[-1].offset) == len(prediction.gaussians)
@@ -82,7 +82,7 @@ def test_validation_logs_it_where_there_is_a_limit(limit, tmp_path):
         shares = []
         for batch in batches:
             with torch.no_grad(), seen_attributes(model.gaussian_head) as seen:
-                model(batch)
+                predict(model, batch)
             shares.append(offsets_at_limit(seen[-1]).item())
         assert numbers["val/offsets_at_limit"] == pytest.approx(sum(shares) / 2, abs=1e-6)
         assert 0 < sum(shares) < 2

@@ -18,7 +18,7 @@ from ghgs_lit.method.heads import stereo
 from ghgs_lit.method.heads.depth import BOUNDED
 from ghgs_lit.method.stages import STAGES
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION
-from tests.helpers.models import close
+from tests.helpers.models import close, load_model, predict
 from tests.helpers.scenes import ellipsoid, make_batch, ring, stack
 from tests.method.heads.test_depth import make_tokens
 
@@ -160,12 +160,12 @@ def test_batch_mates_change_nothing(name, views, size):
     masks = batches[0].masks.clone()
     masks[:, 0] = False
     batches[0] = dataclasses.replace(batches[0], masks=masks)
-    both = model(stack(batches))
+    both = predict(model, stack(batches))
     assert both.depth.isfinite().all()
     assert both.depth.shape == (2, views, *size)
     assert both.gaussians.splits == tuple(int(batch.masks.sum()) for batch in batches)
     for element, batch in enumerate(batches):
-        alone = model(batch)
+        alone = predict(model, batch)
         close(both.gaussians[element], alone.gaussians)
         torch.testing.assert_close(both.depth[element], alone.depth[0])
 
@@ -187,9 +187,9 @@ def test_depths_lie_between_the_bounds_of_the_subject():
 def test_half_precision_stays_near():
     """Correlations and the estimate stay in float32 under autocast; gradients stay finite."""
     batch, model = make_batch(1, 3, 56, 56), peer("gps")
-    expected = model(batch).depth
+    expected = predict(model, batch).depth
     with torch.autocast("cpu", torch.bfloat16):
-        found = model(batch).depth
+        found = predict(model, batch).depth
     assert found.dtype == torch.float32
     error = (found - expected)[batch.masks].abs().mean() / expected[batch.masks].std()
     assert 0 < error < 0.1
@@ -201,7 +201,7 @@ def test_half_precision_stays_near():
 def test_every_weight_learns(name):
     """Of the depth head, from the Gaussians."""
     model = peer(name).train()
-    gaussians = model(make_batch(1, 3, 42, 56)).gaussians
+    gaussians = predict(model, make_batch(1, 3, 42, 56)).gaussians
     sum(getattr(gaussians, name).square().sum() for name in ("means", "scales", "opacities")).backward()
     still = [key for key, p in model.depth_head.named_parameters() if p.grad is None or not p.grad.any()]
     assert still == []
@@ -214,5 +214,5 @@ def test_weights_come_back_from_their_file(name, tmp_path):
     state = {f"model.{key}": value for key, value in model.state_dict().items()}
     content = {"state_dict": state, "config": model.config, "format_version": FORMAT_VERSION}
     torch.save(content, tmp_path / "last.ckpt")
-    found = GHGS.from_checkpoint(tmp_path / "last.ckpt")(batch)
-    assert torch.equal(found.gaussians.means, model(batch).gaussians.means)
+    found = predict(load_model(tmp_path / "last.ckpt"), batch)
+    assert torch.equal(found.gaussians.means, predict(model, batch).gaussians.means)

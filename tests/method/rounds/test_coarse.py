@@ -5,7 +5,6 @@ import dataclasses
 import pytest
 import torch
 
-from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import run_of
 from ghgs_lit.geometry.padding import pad_to_patches
@@ -19,7 +18,7 @@ from ghgs_lit.method.rounds.coarse import (
     with_known_height,
 )
 from ghgs_lit.types import DepthBounds, DepthMaps, Tokens
-from tests.helpers.models import ATTRIBUTES, close, make_model
+from tests.helpers.models import ATTRIBUTES, close, load_model, make_model, predict
 from tests.helpers.scenes import in_dtype, make_batch, with_soft_rims
 
 #: of photographs that are too large for weights that know a subject of ``HEIGHT`` pixels
@@ -162,12 +161,12 @@ def test_rounds_start_from_what_is_found_in_a_smaller_copy():
     model.encoder.register_forward_hook(lambda encoder, inputs, result: tokens.append(result))
     model.recalibration.register_forward_hook(lambda stage, inputs, result: tokens.append(inputs[0]))
     with torch.no_grad():
-        found = model(batch)
+        found = predict(model, batch)
         (copy,) = seen
         of_copy, _, at_full_size = tokens
         size = coarse_sizes(batch, HEIGHT, model.encoder.patch_size)[0]
         assert tuple(copy.masks.shape[2:]) == size
-        alone = model(shrunk(batch, size, None))
+        alone = predict(model, shrunk(batch, size, None))
     spread = spread_tokens(of_copy, batch, 14).flatten(0, 3)
     assert torch.equal(torch.cat((*at_full_size.latent, at_full_size.semantic), -1), spread)
     start, bounds = found.rounds[0].depth, found.rounds[0].bounds
@@ -212,14 +211,14 @@ def test_the_training_says_what_height_the_weights_know(trained, height):
 
 @pytest.fixture(scope="module")
 def shipped():
-    return GHGS.from_checkpoint()
+    return load_model()
 
 
 def without_copies(model, batch):
     """The prediction with ``rounds.height=null``."""
     before = model.rounds.options
     model.rounds.options = before.replace(height=None)
-    found = model(batch)
+    found = predict(model, batch)
     model.rounds.options = before
     return found
 
@@ -269,9 +268,9 @@ def test_elements_with_and_without_a_copy_do_not_touch_one_another(pad):
     batches = [in_dtype(dataclasses.replace(batch, depths=None), torch.float64) for batch in batches]
     model = recurrent(HEIGHT, f"model.pad={pad}").double()
     with torch.no_grad():
-        together = model(stacked(*batches))
+        together = predict(model, stacked(*batches))
         for element, batch in enumerate(batches):
-            alone = model(batch)
+            alone = predict(model, batch)
             close(together.gaussians[element], alone.gaussians, 1e-7)
             valid = alone.depth_valid[0]
             torch.testing.assert_close(
@@ -281,20 +280,7 @@ def test_elements_with_and_without_a_copy_do_not_touch_one_another(pad):
 
 def test_training_reaches_the_depth_head_through_the_copy():
     model = recurrent(HEIGHT).train()
-    model(make_batch(1, 3, SIDE, SIDE)).depth.square().mean().backward()
+    predict(model, make_batch(1, 3, SIDE, SIDE)).depth.square().mean().backward()
     slopes = [parameter.grad for parameter in model.depth_head.parameters() if parameter.requires_grad]
     assert all(slope is not None and slope.isfinite().all() for slope in slopes)
     assert any(slope.abs().max() > 0 for slope in slopes)
-
-
-def test_copies_are_not_asked_for_their_last_gaussians(monkeypatch):
-    """Their depths and tokens start the rounds at full size; bit for bit those of a prediction."""
-    model, batch = recurrent(HEIGHT), make_batch(1, 3, 56, 56)
-    plan, activate, calls = model.plan(batch), model.gaussian_head.activate, []
-    monkeypatch.setattr(model.gaussian_head, "activate", lambda *given: calls.append(1) or activate(*given))
-    with torch.no_grad():
-        whole, copy = (model.predict(batch, plan, keeps_tokens=keeps) for keeps in (False, True))
-    assert sum(calls) == 2 * (1 + model.rounds.count) - 1
-    assert torch.equal(copy.depth_maps.depth, whole.depth_maps.depth)
-    assert torch.equal(copy.depth_maps.confidence, whole.depth_maps.confidence)
-    assert not torch.equal(copy.gaussians.means, whole.gaussians.means)

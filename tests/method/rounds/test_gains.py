@@ -11,7 +11,7 @@ from ghgs_lit.data.imperfections import color_gains
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.method.rounds.gains import divided, equalized, log_gains, log_gammas
 from ghgs_lit.types import Gaussians
-from tests.helpers.models import make_model
+from tests.helpers.models import make_model, predict
 from tests.helpers.scenes import CENTER, RADII, ellipsoid, make_batch, with_soft_rims
 
 
@@ -156,7 +156,7 @@ def test_the_model_equalizes_before_its_rounds():
     models = [make_model("model=recurrent", "skip=exact", f"rounds.gains={on}") for on in ("false", "true")]
     models[1].keeps_drafts = True
     with torch.no_grad():
-        plain, equal = (model.eval()(dark) for model in models)
+        plain, equal = (predict(model.eval(), dark) for model in models)
     photos = dark.images.flatten(0, 1).flatten(2).mT
     own = photos[plain.gaussians.image, plain.gaussians.pixel]
     torch.testing.assert_close(plain.gaussians.colors, own)

@@ -12,12 +12,12 @@ from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.losses import terms
 from ghgs_lit.method.model import GHGS
-from ghgs_lit.method.rounds import RoundsOptions
+from ghgs_lit.method.rounds import NoRounds, RoundsOptions
 from ghgs_lit.rendering import render
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.types import Targets
 from tests.helpers.losses import losses_of
-from tests.helpers.models import ATTRIBUTES, close, config, make_model
+from tests.helpers.models import ATTRIBUTES, close, config, make_model, predict
 from tests.helpers.scenes import make_batch
 
 RECURRENT = ("model=recurrent", "skip=exact", "rounds.hidden=16", "rounds.depths=4")
@@ -35,15 +35,15 @@ def model(*overrides, kick=0.0, seed=0):
 def test_untrained_rounds_change_nothing():
     batch, recurrent = make_batch(2, 3), model("rounds.gains=false")
     with torch.no_grad():
-        found = recurrent(batch)
-        recurrent.rounds = None
-        expected = recurrent(batch)
+        found = predict(recurrent, batch)
+        recurrent.rounds = NoRounds()
+        expected = predict(recurrent, batch)
     assert torch.equal(found.depth, expected.depth)
     for name in ATTRIBUTES:
         assert torch.equal(getattr(found.gaussians, name), getattr(expected.gaussians, name)), name
     assert len(found.rounds) == 3
     assert len(found.drafts) == 2
-    assert not model("rounds.gains=false").train()(batch).drafts  # nothing reads them
+    assert not predict(model("rounds.gains=false").train(), batch).drafts  # nothing reads them
     assert torch.equal(found.depth, found.rounds[-1].depth)
 
 
@@ -54,7 +54,7 @@ def test_more_rounds_than_trained_stay_within_bounds(count):
     wild = model(kick=30.0)
     wild.rounds.count = count
     with torch.no_grad():
-        found = wild(batch)
+        found = predict(wild, batch)
     assert len(found.rounds) == count + 1
     for maps in found.rounds[1:]:
         depth, bounds = maps.depth[maps.valid], maps.bounds
@@ -71,7 +71,7 @@ def test_gaussians_that_are_replaced_need_no_gradient():
     batch, kicked = make_batch(1, 4), model("rounds.training_counts=[2]", kick=0.1)
     learned, found = [p for p in kicked.parameters() if p.requires_grad], []
     for is_training in (False, True):
-        gaussians = kicked.train(is_training)(batch).gaussians
+        gaussians = predict(kicked.train(is_training), batch).gaussians
         loss = sum(getattr(gaussians, name).square().mean() for name in ATTRIBUTES)
         slopes = torch.autograd.grad(loss, learned, allow_unused=True, materialize_grads=True)
         found.append(torch.cat([slope.flatten() for slope in slopes]))
@@ -82,16 +82,17 @@ def test_gaussians_that_are_replaced_need_no_gradient():
 def test_a_batch_equals_its_elements_and_the_order_of_other_views_does_not_matter():
     batch, kicked = make_batch(2, 4), model(kick=0.5)
     with torch.no_grad():
-        together = kicked(batch)
+        together = predict(kicked, batch)
         alone = [
-            kicked(
+            predict(
+                kicked,
                 dataclasses.replace(
                     batch,
                     images=batch.images[b : b + 1],
                     masks=batch.masks[b : b + 1],
                     cameras=batch.cameras[b : b + 1],
                     depths=None,
-                )
+                ),
             )
             for b in range(2)
         ]
@@ -102,7 +103,7 @@ def test_a_batch_equals_its_elements_and_the_order_of_other_views_does_not_matte
 def test_gradients_reach_every_weight_and_every_round_is_supervised():
     batch = make_batch(1, 3)
     kicked = model(kick=0.1).train()
-    prediction = kicked(batch)
+    prediction = predict(kicked, batch)
     rendering = render(prediction.gaussians, batch.cameras)
     loss = (rendering.image - batch.images).abs().mean() + terms.depth(prediction, rendering, batch)
     loss.backward()
@@ -119,7 +120,7 @@ def test_gradients_reach_every_weight_and_every_round_is_supervised():
 def test_half_precision_gives_finite_values():
     batch, kicked = make_batch(1, 3), model(kick=0.5)
     with torch.no_grad(), torch.autocast("cpu", dtype=torch.bfloat16):
-        found = kicked(batch)
+        found = predict(kicked, batch)
     for name in ATTRIBUTES:
         value = getattr(found.gaussians, name)
         assert value.dtype == torch.float32, name
@@ -146,7 +147,7 @@ def test_options_are_checked():
 def test_what_padding_added_is_cut_off_every_round():
     batch = make_batch(1, 2, 50, 50)
     with torch.no_grad():
-        found = model("model.pad=multiple", "model.frame=world", kick=0.1)(batch)
+        found = predict(model("model.pad=multiple", "model.frame=world", kick=0.1), batch)
     assert torch.equal(found.rounds[-1].depth, found.depth)
     assert {maps.depth.shape for maps in found.rounds} == {batch.masks.shape}
     assert found.drafts
@@ -180,7 +181,7 @@ def test_each_round_changes_half_as_much_as_the_one_before():
     states = []
     recurrent.rounds.register_forward_hook(lambda module, inputs, found: states.extend(found))
     with torch.no_grad():
-        recurrent(batch)
+        predict(recurrent, batch)
     for name in ("offset", "scale", "rotation", "opacity"):
         values = [getattr(state.raw, name) for state in states]
         for number, (before, after) in enumerate(itertools.pairwise(values)):
@@ -199,7 +200,7 @@ def test_depths_are_compared_between_near_and_far_only(monkeypatch):
     batch, wild = make_batch(1, 4), model(kick=30.0)
     wild.rounds.count = 1
     with torch.no_grad():
-        maps = wild(batch).rounds[1]
+        maps = predict(wild, batch).rounds[1]
     depth, near, far = (x[maps.valid] for x in (maps.depth, maps.bounds.near, maps.bounds.far))
     assert (depth >= near - 1e-5 * depth).all()
     assert (depth <= far + 1e-5 * depth).all()

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from ghgs_lit import GHGS
 from ghgs_lit.evaluation.tables.variants import model_variant
 from ghgs_people.figures.body import BODY_VERTICES, load_body
+from tests.helpers.models import load_model
 from tests.helpers.people import render_boxes
 from tests.helpers.verbs import ghgs
 
@@ -84,7 +84,7 @@ def test_a_model_starts_from_it_and_leaves_it_as_it_is(pretrained, data, tmp_pat
     assert len(branch) > 10
     for name in branch:
         assert torch.equal(before[name], after[name]), name
-    model = GHGS.from_checkpoint(tmp_path / "checkpoints" / "last.ckpt")
+    model = load_model(tmp_path / "checkpoints" / "last.ckpt")
     for name, value in model.encoder.semantic.named_parameters():
         assert torch.equal(value, before[f"model.encoder.semantic.{name}"]), name
         assert not value.requires_grad

@@ -12,6 +12,7 @@ from ghgs_lit.config import run_of
 from ghgs_lit.diagnostics.stress import inputs
 from ghgs_lit.diagnostics.stress.stage import Stage, Values, case_by_case
 from ghgs_lit.diagnostics.stress.stages.geometry import batch_of, scene
+from ghgs_lit.execution import Predictor
 from ghgs_lit.losses import Losses
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.rendering import render
@@ -37,7 +38,7 @@ def _models(name: str, kicked: bool) -> dict[torch.dtype, GHGS]:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(3)
         if name == SHIPPED:
-            model = GHGS.from_checkpoint()
+            model = Predictor.from_checkpoint().model
         else:
             model = GHGS.from_config(run_of("train", [f"model={name}", *_TINY]).plain)
         for parameter in model.parameters():
@@ -82,7 +83,7 @@ def _model(name: str, v: Values, training: bool) -> GHGS:
 
 def _predict(name: str, v: Values) -> Values:
     batch = batch_of(v)
-    return _dense(_model(name, v, training=name not in _ROUNDS)(batch), batch)
+    return _dense(Predictor(_model(name, v, training=name not in _ROUNDS))(batch), batch)
 
 
 _LOSSES = Losses(weights={"chamfer": 0.0, "depth": 1.0})  # Chamfer has a stage of its own
@@ -100,7 +101,7 @@ def _step(name: str, v: Values) -> Values:
     batch = replace(batch_of(one), targets=targets, body_vertices=[surface], depths=one["truth"])
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(1)  # of which the number of rounds is drawn
-        prediction = model(batch)
+        prediction = Predictor(model)(batch)
     rendering = render(prediction.gaussians, cameras, "reference" if exact else "cpu")
     total, values = _LOSSES(prediction, rendering, batch)
     slopes = torch.autograd.grad(total, list(model.parameters()), allow_unused=True)

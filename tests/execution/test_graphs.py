@@ -11,9 +11,9 @@ import pytest
 import torch
 from torch import nn
 
-from ghgs_lit.runtime import recording
+from ghgs_lit.execution import graphs
+from ghgs_lit.execution.graphs import GraphCache
 from ghgs_lit.runtime.precision import precision_of
-from ghgs_lit.runtime.recording import Recorder
 from ghgs_lit.types import Batch, Cameras
 from tests.helpers.pretend_device import DEVICE, pretend_device
 from tests.helpers.tape import OperatorTape
@@ -28,7 +28,7 @@ def no_gradient():
 
 
 def made(**options):
-    return Recorder(tape=OperatorTape(HERE), **options)
+    return GraphCache(tape=OperatorTape(HERE), **options)
 
 
 def numbers(seed, *shape):
@@ -48,13 +48,13 @@ def work(values):
 
 def test_other_values_give_what_an_eager_call_gives():
     """From the third call on nothing but the recording runs, and results keep their memory."""
-    recorder, calls = made(), []
+    cache, calls = made(), []
 
     def counted(values):
         calls.append(None)
         return work(values)
 
-    found = [recorder(counted, (numbers(seed), numbers(seed + 50))) for seed in range(6)]
+    found = [cache(counted, (numbers(seed), numbers(seed + 50))) for seed in range(6)]
     for seed, result in enumerate(found):
         wanted = work((numbers(seed), numbers(seed + 50)))
         assert torch.equal(result["best"], wanted["best"])
@@ -62,12 +62,12 @@ def test_other_values_give_what_an_eager_call_gives():
         assert result["order"][1:] == (3, "name")
         assert result["best"] is result["same"]
     assert len(calls) == 3  # as always, once before the recording, and for it
-    assert recorder.counts == {"eager": 1, "recorded": 1, "played": 4}
+    assert cache.counts == {"eager": 1, "captured": 1, "replayed": 4}
 
 
 def test_dataclasses_come_back_with_what_they_keep():
     """Values beside fields are inputs like fields: recorded functions may rely on them."""
-    recorder = made()
+    cache = made()
 
     def moved(cameras):
         extrinsics = cameras.extrinsics + vars(cameras)["noted"]
@@ -76,15 +76,15 @@ def test_dataclasses_come_back_with_what_they_keep():
     for seed in range(4):
         cameras = Cameras(numbers(seed, 2, 3, 3), numbers(seed, 2, 4, 4), 5, 6)
         vars(cameras)["noted"] = numbers(seed + 9, 2, 4, 4)
-        found = recorder(moved, cameras)
+        found = cache(moved, cameras)
         assert torch.equal(found.extrinsics, cameras.extrinsics + vars(cameras)["noted"])
         assert (found.height, found.width) == (5, 6)
-    assert recorder.counts["played"] == 2
+    assert cache.counts["replayed"] == 2
 
 
 def test_what_a_call_keeps_is_computed_by_the_recording():
     """The call before it has computed it, too, of inputs that are not those to come."""
-    recorder = made()
+    cache = made()
 
     def shifted(batch):
         return batch.images + batch.once(of_images)
@@ -97,8 +97,8 @@ def test_what_a_call_keeps_is_computed_by_the_recording():
         batch = Batch(
             images, images[:, :, 0] > 0, Cameras(numbers(1, 1, 1, 3, 3), numbers(1, 1, 1, 4, 4), 2, 2)
         )
-        assert torch.equal(recorder(shifted, batch), images + images.sum())
-    assert recorder.counts["played"] == 2
+        assert torch.equal(cache(shifted, batch), images + images.sum())
+    assert cache.counts["replayed"] == 2
 
 
 def bfloat16():
@@ -129,12 +129,12 @@ NAMES = ["shape", "dtype", "number", "type", "structure", "key", "autocast", "gr
 @pytest.mark.parametrize("name", NAMES)
 def test_each_difference_is_a_class_of_its_own(name):
     """What a recording fixes must be the same."""
-    recorder = made()
+    cache = made()
     for each in ("usual", "usual", name, "usual"):
         case = other_class(each)
         with case["around"]:
-            recorder(lambda values: values[0] + values[1], case["inputs"], case["key"])
-    assert recorder.counts == {"eager": 2, "recorded": 1, "played": 1}
+            cache(lambda values: values[0] + values[1], case["inputs"], case["key"])
+    assert cache.counts == {"eager": 2, "captured": 1, "replayed": 1}
 
 
 def test_rounding_of_products_is_a_class_of_its_own():
@@ -142,7 +142,7 @@ def test_rounding_of_products_is_a_class_of_its_own():
     kinds = []
     for name in ("usual", "rounding"):
         with other_class(name)["around"]:
-            kinds.append(recording._surroundings("cuda"))
+            kinds.append(graphs._surroundings("cuda"))
     assert kinds[0] != kinds[1]
 
 
@@ -183,124 +183,114 @@ REFUSED = {
 @pytest.mark.parametrize("function", REFUSED)
 def test_what_cannot_be_played_back_stays_eager(function):
     """It is said once, with the reason, and the answer is right."""
-    recorder = made()
-    recorder(function, (numbers(0), numbers(1)))
+    cache = made()
+    cache(function, (numbers(0), numbers(1)))
     with pytest.warns(UserWarning, match=REFUSED[function]):
-        recorder(function, (numbers(0), numbers(1)))
+        cache(function, (numbers(0), numbers(1)))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for seed in range(3):
             values = (numbers(seed), numbers(seed + 1))
-            assert torch.equal(recorder(function, values), function(values))
-            recorder(function, (*values, seed))
-            recorder(function, (*values, seed))
-    assert recorder.counts["refused"] == 4
-    assert recorder.counts["recorded"] == 0
+            assert torch.equal(cache(function, values), function(values))
+            cache(function, (*values, seed))
+            cache(function, (*values, seed))
+    assert cache.counts["refused"] == 4
+    assert cache.counts["captured"] == 0
 
 
 def refusal(function, values):
     """Why a function is not recorded on the pretend device."""
-    recorder = Recorder(tape=OperatorTape(), eager=0)
-    with pytest.warns(UserWarning, match="not recorded"):
-        recorder(function, values)
-    return recorder.reason
+    cache = GraphCache(tape=OperatorTape(), eager=0)
+    with pytest.warns(UserWarning, match="not captured"):
+        cache(function, values)
+    return cache.reasons[-1]
 
 
 def test_copies_from_the_host_are_refused():
     """A recording would read memory that holds something else by then;
     a waiting copy fails on CUDA."""
-    recorder = Recorder(tape=OperatorTape())
+    cache = GraphCache(tape=OperatorTape())
     with pretend_device():
         values = numbers(0).to(DEVICE)
-        recorder(lambda x: x + torch.tensor([1.0, 2.0, 3.0], device=x.device), values)
+        cache(lambda x: x + torch.tensor([1.0, 2.0, 3.0], device=x.device), values)
         with pytest.warns(UserWarning, match=r"the host's memory is copied by aten::\w+"):
-            recorder(lambda x: x + torch.tensor([1.0, 2.0, 3.0], device=x.device), values)
+            cache(lambda x: x + torch.tensor([1.0, 2.0, 3.0], device=x.device), values)
         assert "a value is read" in refusal(lambda x: x + len(x.tolist()), values)
         for _ in range(3):
-            found = recorder(lambda x: x + torch.ones(3, device=x.device), values, key="made there")
+            found = cache(lambda x: x + torch.ones(3, device=x.device), values, key="made there")
         assert torch.equal(found.cpu(), numbers(0) + 1)
-    assert recorder.counts["played"] == 1
+    assert cache.counts["replayed"] == 1
 
 
 def test_tensors_of_other_devices_are_not_recorded():
     """Recordings act on one type of device; all else is eager, and nothing is said."""
-    recorder = Recorder(tape=OperatorTape())
+    cache = GraphCache(tape=OperatorTape())
     for _ in range(3):
-        recorder(work, (numbers(0), numbers(1)))
-    assert recorder.counts == {"eager": 3}
+        cache(work, (numbers(0), numbers(1)))
+    assert cache.counts == {"eager": 3}
 
 
 def test_an_unhashable_value_is_eager():
     """It cannot be compared with what was recorded."""
-    recorder = made()
+    cache = made()
     for _ in range(3):
-        recorder(lambda values: values[0] + 1, (numbers(0), {"a": {1}}))
-    assert recorder.counts == {"eager": 3}
+        cache(lambda values: values[0] + 1, (numbers(0), {"a": {1}}))
+    assert cache.counts == {"eager": 3}
 
 
 def test_the_least_recently_used_recording_makes_room():
     """And is recorded again when it comes back."""
-    recorder = made(limit=2)
+    cache = made(limit=2)
     for size in (1, 1, 2, 2, 1, 3, 3):  # 2 leaves
-        recorder(lambda x: x + 1, numbers(0, size))
-    assert recorder.counts == {"eager": 3, "recorded": 3, "played": 1}
-    recorder(lambda x: x + 1, numbers(0, 1))
-    recorder(lambda x: x + 1, numbers(0, 2))
-    assert recorder.counts == {"eager": 3, "recorded": 4, "played": 2}
-    assert len(recorder._recordings) == 2
+        cache(lambda x: x + 1, numbers(0, size))
+    assert cache.counts == {"eager": 3, "captured": 3, "replayed": 1}
+    cache(lambda x: x + 1, numbers(0, 1))
+    cache(lambda x: x + 1, numbers(0, 2))
+    assert cache.counts == {"eager": 3, "captured": 4, "replayed": 2}
+    assert len(cache._graphs) == 2
 
 
 def test_memory_of_caches_is_kept():
     """A cache may forget a table that a recording reads."""
-    recorder = made()
+    cache = made()
     address = table(3).data_ptr()
     for seed in range(3):
-        found = recorder(lambda x: x + table(3), numbers(seed))
+        found = cache(lambda x: x + table(3), numbers(seed))
         table(4)
         if seed == 0:
             address = table(3).data_ptr()
     assert torch.equal(found, numbers(2) + torch.arange(3.0))
-    kept = [storage.data_ptr() for each in recorder._recordings.values() for storage in each.kept]
+    kept = [storage.data_ptr() for each in cache._graphs.values() for storage in each.kept]
     assert address in kept or table(3).data_ptr() in kept
 
 
 def test_weights_that_change_in_place_are_seen():
     """Training writes them where they are; after they have moved, all is recorded again."""
-    recorder, layer = made(), nn.Linear(3, 2)
+    cache, layer = made(), nn.Linear(3, 2)
     for seed in range(3):
-        recorder(layer, numbers(seed))
+        cache(layer, numbers(seed))
     layer.weight.add_(1.0)
-    assert torch.equal(recorder(layer, numbers(5)), layer(numbers(5)))
+    assert torch.equal(cache(layer, numbers(5)), layer(numbers(5)))
     layer.weight = nn.Parameter(numbers(6, 2, 3))
-    recorder.clear()
+    cache.clear()
     for seed in range(3):
-        assert torch.equal(recorder(layer, numbers(seed)), layer(numbers(seed)))
-    assert recorder.counts == {"eager": 2, "recorded": 2, "played": 3}
+        assert torch.equal(cache(layer, numbers(seed)), layer(numbers(seed)))
+    assert cache.counts == {"eager": 2, "captured": 2, "replayed": 3}
 
 
 def test_casts_of_weights_are_recorded_with_what_reads_them():
     """Autocast shares casts within a context; a recording reads the weights again."""
-    recorder, layer = made(), nn.Linear(3, 2)
+    cache, layer = made(), nn.Linear(3, 2)
     with bfloat16():
         for seed in range(3):
-            recorder(layer, numbers(seed))
+            cache(layer, numbers(seed))
         layer.weight.mul_(-2.0)
         torch.clear_autocast_cache()
-        assert torch.equal(recorder(layer, numbers(5)), layer(numbers(5)))
-
-
-def test_a_class_can_be_forgotten():
-    """Such as one with too little room for what has come since."""
-    recorder = made()
-    for _ in range(3):
-        recorder(work, (numbers(0), numbers(1)), key=1)
-    recorder.forget((numbers(2), numbers(3)), key=1)
-    recorder(work, (numbers(0), numbers(1)), key=1)
-    assert recorder.counts == {"eager": 1, "recorded": 2, "played": 1}
+        assert torch.equal(cache(layer, numbers(5)), layer(numbers(5)))
 
 
 def test_where_memory_is_lacking_recordings_make_room():
-    """Those of all recorders, for good; without any, or where a call has written, the error stands."""
+    """Those of all caches; without any, or where a call has written, the error stands."""
     holder, other = made(), made()
     for seed in range(2):
         holder(work, (numbers(seed), numbers(seed)))
@@ -313,21 +303,24 @@ def test_where_memory_is_lacking_recordings_make_room():
 
     with pytest.raises(torch.OutOfMemoryError):
         made()(large, numbers(0), written=[torch.ones(1)])
-    assert holder._recordings
+    assert holder._graphs
     failures = iter([True, False, True])
     with pytest.warns(UserWarning, match="too little memory"):
         assert torch.equal(other(large, numbers(0)), numbers(0) + 1)
     with pytest.raises(torch.OutOfMemoryError):  # nothing is left that could make room
         other(large, numbers(0), key="another")
-    before = holder.counts["eager"]
+    assert not holder._graphs
     for seed in range(3):
         holder(work, (numbers(seed), numbers(seed)))
-    assert holder.counts["eager"] == before + 3
+    assert holder.counts == {"eager": 2, "captured": 2, "replayed": 1}
 
 
-def test_a_recording_that_finds_too_little_memory_is_let_go_first():
-    """The call that follows needs the memory that the error would keep."""
-    recorder, alive, calls = made(), [], []
+def test_a_capture_that_finds_too_little_memory_is_let_go_first():
+    """The call that follows needs the memory that the error would keep. Graphs make room, and later
+    calls are captured again."""
+    holder, cache, alive, calls = made(), made(), [], []
+    for seed in range(2):
+        holder(work, (numbers(seed), numbers(seed)))
 
     def large(values):
         calls.append(None)
@@ -338,10 +331,13 @@ def test_a_recording_that_finds_too_little_memory_is_let_go_first():
         assert all(each() is None for each in alive)
         return values + 1
 
-    recorder(large, numbers(0))
-    with pytest.warns(UserWarning, match="out of memory"):
-        recorder(large, numbers(0))
-    assert recorder.counts == {"eager": 1, "refused": 1}
+    cache(large, numbers(0))
+    with pytest.warns(UserWarning, match="too little memory was left beside the graphs"):
+        assert torch.equal(cache(large, numbers(1)), numbers(1) + 1)
+    assert not holder._graphs
+    for seed in range(3):
+        assert torch.equal(cache(large, numbers(seed)), numbers(seed) + 1)
+    assert cache.counts == {"eager": 1, "captured": 1, "replayed": 2}
 
 
 class Held:
@@ -350,12 +346,12 @@ class Held:
 
 def test_what_comes_again_too_late_is_not_recorded():
     """Recordings would push each other out before they are played back."""
-    recorder = Recorder(limit=2, tape=OperatorTape("cpu"), recent=2)
+    cache = GraphCache(limit=2, tape=OperatorTape("cpu"), recent=2)
     for _ in range(3):
         for size in (1, 2, 3):
-            recorder(torch.neg, torch.ones(size))
-    assert dict(recorder.counts) == {"eager": 9}
+            cache(torch.neg, torch.ones(size))
+    assert dict(cache.counts) == {"eager": 9}
     for _ in range(3):
-        recorder(torch.neg, torch.ones(3))
-    assert dict(recorder.counts) == {"eager": 9, "recorded": 1, "played": 2}
-    assert copy.deepcopy(recorder).recent == 2
+        cache(torch.neg, torch.ones(3))
+    assert dict(cache.counts) == {"eager": 9, "captured": 1, "replayed": 2}
+    assert copy.deepcopy(cache).recent == 2

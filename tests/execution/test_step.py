@@ -1,4 +1,4 @@
-"""Training steps that are played back, on the pretend device with a stand-in for CUDA graphs."""
+"""Captured training steps, on the pretend device with a stand-in for CUDA graphs."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -11,14 +11,13 @@ from torch.utils.data import DataLoader
 
 from benchmarks.device import drawing_nothing
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
-from ghgs_lit.method.playback import Playback
+from ghgs_lit.execution import Predictor, step
+from ghgs_lit.execution.graphs import GraphCache
+from ghgs_lit.execution.step import CapturedStep
 from ghgs_lit.rendering import capacity
 from ghgs_lit.rendering.api import Renderer
-from ghgs_lit.runtime.recording import Recorder
-from ghgs_lit.runtime.watching import is_watched
-from ghgs_lit.training import GHGSModule, Optimization, captured
+from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.averaging import Averaging
-from ghgs_lit.training.captured import is_recordable, played
 from ghgs_lit.training.cost import Costs
 from tests.helpers.losses import losses_of
 from tests.helpers.models import make_model
@@ -39,13 +38,24 @@ def there():
     torch.set_num_threads(threads)
 
 
-def recording(*overrides):
-    """A model in training that records its steps, with two rounds if it has some."""
-    model = make_model(*overrides).to(DEVICE).train()
-    model.playback = Playback(*(Recorder(tape=OperatorTape()) for _ in range(2)))
-    if model.rounds is not None:
-        model.rounds._drawn = lambda: 2
-    return model
+def training(*overrides):
+    """A model in training, with two rounds if it has some."""
+    two = ("rounds.training_counts=[2]",) * ("model=recurrent" in overrides)
+    return make_model(*overrides, *two).to(DEVICE).train()
+
+
+def capturing(model, losses=LOSSES, tape=OperatorTape, capture="auto"):
+    """The captured step of a model."""
+    predictor = Predictor(model)
+    predictor.options = predictor.options.replace(capture=capture)
+    return of_tape(CapturedStep(predictor, Renderer(), losses), tape)
+
+
+def of_tape(captured, tape):
+    """A captured step with a stand-in for CUDA graphs."""
+    captured.predictor.graphs = GraphCache(limit=16, tape=tape())
+    captured.graphs = GraphCache(limit=32, recent=8, tape=tape())
+    return captured
 
 
 def scene(size=1, color=1.0, holes=0):
@@ -67,7 +77,7 @@ def slopes(model, total):
 
 def called(model, batch, losses=LOSSES):
     """The loss and its terms, operator by operator."""
-    prediction = model(batch)
+    prediction = Predictor(model)(batch)
     rendering = Renderer()(prediction.gaussians, batch.targets.cameras)
     return *losses(prediction, rendering, batch), len(prediction.gaussians)
 
@@ -78,12 +88,13 @@ def called(model, batch, losses=LOSSES):
 )
 def test_losses_and_gradients_are_those_of_a_step_that_is_called(kind, size, losses):
     """Of other batches of a class, also where a loss is divided among parts of a step."""
-    model = recording(kind)
+    model = training(kind)
+    captured = capturing(model, losses)
     for holes, color in ((0, 1.0), (1, 0.9), (2, 0.8)):
         batch = scene(size, color, holes)
         total, values, gaussians = called(model, batch, losses)
         wanted = slopes(model, total / 2)
-        found = played(model, Renderer(), losses, batch)
+        found = captured(batch)
         assert found.gaussians == gaussians
         torch.testing.assert_close(found.total.detach().cpu(), total.detach().cpu(), rtol=1e-6, atol=0)
         assert {name: float(value.cpu()) for name, value in found.values.items()} == pytest.approx(
@@ -93,55 +104,56 @@ def test_losses_and_gradients_are_those_of_a_step_that_is_called(kind, size, los
         assert slope.keys() == wanted.keys()
         for name in wanted:
             assert (slope[name] - wanted[name]).abs().max() <= 1e-5 * wanted[name].abs().max(), name
-    assert dict(model.playback.steps.counts) == {"eager": 1, "recorded": 1, "played": 1}
+    assert dict(captured.graphs.counts) == {"eager": 1, "captured": 1, "replayed": 1}
 
 
 def test_a_factor_of_the_loss_changes_no_gradient():
     """The same one or another, with the gradients of a step that is called."""
-    model, batch = recording("model=paper"), scene()
+    model, batch = training("model=paper"), scene()
+    captured = capturing(model)
     wanted = slopes(model, called(model, batch)[0])
     for exponent in (10, 16, 12):
         scale = torch.full((), 2.0**exponent, device=DEVICE)
-        found = played(model, Renderer(), LOSSES, batch, scale)
+        found = captured(batch, scale)
         slope = slopes(model, found.total * scale)
         for name in wanted:
             wrong = (slope[name] / 2.0**exponent - wanted[name]).abs().max()
             assert wrong <= 1e-5 * wanted[name].abs().max(), name
-    assert dict(model.playback.steps.counts) == {"eager": 1, "recorded": 1, "played": 1}
+    assert dict(captured.graphs.counts) == {"eager": 1, "captured": 1, "replayed": 1}
 
 
 def test_gradients_of_float16_do_not_underflow():
     """2^-26 is 0 in float16, and its multiple is not."""
     weight = torch.ones(4, requires_grad=True)
     total = ((weight.half() * 2.0**-14).sum() * 2.0**-12).float()
-    assert captured._differentiated(total, [weight], None)[0].abs().max() == 0
+    assert step._differentiated(total, [weight], None)[0].abs().max() == 0
     total = ((weight.half() * 2.0**-14).sum() * 2.0**-12).float()
-    (slope,) = captured._differentiated(total, [weight], torch.tensor(2.0**10))
+    (slope,) = step._differentiated(total, [weight], torch.tensor(2.0**10))
     assert torch.equal(slope, torch.full((4,), 2.0**-26))
 
 
 def test_weights_that_move_are_read_where_they_are():
     """An optimizer moves them in place; the next step that is played back sees it."""
-    model, batch = recording("model=paper"), scene()
+    model, batch = training("model=paper"), scene()
+    captured = capturing(model)
     optimizer = torch.optim.SGD(model.parameters(), lr=1e-2)
     totals = []
     for _ in range(4):
-        found = played(model, Renderer(), LOSSES, batch)
+        found = captured(batch)
         totals.append(float(found.total.detach().cpu()))
         wanted = float(called(model, batch)[0].detach().cpu())
         assert totals[-1] == pytest.approx(wanted, rel=1e-6)
         slopes(model, found.total)
         optimizer.step()
     assert len(set(totals)) == 4
-    model.to(DEVICE)
-    assert not model.playback.steps._recordings
 
 
 def trained(folder, capture):
-    """Weights after four steps of two batches each, and how often passes were played back."""
-    model = recording("model=hull")
-    model.options = model.options.model_copy(update={"capture": capture})
+    """Weights after four steps of two batches each, and how often passes were replayed."""
+    model = training("model=hull")
     module = GHGSModule(model, Renderer(), LOSSES, Optimization(lr=1e-2, warmup=0.0))
+    captured = of_tape(module.captured_step, OperatorTape)
+    captured.predictor.options = captured.predictor.options.replace(capture=capture)
     batches = [scene(color=1 - number / 20, holes=number).to("cpu") for number in range(4)]
     trainer = L.Trainer(
         strategy=SingleDeviceStrategy(DEVICE, PretendAccelerator()), max_steps=4, accumulate_grad_batches=2,
@@ -150,7 +162,7 @@ def trained(folder, capture):
     )  # fmt: skip
     trainer.fit(module, DataLoader(batches, batch_size=None, collate_fn=lambda batch: batch))
     weights = {name: weight.detach().cpu() for name, weight in model.named_parameters()}
-    return weights, model.playback.steps.counts["played"]
+    return weights, captured.graphs.counts["replayed"]
 
 
 def test_a_training_comes_to_the_same_weights(tmp_path):
@@ -176,14 +188,14 @@ class Asked(L.Callback):
 
 def test_a_step_of_a_training_asks_for_little(there, tmp_path, monkeypatch):
     """In Lightning's loop: waits for the plan, for the room of renderings, and for the guard."""
-    model, asked = recording("model=hull"), Asked(there)
-    model.playback = Playback(*(Recorder(tape=SilentTape()) for _ in range(2)))
+    model, asked = training("model=hull"), Asked(there)
     module = GHGSModule(model, Renderer(), LOSSES, Optimization(lr=1e-2, matrix_scale=1.0))
+    of_tape(module.captured_step, SilentTape)
     configured = module.configure_optimizers
 
     def recording_too():
         answer = configured()
-        answer["optimizer"].recorder = Recorder(tape=SilentTape())
+        answer["optimizer"].graphs = GraphCache(tape=SilentTape())
         return answer
 
     monkeypatch.setattr(module, "configure_optimizers", recording_too)
@@ -200,87 +212,131 @@ def test_a_step_of_a_training_asks_for_little(there, tmp_path, monkeypatch):
     assert launches <= 80 < asked.found[0][0]
 
 
-def test_rounds_are_drawn_once_and_are_a_class_each():
-    model, batch = recording("model=recurrent"), scene()
-    counts = iter([1, 1, 2, 1])
-    model.rounds._drawn = lambda: next(counts)
-    for _ in range(4):
-        played(model, Renderer(), LOSSES, batch)
-    assert next(counts, None) is None
-    assert dict(model.playback.steps.counts) == {"eager": 2, "recorded": 1, "played": 1}
+def test_rounds_are_drawn_once_and_are_a_bucket_each():
+    model, batch = training("model=recurrent"), scene()
+    captured = capturing(model)
+    for count in (1, 1, 2, 1):
+        with model.rounds.drawn(count):
+            captured(batch)
+    assert dict(captured.graphs.counts) == {"eager": 2, "captured": 1, "replayed": 1}
 
 
-def test_too_little_room_is_answered_by_another_recording(monkeypatch):
-    model, batch = recording("model=paper"), scene()
+def test_too_little_room_is_answered_by_another_training(monkeypatch):
+    captured, batch = capturing(training("model=paper")), scene()
     for _ in range(3):
-        played(model, Renderer(), LOSSES, batch)
+        captured(batch)
     suffice = iter([False])
     monkeypatch.setattr(capacity.Rooms, "suffice", lambda self: next(suffice, True))
-    played(model, Renderer(), LOSSES, batch)
-    assert model.playback.steps.counts["recorded"] == 2
+    captured(batch)
+    assert captured.graphs.counts["captured"] == 2
 
 
 def test_a_batch_that_does_not_fit_is_called_and_prepared_once(monkeypatch):
     """Such as one with subjects so tall that smaller copies are predicted, too."""
-    model, batch = recording("model=paper"), scene()
+    model, batch = training("model=paper"), scene()
     wanted = float(called(model, batch)[0].detach().cpu())
-    prepared, calls = model.prepared, []
-    monkeypatch.setattr(model, "prepared", lambda *given: calls.append(given) or prepared(*given))
-    monkeypatch.setattr(model, "needs_copies", lambda _: True)
-    found = played(model, Renderer(), LOSSES, batch)
+    captured, calls = capturing(model), []
+    predictor = captured.predictor
+    prepare = predictor.prepare
+    monkeypatch.setattr(predictor, "prepare", lambda *given: calls.append(given) or prepare(*given))
+    monkeypatch.setattr(predictor, "needs_copies", lambda _: True)
+    found = captured(batch)
     assert float(found.total.detach().cpu()) == pytest.approx(wanted, rel=1e-6)
     assert len(calls) == 1
-    assert not model.playback.steps.counts
+    assert not captured.graphs.counts
 
 
 def test_sizes_are_kept_while_they_are_enough():
     """Smaller subjects are played back; one that is larger leaves room for others;
     nothing else changes."""
-    model = recording("model=hull", "skip=fast")
+    model = training("model=hull", "skip=fast")
+    captured = capturing(model)
     for share in (0.1, 0.1, 0.07, 0.16, 0.17, 0.05):
         batch = dataclasses.replace(ellipsoid_batch(share, 3, 56, 1), subjects=("a",)).to(DEVICE)
         batch = dataclasses.replace(batch, depths=2.0 * batch.masks)
         total, _, gaussians = called(model, batch)
         wanted = slopes(model, total)
-        found = played(model, Renderer(), LOSSES, batch)
+        found = captured(batch)
         assert found.gaussians == gaussians
         torch.testing.assert_close(found.total.detach().cpu(), total.detach().cpu(), rtol=1e-5, atol=0)
         slope = slopes(model, found.total)
         for name in wanted:
             assert (slope[name] - wanted[name]).norm() <= 1e-4 * wanted[name].norm() + 1e-9, name
-    assert dict(model.playback.steps.counts) == {"eager": 2, "recorded": 2, "played": 2}
+    assert dict(captured.graphs.counts) == {"eager": 2, "captured": 2, "replayed": 2}
 
 
-def test_what_cannot_be_recorded_is_called(monkeypatch):
+def test_what_cannot_be_captured_is_called(monkeypatch):
     """Other devices, renderers and losses, float16 without a factor of the loss, predictions,
     ``model.capture=off``."""
-    model, batch = recording("model=paper"), scene()
-    assert is_recordable(model, Renderer(), LOSSES, batch)
-    assert not is_recordable(model, Renderer(), LOSSES, batch.to("cpu"))
-    assert not is_recordable(model, lambda *_: None, LOSSES, batch)
-    assert not is_recordable(model, Renderer(), lambda *_: None, batch)
+    model, batch = training("model=paper"), scene()
+    captured = capturing(model)
+    assert captured.captures(batch)
+    assert not captured.captures(batch.to("cpu"))
+    for parts in ((lambda *_: None, LOSSES), (Renderer(), lambda *_: None)):
+        assert not of_tape(CapturedStep(Predictor(model), *parts), OperatorTape).captures(batch)
     with monkeypatch.context() as patch:
         patch.setattr(torch, "is_autocast_enabled", lambda *_: True)
         patch.setattr(torch, "get_autocast_dtype", lambda *_: torch.float16)
-        assert not is_recordable(model, Renderer(), LOSSES, batch)
-        assert is_recordable(model, Renderer(), LOSSES, batch, is_scaled=True)
+        assert not captured.captures(batch)
+        assert captured.captures(batch, is_scaled=True)
     model.encoder.aggregator.patch_embed.cache = object()  # tokens on disk
-    assert not is_recordable(model, Renderer(), LOSSES, batch)
+    assert not captured.captures(batch)
     model.encoder.aggregator.patch_embed.cache = None
-    assert not is_recordable(model.eval(), Renderer(), LOSSES, batch)
-    model.train().options = model.options.model_copy(update={"capture": "off"})
-    assert not is_recordable(model, Renderer(), LOSSES, batch)
+    model.eval()
+    assert not captured.captures(batch)
+    assert not capturing(model.train(), capture="off").captures(batch)
 
 
-def test_times_of_a_step_do_not_keep_it_from_being_played_back():
+def test_hooks_see_every_step():
+    """A step of a model that is observed is called eagerly."""
+    model, batch, calls = training("model=paper"), scene(), []
+    captured = capturing(model)
+    model.encoder.register_forward_hook(lambda *_: calls.append(1))
+    with pytest.warns(UserWarning, match="eagerly: a hook of encoder"):
+        captured(batch)
+    for _ in range(3):
+        captured(batch)
+    assert len(calls) == 4
+
+
+def test_padded_views_are_captured():
+    model = training("model=paper", "model.pad=multiple")
+    captured = capturing(model)
+    for color in (1.0, 0.9, 0.8):
+        batch = ellipsoid_batch(0.15, 3, 24, 1)
+        batch = dataclasses.replace(batch, images=color * batch.images, depths=2.0 * batch.masks).to(DEVICE)
+        wanted = float(called(model, batch)[0].detach().cpu())
+        assert float(captured(batch).total.detach().cpu()) == pytest.approx(wanted, rel=1e-6)
+    assert dict(captured.graphs.counts) == {"eager": 1, "captured": 1, "replayed": 1}
+
+
+def test_shape_buckets_are_part_of_a_checkpoint(tmp_path):
+    """A run that goes on from one has the sizes of the run that wrote it."""
+    module = GHGSModule(training("model=hull", "skip=fast"), Renderer(), LOSSES, Optimization(lr=1e-2))
+    captured = of_tape(module.captured_step, OperatorTape)
+    for share in (0.16, 0.05):
+        batch = ellipsoid_batch(share, 3, 56, 1)
+        captured(dataclasses.replace(batch, depths=2.0 * batch.masks).to(DEVICE))
+    path = tmp_path / "state.pt"
+    torch.save(captured.state_dict(), path)
+    other = CapturedStep(Predictor(module.model), Renderer(), LOSSES)
+    other.load_state_dict(torch.load(path, weights_only=True))
+    assert other.buckets == captured.buckets
+    assert len(other.buckets) == 2
+    assert other.buckets.keys() == captured.buckets.keys()
+
+
+def test_times_of_a_step_do_not_keep_it_from_being_captured():
     """The callback that every training has watches stages only where they are called."""
-    model = recording("model=paper")
+    model = training("model=paper")
     for capture, is_free in (("auto", True), ("off", False)):
-        model.options = model.options.model_copy(update={"capture": capture})
-        module = SimpleNamespace(model=model, renderer=Renderer(), losses=LOSSES, device=DEVICE, ready=None)
+        captured = capturing(model, capture=capture)
+        module = SimpleNamespace(
+            model=model, renderer=Renderer(), losses=LOSSES, device=DEVICE, ready=None, captured_step=captured
+        )
         costs = Costs()
         costs.on_train_start(None, module)
-        assert is_watched() != is_free
+        assert bool(model.encoder._forward_hooks) != is_free
         for mark in (costs.on_train_batch_start, costs.on_before_backward, costs.on_after_backward):
             mark(None, module)
         costs.end("optimizer")

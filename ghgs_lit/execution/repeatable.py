@@ -11,7 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 _PACKAGE = Path(__file__).parents[1]
 #: Files whose lines say nothing about what was recorded.
-_OWN = ("recording.py", "tape.py", Path(__file__).name)
+_OWN = ("graphs.py", "tape.py", Path(__file__).name)
 
 
 class NotRecordable(RuntimeError):

@@ -5,8 +5,9 @@ from contextlib import contextmanager
 import pytest
 import torch
 
-from ghgs_lit.runtime import tape
-from ghgs_lit.runtime.recording import CudaTape, Recorder
+from ghgs_lit.execution import tape
+from ghgs_lit.execution.graphs import GraphCache
+from ghgs_lit.execution.tape import CudaTape
 
 
 class Graphs:
@@ -115,7 +116,7 @@ def test_a_recording_that_fails_leaves_the_device_as_it_was(monkeypatch, end_fai
     log, calls, weight = [], [], torch.ones(3)
     stand_in = Graphs(log, end_fails)
     stand_in.install(monkeypatch)
-    recorder = Recorder(tape=CudaTape("cpu"))
+    cache = GraphCache(tape=CudaTape("cpu"))
     cleared = []
     monkeypatch.setattr(torch, "clear_autocast_cache", lambda: cleared.append(len(calls)))
 
@@ -130,13 +131,13 @@ def test_a_recording_that_fails_leaves_the_device_as_it_was(monkeypatch, end_fai
     for number in range(3):
         if number == 1:
             with pytest.warns(UserWarning, match="cannot end" if end_fails else "not permitted"):
-                found = recorder(work, torch.ones(3), written=[weight])
+                found = cache(work, torch.ones(3), written=[weight])
         else:
-            found = recorder(work, torch.ones(3), written=[weight])
+            found = cache(work, torch.ones(3), written=[weight])
         expected += 1
         assert torch.equal(found, 2 * expected)
         assert stand_in.current is stand_in.main
     assert calls == ["main", "side", "side", "main", "main"]
     assert cleared == [1, 2, 3]
-    assert recorder.counts == {"eager": 2, "refused": 1}
+    assert cache.counts == {"eager": 2, "refused": 1}
     tape._side_stream.cache_clear()

@@ -1,0 +1,226 @@
+"""Predictions of a model for batches of any world and size."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from ghgs_lit.errors import choice
+from ghgs_lit.execution.checks import Finding, any_bad, refuse
+from ghgs_lit.execution.graphs import GraphCache, described, with_memory
+from ghgs_lit.execution.options import ModelOptions
+from ghgs_lit.execution.preprocessing import Preprocessing, preprocess
+from ghgs_lit.execution.scene import Scene
+from ghgs_lit.execution.state import ModelState, NotCapturable, state_of
+from ghgs_lit.geometry.padding import PaddedBatch
+from ghgs_lit.method.model import GHGS
+from ghgs_lit.method.plan import Measured, Plan, Sizes
+from ghgs_lit.method.rounds import Coarse, coarse_of, coarse_sizes
+from ghgs_lit.rendering.capacity import settled
+from ghgs_lit.runtime.precision import PRECISIONS, precision_of
+from ghgs_lit.types import Batch, Prediction
+from ghgs_lit.weights.checkpoint import load_weights, read_config
+from ghgs_lit.weights.reading import SHIPPED
+
+
+class Prepared(NamedTuple):
+    """A batch as the stages see it.
+
+    Attributes:
+        batch: preprocessed.
+        plan: of it.
+        done: what was done to it.
+        state: of the model whose work is captured; None: operators are called one by one.
+    """
+
+    batch: Batch
+    plan: Plan
+    done: Preprocessing
+    state: ModelState | None
+
+
+class Predictor:
+    """``predictor(batch) -> Prediction``: checks, the subject's frame, padding, precision, coarse to
+    fine, and CUDA graphs around a model.
+
+    Args:
+        model: the stages.
+        options: what is done around them; None: those of the configuration that built the model.
+        precision: of products, one of :data:`ghgs_lit.runtime.precision.PRECISIONS`.
+        checks_values: reject input views, depths and bodies with NaN or values out of range.
+
+    Attributes:
+        graphs: captured predictions, at most two for each shape bucket.
+
+    Raises:
+        InputError: an option or the precision is unknown.
+    """
+
+    def __init__(
+        self,
+        model: GHGS,
+        options: ModelOptions | None = None,
+        precision: str = "inherit",
+        checks_values: bool = True,
+    ):
+        choice("precision", precision, PRECISIONS)
+        self.model = model
+        self.options = options or ModelOptions.read(model.config.get("model") or {}, "model")
+        self.precision = precision
+        self.checks_values = checks_values
+        self.graphs = GraphCache(limit=16)
+
+    @classmethod
+    def from_checkpoint(
+        cls, path: str | Path = SHIPPED, map_location: Any = "cpu", dtype: torch.dtype | None = None
+    ) -> "Predictor":
+        """The predictor of a checkpoint, in evaluation mode.
+
+        Args:
+            path: of a checkpoint of this package; by default the weights that come with it.
+            map_location: the device that the model is moved to.
+            dtype: precision of the encoder; None: as in the file, where the device has it.
+                Heads are float32.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            InputError: it is not a checkpoint of this package,
+                or its weights are not finite or do not fit.
+        """
+        model = GHGS.from_config(read_config(path), empty=True)
+        load_weights(model, path, dtype, map_location)
+        return cls(model.to(map_location).eval())
+
+    def __call__(self, batch: Batch) -> Prediction:
+        """Gaussians, depths and points in the world of the cameras.
+
+        Args:
+            batch: input views, masks and cameras are read, and mattes and gains if there are any.
+
+        Returns:
+            The prediction in the pixels of the input views,
+            in the unit and the axes of the cameras' world.
+
+        Raises:
+            InputError: the batch does not fit the stages.
+        """
+        return self.finish(self.prepare(batch))
+
+    def prepare(self, batch: Batch, least: Sizes | None = None) -> Prepared:
+        """What precedes the stages.
+
+        Args:
+            batch: as of :meth:`__call__`.
+            least: sizes that the plan keeps as long as they are enough; None: those of the scene.
+
+        Raises:
+            InputError: the batch does not fit the stages.
+        """
+        state = self._state(batch)
+        inside, done, findings, measured = (
+            self._enter(batch) if state is None else self._captured(batch, state)
+        )
+        plan = self.model.plan(inside, measured, least)
+        if plan.flags[1]:
+            refuse(findings)
+        return Prepared(inside, plan, done, state)
+
+    def finish(self, prepared: Prepared) -> Prediction:
+        """The prediction for what is prepared."""
+        with precision_of(self.precision, prepared.batch.masks.device):
+            prediction = self._predict(prepared, self._coarse(prepared))
+        return prepared.plan.trimmed(prediction)
+
+    @property
+    def side_multiple(self) -> int:
+        """The number of pixels that must divide height and width of input views."""
+        return self.options.side_multiple(self.model.encoder.patch_size)
+
+    def needs_copies(self, batch: Batch) -> bool:
+        """Whether subjects are so tall that smaller copies of their views are predicted, too.
+
+        Args:
+            batch: preprocessed, with extents that a plan has read.
+        """
+        height = self.model.rounds.height
+        return height is not None and any(coarse_sizes(batch, height, self.model.encoder.patch_size))
+
+    def _state(self, batch: Batch) -> ModelState | None:
+        """The state of the model if its work can be captured; the device is looked at first."""
+        if batch.masks.device.type != self.graphs.tape.device or self.options.capture == "off":
+            return None
+        try:
+            return self.graphs.of_weights(state_of(self.model))
+        except NotCapturable as reason:
+            self.graphs.note(str(reason))
+            return None
+
+    def _enter(self, batch: Batch) -> tuple[Batch, Preprocessing, list[Finding], Measured]:
+        patch_size = self.model.encoder.patch_size
+        inside, done, findings = preprocess(batch, self.options, patch_size, self.checks_values)
+        return inside, done, findings, self.model.measure(inside, [any_bad(findings)])
+
+    def _captured(
+        self, batch: Batch, state: ModelState
+    ) -> tuple[Batch, Preprocessing, list[Finding], Measured]:
+        """:meth:`_enter`, captured where no gradient is wanted."""
+        tensors: list[torch.Tensor] = []
+        described(batch, tensors)
+        if any(tensor.requires_grad for tensor in tensors):
+            return self._enter(batch)
+        # Without what was computed of the cameras,
+        # or the same batch would be of another bucket the next time.
+        bare = replace(batch, cameras=replace(batch.cameras), targets=None, subjects=(), views=())
+        key = ("enter", self.options, self.checks_values, state.encoder)
+        with torch.no_grad():
+            inside, *others = self.graphs(self._enter, bare, key)
+        # Targets and names take no part; what was computed of the batch stays with it.
+        vars(inside).update(targets=batch.targets, subjects=batch.subjects, views=batch.views)
+        return inside, *others
+
+    def _predict(self, prepared: Prepared, coarse: Coarse | None) -> Prediction:
+        """The stages and what is undone after them; renderings have room enough."""
+        batch, plan, done, state = prepared
+
+        def predict(
+            batch: Batch, plan: Plan, coarse: Coarse | None, done: Preprocessing | None
+        ) -> Prediction:
+            prediction = self.model(batch, plan, coarse)
+            return prediction if done is None else done.undo(prediction)
+
+        is_eager = state is None or self.model.training or torch.is_grad_enabled()
+        if is_eager or not self.fits(batch, plan):
+            return with_memory(lambda: settled(lambda: predict(batch, plan, coarse, done)))
+        return self.graphs.settled(
+            lambda inputs: predict(*inputs[0].read(), *inputs[1:]),
+            (Scene.of(batch, plan), coarse, done),
+            (self.precision, state.settings),
+        )
+
+    def fits(self, batch: Batch, plan: Plan) -> bool:
+        """Whether the stages can be captured for a batch on a device that captures.
+
+        Args:
+            batch: preprocessed.
+            plan: of it.
+        """
+        if type(batch) not in (Batch, PaddedBatch):
+            self.graphs.note(f"a batch of the class {type(batch).__name__}")
+        elif not plan.is_of_class:
+            self.graphs.note("subjects of fewer pixels than views")
+        else:
+            return True
+        return False
+
+    def _coarse(self, prepared: Prepared) -> Coarse | None:
+        """What is found in smaller copies of views with subjects taller than the rounds know."""
+        model = self.model
+        if model.rounds.height is None:
+            return None
+
+        def predict(small: Batch) -> Prediction:
+            return self._predict(Prepared(small, model.plan(small), None, prepared.state), None)
+
+        sizes = (model.rounds.height, model.encoder.patch_size, self.options.matte)
+        return coarse_of(prepared.batch, *sizes, predict)

@@ -1,0 +1,257 @@
+"""Training steps whose work is captured on a GPU for each shape bucket, and replayed.
+
+A step of a small model needs thousands of launches, and the host takes longer to make them than the
+GPU to run them. What follows a plan depends on sizes alone, in training as in predictions. So the
+stages, the rendering, the loss and the gradients of all weights are one CUDA graph here. What
+surrounds it is called eagerly: the plan before it; hooks of weights, clipping and the optimizer after
+it, which find a loss with a gradient as usual."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from ghgs_lit.execution.graphs import GraphCache
+from ghgs_lit.execution.predictor import Predictor, Prepared
+from ghgs_lit.execution.preprocessing import Preprocessing
+from ghgs_lit.execution.scene import Scene
+from ghgs_lit.losses import Losses
+from ghgs_lit.method.plan import Sizes
+from ghgs_lit.method.plan.window import Span, Window
+from ghgs_lit.rendering.api import Renderer
+from ghgs_lit.runtime.precision import precision_of
+from ghgs_lit.types import Batch
+
+
+class Outcome(NamedTuple):
+    """Of a forward pass.
+
+    Attributes:
+        total: the loss, without dimensions, with a gradient.
+        values: its unweighted terms by name.
+        gaussians: number of Gaussians of the batch.
+    """
+
+    total: Tensor
+    values: dict[str, Tensor]
+    gaussians: int
+
+
+class _Known(torch.autograd.Function):
+    """A loss whose gradients are known: ``apply(total, gradients, *weights)``."""
+
+    @staticmethod
+    def forward(ctx: Any, total: Tensor, gradients: Sequence[Tensor], *weights: nn.Parameter) -> Tensor:
+        ctx.gradients = gradients
+        return total.clone()
+
+    @staticmethod
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
+        gradients = ctx.gradients
+        del ctx.gradients
+        return None, None, *torch._foreach_mul(gradients, slope)
+
+
+class _Pass(nn.Module):
+    """Stages, rendering and loss, whose weights can be replaced by others.
+
+    Args:
+        predictor: has the model of the training.
+        renderer: renders its Gaussians.
+        losses: compares them.
+    """
+
+    def __init__(self, predictor: Predictor, renderer: Renderer, losses: Losses):
+        super().__init__()
+        self.predictor = predictor
+        self.model = predictor.model
+        self.renderer = renderer
+        self.losses = losses
+
+    def forward(self, scene: Scene, done: Preprocessing, seen: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss and its terms. Gaussians that fill a bucket are rendered, too, with opacity 0.
+
+        Args:
+            scene: the batch as the stages see it, and its plan.
+            done: what was done to it.
+            seen: the batch that was given, with targets.
+        """
+        with precision_of(self.predictor.precision, seen.masks.device):
+            prediction = done.undo(self.model(*scene.read()))
+        rendering = self.renderer(prediction.gaussians, seen.targets.cameras)
+        return self.losses(prediction, rendering, seen)
+
+
+class CapturedStep:
+    """``step(batch) -> Outcome``: the forward pass of a training step, captured where it can be.
+
+    Args:
+        predictor: has the model of the training.
+        renderer: of the training; others than this package's may do what depends on values.
+        losses: likewise.
+
+    Attributes:
+        graphs: one for each shape bucket.
+        buckets: sizes so far, by the shape of input views and what their encoder sees. Subjects of
+            other batches are of other sizes, and each bucket would have to be captured. So sizes are
+            kept as long as they are enough for the subjects of a batch.
+    """
+
+    def __init__(self, predictor: Predictor, renderer: Callable, losses: Callable):
+        self.predictor = predictor
+        self.renderer = renderer
+        self.losses = losses
+        self.graphs = GraphCache(limit=32, recent=8)
+        self.buckets: dict[tuple, Sizes] = {}
+
+    def may_capture(self, device: str) -> bool:
+        """Whether steps of the training are of a kind that is captured.
+
+        Args:
+            device: its type.
+        """
+        known = isinstance(self.renderer, Renderer) and isinstance(self.losses, Losses)
+        known = known and not self.losses.weights.model_extra  # terms of a plug-in may do likewise
+        return known and self.predictor.options.capture == "auto" and device == self.graphs.tape.device
+
+    def captures(self, batch: Batch, is_scaled: bool = False) -> bool:
+        """Whether a training step is tried to be captured.
+
+        Args:
+            batch: of the step.
+            is_scaled: whether the loss has a factor.
+
+        Returns:
+            True on a device that captures, with ``model.capture=auto``, where no tokens are read from
+            disk, and a loss with float16 has a factor.
+        """
+        device = batch.masks.device.type
+        model = self.predictor.model
+        if not self.may_capture(device) or not model.training:
+            return False
+        # A plug-in's encoder may not have the attribute.
+        reads_disk = getattr(model.encoder, "keeps_features", False)
+        is_half = torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device) == torch.float16
+        return not reads_disk and (is_scaled or not is_half)  # gradients would underflow
+
+    def __call__(self, batch: Batch, scale: Tensor | None = None) -> Outcome:
+        """The forward pass of a training step, replayed from the third batch of a bucket on.
+
+        A batch with tall subjects, whose sizes are no bucket, or of a model with hooks is called
+        eagerly.
+
+        Args:
+            batch: on the device of the training, with targets; :meth:`captures`.
+            scale: factor of the loss (``16-mixed``), without dimensions; None: 1.
+        """
+        predictor = self.predictor
+        with predictor.model.rounds.drawn():
+            prepared = self._prepare(batch)
+            is_eager = prepared.state is None or not predictor.fits(prepared.batch, prepared.plan)
+            if is_eager or predictor.needs_copies(prepared.batch):
+                prediction = predictor.finish(prepared)
+                rendering = self.renderer(prediction.gaussians, batch.targets.cameras)
+                return Outcome(*self.losses(prediction, rendering, batch), len(prediction.gaussians))
+            targets = dataclasses.replace(batch.targets, names=(), protocols=())
+            bodies = batch.body_vertices if self.losses.weights.chamfer else None
+            seen = dataclasses.replace(batch, targets=targets, body_vertices=bodies, subjects=(), views=())
+            return self._captured(prepared, seen, scale)
+
+    def _prepare(self, batch: Batch) -> Prepared:
+        """What precedes the stages, with a plan of sizes that rarely change."""
+        shape = tuple(batch.masks.shape)
+        encoder = self.predictor.model.encoder
+        view = (*shape, encoder.tokens, encoder.margin)
+        least = self.buckets.get(shape)
+        if least is not None:
+            least = dataclasses.replace(least, kept=self.buckets[view].kept if view in self.buckets else 0)
+        prepared = self.predictor.prepare(batch, least)
+        if prepared.plan.is_of_class:
+            self.buckets[shape] = self.buckets[view] = prepared.plan.sizes
+        return prepared
+
+    def _captured(self, prepared: Prepared, seen: Batch, scale: Tensor | None) -> Outcome:
+        """The loss, whose gradients come from a graph.
+
+        Args:
+            prepared: the batch as the stages see it.
+            seen: the batch that was given, without names.
+            scale: factor of the loss; None: 1.
+        """
+        one_pass = _Pass(self.predictor, self.renderer, self.losses)
+        weights = {name: weight for name, weight in one_pass.named_parameters() if weight.requires_grad}
+
+        def differentiated(inputs: tuple) -> tuple[Tensor, dict[str, Tensor], tuple]:
+            *inputs, scale = inputs
+            # Gradients of the weights themselves would be summed on the stream that first
+            # needed them.
+            twins = {name: weight.detach().requires_grad_() for name, weight in weights.items()}
+            with torch.enable_grad():
+                total, values = functional_call(one_pass, twins, tuple(inputs))
+                gradients = _differentiated(total, list(twins.values()), scale)
+            gradients = tuple(map(_laid_out, gradients, weights.values()))
+            return total.detach(), {name: value.detach() for name, value in values.items()}, gradients
+
+        self.graphs.of_weights(prepared.state)
+        inputs = (Scene.of(prepared.batch, prepared.plan), prepared.done, seen, scale)
+        key = (
+            prepared.state.settings,
+            self.predictor.precision,
+            repr((self.renderer, self.losses)),
+            tuple(weights),
+        )
+        with torch.no_grad():
+            total, values, gradients = self.graphs.settled(differentiated, inputs, key)
+        used = [pair for pair in zip(weights.values(), gradients, strict=True) if pair[1] is not None]
+        known = _Known.apply(total, [gradient for _, gradient in used], *[weight for weight, _ in used])
+        return Outcome(known, values, sum(prepared.plan.counts))
+
+    def state_dict(self) -> list[tuple[tuple, tuple]]:
+        """Shape buckets as plain data: a run that goes on from them computes the same."""
+        return [(key, _plain(sizes)) for key, sizes in self.buckets.items()]
+
+    def load_state_dict(self, state: Sequence[tuple[tuple, tuple]]) -> None:
+        """Go on with the shape buckets of a checkpoint.
+
+        Args:
+            state: of :meth:`state_dict`.
+        """
+        for key, (*rows, window) in state:
+            self.buckets[tuple(key)] = Sizes(*rows, Window(*(Span(*span) for span in window)))
+
+
+def _plain(sizes: Sizes) -> tuple:
+    *rows, window = (getattr(sizes, field.name) for field in dataclasses.fields(sizes))
+    return *rows, tuple(map(tuple, window))
+
+
+def _differentiated(total: Tensor, weights: Sequence[Tensor], scale: Tensor | None) -> list[Tensor | None]:
+    """Gradients of a loss, of float16 as large as those of its multiple.
+
+    Args:
+        total: the loss.
+        weights: of which some may take no part.
+        scale: factor of the loss; None: 1.
+
+    Returns:
+        The gradient of the loss itself for each weight.
+    """
+    with torch.autocast(total.device.type, enabled=False):
+        if scale is None:
+            return list(torch.autograd.grad(total, weights, allow_unused=True))
+        gradients = list(torch.autograd.grad(total * scale, weights, allow_unused=True))
+        used = [number for number, gradient in enumerate(gradients) if gradient is not None]
+        unscaled = torch._foreach_mul([gradients[number] for number in used], 1 / scale)
+        for number, gradient in zip(used, unscaled, strict=True):
+            gradients[number] = gradient
+        return gradients
+
+
+def _laid_out(gradient: Tensor | None, weight: Tensor) -> Tensor | None:
+    """A gradient in the layout of its weight: PyTorch would copy others, one by one."""
+    if gradient is None or gradient.stride() == weight.stride():
+        return gradient
+    return torch.empty_like(weight).copy_(gradient)

@@ -1,0 +1,245 @@
+"""Captured predictions, on the pretend device with a stand-in for CUDA graphs."""
+
+import copy
+import dataclasses
+
+import pytest
+import torch
+
+from benchmarks.device import drawing_nothing
+from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
+from ghgs_lit.execution import Predictor
+from ghgs_lit.execution.graphs import GraphCache
+from ghgs_lit.rendering.capacity import Rooms
+from ghgs_lit.runtime.watching import Watcher, watched
+from tests.helpers.models import ATTRIBUTES, close, make_model
+from tests.helpers.pretend_device import DEVICE, pretend_device
+from tests.helpers.tape import OperatorTape, SilentTape
+
+
+@pytest.fixture(autouse=True)
+def there():
+    """Without a gradient, on the pretend device, on one thread."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    with torch.no_grad(), pretend_device() as log, drawing_nothing():
+        yield log
+    torch.set_num_threads(threads)
+
+
+def capturing(*overrides):
+    """A predictor that captures."""
+    predictor = Predictor(make_model(*overrides).eval().to(DEVICE))
+    predictor.graphs = GraphCache(limit=16, tape=OperatorTape())
+    return predictor
+
+
+def scene(share=0.15, color=1.0, views=2, holes=0, size=28):
+    """Photographs of an ellipsoid that covers a ``share`` of them,
+    with holes in the middle of a mask."""
+    batch = ellipsoid_batch(share, views, size, 1)
+    batch.masks[0, 0, 14, 14 : 14 + holes] = False
+    return dataclasses.replace(batch, images=color * batch.images).to(DEVICE)
+
+
+def counts(predictor):
+    return dict(predictor.graphs.counts)
+
+
+def eager(predictor, batch):
+    """The prediction with ``model.capture=off``."""
+    options = predictor.options.replace(capture="off")
+    return Predictor(predictor.model, options, predictor.precision)(batch)
+
+
+def differs(found, wanted):
+    """Largest difference of two predictions' Gaussians."""
+    pairs = ((getattr(each.gaussians, name).cpu() for each in (found, wanted)) for name in ATTRIBUTES)
+    return max(float((one - other).abs().max()) for one, other in pairs)
+
+
+@pytest.mark.parametrize("kind", [("model=paper", "skip=fast"), ("model=recurrent",)], ids=str)
+def test_other_scenes_of_a_class_are_predicted_as_eagerly(kind):
+    """Other masks and colours; as many Gaussians as each has pixels."""
+    model = capturing(*kind)
+    for holes, color in ((0, 1.0), (1, 0.9), (2, 0.8), (3, 1.0)):
+        batch = scene(holes=holes, color=color)
+        found, wanted = model(batch), eager(model, batch)
+        assert len(found.gaussians) == int(batch.masks.cpu().sum()) == len(wanted.gaussians)
+        close(found.gaussians.to("cpu"), wanted.gaussians.to("cpu"))
+        torch.testing.assert_close(found.depth.cpu(), wanted.depth.cpu(), rtol=1e-5, atol=1e-5)
+    assert counts(model) == {"eager": 2, "captured": 2, "replayed": 4}
+
+
+def test_photographs_with_smaller_copies_are_predicted_as_eagerly():
+    """Both the copies and full size, which starts from their depths and tokens, are played back."""
+    model = capturing("model=recurrent", "rounds.height=14")
+    for color in (1.0, 0.9, 0.8, 0.7):
+        batch = scene(0.3, color)
+        assert model.needs_copies(batch)
+        found, wanted = model(batch), eager(model, batch)
+        close(found.gaussians.to("cpu"), wanted.gaussians.to("cpu"))
+    # What precedes the plan, the stages for copies, and those at full size.
+    assert counts(model) == {"eager": 3, "captured": 3, "replayed": 6}
+
+
+def test_what_changes_a_prediction_is_another_class():
+    """Sizes, the number of rounds, what the encoder sees."""
+    model = capturing("model=recurrent", "encoder.semantic=null")
+    for _ in range(2):
+        model(scene())
+    model.model.rounds.count = 1
+    found = model(scene())
+    assert len(found.rounds) == 2
+    model(scene(views=3))
+    model(scene(0.3))
+    assert counts(model) == {"captured": 2, "eager": 6, "replayed": 2}  # what precedes the plan
+
+
+def test_what_is_watched_or_has_a_gradient_is_called():
+    """Watchers are told of every stage, and a recording has no gradient."""
+    model = capturing("model=paper")
+    for _ in range(2):
+        model(scene())
+    before = counts(model)
+    with watched(model.model, {"head": "gaussian_head"}, Watcher()):
+        model(scene())
+    with torch.enable_grad():
+        assert model(scene()).gaussians.means.requires_grad
+    eager(model, scene())
+    model.model.train()
+    model(scene())
+    # What precedes the plan is played back with a gradient, and of another class in training.
+    assert counts(model) == before | {"replayed": 1, "eager": 3}
+
+
+def test_too_little_room_is_answered_by_another_capturing(monkeypatch):
+    """The first, which would have as little room again, is forgotten."""
+    model, batch = capturing("model=recurrent"), scene()
+    for _ in range(3):
+        wanted = model(batch)
+    suffice = iter([False])
+    monkeypatch.setattr(Rooms, "suffice", lambda self: next(suffice, True))
+    close(model(batch).gaussians.to("cpu"), wanted.gaussians.to("cpu"))
+    assert counts(model) == {"eager": 2, "captured": 3, "replayed": 4}
+
+
+def replaced_storage(model):
+    model.gaussian_head.load_state_dict(
+        {name: 1.5 * value for name, value in model.gaussian_head.state_dict().items()}, assign=True
+    )
+
+
+def replaced_data(model):
+    for weight in model.gaussian_head.parameters():
+        weight.inner = 1.5 * weight.inner  # what ``weight.data = ...`` is on the pretend device
+
+
+def replaced_stage(model):
+    model.gaussian_head = make_model("model=paper", seed=1).gaussian_head.to(DEVICE)
+
+
+def replaced_options(model):
+    model.gaussian_head.options = model.gaussian_head.options.replace(offset_limit=0.5)
+
+
+def replaced_attribute(model):
+    model.recalibration.block.similarity = "none"
+
+
+@pytest.mark.parametrize(
+    "change", [replaced_storage, replaced_data, replaced_stage, replaced_options, replaced_attribute]
+)
+def test_a_changed_model_is_not_replayed(change):
+    """Whatever is replaced, also within a stage, gives what an eager call gives."""
+    predictor, batch = capturing("model=paper"), scene()
+    for _ in range(3):
+        before = predictor(batch)
+    change(predictor.model)
+    for _ in range(3):
+        found = predictor(batch)
+        assert differs(found, eager(predictor, batch)) < 1e-6
+        assert differs(found, before) > 1e-5
+    assert counts(predictor)["captured"] > 2  # those of the model before
+
+
+def test_hooks_and_replaced_methods_are_called_every_time():
+    """Of any module, also within a stage; without them predictions are replayed again."""
+    predictor, batch, calls = capturing("model=paper"), scene(), []
+    head = predictor.model.gaussian_head
+    activate = head.activate
+
+    def replaced(*given):
+        calls.append("method")
+        return activate(*given)
+
+    hook = predictor.model.recalibration.register_forward_hook(lambda *_: calls.append("hook"))
+    with pytest.warns(UserWarning, match=r"eagerly: a hook of recalibration"):
+        predictor(batch)
+    for _ in range(3):
+        predictor(batch)
+    hook.remove()
+    head.activate = replaced
+    with pytest.warns(UserWarning, match=r"eagerly: gaussian_head\.activate is replaced"):
+        predictor(batch)
+    for _ in range(3):
+        predictor(batch)
+    del head.activate
+    assert (calls.count("hook"), calls.count("method")) == (4, 4)
+    for _ in range(3):
+        predictor(batch)
+    assert counts(predictor)["replayed"] > 0
+
+
+@pytest.mark.parametrize(("kind", "size"), [("model=paper", 24), ("model=recurrent", 22)])
+def test_padded_views_are_captured(kind, size):
+    """Of sides that are no multiples of the patch size, as eagerly."""
+    predictor = capturing(kind, "model.pad=multiple")
+    for holes, color in ((0, 1.0), (1, 0.9), (2, 0.8), (0, 0.7)):
+        batch = scene(size=size, holes=holes, color=color)
+        found, wanted = predictor(batch), eager(predictor, batch)
+        assert found.depth.shape == wanted.depth.shape == batch.masks.shape
+        close(found.gaussians.to("cpu"), wanted.gaussians.to("cpu"))
+        assert torch.equal(found.gaussians.pixel.cpu(), wanted.gaussians.pixel.cpu())
+    assert counts(predictor) == {"eager": 2, "captured": 2, "replayed": 4}
+
+
+def test_a_copy_captures_anew():
+    predictor = capturing("model=paper")
+    for _ in range(2):
+        predictor(scene())
+    twin = copy.deepcopy(predictor)
+    assert not twin.graphs._graphs
+    assert len(predictor.graphs._graphs) == 2
+
+
+def test_what_is_played_back_is_not_asked_for(there):
+    """The encoder, the plan and what surrounds the stages remain, and as many waits as before."""
+    model, batch, asked = capturing("model=recurrent"), scene(), []
+    model.graphs.tape = SilentTape()
+    for _ in range(3):
+        there.clear()
+        model(batch)
+        asked.append((there.launches, there.waits.total()))
+    (eager, waits), _, (played, as_many) = asked
+    print(eager, played, waits, as_many)
+    assert 80 * played < eager
+    assert as_many <= waits
+
+
+def test_what_precedes_the_plan_keeps_names_and_gradients():
+    """Batches that differ in names alone are one class;
+    photographs that are learned get their gradient."""
+    model = capturing("model=paper")
+    for name in ("a", "b", "c"):
+        batch = dataclasses.replace(scene(), subjects=(name,), views=(("0", "1"),))
+        inside, *_ = model.prepare(batch)
+        assert (inside.subjects, inside.views) == ((name,), (("0", "1"),))
+        assert inside.targets is batch.targets  # whose skew the plan has read
+        assert not vars(batch.targets.cameras)["has_skew"]
+    assert counts(model) == {"eager": 1, "captured": 1, "replayed": 1}
+    with torch.enable_grad():
+        photographs = batch.images.clone().requires_grad_()
+        inside, *_ = model.prepare(dataclasses.replace(batch, images=photographs))
+    assert inside.images.requires_grad
+    assert counts(model) == {"eager": 1, "captured": 1, "replayed": 1}
