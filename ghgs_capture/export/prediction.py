@@ -10,14 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from ghgs_capture.export.compact import CONVERTED, converted, to_records
-from ghgs_capture.export.gltf import glb_bytes
+from ghgs_capture.export.compact import CONVERTED, converted
 from ghgs_capture.export.instants import mp4_bytes
 from ghgs_capture.export.maps import depth_files, depth_unit, input_files, png, points_ply
 from ghgs_capture.export.page import page
 from ghgs_capture.export.reports import begin_files, end_files, write_file
 from ghgs_capture.export.subject import ExportedSubject, OutputOptions, exported_subject, file_names
-from ghgs_capture.export.unseen import unseen
 from ghgs_lit.errors import choice, installed, require
 from ghgs_lit.geometry.frame import HEIGHT
 from ghgs_lit.metrics import psnr
@@ -79,10 +77,6 @@ FORMATS: dict[str, Format] = {
         name: Format((f"gaussians.{suffix}",), _of_viewers(partial(converted, name)), "gaussforge")
         for name, suffix in CONVERTED.items()
     },
-    "splat": Format(("gaussians.splat",), _of_viewers(lambda g: to_records(g).tobytes())),
-    "glb": Format(
-        ("gaussians.glb",), lambda s: [partial(glb_bytes, s.for_other_renderers, s.up)], "pygltflib"
-    ),
     "html": Format(("viewer.html",), _one(lambda s: page(s, s.name).encode())),
     "turntable": Format(("turntable/{frame:03d}.png",), lambda s: (partial(png, p) for p in s.turntable)),
     "mp4": Format(
@@ -214,6 +208,5 @@ def _report(subject: ExportedSubject) -> dict[str, Any]:
         "depth_pixels": dict(zip(subject.views, valid.flatten(1).sum(1).tolist(), strict=True)),
         "depth_png_unit": depth_unit(float(torch.where(valid, subject.depth, 0).max())),
         "psnr_box_of_inputs": dict(zip(subject.views, quality, strict=True)),
-        **unseen(subject, drawn.depth),
         "versions": versions(),
     }

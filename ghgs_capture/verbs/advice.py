@@ -6,7 +6,6 @@ from pathlib import Path
 from statistics import geometric_mean
 
 from ghgs_capture.export.reports import REPORT
-from ghgs_capture.export.unseen import GUESSED
 from ghgs_capture.tones import tone_lines
 
 #: PSNR in dB, in the subject's box, below which the render of an input counts as poor.
@@ -34,11 +33,6 @@ def advice_of(directory: Path) -> Iterator[str]:
     quality = report["psnr_box_of_inputs"].values()
     if len(quality) < 3:
         yield f"{len(quality)} photographs leave much unseen: 3 to 5 all around show a person"
-    for edge, names in report["cut"].items():
-        yield f"{', '.join(names)} end at the subject's {edge}: what no photograph shows is missing"
-    guessed = [part for part, share in report["seen_once"].items() if share > GUESSED]
-    if guessed:
-        yield f"at {', '.join(guessed)} of its height at most one photograph shows most of it: a guess"
     low = min(quality)
     high = max(quality)
     if low < LOW_PSNR:

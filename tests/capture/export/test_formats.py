@@ -10,23 +10,19 @@ import weakref
 from types import SimpleNamespace
 
 import numpy as np
-import pygltflib
 import pytest
 import torch
-import trimesh
 from gaussforge import GaussForge
 from imageio_ffmpeg import get_ffmpeg_exe, read_frames
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from ghgs_capture.export.compact import CONVERTED, converted, half_turned, to_records
-from ghgs_capture.export.gltf import EXTENSION, glb_bytes
+from ghgs_capture.export.compact import CONVERTED, converted, half_turned
 from ghgs_capture.export.instants import mp4_bytes
 from ghgs_capture.export.maps import input_files
 from ghgs_capture.export.page import page, unpack
-from ghgs_lit.errors import InputError
 from ghgs_lit.metrics import psnr
-from ghgs_lit.ply import SH_CONSTANT, ply_bytes, read_ply
+from ghgs_lit.ply import ply_bytes, read_ply
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Gaussians
 from ghgs_lit.visualization.turntable import pixel_size
@@ -84,57 +80,6 @@ def test_spz_has_y_up_and_z_back_as_its_specification_says(gaussians):
     spread, turned = (covariances(g) for g in (gaussians, half_turned(gaussians)))
     flip = np.diag([1, -1, -1])
     assert np.allclose(turned, flip @ spread @ flip, rtol=1e-4, atol=1e-6 * spread.max())
-
-
-def test_a_splat_file_renders_alike_and_begins_with_large_gaussians(gaussians, tmp_path):
-    records = to_records(gaussians)
-    assert records.nbytes == 32 * len(gaussians)
-    read = read_back(records.tobytes(), "splat", tmp_path / "a.ply")
-    assert decibels(read, gaussians) > 50
-    found, wanted = (
-        torch.nn.functional.normalize(g.quaternions[g.means[:, 0].argsort()], dim=-1)
-        for g in (read, gaussians)
-    )
-    assert (found * wanted).sum(-1).abs().min() > 0.9998  # two degrees
-    size = records["scale"].astype(np.float64).prod(-1) * records["color"][:, 3]
-    assert size[:500].mean() > 2 * size[-500:].mean()
-
-
-def test_a_glb_has_the_khronos_extension_and_stands_upright(gaussians, tmp_path):
-    """Linear scales, opacities, xyzw, SH; lossless; the node turns the world's up to glTF's +y."""
-    (tmp_path / "a.glb").write_bytes(glb_bytes(gaussians, UP))
-    model = pygltflib.GLTF2().load(tmp_path / "a.glb")
-    primitive, blob = model.meshes[0].primitives[0], model.binary_blob()
-    assert model.extensionsUsed == [EXTENSION]
-    assert primitive.mode == pygltflib.POINTS
-    assert primitive.extensions[EXTENSION]["kernel"] == "ellipse"
-
-    def column(name: str) -> torch.Tensor:
-        accessor = model.accessors[vars(primitive.attributes)[name]]
-        view = model.bufferViews[accessor.bufferView]
-        assert view.byteOffset % 4 == 0
-        data = blob[view.byteOffset : view.byteOffset + view.byteLength]
-        return torch.from_numpy(np.frombuffer(data, "<f4").reshape(accessor.count, -1).copy())
-
-    read = Gaussians(
-        means=column("POSITION"),
-        quaternions=column(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]],
-        scales=column(f"{EXTENSION}:SCALE"),
-        opacities=column(f"{EXTENSION}:OPACITY")[:, 0],
-        colors=column(f"{EXTENSION}:SH_DEGREE_0_COEF_0") * SH_CONSTANT + 0.5,
-        splits=gaussians.splits,
-    )
-    assert decibels(read, gaussians) > 80
-    turned = Rotation.from_quat(model.nodes[0].rotation).apply(UP.numpy())
-    assert np.allclose(turned, [0, 1, 0], atol=1e-6)
-    # as points, for programs without the extension
-    cloud = trimesh.load(tmp_path / "a.glb").to_geometry()
-    upright = gaussians.means.numpy() * [1, -1, -1]
-    assert np.allclose(np.sort(cloud.vertices[:, 1]), np.sort(upright[:, 1]), atol=1e-5)
-    colors = (gaussians.colors.clamp(0, 1) * 255).round().numpy()
-    assert np.array_equal(cloud.colors[:, :3], colors)
-    with pytest.raises(InputError, match="at least one Gaussian; found 0"):
-        glb_bytes(gaussians.select(slice(0, 0), (0,)), UP)
 
 
 def test_a_ply_is_lossless(gaussians, tmp_path):

@@ -171,7 +171,7 @@ def test_a_subject_without_gaussians_is_written(subject, tmp_path):
     """Empty masks give empty files and a report without numbers."""
     batch, _ = subject
     batch = dataclasses.replace(batch, masks=torch.zeros_like(batch.masks), targets=None)
-    options = OutputOptions(("ply", "splat", "html", "turntable", "depth", "points", "inputs"), frames=1)
+    options = OutputOptions(("ply", "html", "turntable", "depth", "points", "inputs"), frames=1)
     write_prediction(tmp_path, batch, Standin()(batch), Renderer(), options)
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["gaussians"] == 0
@@ -250,10 +250,10 @@ def test_other_viewers_draw_what_ours_draws(tmp_path):
     """They add 0.3 px^2 and are not antialiased: their files make up for it, the PLY says it."""
     batch, prediction = made_for_thin_pixels()
     wanted, boxes = batch.images[0], box_of(batch.masks[0])
-    write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions(("ply", "splat"), frames=0))
+    write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions(("ply", "sog"), frames=0))
     exact = render(read_ply(tmp_path / "gaussians.ply"), batch.cameras).image[0]
     assert psnr(exact, wanted, boxes).min() > 60
-    data = GaussForge().convert((tmp_path / "gaussians.splat").read_bytes(), "splat", "ply")["data"]
+    data = GaussForge().convert((tmp_path / "gaussians.sog").read_bytes(), "sog", "ply")["data"]
     (tmp_path / "viewer.ply").write_bytes(data)
     adapted = render(read_ply(tmp_path / "viewer.ply"), batch.cameras).image[0]
     as_is = dataclasses.replace(prediction.gaussians, low_pass=0.3, antialiased=False)
