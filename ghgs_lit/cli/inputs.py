@@ -33,7 +33,7 @@ if TYPE_CHECKING:  # it would import Lightning, which takes seconds
 MODEL_NODES = (*STAGES, *OPTIONS, "compat")
 
 #: Keys of ``data`` that describe the machine that trained, not the data.
-OF_MACHINE = ("cache_dir", "cache_images_mb", "packed_gb", "render_workers", "resident", "workers")
+OF_MACHINE = ("cache_dir", "cache_images_mb", "packed_gb", "render_workers", "workers")
 
 #: Keys that may change in a trained model: they change neither shape nor meaning of any tensor.
 FREE = ("bounds", "encoder.precision", "model.pad", "rounds.count", "rounds.height", "skip", "unprojection")

@@ -10,7 +10,7 @@ from ghgs_lit.errors import require
 WITHOUT_INFLUENCE = (
     "hydra", "allow_random_encoder", "chosen", "dry_run", "overwrite", "resume", "logger", "callbacks",
     "data.cache_dir", "data.cache_images_mb", "data.packed_gb", "data.render_workers",
-    "data.resident", "data.workers", "feature_cache.folder",
+    "data.workers", "feature_cache.folder",
     "encoder.weights",  # repeats the origin of init_from's weights, which counts
     "evaluation.pictures", "trainer.log_every_n_steps", "trainer.profiler",
 )  # fmt: skip

@@ -16,7 +16,6 @@ from ghgs_lit.data.batches import BatchBuilder, EvaluationBatches, StepSampler, 
 from ghgs_lit.data.options import LoadingOptions
 from ghgs_lit.data.packed import Packing, folder_of, packed_reader
 from ghgs_lit.data.reader import PHASES, PhotographCache
-from ghgs_lit.data.resident import Drawn, DrawnBatches, resident_batches
 from ghgs_lit.data.sampling import (
     RING_VIEW,
     SampleSpec,
@@ -106,7 +105,6 @@ class PhotographsDataModule(LightningDataModule):
         #: evaluation reads them all the same, for its depth error.
         self.trains_on_depths = True
         self._builders: dict[str, BatchBuilder] = {}
-        self._resident: DrawnBatches | None = None
 
     @property
     def facts(self) -> dict[str, str]:
@@ -241,25 +239,11 @@ class PhotographsDataModule(LightningDataModule):
         planned = planned_batches(self.trainer, length)
         builder = self._packed_builder(planned, rank)
         batches = self._training_batches(sampler, length, rank, world, builder)
-        if self.dataset.resident == "device":
-            device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
-            batches = self._resident = resident_batches(batches, device)
         workers = self.workers(planned)
         if self.dataset.workers == "auto" and rank == 0:
             log.info("data.workers=auto: %d loading processes beside each that trains", workers)
         steps = StepSampler(batches, lambda: trained_batches(self.trainer, length))
         return loader_of(batches, workers, sampler=steps)
-
-    def on_after_batch_transfer(self, batch: Batch | Drawn, dataloader_idx: int) -> Batch:
-        """Photographs of a batch whose numbers have come to the device.
-
-        Args:
-            batch: photographs, or numbers of those on the device.
-            dataloader_idx: Lightning's; not used.
-        """
-        if not isinstance(batch, Drawn):
-            return batch
-        return self._resident.inputs.batch(batch, self._resident.targets)
 
     def evaluation_loader(
         self,

@@ -50,9 +50,6 @@ class LoadingOptions(Options):
     packed_gb: Amount = 16
     """Largest size in GB (10^9 bytes) of the decoded photographs of training that are kept on the
     disk, in the data's folder or the user's cache, and mapped into memory; 0: none are."""
-    resident: Literal["device", "off"] = "off"
-    """device: photographs of training stay in the GPU's memory, where they fit,
-    and are resized there."""
     evaluation_positions: tuple[tuple[Index, ...], ...] = ()
     """Lists of input positions, such as [[0, 6, 11]] for 3 views;
     other numbers of views: evenly spaced."""
