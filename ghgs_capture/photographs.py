@@ -109,9 +109,10 @@ def images_in(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[str, P
     """
     paths: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
-        is_image = path.suffix.lower() in suffixes and not path.name.startswith(".") and not path.is_dir()
+        is_image = path.suffix.lower() in suffixes and not path.name.startswith(".")
         if not is_image or path.stem.lower().endswith(MASK_ENDING):
             continue
+        require(not path.is_dir(), str(path), "a photograph", "a folder")
         name = composed(path.stem)
         require(name not in paths, str(path), "one file for each photograph", str(paths.get(name)))
         paths[name] = path

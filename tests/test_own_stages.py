@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from ghgs_lit.config import registry
+from ghgs_lit import GHGS
+from ghgs_lit.config import registry, run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.ply import read_ply
 from ghgs_lit.training import GHGSModule
@@ -56,6 +57,15 @@ def project(tmp_path, monkeypatch):
     monkeypatch.setenv(registry.VARIABLE, "own_stages.py")
     yield tmp_path
     sys.modules.pop("own_stages", None)
+
+
+def test_an_attribute_that_a_stage_lacks_is_named(project):
+    file = project / "own_stages.py"
+    file.write_text(file.read_text().replace("    is_bounded = True\n", ""))
+    registry.verbs()
+    nodes = run_of("train", ["model=paper", *TINY]).plain | {"depth_head": {"kind": "mine"}}
+    with pytest.raises(InputError, match="depth_head: expected a stage with the attribute is_bounded; found"):
+        GHGS.from_config(nodes)
 
 
 @pytest.mark.parametrize("group", GROUPS)

@@ -115,7 +115,11 @@ def read_toml(path: Path) -> CameraFile:
     """
     content = read_mapping(path, tomllib.loads, "TOML", "TOML")
     tables = _cameras_of(path, content)
-    named = {str(t.get("name", key)) if isinstance(t, dict) else key: t for key, t in tables.items()}
+    named: dict[str, Any] = {}
+    for key, table in tables.items():
+        name = str(table.get("name", key)) if isinstance(table, dict) else key
+        require(name not in named, f"{path}: {key}", "a name that no other table has", name)
+        named[name] = table
     return _read_matrices(path, content, named, "toml")
 
 

@@ -5,6 +5,7 @@ are its attributes (:class:`ghgs_lit.config.run.Run`). All verbs come in by the 
 :mod:`ghgs_lit.config.registry`, those of this distribution as those of a plug-in.
 """
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -58,7 +59,7 @@ class Verb(Run):
         data = self.plain.get("data")  # which is not checked yet
         is_read = self.reads_data and isinstance(data, Mapping) and not data.get("source")
         if is_read and isinstance(data.get("root"), str):
-            require_folder(Path(data["root"]).expanduser())
+            require_folder(Path(os.path.expanduser(data["root"])))
 
     def run(self) -> object:
         """Do the work of the verb.

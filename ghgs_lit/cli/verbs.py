@@ -136,7 +136,7 @@ class Table(Verb):
     example = "ghgs table runs=runs/train/sweep_..."
 
     runs: Annotated[
-        Text | Annotated[tuple[Text, ...], Field(min_length=1)], Words("a text or a list of paths")
+        PathText | Annotated[tuple[PathText, ...], Field(min_length=1)], Words("a path or a list of paths")
     ]
     """The directory of a sweep, or a list of directories."""
     layout: Literal["ablation", "table1", "table2", "table3", "table4"] = "ablation"
@@ -150,7 +150,7 @@ class Table(Verb):
     subjects: Text | None = None
     """A regular expression: subjects whose whole names match are shown,
     such as a.* (people in action); null: all."""
-    others: Texts = ()
+    others: PathText | tuple[PathText, ...] = ()
     """JSON files with results of other methods (docs/tables.md), for table1, table2 and table3."""
     reported: bool = True
     """Also print the paper's own numbers (not with layout=ablation)."""

@@ -114,12 +114,20 @@ def _text(value: Any) -> Any:
     return str(value) if is_number else os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
+def _has_home(path: str) -> str:
+    if os.path.expanduser(path).startswith("~"):
+        raise ValueError("a path, after ~ nothing or a user of this machine")
+    return path
+
+
 def _pair(size: int | tuple[int, int]) -> tuple[int, int]:
     return (size, size) if isinstance(size, int) else size
 
 
 Text = Annotated[str, Field(min_length=1), BeforeValidator(_text)]
-PathText = Annotated[str, Field(min_length=1), BeforeValidator(_text), Words("a path")]
+PathText = Annotated[
+    str, Field(min_length=1), BeforeValidator(_text), AfterValidator(_has_home), Words("a path")
+]
 Count = Annotated[int, Field(ge=1)]
 Index = Annotated[int, Field(ge=0)]
 Amount = Annotated[float, Field(ge=0)]

@@ -149,7 +149,11 @@ class GHGS(nn.Module):
 
         def stage(name: str, **extra: Any) -> Any:
             with torch.device("meta") if empty else nullcontext():
-                return build(config[name], name, **extra)
+                built = build(config[name], name, **extra)
+            for attribute in getattr(stages.INTERFACES.get(name), "__annotations__", ()):
+                expected = f"a stage with the attribute {attribute}"
+                require(hasattr(built, attribute), name, expected, type(built).__name__)
+            return built
 
         encoder = stage("encoder", tokens=skip.tokens, margin=skip.margin)
         heads = {name: stage(name, dim_latent=encoder.dim_latent) for name in HEADS}

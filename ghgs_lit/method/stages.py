@@ -194,6 +194,12 @@ class GaussianHead(Protocol):
         """
 
 
+#: Interface of each stage.
+INTERFACES = dict(
+    zip(STAGES, (Bounds, Encoder, DepthHead, Unprojection, Recalibration, GaussianHead), strict=True)
+)
+
+
 class Renderer(Protocol):
     """Gaussians to images; options: ``build()``."""
 

@@ -60,7 +60,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         Raises:
             InputError: the file is no checkpoint, or its frozen weights are missing."""
         content = frozen.joined(path, open_file(path))
-        content.setdefault("pytorch-lightning_version", L.__version__)
+        content["pytorch-lightning_version"] = L.__version__  # supported ones need no migration
         return content
 
 

@@ -187,6 +187,18 @@ BAD = {
     "links in a loop": (lambda p: loop(p, "cam1.png"), "cam1.png: expected an image", "Too many levels"),
     "deep JSON": (lambda p: write(p, "c.json", "[" * 9999), "c.json: expected JSON", "recursion"),
     "deep TOML": (lambda p: write(p, "c.toml", "a = " + "[" * 9999), "c.toml: expected TOML", "recursion"),
+    "tables of one name": (
+        lambda p: write(p, "c.toml", "[a]\nname = 'cam1'\n[b]\nname = 'cam1'"),
+        "c.toml: b: expected a name that no other table has; found 'cam1'",
+    ),
+    "a folder for a photograph": (
+        lambda p: (remove(p, "cam1.png"), (p / "images" / "cam1.png").mkdir())[0],
+        "cam1.png: expected a photograph; found 'a folder'",
+    ),
+    "a folder beside photographs": (
+        lambda p: (p / "images" / "front.png").mkdir(),
+        "front.png: expected a photograph; found 'a folder'",
+    ),
     "deep YAML": (lambda p: write(p, "c.yml", "a: " + "[" * 9999), "c.yml: expected YAML", "64 levels"),
     "billion laughs": (lambda p: write(p, "c.yml", LAUGHS), "c.yml: expected YAML", "1000000 values"),
     "alias of itself": (lambda p: write(p, "c.yml", "a: &a [*a]"), "c.yml: expected YAML", "an alias"),

@@ -142,6 +142,13 @@ NUMBERS = [
     ("table runs={tmp} by=[seed,seed]", 1, "by: expected different values"),
     ("prepare task=check data=scans data.root={loop}", 1, "{loop}: expected", "links in a loop"),
     ("table runs={loop}", 1, "{loop}: expected", "links in a loop"),
+    ("table runs=x 'others=[\"~nobody-here/x\"]'", 1, "others: expected a path or a list (each a path)"),
+    ("train data=scans 'data.root=\"~nobody-here/x\"'", 1, "~nobody-here/x: expected the folder"),
+    (
+        "predict images={empty} 'cameras=\"~nobody-here/x\"'",
+        1,
+        "cameras: expected a path, after ~ nothing or",
+    ),
     ("predict images={empty} cameras={loop}", 1, "{loop}: expected"),
     ("predict out={loop} images={empty} cameras={text}", 1, "{loop}: expected"),
     ("export checkpoint=shipped inference={loop}", 1, "{loop}: expected"),

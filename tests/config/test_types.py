@@ -56,6 +56,10 @@ class Outer(Options):
         ),
         ({"size": [1, 2, 3]}, "or a list of 2 values (each an integer >= 1 and <= 8192); found [1, 2, 3]"),
         ({"path": True}, "stage.path: expected a path or null; found True"),
+        (
+            {"path": "~nosuchuser/x"},
+            "stage.path: expected a path, after ~ nothing or a user of",
+        ),
         ({"per": "some"}, "stage.per: expected an integer >= 1 or all; found 'some'"),
         ({"name": ""}, "stage.name: expected a text; found ''"),
         (

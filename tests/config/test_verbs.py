@@ -42,7 +42,7 @@ def test_every_key_of_a_verb_has_a_meaning():
         ("train", f"seed={10**400}", "seed: expected an integer >= 0 and <= 4294967295; found 1000"),
         ("train", "+sed=3", "sed: expected one of allow_random_encoder"),
         ("predict", "refine=1e9", "refine: expected an integer >= 0 and <= 10000; found 1000000000.0"),
-        ("table", "runs=[]", "runs: expected a text or a list of paths; found []"),
+        ("table", "runs=[]", "runs: expected a path or a list of paths; found []"),
     ],
 )
 def test_a_wrong_value_is_named(verb, override, message):

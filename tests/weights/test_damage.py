@@ -198,7 +198,9 @@ def test_a_state_of_training_of_another_form_is_refused(tmp_path):
             check_resume(tmp_path / "a.ckpt", held(make_model()), config())
 
 
-def test_a_missing_version_of_lightning_is_this_one(tmp_path):
-    torch.save(content(), tmp_path / "a.ckpt")
+@pytest.mark.parametrize("version", [{}, *({"pytorch-lightning_version": odd} for odd in ("x", 3, None))])
+def test_a_missing_or_odd_version_of_lightning_is_this_one(tmp_path, version):
+    """Lightning would parse it."""
+    torch.save(content(**version), tmp_path / "a.ckpt")
     loaded = AtomicCheckpointIO().load_checkpoint(tmp_path / "a.ckpt")
     assert loaded["pytorch-lightning_version"] == lightning.pytorch.__version__
