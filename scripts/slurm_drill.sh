@@ -78,7 +78,7 @@ begun=$SECONDS
 step() { echo "[$((SECONDS - begun)) s] $*"; }
 
 step "undisturbed: seeds 1 and 2, without SLURM"
-"${train[@]}" -m seed=1,2 "hydra.sweep.dir=$out/whole" > "$out/log/whole" 2>&1
+"${train[@]}" -m seed=1,2 hydra/launcher=joblib hydra.launcher.n_jobs=2 "hydra.sweep.dir=$out/whole" > "$out/log/whole" 2>&1
 
 step "refused by sbatch: a partition and a gres that there are not"
 for wrong in hydra.launcher.partition=nope +hydra.launcher.gres=unicorn:1; do
@@ -98,11 +98,11 @@ step "the same with 3 minutes for a job, and a signal 60 s before"
     "hydra.sweep.dir=$out/timed" > "$out/log/timed" 2>&1
 tail -n 2 "$out/log/timed"
 
-step "sbatch and srun; scontrol requeue after 60 s"
+step "sbatch and srun; scontrol requeue after 20 s of training"
 job=$(sbatch --parsable --output="$out/log/requeued" --open-mode=append --ntasks=1 --wrap \
     "srun $(printf '%q ' "${train[@]}" seed=1 "hydra.run.dir=$out/requeued")")
 while ! grep -qs '"started"' "$out/requeued/sessions.jsonl"; do sleep 1; done
-sleep 60
+sleep 20
 scontrol requeue "$job"
 while squeue --noheader --job="$job" 2> /dev/null | grep -q .; do sleep 1; done
 
@@ -115,7 +115,7 @@ from pathlib import Path
 import torch
 
 out = Path(sys.argv[1])
-differing = 0
+differing = whole_runs = 0
 for name in ("sweep", "timed", "requeued"):
     for path in sorted(out.glob(f"{name}/**/metrics.json")):
         run = path.parent
@@ -125,8 +125,9 @@ for name in ("sweep", "timed", "requeued"):
         lines = [json.loads(line) for line in (run / "sessions.jsonl").read_text().splitlines()]
         steps = [line["steps"] for line in lines if "steps" in line]
         resumed = [line["resumed"] for line in lines if "started" in line]
+        whole_runs += name != "sweep" and len(steps) < 2
         print(f"{name}/{run.name}: steps {steps}, resumed {resumed}; {count} of {len(a)} tensors differ")
 runs = len(list(out.glob("*/**/metrics.json")))
-print(f"{runs} of 7 runs done, {differing} tensors differ")
-sys.exit(runs != 7 or differing != 0)
+print(f"{runs} of 7 runs done, {differing} tensors differ; {whole_runs} were to be interrupted (more STEPS)")
+sys.exit(runs != 7 or differing != 0 or whole_runs != 0)
 TEXT
