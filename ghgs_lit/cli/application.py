@@ -4,6 +4,7 @@ import os
 import re
 import signal
 import sys
+import threading
 import time
 from argparse import Namespace
 from dataclasses import dataclass, field
@@ -24,7 +25,7 @@ from ghgs_lit.config.registry import read_nodes, verb_class
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import require_no_links, write_text_atomically
 from ghgs_lit.runs.job import register_resolvers
-from ghgs_lit.runs.run import RunDirectory
+from ghgs_lit.runs.run import SESSIONS, WRITTEN, RunDirectory
 from ghgs_lit.runs.signals import interruptible
 from ghgs_lit.runtime.allocation import collect_garbage_again
 from ghgs_lit.runtime.cores import children_sleep
@@ -45,7 +46,7 @@ def discard_unused(directory: Path, verb: str, since: float) -> None:
 
 
 #: What a run appends to, or what libraries write as it is, beside the log.
-_WRITTEN_IN_PLACE = (".hydra", "csv", "init_from.txt", "sessions.jsonl", "tensorboard")
+_WRITTEN_IN_PLACE = (".hydra", *WRITTEN, SESSIONS)
 
 
 def write_hydra_files(cfg: DictConfig, directory: Path) -> None:
@@ -102,6 +103,9 @@ class Verb:
             if HydraConfig.get().mode == RunMode.RUN:  # a file may have said that it is a sweep
                 messages.check_directory(HydraConfig.get().overrides.hydra, sweeps=False)
             check_ablation(cfg, HydraConfig.get())
+            is_said = any(word.lstrip("+").startswith("overwrite=") for word in self.argv)
+            fits = is_said or not cfg.get("overwrite")
+            require(fits, "overwrite", "a value on the command line alone", "true in a file")
             verb = verb_class(self.name).begin(plain(cfg))
             if verb.begins_run:
                 run = RunDirectory(directory)
@@ -211,6 +215,7 @@ def run(verb: str, argv: list[str]) -> int:
     wants_trace = os.environ.get("HYDRA_FULL_ERROR") == "1"
     os.environ["HYDRA_FULL_ERROR"] = "1"
     task = Verb(verb, tuple(argv), wants_trace)
+    threading.excepthook = messages.print_of_thread
     try:
         with interruptible():  # before errors are looked at: an interruption may look like one
             flags, overrides, values = messages.parsed(argv[2:])

@@ -2,10 +2,12 @@
 
 import argparse
 import difflib
+import errno
 import os
 import re
 import shlex
 import sys
+import threading
 import traceback
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -28,6 +30,8 @@ from ghgs_lit.errors import InputError, require
 BAD_INPUT = (InputError, OSError, HydraException, OmegaConfBaseException)
 
 _EXTRAS = {"joblib": "cluster", "submitit": "cluster", "optuna": "optuna"}
+
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 #: Hydra would write .hydra through links;
 #: :func:`ghgs_lit.cli.application.write_hydra_files` does not.
@@ -250,8 +254,20 @@ def _system(error: OSError) -> str:
         path = HydraConfig.get().runtime.output_dir if HydraConfig.initialized() else Path.cwd()
     if isinstance(error, FileExistsError | NotADirectoryError):
         return f"{os.fsdecode(path)}: expected a path below folders; found a file in its place or above it"
+    if error.errno in _FULL:
+        return f"{os.fsdecode(path)}: expected space on its disk; found it full ({error.strerror})"
     reason = error.strerror or error
     return f"{os.fsdecode(path)}: expected a file that can be read or written; found {reason}"
+
+
+def print_of_thread(arguments: threading.ExceptHookArgs) -> None:
+    """Print the error of a thread, unless it is a full disk: TensorBoard's raises it again where it logs.
+
+    Args:
+        arguments: of :func:`threading.excepthook`.
+    """
+    if getattr(arguments.exc_value, "errno", None) not in _FULL:
+        threading.__excepthook__(arguments)
 
 
 def raised_by_hydra(error: Exception) -> bool:

@@ -47,7 +47,7 @@ def quiet() -> None:
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
     messages = ("LeafSpec", "smaller than the logging interval", "num_workers", "dataloader is not resumable")
-    messages += ("overridden `transfer_batch", "exists and is not empty")
+    messages += ("overridden `transfer_batch", "exists and is not empty", "`srun` command is available")
     for message in messages:
         warnings.filterwarnings("ignore", f".*{message}.*")
 

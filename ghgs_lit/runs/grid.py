@@ -126,8 +126,8 @@ def _planned(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -
         require_writable(directory, "hydra.sweep.dir", "the runs")
     if config.get("dry_run"):
         return planned
-    require(not config.get("overwrite"), "overwrite", "false in a sweep, which goes on with its runs", True)
     for item in planned:
+        require(not item.run.overwrite, "overwrite", "false in a sweep, which goes on with its runs", True)
         check_config(item.run)
     return planned
 

@@ -26,7 +26,15 @@ from pydantic import BaseModel, ConfigDict
 from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, lookup
 from ghgs_lit.config.run import Run
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.files import append_line, is_locked, lock, lock_owner, resolved, write_text_atomically
+from ghgs_lit.files import (
+    append_line,
+    is_locked,
+    lock,
+    lock_owner,
+    require_no_links,
+    resolved,
+    write_text_atomically,
+)
 from ghgs_lit.parsing import read_json, read_lines_of_json, read_yaml
 from ghgs_lit.runs.processes import is_queued_again, launch, slurm_job
 from ghgs_lit.runs.provenance import config_hash, differences
@@ -48,6 +56,19 @@ WRITTEN = (
     "pictures",
     "tensorboard",
 )
+#: Of it, and of ``curves``, what may be deleted; other files in these folders are a user's.
+_DELETED = (
+    "checkpoints/frozen-*.pt",
+    "csv/metrics.csv",
+    "faults/step_*.pt",
+    "init_from.txt",
+    "metrics.csv",
+    "metrics.json",
+    "pictures/model_v*.png",
+    "pictures/step_*/*.png",
+    "tensorboard/events.out.tfevents.*",
+)
+_CURVES = "tb"  #: Folder of a sweep with TensorBoard's files of its runs
 SESSIONS = "sessions.jsonl"
 PLAN = "multirun.yaml"  #: Configuration of a sweep's last command, beside its runs
 
@@ -173,13 +194,16 @@ class RunDirectory:
     def swept(self) -> list[str]:
         """Overrides that set a run of a grid apart from the others; none for a run of its own."""
         path = self.path / SWEPT
-        return read_json(path) if path.is_file() else []
+        texts = read_json(path) if path.is_file() else []
+        fits = isinstance(texts, list) and all(isinstance(text, str) and text.isprintable() for text in texts)
+        require(fits, str(path), "a list of overrides", texts)
+        return texts
 
     @property
     def title(self) -> str:
         """:attr:`swept` as the name of a folder, without the groups of keys; of a long one the end."""
         changes = (re.sub(r"^[^=]*\.", "", change) for change in self.swept)
-        return ",".join(changes).replace(os.sep, "_")[-200:]
+        return ",".join(changes).replace(os.sep, "_")[-200:].lstrip(".")
 
     @property
     def curves(self) -> Path:
@@ -187,7 +211,7 @@ class RunDirectory:
         beside the runs, called :attr:`title`. ``.run`` in it says whose it is."""
         if not (self.title and (self.path.parent / PLAN).is_file()):
             return self.path / "tensorboard"
-        folder = self.path.parent / "tb" / self.title
+        folder = self.path.parent / _CURVES / self.title
         marker = self.marker
         is_free = marker is None or _owner_of(folder) in (None, marker.id)
         return folder if is_free else folder.with_name(f"{self.title},run={marker.id}")
@@ -237,6 +261,9 @@ class RunDirectory:
         Raises:
             InputError: What another run wrote is there, or files of somebody else.
         """
+        require_no_links(self.path, WRITTEN)
+        if self.curves.parent != self.path:
+            require_no_links(self.path.parent, (_CURVES, str(self.curves.relative_to(self.path.parent))))
         resume = run.resume
         given = None if resume == AUTO else resume
         if self._has(resume) or self.goes_on(run):
@@ -310,7 +337,7 @@ class RunDirectory:
         marker = self.marker
         is_same = self.goes_on(run)
         if not self._has(start):
-            self._clear(with_sessions=not is_same)
+            self._clear(run, with_sessions=not is_same)
         known = marker if is_same or self._has(start) else None
         identity = Identity(
             id=known.id if known else uuid.uuid4().hex[:8],
@@ -324,18 +351,22 @@ class RunDirectory:
             write_text_atomically(self.curves / ".run", identity.id)
         return run.replace(resume=start)
 
-    def _clear(self, with_sessions: bool) -> None:
+    def _clear(self, run: "Training", with_sessions: bool) -> None:
         """Delete what training wrote; only in a run's folder that this process has claimed."""
-        names = self._there(*WRITTEN, SESSIONS) if with_sessions else self._there(*WRITTEN)
-        paths = [self.path / name for name in names]
+        options = run.plain.get("callbacks", {}).values()
+        names = (re.sub(r"\{.*?\}", "*", each["filename"]) for each in options if each and "filename" in each)
+        patterns = [*_DELETED, *(f"checkpoints/{name}.ckpt" for name in names), *[SESSIONS] * with_sessions]
+        paths = [path for pattern in patterns for path in self.path.glob(pattern)]
         marker = self.marker
         if marker is not None and _owner_of(self.curves) == marker.id:
-            paths.append(self.curves)
+            paths += [*self.curves.glob("events.out.tfevents.*"), self.curves / ".run"]
         if paths and not (self._is_mine and marker is not None):
             raise RuntimeError(f"{self.path}: files are deleted in a run that this process has claimed only")
         for path in paths:
-            is_folder = path.is_dir() and not path.is_symlink()
-            shutil.rmtree(path) if is_folder else path.unlink()
+            path.unlink()
+        for folder in {path.parent for path in paths} - {self.path}:
+            with contextlib.suppress(OSError):  # a user's files are in it
+                folder.rmdir()
 
     def discard(self, others: Iterable[str], since: float) -> None:
         """Remove a directory in which nothing was begun: it holds only files of a start, those of a
@@ -409,7 +440,7 @@ class RunDirectory:
 
 def _owner_of(curves: Path) -> str | None:
     path = curves / ".run"
-    return path.read_text() if path.is_file() else None
+    return path.read_text(errors="replace") if path.is_file() else None
 
 
 def begun_by_job(folder: Path, pattern: str) -> list[RunDirectory]:

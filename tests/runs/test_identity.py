@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import time
+from pathlib import Path
 
 import pytest
 
@@ -14,12 +15,15 @@ from ghgs_lit.config.compose import saved_text
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs import job
 from ghgs_lit.runs.provenance import config_hash
-from ghgs_lit.runs.run import MARKER, RunDirectory, State
+from ghgs_lit.runs.run import MARKER, PLAN, SWEPT, RunDirectory, State
 from tests.cli.test_main import call
 from tests.helpers.jobs import hold_run, record_execution, write_finished_run
 from tests.helpers.processes import PREPARED
 
 RUN = run_of("train", ["optimizer.lr=0.5", "trainer.max_steps=4"])
+
+
+EVENTS = "tensorboard/events.out.tfevents.1"
 
 
 class Killed(BaseException):
@@ -31,7 +35,7 @@ def train_to(checkpoint: bool, seen: list):
 
     def train(run, directory, stats):
         seen.append(run.resume)
-        for name in ("csv/metrics.csv", "tensorboard/events", *["checkpoints/last.ckpt"] * checkpoint):
+        for name in ("csv/metrics.csv", EVENTS, *["checkpoints/last.ckpt"] * checkpoint):
             (directory / name).parent.mkdir(exist_ok=True)
             (directory / name).write_text("seed 1")
         raise Killed
@@ -84,9 +88,9 @@ def test_what_is_trained_again_leaves_no_logs_of_before(tmp_path):
     """A kill before the first checkpoint left event files,
     beside which the same steps stood again."""
     killed(tmp_path / "run", checkpoint=False)
-    (tmp_path / "run" / "tensorboard" / "events").rename(tmp_path / "run" / "tensorboard" / "events.1")
+    (tmp_path / "run" / EVENTS).rename(tmp_path / "run" / f"{EVENTS}.x")
     killed(tmp_path / "run", checkpoint=False)
-    assert os.listdir(tmp_path / "run" / "tensorboard") == ["events"]
+    assert os.listdir(tmp_path / "run" / "tensorboard") == [Path(EVENTS).name]
 
 
 def test_a_moved_run_goes_on(tmp_path):
@@ -178,23 +182,77 @@ def test_files_of_others_are_neither_deleted_nor_mixed_with_a_run(verb, tmp_path
     assert not (tmp_path / MARKER).exists()
 
 
-def test_overwriting_deletes_a_run_and_nothing_else(verb, tmp_path):
-    """A link in the run is removed, not what it points to; notes of the user stay;
-    the run has a new name."""
-    outside = tmp_path / "outside"
-    outside.mkdir()
-    (outside / "a.png").touch()
+FOREIGN = ("notes.txt", "tensorboard/notes.txt", "pictures/holiday.png", "checkpoints/mine.ckpt", "csv/a.csv")
+
+
+def test_overwriting_deletes_a_run_and_nothing_else(tmp_path):
+    """Files of the user stay, also in the folders of the run; the run has a new name."""
+    path = tmp_path / "run"
+    killed(path)
+    before = RunDirectory(path).marker.id
+    for name in FOREIGN:
+        (path / name).parent.mkdir(exist_ok=True)
+        (path / name).write_text("mine")
+    killed(path, RUN.replace(seed=2, overwrite=True), checkpoint=False)
+    assert all((path / name).read_text() == "mine" for name in FOREIGN)
+    assert not (path / "checkpoints" / "last.ckpt").exists()
+    assert RunDirectory(path).marker.id != before
+    assert len(RunDirectory(path).sessions()) == 1
+
+
+@pytest.mark.parametrize("swept", ['[".."]', '["../.."]', '["."]', '["a/../.."]'])
+def test_a_title_leads_out_of_no_folder(tmp_path, swept):
+    """Overwriting a stranger's run of a sweep emptied the sweep's folder."""
+    path = tmp_path / "sweep" / "run"
+    killed(path)
+    for folder in (path.parent, path.parent / "tb"):
+        folder.mkdir(exist_ok=True)
+        (folder / ".run").write_text(RunDirectory(path).marker.id)
+        (folder / "events.out.tfevents.9").write_text("mine")
+    (path.parent / PLAN).write_text("{}")
+    (path / SWEPT).write_text(swept)
+    killed(path, RUN.replace(overwrite=True))
+    assert (path.parent / "events.out.tfevents.9").exists()
+    assert (path.parent / "tb" / "events.out.tfevents.9").exists()
+
+
+@pytest.mark.parametrize("text", ["null", "[1, 2]", '"a"', "{}", '["a\\u0000"]', "["])
+def test_a_damaged_title_is_one_line(verb, tmp_path, text):
     killed(tmp_path / "run")
-    before = RunDirectory(tmp_path / "run").marker.id
-    (tmp_path / "run" / "pictures").symlink_to(outside)
-    (tmp_path / "run" / "notes.txt").touch()
-    killed(tmp_path / "run", RUN.replace(seed=2, overwrite=True), checkpoint=False)
-    assert (outside / "a.png").exists()
-    assert (tmp_path / "run" / "notes.txt").exists()
-    assert not (tmp_path / "run" / "pictures").exists()
-    assert not (tmp_path / "run" / "checkpoints").exists()
-    assert RunDirectory(tmp_path / "run").marker.id != before
-    assert len(RunDirectory(tmp_path / "run").sessions()) == 1
+    (tmp_path / PLAN).write_text("{}")
+    (tmp_path / "run" / SWEPT).write_text(text)
+    code, _, err = verb(f"hydra.run.dir={tmp_path / 'run'}", "overwrite=true")
+    assert (code, len(err.splitlines())) == (1, 1), err
+    assert str(tmp_path / "run" / SWEPT) in err
+
+
+@pytest.mark.parametrize("place", ["pictures", "checkpoints", "faults", "../tb", "../tb/seed=2"])
+def test_nothing_is_written_through_links(verb, tmp_path, place):
+    """Pictures went to where the link points."""
+    run, outside = tmp_path / "sweep" / "run", tmp_path / "outside"
+    outside.mkdir()
+    if ".." in place:
+        run.mkdir(parents=True)
+        (run / SWEPT).write_text('["seed=2"]')
+        (run.parent / PLAN).write_text("{}")
+    (run / place).parent.mkdir(parents=True, exist_ok=True)
+    (run / place).symlink_to(outside)
+    code, _, err = verb(f"hydra.run.dir={run}", "seed=2")
+    assert (code, len(err.splitlines())) == (1, 1), err
+    assert "expected a file or folder of the run; found 'a link'" in err
+    assert not list(outside.iterdir())
+
+
+def test_overwriting_is_for_the_command_line(verb, tmp_path):
+    """A stranger's file with ``hydra.run.dir`` and ``overwrite`` replaced a run."""
+    killed(tmp_path / "run")
+    (tmp_path / "conf" / "experiment").mkdir(parents=True)
+    own = f"# @package _global_\nhydra: {{run: {{dir: '{tmp_path / 'run'}'}}}}\noverwrite: true\n"
+    (tmp_path / "conf" / "experiment" / "x.yaml").write_text(own)
+    code, _, err = verb("--config-dir", str(tmp_path / "conf"), "experiment=x")
+    expected = "overwrite: expected a value on the command line alone; found 'true in a file'"
+    assert (code, err) == (1, f"ghgs train: {expected}\n")
+    assert RunDirectory(tmp_path / "run").checkpoint is not None
 
 
 @pytest.mark.parametrize("key", ["init_from", "resume"])
