@@ -5,6 +5,7 @@ import os
 import resource
 import shlex
 import signal
+import threading
 import time
 from unittest.mock import Mock
 
@@ -14,6 +15,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 
 from ghgs_lit.cli import main as cli
+from ghgs_lit.cli import messages
 from ghgs_lit.weights.checkpoint import write_checkpoint
 from ghgs_people import datasets
 from tests.cli.bad_commands import ROWS
@@ -108,10 +110,17 @@ def test_a_disk_that_refuses_a_file_is_one_line_with_its_path(
     code, text = call(monkeypatch, capfd, tmp_path, f"{command.format(**files)} hydra.run.dir={tmp_path}/run")
     verb = command.split()[0]
     assert code == 1, text
-    assert text == (
-        f"ghgs {verb}: {tmp_path}/run/.hydra/config.yaml: expected a file that can be read or"
-        f" written; found {os.strerror(number)}\n"
-    )
+    expected = f"a file that can be read or written; found {os.strerror(number)}"
+    if number in (errno.ENOSPC, errno.EDQUOT):
+        expected = f"space on its disk; found it full ({os.strerror(number)})"
+    assert text == f"ghgs {verb}: {tmp_path}/run/.hydra/config.yaml: expected {expected}\n"
+
+
+def test_threads_say_nothing_of_a_full_disk(capfd):
+    """TensorBoard's printed a traceback, beside the line of the error that it raises later."""
+    for number in (errno.ENOSPC, errno.EIO):
+        messages.print_of_thread(threading.ExceptHookArgs((OSError, OSError(number, "x"), None, None)))
+    assert capfd.readouterr().err.count("OSError") == 1
 
 
 def test_weights_that_do_not_fit_the_disk_are_one_line_with_their_path(monkeypatch, capfd, tmp_path, files):
