@@ -360,9 +360,11 @@ def _check_main_guard() -> None:
 
 
 def start_worker() -> None:
-    """Prepare a worker: one thread, Ctrl-C only in the parent, and an end with the parent."""
+    """Prepare a worker: one thread, signals of a terminal or SLURM only in the parent, and an end with
+    the parent."""
     torch.set_num_threads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for each in (signal.SIGINT, signal.SIGUSR1, signal.SIGUSR2):
+        signal.signal(each, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

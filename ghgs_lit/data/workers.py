@@ -66,5 +66,7 @@ def loader_of(batches: Dataset, workers: int, **options: Any) -> DataLoader:
 
 
 def _leave_interrupts(number: int) -> None:
-    """Ctrl-C reaches every process of a terminal; the one that trains ends the others."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Ctrl-C reaches every process of a terminal, and what SLURM sends before a job's end every one of
+    the job; the one that trains ends the others."""
+    for each in (signal.SIGINT, signal.SIGUSR1, signal.SIGUSR2):
+        signal.signal(each, signal.SIG_IGN)

@@ -45,19 +45,9 @@ if TYPE_CHECKING:
 
 AUTO = "auto"  #: Value of ``resume``: as the directory stands
 MARKER = "run.json"
-#: What training writes into a run's directory and a new one deletes, beside the logs of Hydra.
-WRITTEN = (
-    "checkpoints",
-    "csv",
-    "faults",
-    "init_from.txt",
-    "metrics.csv",
-    "metrics.json",
-    "pictures",
-    "tensorboard",
-)
-#: Of it, and of ``curves``, what may be deleted; other files in these folders are a user's.
-_DELETED = (
+#: What training writes into a run's directory, beside checkpoints of other names and Hydra's logs, and
+#: a new run deletes; other files in these folders are a user's.
+_FILES = (
     "checkpoints/frozen-*.pt",
     "csv/metrics.csv",
     "faults/step_*.pt",
@@ -68,6 +58,7 @@ _DELETED = (
     "pictures/step_*/*.png",
     "tensorboard/events.out.tfevents.*",
 )
+WRITTEN = tuple(dict.fromkeys(pattern.partition("/")[0] for pattern in _FILES))  #: Names in the directory
 _CURVES = "tb"  #: Folder of a sweep with TensorBoard's files of its runs
 SESSIONS = "sessions.jsonl"
 PLAN = "multirun.yaml"  #: Configuration of a sweep's last command, beside its runs
@@ -355,7 +346,7 @@ class RunDirectory:
         """Delete what training wrote; only in a run's folder that this process has claimed."""
         options = run.plain.get("callbacks", {}).values()
         names = (re.sub(r"\{.*?\}", "*", each["filename"]) for each in options if each and "filename" in each)
-        patterns = [*_DELETED, *(f"checkpoints/{name}.ckpt" for name in names), *[SESSIONS] * with_sessions]
+        patterns = [*_FILES, *(f"checkpoints/{name}.ckpt" for name in names), *[SESSIONS] * with_sessions]
         paths = [path for pattern in patterns for path in self.path.glob(pattern)]
         marker = self.marker
         if marker is not None and _owner_of(self.curves) == marker.id:

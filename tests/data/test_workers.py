@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from ghgs_lit.data import workers
-from ghgs_lit.data.workers import automatic_workers
+from ghgs_lit.data.workers import automatic_workers, loader_of
 from tests.helpers.people import equal, render_boxes, rendered
 
 MANY = float("inf")
@@ -84,6 +84,22 @@ try:
 except KeyboardInterrupt:
     print("interrupted", flush=True)
 """
+
+
+class Signalled:
+    """Batches, whose process gets the signal of an announced end with each."""
+
+    def __len__(self):
+        return 3
+
+    def __getitem__(self, index):
+        os.kill(os.getpid(), signal.SIGUSR2)
+        return index
+
+
+def test_an_announced_end_leaves_loading_to_the_training():
+    """SLURM sends the signal to all processes of a job; a worker ended, and with it the training."""
+    assert list(loader_of(Signalled(), 1)) == [0, 1, 2]
 
 
 def test_an_interrupt_ends_all_processes_without_their_traces(root):
