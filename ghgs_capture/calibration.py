@@ -46,7 +46,8 @@ class Convention:
         pixel_centers: the first pixel's centre lies at 0.5 (``half``) or at 0
             (``integer``, as OpenCV's).
         resized: factor of a resize after the calibration, beyond the sizes that the file says.
-        unit: metres of one unit of length."""
+        unit: metres of one unit of length.
+        exif: which pixels of a turned photograph it is for: ``auto`` | ``stored`` | ``shown``."""
 
     extrinsics: str = "world_to_camera"
     axes: str = "opencv"
@@ -54,6 +55,7 @@ class Convention:
     pixel_centers: str = "half"
     resized: float = 1.0
     unit: float = 1.0
+    exif: str = "auto"
 
     def __post_init__(self) -> None:
         for name, value in (("resized", self.resized), ("unit", self.unit)):

@@ -8,7 +8,15 @@ from typing import Any
 import numpy as np
 
 from ghgs_capture.folder import CaptureFolder
-from ghgs_capture.hypotheses import Hypothesis, StoredView, for_all, for_some, gradient_of, outline_of
+from ghgs_capture.hypotheses import (
+    Hypothesis,
+    StoredView,
+    for_all,
+    for_some,
+    for_turned,
+    gradient_of,
+    outline_of,
+)
 from ghgs_capture.photographs import Pixels, fits_stored
 from ghgs_capture.placement import copies, placement_lines
 from ghgs_lit.data.mask_checks import twins
@@ -75,6 +83,9 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
         size = given.size(folder)
         agree = f"{given.score:.0%} of each mask or more lies in the hull of the others"
         lines = [f"cameras and masks agree ({agree})", _size_line(size)]
+        for other in (hypothesis.ranked(folder) for hypothesis in for_turned(views)):
+            if other.score > given.score + _SAME:
+                lines.append(f"{other.option} agrees better, by {other.score:.0%}")
         suspects, *suspicion = _suspected(given, folder) if given.score < _SOUND else ((),)
         lines += [*suspicion, *placement_lines(photographs, [view.camera.pose for view in views])]
         return Diagnosis(True, tuple(lines), "", (given,), size, suspects)
@@ -113,11 +124,13 @@ def small_views(folder: CaptureFolder, instant: str) -> tuple[StoredView, ...]:
         scale = min(_SIDE / max(height, width), 1)
         size = max(round(height * scale), 1), max(round(width * scale), 1)
         # Without a stored size the intrinsics are for the whole photograph.
-        keeps_stored = fits_stored(pixels, camera, folder.calibration.exif)
-        camera = camera.sized(pixels.stored_size if keeps_stored else pixels.size)
+        sizes = pixels.size, pixels.stored_size
+        keeps_stored = fits_stored(pixels, camera, folder.convention.exif)
+        read = camera.sized(sizes[keeps_stored])
         small = Pixels(area_image(np.ascontiguousarray(pixels.image), *size), None, pixels.turns)
         mask = area_mask(np.ascontiguousarray(matte > 127), *size)
-        views.append(StoredView(name, camera, small, mask, folder.convention))
+        turned = camera.sized(sizes[not keeps_stored])
+        views.append(StoredView(name, read, small, mask, folder.convention, turned))
     return tuple(views)
 
 

@@ -256,7 +256,7 @@ class CaptureFolder:
         """
         image = pixels.image
         turns = 0
-        if fits_stored(pixels, camera, self.calibration.exif):
+        if fits_stored(pixels, camera, convention.exif):
             turns = pixels.turns
             image = np.rot90(image, -turns)
             matte = np.rot90(matte, -turns)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ghgs_capture.calibration import Convention, StoredCamera, calibrate
+from ghgs_capture.masks import fitted
 from ghgs_capture.photographs import (
     MASK_ENDING,
     Pixels,
@@ -27,6 +28,7 @@ from ghgs_lit.runtime.cores import allowed_cores
 # Coding changes black and white by less than this.
 _CODED = 16
 _DIGITS = 6
+_TO_SRGB = "zscale=t=linear:npl={},format=gbrpf32le,zscale=p=bt709:t=iec61966-2-1:m=bt709:r=tv,format=yuv420p"
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,9 +81,8 @@ class VideoFrame:
             InputError: it cannot be decoded, or has another size.
         """
         grey = self.video.frame(self.number)
-        expected = f"the size of its video, {pixels.size} (height, width)"
-        require(grey.shape == pixels.size, str(self.video.video.path), expected, grey.shape)
-        return np.where(grey < _CODED, 0, np.where(grey > 255 - _CODED, 255, grey)).astype(np.uint8)
+        exact = np.where(grey < _CODED, 0, np.where(grey > 255 - _CODED, 255, grey)).astype(np.uint8)
+        return fitted(exact, pixels, self.video.video.path)
 
 
 Source = Path | Frame | VideoFrame  #: Where a photograph comes from
@@ -139,6 +140,9 @@ def find_frames(
         videos = dict(zip(paths, pool.map(read_video, paths.values()), strict=True))
     for name, video in videos.items():
         camera = cameras[name]
+        filters = _TO_SRGB.format(100 if video.hdr == "HLG" else 203)
+        expected = f"colours of standard range (ffmpeg -i {video.path.name} -vf {filters} ...)"
+        require(not video.hdr, str(video.path), expected, video.hdr)
         calibrate(replace(camera, origin=f"{video.path}: {camera.origin}"), convention, video.size)
     if isinstance(sync, str):
         numbers = _by_time(videos, Path(sync).expanduser(), names)

@@ -28,6 +28,7 @@ class StoredView:
     pixels: Pixels
     mask: np.ndarray
     convention: Convention
+    turned: StoredCamera  #: the camera, where the photograph's EXIF turn is read the other way
 
 
 @dataclass(frozen=True)
@@ -110,15 +111,26 @@ class Hypothesis:
         return float(np.median([s.extent(focus).max() for s in silhouettes]))
 
 
+def for_turned(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
+    """The other reading of EXIF turns, where a photograph has one."""
+    exif = "shown" if views[0].convention.exif == "stored" else "stored"
+    if any(view.pixels.turns for view in views):
+        convention = replace(views[0].convention, exif=exif)
+        changed = tuple(replace(view, camera=view.turned, convention=convention) for view in views)
+        yield Hypothesis(f"all cameras: exif {exif}", f"calibration.exif={exif}", changed)
+
+
 def for_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
-    """Other meanings of all cameras: what poses map, axes, unit of the intrinsics, and a resize."""
+    """Other meanings of all cameras: what poses map, axes, unit of the intrinsics, a resize, and
+    EXIF turns."""
     given = views[0].convention
+    readings = [views, *(hypothesis.views for hypothesis in for_turned(views))]
     points = [view.camera.intrinsics[:2, 2] / np.array(view.camera.size)[::-1] for view in views]
     scale = 0.5 / max(float(np.median(points)), 0.01)  # brings principal points to the middle
     likely = min(_RESIZES, key=lambda resize: abs(np.log(resize / scale)))
-    for intrinsics, resized in itertools.product(INTRINSICS, (given.resized, likely)):
-        inner = replace(given, intrinsics=intrinsics, resized=resized)
-        if not all(_plausible(replace(view, convention=inner)) for view in views):
+    for read, intrinsics, resized in itertools.product(readings, INTRINSICS, (given.resized, likely)):
+        inner = replace(read[0].convention, intrinsics=intrinsics, resized=resized)
+        if not all(_plausible(replace(view, convention=inner)) for view in read):
             continue
         for extrinsics, axes in itertools.product(EXTRINSICS, AXES):
             convention = replace(inner, extrinsics=extrinsics, axes=axes)
@@ -132,7 +144,7 @@ def for_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
             yield Hypothesis(
                 f"all cameras: {', '.join(map(' '.join, changed))}",
                 " ".join(f"calibration.{key}={value}" for key, value in changed),
-                tuple(replace(view, convention=convention) for view in views),
+                tuple(replace(view, convention=convention) for view in read),
             )
 
 
@@ -151,6 +163,13 @@ def for_some(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
         for says, changed in _mistakes(view):
             mended = (*views[:i], changed, *views[i + 1 :])
             yield Hypothesis(f"{view.name} alone: {says}", "", mended, (view.name,))
+    names = [view.name for view in views]
+    for step, word in ((1, "next"), (-1, "previous")) if len(views) > 2 else ():
+        shifted = views[step:] + views[:step]
+        changed = tuple(replace(v, camera=other.camera) for v, other in zip(views, shifted, strict=True))
+        pairs = ", ".join(f"{v.name}: {other.name}" for v, other in zip(views, shifted, strict=True))
+        says = f"each photograph has the camera of the {word} one"
+        yield Hypothesis(says, f"'calibration.names={{{pairs}}}'", changed, tuple(names))
     for i, j in itertools.combinations(range(len(views)), 2):
         one = views[i]
         other = views[j]

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from ghgs_capture.photographs import MASK_ENDING, Pixels, image_named, read_pixels
+from ghgs_capture.calibration import same_ratio
+from ghgs_capture.photographs import MASK_ENDING, Pixels, image_named, mask_alike, read_pixels
 from ghgs_lit.data.images import read_image
 from ghgs_lit.errors import choice, installed, require
 
@@ -28,7 +29,7 @@ def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
     """The matte of a photograph from alpha, labels, or grey of 8 or 16 bits.
 
     An alpha channel counts unless it is constant. All labels but 0 are the subject; a single larger
-    number beside them is void.
+    number beside them is void. A mask of another size is scaled.
 
     Args:
         path: of the mask.
@@ -47,17 +48,39 @@ def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
         values = alpha if alpha.min() < alpha.max() else values[..., :-1]
     require(values.dtype.kind in "bui", str(path), "a mask of whole numbers", values.dtype)
     values = values if values.ndim == 2 else values.max(-1)
-    if values.shape != pixels.size:
-        fits = values.shape == pixels.stored_size
-        require(fits, str(path), f"the size of its photograph, {pixels.size} (height, width)", values.shape)
-        values = np.rot90(values, pixels.turns)
     most = int(values.max(initial=0))
     labelled = (values > 0) & (values < _LABELS)
     # Void is a thin rim, and a soft matte has numbers between it and the labels.
     is_void = (values == most).sum() < labelled.sum() and not ((values >= _LABELS) & (values < most)).any()
     if most < _LABELS or is_void:
-        return labelled * np.uint8(255)
-    return np.round(values * (1 / 257 if most > 255 else 1)).astype(np.uint8)
+        return fitted(labelled * np.uint8(255), pixels, path)
+    return fitted(np.round(values * (1 / 257 if most > 255 else 1)).astype(np.uint8), pixels, path)
+
+
+def fitted(matte: np.ndarray, pixels: Pixels, path: Path) -> np.ndarray:
+    """A matte turned and scaled to its photograph.
+
+    Args:
+        matte: [h, w] uint8, of the photograph as shown or as stored, at any size.
+        pixels: the photograph as shown.
+        path: of the matte, for the message.
+
+    Returns:
+        [h, w] uint8 of the photograph as shown.
+
+    Raises:
+        InputError: its aspect ratio is not that of the photograph.
+    """
+    sizes = (pixels.size, pixels.stored_size)
+    alike = [size for size in sizes if size == matte.shape] or [
+        s for s in sizes if same_ratio(s, matte.shape)
+    ]
+    expected = f"the size of its photograph, {pixels.size} (height, width), or its aspect ratio"
+    require(bool(alike), str(path), expected, matte.shape)
+    matte = matte if alike[0] == pixels.size else np.rot90(matte, pixels.turns)
+    if matte.shape == pixels.size:
+        return matte
+    return np.asarray(Image.fromarray(matte).resize(pixels.size[::-1], Image.Resampling.BILINEAR))
 
 
 def matte_of_background(pixels: Pixels, path: Path) -> np.ndarray:
@@ -132,4 +155,5 @@ def mask_path(photograph: Path, images: Path, masks: Path) -> Path | None:
     # Beside the photograph, the image of its name is the photograph itself.
     is_same_folder = os.path.realpath(folder) == os.path.realpath(photograph.parent)
     # COLMAP's masks keep the suffix of the photograph: front.jpg.png.
-    return image_named(folder, *([marked] if is_same_folder else [photograph.stem, photograph.name, marked]))
+    names = [marked] if is_same_folder else [photograph.stem, photograph.name, marked]
+    return image_named(folder, *names) or mask_alike(folder, photograph.stem, is_same_folder)

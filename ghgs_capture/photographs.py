@@ -1,5 +1,6 @@
 """Photographs in a folder: which camera took each, and the pixels that its calibration is for."""
 
+import functools
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -18,6 +19,12 @@ SUFFIXES = (".jpg", ".jpeg", ".jpe", ".jfif", ".png", ".webp", ".avif", ".tif", 
 PICTURES = "heic heif hif jxl jp2 j2k gif tga ppm pgm exr hdr psd dng cr2 cr3 nef arw raf orf rw2 pef srw raw"
 _COMPANIONS = "json xml xmp txt toml yaml yml csv npy npz pkl aae md log ply obj"
 MASK_ENDING = "_mask"  #: A mask beside its photograph ends with this
+# The same with a number after it, or of a foreground.
+_MASK = re.compile(r"_f?mask_?\d*$", re.IGNORECASE)
+#: Words of names that tell photographs from masks, not what they show.
+_KINDS = (
+    "rgb rgbs img image images color colour photo frame mask masks fmask matte alpha silhouette seg label"
+)
 #: Quarter turns as of ``numpy.rot90`` by EXIF orientation.
 _TURNS = {1: 0, 3: 2, 6: 3, 8: 1}
 
@@ -110,12 +117,47 @@ def images_in(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[str, P
     paths: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         is_image = path.suffix.lower() in suffixes and not path.name.startswith(".")
-        if not is_image or path.stem.lower().endswith(MASK_ENDING):
+        if not is_image or _MASK.search(path.stem):
             continue
         require(not path.is_dir(), str(path), "a photograph", "a folder")
         name = composed(path.stem)
         require(name not in paths, str(path), "one file for each photograph", str(paths.get(name)))
         paths[name] = path
+    return paths
+
+
+def parts_of_name(name: str) -> tuple[str, ...]:
+    """Words and numbers of a name, without those of its kind: of ``cam1_rgb007`` cam, 1, 007.
+
+    Args:
+        name: of a photograph or a mask, without suffix.
+    """
+    parts = re.findall(r"\d+|[^\W\d_]+", composed(name).casefold())
+    return tuple(part for part in parts if part not in _KINDS.split())
+
+
+def mask_alike(folder: Path, name: str, is_beside: bool) -> Path | None:
+    """The only mask of a folder whose name has the same parts (:func:`parts_of_name`).
+
+    Args:
+        folder: where it may lie.
+        name: of a photograph, without suffix.
+        is_beside: whether photographs lie in this folder, too.
+    """
+    if not folder.is_dir():
+        return None
+    paths = _by_parts(folder, folder.stat().st_mtime_ns).get(parts_of_name(name), [])
+    paths = [path for path in paths if _MASK.search(path.stem) or not is_beside]
+    return paths[0] if len(paths) == 1 else None
+
+
+@functools.lru_cache(maxsize=64)
+def _by_parts(folder: Path, changed: int) -> dict[tuple[str, ...], list[Path]]:
+    """Images of a folder that has not ``changed`` by the parts of their names."""
+    paths: dict[tuple[str, ...], list[Path]] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() in SUFFIXES and not path.name.startswith("."):
+            paths.setdefault(parts_of_name(path.stem), []).append(path)
     return paths
 
 
@@ -152,7 +194,7 @@ def require_all_read(
         name = composed(path.name)
         kind = path.suffix.lower().removeprefix(".")
         begins = {name[:end] for end, letter in enumerate(f"{name}.") if letter == "."}
-        is_other = path.name.startswith(".") or path.is_dir() or path.stem.lower().endswith(MASK_ENDING)
+        is_other = path.name.startswith(".") or path.is_dir() or _MASK.search(path.stem)
         if is_other or kind in _COMPANIONS.split() or not begins.isdisjoint(read):
             continue
         if kind in PICTURES.split() or not begins.isdisjoint(known):
@@ -221,6 +263,8 @@ def counted(name: str) -> list[str | int]:
 def _by_instant(folder: Path, by_camera: Mapping[str, dict[str, Path]]) -> dict[str, dict[str, Path]]:
     """Turn ``{camera: {instant: path}}`` into ``{instant: {camera: path}}``."""
     first, *others = by_camera
+    if any(by_camera[first].keys().isdisjoint(by_camera[other]) for other in others):
+        by_camera = {camera: _without_folder(paths) for camera, paths in by_camera.items()}
     for other in others:
         shared = by_camera[first].keys() & by_camera[other].keys()
         expected = f"photographs named as those of {first}"
@@ -232,6 +276,17 @@ def _by_instant(folder: Path, by_camera: Mapping[str, dict[str, Path]]) -> dict[
         of_cameras = {camera: paths[instant] for camera, paths in by_camera.items() if instant in paths}
         by_instant[instant] = of_cameras
     return by_instant
+
+
+def _without_folder(paths: Mapping[str, Path]) -> Mapping[str, Path]:
+    """Photographs of a camera by the parts of their names that do not repeat their folder's;
+    as given where that makes two of them alike."""
+    named = {}
+    for name, path in paths.items():
+        parts, folder = parts_of_name(name), parts_of_name(path.parent.name)
+        parts = parts[len(folder) :] if parts[: len(folder)] == folder else parts
+        named["_".join(parts)] = path
+    return named if len(named) == len(paths) and "" not in named else paths
 
 
 def camera_named(name: str, cameras: Collection[str], names: Mapping[str, str]) -> str:

@@ -27,6 +27,9 @@ _EXACT = "bicubic+accurate_rnd+full_chroma_int"
 # How framecrc lists a packet that says no time, and one that is not shown.
 _UNTIMED = -(2**63)
 _HIDDEN = re.compile("F=0x[4-7]")
+# Curves of colours that ffmpeg does not turn into those of photographs.
+_HDR = re.compile(r"Video: .*\b(arib-std-b67|smpte2084)\b")
+_NAMES = {"arib-std-b67": "HLG", "smpte2084": "PQ"}
 _PATIENCE = 10.0  #: Seconds of a video that are decoded to reach a frame; beyond, it is sought
 
 
@@ -38,6 +41,7 @@ class Video:
     size: tuple[int, int]  #: (height, width) in pixels as shown
     seconds: np.ndarray  #: [n] float64, when each frame is shown, ascending
     numbers: np.ndarray  #: [n] int64, the number of each; dropped frames have numbers, too
+    hdr: str = ""  #: HLG or PQ, where colours follow their curve
 
     @property
     def count(self) -> int:
@@ -87,8 +91,10 @@ def _read_video(path: Path, changed: int) -> Video:
     options = ("-frames:v", "1", "-f", "image2pipe", "-c:v", "pgm")
     first = subprocess.run(_command(path, "gray", *options, log="error"), capture_output=True)
     time = _TIME.search(first.stderr)
-    listing = [*_source(path), "-c", "copy", "-f", "framecrc", "-"]
-    listed = subprocess.run(listing, capture_output=True).stdout.decode().splitlines()
+    listing = [*_source(path, log="info"), "-c", "copy", "-f", "framecrc", "-"]
+    copied = subprocess.run(listing, capture_output=True)
+    listed = copied.stdout.decode().splitlines()
+    hdr = _HDR.search(copied.stderr.decode(errors="replace"))
     packets = [line.split(",")[1:3] for line in listed if line[:1].isdigit() and not _HIDDEN.search(line)]
     if time is None or not packets:
         last_line = first.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no output of ffmpeg"]
@@ -102,7 +108,8 @@ def _read_video(path: Path, changed: int) -> Video:
     steps = np.diff(seconds)
     usual = max(float(np.median(steps)), 1e-6) if len(steps) else 1.0
     numbers = np.cumsum([0, *np.rint(steps / usual).clip(1)]).astype(np.int64)
-    return Video(path, Image.open(io.BytesIO(first.stdout), formats=["PPM"]).size[::-1], seconds, numbers)
+    size = Image.open(io.BytesIO(first.stdout), formats=["PPM"]).size[::-1]
+    return Video(path, size, seconds, numbers, _NAMES[hdr[1]] if hdr else "")
 
 
 def _source(path: Path, seek: float = 0.0, log: str = "quiet") -> list[str]:

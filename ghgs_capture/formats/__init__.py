@@ -9,7 +9,7 @@ from ghgs_capture.formats.json_and_toml import read_json, read_json_file, read_t
 from ghgs_capture.formats.nerfstudio import read_nerfstudio
 from ghgs_capture.formats.opencv import EASYMOCAP, read_easymocap, read_opencv, yaml_files
 from ghgs_capture.formats.qualisys import read_qualisys
-from ghgs_lit.errors import InputError, choice
+from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.parsing import find_path
 
 __all__ = ["FORMATS", "CameraFile", "read_cameras"]
@@ -24,14 +24,17 @@ FORMATS: dict[str, Callable[[Path], CameraFile]] = {
     "toml": read_toml,
     "qualisys": read_qualisys,
 }
+#: Formats that may have several files, and endings of those of one.
+_OF_FOLDERS = ("colmap", "opencv", "easymocap")
+_SINGLE = (".json", ".toml", ".qca.txt")
 
 
 def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
     """Read a file or a folder of cameras; a warning names entries that are not read.
 
     Args:
-        path: a file; or a folder for COLMAP's models, OpenCV's files for each camera and
-            EasyMocap's.
+        path: a file, or the folder of one: of transforms.json, COLMAP's model, EasyMocap's files,
+            OpenCV's YAML of each camera, or a single JSON, TOML or .qca.txt.
         format: one of :data:`FORMATS`; ``auto`` tells it by file names and keys of JSON.
 
     Returns:
@@ -44,7 +47,23 @@ def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
     choice("calibration.format", format, ("auto", *FORMATS))
     if not path.exists():
         raise InputError(f"{path}: expected a file or folder of cameras; found no such path")
+    path = _file_in(path, format) if path.is_dir() else path
     return FORMATS[_format_of(path) if format == "auto" else format](path)
+
+
+def _file_in(folder: Path, format: str) -> Path:
+    """The file of a folder that holds the cameras; the folder itself for formats of several files.
+    InputError: there are several."""
+    of_folder = format in _OF_FOLDERS or find_path(folder, EASYMOCAP[0]) is not None
+    if of_folder or (format == "auto" and (model_folder(folder) is not None or yaml_files(folder))):
+        return folder
+    transforms = find_path(folder, "transforms.json")
+    if transforms is not None and format in ("auto", "nerfstudio"):
+        return transforms
+    files = [path for path in sorted(folder.iterdir()) if path.name.lower().endswith(_SINGLE)]
+    expected = "one file of cameras, or transforms.json"
+    require(len(files) < 2, str(folder), expected, ", ".join(path.name for path in files))
+    return files[0] if files else folder
 
 
 def _format_of(path: Path) -> str:

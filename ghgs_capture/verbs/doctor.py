@@ -84,7 +84,7 @@ def cameras(run: "Doctor") -> None:
         images = [photograph.image for photograph in best.photographs(folder)]
         save_png(camera_sheet([v.name for v in views], images, best.silhouettes(folder)), picture)
         announce(picture)
-    if diagnosis.option:
+    if diagnosis.option and "exif" not in diagnosis.option:  # of stored pixels, which no file says
         best_cameras = {
             v.name: (calibrate(v.camera, v.convention, v.camera.size), v.camera.size) for v in views
         }

@@ -7,6 +7,8 @@ import torch.nn.functional as F
 
 # Pixels between evaluations of the model; it is interpolated linearly, with errors below 0.01 px.
 _STEP = 8
+_OUTSIDE = 4.0  # of a grid's positions, which are from -1 to 1 inside
+_RADII = 4096  # at which a lens is examined for where its model turns back
 
 
 def undistorting_grid(
@@ -25,7 +27,9 @@ def undistorting_grid(
         fisheye: whether the coefficients are those of the fisheye model.
 
     Returns:
-        Positions [1, h, w, 2] float32 for ``grid_sample`` with ``align_corners=False``.
+        Positions [1, h, w, 2] float32 for ``grid_sample`` with ``align_corners=False``; outside of
+        the photograph beyond the radius at which the model turns back, where it shows once more what
+        lies further inside.
     """
     # Here: importing kornia takes longer than reading photographs without distortion.
     from kornia.geometry.calibration import distort_points
@@ -48,7 +52,27 @@ def undistorting_grid(
         places = distort_points(pixels[None], matrix[None], coefficients[None])[0]
     grid = (2 * places / places.new_tensor([width, height]) - 1).reshape(1, *counts, 2).float()
     dense = F.interpolate(grid.permute(0, 3, 1, 2), (height, width), mode="bilinear", align_corners=True)
-    return dense.permute(0, 2, 3, 1)
+    columns, rows = np.arange(width) + 0.5, np.arange(height) + 0.5
+    focal, middle = np.diag(intrinsics)[:2], intrinsics[:2, 2]
+    radii = np.hypot(((rows - middle[1]) / focal[1])[:, None], (columns - middle[0]) / focal[0])
+    is_beyond = torch.from_numpy(radii > _range(distortion, fisheye, radii.max()))
+    return dense.permute(0, 2, 3, 1).masked_fill(is_beyond[..., None], _OUTSIDE)
+
+
+def _range(distortion: np.ndarray, fisheye: bool, largest: float) -> float:
+    """The radius on the plane at depth 1 at which a lens model turns back; ``largest``: not below it."""
+    radii = np.linspace(0, largest, _RADII)
+    k = np.zeros(14)
+    k[: len(distortion)] = distortion
+    if fisheye:
+        inner = np.arctan(radii)
+        bent = inner * np.polynomial.Polynomial([1, *k[:4]])(inner**2)
+    else:
+        inner = radii**2
+        below = np.polynomial.Polynomial([1, *k[5:8]])(inner)
+        bent = radii * np.polynomial.Polynomial([1, k[0], k[1], k[4]])(inner) / below
+    turns = np.flatnonzero(np.diff(bent) <= 0)
+    return radii[turns[0]] if len(turns) else largest
 
 
 def undistort(image: np.ndarray, matte: np.ndarray, grid: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:

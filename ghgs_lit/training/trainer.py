@@ -54,8 +54,8 @@ class TrainerOptions(Options):
     max_time: Duration | None = None
     """days:hours:minutes:seconds; the learning rate follows the budget that ends first;
     null: no limit."""
-    val_check_interval: Batches = 5000
-    """Steps between two validations."""
+    val_check_interval: Count = 5000
+    """Steps of the optimizer between two validations."""
     limit_val_batches: Index | Share = 8
     """Batches of each validation; 0: none."""
     log_every_n_steps: Index = 50
@@ -86,6 +86,7 @@ class TrainerOptions(Options):
         Raises:
             InputError: Lightning refuses the options."""
         options = dict(self)
+        options["val_check_interval"] *= self.accumulate_grad_batches  # Lightning counts batches
         if self.precision == "tf32":
             options["precision"] = "32-true"
         round_products(self.precision == "tf32")  # also back, after another run of the process

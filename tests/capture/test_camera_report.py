@@ -50,6 +50,46 @@ def test_one_camera_that_disagrees_is_named(tmp_path, name):
     assert any(words in line and "cam2" in line for line in found.lines)
 
 
+def test_a_camera_that_hangs_upside_down(tmp_path):
+    """Its file is turned by EXIF, its calibration is of the pixels as stored."""
+    figure = Figure()
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    stored = np.ascontiguousarray(np.rot90(figure.images[1], 2))
+    cameras = {**figure.cameras, "cam1": half_turned(figure.cameras["cam1"])}
+    path = figure.write(tmp_path, cameras=cameras)
+    Image.fromarray(stored).save(tmp_path / "cam1.png", exif=exif)
+    found = diagnose(CaptureFolder(tmp_path, path))
+    assert not found.consistent
+    assert found.option == "calibration.exif=stored"
+    assert diagnose(CaptureFolder(tmp_path, path, calibration={"exif": "stored"})).consistent
+    figure.write(tmp_path)
+    Image.fromarray(stored).save(tmp_path / "cam1.png", exif=exif)
+    assert (
+        diagnose(CaptureFolder(tmp_path, path, calibration={"exif": "stored"})).option
+        == "calibration.exif=shown"
+    )
+
+
+def half_turned(camera):
+    k = np.array(camera["intrinsics"])
+    k[:2, 2] = np.array([camera["width"], camera["height"]]) - k[:2, 2]
+    pose = np.diag([-1.0, -1, 1, 1]) @ np.array(camera["extrinsics"])
+    return {**camera, "intrinsics": k.tolist(), "extrinsics": pose.tolist()}
+
+
+@pytest.mark.parametrize("step", [1, -1])
+def test_cameras_that_are_counted_from_the_next_one(tmp_path, step):
+    figure = Figure(views=5, jitter=0.1)
+    shifted = figure.names[step:] + figure.names[:step]
+    cameras = {other: figure.cameras[name] for name, other in zip(figure.names, shifted, strict=True)}
+    found = examine(tmp_path, cameras, figure)
+    names = dict(zip(figure.names, shifted, strict=True))
+    assert found.option == f"'calibration.names={{{', '.join(f'{a}: {b}' for a, b in names.items())}}}'"
+    mended = {"names": names}
+    assert diagnose(CaptureFolder(tmp_path, tmp_path / "cameras.json", calibration=mended)).consistent
+
+
 def test_exchanged_cameras_and_copies_are_named(tmp_path):
     figure = Figure()
     c = figure.cameras

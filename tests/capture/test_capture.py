@@ -231,6 +231,28 @@ def test_undistorted_photographs_are_pinhole_photographs(fisheye):
     assert np.abs(ours - places).max() < 0.02
 
 
+@pytest.mark.parametrize(
+    ("lens", "fisheye", "turn"),
+    [
+        ([0.02, -0.05, 0, 0, -6], False, 0.5361),  # 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6 = 0
+        ([-0.1, 0, 0, 0], False, (1 / 0.3) ** 0.5),
+        ([-1.0, 0, 0, 0], True, np.tan((1 / 3) ** 0.5)),
+        ([0.1, 0.01, 0, 0, 0.001], False, None),
+    ],
+)
+def test_a_lens_is_not_read_beyond_where_its_model_turns_back(lens, fisheye, turn):
+    matrix = np.array([[50.0, 0, 50], [0, 50, 40], [0, 0, 1]])
+    grid = undistorting_grid(matrix, np.array(lens), 300, 300, fisheye)[0]
+    rows, columns = np.meshgrid(np.arange(300) + 0.5, np.arange(300) + 0.5, indexing="ij")
+    radii = np.hypot((columns - 50) / 50, (rows - 40) / 50)
+    is_read = ~(grid == 4).all(-1).numpy()
+    if turn is None:
+        assert is_read.all()
+    else:
+        assert is_read[radii < turn - 0.01].all()
+        assert not is_read[radii > turn + 0.01].any()
+
+
 def test_a_bent_photograph_is_straightened(tmp_path):
     """OpenCV bends the photographs of a pinhole camera; reading them undoes it."""
     figure = Figure()

@@ -11,10 +11,11 @@ from PIL import Image
 from ghgs_capture import Capture
 from ghgs_capture.camera_report import diagnose
 from ghgs_capture.folder import CaptureFolder
+from ghgs_capture.formats import read_cameras
 from ghgs_capture.masks import matte_of_file
 from ghgs_capture.photographs import Pixels
 from ghgs_lit.errors import InputError
-from tests.helpers.calibrations import frame, write
+from tests.helpers.calibrations import frame, transforms, write
 from tests.helpers.figures import Figure
 
 
@@ -64,6 +65,77 @@ def test_names_of_masks(capture, change):
     """``cam0.PNG`` of Windows, and COLMAP's ``cam0.png.png``."""
     rename(capture, "masks", change)
     assert len(read(capture).photographs) == 4
+
+
+@pytest.mark.parametrize(
+    ("photograph", "mask", "instants"),
+    [
+        ("{camera}_rgb{n:06d}", "{camera}_mask{n:06d}", ["000000", "000001"]),
+        ("{n:04d}_img", "{n:04d}_img_fmask", ["0000_img", "0001_img"]),
+        ("{camera}-{n}", "{camera}_{n}.alpha", ["0", "1"]),
+    ],
+)
+@pytest.mark.parametrize("beside", [False, True])
+def test_names_that_repeat_camera_and_kind(capture, photograph, mask, instants, beside):
+    if beside and "mask" not in mask:
+        return
+    for path in sorted((capture / "images").glob("*.png")):
+        for folder, name in (("rgbs", photograph), ("rgbs" if beside else "mattes", mask)):
+            place = capture / folder / path.stem
+            place.mkdir(parents=True, exist_ok=True)
+            source = path if name == photograph else capture / "masks" / path.name
+            for n in range(2):
+                (place / f"{name.format(camera=path.stem, n=n)}.png").write_bytes(source.read_bytes())
+    masks = None if beside else capture / "mattes"
+    folder = CaptureFolder(capture / "rgbs", capture / "cameras.json", masks)
+    assert folder.instants == instants
+    for one, other in zip(folder.photographs(instants[1]), read(capture).photographs, strict=True):
+        np.testing.assert_array_equal(one.matte, other.matte)
+
+
+def test_a_mask_of_another_camera_is_no_mask(capture):
+    os.rename(capture / "masks" / "cam0.png", capture / "masks" / "cam00_mask.png")
+    with pytest.raises(InputError, match=r"masks: expected a mask of .*cam0\.png; found"):
+        read(capture)
+
+
+@pytest.mark.parametrize("factor", [2, 0.5])
+def test_masks_of_another_size_are_scaled(capture, factor):
+    right = read(capture)
+    for path in (capture / "masks").iterdir():
+        image = Image.open(path).convert("L")
+        image.resize((round(image.width * factor), round(image.height * factor)), Image.Resampling.BOX).save(
+            path
+        )
+    for one, other in zip(right.photographs, read(capture).photographs, strict=True):
+        assert (one.mask & other.mask).sum() > 0.9 * (one.mask | other.mask).sum()
+
+
+@pytest.mark.parametrize(
+    ("files", "line"),
+    [
+        (("cameras.json",), None),
+        (("cameras.json", "transforms.json"), None),
+        (
+            ("cameras.json", "other.toml"),
+            "expected one file of cameras, or transforms.json; found 'cameras.json",
+        ),
+        ((), "found a folder without any"),
+    ],
+)
+def test_the_folder_of_a_single_file_of_cameras(capture, files, line):
+    folder = capture / "calibration"
+    folder.mkdir()
+    for name in files:
+        (folder / name).write_bytes((capture / "cameras.json").read_bytes())
+    if "transforms.json" in files:
+        transforms(folder, frame("a.png"))
+    if line is None:
+        expected = "nerfstudio" if "transforms.json" in files else "ghgs"
+        assert read_cameras(folder).format == expected
+        return
+    with pytest.raises(InputError, match=line):
+        read_cameras(folder)
 
 
 def test_a_capture_with_an_angle_of_view_alone(capture):

@@ -123,6 +123,18 @@ def test_another_size_of_a_mask_video(place, capsys):
     assert "instant 000003 is without cam1: " in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(("curve", "name"), [(18, "HLG"), (16, "PQ")])
+def test_colours_of_another_curve_are_named(place, curve, name):
+    path = place / "images" / "cam1.mp4"
+    tags = ["-c", "copy", "-bsf:v", f"h264_metadata=transfer_characteristics={curve}"]
+    subprocess.run([get_ffmpeg_exe(), "-v", "error", "-i", path, *tags, place / "hdr.mp4"], check=True)
+    (place / "hdr.mp4").rename(path)
+    with pytest.raises(
+        InputError, match=rf"cam1\.mp4: expected colours of standard range .*; found '{name}'"
+    ):
+        opened(place)
+
+
 def test_another_rate(place):
     write_video(place / "images" / "cam3.mp4", frames_of(3), fps=15)
     line = r"sequence\.sync: expected as many frames a second .*found .*'cam2': 10\.0, 'cam3': 15\.0"

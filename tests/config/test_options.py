@@ -147,7 +147,6 @@ def test_what_the_documentation_allows_passes(whole):
         ("optimizer.lr", 1),
         ("trainer.max_time", {"hours": 2}),
         ("trainer.max_time", None),
-        ("trainer.val_check_interval", 0.5),
         ("trainer.devices", [0, 1]),
         ("callbacks.best.filename", "best-{step:06d}-{val/psnr:.2f}"),
         ("targets.per_subject", "all"),
