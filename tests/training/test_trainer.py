@@ -19,13 +19,16 @@ class Seen(L.Callback):
     """Steps' first photographs, and numbers of validated batches."""
 
     def __init__(self):
-        self.trained, self.validated = [], 0
+        self.trained, self.validated, self.steps = [], 0, []
 
     def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
         self.trained.append(float(batch.images.sum()))
 
     def on_validation_batch_end(self, *_):
         self.validated += 1
+
+    def on_validation_start(self, trainer, pl_module):
+        self.steps.append(trainer.global_step)
 
 
 def fit(folder, **options) -> tuple[L.Trainer, Seen]:
@@ -54,6 +57,12 @@ def test_an_epoch_of_fewer_batches_goes_on_with_the_next(tmp_path):
     assert trainer.global_step == len(seen.trained) == 6
     assert seen.trained == all_of_them.trained
     assert len(set(seen.trained)) == 6
+
+
+@pytest.mark.parametrize("accumulated", [1, 2])
+def test_validations_are_counted_in_steps_of_the_optimizer(tmp_path, accumulated):
+    options = {"accumulate_grad_batches": accumulated, "limit_train_batches": 4, "val_check_interval": 2}
+    assert fit(tmp_path, **options)[1].steps == [2, 4, 6]
 
 
 @pytest.mark.parametrize("batches", [2, 0.5])
