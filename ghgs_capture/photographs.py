@@ -210,7 +210,8 @@ def find_instants(
     """Find photographs in a folder itself or in its folders.
 
     A folder is an instant with a photograph of every camera, or, if named after a camera, has one
-    photograph for each instant. Of several instants one may lack photographs.
+    photograph for each instant. Names may begin with the camera's (``front_rgb0001``). Of several
+    instants one may lack photographs.
 
     Args:
         folder: of photographs, or of such folders.
@@ -229,6 +230,9 @@ def find_instants(
     photographs = images_in(folder)
     require_all_read(folder, photographs, known)
     if photographs:
+        if of_cameras := _split_names(photographs, cameras, names):
+            instants = _by_instant(folder, of_cameras)
+            return {name or folder.resolve().name: paths for name, paths in instants.items()}
         return {folder.resolve().name: by_camera(folder, photographs, cameras, names)}
     places = {
         composed(path.name): path
@@ -246,6 +250,24 @@ def find_instants(
         return _by_instant(folder, by_camera(folder, folders, cameras, names))
     least = 2 if len(folders) == 1 else 1
     return {name: by_camera(folder / name, paths, cameras, names, least) for name, paths in folders.items()}
+
+
+def _split_names(
+    photographs: Mapping[str, Path], cameras: Mapping[str, StoredCamera], names: Mapping[str, str]
+) -> dict[str, dict[str, Path]]:
+    """Photographs by camera and by what follows its name; empty unless all begin with the names of
+    cameras and none is that of a camera."""
+    of_cameras: dict[str, dict[str, Path]] = {}
+    for name, path in photographs.items():
+        parts = parts_of_name(name)
+        begins = {parts_of_name(known): known for known in (*cameras, *names)}
+        count = max((n for n in range(1, len(parts) + 1) if parts[:n] in begins), default=0)
+        rest = "_".join(parts[count:])
+        camera = names.get(begins.get(parts[:count], ""), begins.get(parts[:count], ""))
+        if not count or camera_named(name, cameras, names) in cameras or rest in of_cameras.get(camera, {}):
+            return {}
+        of_cameras.setdefault(camera, {})[rest] = path
+    return of_cameras
 
 
 def counted(name: str) -> list[str | int]:

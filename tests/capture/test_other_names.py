@@ -93,6 +93,26 @@ def test_names_that_repeat_camera_and_kind(capture, photograph, mask, instants, 
         np.testing.assert_array_equal(one.matte, other.matte)
 
 
+@pytest.mark.parametrize(
+    ("photograph", "mask", "instants"),
+    [
+        ("{camera}_rgb{n:06d}", "{camera}_mask{n:06d}", ["000000", "000001"]),
+        ("{camera}_img", "{camera}_fmask", ["rgbs"]),
+    ],
+)
+def test_names_that_begin_with_the_camera(capture, photograph, mask, instants):
+    for folder, name, source in (("rgbs", photograph, "images"), ("mattes", mask, "masks")):
+        (capture / folder).mkdir()
+        for path in (capture / source).glob("*.png"):
+            for n in range(len(instants)):
+                place = capture / folder / f"{name.format(camera=path.stem, n=n)}.png"
+                place.write_bytes(path.read_bytes())
+    folder = CaptureFolder(capture / "rgbs", capture / "cameras.json", capture / "mattes")
+    assert folder.instants == instants
+    for one, other in zip(folder.photographs(instants[-1]), read(capture).photographs, strict=True):
+        np.testing.assert_array_equal(one.matte, other.matte)
+
+
 def test_a_mask_of_another_camera_is_no_mask(capture):
     os.rename(capture / "masks" / "cam0.png", capture / "masks" / "cam00_mask.png")
     with pytest.raises(InputError, match=r"masks: expected a mask of .*cam0\.png; found"):
