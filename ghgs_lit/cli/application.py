@@ -107,17 +107,22 @@ class Verb:
             fits = is_said or not cfg.get("overwrite")
             require(fits, "overwrite", "a value on the command line alone", "true in a file")
             verb = verb_class(self.name).begin(plain(cfg))
-            if verb.begins_run:
+            is_dry = getattr(verb, "dry_run", False)
+            if verb.begins_run and not is_dry:
                 run = RunDirectory(directory)
                 if run.marker is not None:  # it compares whole configurations
                     verb.complete(plain(fill(cfg)))
                 run.start(verb)
-            write_hydra_files(cfg, directory)
+            if not is_dry:
+                write_hydra_files(cfg, directory)
             verb.require_files()
             verb.complete(plain(fill(cfg)))  # before the verb imports what takes longer
             collect_garbage_again()
             children_sleep()
-            return verb.run()
+            result = verb.run()
+            if is_dry:
+                discard_unused(directory, self.name, self.started)
+            return result
         except messages.BAD_INPUT as error:
             # In a sweep Hydra prints the error with its job's number.
             if HydraConfig.get().mode == RunMode.MULTIRUN:
@@ -164,10 +169,12 @@ def _help(verb: str, words: list[str], folder: str | None) -> int:
 
     folders = [] if folder is None else [Path(folder)]
     groups = [word for word in words if "=" not in word]
+    overrides = _for_hydra(verb, [word for word in words if "=" in word])
+    cfg = compose(verb, overrides, with_hydra=True, folder=folder, is_filled=bool(groups))
     for group in groups:
-        print_group(verb, group, folders)
+        print_group(verb, group, cfg, folders)
     if not groups:
-        print_verb(verb, folders)
+        print_verb(verb, cfg, folders)
     return 0
 
 

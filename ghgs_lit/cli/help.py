@@ -2,42 +2,29 @@
 read from the options classes."""
 
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path
+from typing import Any
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from ghgs_lit.config import compose, conf_dir
+from ghgs_lit.config import conf_dir
 from ghgs_lit.config.options import did_you_mean, expected, meanings, options_of
-from ghgs_lit.config.registry import KINDS, class_of, kinds_of, verb_class
+from ghgs_lit.config.registry import KINDS, NAMED, class_of, kinds_of, verb_class
 from ghgs_lit.errors import InputError
 from ghgs_lit.parsing import read_text
 
 _WIDTH = 100
 
-#: Groups whose options ``model=<option>`` chooses.
-_OF_MODELS = ("bounds", "depth_head", "unprojection", "recalibration", "gaussian_head")
 
-
-def defaults_of(verb: str) -> dict[str, str | None]:
-    """Default option of each config group that a verb composes; None where there is none.
-
-    Args:
-        verb: name of a verb, or of another file in ``conf``.
-    """
-    if not (conf_dir() / f"{verb}.yaml").is_file():  # a plug-in's, with its own keys alone
-        return {}
-    shipped = OmegaConf.to_container(OmegaConf.load(conf_dir() / f"{verb}.yaml"))
-    chosen: dict[str, str | None] = {}
-    for entry in shipped["defaults"]:
-        if isinstance(entry, str) and entry != "_self_":  # the configuration of another verb
-            chosen |= defaults_of(entry)
-        elif isinstance(entry, dict):
-            chosen |= {group: name for group, name in entry.items() if not group.startswith("override")}
-    return chosen | (dict.fromkeys(_OF_MODELS) if "model" in chosen else {})
+def _chosen(cfg: DictConfig) -> dict[str, str | None]:
+    """Option of each config group that a command chooses; None where there is none."""
+    choices = cfg.hydra.runtime.choices
+    groups = [name for name in reversed(list(choices)) if "@" not in name and not name.startswith("hydra/")]
+    return {group: choices[group] for group in groups}
 
 
 def _files(group: str, folders: Sequence[Path]) -> list[Path]:
@@ -49,51 +36,56 @@ def _files(group: str, folders: Sequence[Path]) -> list[Path]:
     return paths
 
 
-def print_verb(verb: str, folders: Sequence[Path] = ()) -> None:
+def print_verb(verb: str, cfg: DictConfig, folders: Sequence[Path] = ()) -> None:
     """Print what a verb does, its groups and its keys.
 
     Args:
         verb: name of a verb.
+        cfg: what the command composes, with the node ``hydra``.
         folders: those of ``--config-dir``.
     """
     print(f"ghgs {verb} [key=value ...] [group=option ...] [-m for a sweep over comma-separated values]\n")
     about = verb_class(verb)
     print(f"{about.summary()}: {about.example}\n")
-    print("== Groups (group=option; * is the default) ==")
-    for group, default in defaults_of(verb).items():
-        names = [f"{path.stem}{'*' * (path.stem == default)}" for path in _files(group, folders)]
+    print("== Groups (group=option; * is chosen) ==")
+    for group, chosen in _chosen(cfg).items():
+        names = [f"{path.stem}{'*' * (path.stem == chosen)}" for path in _files(group, folders)]
         print(_filled(f"{group}: {' | '.join(names)}"))
     print(f"\nghgs {verb} --help <group> explains the keys of a group.\n\n== Keys (key=value) ==")
-    for line in _fields(about):
+    for line in _fields(about, cfg):
         print(line)
     print("\n--cfg job prints the composed configuration, --info defaults says where each part comes from.")
 
 
-def print_group(verb: str, group: str, folders: Sequence[Path] = ()) -> None:
+def print_group(verb: str, group: str, cfg: DictConfig, folders: Sequence[Path] = ()) -> None:
     """Print the keys of a group with their meaning.
 
     Args:
         verb: name of a verb.
         group: name of the group.
+        cfg: what the command composes, with the node ``hydra``.
         folders: those of ``--config-dir``.
 
     Raises:
         InputError: the verb has no such group.
     """
-    known = [*defaults_of(verb), *(name for name in compose(verb) if name in KINDS)]
+    chosen = _chosen(cfg)
+    known = [*chosen, *(name for name in cfg if name in KINDS)]
     known = list(dict.fromkeys([*known, *(["rounds"] if "model" in known else [])]))
     if group not in known:
         hint = did_you_mean(group, known)
         raise InputError(
             f"--help: expected a group of ghgs {verb}, one of {', '.join(known)}; found {group!r}{hint}"
         )
+    node = OmegaConf.select(cfg, group.replace("/", ".")) or {}
+    values = {part.get("kind"): part for part in (node.values() if group in NAMED else [node])}
     for kind in kinds_of(group):
         print(f"== {group}" + (f": {{kind: {kind}, ...}}" if kind else "") + " ==")
-        for line in _fields(class_of(group, kind, group)):
+        for line in _fields(class_of(group, kind, group), values.get(kind, {})):
             print(line)
         print()
     for path in _files(group, folders):
-        print(f"{group}={path.stem}: {_purpose(path)}")
+        print(f"{group}={path.stem}{' *' * (path.stem == chosen.get(group))}: {_purpose(path)}")
 
 
 def _purpose(path: Path) -> str:
@@ -101,14 +93,15 @@ def _purpose(path: Path) -> str:
     return " ".join(line.removeprefix("# ") for line in lines if "@package" not in line)
 
 
-def _fields(cls: type[BaseModel], indent: str = "") -> Iterator[str]:
+def _fields(cls: type[BaseModel], values: Mapping[str, Any], indent: str = "") -> Iterator[str]:
+    """Lines for the fields of a class, with the values that the command composes as defaults."""
     texts = meanings(cls)
     for name, field in cls.model_fields.items():
         nested = options_of(field.annotation)
-        default = field.get_default(call_default_factory=True)
+        default = values.get(name, field.get_default(call_default_factory=True))
         if nested is not None:
             yield f"{indent}{name}: {' '.join(texts.get(name, '').split())}"
-            yield from _fields(nested, indent + "  ")
+            yield from _fields(nested, default if isinstance(default, Mapping) else {}, indent + "  ")
             continue
         shown = "must be given" if default is PydanticUndefined else f"default {_yaml(default)}"
         yield f"{indent}{name} ({shown}; {expected(field)})"
@@ -119,7 +112,7 @@ def _fields(cls: type[BaseModel], indent: str = "") -> Iterator[str]:
 def _yaml(value: object) -> str:
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
-    if isinstance(value, tuple):
+    if isinstance(value, Sequence) and not isinstance(value, str):
         return f"[{', '.join(map(_yaml, value))}]"
     return str(value)
 

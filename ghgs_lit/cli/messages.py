@@ -37,6 +37,9 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 #: :func:`ghgs_lit.cli.application.write_hydra_files` does not.
 NO_FILES_OF_HYDRA = "hydra.output_subdir=null"
 
+#: Keys that a path without a key may be meant for, the first of a verb.
+_PATHS = ("path", "runs", "checkpoint")
+
 #: Nodes of Lightning's classes, whose keys have defaults and so may be deleted.
 _LIGHTNING = ("trainer", "callbacks", "logger")
 
@@ -51,7 +54,7 @@ def one_line(error: Exception, verb: str) -> str:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         text = _missing_option(error)
     elif isinstance(error, OverrideParseException):
-        text = _unread_override(error)
+        text = _unread_override(error, verb)
     elif isinstance(error, HydraException):
         text = _composition(error, verb)
     elif isinstance(error, OSError):
@@ -94,10 +97,12 @@ def _command_line() -> str:
     return " ".join(word for word in sys.argv[1:] if word != NO_FILES_OF_HYDRA)
 
 
-def _unread_override(error: OverrideParseException) -> str:
+def _unread_override(error: OverrideParseException, verb: str) -> str:
     key, sign, value = str(error.override).partition("=")
     if not sign:
-        return f"{error.override}: expected key=value or group=option; found no ="
+        keys = [name for name in _PATHS if name in verb_class(verb).model_fields and os.sep in key]
+        hint = f" (did you mean {keys[0]}={key}?)" if keys else ""
+        return f"{key}: expected key=value or group=option; found no ={hint}"
     if value.endswith(","):
         return f"{key}: expected values without a space after the comma; found {value!r} and another word"
     if not value or value[0] in "[{\"'":
@@ -306,6 +311,8 @@ def parsed(arguments: Sequence[str]) -> tuple[list[str], list[str], argparse.Nam
     parser = get_args_parser()
     parser.__class__ = _Parser
     values = parser.parse_intermixed_args(list(arguments))
+    if values.shell_completion:  # Hydra's calls the program without its verb
+        parser.error("--shell-completion: ghgs has none")
     flags = [word for word in arguments if word not in values.overrides]
     return flags, values.overrides, values
 

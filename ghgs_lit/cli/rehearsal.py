@@ -13,14 +13,17 @@ from typing import TYPE_CHECKING, Any
 
 from lightning.pytorch.callbacks import Callback
 
-from ghgs_lit.cli.inputs import build_data, build_renderer, check_size
+from ghgs_lit.cli.inputs import build_data, build_renderer, check_size, overrides
+from ghgs_lit.cli.runtime import output_dir
 from ghgs_lit.cli.train import build_trainer, quiet
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.protocols import check_evaluation
+from ghgs_lit.execution.predictor import Predictor
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.runs import job
-from ghgs_lit.runs.planned import Rehearsal
+from ghgs_lit.runs.planned import PlannedRun, Rehearsal, print_plan
 from ghgs_lit.runs.provenance import config_hash
+from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.training import GHGSModule, start
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
@@ -125,7 +128,7 @@ class _Rehearsed:
             and nothing must be rendered.
         """
         if model is not None:
-            self.attempt(check_size, data, model)
+            self.attempt(check_size, data, Predictor(model))
         split = self.run.evaluation.split
         if hasattr(data.dataset, "cache_dir") and not _is_rendered(data, {"train", "val", split}):
             self.notes[f"data={data.dataset.name}: people are rendered before the first step"] = None
@@ -286,3 +289,17 @@ def rehearse(runs: Sequence["Train"]) -> Rehearsal:
                 seconds = rehearsed.step_seconds(data, Path(folder))
             tried.add(key)
     return Rehearsal(summarized(reasons), list(notes), seconds)
+
+
+def plan(run: "Train") -> None:
+    """Print the plan of a single run, as of :func:`ghgs_lit.runs.planned.print_plan`.
+
+    Args:
+        run: as configured.
+
+    Raises:
+        InputError: something is missing.
+    """
+    directory = RunDirectory(output_dir()).of(run)
+    item = PlannedRun(directory.path.name, (), tuple(overrides()), run, directory)
+    print_plan([item], directory.path, rehearse)

@@ -19,7 +19,7 @@ from ghgs_lit.cli.inputs import build_data, check_size, choices, given_keys, ove
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config.compose import chosen_options, saved_text
 from ghgs_lit.config.run import Run
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.protocols import check_evaluation
 from ghgs_lit.evaluation.report import measure_and_write, table_of
@@ -35,6 +35,7 @@ from ghgs_lit.training.checkpoints import AtomicCheckpointIO, StopAtStep
 from ghgs_lit.training.cost import TrainingCost
 from ghgs_lit.weights import switches
 from ghgs_lit.weights.checkpoint import read_config
+from ghgs_lit.weights.reading import file_of
 
 if TYPE_CHECKING:
     from ghgs_lit.cli.verb import Training
@@ -160,7 +161,6 @@ def run(verb: "Train") -> float | str | None:
         InputError: the configuration, a checkpoint or the data is wrong.
         Interrupted: by Ctrl-C or SIGTERM.
     """
-    require(not verb.dry_run, "dry_run", "false without a grid (-m, or sweep=<file>)", True)
     job.check_config(verb)
     if job.in_sweep():
         job.check_launcher(verb, HydraConfig.get().runtime.choices["hydra/launcher"])
@@ -275,7 +275,7 @@ def fit(
     loggers.begin(trainer.loggers, saved_text(module.config), step)
     started = time.perf_counter()
     try:
-        trainer.fit(module, data, ckpt_path=resume)
+        trainer.fit(module, data, ckpt_path=resume and file_of(resume))
     except MisconfigurationException as error:  # of options that do not fit the data
         raise InputError(f"trainer: {error}") from None
     finally:

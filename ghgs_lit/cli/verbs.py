@@ -35,6 +35,10 @@ class Train(Training):
     """Print what would be run, how long it takes and where it goes, and run nothing."""
 
     def run(self) -> object:
+        if self.dry_run:
+            from ghgs_lit.cli import rehearsal
+
+            return rehearsal.plan(self)
         from ghgs_lit.cli import train
 
         return train.run(self)

@@ -65,7 +65,11 @@ def store_defaults(verb: str, folder: str | None = None) -> None:
 
 
 def compose(
-    verb: str, overrides: Sequence[str] = (), with_hydra: bool = False, folder: str | None = None
+    verb: str,
+    overrides: Sequence[str] = (),
+    with_hydra: bool = False,
+    folder: str | None = None,
+    is_filled: bool = True,
 ) -> DictConfig:
     """The configuration of ``ghgs <verb> <overrides>``, with all defaults.
 
@@ -74,6 +78,7 @@ def compose(
         overrides: as on the command line, such as ``model=paper``.
         with_hydra: whether the node ``hydra`` is part of it.
         folder: of ``--config-dir``, if any.
+        is_filled: whether nodes have the defaults of their classes, which are imported then.
 
     Raises:
         HydraException: an override does not fit.
@@ -85,7 +90,8 @@ def compose(
         searched = json.dumps([f"file://{Path(folder).resolve()}"], ensure_ascii=False)
         overrides = [*overrides, f"hydra.searchpath={searched}"]
     with _application():
-        return fill(hydra.compose(verb, overrides=list(overrides), return_hydra_config=with_hydra))
+        cfg = hydra.compose(verb, overrides=list(overrides), return_hydra_config=with_hydra)
+        return fill(cfg) if is_filled else cfg
 
 
 def saved_text(config: dict[str, Any]) -> str:

@@ -292,7 +292,7 @@ def _load(group: str) -> None:
 def kinds_of(group: str) -> list[str | None]:
     """All kinds of a group, including registered ones; None: the group has no kinds."""
     _load(group)
-    return [*_SHIPPED[group], *(kind for of, kind in _REGISTERED if of == group)]
+    return [*_SHIPPED.get(group, {}), *(kind for of, kind in _REGISTERED if of == group)]
 
 
 def class_of(group: str, kind: Any, key: str) -> type[Options]:

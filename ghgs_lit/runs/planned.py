@@ -161,7 +161,8 @@ def print_plan(planned: Sequence[PlannedRun], directory: Path, rehearse: Rehears
     known = "unknown" if None in left else clock(sum(left))
     reason = "; ".join(basis) or "no trainer.max_time, and no step was measured or tried"
     print(f"expected training time of the remaining runs, one after another: {known} ({reason})")
-    print(f"outputs: {directory}/<run>/ with {OUTPUTS}", flush=True)
+    place = f"{directory}/<run>" if len(planned) > 1 else planned[0].directory.path
+    print(f"outputs: {place}/ with {OUTPUTS}", flush=True)
     for note in rehearsal.notes:
         print(f"note: {note}")
     reasons = [*rehearsal.reasons, *_unreadable(planned, states)]

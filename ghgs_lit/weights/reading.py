@@ -40,8 +40,10 @@ _CHUNK = 1 << 28  #: Bytes of tensors that are converted before the file is mapp
 
 
 def file_of(path: str | Path) -> Path:
-    """The file of a checkpoint, which may be :data:`SHIPPED`."""
-    return SHIPPED_FILE if str(path) == SHIPPED else Path(path).expanduser()
+    """The file of a checkpoint, which may be :data:`SHIPPED` or the folder of a run."""
+    file = SHIPPED_FILE if str(path) == SHIPPED else Path(path).expanduser()
+    last = file / "checkpoints" / "last.ckpt"
+    return last if last.is_file() else file
 
 
 def open_file(path: str | Path) -> Any:
@@ -50,7 +52,7 @@ def open_file(path: str | Path) -> Any:
     No code in it is executed (``weights_only=True``).
 
     Args:
-        path: of the file, or :data:`SHIPPED`.
+        path: of the file, :data:`SHIPPED`, or the folder of a run, whose last weights count.
 
     Returns:
         What the file holds; tensors are mapped from the disk,

@@ -61,6 +61,8 @@ MISSPELT = [
     ("export vgt=x.pt", 1, "vgt", "did you mean vggt?"),
     ("table runs={tmp} test.unt=1", 1, "test.unt", "did you mean test.unit?"),
     ("train encoder=vggt_nanoo", 1, "encoder: expected one of vggt_1b", "'vggt_nanoo'", "vggt_nano?"),
+    ("view runs/x", 1, "runs/x: expected key=value", "(did you mean path=runs/x?)"),
+    ("train -sc install=bash", 2, "--shell-completion: ghgs has none"),
     ("train views=4", 1, "views: expected one of ", "v3, v4, v5", "; found 4 (did you mean v4?)\n"),
     ("train -m views=3,4", 1, "views: expected one of ", "; found 3,4 (did you mean v3?)\n"),
     ("train sweep=table5", 1, "sweep: expected one of table1", "found 'table5'"),

@@ -128,14 +128,18 @@ def test_help_of_a_verb_and_of_a_group(monkeypatch, capsys, tmp_path):
     assert code == 0
     assert "model=hull; the paper's method: model=paper" in out
     assert "ablation: full*" in out
+    assert "bounds: box* | hull" in out
     assert "| my_people" in out
     assert "seed (default 1; an integer >= 0 and <= 4294967295)\n    Of weights" in out
     code, out, _ = call(monkeypatch, capsys, "train", "--help", "depth_head")
     assert code == 0
     assert "== depth_head: {kind: dpt, ...} ==" in out
-    assert "start (default 0.5; a number > 0 and < 1)" in out
+    assert "start (default 0.25; a number > 0 and < 1)" in out  # of depth_head=hull
     code, out, _ = call(monkeypatch, capsys, "train", *flags, "--help", "data")
     assert "data=my_people: Mine." in out
+    _, out, _ = call(monkeypatch, capsys, "train", "model=paper", "bounds.dilation=0.02", "--help", "bounds")
+    assert "bounds=box *: " in out
+    assert "dilation (default 0.02; " in out
     code, _, err = call(monkeypatch, capsys, "train", "--help", "depth_heat")
     assert code == 1
     assert "found 'depth_heat' (did you mean depth_head?)" in err

@@ -154,6 +154,11 @@ def test_a_step_is_timed_where_nothing_is_missing(monkeypatch, capsys, tmp_path,
     assert "would be refused" not in out
     assert re.search(r"one after another: \d+:\d\d:\d\d \([\d.e-]+ s a step, tried with the first run\)", out)
     assert not list(tmp_path.iterdir())
+    alone = [*SMALL, f"data.root={rendered}", "dry_run=true", "hydra.run.dir=alone"]
+    code, out, err = call(monkeypatch, capsys, "train", *alone)
+    assert code == 0, err
+    assert f"outputs: {tmp_path / 'alone'}/ with config.yaml" in out
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_a_sweep_lacks_ends_its_dry_run_with_an_error(monkeypatch, capsys, tmp_path):

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from matplotlib.figure import Figure
 
 from ghgs_lit.diagnostics.benchmark.measure import Record
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL
 from ghgs_lit.diagnostics.machine import in_words
-from ghgs_lit.diagnostics.output import Tables, document, pivoted, texts
+from ghgs_lit.diagnostics.output import Tables, document, pivoted, save_figure, texts
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.results import Row, plain, summarize
 
@@ -184,8 +185,31 @@ def notes_of(content: Mapping[str, Any]) -> list[str]:
     return notes + [f"Budget broken: {line}." for line in content["broken"]]
 
 
+def draw(rows: Sequence[Row]) -> Figure:
+    """Run time against PSNR, a dot for each case; the line is the Pareto front.
+
+    Args:
+        rows: as of :func:`rows_of`.
+    """
+    front: list[Row] = []
+    for row in sorted(totals(rows), key=lambda row: (row["seconds"], -row["psnr"])):
+        if not front or row["psnr"] > front[-1]["psnr"]:
+            front.append(row)
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    axes = figure.add_subplot(xlabel="run time of a batch in ms", ylabel="PSNR in dB")
+    curve = [1e3 * row["seconds"] for row in front], [row["psnr"] for row in front]
+    axes.plot(*curve, "-o", color="gold", markersize=14, label="Pareto front")
+    for row in totals(rows):
+        place = 1e3 * row["seconds"], row["psnr"]
+        axes.plot(*place, "o")
+        axes.annotate(row["preset"], place, xytext=(5, 5), textcoords="offset points")
+    axes.margins(0.15)
+    axes.legend()
+    return figure
+
+
 def write_numbers(directory: Path, content: Mapping[str, Any], tables: Tables) -> Path:
-    """Write ``benchmark.md`` and ``benchmark.json``.
+    """Write ``benchmark.md``, ``benchmark.png`` and ``benchmark.json``.
 
     Args:
         directory: the run's.
@@ -196,6 +220,7 @@ def write_numbers(directory: Path, content: Mapping[str, Any], tables: Tables) -
         Path of the JSON file.
     """
     write_text_atomically(directory / "benchmark.md", document("Benchmark", notes_of(content), tables))
+    save_figure(draw(content["rows"]), directory / "benchmark.png")
     path = directory / "benchmark.json"
     write_text_atomically(path, json.dumps(plain(content), indent=1, allow_nan=False) + "\n")
     return path

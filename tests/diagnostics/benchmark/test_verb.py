@@ -112,7 +112,7 @@ def test_all_files_of_a_benchmark_are_written(measured):
     assert "| balanced |" in text
     assert "Machine: " in text
     files = {path.name for path in measured.iterdir() if not path.name.startswith(".")}
-    assert files >= {"benchmark.json", "benchmark.md", "config.yaml"}
+    assert files >= {"benchmark.json", "benchmark.md", "benchmark.png", "config.yaml"}
     assert not files & {"benchmark.csv", "benchmark.html", "tensorboard"}
 
 
