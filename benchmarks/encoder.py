@@ -23,13 +23,13 @@ from torch.utils.flop_counter import FlopCounterMode
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from recorder import Recorder, Stage, forget_peak, memory_gb, merged
 
-from ghgs_lit import encoder
 from ghgs_lit.config import compose
 from ghgs_lit.diagnostics.benchmark.scene import random_model
-from ghgs_lit.kernels.linear import linear
 from ghgs_lit.method.model import GHGS, STAGES
 from ghgs_lit.method.plan import Plan
 from ghgs_lit.method.plan.patches import KeptPatches
+from ghgs_lit.ops.attention import attend
+from ghgs_lit.ops.linear import linear
 from ghgs_lit.types import Batch, DepthBounds, Points, Tokens
 from tests.helpers.literal_recalibration import literal_recalibration
 from tests.helpers.scenes import make_batch
@@ -165,8 +165,8 @@ def load_kernels(dtype: torch.dtype) -> float:
     """Seconds to compile the kernels of the stages, or to read them from disk."""
     start = time.perf_counter()
     x = torch.zeros(1, 16, 1024, 64, dtype=dtype)
-    if encoder.cpu.is_supported(x, x):
-        encoder.cpu.attend(*[x[:, :1, :1]] * 3)
+    if attend.has_kernel(x, x, x, None):
+        torch.ops.ghgs_lit.attend(*[x[:, :1, :1]] * 3, None)
     return time.perf_counter() - start
 
 

@@ -31,9 +31,9 @@ from triton.compiler import ASTSource
 from benchmarks import device
 from ghgs_lit.config import run_of
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
-from ghgs_lit.kernels import gpu
 from ghgs_lit.method.model import GHGS
-from ghgs_lit.rendering.intersections import intersections
+from ghgs_lit.ops import dispatch
+from ghgs_lit.ops.intersections import intersections
 from ghgs_lit.runtime.precision import round_products
 
 SMALL = ("encoder.width=32", "encoder.heads=2", "encoder.vit.channels=8", "recalibration.k=8")
@@ -98,12 +98,12 @@ def _needs(compiled: Any) -> str:
     return f"{registers} registers, {spilled[1] if spilled else 0} bytes spilled"
 
 
-def compiled_too(name: str, plain: Callable[..., Any]) -> Callable[..., Any]:
+def compiled_too(operator: dispatch.Operator) -> Callable[..., Any]:
     """An operator in plain PyTorch that calls its kernel, too."""
 
     def call(*inputs):
-        gpu.KERNELS[name](*inputs)
-        return plain(*inputs)
+        operator.kernels["cuda"](*inputs)
+        return operator.plain(*inputs)
 
     return call
 
@@ -115,9 +115,10 @@ def main() -> None:
     batch = ellipsoid_batch(0.15, 3, 28, 1)
     with ExitStack() as stack:
         library = stack.enter_context(_scoped_library("ghgs_lit", "IMPL"))
-        for name, plain in gpu.PLAIN.items():
-            library.impl(name, compiled_too(name, plain), "CPU")
-        stack.enter_context(mock.patch.object(gpu, "DEVICES", {"cpu"}))
+        for name, operator in dispatch.OPERATORS.items():
+            if "cuda" in operator.kernels:
+                library.impl(name, compiled_too(operator), "CPU", allow_override=True)
+        stack.enter_context(mock.patch.object(dispatch, "DEVICES", {"cpu"}))
         stack.enter_context(
             mock.patch.object(triton.JITFunction, "run", lambda *a, **b: compiler.run(*a, **b))
         )

@@ -23,10 +23,10 @@ from ghgs_lit.diagnostics.machine import machine_facts
 from ghgs_lit.execution import Predictor
 from ghgs_lit.execution.graphs import GraphCache
 from ghgs_lit.execution.step import CapturedStep
-from ghgs_lit.kernels.gpu import PLAIN
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.method.rounds import NoRounds
 from ghgs_lit.method.stages import STAGES
+from ghgs_lit.ops.dispatch import OPERATORS
 from ghgs_lit.rendering.capacity import deferred
 from ghgs_lit.runtime.precision import keep_rounded, precision_of
 from ghgs_lit.runtime.watching import Inputs, Watcher
@@ -319,16 +319,17 @@ def kernels(call: Call) -> None:
         with torch.no_grad():
             predictor(batch)  # one kernel is of predictions alone
         predictor(batch).gaussians.means.sum().backward()
-    for name in set(PLAIN) - set(calls.inputs):
+    with_kernels = {name for name, operator in OPERATORS.items() if "cuda" in operator.kernels}
+    for name in with_kernels - set(calls.inputs):
         call.add(name, refused="not called")
     moved = {}
     for name, (function, inputs) in calls.inputs.items():
         moved[name] = _bytes(inputs) + _bytes(function(*inputs))
-        for kind, run in {"kernel": function, "eager": PLAIN[name]}.items():
+        for kind, run in {"kernel": function, "eager": OPERATORS[name].plain}.items():
             _chain(call, name, kind, partial(run, *inputs), moved[name])
     _attention(call)
     for name, (_, inputs) in calls.inputs.items():  # takes longest
-        compiled = torch.compile(PLAIN[name], dynamic=False)
+        compiled = torch.compile(OPERATORS[name].plain, dynamic=False)
         _chain(call, name, "compiled", partial(compiled, *inputs), moved[name])
 
 

@@ -15,18 +15,18 @@ from torch import Generator, Tensor
 from torch.autograd import gradcheck
 
 from ghgs_lit.geometry.masks import relative_bounds, relative_depth
-from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import inverse_intrinsics, project, unproject, world_to_camera
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.geometry.undistortion import undistorting_grid
 from ghgs_lit.geometry.unprojection import subject_tokens
 from ghgs_lit.losses import terms
 from ghgs_lit.method.bounds import SubjectBox, VisualHull
-from ghgs_lit.method.heads.activations import confidence_of
 from ghgs_lit.method.heads.attributes import FootprintAttributes, release_attributes
 from ghgs_lit.method.heads.depth import BOUNDED, bounded_depth, inverse_linear
 from ghgs_lit.method.plan.window import Span, Window
 from ghgs_lit.method.recalibration import SemanticAttention
+from ghgs_lit.ops.activation import confidence_of
+from ghgs_lit.ops.photo_consistency import photo_consistency
 from ghgs_lit.types import DepthBounds, DepthMaps
 from tests.helpers.scenes import make_batch, training_batch
 from tests.helpers.training import Standin, flat_renderer

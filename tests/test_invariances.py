@@ -5,12 +5,12 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from ghgs_lit.geometry.photo_consistency import photo_consistency
-from ghgs_lit.kernels.compile import processor_features
-from ghgs_lit.method.encoder import cpu
 from ghgs_lit.method.recalibration import SemanticAttention, nearest_neighbors
 from ghgs_lit.method.recalibration.recalibration import neighbor_cosines
 from ghgs_lit.metrics.functional import ssim
+from ghgs_lit.ops.attention import cpu
+from ghgs_lit.ops.compile import processor_features
+from ghgs_lit.ops.photo_consistency import photo_consistency
 from ghgs_lit.types import DepthBounds
 from tests.helpers.literal_recalibration import literal_recalibration
 from tests.helpers.models import close, make_model, predict
@@ -41,7 +41,7 @@ def attention(g):
     q, k, v = (torch.randn(2, 3, 200, 64, generator=g) for _ in range(3))
 
     def ours(dtype):
-        return cpu.attend(*(x.to(dtype) for x in (q, k, v)))
+        return cpu.attend_heads(*(x.to(dtype) for x in (q, k, v)))
 
     def plain(dtype):
         return F.scaled_dot_product_attention(*(x.to(dtype) for x in (q, k, v))).transpose(1, 2)

@@ -1,7 +1,7 @@
 """What a GPU is asked for may not grow: launches, and waits of the host,
 counted on the pretend device.
 
-Operators of the package (:mod:`ghgs_lit.kernels.gpu`) are one launch, as on CUDA. Counts are exact
+Operators of the package (:mod:`ghgs_lit.ops.dispatch`) are one launch, as on CUDA. Counts are exact
 and the same on every machine; each limit is the count of today. Whoever needs fewer lowers it: a
 failing test prints the line to write. Other versions of PyTorch may divide an operator otherwise,
 so that they are held to waits alone."""

@@ -15,9 +15,9 @@ from ghgs_lit.geometry.chamfer import chamfer as chamfer_distance
 from ghgs_lit.geometry.chamfer import chamfer_of_rows
 from ghgs_lit.geometry.masks import coverage
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.kernels.pool import have_values
 from ghgs_lit.metrics.functional import SSIM_WINDOW, ssim_map
 from ghgs_lit.metrics.protocol import LPIPS
+from ghgs_lit.ops.pool import have_values
 from ghgs_lit.types import Batch, Prediction, Rendering
 
 Scalar = Float[Tensor, ""]

@@ -14,8 +14,8 @@ from torch import Tensor
 from ghgs_lit.config.options import Options, Positive
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.projection import at_least_float32, world_to_camera
+from ghgs_lit.ops.rasterization.settings import RasterSettings
 from ghgs_lit.rendering import gsplat_backend
-from ghgs_lit.rendering.settings import RasterSettings
 from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
@@ -23,7 +23,11 @@ BACKENDS = ("auto", "gsplat", "cpu", "reference")
 _OF_DEVICE = {"cuda": "gsplat", "cpu": "cpu"}
 #: Farthest depth in metres: practically no limit.
 FAR = 1e10
-_MODULES = {"gsplat": "gsplat_backend", "cpu": "cpu.backend", "reference": "reference"}
+_MODULES = {
+    "gsplat": "ghgs_lit.rendering.gsplat_backend",
+    "cpu": "ghgs_lit.ops.rasterization.cpu",
+    "reference": "ghgs_lit.rendering.reference",
+}
 
 Background = Tensor | float | Sequence[float]
 
@@ -41,7 +45,7 @@ def render(
 
     Differentiable in means, quaternions, scales, opacities, colours and background. Any number
     ``C`` of colour channels, any image size and any number of Gaussians per element, including
-    none. The image is defined by :class:`ghgs_lit.rendering.settings.RasterSettings`, as in 3D
+    none. The image is defined by :class:`ghgs_lit.ops.rasterization.settings.RasterSettings`, as in 3D
     Gaussian Splatting (Kerbl et al. 2023).
 
     Args:
@@ -70,7 +74,7 @@ def render(
     require(near < far < math.inf, "far", f"more than near = {near}", far)
     _check_inputs(gaussians, cameras)
     backend = resolve_backend(backend, gaussians.means.device)
-    module = importlib.import_module(f"ghgs_lit.rendering.{_MODULES[backend]}")
+    module = importlib.import_module(_MODULES[backend])
     metre = gaussians.metre
     with exact(gaussians.means.device.type):
         gaussians, cameras = _in_metres(*_around_cameras(_in_one_dtype(gaussians), cameras))

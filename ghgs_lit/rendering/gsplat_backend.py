@@ -1,7 +1,7 @@
 """The gsplat backend (CUDA), imported on first use; most constants are compiled into gsplat.
 
 Its kernels project and draw. What lies between them, finding the splats of each tile, makes the
-host wait in gsplat, and is done here (:mod:`ghgs_lit.rendering.intersections`)."""
+host wait in gsplat, and is done here (:mod:`ghgs_lit.ops.intersections`)."""
 
 import importlib
 import warnings
@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.ops.intersections import TILE, Intersections, intersections
+from ghgs_lit.ops.rasterization.settings import RasterSettings
 from ghgs_lit.rendering.capacity import with_room
-from ghgs_lit.rendering.intersections import TILE, Intersections, intersections
-from ghgs_lit.rendering.settings import RasterSettings
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 #: The limit of alpha that is compiled into gsplat.

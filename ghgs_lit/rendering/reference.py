@@ -1,6 +1,6 @@
 """The reference renderer for tests, in plain PyTorch and the dtype of its input. It evaluates every
 Gaussian in every pixel, so it is slow and needs much memory; gradients are by autograd.
-:class:`ghgs_lit.rendering.settings.RasterSettings` defines the image."""
+:class:`ghgs_lit.ops.rasterization.settings.RasterSettings` defines the image."""
 
 import math
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ghgs_lit.geometry.projection import pixel_centers
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
-from ghgs_lit.rendering.settings import RasterSettings
+from ghgs_lit.ops.rasterization.settings import RasterSettings
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 # Gaussians times pixels in memory at once.

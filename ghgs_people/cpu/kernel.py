@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numba.core import types
 
-from ghgs_lit.kernels.compile import FLOATS, NUMBER, helper, kernel_for
+from ghgs_lit.ops.compile import FLOATS, NUMBER, helper, kernel_for
 
 ZERO, HALF, ONE = (np.float32(x) for x in (0, 0.5, 1))
 LEVELS = np.arange(256, dtype=np.float32) / np.float32(255)

@@ -5,7 +5,7 @@ import torch.nn.functional as F
 
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.rotations import unit
-from ghgs_lit.method.heads.activations import confidence_of
+from ghgs_lit.ops.activation import confidence_of
 
 
 def inverse_log(x):

@@ -26,7 +26,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
 
 import ghgs_lit
-from ghgs_lit.kernels import gpu
+from ghgs_lit.ops import dispatch
 
 _PACKAGE = str(Path(ghgs_lit.__file__).parent)
 
@@ -214,7 +214,7 @@ def pretend_device(by_line: bool = False) -> Iterator[Log]:
     log = Log(by_line)
     _logs.append(log)
     try:
-        with _Mode(), _attention_is_one_call(), mock.patch.object(gpu, "DEVICES", {DEVICE.type}):
+        with _Mode(), _attention_is_one_call(), mock.patch.object(dispatch, "DEVICES", {DEVICE.type}):
             yield log
     finally:
         _logs.remove(log)

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from ghgs_lit.extents import bucket_size
+from ghgs_lit.ops.intersections import TILE, intersections
 from ghgs_lit.rendering import RasterSettings, capacity, gsplat_backend, reference
 from ghgs_lit.rendering.capacity import deferred, settled
-from ghgs_lit.rendering.intersections import TILE, intersections
 from tests.helpers.gsplat import InParts, functions
 from tests.helpers.pretend_device import DEVICE, pretend_device
 from tests.helpers.splats import camera_ring, cloud

@@ -8,7 +8,7 @@ import threading
 import pytest
 import torch
 
-from ghgs_lit.kernels import pool
+from ghgs_lit.ops import pool
 from ghgs_lit.rendering import render
 from tests.helpers.processes import run_prepared, run_python
 from tests.helpers.splats import FIELDS, body, camera_ring, with_gradients

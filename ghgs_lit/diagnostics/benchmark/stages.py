@@ -1,18 +1,15 @@
 """Probes of the stages of a forward pass: seconds, peak memory and FLOPs."""
 
 from collections.abc import Iterable
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import Any
-from unittest import mock
 
 import torch
-from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, sdpa_flop_count
 
 from ghgs_lit.evaluation.measure import Renderer
 from ghgs_lit.execution import Predictor
-from ghgs_lit.method.encoder import cpu
 from ghgs_lit.method.model import GHGS, STAGES
 from ghgs_lit.runtime.allocation import can_forget_peak, forget_peak, resident_bytes, return_free_memory
 from ghgs_lit.runtime.watching import Inputs, Stopwatch, Watcher, inside
@@ -138,8 +135,9 @@ class PeakProbe(Watcher):
             forget_peak()
 
 
-#: FLOPs of PyTorch's attention on a CPU, which its own counter does not know.
+#: FLOPs of attention on a CPU, which PyTorch's counter does not know.
 _CPU_ATTENTION = {
+    torch.ops.ghgs_lit.attend: lambda q, k, v, *_, **__: sdpa_flop_count(q, k, v),
     torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: (
         lambda q, k, v, *_, **__: sdpa_flop_count(q, k, v)
     ),
@@ -161,9 +159,7 @@ class FlopsProbe(Watcher):
     def __init__(self) -> None:
         self.flops: dict[str, int] = {}
         self._counter = FlopCounterMode(display=False, custom_mapping=_CPU_ATTENTION)
-        self._in_kernel = 0
         self._open: list[int] = []
-        self._stack = ExitStack()
 
     def begin(self, stage: str, inputs: Inputs = ((), {})) -> None:
         self._open.append(self._so_far())
@@ -172,18 +168,11 @@ class FlopsProbe(Watcher):
         self.flops[stage] = self.flops.get(stage, 0) + self._so_far() - self._open.pop()
 
     def __enter__(self) -> "FlopsProbe":
-        kernel = cpu.attend
-
-        def counting(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-            self._in_kernel += sdpa_flop_count(q.shape, k.shape, v.shape)
-            return kernel(q, k, v)
-
-        self._stack.enter_context(self._counter)
-        self._stack.enter_context(mock.patch.object(cpu, "attend", counting))
+        self._counter.__enter__()
         return self
 
     def __exit__(self, *details: Any) -> None:
-        self._stack.close()
+        self._counter.__exit__(*details)
 
     def _so_far(self) -> int:
-        return self._counter.get_total_flops() + self._in_kernel
+        return self._counter.get_total_flops()

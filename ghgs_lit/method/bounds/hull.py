@@ -9,8 +9,6 @@ from torch import Tensor
 
 from ghgs_lit.extents import bucket_size, true_places
 from ghgs_lit.geometry.constants import constant, middles, other_images
-from ghgs_lit.kernels.pool import at_once, even_parts
-from ghgs_lit.method.bounds import cpu
 from ghgs_lit.method.bounds.box import SubjectBox
 from ghgs_lit.method.bounds.rays import (
     Silhouettes,
@@ -22,6 +20,7 @@ from ghgs_lit.method.bounds.rays import (
     ray_directions,
     votes_outside,
 )
+from ghgs_lit.ops.pool import at_once, even_parts
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 
 #: Depths in memory at once, on a CPU and elsewhere.
@@ -97,8 +96,6 @@ def hull_bounds(
     directions = ray_directions(cameras)
     matrices = projection_matrices(cameras)
     steps = constant(middles, samples, like=start.near)
-    if cpu.fits(start.near, directions, matrices):
-        return cpu.march(outside, masks, matrices, directions, cameras.centers, start, steps, tolerance)
     near, far = (bound.clone(memory_format=torch.contiguous_format) for bound in (start.near, start.far))
     if rays is None:
         known = count is not None

@@ -15,9 +15,9 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.kernels.linear import Linear
-from ghgs_lit.kernels.pool import at_once, even_parts
-from ghgs_lit.method.encoder import cpu
+from ghgs_lit.ops.attention import attend
+from ghgs_lit.ops.linear import Linear
+from ghgs_lit.ops.pool import at_once, even_parts
 
 BASE = 100.0
 
@@ -107,10 +107,10 @@ class Attention(nn.Module):
         if len(set(lengths)) == 1:
             each = (rearrange(values, "a (n t) d -> n a t d", n=len(lengths)) for values in (q, k, v))
             keys = None if real is None else real.view(len(lengths), 1, 1, -1)
-            return self.proj(_attend(*each, keys).flatten(0, 1))
+            return self.proj(attend(*each, keys).flatten(0, 1))
         # One by one: a block mask would also compute the products between different sequences.
         parts = zip(*(values[None].split(lengths, dim=2) for values in (q, k, v)), strict=True)
-        return self.proj(torch.cat([_attend(*part)[0] for part in parts]))
+        return self.proj(torch.cat([attend(*part, None)[0] for part in parts]))
 
     def _norm_and_rotate(self, x: Float[Tensor, "a t d"], norm: nn.Module, rotary: Rotary | None) -> Tensor:
         if rotary is None:
@@ -123,27 +123,6 @@ class Attention(nn.Module):
         for heads in even_parts(len(x), most):
             x[heads] = rotate(norm(x[heads]), rotary)
         return x
-
-
-def _attend(
-    q: Float[Tensor, "n a t d"],
-    k: Float[Tensor, "n a t d"],
-    v: Float[Tensor, "n a t d"],
-    keys: Bool[Tensor, "n 1 1 t"] | None = None,
-) -> Float[Tensor, "n t c"]:
-    """``softmax(q k^T / sqrt(d)) v`` of every head, heads concatenated.
-
-    Args:
-        q: queries.
-        k: keys.
-        v: values.
-        keys: which keys take part; None: all.
-    """
-    if keys is None and cpu.is_supported(q, v):
-        return cpu.attend(q, k, v).flatten(2)
-    mask = {} if keys is None else {"attn_mask": keys}  # flash kernels take none
-    y = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v, **mask)
-    return rearrange(y, "n a t d -> n t (a d)")
 
 
 #: Register tokens of each view in the ViT and in the aggregator.

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ghgs_lit.config.options import Amount, Options, Positive, Share
 from ghgs_lit.geometry.rotations import unit
-from ghgs_lit.method.heads.activations import (
+from ghgs_lit.ops.activation import (
     Attributes,
     Constants,
     footprint_attributes,
@@ -129,7 +129,7 @@ class FootprintAttributes(Options):
         return _logit((OPACITY_START - self.opacity_floor) / (1 - self.opacity_floor))
 
     def constants(self, offset_limit: float | None, color_limit: float) -> Constants:
-        """Numbers of :func:`ghgs_lit.method.heads.activations.footprint_attributes`.
+        """Numbers of :func:`ghgs_lit.ops.activation.footprint_attributes`.
 
         Args:
             offset_limit: of ``gaussian_head``, in metres; None: none.

@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ghgs_lit.kernels.pool import at_once, even_parts
 from ghgs_lit.method.heads.dpt import DPTHead
 from ghgs_lit.method.heads.guide import Guide
 from ghgs_lit.method.plan.window import Span, Window
+from ghgs_lit.ops.pool import at_once, even_parts
 from ghgs_lit.types import Tokens
 
 #: Values of the largest map in memory at once without a gradient (32 MB in float32); on a GPU 4 GB.

@@ -11,13 +11,13 @@ from torch import Tensor, nn
 
 from ghgs_lit.config.options import Options
 from ghgs_lit.geometry.masks import BOUNDS_CHANNELS, relative_bounds
-from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.method.heads.activations import bounded_sigmoid, confidence_of
 from ghgs_lit.method.heads.dense import Part, decode
 from ghgs_lit.method.heads.dpt import DPTHead
 from ghgs_lit.method.heads.guide import PHOTO_CHANNELS, photo_guide
 from ghgs_lit.method.plan import Plan
+from ghgs_lit.ops.activation import bounded_sigmoid, confidence_of
+from ghgs_lit.ops.photo_consistency import photo_consistency
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Tokens
 
 

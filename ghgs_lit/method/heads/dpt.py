@@ -15,10 +15,10 @@ from torch import Tensor, nn
 
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.kernels.linear import linear
-from ghgs_lit.kernels.pool import at_once, even_parts
 from ghgs_lit.method.heads.guide import Guide, GuidePyramid
 from ghgs_lit.method.plan.window import Span, Window, reach
+from ghgs_lit.ops.linear import linear
+from ghgs_lit.ops.pool import at_once, even_parts
 from ghgs_lit.runtime.precision import exact, without_float16
 from ghgs_lit.types import Tokens
 

@@ -11,14 +11,7 @@ from torch import Tensor, nn
 
 from ghgs_lit.config.options import Amount, Options, Positive, Share, Width
 from ghgs_lit.geometry.masks import relative_depth, surface_colors
-from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.kernels.linear import Linear
-from ghgs_lit.method.heads import cpu, cuda
-from ghgs_lit.method.heads.activations import (
-    activated,
-    footprint_gaussians,
-)
 from ghgs_lit.method.heads.attributes import (
     OFFSET_UNIT,
     FootprintAttributes,
@@ -30,6 +23,12 @@ from ghgs_lit.method.heads.dpt import DPTHead
 from ghgs_lit.method.heads.guide import PHOTO_CHANNELS, Guide, photo_guide
 from ghgs_lit.method.plan import Plan
 from ghgs_lit.method.plan.rows import Rows
+from ghgs_lit.ops.activation import (
+    activated,
+    footprint_gaussians,
+)
+from ghgs_lit.ops.linear import Linear
+from ghgs_lit.ops.photo_consistency import photo_consistency
 from ghgs_lit.runtime.precision import exact, without_float16
 from ghgs_lit.types import (
     Batch,
@@ -191,18 +190,13 @@ class GaussianHead(nn.Module):
         photo = batch.once(surface_colors)
         share = batch.alpha
         options = self.options
-        inputs = (*numbers, photo, share, depth_maps.depth, points.pixels, batch.cameras.extrinsics)
         given = (numbers, raw.image, raw.pixel, depth_maps, points.pixels, photo, share, batch.cameras)
         on_surface = options.axes == "surface"
         if not isinstance(self.attributes, FootprintAttributes):
             fields = activated(*given, self.attributes, options.color_limit, on_surface)
         else:
             constants = self.attributes.constants(options.offset_limit, options.color_limit)
-            if cuda.is_supported(*inputs, fixed=(photo, share, batch.cameras.intrinsics)):
-                activate = cuda.activate
-            else:
-                activate = cpu.activate if cpu.is_supported(*inputs) else footprint_gaussians
-            fields = activate(*given, constants, on_surface)
+            fields = footprint_gaussians(*given, constants, on_surface)
         if raw.real is not None:
             fields = (*fields[:3], fields[3] * raw.real, *fields[4:])
         constants = {"low_pass": options.low_pass, "antialiased": options.antialiased}

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ghgs_lit.method.heads.activations import bounded_tanh
 from ghgs_lit.method.heads.attributes import RawGaussians
 from ghgs_lit.method.heads.gaussian import GaussianHead
+from ghgs_lit.ops.activation import bounded_tanh
 
 NEAR_LIMIT = 0.95
 """Share of ``gaussian_head.offset_limit`` from which on an offset counts as at its limit."""

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.kernels.pool import at_once, even_parts
+from ghgs_lit.ops.pool import at_once, even_parts
 
 #: Distances in memory at once: a block fits a CPU's cache.
 _BLOCK = 1 << 17

@@ -11,12 +11,12 @@ from torch import Tensor, nn
 from ghgs_lit.config.options import Count, Options, Width
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.rotations import unit
-from ghgs_lit.kernels.linear import linear
-from ghgs_lit.kernels.pool import at_once, even_parts
 from ghgs_lit.method.plan import Plan
 from ghgs_lit.method.plan.rows import Rows
 from ghgs_lit.method.recalibration.attention import SemanticAttention, Similarity
 from ghgs_lit.method.recalibration.neighbors import nearest_neighbors
+from ghgs_lit.ops.linear import linear
+from ghgs_lit.ops.pool import at_once, even_parts
 from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import DecodedPixels, Points, Tokens
 

@@ -10,8 +10,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from ghgs_lit.extents import bucket_size
-from ghgs_lit.kernels.linear import Linear
 from ghgs_lit.method.heads.gaussian import RawGaussians
+from ghgs_lit.ops.linear import Linear
 from ghgs_lit.types import Batch
 
 #: Side in pixels of the square around a Gaussian's pixel whose Gaussians it exchanges

@@ -18,24 +18,21 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from ghgs_lit.config.options import Options, Width
-from ghgs_lit.geometry.photo_consistency import consistency_of
 from ghgs_lit.geometry.projection import at_least_float32, focal_lengths
-from ghgs_lit.kernels.linear import Linear
-from ghgs_lit.kernels.pool import at_once, even_parts, multiplies
 from ghgs_lit.method.bounds.rays import ray_directions
-from ghgs_lit.method.heads.activations import bounded_tanh
 from ghgs_lit.method.heads.attributes import RAW_VALUES, RawGaussians
 from ghgs_lit.method.heads.gaussian import float32_last
-from ghgs_lit.method.rounds import cpu
 from ghgs_lit.method.rounds.exchange import Exchange, Windows
 from ghgs_lit.method.rounds.gains import equalized
-from ghgs_lit.method.rounds.memory import fits, remembered, remembered_plainly
-from ghgs_lit.method.rounds.observation import CHANNELS, SLOPES, observe, slopes
+from ghgs_lit.method.rounds.observation import SLOPES, observe, slopes
+from ghgs_lit.ops.activation import bounded_tanh
+from ghgs_lit.ops.linear import Linear
+from ghgs_lit.ops.observation import CHANNELS
+from ghgs_lit.ops.photo_consistency import consistency_of
+from ghgs_lit.ops.round_memory import remembered
 from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Prediction, Tokens
 
-#: Gaussians that go through the network at once on a CPU.
-_AT_ONCE = 2048
 #: Largest distance of the depths that the first round compares from the current one, as a share of
 #: the way from near to far.
 REACH = 0.25
@@ -327,30 +324,13 @@ class Rounds(nn.Module):
             memory: of the rounds before.
             windows: places of the Gaussians in maps; None: nothing is exchanged.
         """
-        if fits(each, known, memory, self.memory.weight):
-            memory = remembered(self._layers, each, known, memory)
-        elif multiplies(each, known, memory, self.memory.weight):
-            memory = cpu.remembered(self.view, self.update, self.memory, each, known, memory)
-        else:
-            memory = self._remembered_in_parts(each, known, memory)
+        memory = remembered(self._layers, each, known, memory)
         memory = memory if windows is None else self.exchange(memory, windows)
         return memory, float32_last(self.change, memory)
 
-    def _remembered_in_parts(self, *rows: Tensor) -> Float[Tensor, "N h"]:
-        """:meth:`_remembered` in parts that fit a CPU's cache, in half the time;
-        at once with a gradient."""
-        count = len(rows[0])
-        device = rows[0].device
-        parts = even_parts(count, count if torch.is_grad_enabled() else at_once(device, _AT_ONCE, count))
-        return torch.cat([self._remembered(*(row[part] for row in rows)) for part in parts])
-
-    def _remembered(self, *rows: Tensor) -> Float[Tensor, "n h"]:
-        """The new memory from observations, what is known beside them, and the memory before."""
-        return remembered_plainly(self._layers, *rows)
-
     @property
     def _layers(self) -> tuple[nn.Linear, ...]:
-        """What :func:`ghgs_lit.method.rounds.memory.remembered` multiplies with."""
+        """What :func:`ghgs_lit.ops.round_memory.remembered` multiplies with."""
         return self.view[0], self.view[2], self.update[0], self.update[2], self.memory
 
     @torch.no_grad()

@@ -14,7 +14,7 @@ import pytest
 
 from ghgs_lit.diagnostics.stress.measure import measure
 from ghgs_lit.diagnostics.stress.stages import STAGES, heads
-from ghgs_lit.rendering.cpu import backend
+from ghgs_lit.ops.rasterization import cpu
 from tests.helpers.planting import CODE, change_code, found
 
 #: What is wrong, where, the change, and the stage, family and dtype that show it.
@@ -62,11 +62,11 @@ def test_a_norm_without_its_epsilon_is_reported(monkeypatch):
 
 def test_tiles_from_back_to_front_are_reported(monkeypatch):
     """The order of the splats of a tile is that of their depths."""
-    right = backend.scatter
+    right = cpu.scatter
 
     def reversed_(first, last, shifts, depths, *rest):
         with np.errstate(all="ignore"):
             return right(first, last, shifts, (1 / depths).astype(np.float32), *rest)
 
-    monkeypatch.setattr(backend, "scatter", reversed_)
+    monkeypatch.setattr(cpu, "scatter", reversed_)
     assert failures("compositing", "ordinary", "float32") > 0

@@ -6,14 +6,14 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-import ghgs_lit.kernels.linear
+import ghgs_lit.ops.linear
 from ghgs_lit.errors import InputError
-from ghgs_lit.kernels.compile import processor_features
-from ghgs_lit.kernels.linear import linear
-from ghgs_lit.kernels.pool import even_parts
-from ghgs_lit.method.encoder import cpu
 from ghgs_lit.method.encoder.block import Block, rotary_tables
 from ghgs_lit.method.plan.patches import KeptPatches
+from ghgs_lit.ops.attention import cpu
+from ghgs_lit.ops.compile import processor_features
+from ghgs_lit.ops.linear import linear
+from ghgs_lit.ops.pool import even_parts
 from ghgs_lit.runtime.precision import has_bfloat16, precision_of
 from tests.helpers.encoders import make_encoder
 from tests.helpers.models import ATTRIBUTES, make_model
@@ -25,9 +25,9 @@ CPU = torch.device("cpu")
 @pytest.fixture
 def convolutions(monkeypatch):
     """Compute products of any size by oneDNN, with a gradient as convolutions, on any machine."""
-    monkeypatch.setattr(ghgs_lit.kernels.linear, "_WIDE_PRODUCTS", True)
+    monkeypatch.setattr(ghgs_lit.ops.linear, "_WIDE_PRODUCTS", True)
     for limit in ("_SMALL", "_LARGE", "_PIXELS"):
-        monkeypatch.setattr(ghgs_lit.kernels.linear, limit, 0)
+        monkeypatch.setattr(ghgs_lit.ops.linear, limit, 0)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
 
 
@@ -37,10 +37,10 @@ def kernels(monkeypatch):
     also where the processor lacks features that make it fast."""
     features = processor_features() | {"avx2", "fma"}
     for limit in ("_SMALL", "_LARGE"):
-        monkeypatch.setattr(f"ghgs_lit.method.encoder.cpu.{limit}", 0)
-    monkeypatch.setattr("ghgs_lit.kernels.pool.features", lambda: features)
-    calls, attend = [], cpu.attend
-    monkeypatch.setattr(cpu, "attend", lambda *args: calls.append(1) or attend(*args))
+        monkeypatch.setattr(f"ghgs_lit.ops.attention.{limit}", 0)
+    monkeypatch.setattr("ghgs_lit.ops.pool.features", lambda: features)
+    calls, attend = [], cpu.attend_heads
+    monkeypatch.setattr(cpu, "attend_heads", lambda *args: calls.append(1) or attend(*args))
     yield
     assert calls
 
@@ -76,9 +76,9 @@ def test_product_without_a_gradient_is_the_linear_layer(convolutions, shape, bia
 def test_which_products_are_onednns(monkeypatch):
     """Those of a processor with wide vectors, but for tiny ones, in float32,
     in training with two threads."""
-    monkeypatch.setattr(ghgs_lit.kernels.linear, "_WIDE_PRODUCTS", True)
+    monkeypatch.setattr(ghgs_lit.ops.linear, "_WIDE_PRODUCTS", True)
     threads, x, weight = torch.get_num_threads(), torch.empty(1000, 512), torch.empty(64, 512)
-    prefers = ghgs_lit.kernels.linear.prefers_onednn
+    prefers = ghgs_lit.ops.linear.prefers_onednn
     try:
         for count in (1, 2):
             torch.set_num_threads(count)
@@ -90,7 +90,7 @@ def test_which_products_are_onednns(monkeypatch):
                 assert not prefers(x.to("meta"), weight.to("meta"))
     finally:
         torch.set_num_threads(threads)
-    monkeypatch.setattr(ghgs_lit.kernels.linear, "_WIDE_PRODUCTS", False)
+    monkeypatch.setattr(ghgs_lit.ops.linear, "_WIDE_PRODUCTS", False)
     with torch.no_grad():
         assert not prefers(x, weight)
 
@@ -98,7 +98,7 @@ def test_which_products_are_onednns(monkeypatch):
 @pytest.mark.parametrize(("rows", "calls"), [(11, 5), (12, 1), (40, 1)])
 def test_weights_of_products_of_few_rows_are_copied_in_parts(convolutions, monkeypatch, rows, calls):
     """Large weights with few rows are divided, so that oneDNN's copy does not fill the memory."""
-    monkeypatch.setattr(ghgs_lit.kernels.linear, "_COPY", 24)
+    monkeypatch.setattr(ghgs_lit.ops.linear, "_COPY", 24)
     g = torch.Generator().manual_seed(0)
     x, weight, b = (torch.randn(s, generator=g) for s in ((rows, 12), (9, 12), (9,)))
     seen, convolve = [], F.conv2d

@@ -10,7 +10,8 @@ from ghgs_lit.geometry.masks import coverage, on_black
 from ghgs_lit.geometry.projection import project, unproject_maps
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.method.rounds import observation
-from ghgs_lit.method.rounds.observation import CHANNELS, SLOPES, looked_up, observe, slopes
+from ghgs_lit.method.rounds.observation import SLOPES, looked_up, observe, slopes
+from ghgs_lit.ops.observation import CHANNELS
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Batch, Gaussians
 from tests.helpers.scenes import make_batch, with_soft_rims

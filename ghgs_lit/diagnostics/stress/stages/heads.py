@@ -9,10 +9,10 @@ from torch import Generator
 from ghgs_lit.diagnostics.stress import inputs
 from ghgs_lit.diagnostics.stress.stage import Stage, Values
 from ghgs_lit.geometry.rotations import quaternion_to_matrix, unit
-from ghgs_lit.method.heads.activations import confidence_of
 from ghgs_lit.method.heads.attributes import FootprintAttributes
 from ghgs_lit.method.heads.depth import BOUNDED, bounded_depth
 from ghgs_lit.method.heads.dpt import DPTHead
+from ghgs_lit.ops.activation import confidence_of
 from ghgs_lit.types import Tokens
 
 

@@ -6,10 +6,10 @@ from torch import Generator, Tensor
 
 from ghgs_lit.diagnostics.stress import inputs
 from ghgs_lit.diagnostics.stress.stage import Stage, Values, case_by_case
-from ghgs_lit.kernels.compile import processor_features
-from ghgs_lit.method.encoder.cpu import attend as attend_heads
 from ghgs_lit.method.recalibration import SemanticAttention, nearest_neighbors
 from ghgs_lit.method.recalibration.recalibration import neighbor_cosines
+from ghgs_lit.ops.attention.cpu import attend_heads
+from ghgs_lit.ops.compile import processor_features
 
 _K = 6
 _COUNT = {"few": 4, "single": 1}

@@ -1,1 +1,0 @@
-"""Photo-consistency for GPUs: one kernel for all depths of all pixels."""

@@ -1,2 +1,0 @@
-"""Shared parts of the CPU kernels: compilation with a disk cache, vectors, memory access,
-threads."""

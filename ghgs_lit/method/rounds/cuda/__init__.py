@@ -1,1 +1,0 @@
-"""Rounds for GPUs: observations of Gaussians in one kernel."""

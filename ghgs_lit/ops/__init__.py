@@ -1,0 +1,1 @@
+"""Operators: each in plain PyTorch, with compiled kernels beside it where these win."""

@@ -1,0 +1,301 @@
+"""Activations of the raw channels of heads, and Gaussians from them."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.library import register_autograd
+
+from ghgs_lit.geometry.projection import focal_lengths
+from ghgs_lit.geometry.rotations import multiply_quaternions, rotate, unit
+from ghgs_lit.ops.activation.surface import surface_axes
+from ghgs_lit.ops.dispatch import LIBRARY, Operator, everything, without_gradients
+from ghgs_lit.types import Cameras, DepthMaps
+
+
+class _Saturate(torch.autograd.Function):
+    """A sigmoid or tanh whose argument is clamped; see :func:`bounded_sigmoid`."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor, limit: float, symmetric: bool) -> Tensor:
+        """The activation of ``x`` within its limit.
+
+        Args:
+            ctx: of autograd.
+            x: raw values.
+            limit: largest argument.
+            symmetric: tanh instead of sigmoid.
+        """
+        ctx.save_for_backward(x)
+        ctx.limit = limit
+        ctx.symmetric = symmetric
+        stopped = x.clamp(-limit, limit)
+        return stopped.tanh() if symmetric else stopped.sigmoid()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, slope: Tensor):
+        (x,) = ctx.saved_tensors
+        stopped = x.clamp(-ctx.limit, ctx.limit)
+        # Not y (1 - y), which has few exact digits where y is nearly 1.
+        if ctx.symmetric:
+            own = stopped.cosh().square().reciprocal()
+        else:
+            own = stopped.sigmoid() * (-stopped).sigmoid()
+        # Gradient descent subtracts, so a gradient with the sign of x leads back into the limits.
+        leads_back = (stopped == x) | (slope * x > 0)
+        return torch.where(leads_back, slope * own, 0), None, None
+
+
+#: Largest arguments of the activations; sigmoid and tanh have slopes of 4.5e-5 and 1.8e-4 there.
+SIGMOID_LIMIT = 10.0
+TANH_LIMIT = 5.0
+EXP_LIMIT = 80.0
+
+
+def bounded_sigmoid(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """The sigmoid of ``x`` clamped to +-10; beyond,
+    only gradients that lead back into the limits remain.
+
+    In float32 a plain sigmoid is exactly 1 from 17 on, without a gradient: one step that is too
+    large ends the training of a head.
+    """
+    return _Saturate.apply(x, SIGMOID_LIMIT, False)
+
+
+def bounded_tanh(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """The hyperbolic tangent of ``x`` clamped to +-5,
+    with gradients as of :func:`bounded_sigmoid`."""
+    return _Saturate.apply(x, TANH_LIMIT, True)
+
+
+def confidence_of(raw: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """A confidence of at least 1, as in published heads (VGGT),
+    finite for any raw value but NaN."""
+    return 1 + raw.clamp(max=EXP_LIMIT).exp()
+
+
+#: The gradient of shorter quaternions is that of this length: it would grow without bound near 0.
+SHORTEST = 0.1
+
+Attributes = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+class Constants(NamedTuple):
+    """Numbers of :func:`footprint_attributes`.
+    Lengths are in footprints, except those of offsets."""
+
+    offset_limit: float
+    """Largest offset along each axis in metres; 0: none."""
+    offset_unit: float
+    """Offset in metres for a raw value of 1 where there is no limit."""
+    inward: float
+    scale_floor: float
+    scale_range: float
+    """Logarithm of the ratio of the largest to the smallest scale."""
+    across: float
+    """Bias of the raw scales of the first two axes."""
+    thickness: float
+    """Bias of the raw scale of the third axis."""
+    opacity_floor: float
+    opacity_bias: float
+    color_limit: float
+    """Largest change of a colour from its pixel's."""
+
+
+def footprint_attributes(
+    offset: Float[Tensor, "N 3"],
+    scale: Float[Tensor, "N 3"],
+    rotation: Float[Tensor, "N 4"],
+    opacity: Float[Tensor, " N"],
+    footprint: Float[Tensor, " N"],
+    constants: Constants,
+) -> Attributes:
+    """Offsets, scales, quaternions and opacities in units of a pixel's footprint.
+
+    Args:
+        offset: raw, as are the next three.
+        scale: raw.
+        rotation: raw; 0 is no rotation.
+        opacity: raw.
+        footprint: side of a pixel at each Gaussian's depth, in metres.
+        constants: of ``FootprintAttributes``.
+
+    Returns:
+        Offsets and scales in metres, unit quaternions, and opacities from ``opacity_floor`` to 1.
+    """
+    limit, metres, inward, floor, span, across, thickness, least, bias, _ = constants
+    identity = F.pad(rotation.new_ones(1), (0, 3))
+    scale = torch.cat((scale[:, :2] + across, scale[:, 2:] + thickness), 1)
+    scale = floor * torch.exp(span * bounded_sigmoid(scale))
+    shown = bounded_sigmoid(opacity + bias)
+    moved = limit * bounded_tanh(offset) if limit > 0 else metres * offset
+    return (
+        moved + F.pad(inward * footprint[:, None], (2, 0)),
+        footprint[:, None] * scale,
+        unit(identity + rotation, SHORTEST),
+        least + (1 - least) * shown,
+    )
+
+
+def activated(
+    raw: tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None],
+    image: Int[Tensor, " N"],
+    pixel: Int[Tensor, " N"],
+    maps: DepthMaps,
+    points: Float[Tensor, "B V H W 3"],
+    photo: Float[Tensor, "B V 3 H W"],
+    share: Float[Tensor, "B V H W"] | None,
+    cameras: Cameras,
+    attributes: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], Attributes],
+    color_limit: float,
+    on_surface: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Gaussians from raw attributes.
+
+    Args:
+        raw: offsets, scales, rotations, opacities and colours (or None) before activations.
+        image: numbers of the images (``b * V + v``) that the Gaussians belong to.
+        pixel: row-major indices of their pixels.
+        maps: depths in metres.
+        points: world points of pixels, in metres.
+        photo: colours of pixels, in [0, 1].
+        share: factors of opacities; None: 1.
+        cameras: of the images.
+        attributes: offsets, scales, quaternions and opacities of raw ones and of footprints.
+        color_limit: largest change of a colour from its pixel's.
+        on_surface: ``raw`` is in axes of the surface.
+
+    Returns:
+        Means in metres [N, 3], quaternions [N, 4], scales in metres [N, 3],
+        opacities [N] and colours [N, 3].
+    """
+    *numbers, color = raw
+    focal = focal_lengths(cameras).prod(-1).sqrt().flatten()[image]
+    depth = maps.depth.flatten(0, 1).flatten(1)[image, pixel]
+    # No gradient: a splat that is too large must not move nearer to become smaller.
+    footprint = depth.detach() / focal
+    offset, scales, quaternions, opacities = attributes(*numbers, footprint)
+    if on_surface:
+        axes = surface_axes(maps, cameras, image, pixel)
+        offset = rotate(axes, offset)
+        quaternions = multiply_quaternions(axes, quaternions)
+    if share is not None:
+        opacities = opacities * share.to(opacities).flatten(0, 1).flatten(1)[image, pixel]
+    colors = photo.flatten(0, 1).flatten(2).transpose(1, 2)[image, pixel]
+    if color is not None:
+        colors = colors + color_limit * bounded_tanh(color)
+    means = points.flatten(0, 1).flatten(1, 2)[image, pixel] + offset
+    return means, quaternions, scales, opacities, colors
+
+
+def footprint_gaussians(
+    raw: tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None],
+    image: Int[Tensor, " N"],
+    pixel: Int[Tensor, " N"],
+    maps: DepthMaps,
+    points: Float[Tensor, "B V H W 3"],
+    photo: Float[Tensor, "B V 3 H W"],
+    share: Float[Tensor, "B V H W"] | None,
+    cameras: Cameras,
+    constants: Constants,
+    on_surface: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """:func:`activated` with :func:`footprint_attributes`; differentiable in all but cameras and depths.
+
+    Args:
+        raw: as of :func:`activated`, as are all but ``constants``.
+        image: numbers of the images (``b * V + v``) that the Gaussians belong to.
+        pixel: row-major indices of their pixels.
+        maps: depths in metres.
+        points: world points of pixels, in metres.
+        photo: colours of pixels, in [0, 1].
+        share: factors of opacities; None: 1.
+        cameras: of the images.
+        constants: of ``FootprintAttributes``, with the limit of colours.
+        on_surface: ``raw`` is in axes of the surface.
+
+    Returns:
+        As of :func:`activated`.
+    """
+    seen = (image, pixel, maps.depth, maps.valid, points, photo, share)
+    return _activate(*raw, *seen, cameras.intrinsics, cameras.extrinsics, list(constants), on_surface)
+
+
+_INPUTS = (
+    "Tensor offset, Tensor scale, Tensor rotation, Tensor opacity, Tensor? color, Tensor image, "
+    "Tensor pixel, Tensor depth, Tensor valid, Tensor points, Tensor photo, Tensor? share, "
+    "Tensor intrinsics, Tensor extrinsics, float[] constants, bool on_surface"
+)
+#: Places of the inputs that have a gradient, and of depths and extrinsics, on which nothing
+#: depends differentiably.
+_RAW = (0, 1, 2, 3, 4)
+_POINTS = 9
+_FIXED = (7, 13)
+
+
+def _plain(*inputs: Any) -> tuple[Tensor, ...]:
+    """:func:`footprint_gaussians` in plain PyTorch; inputs in the order of ``_INPUTS``."""
+    *raw, image, pixel, depth, valid, points, photo, share = inputs[:12]
+    intrinsics, extrinsics, constants, on_surface = inputs[12:]
+    maps = DepthMaps(depth, valid, depth)
+    cameras = Cameras(intrinsics, extrinsics, *depth.shape[-2:])
+    constants = Constants(*constants)
+    attributes = partial(footprint_attributes, constants=constants)
+    given = (raw, image, pixel, maps, points, photo, share, cameras)
+    return activated(*given, attributes, constants.color_limit, on_surface)
+
+
+def _plain_back(*inputs: Any) -> list[Tensor]:
+    """Gradients of raw values and points in plain PyTorch.
+
+    Inputs are those of :func:`_plain` and gradients of its results.
+    """
+    *inputs, slopes = inputs
+    places = [place for place in (*_RAW, _POINTS) if inputs[place] is not None]
+    for place in places:
+        inputs[place] = inputs[place].detach().requires_grad_()
+    with torch.enable_grad():
+        pairs = zip(_plain(*inputs), slopes, strict=True)
+        learned = [(output, slope) for output, slope in pairs if output.requires_grad]
+        outputs, slopes = zip(*learned, strict=True)
+        gradients = torch.autograd.grad(outputs, [inputs[place] for place in places], slopes)
+    at_place = dict(zip(places, gradients, strict=True))
+    return [at_place.get(place, inputs[0].new_empty(0)) for place in (*_RAW, _POINTS)]
+
+
+_activate = Operator(
+    f"activate({_INPUTS}) -> ({', '.join(['Tensor'] * 5)})",
+    _plain,
+    __name__,
+    {"cpu": without_gradients, "cuda": everything},
+    learned={"cuda": (*_RAW, _POINTS, *_FIXED)},
+)
+_activate_back = Operator(
+    f"activate_back({_INPUTS}, Tensor[] slopes) -> Tensor[]", _plain_back, __name__, {"cuda": everything}
+)
+
+
+def _save(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
+    *tensors, ctx.constants, ctx.on_surface = inputs
+    ctx.save_for_backward(*tensors)
+    if tensors[4] is None:  # colours are those of the photographs
+        ctx.mark_non_differentiable(output[4])
+
+
+@torch.autograd.function.once_differentiable
+def _back(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+    inputs = ctx.saved_tensors
+    *of_raw, of_points = _activate_back(*inputs, ctx.constants, ctx.on_surface, slopes)
+    gradients = [*of_raw, *[None] * (len(inputs) + 2 - len(of_raw))]
+    gradients[_POINTS] = of_points
+    if inputs[4] is None:
+        gradients[4] = None
+    return tuple(gradients)
+
+
+register_autograd("ghgs_lit::activate", _back, setup_context=_save, lib=LIBRARY)

@@ -1,0 +1,259 @@
+"""Activations of Gaussians and their gradients for a GPU, in Triton:
+``ROWS`` Gaussians in a program.
+
+Formulas are those of :mod:`ghgs_lit.ops.activation` and :mod:`ghgs_lit.ops.activation.surface`. A
+Gaussian reads at most 45 numbers, so that its gradient computes again what it needs."""
+
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from ghgs_lit.ops import activation
+from ghgs_lit.ops.activation.axes import product, rotated, surface_axes, unit_quaternion
+from ghgs_lit.ops.tiles import clamp, load3, load4, rows_of, start, store3, store4, tanh
+
+SIGMOID = tl.constexpr(activation.SIGMOID_LIMIT)
+TANH = tl.constexpr(activation.TANH_LIMIT)
+SHORTEST = tl.constexpr(activation.SHORTEST)
+
+
+@triton.jit
+def _sigmoid(x):
+    """The sigmoid of ``x`` within its limit, and its slope,
+    exact also where the sigmoid is nearly 1."""
+    x = clamp(x, -SIGMOID, SIGMOID)
+    shrunk = tl.exp(-tl.abs(x))
+    other = 1 / (1 + shrunk)
+    return tl.where(x < 0, shrunk * other, other), shrunk * other * other
+
+
+@triton.jit
+def _back(slope, own, x, limit):
+    """Gradient of an activation: beyond the limit only what leads back into it remains.
+
+    Args:
+        slope: gradient of its result.
+        own: slope of the activation.
+        x: its argument.
+        limit: largest argument.
+    """
+    return tl.where((tl.abs(x) <= limit) | (slope * x > 0), slope * own, 0.0)
+
+
+@triton.jit
+def _tanh_back(slope, x):
+    """Gradient of a tanh within its limit."""
+    shrunk = tl.exp(-2 * tl.abs(clamp(x, -TANH, TANH)))
+    return _back(slope, 4 * shrunk / ((1 + shrunk) * (1 + shrunk)), x, TANH)
+
+
+@triton.jit
+def _depth_and_footprint(depth, intrinsics, image, place):
+    """Depths, and sides of the pixels there, in metres.
+
+    Args:
+        depth: [images, height, width] in metres.
+        intrinsics: [images, 3, 3] in pixels.
+        image: number of the image.
+        place: index of the pixel among those of all images.
+    """
+    own = tl.load(depth + place)
+    fx = tl.load(intrinsics + image * 9)
+    fy = tl.load(intrinsics + image * 9 + 4)
+    return own, own / tl.sqrt(fx * fy)
+
+
+@triton.jit
+def _offset(x, limit, unit, HAS_LIMIT: tl.constexpr):
+    """A coordinate of an offset in metres.
+
+    Args:
+        x: raw value.
+        limit: largest offset in metres.
+        unit: offset in metres for a raw value of 1 where there is no limit.
+        HAS_LIMIT: whether there is one.
+    """
+    return limit * tanh(clamp(x, -TANH, TANH)) if HAS_LIMIT else unit * x
+
+
+@triton.jit
+def _offset_back(slope, x, limit, unit, HAS_LIMIT: tl.constexpr):
+    """Gradient of the raw value of an offset's coordinate.
+
+    Args:
+        slope: gradient of the coordinate.
+        x: raw value.
+        limit: largest offset in metres.
+        unit: offset in metres for a raw value of 1 where there is no limit.
+        HAS_LIMIT: whether there is one.
+    """
+    return _tanh_back(limit * slope, x) if HAS_LIMIT else unit * slope
+
+
+@triton.jit
+def activate_rows(
+    count, offset, scale, rotation, opacity, color, image, pixel, depth, valid, points, photo, share,
+    intrinsics, extrinsics, means, quaternions, scales, opacities, colors, height, width,
+    limit, unit, inward, floor, span, across, thickness, least, bias, change,
+    HAS_LIMIT: tl.constexpr, HAS_COLOR: tl.constexpr, HAS_SHARE: tl.constexpr, ON_SURFACE: tl.constexpr,
+    ROWS: tl.constexpr,
+):  # fmt: skip
+    """Write ``ROWS`` Gaussians; see :func:`activate`.
+
+    Args:
+        count: number N of Gaussians.
+        offset, scale, rotation, opacity, color: raw, [N, 3], [N, 3], [N, 4], [N] and [N, 3].
+        image: [N], numbers of the images (``b * V + v``) that they belong to.
+        pixel: [N], row-major indices of their pixels.
+        depth, valid: [B, V, height, width], in metres, and which depths are valid.
+        points: [B, V, height, width, 3], world points in metres.
+        photo: [B, V, 3, height, width], colours.
+        share: [B, V, height, width], factors of opacities.
+        intrinsics, extrinsics: [B, V, 3, 3] in pixels, and [B, V, 4, 4].
+        means, quaternions, scales, opacities, colors: [N, 3], [N, 4], [N, 3], [N] and [N, 3],
+            written.
+        height, width: of the images.
+        limit, unit, inward, floor, span, across, thickness, least, bias, change: numbers of
+            :class:`ghgs_lit.ops.activation.Constants`, in their order.
+        HAS_LIMIT, HAS_COLOR, HAS_SHARE: whether there are a limit of offsets, raw colours, factors.
+        ON_SURFACE: raw values are in axes of the surface.
+        ROWS: Gaussians of a program.
+    """
+    i = rows_of(count, ROWS)
+    view = tl.load(image + i)
+    at = tl.load(pixel + i)
+    place = view * height * width + at
+    own, footprint = _depth_and_footprint(depth, intrinsics, view, place)
+    x, y, z = load3(offset, i)
+    x = _offset(x, limit, unit, HAS_LIMIT)
+    y = _offset(y, limit, unit, HAS_LIMIT)
+    z = _offset(z, limit, unit, HAS_LIMIT) + inward * footprint
+    w, a, b, c = load4(rotation, i)
+    w, a, b, c, _ = unit_quaternion(w + 1, a, b, c)
+    if ON_SURFACE:
+        p, q, r, s = surface_axes(depth, valid, intrinsics, extrinsics, view, at, own, height, width)
+        x, y, z = rotated(p, q, r, s, x, y, z)
+        w, a, b, c = product(p, q, r, s, w, a, b, c)
+    u, v, t = load3(points, place)
+    store3(means, i, u + x, v + y, t + z)
+    store4(quaternions, i, w, a, b, c)
+    for k in tl.static_range(3):
+        raw = tl.load(scale + 3 * i + k) + (thickness if k == 2 else across)
+        tl.store(scales + 3 * i + k, footprint * (floor * tl.exp(span * _sigmoid(raw)[0])))
+        shade = tl.load(photo + (view * 3 + k) * height * width + at)
+        if HAS_COLOR:
+            shade += change * tanh(clamp(tl.load(color + 3 * i + k), -TANH, TANH))
+        tl.store(colors + 3 * i + k, shade)
+    shown = least + (1 - least) * _sigmoid(tl.load(opacity + i) + bias)[0]
+    if HAS_SHARE:
+        shown *= tl.load(share + place)
+    tl.store(opacities + i, shown)
+
+
+@triton.jit
+def activate_back_rows(
+    count, offset, scale, rotation, opacity, color, image, pixel, depth, valid, share, intrinsics, extrinsics,
+    of_means, of_quaternions, of_scales, of_opacities, of_colors,
+    d_offset, d_scale, d_rotation, d_opacity, d_color, d_points, height, width,
+    limit, unit, inward, floor, span, across, thickness, least, bias, change,
+    HAS_LIMIT: tl.constexpr, HAS_COLOR: tl.constexpr, HAS_SHARE: tl.constexpr, ON_SURFACE: tl.constexpr,
+    ROWS: tl.constexpr,
+):  # fmt: skip
+    """Write the gradients of ``ROWS`` Gaussians; see :func:`activate_back`.
+
+    Args:
+        count: number N of Gaussians.
+        offset, scale, rotation, opacity, color: raw, [N, 3], [N, 3], [N, 4], [N] and [N, 3].
+        image: [N], numbers of the images (``b * V + v``) that they belong to.
+        pixel: [N], row-major indices of their pixels.
+        depth, valid: [B, V, height, width], in metres, and which depths are valid.
+        share: [B, V, height, width], factors of opacities.
+        intrinsics, extrinsics: [B, V, 3, 3] in pixels, and [B, V, 4, 4].
+        of_means, of_quaternions, of_scales, of_opacities, of_colors: gradients of the results.
+        d_offset, d_scale, d_rotation, d_opacity, d_color: written, gradients of raw values.
+        d_points: [B, V, height, width, 3], gradients of points are added.
+        height, width: of the images.
+        limit, unit, inward, floor, span, across, thickness, least, bias, change: numbers of
+            :class:`ghgs_lit.ops.activation.Constants`, in their order.
+        HAS_LIMIT, HAS_COLOR, HAS_SHARE: whether there are a limit of offsets, raw colours, factors.
+        ON_SURFACE: raw values are in axes of the surface.
+        ROWS: Gaussians of a program.
+    """
+    i = rows_of(count, ROWS)
+    view = tl.load(image + i)
+    at = tl.load(pixel + i)
+    place = view * height * width + at
+    own, footprint = _depth_and_footprint(depth, intrinsics, view, place)
+    x, y, z = load3(of_means, i)
+    # Added, since a plan may list a pixel more than once; not by rows that repeat the last one.
+    is_own = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS) < count
+    tl.atomic_add(d_points + 3 * place, x, is_own)
+    tl.atomic_add(d_points + 3 * place + 1, y, is_own)
+    tl.atomic_add(d_points + 3 * place + 2, z, is_own)
+    w, a, b, c = load4(of_quaternions, i)
+    if ON_SURFACE:
+        # Rotations and products with unit quaternions are transposed by the conjugate.
+        p, q, r, s = surface_axes(depth, valid, intrinsics, extrinsics, view, at, own, height, width)
+        x, y, z = rotated(p, -q, -r, -s, x, y, z)
+        w, a, b, c = product(p, -q, -r, -s, w, a, b, c)
+    u, v, t = load3(offset, i)
+    x = _offset_back(x, u, limit, unit, HAS_LIMIT)
+    y = _offset_back(y, v, limit, unit, HAS_LIMIT)
+    store3(d_offset, i, x, y, _offset_back(z, t, limit, unit, HAS_LIMIT))
+    p, q, r, s = load4(rotation, i)
+    p, q, r, s, length = unit_quaternion(p + 1, q, r, s)
+    rate = tl.where(length == 0, 0.0, 1 / tl.where(length < SHORTEST, SHORTEST, length))
+    along = p * w + q * a + r * b + s * c
+    w = w - p * along
+    a = a - q * along
+    b = b - r * along
+    c = c - s * along
+    store4(d_rotation, i, rate * w, rate * a, rate * b, rate * c)
+    for k in tl.static_range(3):
+        raw = tl.load(scale + 3 * i + k) + (thickness if k == 2 else across)
+        value, steep = _sigmoid(raw)
+        slope = tl.load(of_scales + 3 * i + k) * footprint * (floor * tl.exp(span * value)) * span
+        tl.store(d_scale + 3 * i + k, _back(slope, steep, raw, SIGMOID))
+        if HAS_COLOR:
+            slope = change * tl.load(of_colors + 3 * i + k)
+            tl.store(d_color + 3 * i + k, _tanh_back(slope, tl.load(color + 3 * i + k)))
+    raw = tl.load(opacity + i) + bias
+    slope = (1 - least) * tl.load(of_opacities + i)
+    if HAS_SHARE:
+        slope *= tl.load(share + place)
+    tl.store(d_opacity + i, _back(slope, _sigmoid(raw)[1], raw, SIGMOID))
+
+
+def _flags(constants: list[float], color: Tensor | None, share: Tensor | None, on_surface: bool) -> dict:
+    """What the kernels are compiled for.
+
+    Args:
+        constants: numbers of :class:`ghgs_lit.ops.activation.Constants`, in their order.
+        color: raw colours; None: none.
+        share: factors of opacities; None: none.
+        on_surface: raw values are in axes of the surface.
+    """
+    flags = {"HAS_LIMIT": constants[0] > 0, "HAS_COLOR": color is not None, "HAS_SHARE": share is not None}
+    return {**flags, "ON_SURFACE": on_surface}
+
+
+def activate(*inputs) -> tuple[Tensor, ...]:
+    """The operator of :mod:`ghgs_lit.ops.activation`."""
+    *tensors, constants, on_surface = inputs
+    offset, color, image, depth, share = (tensors[k] for k in (0, 4, 5, 7, 11))
+    out = [offset.new_empty(len(image), *size) for size in ((3,), (4,), (3,), (), (3,))]
+    flags = _flags(constants, color, share, on_surface)
+    start(activate_rows, len(image), *tensors, *out, *depth.shape[-2:], *constants, **flags)
+    return tuple(out)
+
+
+def activate_back(*inputs) -> list[Tensor]:
+    """The operator of :mod:`ghgs_lit.ops.activation`."""
+    *tensors, constants, on_surface, slopes = inputs
+    offset, color, image, depth, points, share = (tensors[k] for k in (0, 4, 5, 7, 9, 11))
+    gradients = [offset.new_empty(0 if x is None else x.shape) for x in tensors[:5]]
+    gradients.append(points.new_zeros(points.shape))
+    given = (*tensors[:9], *tensors[11:], *slopes, *gradients)
+    flags = _flags(constants, color, share, on_surface)
+    start(activate_back_rows, len(image), *given, *depth.shape[-2:], *constants, **flags)
+    return gradients

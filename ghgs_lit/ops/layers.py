@@ -1,0 +1,355 @@
+"""Small networks inside kernels, ``PANEL`` rows at a time, and their gradients.
+
+Matrix products stay in registers: a tile of the result is ``ROWS`` x ``PANEL``; its right factor is
+a panel, ``PANEL`` numbers for every step of the sum.
+
+Values are stored by channel: a channel is a line of ``PANEL`` floats, one lane for each row. So the
+result of a layer is the input of the next without another layout. The gradient of a layer's input
+is a product with the transposed weights; that of its weights and biases is a sum over lanes, for
+which the input has a line of ones below its channels.
+
+``emit(context, builder, sig, args)`` writes the LLVM instructions of a function with
+``@intrinsic``, which kernels call without its first parameter, Numba's ``typing_context``.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+from torch import Tensor, nn
+
+from ghgs_lit.ops import memory, simd
+from ghgs_lit.ops.compile import helper, processor_features
+from ghgs_lit.ops.memory import pointer_to
+from ghgs_lit.ops.simd import I64, LANES, call, constant, everywhere, floats
+
+#: Rows and columns of a tile: 24 of the 32 registers of AVX-512, or 12 of the 16 of AVX2. They
+#: divide ``QUERIES`` and ``WIDTH`` of ``ops.attention``.
+ROWS, PANEL = (12, 32) if "avx512f" in processor_features() else (6, 16)
+
+
+def _steps(builder, rows, row_stride: int, step_stride: int, panel, steps, totals) -> None:
+    """Add the products of each row and the panel over ``steps`` numbers to ``totals``.
+
+    Args:
+        builder: of LLVM instructions.
+        rows: pointer to the first number of the first row.
+        row_stride: numbers from row to row.
+        step_stride: numbers from step to step.
+        panel: pointer to the panel, ``PANEL`` floats for each step.
+        steps: numbers of the sum, an LLVM integer.
+        totals: pointers to the sums, [ROWS][PANEL / LANES] vectors.
+    """
+    with cgutils.for_range(builder, steps, intp=I64) as loop:
+        line = builder.gep(panel, [builder.mul(loop.index, ir.Constant(I64, PANEL))])
+        parts = []
+        for j in range(PANEL // LANES):
+            place = builder.gep(line, [ir.Constant(I64, LANES * j)])
+            parts.append(builder.load(builder.bitcast(place, floats.llvm.as_pointer()), align=64))
+        first = builder.gep(rows, [builder.mul(loop.index, ir.Constant(I64, step_stride))])
+        for r in range(ROWS):
+            number = builder.load(builder.gep(first, [ir.Constant(I64, row_stride * r)]))
+            x = everywhere(builder, number, LANES)
+            for part, total in zip(parts, totals[r], strict=True):
+                builder.store(call(builder, "fmuladd", floats, x, part, builder.load(total)), total)
+
+
+def make_product(strides: tuple[int, int], adds: bool):
+    """A function that multiplies ``ROWS`` rows with a panel.
+
+    Args:
+        strides: distances in numbers from row to row and from step to step, constants for the
+            compiler, which keep all registers free for the tile.
+        adds: add the product to ``out`` instead of overwriting it.
+
+    Returns:
+        An intrinsic of Numba:
+        ``product(x, x_at, panels, panel_at, steps, out, out_at, out_stride)``.
+    """
+
+    @intrinsic
+    def product(typing_context, x, x_at, panels, panel_at, steps, out, out_at, out_stride):
+        """Multiply ``ROWS`` rows of ``x`` with a panel, to ``ROWS`` x ``PANEL`` numbers of ``out``.
+
+        Args:
+            typing_context: Numba's.
+            x: flat float32.
+            x_at: index of the first number of the first row.
+            panels: flat float32, from a cache line on.
+            panel_at: index of the panel, a multiple of 16.
+            steps: numbers of the sum.
+            out: flat float32, from a cache line on.
+            out_at: index of the first number of the tile, a multiple of 16.
+            out_stride: numbers from row to row of ``out``, a multiple of 16.
+        """
+
+        def emit(context, builder, sig, args):
+            def place(k):
+                return pointer_to(
+                    context, builder, sig.args[k], args[k], args[k + 1], types.int64, ir.FloatType()
+                )
+
+            count = PANEL // LANES
+            # These become registers, since their addresses stay in this function.
+            totals = []
+            for _ in range(ROWS):
+                totals.append([cgutils.alloca_once(builder, floats.llvm) for _ in range(count)])
+            for row in totals:
+                for total in row:
+                    builder.store(constant(floats, 0.0), total)
+            _steps(builder, place(0), *strides, place(2), args[4], totals)
+            first = place(5)
+            for r, row in enumerate(totals):
+                line = builder.gep(first, [builder.mul(args[7], ir.Constant(I64, r))])
+                for j, total in enumerate(row):
+                    target = builder.gep(line, [ir.Constant(I64, LANES * j)])
+                    target = builder.bitcast(target, floats.llvm.as_pointer())
+                    value = builder.load(total)
+                    if adds:
+                        value = builder.fadd(builder.load(target, align=64), value)
+                    builder.store(value, target, align=64)
+            return context.get_dummy_value()
+
+        i = types.int64
+        return types.void(x, i, panels, i, i, out, i, i), emit
+
+    return product
+
+
+#: ``out = x y`` where the numbers of all rows for one step are contiguous.
+product = make_product((1, ROWS), adds=False)
+
+
+ZERO = np.float32(0)
+ONE = np.float32(1)
+
+#: ``out += x y^T``, summed over the lanes of the lines ``x`` and of ``y`` as
+#: :func:`_turn` stores it.
+_lane_product = make_product((PANEL, 1), adds=True)
+
+
+def room(channels: int) -> int:
+    """Lines that a layer with ``channels`` outputs writes: whole tiles."""
+    return -(-channels // ROWS) * ROWS
+
+
+def parameters(layers: Sequence[nn.Module]) -> list[nn.Parameter]:
+    """Weight and bias of each linear layer, in the order that :func:`packed` expects.
+
+    Args:
+        layers: such as those of an ``nn.Sequential``; others than linear ones are left out.
+    """
+    numbers = []
+    for layer in layers:
+        if isinstance(layer, nn.Linear):
+            numbers += [layer.weight, layer.bias]
+    return numbers
+
+
+def packed(numbers: Sequence[Tensor], transposed: bool = False) -> np.ndarray:
+    """Layers packed into one flat array.
+
+    Args:
+        numbers: weight [outputs, inputs] and bias [outputs] of each layer.
+        transposed: pack transposed weights, with biases of 0.
+
+    Returns:
+        For each layer the weights in tiles of ``ROWS`` outputs, each [inputs, ROWS], then the
+        biases; float32.
+    """
+    parts = []
+    for weight, bias in _pairs(numbers):
+        weight = weight.detach().numpy()
+        weight = weight.T if transposed else weight
+        outputs, inputs = weight.shape
+        both = np.zeros((room(outputs), inputs + 1), np.float32)
+        both[:outputs, :-1] = weight
+        both[:outputs, -1] = 0 if transposed else bias.detach().numpy()
+        parts += [both[:, :-1].reshape(-1, ROWS, inputs).swapaxes(1, 2).ravel(), both[:, -1]]
+    return np.concatenate(parts)
+
+
+def _pairs(numbers: Sequence) -> list[tuple]:
+    """Weight and bias of each layer."""
+    return list(zip(numbers[::2], numbers[1::2], strict=True))
+
+
+class Sums:
+    """Sums of the gradients of layers for each task of a kernel.
+
+    Args:
+        numbers: weight [outputs, inputs] and bias [outputs] of each layer.
+        tasks: number of tasks that run at once.
+
+    Attributes:
+        places: where packed weights, transposed weights and sums of each layer begin,
+            [layers + 1, 3].
+        of_task: sums of each task, from :func:`learn`, [tasks, numbers].
+    """
+
+    def __init__(self, numbers: Sequence[Tensor], tasks: int):
+        self._shapes = [tuple(weight.shape) for weight, _ in _pairs(numbers)]
+        self._blocks = [(-(-o // PANEL), room(i + 1), PANEL) for o, i in self._shapes]
+        counts = [(room(o) * (i + 1), room(i) * (o + 1)) for o, i in self._shapes]
+        sizes = [(*count, int(np.prod(block))) for count, block in zip(counts, self._blocks, strict=True)]
+        self.places = np.cumsum([(0, 0, 0), *sizes], 0)
+        self.of_task = simd.aligned_floats(tasks * self.places[-1, 2]).reshape(tasks, -1)
+        self.of_task[:] = 0
+
+    def gradients(self) -> list[Tensor]:
+        """Gradients of weight and bias of each layer."""
+        sums = np.split(self.of_task.sum(0), self.places[1:-1, 2])
+        both = [
+            part.reshape(block).swapaxes(1, 2).reshape(-1, block[1])[: shape[0], : shape[1] + 1]
+            for part, block, shape in zip(sums, self._blocks, self._shapes, strict=True)
+        ]
+        gradients = []
+        for each in both:
+            gradients += [torch.tensor(each[:, :-1]), torch.tensor(each[:, -1])]
+        return gradients
+
+
+#: :func:`room` inside kernels.
+lines = helper(room)
+
+
+@helper
+def size(outputs, inputs):
+    """Floats of a packed layer.
+
+    Args:
+        outputs: channels of its result.
+        inputs: channels of its input.
+    """
+    return lines(outputs) * (inputs + 1)
+
+
+@helper
+def put_rows(table, first, count, line, values):
+    """Copy rows of a table to lines; the last row is repeated in the other lanes.
+
+    Args:
+        table: float32 [rows, channels].
+        first: first row.
+        count: number of rows, 1 to ``PANEL``.
+        line: first line that is written.
+        values: lines of ``PANEL`` floats, flat.
+    """
+    for lane in range(PANEL):
+        row = first + min(lane, count - 1)
+        for channel in range(table.shape[1]):
+            values[(line + channel) * PANEL + lane] = table[row, channel]
+
+
+@helper
+def linear(layers, at, outputs, inputs, values, result):
+    """``result = W values`` of a packed layer, without its biases.
+
+    Args:
+        layers: packed layers, from :func:`packed`.
+        at: where the layer begins.
+        outputs: channels of the result.
+        inputs: channels of ``values``.
+        values: lines of ``PANEL`` floats, flat.
+        result: gets ``room(outputs)`` lines.
+    """
+    for row in range(0, outputs, ROWS):
+        product(layers, at + row * inputs, values, 0, inputs, result, row * PANEL, PANEL)
+
+
+@helper
+def rectify(layers, at, outputs, inputs, values):
+    """``values = max(values + b, 0)`` with the biases of a packed layer; NaN stays.
+
+    Args:
+        layers: packed layers, from :func:`packed`.
+        at: where the layer begins.
+        outputs: channels of ``values``.
+        inputs: channels of the layer's input.
+        values: lines of ``PANEL`` floats, flat; changed in place.
+    """
+    biases = at + lines(outputs) * inputs
+    for channel in range(outputs):
+        for i in range(channel * PANEL, (channel + 1) * PANEL, LANES):
+            memory.store(values, i, simd.maximum(ZERO, memory.load(values, i) + layers[biases + channel]))
+
+
+@helper
+def put_ones(line, values):
+    """Fill a line with ones, the input of biases.
+
+    Args:
+        line: the line, counted from the first one.
+        values: lines of ``PANEL`` floats, flat.
+    """
+    for i in range(line * PANEL, (line + 1) * PANEL, LANES):
+        memory.store(values, i, simd.full(ONE))
+
+
+@helper
+def put_slopes(table, first, count, values):
+    """Copy rows of a table to lines; the other lanes become 0.
+
+    Args:
+        table: float32 [rows, channels].
+        first: first row.
+        count: number of rows, at most ``PANEL``.
+        values: gets a line of ``PANEL`` floats for each channel.
+    """
+    for lane in range(PANEL):
+        for channel in range(table.shape[1]):
+            value = table[first + lane, channel] if lane < count else ZERO
+            values[channel * PANEL + lane] = value
+
+
+@helper
+def unrectify(values, channels, slopes):
+    """Gradients before a ReLU, in place of those after it.
+
+    Args:
+        values: results of the ReLU, lines of ``PANEL`` floats.
+        channels: number of lines.
+        slopes: gradients of the results; changed in place.
+    """
+    for i in range(0, channels * PANEL, LANES):
+        is_off = memory.load(values, i) <= ZERO
+        memory.store(slopes, i, simd.select(is_off, ZERO, memory.load(slopes, i)))
+
+
+@helper
+def _turn(slopes, channels, turned):
+    """Write lines as panels of ``PANEL`` channels, with a row for each lane.
+
+    Args:
+        slopes: lines of ``PANEL`` floats.
+        channels: number of lines.
+        turned: gets whole panels.
+    """
+    for channel in range(channels):
+        at = channel // PANEL * PANEL * PANEL + channel % PANEL
+        for lane in range(PANEL):
+            turned[at + lane * PANEL] = slopes[channel * PANEL + lane]
+
+
+@helper
+def learn(values, inputs, slopes, outputs, turned, at, sums):
+    """Add the gradients of a layer's weights and biases to ``sums``.
+
+    Args:
+        values: inputs of the layer and a line of ones, lines of ``PANEL`` floats.
+        inputs: channels of the layer's input.
+        slopes: gradients of the layer's outputs, lines of ``PANEL`` floats.
+        outputs: channels of the layer's output.
+        turned: room for whole panels of ``slopes``.
+        at: where the layer's sums begin.
+        sums: of one task, as in :class:`Sums`.
+    """
+    _turn(slopes, outputs, turned)
+    rows = lines(inputs + 1)
+    for panel in range(0, outputs, PANEL):
+        for row in range(0, rows, ROWS):
+            to = at + panel * rows + row * PANEL
+            _lane_product(values, row * PANEL, turned, panel * PANEL, PANEL, sums, to, PANEL)

@@ -1,0 +1,257 @@
+"""Photo-consistency: how well the photographs agree at several depths of each pixel. A plane
+sweep (Collins, CVPR 1996) within each pixel's own bounds: a point on the surface has the same
+colour in all views."""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ghgs_lit.geometry.constants import constant, middles
+from ghgs_lit.geometry.masks import surface_colors
+from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, pixel_centers, sample
+from ghgs_lit.ops.dispatch import Operator, everything
+from ghgs_lit.ops.pool import even_parts
+from ghgs_lit.runtime.precision import exact
+from ghgs_lit.types import Batch, DepthBounds
+
+#: Samples in memory at once.
+_SAMPLES = 1 << 22
+
+#: Mean absolute difference of two colours at which the consistency is 1 / e.
+TOLERANCE = 0.1
+
+#: Smallest cosine between the axes of two views that are compared (127 degrees): beyond it they
+#: hardly share any surface.
+WIDEST = -0.6
+
+
+@torch.no_grad()
+def photo_consistency(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Tensor, "B V S H W"]:
+    """Agreement of each pixel of the subject with the best other view, without a gradient.
+
+    Args:
+        batch: images, masks and cameras are read.
+        bounds: depths between which a pixel's point lies, in the unit of the cameras.
+        steps: S, the number of depths: the middles of S equal parts from near to far.
+
+    Returns:
+        [B, V, S, H, W] in [0, 1]; 0 outside the subject,
+        and where no other view has the point in its mask.
+    """
+    near, far = (bound.flatten()[batch.pixels] for bound in (bounds.near, bounds.far))
+    agreement = consistency_of(batch, batch.pixels, near, far, steps)
+    result = agreement.new_zeros(batch.masks.numel(), steps).index_copy_(0, batch.pixels, agreement)
+    return result.view(*batch.masks.shape, steps).permute(0, 1, 4, 2, 3)
+
+
+@torch.no_grad()
+def consistency_of(
+    batch: Batch, pixels: Int[Tensor, " N"], near: Float[Tensor, " N"], far: Float[Tensor, " N"], steps: int
+) -> Float[Tensor, "N S"]:
+    """:func:`photo_consistency` of some pixels of the subject.
+
+    Args:
+        batch: images, masks and cameras are read.
+        pixels: ascending indices [N] among those of all images.
+        near: least depth of each of these pixels [N], in the unit of the cameras.
+        far: largest depth of each [N].
+        steps: S, the number of depths: the middles of S equal parts from near to far.
+
+    Returns:
+        [N, S] in [0, 1].
+    """
+    near = at_least_float32(near)
+    far = at_least_float32(far)
+    # An error of half a pixel, as in bfloat16, would give another colour.
+    with exact(batch.masks.device.type):
+        views = [x.to(near) if x.is_floating_point() else x for x in batch.once(_pairs)]
+        colors = batch.once(_smooth if near.dtype == torch.float32 else _smooth_plainly).to(near)
+        return _sweep(pixels, near, far, colors, *views, *batch.masks.shape[2:], steps, TOLERANCE)
+
+
+def _swept(
+    pixels: Int[Tensor, " N"],
+    near: Float[Tensor, " N"],
+    far: Float[Tensor, " N"],
+    colors: Float[Tensor, "B V 4 H W"],
+    turn: Float[Tensor, "B V V 3 3"],
+    shift: Float[Tensor, "B V V 3"],
+    compared: Bool[Tensor, "B V V"],
+    height: int,
+    width: int,
+    steps: int,
+    tolerance: float,
+) -> Float[Tensor, "N S"]:
+    """:func:`consistency_of` in plain PyTorch.
+
+    Args:
+        pixels: indices among those of all images.
+        near: least depths, in the unit of the cameras.
+        far: largest depths, the same.
+        colors: smoothed photographs and their masks (:func:`_smoothed`).
+        turn: matrices from pixels of a view (second axis) to another (third axis), as is the next.
+        shift: what is added in the other view.
+        compared: whether two views are compared.
+        height: of an image, as is the next; kernels read it of flat colours.
+        width: of an image.
+        steps: S, the number of depths.
+        tolerance: mean difference of colours at which the agreement is 1 / e.
+
+    Returns:
+        [N, S] in [0, 1].
+    """
+    shares = constant(middles, steps, like=near)
+    result = near.new_zeros(len(pixels), steps)
+    for part in even_parts(len(pixels), _SAMPLES // (steps * (colors.shape[1] - 1))):
+        depth = near[part, None] + (far - near)[part, None] * shares
+        result[part] = _best_match(pixels[part], depth, colors, turn, shift, compared, tolerance)
+    return result
+
+
+def _pairs(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+    cameras = [at_least_float32(x) for x in (batch.cameras.intrinsics, batch.cameras.extrinsics)]
+    turn, shift, facing = _relations(*cameras)
+    return turn, shift, ~(facing < WIDEST)
+
+
+def _best_match(
+    pixels: Int[Tensor, " n"],
+    depth: Float[Tensor, "n S"],
+    colors: Float[Tensor, "B V 4 H W"],
+    turn: Float[Tensor, "B V V 3 3"],
+    shift: Float[Tensor, "B V V 3"],
+    compared: Bool[Tensor, "B V V"],
+    tolerance: float,
+) -> Float[Tensor, "n S"]:
+    """Agreement of pixels of any images, at their depths, with the best other view.
+
+    Args:
+        pixels: indices among those of all images.
+        depth: depths of each pixel that are tried.
+        colors: as for :func:`_swept`, as are the next.
+        turn: matrices from pixels of a view to another.
+        shift: what is added in the other view.
+        compared: whether two views are compared.
+        tolerance: mean difference of colours at which the agreement is 1 / e.
+
+    Returns:
+        [n, S] in [0, 1].
+    """
+    views, _, height, width = colors.shape[1:]
+    image = pixels // (height * width)
+    place = pixels % (height * width)
+    centers = F.pad(pixel_centers(height, width, depth).flatten(0, 1)[place], (0, 1), value=1.0)
+    flat = colors.flatten(0, 1)
+    pixel_colors = flat.flatten(2)[image, :3, place]
+    k = (image[:, None] + torch.arange(1, views, device=image.device)) % views
+    pair = image[:, None] * views + k
+    rays = (turn.flatten(0, 2)[pair] * centers[:, None, None]).sum(-1)
+    other = image[:, None] // views * views + k
+    agreement = _match(flat, other, pixel_colors, rays, shift.flatten(0, 2)[pair], depth, tolerance)
+    return torch.where(compared.flatten()[pair][..., None], agreement, 0).amax(1)
+
+
+def _match(
+    images: Tensor,
+    image: Tensor,
+    pixel_colors: Tensor,
+    rays: Tensor,
+    shift: Tensor,
+    depth: Tensor,
+    tolerance: float,
+) -> Tensor:
+    """Agreement of the colours of pixels with those of other images at their depths.
+
+    Args:
+        images: smoothed colours and masks of all m images [m, 4, H, W].
+        image: images that each pixel is compared with [n, o].
+        pixel_colors: colours of the pixels [n, 3].
+        rays: what a unit of depth adds to a point's homogeneous pixel in these images [n, o, 3].
+        shift: that of the camera's centre [n, o, 3].
+        depth: depths of each pixel that are tried [n, S].
+        tolerance: mean difference of colours at which the agreement is 1 / e.
+
+    Returns:
+        [n, o, S] in [0, 1].
+    """
+    points = rays[:, :, None] * depth[:, None, :, None] + shift[:, :, None]
+    z = points[..., 2]
+    front = z > 0
+    pixels = points[..., :2] / torch.where(front, z, 1.0)[..., None]
+    seen = sample(images, image[..., None].expand(z.shape), pixels)
+    difference = (seen[..., :3] - pixel_colors[:, None, None]).abs().mean(-1)
+    return torch.exp(-difference / tolerance) * seen[..., 3] * front
+
+
+def _smooth(batch: Batch) -> Tensor:
+    return _smoothing(batch.once(surface_colors), batch.masks)
+
+
+def _smooth_plainly(batch: Batch) -> Tensor:
+    return _smoothed(batch.once(surface_colors), batch.masks)
+
+
+def _smoothed(
+    images: Float[Tensor, "B V 3 H W"], masks: Bool[Tensor, "B V H W"]
+) -> Float[Tensor, "B V 4 H W"]:
+    """Mean colours of the subject's pixels in 3 x 3, and the mask as a fourth channel.
+
+    Pixels that are not finite are left out of the mask: they would spread through sums and samples.
+
+    Args:
+        images: colours of the surface [B, V, 3, H, W].
+        masks: of the subject [B, V, H, W].
+
+    Returns:
+        [B, V, 4, H, W].
+    """
+    inside = (masks & images.sum(2).isfinite())[:, :, None]
+    both = torch.cat((torch.where(inside, images, 0), inside.to(images.dtype)), 2)
+    for axis in (-2, -1):  # several times as fast as an average pool
+        both = _sum_of_three(both, axis)
+    colors = both[:, :, :3] / torch.where(both[:, :, 3:] > 0, both[:, :, 3:], 1.0)
+    return torch.cat((colors, inside.to(colors)), 2)
+
+
+def _sum_of_three(values: Tensor, axis: int) -> Tensor:
+    """Sum of each value and its two neighbours along an axis, with 0 beyond the border."""
+    sums = values.clone()
+    inner = values.shape[axis] - 1
+    sums.narrow(axis, 1, inner).add_(values.narrow(axis, 0, inner))
+    sums.narrow(axis, 0, inner).add_(values.narrow(axis, 1, inner))
+    return sums
+
+
+def _relations(
+    intrinsics: Float[Tensor, "B V 3 3"], extrinsics: Float[Tensor, "B V 4 4"]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What leads from pixels of a view j to those of a view k: ``z_k p_k = z_j turn p_j + shift``.
+
+    Args:
+        intrinsics: K [B, V, 3, 3] in pixels.
+        extrinsics: world to camera [B, V, 4, 4].
+
+    Returns:
+        ``turn`` [B, j, k, 3, 3], ``shift`` [B, j, k, 3],
+        and the cosines between the axes of views [B, j, k].
+    """
+    rotation = extrinsics[..., :3, :3]
+    translation = extrinsics[..., :3, 3:]
+    relative = rotation[:, None] @ rotation[:, :, None].mT
+    turn = intrinsics[:, None] @ relative @ inverse_intrinsics(intrinsics)[:, :, None]
+    shift = intrinsics[:, None] @ (translation[:, None] - relative @ translation[:, :, None])
+    return turn, shift[..., 0], relative[..., 2, 2].clone()
+
+
+#: On a CPU, colours as one flat array, which :data:`_sweep` reads there.
+_smoothing = Operator(
+    "smoothed(Tensor images, Tensor masks) -> Tensor", _smoothed, __name__, {"cpu": everything}
+)
+_sweep = Operator(
+    "swept(Tensor pixels, Tensor near, Tensor far, Tensor colors, Tensor turn, Tensor shift, "
+    "Tensor compared, int height, int width, int steps, float tolerance) -> Tensor",
+    _swept,
+    __name__,
+    {"cpu": lambda pixels, near, far, colors, *others: colors.dim() == 1, "cuda": everything},
+)

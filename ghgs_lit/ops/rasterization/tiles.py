@@ -1,0 +1,175 @@
+"""Parts of drawing a tile that the forward and the backward pass share. A tile is 16 x 16 pixels in
+16 blocks of 4 x 4; a block is one vector. Most splats are small (one for each input pixel) and fit
+a 4 x 4 block better than a row of 16. The planes of a tile are its colour channels, the sum of
+``w z`` and the sum of ``w``."""
+
+import numpy as np
+
+from ghgs_lit.ops import memory, simd
+from ghgs_lit.ops.compile import helper
+from ghgs_lit.ops.rasterization import layout
+
+LANES = simd.LANES
+BLOCKS = layout.PIXELS // LANES
+ZERO = np.float32(0)
+ONE = np.float32(1)
+# Smallest denominator of the expected depth; for smaller alphas depth has no gradient in alpha.
+LEAST_ALPHA = np.float32(1e-10)
+
+
+@helper
+def grid():
+    """Columns, then rows of a tile's pixels, block by block."""
+    pixels = simd.aligned(2 * layout.PIXELS)
+    for pixel in range(layout.PIXELS):
+        block = pixel // LANES
+        lane = pixel % LANES
+        pixels[pixel] = block % 4 * 4 + lane % 4
+        pixels[layout.PIXELS + pixel] = block // 4 * 4 + lane // 4
+    return pixels
+
+
+@helper
+def place(tile, tiles_x, tiles_y, height, width):
+    """Where a tile is.
+
+    Args:
+        tile: index among the tiles of all views.
+        tiles_x: number of tiles across a view.
+        tiles_y: number of tiles down a view.
+        height: of the images, in pixels.
+        width: of the images, in pixels.
+
+    Returns:
+        View, first column and row, rows and columns that lie in the image, and index of the first
+        pixel in a plane of the image.
+    """
+    view = tile // (tiles_x * tiles_y)
+    inner = tile % (tiles_x * tiles_y)
+    y0 = inner // tiles_x * layout.TILE
+    x0 = inner % tiles_x * layout.TILE
+    rows = min(layout.TILE, height - y0)
+    columns = min(layout.TILE, width - x0)
+    return view, x0, y0, rows, columns, y0 * width + x0
+
+
+@helper
+def open_pixels(view, x0, y0, pixels, transmittance):
+    """Set the transmittance to 1 in pixels of the image, to 0 beyond.
+
+    Args:
+        view: a camera, [VIEW].
+        x0: first column of the tile, in pixels.
+        y0: first row of the tile, in pixels.
+        pixels: places of the tile's pixels, from :func:`grid`.
+        transmittance: gets [PIXELS], block by block.
+
+    Returns:
+        The blocks with pixels of the image, as bits.
+    """
+    live = 0
+    right = simd.full(np.float32(view[layout.RIGHT] - x0))
+    bottom = simd.full(np.float32(view[layout.BOTTOM] - y0))
+    for block in range(BLOCKS):
+        at = block * LANES
+        x = memory.load(pixels, at)
+        y = memory.load(pixels, layout.PIXELS + at)
+        within = (x <= right) & (y <= bottom)
+        memory.store(transmittance, at, simd.select(within, simd.full(ONE), ZERO))
+        if simd.bits(within) != 0:
+            live |= 1 << block
+    return live
+
+
+@helper
+def read_splat(record, x0, y0):
+    """A splat's numbers for a tile.
+
+    Args:
+        record: one splat's record [RECORD], or a tuple with a vector for each of its numbers.
+        x0: first column of the tile, in pixels.
+        y0: first row of the tile, in pixels.
+
+    Returns:
+        Vector from the splat's centre to the tile's first pixel (2), ``K`` (3), opacity and cutoff.
+    """
+    x = x0 - record[layout.COLUMN]
+    y = y0 - record[layout.ROW]
+    return (
+        x + record[layout.REST_X], y + record[layout.REST_Y], record[layout.K_XX], record[layout.K_YX],
+        record[layout.K_YY], record[layout.OPACITY], record[layout.CUTOFF],
+    )  # fmt: skip
+
+
+@helper
+def color(records, s, colors, n, c, count):
+    """A channel of a splat's colour.
+
+    Args:
+        records: [splats, RECORD]; hold colours of at most ``layout.ROOM`` channels.
+        s: index of the splat.
+        colors: [N, C].
+        n: index of its Gaussian.
+        c: the channel.
+        count: number of channels C, or a tuple of that length.
+    """
+    if simd.length(count) <= layout.ROOM:
+        return records[s, layout.COLORS + c]
+    return colors[n, c]
+
+
+@helper
+def prefetch(records, s, colors, n):
+    """Prefetch a splat: splats of a tile may lie anywhere in memory.
+
+    Args:
+        records: [splats, RECORD].
+        s: index of the splat.
+        colors: [N, C].
+        n: index of its Gaussian.
+    """
+    memory.prefetch(records, s * layout.RECORD)
+    if colors.shape[1] > layout.ROOM:
+        memory.prefetch(colors, n * colors.shape[1])
+
+
+@helper
+def whiten(numbers, dx, dy):
+    """Whitened coordinates ``p`` and ``q`` of vectors from a splat's centre (see ``layout``).
+
+    Args:
+        numbers: from :func:`read_splat`.
+        dx: pixels across.
+        dy: pixels down.
+    """
+    return numbers[2] * dx, simd.fma(numbers[3], dx, numbers[4] * dy)
+
+
+@helper
+def blend(numbers, p, q, before, alpha_max, stop):
+    """Blend a splat over a block of pixels.
+
+    Masked lanes hold zeros, so that vectors are stored whole: a masked store could not be forwarded
+    to the next splat's load.
+
+    Args:
+        numbers: from :func:`read_splat`.
+        p: first whitened coordinate of the pixels.
+        q: second whitened coordinate of the pixels.
+        before: transmittance in front of the splat.
+        alpha_max: upper limit of alpha.
+        stop: transmittance at which a pixel ends.
+
+    Returns:
+        The unclamped and the clamped alpha; the lanes that the splat reaches, where it is seen, and
+        that stay open; and the transmittance behind it. Where that would fall to ``stop``, the
+        splat is left out and the transmittance becomes 0, which excludes all splats behind.
+    """
+    squared = simd.fma(p, p, q * q)
+    reached = squared <= numbers[6]
+    # Lanes out of reach are clamped to the cutoff: denormal numbers would be slow.
+    raw = numbers[5] * simd.exp2_minus(simd.minimum(squared, numbers[6]))
+    alpha = simd.select(reached, simd.minimum(raw, alpha_max), ZERO)
+    behind = before - before * alpha
+    is_open = behind > stop
+    return raw, alpha, reached, reached & is_open, is_open, simd.select(is_open, behind, ZERO)

@@ -1,0 +1,155 @@
+"""The GPU's kernels of the activations of Gaussians against plain PyTorch in float64."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from ghgs_lit.method.heads.attributes import RawGaussians
+from ghgs_lit.types import map_tensors
+from tests.helpers.kernels import DEVICE, kernels
+from tests.method.heads.test_gaussian import make_head
+from tests.ops.cpu.test_activation import FIELDS, scene
+
+RAW = ("offset", "scale", "rotation", "opacity", "color")
+
+
+def to(value, *where):
+    """Floating-point tensors in another precision, all on another device."""
+    return map_tensors(value, lambda x: x.to(*where) if x.is_floating_point() else x.to(DEVICE))
+
+
+def gaussians_and_gradients(head, raw, batch, points, maps, slopes):
+    """Attributes, and the gradients of their products with ``slopes`` by raw attributes
+    and points."""
+    leaves = [getattr(raw, name) for name in RAW] + [points.pixels]
+    leaves = [None if x is None else x.detach().clone().requires_grad_() for x in leaves]
+    raw = dataclasses.replace(raw, **dict(zip(RAW, leaves, strict=False)))
+    points = dataclasses.replace(points, pixels=leaves[-1])
+    gaussians = head.activate(raw, batch, points, maps)
+    found = [getattr(gaussians, name) for name in FIELDS]
+    leaves = [x for x in leaves if x is not None]
+    learned = [(x, slope.to(x)) for x, slope in zip(found, slopes, strict=True) if x.requires_grad]
+    assert len(learned) == 5 - (raw.color is None)
+    outputs, slopes = zip(*learned, strict=True)
+    gradients = torch.autograd.grad(outputs, leaves, slopes)
+    return [x.detach() for x in found], gradients
+
+
+def errors(found, exact):
+    return [float((x - y).abs().max()) for x, y in zip(found, exact, strict=True)]
+
+
+def assert_as_exact_as_pytorch(head, *inputs):
+    """Four times the error of plain float32 and four roundings, of the largest value, at most."""
+    generator = torch.Generator().manual_seed(1)
+    n = len(inputs[0].image)
+    slopes = [torch.randn(n, *size, generator=generator) for size in ((3,), (4,), (3,), (), (3,))]
+    inputs = [to(x, DEVICE) for x in inputs]
+    plain = gaussians_and_gradients(head, *inputs, slopes)
+    exact = gaussians_and_gradients(head, *(to(x, torch.float64) for x in inputs), slopes)
+    with kernels() as called:
+        found = gaussians_and_gradients(head, *inputs, slopes)
+    assert called == ["activate", "activate_back"]
+    for mine, own, true in zip(found, plain, exact, strict=True):
+        limits = [4 * error for error in errors(own, true)]
+        for error, limit, x in zip(errors(mine, true), limits, true, strict=True):
+            assert error <= limit + 4 * torch.finfo(torch.float32).eps * float(x.abs().max())
+
+
+@pytest.mark.parametrize("axes", ["world", "surface"])
+@pytest.mark.parametrize(("b", "v", "height", "width"), [(2, 3, 28, 42), (1, 4, 56, 28)])
+@pytest.mark.parametrize(("scale", "limit"), [(1.0, 0.05), (1.0, None), (30.0, 0.05)])
+@pytest.mark.parametrize("is_soft", [False, True])
+def test_values_and_gradients_are_as_exact_as_plain_pytorchs(
+    axes, b, v, height, width, scale, limit, is_soft
+):
+    """With saturated attributes, with and without mattes, limits of offsets,
+    and changes of colours."""
+    raw, batch, points, maps = scene(b, v, height, width, scale, color=is_soft)
+    batch = batch if is_soft else dataclasses.replace(batch, alpha=None)
+    options = {"axes": axes, "guide": True, "color_limit": 0.5 * is_soft, "offset_limit": limit}
+    head = make_head(attributes={"inward": 0.4, "thickness_start": 0.2}, **options)
+    assert_as_exact_as_pytorch(head, raw, batch, points, maps)
+
+
+def test_rotations_near_none_at_all():
+    """The zero quaternion has no direction; the gradient of short ones is bounded."""
+    raw, *others = scene(1, 3, 28, 28)
+    short = torch.tensor([-1.0, 0.0, 0.0, 0.0]).repeat(len(raw.image), 1)
+    short[1::3, 1], short[2::3, 2] = 1e-30, -0.03
+    assert_as_exact_as_pytorch(
+        make_head(axes="surface", guide=True, color_limit=0.1),
+        dataclasses.replace(raw, rotation=short),
+        *others,
+    )
+
+
+def test_a_pixel_that_is_listed_twice_has_the_sum_of_both_gradients():
+    """Plans of a GPU fill up the rows of a batch with the last one."""
+    raw, *others = scene(1, 3, 28, 28)
+    rows = torch.cat((torch.arange(len(raw.image)), torch.tensor([len(raw.image) - 1] * 9)))
+    values = {name: getattr(raw, name)[rows] for name in ("descriptors", *RAW, "image", "pixel")}
+    raw = dataclasses.replace(raw, **values, splits=(len(rows),))
+    assert_as_exact_as_pytorch(make_head(axes="surface", guide=True, color_limit=0.1), raw, *others)
+
+
+def strided(x):
+    """The same values in every second place of the last axis."""
+    return torch.stack((x, torch.zeros_like(x)), -1)[..., 0]
+
+
+@torch.no_grad()
+def test_strides_change_nothing_and_what_is_not_finite_no_other():
+    raw, batch, points, maps = (to(x, DEVICE) for x in scene(2, 3, 28, 42))
+    head = make_head(axes="surface")
+    raw = dataclasses.replace(raw, color=None)
+    with kernels():
+        expected = head.activate(raw, batch, points, maps)
+        found = head.activate(*(map_tensors(x, strided) for x in (raw, batch, points, maps)))
+        broken = raw.scale.clone()
+        broken[7] = torch.nan
+        other = head.activate(dataclasses.replace(raw, scale=broken), batch, points, maps)
+    for name in FIELDS:
+        assert torch.equal(getattr(found, name), getattr(expected, name)), name
+        assert torch.equal(getattr(other, name)[8:], getattr(expected, name)[8:]), name
+    assert other.scales[7].isnan().all()
+
+
+def test_no_gaussian_has_no_gradient():
+    raw, batch, points, maps = scene(1, 3, 28, 28)
+    nothing = [getattr(raw, name)[:0].requires_grad_() for name in RAW]
+    raw = RawGaussians(raw.descriptors[:0], *nothing, raw.image[:0], raw.pixel[:0], (0,))
+    points = dataclasses.replace(points, pixels=points.pixels.requires_grad_())
+    with kernels() as called:
+        gaussians = make_head(guide=True, color_limit=0.1).activate(
+            *(to(x, DEVICE) for x in (raw, batch, points, maps))
+        )
+        sum(getattr(gaussians, name).sum() for name in FIELDS).backward()
+    assert called == ["activate", "activate_back"]
+    assert len(gaussians) == 0
+    assert not points.pixels.grad.any()
+
+
+def test_what_the_kernels_do_not_know_is_plain_pytorch():
+    """Float64; gradients of photographs; the published attributes."""
+    inputs = [to(x, DEVICE) for x in scene(1, 2, 28, 28)]
+    wide = [to(x, torch.float64) for x in inputs]
+    images = inputs[1].images.clone().requires_grad_()
+    learned = [inputs[0], dataclasses.replace(inputs[1], images=images, alpha=None), *inputs[2:]]
+    with kernels() as called:
+        make_head().activate(*wide)
+        make_head().activate(*learned).colors.sum().backward()
+        make_head(parameterization="release").activate(*inputs)
+    assert called == []
+    assert images.grad.any()
+
+
+def test_autocast_rounds_nothing():
+    inputs = [to(x, DEVICE) for x in scene(1, 2, 28, 28)]
+    with kernels(), torch.no_grad():
+        expected = make_head(axes="surface").activate(*inputs)
+        with torch.autocast(DEVICE.type, torch.bfloat16):
+            found = make_head(axes="surface").activate(*inputs)
+    for name in FIELDS:
+        assert torch.equal(getattr(found, name), getattr(expected, name)), name

@@ -1,0 +1,175 @@
+"""How well photographs agree about a depth, against a pixel-by-pixel version on SciPy's
+interpolation."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import map_coordinates, uniform_filter
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.method.bounds import VisualHull
+from ghgs_lit.method.heads.depth import DepthHeadOptions
+from ghgs_lit.ops.photo_consistency import TOLERANCE, photo_consistency
+from ghgs_lit.types import DepthBounds
+from tests.helpers.scenes import make_batch, ring
+from tests.method.heads.test_gaussian import make_head, run, shake
+
+
+def by_hand(batch, bounds, b, v, row, column, steps):
+    """Agreement at one pixel in float64; views face each other less than the limit in
+    these scenes."""
+    masks = batch.masks[b].double().numpy()
+    images = batch.images[b].double().numpy() * masks[:, None]
+    intrinsics, extrinsics = (
+        x[b].double().numpy() for x in (batch.cameras.intrinsics, batch.cameras.extrinsics)
+    )
+    weight = np.stack([uniform_filter(m, 3, mode="constant") for m in masks])
+    smooth = np.stack([[uniform_filter(c, 3, mode="constant") for c in image] for image in images])
+    smooth = smooth / np.where(weight > 1e-9, weight, 1)[:, None]
+    near, far = (float(bound[b, v, row, column]) for bound in (bounds.near, bounds.far))
+    found = []
+    for step in range(steps):
+        z = near + (far - near) * (step + 0.5) / steps
+        ray = np.linalg.inv(intrinsics[v]) @ [column + 0.5, row + 0.5, 1]
+        world = extrinsics[v, :3, :3].T @ (z * ray - extrinsics[v, :3, 3])
+        best = 0.0
+        for k in range(len(masks)):
+            if k != v:
+                pixel = intrinsics[k] @ (extrinsics[k, :3, :3] @ world + extrinsics[k, :3, 3])
+                at = [[pixel[1] / pixel[2] - 0.5], [pixel[0] / pixel[2] - 0.5]]
+                inside, *color = (
+                    map_coordinates(x, at, order=1, mode="grid-constant")[0] for x in (masks[k], *smooth[k])
+                )
+                difference = np.abs(np.array(color) - smooth[v, :, row, column]).mean()
+                best = max(best, np.exp(-difference / TOLERANCE) * inside)
+        found.append(best)
+    return found
+
+
+@pytest.mark.parametrize("size", [(42, 56), (56, 42)])
+def test_agreement_is_that_of_each_ray(size):
+    """The batched plane sweep must equal a pixel-by-pixel version."""
+    batch = make_batch(2, 3, *size, spread=150.0)
+    bounds = VisualHull()(batch)
+    maps = photo_consistency(batch, bounds, 5)
+    assert maps.shape == (2, 3, 5, *size)
+    places = batch.masks.nonzero()
+    for b, v, row, column in places[:: max(1, len(places) // 25)].tolist():
+        expected = by_hand(batch, bounds, b, v, row, column, 5)
+        np.testing.assert_allclose(maps[b, v, :, row, column].numpy(), expected, atol=2e-4)
+
+
+def test_the_surface_agrees_more_than_what_lies_behind_it():
+    """A subject whose colour is a smooth function of the place, seen by neighbouring views."""
+    batch = make_batch(1, 4, 56, 56, spread=100.0)
+
+    points = unproject_maps(batch.depths, batch.cameras)
+    colors = (points * 9).sin() / 2 + 0.5
+    images = colors.movedim(-1, 2) * batch.masks[:, :, None]
+    batch = dataclasses.replace(batch, images=images)
+    at = photo_consistency(batch, DepthBounds(batch.depths, batch.depths), 1)[:, :, 0][batch.masks]
+    deeper = DepthBounds(batch.depths + 0.15, batch.depths + 0.15)
+    behind = photo_consistency(batch, deeper, 1)[:, :, 0][batch.masks]
+    assert at.mean() > 0.75
+    assert behind.mean() < at.mean() - 0.25
+
+
+@pytest.mark.parametrize("size", [56, 518])
+def test_half_precision_does_not_reach_the_sweep(size):
+    """A pixel rounded to bfloat16 lies in another place: training would see a broken guide."""
+    batch = make_batch(1, 4, size, size, spread=100.0)
+    bounds = DepthBounds(batch.depths, batch.depths + 0.05)
+    expected = photo_consistency(batch, bounds, 2)
+    centers = batch.cameras.centers
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(photo_consistency(batch, bounds, 2), expected)
+        assert torch.equal(batch.cameras.centers, centers)
+
+
+def test_opposite_views_say_nothing():
+    """Views from opposite sides see no common surface and must not vote."""
+    batch = make_batch(1, 2)
+    bounds = VisualHull()(batch)
+    assert not photo_consistency(batch, bounds, 4).any()
+
+
+def test_empty_masks_and_points_behind_cameras_are_defined():
+    """Degenerate input must give finite values in [0, 1]."""
+    batch = make_batch(1, 3)
+    empty = dataclasses.replace(batch, masks=torch.zeros_like(batch.masks))
+    depth = batch.depths.clamp(min=1)
+    assert not photo_consistency(empty, DepthBounds(depth, depth), 2).any()
+    far = torch.full_like(depth, 50.0)
+    found = photo_consistency(batch, DepthBounds(-far, far), 4)
+    assert found.isfinite().all()
+    assert ((found >= 0) & (found <= 1)).all()
+
+
+def test_the_order_of_views_does_not_matter():
+    """The best other view must not depend on the order of views."""
+    batch = make_batch(1, 3, spread=250.0)
+    order = [2, 0, 1]
+    turned = dataclasses.replace(
+        batch,
+        images=batch.images[:, order],
+        masks=batch.masks[:, order],
+        depths=batch.depths[:, order],
+        cameras=dataclasses.replace(
+            batch.cameras,
+            intrinsics=batch.cameras.intrinsics[:, order],
+            extrinsics=batch.cameras.extrinsics[:, order],
+        ),
+    )
+    first = photo_consistency(batch, DepthBounds(batch.depths, batch.depths + 0.2), 3)
+    second = photo_consistency(turned, DepthBounds(turned.depths, turned.depths + 0.2), 3)
+    torch.testing.assert_close(first[:, order], second)
+
+
+def test_precision_is_that_of_the_bounds():
+    """Double-precision bounds must not be computed in single precision."""
+    batch = make_batch(1, 3, spread=150.0)
+    bounds = DepthBounds(batch.depths, batch.depths + 0.2)
+    single = photo_consistency(batch, bounds, 2)
+    double = photo_consistency(batch, bounds.to(torch.float64), 2)
+    assert double.dtype == torch.float64
+    torch.testing.assert_close(single.double(), double, atol=1e-4, rtol=0)
+
+
+def test_heads_ask_for_what_photo_consistency_needs():
+    """Photo-consistency without a guide would be computed and never seen."""
+    for options in ({"guide": False, "consistency_depths": 4}, {"guide": True, "consistency_depths": -1}):
+        with pytest.raises(InputError, match=r"depth_head\.consistency_depths"):
+            DepthHeadOptions(**options)
+    with pytest.raises(InputError, match=r"gaussian_head\.photo_consistency"):
+        make_head(photo_consistency=True)
+
+
+def test_splats_see_photo_consistency_and_colors_leave_their_pixels_within_the_limit():
+    """The guide must reach the opacities, and colours must stay within their limit."""
+    batch = make_batch(1, 3, spread=250.0)
+    other = dataclasses.replace(batch, cameras=ring(1, 3, 56, 56, spread=200.0))
+    head = shake(make_head(guide=True, photo_consistency=True, color_limit=0.25))
+    pixels = batch.images.permute(0, 1, 3, 4, 2)[batch.masks]
+    assert torch.equal(run(head, batch).colors, pixels)
+    torch.nn.init.normal_(head.color_header[-1].weight)
+    here, there = run(head, batch), run(head, other)
+    assert not torch.equal(here.opacities, there.opacities)
+    change = (here.colors - pixels).abs()
+    assert 0 < change.max() <= 0.25
+
+
+def test_rims_agree_as_if_they_were_not_premultiplied():
+    """Photographs on black are darker where they show the subject in part."""
+    batch = make_batch(1, 3)
+    share = (
+        0.3 + 0.7 * torch.rand(batch.masks.shape, generator=torch.Generator().manual_seed(1))
+    ) * batch.masks
+    mixed = dataclasses.replace(batch, images=batch.images * share[:, :, None], alpha=share)
+    bounds = DepthBounds(batch.depths - 0.1, batch.depths + 0.1)
+    expected = photo_consistency(batch, bounds, 4)
+    torch.testing.assert_close(photo_consistency(mixed, bounds, 4), expected, atol=1e-5, rtol=1e-4)
+    dark = photo_consistency(dataclasses.replace(mixed, alpha=None), bounds, 4)
+    assert (dark - expected).abs().max() > 0.1
