@@ -56,12 +56,12 @@ class Operator:
         LIBRARY.impl(self.name, plain, "CompositeExplicitAutograd")
         for device, kernel in self.kernels.items():
             LIBRARY.impl(self.name, kernel, device.upper())
-        self._compiled = getattr(torch.ops.ghgs_lit, self.name).default
+        self.packet = getattr(torch.ops.ghgs_lit, self.name)
         OPERATORS[self.name] = self
 
     def __call__(self, *inputs: Any) -> Any:
         """The results; see the plain form."""
-        return (self._compiled if self.has_kernel(*inputs) else self.plain)(*inputs)
+        return (self.packet.default if self.has_kernel(*inputs) else self.plain)(*inputs)
 
     def has_kernel(self, *inputs: Any) -> bool:
         """Whether a kernel computes with these."""

@@ -11,6 +11,7 @@ from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, 
 from ghgs_lit.evaluation.measure import Renderer
 from ghgs_lit.execution import Predictor
 from ghgs_lit.method.model import GHGS, STAGES
+from ghgs_lit.ops.attention import attend
 from ghgs_lit.runtime.allocation import can_forget_peak, forget_peak, resident_bytes, return_free_memory
 from ghgs_lit.runtime.watching import Inputs, Stopwatch, Watcher, inside
 from ghgs_lit.runtime.watching import watched as stages_watched
@@ -137,7 +138,7 @@ class PeakProbe(Watcher):
 
 #: FLOPs of attention on a CPU, which PyTorch's counter does not know.
 _CPU_ATTENTION = {
-    torch.ops.ghgs_lit.attend: lambda q, k, v, *_, **__: sdpa_flop_count(q, k, v),
+    attend.packet: lambda q, k, v, *_, **__: sdpa_flop_count(q, k, v),
     torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: (
         lambda q, k, v, *_, **__: sdpa_flop_count(q, k, v)
     ),
