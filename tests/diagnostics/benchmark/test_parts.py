@@ -36,7 +36,6 @@ from ghgs_lit.diagnostics.benchmark.stages import (
 )
 from ghgs_lit.errors import InputError
 from ghgs_lit.execution import Predictor
-from ghgs_lit.method import encoder
 from ghgs_lit.rendering import Renderer
 from tests.helpers.models import close, make_model
 
