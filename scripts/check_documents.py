@@ -70,7 +70,6 @@ NOT_RUN = [
     (r"ghgs train .*hydra/launcher=slurm", "needs a cluster"),
     (r"ghgs train .*hydra/sweeper=optuna", "needs the extra `optuna`"),
     (r"ghgs adapt (cameras=<|data\.size=518)", "renders the people of a rig, for minutes"),
-    (r"ghgs stress dump=", "needs a training step that was not finite"),
     (r"ghgs (train|evaluate|benchmark) .*split=bench", "renders forty people"),
     (r"ghgs table .*runs/ablation", "needs twelve runs"),
     (r"(GHGS_PLUGINS=\S+ )?ghgs (train|table) .*controls", "needs 21 runs"),

@@ -1,5 +1,4 @@
-"""``ghgs stress``: compare stages with float64 on adversarial inputs,
-or repeat a saved training step."""
+"""``ghgs stress``: compare stages with float64 on adversarial inputs."""
 
 import sys
 from typing import TYPE_CHECKING
@@ -12,31 +11,23 @@ from ghgs_lit.diagnostics.stress.run import run_tasks, tasks_of
 from ghgs_lit.errors import require
 from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.runtime.cores import allowed_cores
-from ghgs_lit.training.replay import replay
 
 if TYPE_CHECKING:
     from ghgs_lit.cli.verbs import Stress
 
 
 def run(verb: "Stress") -> None:
-    """Compare stages with float64 and write the report, or repeat a saved training step.
+    """Compare stages with float64 and write the report.
 
     Args:
         verb: the run.
 
     Raises:
         InputError: there is no such stage or family.
-        SystemExit: code 1: an error exceeds its budget, or the repeated step is not finite.
+        SystemExit: code 1: an error exceeds its budget.
     """
     directory = output_dir()
     write_config(verb, directory)
-    if verb.dump is not None:
-        step, recorded, fault = replay(verb.dump)
-        print(f"step {step}, when it was saved: {recorded}")
-        print(f"step {step}, now: {fault or 'all values are finite'}")
-        if fault is not None:
-            raise SystemExit(1)
-        return
     tasks = tasks_of(verb.stages, verb.families, verb.quick)
     require(bool(tasks), "families", "a family that one of the stages has", verb.families)
     rows = run_tasks(tasks, allowed_cores() if verb.workers is None else verb.workers)

@@ -122,9 +122,6 @@ class Stress(Verb):
     """Names of stages, as a run prints them; null: all."""
     families: tuple[Text, ...] | None = None
     """Names of families of inputs, as stress.md lists them; null: all."""
-    dump: PathText | None = None
-    """A training step that was not finite, <run>/faults/step_<n>.pt: run it again,
-    and nothing else."""
     workers: Workers | None = None
     """Processes; null: one for each processor, 0: this one."""
 

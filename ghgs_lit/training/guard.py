@@ -1,6 +1,7 @@
 """Guard against training steps that are not finite: they are explained, saved and skipped."""
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 
 import lightning.pytorch as L
@@ -9,8 +10,7 @@ from torch import Tensor
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.files import write_atomically
-from ghgs_lit.training.faults import Fault, Step, first_fault
-from ghgs_lit.weights.checkpoint import STATE_PREFIX
+from ghgs_lit.training.faults import Step, first_fault
 
 
 class DivergedError(InputError):
@@ -19,8 +19,8 @@ class DivergedError(InputError):
 
 class Guard:
     """Checks each step of the optimizer, and runs the step again only if it is not finite. All
-    processes decide alike. A fault is saved to ``<run>/faults/step_<n>.pt`` (once for each stage),
-    which :mod:`ghgs_lit.training.replay` can run again.
+    processes decide alike. The inputs of the step are saved to ``<run>/faults/step_<n>.pt``, once
+    for each stage.
 
     Args:
         limit: steps in a row that are skipped before the run stops.
@@ -106,29 +106,7 @@ class Guard:
             rank = f"_process_{module.global_rank}" if module.global_rank else ""
             folder = Path(module.trainer.default_root_dir) / "faults"
             path = folder / f"step_{module.global_step:06d}{rank}.pt"
-            _write(path, module, step, fault)
-            return f"{fault}; `ghgs stress dump={path}` runs it again"
+            content = {**dataclasses.asdict(step), "autocast": str(step.autocast), "fault": str(fault)}
+            write_atomically(path, partial(torch.save, content))
+            return f"{fault}; its batch is in {path}"
         return ""
-
-
-def _write(path: Path, module: L.LightningModule, step: Step, fault: Fault) -> None:
-    """Write all that :func:`ghgs_lit.training.replay.replay` needs.
-
-    Args:
-        path: of the file.
-        module: whose weights, optimizer and configuration are written.
-        step: that was not finite.
-        fault: what was not finite first.
-    """
-    inputs = dataclasses.asdict(step)
-    inputs["autocast"] = str(step.autocast or "").removeprefix("torch.")
-    weights = {name.removeprefix(STATE_PREFIX): value for name, value in module.state_dict().items()}
-    content = {
-        "fault": str(fault),
-        "global_step": module.global_step,
-        "step": inputs,
-        "state_dict": weights,
-        "optimizer_states": [optimizer.state_dict() for optimizer in module.trainer.optimizers],
-        "config": dict(module.config),
-    }
-    write_atomically(path, lambda temporary: torch.save(content, temporary))

@@ -5,7 +5,6 @@ import shutil
 import sys
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 
 import lightning.pytorch as L
 import pytest
@@ -16,12 +15,9 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.averaging import AveragingOptions
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO
-from ghgs_lit.training.faults import Fault, Step
-from ghgs_lit.training.guard import _write
-from ghgs_lit.training.replay import replay
 from ghgs_lit.training.start import check_resume
 from tests.helpers.models import config, load_model, make_model, predict
-from tests.helpers.scenes import make_batch, training_batch
+from tests.helpers.scenes import make_batch
 from tests.helpers.training import Standin, StepData, flat_renderer
 
 FILE = Path(__file__).parents[1] / "fixtures" / "own_loss.py"
@@ -195,19 +191,6 @@ def test_a_fault_in_its_weights_is_found(tmp_path):
 
     with pytest.raises(InputError, match=r"weights of losses \(losses\.log_variance\)"):
         trainer(tmp_path, 2, Spoil()).fit(module(), StepData())
-
-
-def test_a_saved_step_has_its_weights(tmp_path, monkeypatch):
-    """Run again elsewhere, the loss is as it was."""
-    nodes = run_of("train").plain
-    settings = {**config(), "loss": NODE, "renderer": nodes["renderer"], "optimizer": nodes["optimizer"]}
-    subject = module(make_model(), settings)
-    subject.losses.mixing.data[0, 0] = torch.inf
-    subject._trainer = SimpleNamespace(optimizers=[], global_step=7)
-    _write(tmp_path / "step.pt", subject, Step(training_batch(), 1), Fault("", "", "", ""))
-    number, _, fault = replay(tmp_path / "step.pt")
-    assert number == 7
-    assert (fault.where, fault.place) == ("weights of", "losses.mixing")
 
 
 def test_terms_join_by_registration(tmp_path):
