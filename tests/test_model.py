@@ -57,7 +57,6 @@ def release_model(inputs, dtype):
         Unprojection(tokens="release"),
         RecalibrationOptions(k=8, similarity="product_clamped", tokens="all").build(64),
         GaussianHeadOptions(parameterization="release").build(64),
-        options=ModelOptions(pad="multiple", frame="world"),
     )
     widths = 16, (16, 20, 24, 32)  # of the fixture
     model.depth_head.dpt = DPTHead(64, 2, widths=widths)
@@ -80,7 +79,7 @@ def test_the_pipeline_matches_the_release(dtype):
     # the model does so itself.
     batch = Batch(inputs["image"][..., 3:-3, 3:-3], masks, Cameras(inputs["intr"], extrinsics, 64, 64))
     model = release_model(inputs, dtype)
-    prediction = predict(model, batch)
+    prediction = Predictor(model, ModelOptions(pad="multiple", frame="world"))(batch)
     found = {
         "inv_depth": 1 / prediction.depth,
         "offset_free_points": prediction.points.pixels[masks],

@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from ghgs_lit.errors import InputError
+from ghgs_lit.execution import Predictor
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.geometry.projection import pixel_centers, project
 from ghgs_lit.method.bounds import SubjectBox
@@ -113,4 +114,4 @@ def test_an_impossible_matte_is_refused():
     with pytest.raises(
         InputError, match=r"model\.matte: expected a number >= 0 and <= 0\.5 or null; found 0\.7"
     ):
-        make_model("model=hull", "model.matte=0.7")
+        Predictor(make_model("model=hull", "model.matte=0.7"))

@@ -10,6 +10,7 @@ from lightning.pytorch.callbacks import Callback
 
 from ghgs_lit.config.options import Options
 from ghgs_lit.method.model import STAGES
+from ghgs_lit.method.rounds import NoRounds
 from ghgs_lit.runtime.allocation import forget_peak, resident_bytes
 from ghgs_lit.runtime.watching import Inputs, Stopwatch, Watcher, watched
 
@@ -46,6 +47,8 @@ class Costs(Callback, Watcher):
         if not self._has_stages:
             return
         places = {name: f"model.{name}" for name in (*STAGES, "rounds")}
+        if isinstance(getattr(pl_module.model, "rounds", None), NoRounds):
+            del places["rounds"]
         places |= {"render": "renderer", "loss": "losses"}
         self._stack.enter_context(watched(pl_module, places, self))
 

@@ -11,6 +11,7 @@ from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, 
 from ghgs_lit.evaluation.measure import Renderer
 from ghgs_lit.execution import Predictor
 from ghgs_lit.method.model import GHGS, STAGES
+from ghgs_lit.method.rounds import NoRounds
 from ghgs_lit.ops.attention import attend
 from ghgs_lit.runtime.allocation import can_forget_peak, forget_peak, resident_bytes, return_free_memory
 from ghgs_lit.runtime.watching import Inputs, Stopwatch, Watcher, inside
@@ -49,7 +50,8 @@ def watched(model: GHGS, probe: Watcher) -> AbstractContextManager[None]:
         model: has the stages.
         probe: is called when they begin and end.
     """
-    return stages_watched(model, {name: name for name in (*STAGES, ROUNDS)} | PARTS, probe)
+    names = [*STAGES, *([] if isinstance(model.rounds, NoRounds) else [ROUNDS])]
+    return stages_watched(model, {name: name for name in names} | PARTS, probe)
 
 
 @torch.inference_mode()

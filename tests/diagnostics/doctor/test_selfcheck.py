@@ -75,14 +75,14 @@ def test_it_runs_on_the_pretend_device():
 def test_it_checks_what_a_user_has(monkeypatch):
     """``inherit`` leaves the process as it is, with convolutions in TF32, and may round as much;
     the gradient is that of a training in float32."""
-    right, seen = Predictor.finish, []
+    right, seen = Predictor._predict, []
 
-    def noted(self, prepared):
+    def noted(self, prepared, coarse):
         if prepared.batch.images.dtype == torch.float32:
             seen.append((self.precision, self.model.training, rounds_products("cuda")))
-        return right(self, prepared)
+        return right(self, prepared, coarse)
 
-    monkeypatch.setattr(Predictor, "finish", noted)
+    monkeypatch.setattr(Predictor, "_predict", noted)
     # PyTorch's default, which trainings change
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)
     with pretend_device():

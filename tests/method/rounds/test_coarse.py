@@ -245,8 +245,8 @@ def test_a_larger_photograph_is_placed_better_with_the_weights_of_the_package(sh
     assert shipped.rounds.height == 202
     assert shipped.config["rounds"]["height"] == 202
     small, large = person(tmp_path, 252), person(tmp_path, 322)
-    of_large = error(shipped(large), large)
-    of_small = shipped(small)
+    of_large = error(predict(shipped, large), large)
+    of_small = predict(shipped, small)
     print(of_large, error(without_copies(shipped, large), large), error(of_small, small))
     assert of_large < 0.9 * error(without_copies(shipped, large), large)
     assert of_large < 0.95 * error(of_small, small)
@@ -256,7 +256,7 @@ def test_a_larger_photograph_is_placed_better_with_the_weights_of_the_package(sh
 def test_photographs_of_the_size_of_the_training_have_no_copy():
     batch = make_batch(1, 3)
     with torch.no_grad():
-        found, expected = recurrent(HEIGHT * 2)(batch), recurrent("null")(batch)
+        found, expected = (predict(recurrent(height), batch) for height in (HEIGHT * 2, "null"))
     for name in ATTRIBUTES:
         assert torch.equal(getattr(found.gaussians, name), getattr(expected.gaussians, name)), name
 
