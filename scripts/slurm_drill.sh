@@ -6,7 +6,7 @@
 #
 # Needs the extra `cluster` and SLURM's programs (Debian: apt-get install slurm-wlm munge). It starts a SLURM of one
 # node with its own configuration and key in the new directory, beside any that is there, and stops it at the end.
-# STEPS (default 200) must take longer than the 1 to 2 minutes after which a job's time is up.
+# STEPS (default 160) must take longer than the 1 to 2 minutes after which a job's time is up.
 set -euo pipefail
 out=$(realpath -m "${1:?expected a new directory}")
 shift
@@ -16,7 +16,7 @@ for program in slurmctld slurmd munged sbatch srun scontrol; do
         { echo "$program: expected SLURM's programs (apt-get install slurm-wlm munge); found none" >&2; exit 1; }
 done
 PATH=$PATH:/usr/sbin
-steps=${STEPS:-200}
+steps=${STEPS:-160}
 mkdir -p "$out"/{munge,state,spool,log}
 chmod 711 "$out" "$out/munge"
 cd "$(dirname "$0")/.."
@@ -128,6 +128,6 @@ for name in ("sweep", "timed", "requeued"):
         whole_runs += name != "sweep" and len(steps) < 2
         print(f"{name}/{run.name}: steps {steps}, resumed {resumed}; {count} of {len(a)} tensors differ")
 runs = len(list(out.glob("*/**/metrics.json")))
-print(f"{runs} of 7 runs done, {differing} tensors differ; {whole_runs} were to be interrupted (more STEPS)")
+print(f"{runs} of 7 runs done, {differing} tensors differ; {whole_runs} were not interrupted (more STEPS)")
 sys.exit(runs != 7 or differing != 0 or whole_runs != 0)
 TEXT
