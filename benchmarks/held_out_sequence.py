@@ -1,7 +1,7 @@
-"""Each camera of a rig held out over a sequence, predicted from the others, and a generated person beside it.
+"""Each camera of a rig held out over a sequence, predicted from the others.
 
     python benchmarks/held_out_sequence.py photographs cameras.json --out held_out_sequence --step 5 \\
-        --adapted odd.ckpt even.ckpt --people 2
+        --adapted odd.ckpt even.ckpt
 
 Cameras are corrected with all photographs (the calibration is theirs), once, as `ghgs predict`
 does; so are colour gains, with a mean of 1 over those that predict. All ways are measured against
@@ -9,8 +9,7 @@ the same masks: those of the sequence, cut anew where they fail. Photographs who
 the hull of the others or by the background (`is_contradicted`), are counted and not measured. Prints
 over all instants and cameras PSNR of the photograph on black, whole and in the box of the subject;
 there of images scaled to one brightness; and there of the photograph as it is, the render before the
-background, which asks no mask; CPU seconds of an instant without the rig's. Generated people stand in
-the same rig, with exact masks, cameras and exposures: what the protocol leaves of sound data. What is
+background, which asks no mask; CPU seconds of an instant without the rig's. What is
 done stays in --out, and is not done again: a run that was stopped goes on. Each instant is said, and in
 --out/results.json at once. Weights that learned from the odd instants predict the even ones, and
 the other way round: `--adapted odd.ckpt even.ckpt`.
@@ -41,10 +40,6 @@ from ghgs_capture.doubts import CORRECTION, doubt_of_masks
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.prediction import crop_size, in_frame
 from ghgs_capture.rig import INSTANTS, Rig, corrected_rig, spread
-from ghgs_capture.verbs import Adapt
-from ghgs_capture.verbs.adapt import with_rig
-from ghgs_lit.cli.inputs import build_data
-from ghgs_lit.config import run_of
 from ghgs_lit.data.view import area_image
 from ghgs_lit.execution import Predictor
 from ghgs_lit.files import write_text_atomically
@@ -182,34 +177,6 @@ class Measured:
             self.say(way, name, found[-1])
         return np.array(found).swapaxes(0, 1)
 
-    def control(self, run: Adapt, weights: str) -> np.ndarray:
-        """Columns [cameras, people, 5] of generated people in the rig, each camera held out."""
-        data = build_data(run)
-        data.prepare_data(["val"])
-        found = []
-        for path, model in zip(self.weights[weights], self.models[weights], strict=True):
-            for name in data.subjects("val"):
-                place = f"control_{Path(path).stem}_{name}"
-                found.append(self.kept(place, lambda: self.person(model, data.evaluation_batch(name))))  # noqa: B023
-                self.say(f"generated people, {Path(path).stem}", name, found[-1])
-        return np.array(found).swapaxes(0, 1)
-
-    @torch.no_grad()
-    def person(self, model: Predictor, batch: Batch) -> list[list[float]]:
-        """The columns of each camera held out of a person whose cameras and masks are exact."""
-        rows = []
-        for view in range(len(self.cameras)):
-            begin = time.process_time()
-            seen = batch.of_views([other for other in range(len(self.cameras)) if other != view])
-            gaussians = in_frame(model, seen).gaussians
-            seconds = time.process_time() - begin
-            image = self.renderer(gaussians, batch.of_views([view]).cameras).image[0].clamp(0, 1)
-            target, mask = batch.images[0, view : view + 1], batch.masks[0, view : view + 1]
-            pair = psnr(image, target), psnr(image, target, box_of(mask))
-            values = [value.item() for value in (*pair, psnr_box_40(image, target, mask))]
-            rows.append([*values, np.nan, seconds])
-        return rows
-
 
 def is_contradicted(photograph: Photograph, behind: Background, inside: np.ndarray) -> bool:
     """Whether a mask shows the background, or lacks what differs from it inside the others' hull, in
@@ -289,18 +256,12 @@ def main() -> None:
     several = "weights of ghgs adapt for this capture; of n, instant i is predicted by number i modulo n"
     parser.add_argument("--adapted", nargs="+", help=several)
     parser.add_argument("--ways", nargs="+", default=list(WAYS), choices=list(WAYS))
-    parser.add_argument("--people", type=int, default=2, help="generated people in the rig")
     options = parser.parse_args()
     weights = {"shipped": [options.checkpoint]} | ({"adapted": options.adapted} if options.adapted else {})
     measured = Measured(options.images, options.cameras, options.out, options.step, weights)
     print("| | " + " | ".join(COLUMNS) + " | by camera |\n|---" + "|---" * (len(COLUMNS) + 1) + "|")
     for way in ["black", *(way for way in options.ways if WAYS[way][3] in weights)]:
         print(line(way, measured.rows(way)), flush=True)
-    if options.people:
-        said = [f"images={options.images}", f"cameras={options.cameras}", "data.active.val=0"]
-        run = with_rig(run_of("adapt", [*said, f"data.people.val={options.people}"]))
-        for name in weights:
-            print(line(f"generated people, {name}", measured.control(run, name)), flush=True)
     rig, seconds = measured.shared[1:]
     truths = [measured.kept(f"truth_{name}", partial(measured.truth, name)) for name in measured.names]
     failed = sum(truth["fails"] for each in truths for truth in each)
