@@ -4,7 +4,6 @@ import logging
 import os
 import time
 import warnings
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +14,7 @@ from lightning.pytorch.callbacks import Callback, Checkpoint
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from ghgs_lit.cli.inputs import build_data, check_size, choices, given_keys, overrides
+from ghgs_lit.cli.inputs import build_data, check_size, choices, overrides
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config.compose import chosen_options, saved_text
 from ghgs_lit.config.run import Run
@@ -51,14 +50,6 @@ def quiet() -> None:
     messages += ("overridden `transfer_batch", "exists and is not empty", "`srun` command is available")
     for message in messages:
         warnings.filterwarnings("ignore", f".*{message}.*")
-
-
-@cache
-def say_which_model() -> None:
-    """Print once per process that the default model, unless one was chosen, is not the paper's."""
-    chosen = {"model", "experiment", "sweep"} & set(given_keys())
-    if choices().get("model") == "hull" and not chosen:
-        print("training model=hull, which learns in minutes; model=paper is the paper's method", flush=True)
 
 
 def prepare_start(run: "Train", module: GHGSModule, directory: Path) -> int | None:
@@ -212,7 +203,6 @@ def train(run: "Train", directory: Path, stats: dict[str, Any]) -> float | None:
     """
     if rank_zero_only.rank == 0:
         write_config(run, directory)
-        say_which_model()
     L.seed_everything(run.seed, workers=True, verbose=False)
     data = build_data(run)
     model = GHGS.from_config(run.plain)

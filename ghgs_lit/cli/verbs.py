@@ -13,9 +13,9 @@ from ghgs_lit.config.options import Count, PathText, Seed, Text, Words, Workers
 
 
 class Train(Training):
-    """Train a model (model=hull; the paper's method: model=paper) and evaluate it."""
+    """Train the paper's model, or model=hull or model=recurrent, and evaluate it."""
 
-    example = "ghgs train model=hull data=synthetic trainer.max_time=00:00:10:00"
+    example = "ghgs train data=synthetic trainer.max_time=00:00:10:00"
     begins_run = True
     opens = ("resume", "init_from")
     reads_data = True

@@ -126,7 +126,7 @@ def test_help_of_a_verb_and_of_a_group(monkeypatch, capsys, tmp_path):
     flags = ("model=paper", "--config-dir", str(tmp_path))
     code, out, _ = call(monkeypatch, capsys, "train", *flags, "--help")
     assert code == 0
-    assert "model=hull; the paper's method: model=paper" in out
+    assert "the paper's model, or model=hull" in out
     assert "ablation: full*" in out
     assert "bounds: box* | hull" in out
     assert "| my_people" in out
