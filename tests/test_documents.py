@@ -40,6 +40,7 @@ OPTIONS = {
     "ablation": {"one_neighbor", "residual", "shuffled", "relative"},
     "sweep": {"controls"},
     "data": {"my_people"},
+    "model": {"gps"},
     "hydra/launcher": {"joblib", "submitit_local"},
     "hydra/sweeper": {"optuna"},
 }

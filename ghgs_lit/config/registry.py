@@ -96,10 +96,7 @@ KINDS: dict[str, dict[str | None, str]] = {
         "none": "ghgs_lit.method.bounds.NoBounds",
     },
     "encoder": {"vggt": "ghgs_lit.method.encoder.VGGTOptions"},
-    "depth_head": {
-        "dpt": "ghgs_lit.method.heads.depth.DepthHeadOptions",
-        "stereo": "ghgs_lit.method.heads.stereo.StereoHeadOptions",
-    },
+    "depth_head": {"dpt": "ghgs_lit.method.heads.depth.DepthHeadOptions"},
     "unprojection": {"pinhole": "ghgs_lit.geometry.unprojection.Unprojection"},
     "recalibration": {
         "none": "ghgs_lit.method.recalibration.recalibration.NoRecalibrationOptions",

@@ -53,7 +53,7 @@ MISSPELT = [
     ("train foo=1", 1, "foo: expected a key or group of this verb; found none of that name\n"),
     ("train optimizer.lr.x=3", 1, "optimizer.lr: expected a number > 0; found {{'x': 3}}"),
     ("train gaussian_head.attributes.inwards=0", 1, "(did you mean gaussian_head.attributes.inward?)\n"),
-    ("train model=gps recalibration.k=3", 1, "(recalibration=paper or small has it)\n"),
+    ("train model=pixel recalibration.k=3", 1, "(recalibration=paper or small has it)\n"),
     ("train --cfg job optimizer.lrr=1", 1, "optimizer.lrr: expected a key", "did you mean optimizer.lr?"),
     ("train -m optimizer.lrr=1,2", 1, "optimizer.lrr: expected a key", "did you mean optimizer.lr?"),
     ("train encodr=vggt_nano", 1, "encodr: expected a key or group", "did you mean encoder?"),

@@ -135,7 +135,7 @@ def test_a_file_of_a_room_registers_its_kinds(monkeypatch, tmp_path):
     monkeypatch.setattr("ghgs_lit.method.heads.__path__", [*ghgs_lit.method.heads.__path__, str(tmp_path)])
     registry._import_room.cache_clear()
     assert read_node({"kind": "flat", "metres": 3}, "depth_head").metres == 3.0
-    assert registry.kinds_of("depth_head") == ["dpt", "stereo", "flat"]
+    assert registry.kinds_of("depth_head") == ["dpt", "flat"]
 
 
 def test_a_node_without_a_kind_names_those_that_there_are():

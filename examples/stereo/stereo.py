@@ -1,5 +1,7 @@
-"""Depth by recurrent stereo between neighbouring views, for comparison;
-not part of the paper's method.
+"""A custom depth head: recurrent stereo between neighbouring views, for comparison with the paper's.
+
+    export GHGS_PLUGINS=examples/stereo/stereo.py
+    ghgs train --config-dir examples/stereo/conf model=gps
 
 After the published description of GPS-Gaussian (Zheng et al., CVPR 2024): one small network
 computes features of all views; they are correlated along epipolar lines; a GRU updates the estimate
@@ -15,6 +17,7 @@ from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor, nn
 
+from ghgs_lit.config import register
 from ghgs_lit.config.options import Options
 from ghgs_lit.extents import bucket_size, true_places
 from ghgs_lit.geometry.masks import coverage, surface_colors
@@ -39,6 +42,7 @@ RADIUS = 4
 _inverse = BOUNDED["bounded_inverse"]
 
 
+@register("depth_head", "stereo")
 class StereoHeadOptions(Options):
     """Photographs to one depth for each pixel, by stereo between neighbouring views."""
 

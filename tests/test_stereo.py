@@ -1,6 +1,9 @@
-"""Stereo between neighbouring views, and the peers that are built of it."""
+"""The depth head in ``examples/stereo``, and the peers that tables compare the paper's model with."""
 
 import dataclasses
+import json
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,26 +14,38 @@ from scipy.ndimage import map_coordinates
 from torch.autograd import gradcheck
 
 from ghgs_lit import GHGS
-from ghgs_lit.config import compose
+from ghgs_lit.config import compose, registry
+from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.method.bounds import SubjectBox
-from ghgs_lit.method.heads import stereo
-from ghgs_lit.method.heads.depth import BOUNDED
 from ghgs_lit.method.stages import STAGES
-from ghgs_lit.weights.checkpoint import FORMAT_VERSION
 from tests.helpers.models import close, load_model, predict
+from tests.helpers.people import render_boxes
 from tests.helpers.scenes import ellipsoid, make_batch, ring, stack
+from tests.helpers.verbs import ghgs
 from tests.method.heads.test_depth import make_tokens
 
 SMALL = ["encoder.width=32", "encoder.heads=2", "encoder.vit.channels=8"]
 PEERS = ["gps", "pixel"]
+CELL = 4
+FOLDER = Path(__file__).parents[1] / "examples" / "stereo"
 
 
-def peer(name, *overrides):
+@pytest.fixture(autouse=True)
+def stereo(monkeypatch):
+    """The plug-in."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(registry, "_REGISTERED", dict(registry._REGISTERED))
+    monkeypatch.setenv(registry.VARIABLE, str(FOLDER / "stereo.py"))
+    registry.load_plugins()
+    yield sys.modules["stereo"]
+    sys.modules.pop("stereo", None)
+
+
+def peer(name):
     """A small one that has left its initial state, in which depths are constant."""
-    config = OmegaConf.masked_copy(
-        compose("train", [f"model={name}", *SMALL, *overrides]), [*STAGES, "model"]
-    )
+    searched = f"hydra.searchpath=[file://{FOLDER / 'conf'}]"
+    config = OmegaConf.masked_copy(compose("train", [searched, f"model={name}", *SMALL]), [*STAGES, "model"])
     torch.manual_seed(0)
     model = GHGS.from_config(OmegaConf.to_container(config, resolve=True)).eval()
     head = model.depth_head
@@ -39,18 +54,18 @@ def peer(name, *overrides):
     return model
 
 
-def painted(count=4, size=112, spread=360.0):
+def painted(count, size):
     """Features of cells that a random function of the place on an ellipsoid paints, cameras,
     true depths."""
-    cameras = ring(1, count, size, size, spread=spread)
+    cameras = ring(1, count, size, size)
     masks, depths = ellipsoid(cameras)
     g = torch.Generator().manual_seed(2)
     waves, phases = 25 * torch.randn(3, 32, generator=g), 6.28 * torch.rand(32, generator=g)
     maps = torch.sin(unproject_maps(depths, cameras) @ waves + phases) * masks[..., None]
-    cells = size // stereo.CELL
-    features = F.avg_pool2d(maps.flatten(0, 1).movedim(-1, 1), stereo.CELL)
-    whole = F.avg_pool2d(masks.flatten(0, 1).float(), stereo.CELL) == 1
-    mean = F.avg_pool2d(depths.flatten(0, 1), stereo.CELL)
+    cells = size // CELL
+    features = F.avg_pool2d(maps.flatten(0, 1).movedim(-1, 1), CELL)
+    whole = F.avg_pool2d(masks.flatten(0, 1).float(), CELL) == 1
+    mean = F.avg_pool2d(depths.flatten(0, 1), CELL)
     return F.normalize(features, dim=1).unflatten(0, (1, count)), cameras.resized(cells, cells), whole, mean
 
 
@@ -59,23 +74,7 @@ def limits(depth, whole):
     return (bound.expand(1, len(depth), 1, 1) for bound in (near, far))
 
 
-def test_the_correlation_is_largest_at_the_true_depth():
-    """Where a neighbour sees the surface: nearly everywhere, with neighbours 22 degrees away.
-
-    Half a cell in the neighbour's image is 5 cm of depth here.
-    """
-    features, cameras, whole, depth = painted(3, 224, spread=67.5)
-    near, far = limits(depth, whole)
-    cells = whole.flatten().nonzero()[:, 0]
-    found = stereo.correlations(features, cameras, cells, near, far, 64)
-    share = torch.linspace(0, 1, 64)
-    best = BOUNDED["bounded_inverse"](share, near[0, 0, 0], far[0, 0, 0])[found.argmax(1)]
-    error = (best - depth.flatten()[cells]).abs()
-    assert (error < 0.05).float().mean() > 0.95
-    assert found.max() <= 1 / 32**0.5 + 1e-5  # cosines over the square root of the channels
-
-
-def test_correlations_are_those_of_a_literal_loop():
+def test_correlations_are_those_of_a_literal_loop(stereo):
     """Matrices of NumPy and SciPy's interpolation, in float64, cell by cell;
     5 cameras have 2 neighbours."""
     features, cameras, whole, depth = painted(5, 56)
@@ -101,15 +100,7 @@ def test_correlations_are_those_of_a_literal_loop():
         np.testing.assert_allclose(row, expected, atol=1e-5)
 
 
-@pytest.mark.parametrize(("views", "expected"), [(2, [[1], [0]]), (4, [[1, 3], [0, 2], [1, 3], [0, 2]])])
-def test_neighbors_stand_on_either_side(views, expected):
-    """Of all elements, numbered on."""
-    found = stereo.neighboring_views(ring(2, views, 28, 28))
-    expected = torch.tensor([expected, (torch.tensor(expected) + views).tolist()]).flatten(0, 1)
-    assert torch.equal(found.sort(1).values, expected)
-
-
-def test_looking_up_is_linear_interpolation():
+def test_looking_up_is_linear_interpolation(stereo):
     """As ``grid_sample`` between the centres of the steps; the ends are repeated."""
     level = torch.rand(2, 12, 3, 4, generator=torch.Generator().manual_seed(1))
     fraction = torch.rand(2, 1, 3, 4, generator=torch.Generator().manual_seed(2))
@@ -122,7 +113,7 @@ def test_looking_up_is_linear_interpolation():
         torch.testing.assert_close(found[:, i].flatten(), expected.flatten())
 
 
-def test_upsampled_maps_are_convex_combinations():
+def test_upsampled_maps_are_convex_combinations(stereo):
     """With all weight on the own cell it is repeated;
     with equal weights it is the mean of 3 x 3."""
     maps = torch.rand(2, 1, 3, 5)
@@ -135,7 +126,7 @@ def test_upsampled_maps_are_convex_combinations():
     torch.testing.assert_close(found, F.interpolate(mean, scale_factor=4, mode="nearest")[:, 0])
 
 
-def test_gradients_are_those_of_finite_differences():
+def test_gradients_are_those_of_finite_differences(stereo):
     """Of correlations by the features, of an update by all that it sees, of upsampling by both."""
     torch.manual_seed(3)
     features, cameras, whole, depth = painted(2, 40)
@@ -170,7 +161,7 @@ def test_batch_mates_change_nothing(name, views, size):
         torch.testing.assert_close(both.depth[element], alone.depth[0])
 
 
-def test_depths_lie_between_the_bounds_of_the_subject():
+def test_depths_lie_between_the_bounds_of_the_subject(stereo):
     """Of the nearest and the farthest of its pixels; far off, a gradient leads back."""
     batch, model = make_batch(1, 3, 56, 56), peer("gps")
     bounds = SubjectBox()(batch)
@@ -207,12 +198,35 @@ def test_every_weight_learns(name):
     assert still == []
 
 
-@pytest.mark.parametrize("name", PEERS)
-def test_weights_come_back_from_their_file(name, tmp_path):
-    """The file says what to build."""
-    model, batch = peer(name), make_batch(1, 3, 42, 42)
-    state = {f"model.{key}": value for key, value in model.state_dict().items()}
-    content = {"state_dict": state, "config": model.config, "format_version": FORMAT_VERSION}
-    torch.save(content, tmp_path / "last.ckpt")
-    found = predict(load_model(tmp_path / "last.ckpt"), batch)
-    assert torch.equal(found.gaussians.means, predict(model, batch).gaussians.means)
+def test_a_sweep_and_its_table_compare_it_with_others(tmp_path, monkeypatch, capsys):
+    """Trained, saved, loaded and measured from outside of the package, by the same commands."""
+    render_boxes(tmp_path / "rendered", tmp_path / "scans", train=1, val=1)
+    monkeypatch.chdir(tmp_path)
+    common = ["--config-dir", str(FOLDER / "conf"), "views=v3", "evaluation.targets=[midway]"]
+    common += ["evaluation.pictures=0"]
+    small = ["data=scans", "data.root=rendered", "data.size=28", "loss=depth", *SMALL]
+    quick = ["trainer.max_steps=2", "logger=none", "callbacks=none", "hydra.sweep.dir=sweep"]
+    assert ghgs("train", "-m", *common, *small, *quick, "model=gps,pixel") == 0
+    capsys.readouterr()
+    table = ["layout=table3", "reported=false", "evaluation.views=[3]", "columns=[psnr]"]
+    assert ghgs("table", "runs=sweep", *table, "hydra.run.dir=table") == 0
+    out = capsys.readouterr().out
+    assert "After GPS-Gaussian" in out
+    assert "Pixel-aligned" in out
+    for path in Path("sweep").glob("*/metrics.json"):
+        trained = json.loads(path.read_text())
+        if trained["provenance"]["config"]["model"]["name"] == "gps":
+            break
+    checkpoint = path.parent / "checkpoints" / "last.ckpt"
+    assert ghgs("evaluate", *common, f"checkpoint={checkpoint}", "hydra.run.dir=measured") == 0
+    measured = json.loads(Path("measured/metrics.json").read_text())
+    assert [row["psnr"] for row in measured["rows"]] == [row["psnr"] for row in trained["rows"]]
+    registry._REGISTERED.clear()
+    monkeypatch.delenv(registry.VARIABLE)
+    with pytest.raises(InputError, match=rf"depth_head\.kind: expected .*{registry.VARIABLE}"):
+        load_model(checkpoint)
+
+
+def test_the_number_of_depths_can_be_halved_for_each_resolution(stereo):
+    with pytest.raises(InputError, match=r"consistency_depths: expected .* and a multiple of 4; found 46"):
+        stereo.StereoHeadOptions(consistency_depths=46)
