@@ -269,7 +269,7 @@ def composed(*overrides: str):
         ("table1", 6, "zju_mocap"),
         ("table2", 9, "thuman2"),
         ("table3", 3, "thuman2"),
-        ("table4", 12, "thuman2"),
+        ("table4", 20, "thuman2"),
     ],
 )
 def test_named_sweeps(name, count, data):
