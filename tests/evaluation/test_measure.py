@@ -39,7 +39,7 @@ def trained(boxes, tmp_path_factory):
     directory = tmp_path_factory.mktemp("train") / "run"
     code = ghgs(
         "train", *data_of(boxes), "trainer.max_steps=3", "trainer.val_check_interval=2", "loss=depth",
-        "evaluation.views=[3,4]", "evaluation.pictures=1", f"hydra.run.dir={directory}",
+        "model=hull", "evaluation.views=[3,4]", "evaluation.pictures=1", f"hydra.run.dir={directory}",
     )  # fmt: skip
     assert code == 0
     return directory

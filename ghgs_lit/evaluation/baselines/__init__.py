@@ -19,7 +19,7 @@ from ghgs_lit.evaluation.baselines.splats import (
     true_depth,
 )
 from ghgs_lit.evaluation.measure import Estimate, Method, ModelMethod, Renderer
-from ghgs_lit.types import Batch
+from ghgs_lit.types import Batch, Prediction
 
 __all__ = ["BASELINES", "baseline", "black", "nearest_view", "splats_at", "splatted"]
 
@@ -29,14 +29,17 @@ BASELINES = ("black", "nearest_view", *DEPTHS, "per_scene", "untrained")
 
 
 def baseline(
-    name: str, renderer: Renderer, untrained: Callable[[], torch.nn.Module], per_scene: nodes.PerScene
+    name: str,
+    renderer: Renderer,
+    untrained: Callable[[], Callable[[Batch], Prediction]],
+    per_scene: nodes.PerScene,
 ) -> Method:
     """The baseline of a name.
 
     Args:
         name: One of ``BASELINES``.
         renderer: Draws Gaussians from the target cameras.
-        untrained: Builds a model with random weights, for ``untrained``.
+        untrained: Builds what predicts with random weights, for ``untrained``.
         per_scene: Options of the baseline of that name.
 
     Returns:
@@ -51,7 +54,7 @@ def baseline(
     if name == "per_scene":
         return PerScene(renderer, per_scene.steps)
     if name == "untrained":
-        return ModelMethod(untrained().eval(), renderer)
+        return ModelMethod(untrained(), renderer)
     return {"black": black, "nearest_view": nearest_view}[name]
 
 
