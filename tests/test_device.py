@@ -70,7 +70,7 @@ def test_every_stage_runs_there_and_predicts_the_same(kind, skip):
     with torch.no_grad():
         expected = predicted(model, batch)
         with pretend_device():
-            found = model.to(DEVICE)(batch.to(DEVICE))
+            found = predicted(model.to(DEVICE), batch.to(DEVICE))
             assert found.gaussians.means.device == found.points.tokens.device == DEVICE
             found = found.to("cpu")
     # Unbounded depths amplify rounding.
