@@ -69,7 +69,6 @@ NOT_RUN = [
     (r"ghgs train (?!.*dry_run).*encoder=vggt_1b", PUBLISHED),
     (r"ghgs train .*hydra/launcher=slurm", "needs a cluster"),
     (r"bash scripts/slurm_drill", "needs SLURM"),
-    (r"ghgs train .*hydra/sweeper=optuna", "needs the extra `optuna`"),
     (r"ghgs adapt (cameras=<|data\.size=518)", "renders the people of a rig, for minutes"),
     (r"ghgs (train|evaluate|benchmark) .*split=bench", "renders forty people"),
     (r"ghgs table .*runs/ablation", "needs twelve runs"),

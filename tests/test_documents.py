@@ -42,7 +42,6 @@ OPTIONS = {
     "data": {"my_people"},
     "model": {"gps"},
     "hydra/launcher": {"joblib", "submitit_local"},
-    "hydra/sweeper": {"optuna"},
 }
 # a group of entry points, and the format of a file
 NO_MODULES = {"ghgs_lit.plugins", "ghgs_lit.others"}

@@ -29,7 +29,7 @@ from ghgs_lit.errors import InputError, require
 #: Errors that are bad input, not bugs.
 BAD_INPUT = (InputError, OSError, HydraException, OmegaConfBaseException)
 
-_EXTRAS = {"joblib": "cluster", "submitit": "cluster", "optuna": "optuna"}
+_EXTRAS = {"joblib": "cluster", "submitit": "cluster"}
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 

@@ -36,21 +36,16 @@ _LAUNCHER = """
     partition qos comment constraint exclude gres cpus_per_gpu gpus_per_task mem_per_gpu mem_per_cpu account
     signal_delay_s max_num_timeout array_parallelism
 """
-#: Of sweepers: the grid, and Optuna's study.
-_SWEEPER = """
-    params max_batch_size direction storage study_name n_trials n_jobs max_failure_rate sampler search_space
-"""
 #: What a file outside of the package may set below ``hydra``.
 SETTABLE = (
     "mode", "verbose", "run.dir", "sweep.dir", "sweep.subdir", "job.name", "job.chdir", "job.config",
     *(f"launcher.{key}" for key in _LAUNCHER.split()),
-    *(f"sweeper.{key}" for key in _SWEEPER.split()),
+    "sweeper.params", "sweeper.max_batch_size",
 )  # fmt: skip
 #: Classes that it may name; Hydra itself demands that the first two are registered plugins.
 _CLASSES = {
     "launcher._target_": r"(hydra_plugins|hydra\._internal\.core_plugins)\.[\w.]+",
     "sweeper._target_": r"(hydra_plugins|hydra\._internal\.core_plugins)\.[\w.]+",
-    "sweeper.sampler._target_": r"optuna\.samplers\.\w+Sampler",
 }
 #: An interpolation that calls no resolver.
 _REFERENCE = re.compile(r"\$\{[\w.\[\]-]+\}")

@@ -15,7 +15,6 @@ from ghgs_lit.config.defaults import fill
 from ghgs_lit.config.keys import lookup
 from ghgs_lit.config.run import Run
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.files import resolved
 from ghgs_lit.parsing import read_yaml
 from ghgs_lit.runs.processes import is_queued_again, process_count
 from ghgs_lit.runs.provenance import config_hash
@@ -48,8 +47,7 @@ def _waits() -> bool:
 def register_resolvers() -> None:
     """Register resolvers of configurations: ``${config_hash:}``, the name of a run's directory;
     ``${run_of_job:name}``, the name of a directory that a job of SLURM goes on in, else ``name``;
-    ``${sqlite:path}``, a database's URL; ``${folder:first,second}``, the second if the
-    first is null."""
+    ``${folder:first,second}``, the second if the first is null."""
 
     def hash_of_run(*, _root_: DictConfig) -> str:
         keys = [key for key in _root_ if key != "hydra"]
@@ -69,17 +67,12 @@ def register_resolvers() -> None:
             folders = [run.path for run in begun if run.marker.config_hash == own_hash]
         return max((path.name for path in folders), default=name)
 
-    def sqlite(path: str) -> str:
-        place = resolved(path)
-        place.parent.mkdir(parents=True, exist_ok=True)  # SQLite does not
-        return f"sqlite:///{place}"
-
     def folder(first: str | float | None, second: str) -> str:
         return second if first is None else str(Path(str(first)).expanduser())
 
     is_old = omegaconf.__version__.startswith("2.3")
     register = OmegaConf.register_new_resolver if is_old else OmegaConf.register_resolver
-    resolvers = {"folder": folder, "config_hash": hash_of_run, "sqlite": sqlite, "run_of_job": run_of_job}
+    resolvers = {"folder": folder, "config_hash": hash_of_run, "run_of_job": run_of_job}
     for name, resolver in resolvers.items():
         register(name, resolver, replace=True)
 

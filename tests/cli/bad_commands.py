@@ -68,10 +68,10 @@ MISSPELT = [
     ("train sweep=table5", 1, "sweep: expected one of table1", "found 'table5'"),
     ("train hydra/launcher=jobib", 1, "hydra/launcher: expected one of", "did you mean joblib?"),
     (
-        "train hydra/sweeper=optuna_of_a_far_lab",
+        "train hydra/launcher=joblib_of_a_far_lab",
         1,
-        "hydra/sweeper: expected",
-        "install 'ghgs-lit[optuna]')",
+        "hydra/launcher: expected",
+        "install 'ghgs-lit[cluster]')",
     ),
     ("train +optimizer.lrr=1", 1, "optimizer", "lrr"),
     ("train +seed=3", 1, "+seed=3: expected", "already at 'seed'"),

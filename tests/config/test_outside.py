@@ -22,10 +22,6 @@ REFUSED = {
         {"experiment/x": GLOBAL + "hydra: {job_logging: {handlers: {a: {(): CALL}}}}"},
         "hydra.job_logging.handlers.a.()=",
     ),
-    "a sampler": (
-        {"experiment/x": GLOBAL + "hydra: {sweeper: {sampler: {_target_: CALL}}}"},
-        "hydra.sweeper.sampler._target_=",
-    ),
     "a value of the grid": (
         {"experiment/x": GLOBAL + "hydra: {sweeper: {params: {seed: {_target_: CALL}}}}"},
         "hydra.sweeper.params.seed._target_=",

@@ -1,7 +1,6 @@
 """Hydra's launchers and sweepers that come as extras, on sweeps without training."""
 
 import os
-import sys
 from pathlib import Path
 
 import pytest
@@ -45,27 +44,6 @@ def test_launchers_run_a_sweep_once(launcher, monkeypatch, capsys, tmp_path):
     assert f"{count} runs: {count} done" in capsys.readouterr().out
     hydra_app(monkeypatch, *chosen, *grid)
     assert len(executed(tmp_path)) == count
-
-
-def test_an_optuna_study_is_kept_in_the_sweep(monkeypatch, tmp_path):
-    """A second call must continue the study, and not train its first trials again."""
-    pytest.importorskip(
-        "hydra_plugins.hydra_optuna_sweeper", reason="the extra optuna is not installed", exc_type=ImportError
-    )
-    import optuna
-
-    command = ["-m", "hydra/sweeper=optuna_stored", "hydra.sweeper.n_trials=2", f"hydra.sweep.dir={tmp_path}"]
-    for _ in range(2):
-        GlobalHydra.instance().clear()
-        hydra_app(monkeypatch, *command, "optimizer.lr=interval(0.001,0.01)")
-    study = optuna.load_study(study_name="ghgs", storage=f"sqlite:///{tmp_path / 'optuna.db'}")
-    values = [trial.value for trial in study.trials]
-    assert len(values) == 4
-    assert study.best_value == max(values)
-    assert all(trial.value == pytest.approx(20 + trial.params["optimizer.lr"]) for trial in study.trials)
-    # The second call repeats the first trials and finds their runs done.
-    assert len(executed(tmp_path)) == len({t.params["optimizer.lr"] for t in study.trials}) == 2
-    assert sys.modules["optuna"].__version__.startswith("2.")
 
 
 # Replacements of the programs that submitit calls; jobs run at once on this machine.
