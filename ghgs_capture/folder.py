@@ -14,7 +14,7 @@ import numpy as np
 from ghgs_capture.calibration import Convention, StoredCamera, calibrate, quarter_turned
 from ghgs_capture.crops import Photograph
 from ghgs_capture.formats import CameraFile, read_cameras
-from ghgs_capture.frames import Frame, Source, VideoFrame, find_frames, has_videos
+from ghgs_capture.frames import Source, VideoFrame, find_frames, has_videos
 from ghgs_capture.masks import mask_path, matte_of_background, matte_of_file, segmenter
 from ghgs_capture.photographs import (
     Pixels,
@@ -41,8 +41,7 @@ class CaptureFolder:
 
     Args:
         images: folder of photographs named after their cameras; of such folders, one for each
-            instant; or of videos named after their cameras. Or the decoded frames of one instant,
-            by camera.
+            instant; or of videos named after their cameras.
         cameras: the calibration, in one of :data:`ghgs_capture.formats.FORMATS`, or already read.
         masks: folder of masks, laid out and named as the photographs; None: the first there is of
             ``backgrounds``, ``segment``, masks beside the photographs (``<name>_mask.png``) or
@@ -58,7 +57,7 @@ class CaptureFolder:
         InputError: a folder or file is missing or wrong.
     """
 
-    images: str | Path | Mapping[str, Frame]
+    images: str | Path
     cameras: str | Path | CameraFile
     masks: str | Path | None = None
     backgrounds: str | Path | None = None
@@ -98,8 +97,6 @@ class CaptureFolder:
         folder = self.images
         cameras = self.file.cameras
         part = self.sequence
-        if isinstance(folder, Mapping):
-            return {"": dict(folder)}, ""
         names = composed_names(self.calibration.names)
         if has_videos(folder, cameras, names):
             return find_frames(folder, self.masks, cameras, names, self.convention, part.sync, part.step)

@@ -32,23 +32,6 @@ _TO_SRGB = "zscale=t=linear:npl={},format=gbrpf32le,zscale=p=bt709:t=iec61966-2-
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
-    """A decoded photograph [h, w, 3] uint8 RGB, and its source;
-    ``mask`` as for :class:`VideoFrame`."""
-
-    origin: str
-    image: np.ndarray
-    mask: None = None
-
-    def __str__(self) -> str:
-        return self.origin
-
-    def pixels(self) -> Pixels:
-        """The photograph."""
-        return Pixels(self.image, None, 0)
-
-
-@dataclass(frozen=True, slots=True)
 class VideoFrame:
     """A photograph, or a mask, that is a frame of a video;
     ``mask``: that of the photograph, where known."""
@@ -85,7 +68,7 @@ class VideoFrame:
         return fitted(exact, pixels, self.video.video.path)
 
 
-Source = Path | Frame | VideoFrame  #: Where a photograph comes from
+Source = Path | VideoFrame  #: Where a photograph comes from
 
 
 def has_videos(folder: Path, cameras: Mapping[str, StoredCamera], names: Mapping[str, str]) -> bool:
