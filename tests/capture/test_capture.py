@@ -13,6 +13,7 @@ from ghgs_capture import Capture, predict
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.masks import matte_of_file
 from ghgs_capture.photographs import Pixels
+from ghgs_lit.execution import Predictor
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.geometry.masks import on_black
 from ghgs_lit.geometry.projection import project
@@ -67,7 +68,7 @@ def test_a_subject_cut_by_the_border_is_cut_in_the_crop(tmp_path):
 )
 def test_figurines_and_statues_are_predicted_alike(tmp_path, scale, origin):
     """The same photographs in another unit and place give the same Gaussians there."""
-    model = make_model("model=hull").eval()
+    model = Predictor(make_model("model=hull").eval())
     first = Capture.read(tmp_path / "a", Figure().write(tmp_path / "a"))
     other = Capture.read(tmp_path / "b", Figure(scale=scale, origin=origin).write(tmp_path / "b"))
     person, moved = (predict(capture, model, 56) for capture in (first, other))
@@ -86,7 +87,10 @@ def test_figurines_and_statues_are_predicted_alike(tmp_path, scale, origin):
 def test_python_refines_as_the_command_line_does(tmp_path):
     """All that brings a prediction nearer to the photographs can be asked for,
     and says what it gained."""
-    capture, model = Capture.read(tmp_path, Figure().write(tmp_path)), make_model("model=hull").eval()
+    capture, model = (
+        Capture.read(tmp_path, Figure().write(tmp_path)),
+        Predictor(make_model("model=hull").eval()),
+    )
     plain, refined = (predict(capture, model, 28, refine=steps) for steps in (0, 2))
     assert plain.refined is None
     expected = Refinement(2, Renderer())(plain.gaussians, plain.batch)

@@ -12,6 +12,7 @@ from ghgs_capture import prediction as predicting
 from ghgs_capture.capture import Capture
 from ghgs_capture.doubts import CORRECTION, doubt_of_cameras, doubt_of_masks
 from ghgs_capture.prediction import predict
+from ghgs_lit.execution import Predictor
 from ghgs_lit.geometry.masks import signed_distance
 from tests.helpers.figures import Figure
 from tests.helpers.models import make_model
@@ -91,7 +92,7 @@ def test_masks_without_an_outline_are_not_doubted(taken):
 
 
 def test_an_exact_capture_is_predicted_as_it_is(taken):
-    model = make_model("model=hull").eval()
+    model = Predictor(make_model("model=hull").eval())
     found, plain = predict(taken, model, 56), predict(taken, model, 56, refine_cameras=0, refine_masks=0)
     assert (found.why, found.moved, found.changed) == ({}, (), ())
     assert torch.equal(found.gaussians.means, plain.gaussians.means)
@@ -100,7 +101,7 @@ def test_an_exact_capture_is_predicted_as_it_is(taken):
 
 def test_what_is_doubted_is_refined(taken, monkeypatch):
     """As if it had been asked for; 0 leaves it, and cameras are judged by the refined masks."""
-    model, wrong = make_model("model=hull").eval(), with_outlines(taken, 5)
+    model, wrong = Predictor(make_model("model=hull").eval()), with_outlines(taken, 5)
     seen = []
     monkeypatch.setattr(predicting, "doubt_of_cameras", lambda capture, batch: seen.append(batch) or "")
     found = predict(wrong, model, 56)

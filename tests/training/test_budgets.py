@@ -117,7 +117,7 @@ def test_without_budgets_the_model_stays_as_it_is_configured():
     """The default must not change what training sees."""
     model = Watched()
     with token_budget(model, None):
-        predict(model, example_batch())
+        model(example_batch())
     assert model.trained == [("subject", 7)]
 
 

@@ -6,10 +6,9 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from ghgs_lit.extents import extents
+from ghgs_lit.extents import bucket_size, extents
 from ghgs_lit.method.heads import dense, dpt
 from ghgs_lit.method.heads.dense import decode
-from ghgs_lit.method.plan.rows import size_class
 from ghgs_lit.method.plan.window import Span, Window, subject_windows
 from tests.method.heads.test_dpt import _head, _tokens
 
@@ -172,7 +171,7 @@ def test_a_widened_span_stays_within_its_map(full):
     for start, stop in itertools.combinations(range(full + 1), 2):
         span = Span(start, stop, full).widened()
         assert 0 <= span.start <= start < stop <= span.stop <= full
-        assert span.stop - span.start == min(size_class(stop - start), full)
+        assert span.stop - span.start == min(bucket_size(stop - start), full)
 
 
 @pytest.mark.parametrize("guided", [False, True], ids=["tokens", "guide"])

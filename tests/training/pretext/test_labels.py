@@ -16,7 +16,7 @@ from ghgs_lit.training.validation_pictures import PicturesOptions
 from ghgs_people.figures.body import BODY_VERTICES, load_body
 from ghgs_people.figures.parts import vertex_parts
 from tests.helpers.bodies import body_batch
-from tests.helpers.models import make_model
+from tests.helpers.models import make_model, predict
 
 SIZE = 14
 scene = functools.cache(body_batch)
@@ -87,7 +87,7 @@ def test_validation_logs_the_share_of_attention_on_other_parts(size):
     logged, seen = {}, []
     model.recalibration.register_forward_pre_hook(lambda stage, inputs: seen.append((stage, *inputs[:2])))
     with torch.no_grad():
-        model(batch)
+        predict(model, batch)
     pictures = PicturesOptions().build()
     pictures._seen, module = (
         seen[0],
