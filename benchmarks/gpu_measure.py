@@ -19,8 +19,8 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.device import drawing_nothing
+from ghgs_lit.execution import predictor, step
 from ghgs_lit.execution.tape import CudaTape, Tape
-from ghgs_lit.method import model as models
 from ghgs_lit.runtime import precision
 from tests.helpers.pretend_device import DEVICE, pretend_device
 from tests.helpers.tape import OperatorTape
@@ -118,9 +118,9 @@ def rehearsal() -> Iterator[Gpu]:
             stack.enter_context(mock.patch.object(torch.cuda, name, value))
         stack.enter_context(mock.patch.object(torch, "compile", lambda function, **_: function))
         stack.enter_context(mock.patch.object(precision, "has_bfloat16", return_value=True))
-        of = models.precision_of  # as on CUDA: tf32, too
-        on_cuda = partial(of, device=torch.device("cuda"))
-        stack.enter_context(mock.patch.object(models, "precision_of", lambda name, _: on_cuda(name)))
+        on_cuda = partial(precision.precision_of, device=torch.device("cuda"))  # tf32, too
+        for module in (predictor, step):
+            stack.enter_context(mock.patch.object(module, "precision_of", lambda name, _: on_cuda(name)))
         without = partial(torch.autocast, enabled=False)  # it has no half precision
         stack.enter_context(mock.patch.object(torch, "autocast", lambda device, *_, **__: without(device)))
         yield Gpu(DEVICE, is_real=False)
