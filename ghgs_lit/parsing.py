@@ -6,6 +6,7 @@ import functools
 import io
 import json
 import os
+import re
 import stat
 import unicodedata
 from collections.abc import Callable, Iterator, Sequence
@@ -279,7 +280,8 @@ def read_parsed(path: Path, expected: str, parse: Callable[[str], Any]) -> Any:
     except InputError:
         raise
     except (LookupError, ValueError, TypeError, ArithmeticError, RecursionError, *_NO_TEXT) as error:
-        raise InputError(f"{path}: expected {expected}; found {error}") from error
+        found = re.sub(r'\s+in "<[^>]*>",', " in", str(error))  # where YAML's errors name no file
+        raise InputError(f"{path}: expected {expected}; found {found}") from error
     return value
 
 

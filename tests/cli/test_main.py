@@ -131,7 +131,7 @@ def test_help_of_a_verb_and_of_a_group(monkeypatch, capsys, tmp_path):
     assert "bounds: box* | hull" in out
     assert "| my_people" in out
     assert "seed (default 1; an integer >= 0 and <= 4294967295)\n    Of weights" in out
-    code, out, _ = call(monkeypatch, capsys, "train", "--help", "depth_head")
+    code, out, _ = call(monkeypatch, capsys, "train", "model=hull", "--help", "depth_head")
     assert code == 0
     assert "== depth_head: {kind: dpt, ...} ==" in out
     assert "start (default 0.25; a number > 0 and < 1)" in out  # of depth_head=hull

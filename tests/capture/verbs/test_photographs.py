@@ -133,7 +133,6 @@ def test_what_makes_a_prediction_poor_is_said(here, checkpoint, capsys):
         assert ghgs("predict", "images=images", f"cameras={cameras}", "out=splat", "size=70", *run) == 0
     out = capsys.readouterr().out
     assert "2 photographs leave much unseen: 3 to 5 all around show a person" in out
-    assert "of its height at most one photograph shows most of it: a guess" in out
     report = json.loads((here / "splat" / "report.json").read_text())
     low, high = sorted(report["psnr_box_of_inputs"].values())
     said = (
