@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Generator, Tensor
 
@@ -22,12 +23,28 @@ _STEP = 8  #: Pixels between evaluations of the lens's model
 
 
 def _lens_inputs(family: str, g: Generator) -> Values:
+    """A lens and its distortion, with ``within`` [2, s, s]: 1 within the radius at which OpenCV's
+    and the fisheye's model turn back, -1 beyond it, 0 near it, where rounding decides."""
     lenses, _ = inputs.cameras(family, g, 1, _LENS, inputs.place(family, g))
+    radial = inputs.uniform(g, -0.1, 0.1, 4)
+    fx, fy, cx, cy = lenses[0]
+    pixels = torch.arange(_LENS, dtype=torch.float64) + 0.5
+    radii = torch.hypot((pixels - cx) / fx, ((pixels - cy) / fy)[:, None])
+    turns = _turn(radial[:3]), np.tan(min(_turn(radial), np.pi / 2))
+    ratios = torch.stack([radii / turn for turn in turns])
     return {
         "lens": lenses[0],
-        "radial": inputs.uniform(g, -0.1, 0.1, 4),
+        "radial": radial,
         "p": inputs.uniform(g, -0.02, 0.02, 2),
+        "within": (ratios < 0.99).double() - (ratios > 1.01).double(),
     }
+
+
+def _turn(radial: Tensor) -> float:
+    """The least x > 0 at which x (1 + k1 x^2 + k2 x^4 + ...) stops growing; infinity: none."""
+    slopes = [1.0, *((2 * i + 3) * float(k) for i, k in enumerate(radial))]
+    squares = np.roots(slopes[::-1])
+    return float(np.sqrt(squares.real[(squares.imag == 0) & (squares.real > 0)].min(initial=np.inf)))
 
 
 def _lens(v: Values) -> Values:
@@ -38,9 +55,10 @@ def _lens(v: Values) -> Values:
     opencv = torch.stack((k1, k2, *v["p"].mT, k3), -1).numpy()
     models = {"opencv": (opencv, False), "fisheye": (v["radial"].numpy(), True)}
     grids = {}
-    for name, (lens, fisheye) in models.items():
+    for (name, (lens, fisheye)), within in zip(models.items(), v["within"].unbind(1), strict=True):
         pairs = zip(matrices, lens, strict=True)
-        grids[name] = torch.cat([undistorting_grid(k, d, _LENS, _LENS, fisheye) for k, d in pairs])
+        grid = torch.cat([undistorting_grid(k, d, _LENS, _LENS, fisheye) for k, d in pairs])
+        grids[name] = grid * within.abs()[..., None]
     return grids
 
 
@@ -59,16 +77,18 @@ def _lens_slowly(v: Values) -> Values:
     angle = r.sqrt().atan()
     bent = angle * (1 + k1 * angle**2 + k2 * angle**4 + k3 * angle**6 + k4 * angle**8)
     share = torch.where(r > 0, bent / r.sqrt(), 1.0)
+    places = {"opencv": opencv, "fisheye": (share * x, share * y)}
     return {
-        name: _between_knots(torch.stack((fx * across + cx, fy * down + cy), 1))
-        for name, (across, down) in {"opencv": opencv, "fisheye": (share * x, share * y)}.items()
+        name: _between_knots(torch.stack((fx * across + cx, fy * down + cy), 1), within)
+        for (name, (across, down)), within in zip(places.items(), v["within"].unbind(1), strict=True)
     }
 
 
-def _between_knots(pixels: Tensor) -> Tensor:
+def _between_knots(pixels: Tensor, within: Tensor) -> Tensor:
     grid = 2 * pixels / _LENS - 1
     dense = torch.nn.functional.interpolate(grid, (_LENS, _LENS), mode="bilinear", align_corners=True)
-    return dense.permute(0, 2, 3, 1)
+    beyond = 4.0  # outside of the photograph
+    return torch.where(within[:, None] < 0, beyond, dense * within[:, None]).permute(0, 2, 3, 1)
 
 
 def _surface_inputs(views: int, size: int, family: str, g: Generator) -> Values:
@@ -192,7 +212,8 @@ _EXCLUDED = {
 STAGES = (
     Stage(
         "undistortion", ("cameras",), _lens_inputs, _lens, 50,
-        "a polynomial of degree 9 and its division by the focal length", _lens_slowly, kind="kernel",
+        "a polynomial of degree 9 and its division by the focal length", _lens_slowly,
+        steady=("within",), kind="kernel",
     ),
     Stage(
         "gains", ("cameras", "images", "masks"), partial(_surface_inputs, 5, 32), case_by_case(_gains), 100,
