@@ -18,7 +18,7 @@ USAGE = [
         "train --config-dir {yaml} views=cut",
         1,
         "{yaml}/views/cut.yaml: expected YAML; found",
-        "']' in line 3, column 1",
+        " in line 3, column 1",
     ),
     (
         "train --config-dir {yaml} views=tagged",
