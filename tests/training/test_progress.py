@@ -33,7 +33,7 @@ def test_a_bar_shows_how_far_the_run_is(tmp_path, capsys, monkeypatch):
     """On a terminal there are no lines beside it; the log has them."""
     monkeypatch.setattr("ghgs_lit.training.callbacks.on_terminal", lambda: True)
     monkeypatch.setattr("ghgs_lit.training.callbacks.Lines.due", lambda _: True)
-    monkeypatch.setenv("COLUMNS", "120")
+    monkeypatch.setenv("COLUMNS", "160")
     trainer(tmp_path, steps=12, callbacks=[RunProgress()]).fit(module(), loader(), loader(1))
     shown = capsys.readouterr().out
     assert re.search(r"100% step 12 of 12 +loss/total .* \S+ steps/s +0:00:00 left", shown)
