@@ -68,8 +68,9 @@ def state_of(model: nn.Module) -> ModelState:
             raise NotCapturable(f"a hook of {name or 'the model'}")
         settings = stages.setdefault(name.partition(".")[0], [])
         settings.append(Same(part))
-        for attribute in values.keys() - _COMMON:
-            value = values[attribute]
+        for attribute, value in values.items():
+            if attribute in _COMMON:
+                continue
             if isinstance(value, Wrapped) or (callable(value) and hasattr(type(part), attribute)):
                 raise NotCapturable(f"{f'{name}.' * bool(name)}{attribute} is replaced")
             settings.append((attribute, _key(value)))
