@@ -9,14 +9,13 @@ from torch import Tensor
 from ghgs_lit.geometry.constants import constant, middles
 from ghgs_lit.geometry.frame import in_cameras
 from ghgs_lit.method.bounds.rays import (
-    NEAREST,
     Silhouettes,
     dilate,
-    look_up,
     projection_matrices,
     ray_directions,
     votes_outside,
 )
+from ghgs_lit.ops.ray_marching import NEAREST, look_up
 
 #: Cells along the longer side of the masks, and depths along each ray: enough to find gross errors.
 RESOLUTION = 32

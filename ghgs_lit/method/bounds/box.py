@@ -16,17 +16,16 @@ from ghgs_lit.geometry.masks import first_and_last
 from ghgs_lit.geometry.projection import focal_lengths, project
 from ghgs_lit.method.bounds import agreement
 from ghgs_lit.method.bounds.rays import (
-    NEAREST,
     Silhouettes,
     cut_sides,
     depths_in_box,
     dilate,
-    look_up,
     pixel_axes,
     projection_matrices,
     silhouettes,
     votes_outside,
 )
+from ghgs_lit.ops.ray_marching import NEAREST, look_up
 from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 

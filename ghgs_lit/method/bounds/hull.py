@@ -3,28 +3,24 @@ pixels are marched through the subject's box; depths that the masks of the *othe
 kept: the image-based visual hull (Matusik et al. 2000). Nothing here has a gradient."""
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Int
 from pydantic import Field
 from torch import Tensor
 
-from ghgs_lit.extents import bucket_size, true_places
-from ghgs_lit.geometry.constants import constant, middles, other_images
+from ghgs_lit.extents import bucket_size
+from ghgs_lit.geometry.constants import constant, middles
 from ghgs_lit.method.bounds.box import SubjectBox
 from ghgs_lit.method.bounds.rays import (
     Silhouettes,
     cut_sides,
     depths_in_box,
     dilate,
-    look_up,
     projection_matrices,
     ray_directions,
     votes_outside,
 )
-from ghgs_lit.ops.pool import at_once, even_parts
+from ghgs_lit.ops.ray_marching import march
 from ghgs_lit.types import Batch, Cameras, DepthBounds
-
-#: Depths in memory at once, on a CPU and elsewhere.
-_DEPTHS = 1 << 18, 1 << 23
 
 
 class VisualHull(SubjectBox):
@@ -96,64 +92,11 @@ def hull_bounds(
     directions = ray_directions(cameras)
     matrices = projection_matrices(cameras)
     steps = constant(middles, samples, like=start.near)
-    near, far = (bound.clone(memory_format=torch.contiguous_format) for bound in (start.near, start.far))
-    if rays is None:
-        known = count is not None
-        rays = true_places(masks, count, repeats=True) if known else masks.flatten().nonzero()[:, 0]
-    most = at_once(near.device, *_DEPTHS) // (samples * (masks.shape[1] - 1))
-    for part in even_parts(len(rays), most):
-        _march(rays[part], outside, matrices, directions, cameras.centers, start, near, far, steps, tolerance)
+    bounds = (start.near, start.far)
+    near, far = march(
+        masks, outside, matrices, directions, cameras.centers, *bounds, steps, tolerance, rays, count
+    )
     return DepthBounds(near, far)
-
-
-def _march(
-    rays: Int[Tensor, " r"],
-    outside: UInt8[Tensor, "B V h w"],
-    matrices: Float[Tensor, "B V 3 4"],
-    directions: Float[Tensor, "B V h w 3"],
-    centers: Float[Tensor, "B V 3"],
-    start: DepthBounds,
-    near: Float[Tensor, "B V h w"],
-    far: Float[Tensor, "B V h w"],
-    steps: Float[Tensor, " s"],
-    tolerance: int,
-) -> None:
-    """Replace the bounds of some pixels by the first and the last depth that the other views allow;
-    unchanged where there is none.
-
-    Args:
-        rays: indices of pixels; one may be listed more than once, so that ``start`` is read.
-        outside: 1 where a view says "outside".
-        matrices: of projection.
-        directions: of the rays.
-        centers: of the cameras.
-        start: the depths in metres between which others are tried.
-        near: written; contiguous, as is ``far``.
-        far: written.
-        steps: fractions of the way from near to far that are tried.
-        tolerance: votes that an allowed depth may have.
-    """
-    views = outside.shape[1]
-    samples = len(steps)
-    image = rays // outside[0, 0].numel()
-    begin, end = (bound.reshape(-1)[rays] for bound in (start.near, start.far))
-    length = end - begin
-    depth = begin[:, None] + steps * length[:, None]
-    direction = directions.reshape(-1, 1, 3)[rays]
-    center = centers.reshape(-1, 1, 3)[image]
-    other = constant(other_images, len(outside), views, like=image)[image]
-    matrix = matrices.flatten(0, 1).movedim(1, 0)[:, other]
-    along = (matrix[..., :3] * direction).sum(-1)
-    origin = (matrix[..., :3] * center).sum(-1) + matrix[..., 3]
-    pixels = torch.addcmul(origin[..., None], depth[:, None], along[..., None])
-    votes = look_up(outside.flatten(0, 1), other[..., None], pixels)
-    inside = (votes.sum(1) <= tolerance).to(torch.uint8)
-    hit = inside.amax(1).bool()
-    half = length / (2 * samples)
-    first = depth.gather(1, inside.argmax(1, keepdim=True))[:, 0] - half
-    last = depth.gather(1, samples - 1 - inside.flip(1).argmax(1, keepdim=True))[:, 0] + half
-    near.view(-1)[rays] = torch.where(hit, first, begin)
-    far.view(-1)[rays] = torch.where(hit, last, end)
 
 
 def _enlarge(values: Tensor, stride: int, size: tuple[int, int]) -> Tensor:

@@ -7,7 +7,7 @@ from math import ceil
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from ghgs_lit.geometry.constants import constant
@@ -76,10 +76,6 @@ def depths_in_box(cameras: Cameras, lower: Float[Tensor, "B 3"], upper: Float[Te
 
 #: Which faces meet in each corner of a box.
 _CORNERS = tuple(product((False, True), repeat=3))
-
-#: The smallest depth in metres at which masks are looked up;
-#: points behind the camera are moved there.
-NEAREST = 1e-4
 
 
 @dataclass(frozen=True)
@@ -204,30 +200,3 @@ def votes_outside(
         known = sides if ends.shape[axis] == 2 else sides.all(-1, keepdim=True)
         ends &= known.unsqueeze(-3 - axis)
     return outside.view(torch.uint8)
-
-
-def look_up(
-    tables: Shaped[Tensor, "n h w"], image: Int[Tensor, "..."], pixels: Float[Tensor, "3 ..."]
-) -> Tensor:
-    """Entries of tables at homogeneous pixels.
-
-    Points outside the frame take the entry of the nearest border pixel: a mask that does not
-    touch the border has the whole subject in its frame, and :func:`votes_outside` says what the
-    others know. Points behind the camera land far outside the frame.
-
-    Args:
-        tables: of votes or other values.
-        image: which table; broadcasts with the pixels.
-        pixels: the three coordinates of each; overwritten.
-
-    Returns:
-        Entries of the shape that ``image`` and the pixels broadcast to.
-    """
-    height, width = tables.shape[1:]
-    inverse = pixels[2].clamp_(min=NEAREST).reciprocal_()
-    # Cameras of absurd sizes overflow to NaN, which has no index.
-    places = pixels[:2].mul_(inverse).nan_to_num_().clamp_(min=0)
-    last = constant(torch.tensor, (width - 1, height - 1), like=pixels)
-    column, row = torch.minimum(places, last.view(2, *[1] * (pixels.dim() - 1))).int()
-    place = torch.add(column, row, alpha=width)
-    return tables.flatten().take(torch.add(place, image, alpha=height * width))

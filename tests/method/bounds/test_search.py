@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from ghgs_lit.method.bounds.hull import hull_bounds
+from ghgs_lit.ops.ray_marching import march
 from ghgs_lit.types import DepthBounds
 from tests.helpers.scenes import make_batch
 
@@ -30,9 +31,12 @@ def by_hand(batch, start, tolerance, samples, v, row, column):
     return (allowed[0] - step / 2, allowed[-1] + step / 2) if allowed else (near, far)
 
 
+@pytest.mark.parametrize("by_kernel", [True, False])
 @pytest.mark.parametrize("tolerance", [0, 1])
-def test_a_ray_ends_where_the_masks_of_the_other_views_end(tolerance):
-    """The search against the definition of the hull, ray by ray."""
+def test_a_ray_ends_where_the_masks_of_the_other_views_end(monkeypatch, tolerance, by_kernel):
+    """Both searches against the definition of the hull, ray by ray."""
+    if not by_kernel:
+        monkeypatch.setitem(march.fits, "cpu", lambda *_: False)
     batch = make_batch(1, 4, 56, 70, zoom=0.6)
     start = DepthBounds(*(torch.full(batch.masks.shape, z) for z in (1.6, 2.5)))
     arguments = (batch.masks, batch.cameras, start, 0, tolerance, 12)

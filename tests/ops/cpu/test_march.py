@@ -1,0 +1,55 @@
+"""The search of a CPU along rays against plain PyTorch: the same arithmetic, so the same bits."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from ghgs_lit.method.bounds import VisualHull
+from ghgs_lit.ops.ray_marching import march
+from ghgs_lit.types import Batch
+from tests.helpers.scenes import make_batch
+
+SCENES = {
+    "batch": {"batch": 2, "views": 4, "height": 70, "width": 98},
+    "coarse": {"batch": 1, "views": 3, "height": 182, "width": 168},
+    "cut": {"batch": 2, "views": 3, "zoom": 1.6},
+    "opposite": {"batch": 1, "views": 2},
+}
+
+
+def spoiled(batch: Batch) -> Batch:
+    """Views with an empty mask, a full one and a single pixel."""
+    masks = batch.masks.clone()
+    masks[0, 0] = False
+    masks[-1, 1] = True
+    if masks.shape[1] > 2:
+        masks[-1, 2] = False
+        masks[-1, 2, 20, 20] = True
+    return dataclasses.replace(batch, masks=masks)
+
+
+@pytest.mark.parametrize("change", [lambda batch: batch, spoiled], ids=["clean", "spoiled"])
+@pytest.mark.parametrize("tolerance", [0, 1])
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_kernel_gives_the_bounds_of_plain_pytorch(monkeypatch, scene, tolerance, change):
+    batch = change(make_batch(**SCENES[scene]))
+    found = VisualHull(tolerance=tolerance)(dataclasses.replace(batch))
+    monkeypatch.setitem(march.fits, "cpu", lambda *_: False)
+    expected = VisualHull(tolerance=tolerance)(dataclasses.replace(batch))
+    assert (found.near != expected.near).float().mean() < 1e-4
+    assert (found.far != expected.far).float().mean() < 1e-4
+
+
+def test_the_number_of_threads_changes_no_bit():
+    """Tasks write apart: an order of threads must not show."""
+    batch, threads = make_batch(2, 4, 112, 112), torch.get_num_threads()
+    results = []
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            results.append(VisualHull()(batch))
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(results[0].near, results[1].near)
+    assert torch.equal(results[0].far, results[1].far)
