@@ -17,8 +17,9 @@ from ghgs_lit.config.nodes import PerScene
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.measure import ModelMethod, measure
 from ghgs_lit.execution import Predictor
-from ghgs_lit.method.bounds import box, hull
+from ghgs_lit.method.bounds import box
 from ghgs_lit.metrics import MetricsOptions
+from ghgs_lit.ops import ray_marching
 from ghgs_lit.refinement import CameraRefinement, Refinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.training import GHGSModule, Optimization
@@ -247,7 +248,7 @@ def test_the_host_waits_once(overrides):
 def test_the_hull_of_larger_photographs_is_found_without_asking_for_the_number_of_rays(monkeypatch):
     """As on a CPU, though more rays are marched than there are: the first is repeated."""
     monkeypatch.setattr(box, "RESOLUTION", 28)
-    monkeypatch.setattr(hull, "_DEPTHS", (20_000, 20_000))
+    monkeypatch.setattr(ray_marching, "_DEPTHS", (20_000, 20_000))
     stage, batch = make_model("model=hull").bounds, make_batch(2, 3, 56, 42)
     expected = stage(batch)
     with pretend_device() as log:
