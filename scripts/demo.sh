@@ -21,7 +21,7 @@ Table:        $out/table/table.md
               model=hull is told by the masks where depths are; within a box they take longer than a minute to
               learn. The paper's ablation takes hours: "Reproduce the table" in README.md
 Pictures:     $out/*/pictures
-TensorBoard:  tensorboard --logdir $out/tensorboard
+TensorBoard:  tensorboard --logdir $out
 Splat:        ghgs predict checkpoint=$hull/checkpoints/last.ckpt (of the model trained here)
 Person:       $out/person/viewer.html (in a browser), gaussians.ply, sheet.png (inputs, depth, a view half-way)
 (the commands are in .venv/bin: source .venv/bin/activate)
