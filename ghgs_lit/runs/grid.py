@@ -5,7 +5,6 @@ import contextlib
 import json
 import logging
 import re
-import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -31,6 +30,7 @@ from ghgs_lit.runs.processes import queue_again
 from ghgs_lit.runs.provenance import config_hash, differences
 from ghgs_lit.runs.run import PLAN, SWEPT, RunDirectory, State, runs_in_order
 from ghgs_lit.runs.signals import Interrupted, interruptible, print_how_to_go_on, stop_if_interrupted
+from ghgs_lit.runs.submission import submit
 
 
 def _sets_apart(override: str, shared: set[str]) -> bool:
@@ -72,7 +72,8 @@ def sweep(sweeper: BasicSweeper, arguments: Sequence[str], rehearse: Rehearse) -
                 return []
             begun = planned
             write_plan(planned, sweeper.config, directory)
-            returns = run_all(planned, partial(submit, sweeper), sweeper.max_batch_size)
+            launch = partial(submit, sweeper.launcher, sweeper.config.hydra.launcher)
+            returns = run_all(planned, launch, sweeper.max_batch_size)
     except Interrupted as stop:
         if not stop.explained:
             how = _how_to_go_on(begun, directory)
@@ -270,71 +271,6 @@ def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Pat
     names = dict.fromkeys([*(item.directory.path.name for item in planned), *runs_in_order(directory)])
     runs = OmegaConf.to_yaml({"runs": list(names)})
     write_text_atomically(directory / PLAN, OmegaConf.to_yaml(config) + runs)
-
-
-#: Words of what sbatch refuses, and the keys that they are about.
-_ABOUT = {
-    "partition": ("partition",),
-    "gres": ("gres", "gpus_per_node", "gpus_per_task"),
-    "memory": ("mem_gb", "mem_per_cpu", "mem_per_gpu"),
-    "feature": ("constraint",),
-    "qos": ("qos",),
-    "account": ("account",),
-    "cpu": ("cpus_per_task", "cpus_per_gpu"),
-    "node": ("exclude", "nodelist", "nodes"),
-    "time": ("timeout_min",),
-}
-
-
-def submit(sweeper: BasicSweeper, jobs: Sequence[Sequence[str]], first: int) -> Sequence[JobReturn]:
-    """Launch jobs and wait for them.
-
-    Args:
-        sweeper: Hydra's, with configuration and launcher.
-        jobs: Overrides of each.
-        first: Number of the first.
-
-    Returns:
-        What the jobs returned.
-
-    Raises:
-        InputError: submitit cannot submit them, or a job ended without a result.
-    """
-    launcher = sweeper.launcher
-    if not type(launcher).__module__.startswith("hydra_plugins.hydra_submitit_launcher"):
-        return launcher.launch(jobs, first)
-    if type(launcher).__name__ == "SlurmLauncher":
-        _ask_for_accounting()
-    try:
-        return launcher.launch(jobs, first)
-    except (RuntimeError, ValueError) as error:
-        is_refused = isinstance(error.__cause__, subprocess.CalledProcessError)
-        lines = [line.removeprefix("sbatch: error: ") for line in str(error).splitlines()]
-    options = sweeper.config.hydra.launcher
-    found = "; ".join(lines[:2])
-    if not is_refused:
-        logs = options.submitit_folder.replace("%j", "*")
-        raise InputError(
-            f"hydra.launcher: expected jobs that end with a result; found {found} (logs: {logs})"
-        )
-    about = (keys for word, keys in _ABOUT.items() if re.search(rf"\b{word}", found, re.IGNORECASE))
-    key = next((key for key in next(about, ()) if options.get(key) is not None), None)
-    where = "hydra.launcher" if key is None else f"hydra.launcher.{key}={options[key]}"
-    raise InputError(f"{where}: expected what sbatch accepts; found {found}")
-
-
-def _ask_for_accounting() -> None:
-    """Let submitit not call ``sacct``, which it would do all the time, where SLURM has none."""
-    with contextlib.suppress(OSError):
-        answer = subprocess.run(["sacct", "--noheader"], check=False, capture_output=True, text=True)
-        if answer.returncode != 0:
-            from submitit import SlurmJob
-
-            SlurmJob.watcher._make_command = lambda: None
-            said = " ".join(answer.stderr.split())
-            print(
-                f"note: {said or 'sacct fails'}: the sweep waits for jobs that are cancelled, too", flush=True
-            )
 
 
 def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = None) -> list[JobReturn]:
