@@ -69,7 +69,7 @@ NOT_RUN = [
     (r"ghgs train (?!.*dry_run).*encoder=vggt_1b", PUBLISHED),
     (r"ghgs train .*hydra/launcher=slurm", "needs a cluster"),
     (r"bash scripts/slurm_drill", "needs SLURM"),
-    (r"ghgs adapt (cameras=<|data\.size=518)", "renders the people of a rig, for minutes"),
+    (r"ghgs adapt (cameras=<|data\.size=518)", "needs a capture of several instants"),
     (r"ghgs (train|evaluate|benchmark) .*split=bench", "renders forty people"),
     (r"ghgs table .*runs/ablation", "needs twelve runs"),
     (r"(GHGS_PLUGINS=\S+ )?ghgs (train|table) .*controls", "needs 21 runs"),
