@@ -9,6 +9,7 @@ from typing import Any
 import lightning.pytorch as L
 from lightning.pytorch.callbacks import Callback
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+from rich.table import Column
 
 from ghgs_lit.config.options import Options
 from ghgs_lit.method.recalibration.inspection import neighborhoods, seen_calls
@@ -31,7 +32,8 @@ class RunProgress(Callback):
         """Open the log and the bar."""
         has_bar = on_terminal()
         self._lines = Lines(Path(trainer.default_root_dir) / "train.log", printed=not has_bar)
-        columns = (BarColumn(), TaskProgressColumn(), TextColumn("{task.description}"))
+        text = TextColumn("{task.description}", table_column=Column())  # wraps on a narrow terminal
+        columns = (BarColumn(), TaskProgressColumn(), text)
         self._bar = Progress(*columns, disable=not (has_bar and trainer.is_global_zero))
         self._task = self._bar.add_task("training", total=1.0)
         self._bar.start()

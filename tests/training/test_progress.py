@@ -3,6 +3,8 @@
 import dataclasses
 import re
 
+import pytest
+from rich.console import ConsoleDimensions
 from torch.utils.data import DataLoader
 
 from ghgs_lit.rendering import render
@@ -29,13 +31,14 @@ def test_lines_say_how_far_the_run_is(tmp_path, capsys, monkeypatch):
     assert re.search(last, lines[10])
 
 
-def test_a_bar_shows_how_far_the_run_is(tmp_path, capsys, monkeypatch):
-    """On a terminal there are no lines beside it; the log has them."""
+@pytest.mark.parametrize("width", [80, 160])
+def test_a_bar_shows_how_far_the_run_is(width, tmp_path, capsys, monkeypatch):
+    """On a terminal there are no lines beside it; the log has them. A narrow one wraps the text."""
     monkeypatch.setattr("ghgs_lit.training.callbacks.on_terminal", lambda: True)
     monkeypatch.setattr("ghgs_lit.training.callbacks.Lines.due", lambda _: True)
-    monkeypatch.setenv("COLUMNS", "160")
+    monkeypatch.setattr("rich.console.Console.size", ConsoleDimensions(width, 25))
     trainer(tmp_path, steps=12, callbacks=[RunProgress()]).fit(module(), loader(), loader(1))
-    shown = capsys.readouterr().out
+    shown = " ".join(capsys.readouterr().out.split())
     assert re.search(r"100% step 12 of 12 +loss/total .* \S+ steps/s +0:00:00 left", shown)
     assert len((tmp_path / "train.log").read_text().splitlines()) == 12
 
