@@ -31,10 +31,10 @@ from triton.compiler import ASTSource
 from benchmarks import device
 from ghgs_lit.config import run_of
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
+from ghgs_lit.geometry.precision import round_products
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.ops import dispatch
 from ghgs_lit.ops.intersections import intersections
-from ghgs_lit.runtime.precision import round_products
 
 SMALL = ("encoder.width=32", "encoder.heads=2", "encoder.vit.channels=8", "recalibration.k=8")
 #: Names of types in Triton.

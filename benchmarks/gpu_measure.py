@@ -21,7 +21,7 @@ from torch.profiler import ProfilerActivity, profile
 from benchmarks.device import drawing_nothing
 from ghgs_lit.execution import predictor, step
 from ghgs_lit.execution.tape import CudaTape, Tape
-from ghgs_lit.runtime import precision
+from ghgs_lit.geometry import precision
 from tests.helpers.pretend_device import DEVICE, pretend_device
 from tests.helpers.tape import OperatorTape
 

@@ -23,12 +23,12 @@ from ghgs_lit.diagnostics.machine import machine_facts
 from ghgs_lit.execution import Predictor
 from ghgs_lit.execution.graphs import GraphCache
 from ghgs_lit.execution.step import CapturedStep
+from ghgs_lit.geometry.precision import keep_rounded, precision_of
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.method.rounds import NoRounds
 from ghgs_lit.method.stages import STAGES
 from ghgs_lit.ops.dispatch import OPERATORS
 from ghgs_lit.rendering.capacity import deferred
-from ghgs_lit.runtime.precision import keep_rounded, precision_of
 from ghgs_lit.runtime.watching import Inputs, Watcher
 from ghgs_lit.runtime.watching import watched as stages_watched
 from ghgs_lit.training.optimization import hold_rates

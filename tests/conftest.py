@@ -51,7 +51,7 @@ if not torch.cuda.is_available():
 
 import tests.helpers.composing  # noqa: E402, F401
 from ghgs_lit.config.registry import load_plugins  # noqa: E402
-from ghgs_lit.runtime.precision import _Rounding  # noqa: E402
+from ghgs_lit.geometry.precision import _Rounding  # noqa: E402
 
 load_plugins()  # before any test has a register of its own
 

@@ -21,12 +21,12 @@ from ghgs_lit.config import register
 from ghgs_lit.config.options import Options
 from ghgs_lit.extents import bucket_size, true_places
 from ghgs_lit.geometry.masks import coverage, surface_colors
+from ghgs_lit.geometry.precision import exact, without_float16
 from ghgs_lit.geometry.projection import at_least_float32, pixel_centers, project, sample, unproject
 from ghgs_lit.method.heads.depth import BOUNDED, finite_maps
 from ghgs_lit.method.heads.dpt import ResidualUnit
 from ghgs_lit.method.plan import Plan
 from ghgs_lit.ops.activation import bounded_sigmoid
-from ghgs_lit.runtime.precision import exact, without_float16
 from ghgs_lit.types import Batch, Cameras, DepthBounds, DepthMaps, Tokens
 
 #: Side of a cell in pixels, and channels of its features and of the GRU's memory.

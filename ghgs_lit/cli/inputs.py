@@ -17,12 +17,11 @@ from ghgs_lit.config.run import Run
 from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.execution import Predictor
-from ghgs_lit.method.model import GHGS
-from ghgs_lit.method.rounds import with_known_height
+from ghgs_lit.geometry.precision import half_precision, keep_rounded
+from ghgs_lit.method.model import GHGS, with_known_height
 from ghgs_lit.method.stages import OPTIONS, STAGES
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.rendering.api import resolve_backend
-from ghgs_lit.runtime.precision import half_precision, keep_rounded
 from ghgs_lit.weights.checkpoint import load_weights, read_config
 from ghgs_lit.weights.reading import SHIPPED
 

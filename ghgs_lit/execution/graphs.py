@@ -21,8 +21,8 @@ from torch import Tensor
 from ghgs_lit.execution.repeatable import Guard
 from ghgs_lit.execution.state import ModelState
 from ghgs_lit.execution.tape import CudaTape, Tape
+from ghgs_lit.geometry.precision import rounding_state
 from ghgs_lit.rendering.capacity import Rooms, deferred
-from ghgs_lit.runtime.precision import rounding_state
 
 Result = TypeVar("Result")
 

@@ -14,11 +14,11 @@ from ghgs_lit.execution.preprocessing import Preprocessing, preprocess
 from ghgs_lit.execution.scene import Scene
 from ghgs_lit.execution.state import ModelState, NotCapturable, state_of
 from ghgs_lit.geometry.padding import PaddedBatch
+from ghgs_lit.geometry.precision import PRECISIONS, precision_of
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.method.plan import Measured, Plan, Sizes
 from ghgs_lit.method.rounds import Coarse, coarse_of, coarse_sizes
 from ghgs_lit.rendering.capacity import settled
-from ghgs_lit.runtime.precision import PRECISIONS, precision_of
 from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.weights.checkpoint import load_weights, read_config
 from ghgs_lit.weights.reading import SHIPPED
@@ -47,7 +47,7 @@ class Predictor:
     Args:
         model: the stages.
         options: what is done around them; None: those of the configuration that built the model.
-        precision: of products, one of :data:`ghgs_lit.runtime.precision.PRECISIONS`.
+        precision: of products, one of :data:`ghgs_lit.geometry.precision.PRECISIONS`.
         checks_values: reject input views, depths and bodies with NaN or values out of range.
 
     Attributes:

@@ -18,11 +18,11 @@ from ghgs_lit.execution.graphs import GraphCache
 from ghgs_lit.execution.predictor import Predictor, Prepared
 from ghgs_lit.execution.preprocessing import Preprocessing
 from ghgs_lit.execution.scene import Scene
+from ghgs_lit.geometry.precision import precision_of
 from ghgs_lit.losses import Losses
 from ghgs_lit.method.plan import Sizes
 from ghgs_lit.method.plan.window import Span, Window
 from ghgs_lit.rendering.api import Renderer
-from ghgs_lit.runtime.precision import precision_of
 from ghgs_lit.types import Batch
 
 

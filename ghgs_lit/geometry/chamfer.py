@@ -6,8 +6,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.runtime.precision import exact
 
 #: Distances in the memory of an accelerator at once.
 _DISTANCES = 1 << 26

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ghgs_lit.geometry.constants import constant
 from ghgs_lit.geometry.masks import first_and_last
+from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import (
     at_least_float32,
     homogeneous_centers,
@@ -22,7 +23,6 @@ from ghgs_lit.geometry.projection import (
     world_to_camera,
 )
 from ghgs_lit.geometry.rotations import matrix_to_quaternion, multiply_quaternions, unit
-from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds, DepthMaps, Gaussians, Prediction
 
 #: Height of the subject in its frame, or its width if larger, in metres.
@@ -180,7 +180,7 @@ def subject_center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Te
 
     Optical axes have a small weight, so that one mask or none is enough, and the cameras a smaller
     one, for parallel rays. To be called where products are exact
-    (:func:`ghgs_lit.runtime.precision.exact`).
+    (:func:`ghgs_lit.geometry.precision.exact`).
 
     Args:
         masks: of the subject [B, V, h, w].

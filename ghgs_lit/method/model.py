@@ -1,21 +1,25 @@
 """The whole method as one module, from input views to Gaussians (paper, section 3)."""
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from typing import Any
 
 import torch
 from jaxtyping import Bool
+from omegaconf import OmegaConf
 from torch import Tensor, nn
 
+from ghgs_lit.config.keys import lookup
 from ghgs_lit.config.registry import build, read_node
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.padding import bounds_of
 from ghgs_lit.method import stages
 from ghgs_lit.method.heads.dpt import LEVELS, DPTHead
 from ghgs_lit.method.plan import Measured, Plan, Sizes, SkipOptions, planned
-from ghgs_lit.method.rounds import Coarse, NoRounds, Rounds, State, prediction_of, with_known_height
+from ghgs_lit.method.rounds import Coarse, NoRounds, Rounds, State, prediction_of
+from ghgs_lit.method.rounds.coarse import FILLED
 from ghgs_lit.method.stages import HEADS, OPTIONS, STAGES
 from ghgs_lit.types import Batch, Prediction, Tokens
 
@@ -168,3 +172,26 @@ class GHGS(nn.Module):
         model = cls(encoder=encoder, **heads, **others, rounds=rounds, skip=skip)
         model.config = {node: config[node] for node in (*STAGES, *OPTIONS, "compat") if node in config}
         return model
+
+
+def with_known_height(nodes: Mapping[str, Any], trained: Mapping[str, Any]) -> dict[str, Any]:
+    """Nodes of a model whose ``rounds.height`` is a number where it was ``auto``.
+
+    Args:
+        nodes: of the model, by name, with or without rounds.
+        trained: configuration of its training,
+            whose ``data.size`` and ``augmentation.sizes`` are read.
+
+    Returns:
+        The nodes; without known sizes ``rounds.height`` is null.
+    """
+    rounds = nodes.get("rounds")
+    rounds = OmegaConf.to_container(rounds, resolve=True) if OmegaConf.is_config(rounds) else rounds
+    # not a user's own kind
+    is_known = isinstance(rounds, Mapping) and rounds.get("kind") == "recurrent"
+    if not is_known or rounds.get("height", "auto") != "auto":
+        return dict(nodes)
+    sides: list[int] = []
+    for size in (lookup(trained, "data.size"), *(lookup(trained, "augmentation.sizes") or ())):
+        sides += [size] if isinstance(size, int) else size or ()
+    return {**nodes, "rounds": {**rounds, "height": math.ceil(FILLED * max(sides)) if sides else None}}

@@ -12,9 +12,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.metrics.functional import correlate
-from ghgs_lit.runtime.precision import exact
 
 PIXELS_PER_DEGREE = 67.0206
 """Resolution in the eye of the paper's viewer:

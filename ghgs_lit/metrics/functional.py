@@ -10,9 +10,9 @@ from torch import Tensor
 
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.chamfer import nearest
+from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.metrics.regions import box_of, grown, mean_inside, mean_over
-from ghgs_lit.runtime.precision import exact
 
 PADDINGS = ("valid", "reflect", "zeros")
 PSNR_CAP = 100.0

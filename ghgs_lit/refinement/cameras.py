@@ -17,10 +17,10 @@ from torch import Tensor
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.frame import HEIGHT, Frame
 from ghgs_lit.geometry.masks import coverage, on_black
+from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import at_least_float32, project
 from ghgs_lit.geometry.rotations import after_motions, rigid, without_common
 from ghgs_lit.refinement.coherence import coherent_cameras
-from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
 
 Renderer = Callable[..., Rendering]

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.masks import coverage, on_black
+from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import world_to_camera
 from ghgs_lit.metrics.functional import psnr, ssim
 from ghgs_lit.metrics.regions import box_of
-from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering
 
 Renderer = Callable[..., Rendering]

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from ghgs_lit.config.options import Options, Positive
 from ghgs_lit.errors import choice, require
+from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import at_least_float32, world_to_camera
 from ghgs_lit.ops.rasterization.settings import RasterSettings
 from ghgs_lit.rendering import gsplat_backend
-from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 BACKENDS = ("auto", "gsplat", "cpu", "reference")

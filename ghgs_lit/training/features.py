@@ -1,5 +1,5 @@
 """Which photographs' frozen tokens a training keeps on disk
-(:mod:`ghgs_lit.method.encoder.feature_cache`)."""
+(:mod:`ghgs_lit.training.feature_cache`)."""
 
 import logging
 import math
@@ -16,8 +16,8 @@ from ghgs_lit.config.options import Options, PathText
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import require_writable
-from ghgs_lit.method.encoder.feature_cache import FeatureCache
 from ghgs_lit.method.encoder.vit import VisionTransformer
+from ghgs_lit.training.feature_cache import FeatureCache
 from ghgs_lit.weights.frozen import digest_of
 
 log = logging.getLogger(__name__)

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from ghgs_lit.config.options import Count, Index, Options, Share, Words
 from ghgs_lit.errors import InputError
-from ghgs_lit.runtime.precision import round_products
+from ghgs_lit.geometry.precision import round_products
 
 #: Limits that keep every duration in Python's range.
 Duration = Annotated[

@@ -16,7 +16,7 @@ from ghgs_lit.config.keys import flatten, require_plain
 from ghgs_lit.config.registry import KINDS
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically
-from ghgs_lit.runtime.precision import fast_precision
+from ghgs_lit.geometry.precision import fast_precision
 from ghgs_lit.weights.frozen import SHARING, joined
 from ghgs_lit.weights.names import RELEASE_ENTRY, VGGT
 from ghgs_lit.weights.reading import cast, file_of, open_file, require_dense

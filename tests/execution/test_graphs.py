@@ -13,7 +13,7 @@ from torch import nn
 
 from ghgs_lit.execution import graphs
 from ghgs_lit.execution.graphs import GraphCache
-from ghgs_lit.runtime.precision import precision_of
+from ghgs_lit.geometry.precision import precision_of
 from ghgs_lit.types import Batch, Cameras
 from tests.helpers.pretend_device import DEVICE, pretend_device
 from tests.helpers.tape import OperatorTape

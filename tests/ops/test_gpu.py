@@ -11,8 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from ghgs_lit.geometry.precision import exact
 from ghgs_lit.ops import dispatch
-from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Gaussians
 from tests.helpers.kernels import DEVICE, NAMES, kernels
 from tests.helpers.models import ATTRIBUTES, close, make_model

@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader
 
 from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
-from ghgs_lit.runtime.precision import exact
+from ghgs_lit.geometry.precision import exact
 from ghgs_lit.training import DivergedError, GHGSModule, Optimization
 from ghgs_lit.training.callbacks import RunProgress
 from ghgs_lit.training.checkpoints import CheckpointOptions

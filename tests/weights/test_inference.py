@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.runtime import precision
+from ghgs_lit.geometry import precision
 from ghgs_lit.weights.checkpoint import model_state, read_checkpoint, write_checkpoint
 from ghgs_lit.weights.exporting import write_inference
 from tests.helpers.models import config, load_model, make_model

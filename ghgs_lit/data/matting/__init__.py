@@ -19,7 +19,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from ghgs_lit.geometry.masks import signed_distance
-from ghgs_lit.runtime.precision import exact
+from ghgs_lit.geometry.precision import exact
 
 #: Channels at the full size of the image and at each half of it.
 _WIDTHS = (16, 32, 48, 64)

@@ -11,10 +11,10 @@ from ghgs_lit.diagnostics.benchmark.measure import ATTRIBUTES
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch, random_model
 from ghgs_lit.errors import InputError
 from ghgs_lit.execution import Predictor
+from ghgs_lit.geometry.precision import exact, has_bfloat16, rounds_products
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.rendering import RasterSettings, render
 from ghgs_lit.rendering.api import resolve_backend
-from ghgs_lit.runtime.precision import exact, has_bfloat16, rounds_products
 from ghgs_lit.runtime.watching import Results, watched
 from ghgs_lit.types import Batch, Cameras, Gaussians
 

@@ -13,6 +13,7 @@ from ghgs_lit.config.options import Index, Options
 from ghgs_lit.geometry.constants import constant
 from ghgs_lit.geometry.frame import in_cameras, subject_center
 from ghgs_lit.geometry.masks import first_and_last
+from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import focal_lengths, project
 from ghgs_lit.method.bounds import agreement
 from ghgs_lit.method.bounds.rays import (
@@ -26,7 +27,6 @@ from ghgs_lit.method.bounds.rays import (
     votes_outside,
 )
 from ghgs_lit.ops.ray_marching import NEAREST, look_up
-from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 
 #: Cells along the longer side of the masks that are searched,

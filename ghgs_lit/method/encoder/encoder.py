@@ -19,13 +19,13 @@ from ghgs_lit.geometry.masks import (
     patches_in_window,
     relative_bounds,
 )
+from ghgs_lit.geometry.precision import bfloat16_where_possible
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.method.encoder.block import REGISTERS, Block, draw_normal_, rotary_tables, run_block
 from ghgs_lit.method.encoder.semantic import PARTS, SemanticOptions
 from ghgs_lit.method.encoder.vit import ConvStem, PatchEmbed, VisionTransformer
 from ghgs_lit.method.plan import Plan, planned
 from ghgs_lit.method.plan.patches import KeptPatches
-from ghgs_lit.runtime.precision import bfloat16_where_possible
 from ghgs_lit.types import DepthBounds, Tokens
 
 #: Fields of each kind of patch embedding.

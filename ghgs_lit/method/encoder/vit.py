@@ -2,6 +2,7 @@
 registers, whose tokens are the semantic features F of the paper."""
 
 import math
+from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
@@ -10,7 +11,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.method.encoder.block import REGISTERS, Block, draw_normal_, run_block
-from ghgs_lit.method.encoder.feature_cache import FeatureCache
 from ghgs_lit.method.plan.patches import KeptPatches
 
 
@@ -113,8 +113,8 @@ class VisionTransformer(nn.Module):
         self.patch_size = patch_size
         self.special = 1 + REGISTERS
         self.checkpointing = checkpointing
-        #: Finds tokens of photographs that training has seen; None: all are computed.
-        self.cache: FeatureCache | None = None
+        #: ``cache(dense, images)`` gives tokens of known photographs; None: all are computed.
+        self.cache: Callable[..., Tensor] | None = None
         self.patch_embed = PatchEmbed(in_channels, width, patch_size)
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + (image_size // patch_size) ** 2, width))

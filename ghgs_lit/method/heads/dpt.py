@@ -14,12 +14,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.errors import require
+from ghgs_lit.geometry.precision import exact, without_float16
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.method.heads.guide import Guide, GuidePyramid
 from ghgs_lit.method.plan.window import Span, Window, reach
 from ghgs_lit.ops.linear import linear
 from ghgs_lit.ops.pool import at_once, even_parts
-from ghgs_lit.runtime.precision import exact, without_float16
 from ghgs_lit.types import Tokens
 
 SCALE = 0.1

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from ghgs_lit.config.options import Amount, Options, Positive, Share, Width
 from ghgs_lit.geometry.masks import relative_depth, surface_colors
+from ghgs_lit.geometry.precision import exact, without_float16
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.method.heads.attributes import (
     OFFSET_UNIT,
@@ -29,7 +30,6 @@ from ghgs_lit.ops.activation import (
 )
 from ghgs_lit.ops.linear import Linear
 from ghgs_lit.ops.photo_consistency import photo_consistency
-from ghgs_lit.runtime.precision import exact, without_float16
 from ghgs_lit.types import (
     Batch,
     DepthBounds,

@@ -11,10 +11,10 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from ghgs_lit.errors import require
+from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.ops.linear import Linear
 from ghgs_lit.ops.pool import even_parts
-from ghgs_lit.runtime.precision import exact
 
 #: How the similarity of two tokens changes their logit; see :class:`SemanticAttention`.
 Similarity = Literal["product", "product_clamped", "log", "none"]

@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from ghgs_lit.config.options import Count, Options, Width
+from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.rotations import unit
 from ghgs_lit.method.plan import Plan
@@ -17,7 +18,6 @@ from ghgs_lit.method.recalibration.attention import SemanticAttention, Similarit
 from ghgs_lit.method.recalibration.neighbors import nearest_neighbors
 from ghgs_lit.ops.linear import linear
 from ghgs_lit.ops.pool import at_once, even_parts
-from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import DecodedPixels, Points, Tokens
 
 #: Cosines in memory at once.

@@ -1,6 +1,6 @@
 """Rounds of refinement: Gaussians are compared with the photographs and corrected."""
 
-from ghgs_lit.method.rounds.coarse import Coarse, CoarseDepths, coarse_of, coarse_sizes, with_known_height
+from ghgs_lit.method.rounds.coarse import Coarse, CoarseDepths, coarse_of, coarse_sizes
 from ghgs_lit.method.rounds.rounds import NoRounds, Rounds, RoundsOptions, State, prediction_of
 
 __all__ = [
@@ -13,5 +13,4 @@ __all__ = [
     "coarse_of",
     "coarse_sizes",
     "prediction_of",
-    "with_known_height",
 ]

@@ -11,18 +11,14 @@ the size of the photographs alone.
 
 import dataclasses
 import functools
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
-from omegaconf import OmegaConf
 from torch import Tensor
 
-from ghgs_lit.config.keys import lookup
 from ghgs_lit.geometry.constants import constant
 from ghgs_lit.geometry.masks import coverage
 from ghgs_lit.geometry.padding import PaddedBatch
@@ -41,29 +37,6 @@ _COVERED = 0.5
 
 #: Height and width in pixels.
 Size = tuple[int, int]
-
-
-def with_known_height(nodes: Mapping[str, Any], trained: Mapping[str, Any]) -> dict[str, Any]:
-    """Nodes of a model whose ``rounds.height`` is a number where it was ``auto``.
-
-    Args:
-        nodes: of the model, by name, with or without rounds.
-        trained: configuration of its training,
-            whose ``data.size`` and ``augmentation.sizes`` are read.
-
-    Returns:
-        The nodes; without known sizes ``rounds.height`` is null.
-    """
-    rounds = nodes.get("rounds")
-    rounds = OmegaConf.to_container(rounds, resolve=True) if OmegaConf.is_config(rounds) else rounds
-    # not a user's own kind
-    is_known = isinstance(rounds, Mapping) and rounds.get("kind") == "recurrent"
-    if not is_known or rounds.get("height", "auto") != "auto":
-        return dict(nodes)
-    sides: list[int] = []
-    for size in (lookup(trained, "data.size"), *(lookup(trained, "augmentation.sizes") or ())):
-        sides += [size] if isinstance(size, int) else size or ()
-    return {**nodes, "rounds": {**rounds, "height": math.ceil(FILLED * max(sides)) if sides else None}}
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from ghgs_lit.geometry.constants import constant
 from ghgs_lit.geometry.masks import coverage, surface_colors
+from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.method.rounds.observation import looked_up
 from ghgs_lit.rendering import render
-from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Gaussians
 
 #: Distance in metres from a view's rendered surface at which a Gaussian's weight in that

@@ -7,11 +7,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.geometry.masks import coverage, on_black
+from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.rotations import rotate, unit
 from ghgs_lit.ops.observation import observations, values_at
 from ghgs_lit.rendering import render
-from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering, map_tensors
 
 #: Scale in metres of a Gaussian's distance behind the rendered surface (tanh of the ratio).

@@ -18,6 +18,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from ghgs_lit.config.options import Options, Width
+from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import at_least_float32, focal_lengths
 from ghgs_lit.method.bounds.rays import ray_directions
 from ghgs_lit.method.heads.attributes import RAW_VALUES, RawGaussians
@@ -30,7 +31,6 @@ from ghgs_lit.ops.linear import Linear
 from ghgs_lit.ops.observation import CHANNELS
 from ghgs_lit.ops.photo_consistency import consistency_of
 from ghgs_lit.ops.round_memory import remembered
-from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Prediction, Tokens
 
 #: Largest distance of the depths that the first round compares from the current one, as a share of

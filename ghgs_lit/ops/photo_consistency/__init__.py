@@ -9,10 +9,10 @@ from torch import Tensor
 
 from ghgs_lit.geometry.constants import constant, middles
 from ghgs_lit.geometry.masks import surface_colors
+from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, pixel_centers, sample
 from ghgs_lit.ops.dispatch import Operator, everything
 from ghgs_lit.ops.pool import even_parts
-from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, DepthBounds
 
 #: Samples in memory at once.

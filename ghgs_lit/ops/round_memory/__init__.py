@@ -12,9 +12,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.library import register_autograd
 
+from ghgs_lit.geometry.precision import rounds_products
 from ghgs_lit.ops.dispatch import LIBRARY, Operator
 from ghgs_lit.ops.pool import at_once, even_parts, multiplies
-from ghgs_lit.runtime.precision import rounds_products
 
 #: Gaussians at once that fit a CPU's cache, in half the time.
 _AT_ONCE = 2048

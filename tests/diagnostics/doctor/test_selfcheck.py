@@ -21,10 +21,10 @@ from ghgs_lit.diagnostics.doctor.selfcheck import (
     table,
 )
 from ghgs_lit.execution import Predictor
+from ghgs_lit.geometry.precision import rounds_products
 from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.method.recalibration import Recalibration
 from ghgs_lit.ops.rasterization import cpu
-from ghgs_lit.runtime.precision import rounds_products
 from tests.helpers.models import TINY
 from tests.helpers.pretend_device import DEVICE, pretend_device
 from tests.helpers.verbs import ghgs

@@ -9,13 +9,13 @@ import torch.nn.functional as F
 import ghgs_lit.ops.linear
 from ghgs_lit.errors import InputError
 from ghgs_lit.execution import Predictor
+from ghgs_lit.geometry.precision import has_bfloat16, precision_of
 from ghgs_lit.method.encoder.block import Block, rotary_tables
 from ghgs_lit.method.plan.patches import KeptPatches
 from ghgs_lit.ops.attention import cpu
 from ghgs_lit.ops.compile import processor_features
 from ghgs_lit.ops.linear import linear
 from ghgs_lit.ops.pool import even_parts
-from ghgs_lit.runtime.precision import has_bfloat16, precision_of
 from tests.helpers.encoders import make_encoder
 from tests.helpers.models import ATTRIBUTES, make_model
 from tests.helpers.scenes import make_batch
@@ -223,7 +223,7 @@ def test_training_under_autocast_gives_float32_gradients():
 
 def test_precision_is_what_the_model_is_told(monkeypatch):
     """The model's precision setting overrides the caller's autocast."""
-    monkeypatch.setattr("ghgs_lit.runtime.precision.has_bfloat16", lambda _: True)
+    monkeypatch.setattr("ghgs_lit.geometry.precision.has_bfloat16", lambda _: True)
     module = Predictor(make_model("model=paper").eval())
     batch = make_batch(height=56, width=56, views=2)
     with torch.no_grad():

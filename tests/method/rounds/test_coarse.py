@@ -9,13 +9,13 @@ from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import run_of
 from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.geometry.projection import project, unproject_maps
+from ghgs_lit.method.model import with_known_height
 from ghgs_lit.method.rounds.coarse import (
     CoarseDepths,
     coarse_sizes,
     enlarged,
     shrunk,
     spread_tokens,
-    with_known_height,
 )
 from ghgs_lit.types import DepthBounds, DepthMaps, Tokens
 from tests.helpers.models import ATTRIBUTES, close, load_model, make_model, predict

@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch import nn
 
+from ghgs_lit.geometry.precision import _float32
 from ghgs_lit.ops.dispatch import OPERATORS
 from ghgs_lit.ops.round_memory import plain, remembered
-from ghgs_lit.runtime.precision import _float32
 from tests.helpers.kernels import DEVICE, kernels
 
 

@@ -9,12 +9,12 @@ from ghgs_lit.diagnostics.stress.stage import Stage, Values
 from ghgs_lit.geometry.frame import Frame, to_world
 from ghgs_lit.geometry.masks import relative_bounds, relative_depth
 from ghgs_lit.geometry.padding import pad_to_patches
+from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import project, sample, unproject, world_to_camera
 from ghgs_lit.geometry.unprojection import subject_tokens
 from ghgs_lit.method.bounds import VisualHull
 from ghgs_lit.method.bounds.rays import depths_in_box, ray_directions
 from ghgs_lit.ops.photo_consistency import photo_consistency
-from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds, DepthMaps
 
 _SIZE = 12

@@ -6,10 +6,10 @@ from torch import Generator, Tensor
 from ghgs_lit.diagnostics.stress import inputs
 from ghgs_lit.diagnostics.stress.stage import Stage, Values, case_by_case
 from ghgs_lit.geometry.chamfer import chamfer
+from ghgs_lit.geometry.precision import exact
 from ghgs_lit.metrics.flip import flip_map
 from ghgs_lit.metrics.functional import psnr, ssim
 from ghgs_lit.rendering import RasterSettings, reference, render
-from ghgs_lit.runtime.precision import exact
 from ghgs_lit.types import Cameras, Gaussians
 
 _SIZE = 16

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ghgs_lit.errors import require
 from ghgs_lit.files import write_atomically
-from ghgs_lit.runtime.precision import rounds_products
+from ghgs_lit.geometry.precision import rounds_products
 
 
 class FeatureCache:

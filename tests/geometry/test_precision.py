@@ -9,7 +9,7 @@ from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.runtime.precision import (
+from ghgs_lit.geometry.precision import (
     _say_rounding,
     exact,
     keep_rounded,

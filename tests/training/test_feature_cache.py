@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.precision import round_products
 from ghgs_lit.method.encoder import encoder as encoder_module
-from ghgs_lit.method.encoder.feature_cache import FeatureCache
-from ghgs_lit.runtime.precision import round_products
+from ghgs_lit.training.feature_cache import FeatureCache
 from tests.helpers.encoders import SMALL_VGGT, make_encoder
 from tests.helpers.scenes import make_batch
 
@@ -137,7 +137,7 @@ def test_the_encoder_alone_runs_in_bfloat16_where_the_device_has_it(batch, monke
     layer = encoder.aggregator.global_blocks[0].mlp.fc2
     layer.register_forward_hook(lambda module, inputs, out: seen.append(out.dtype))
     for has, dtype in ((False, torch.float32), (True, torch.bfloat16)):
-        monkeypatch.setattr("ghgs_lit.runtime.precision.has_bfloat16", lambda device, has=has: has)
+        monkeypatch.setattr("ghgs_lit.geometry.precision.has_bfloat16", lambda device, has=has: has)
         found = encoder(batch.images, batch.masks)
         assert seen.pop() == dtype
         error = (found.latent[1].float() - expected.latent[1]).abs().max()
