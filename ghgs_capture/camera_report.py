@@ -1,26 +1,20 @@
-"""Report on the cameras of a capture: other meanings of their numbers (:class:`Hypothesis`), ranked
-by how well masks and cameras agree (:mod:`ghgs_lit.geometry.silhouettes`)."""
+"""Report on the cameras of a capture: how far masks and cameras agree
+(:mod:`ghgs_lit.geometry.silhouettes`), and which other meaning of the calibration's numbers
+(:class:`Hypothesis`) makes them agree."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ghgs_capture.calibration import AXES, EXTRINSICS, INTRINSICS, Convention, StoredCamera
+from ghgs_capture.crops import Photograph
 from ghgs_capture.folder import CaptureFolder
-from ghgs_capture.hypotheses import (
-    Hypothesis,
-    StoredView,
-    for_all,
-    for_some,
-    for_turned,
-    gradient_of,
-    outline_of,
-)
 from ghgs_capture.photographs import Pixels, fits_stored
-from ghgs_capture.placement import copies, placement_lines
 from ghgs_lit.data.mask_checks import twins
 from ghgs_lit.data.view import area_image, area_mask
+from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, subject_sphere
 
 #: Least agreement of every view of a right calibration, and by how much a better meaning must win.
@@ -31,12 +25,75 @@ BETTER = 0.05
 _SOUND = 0.97
 _REST = 1 / 3
 _SAME = 0.01  # Difference of agreement that tells nothing
-_BESIDE = 3  # Pixels beside a mask in which it may lack a part
 _SIDE = 320  # Longer side of the photographs that are compared, in pixels
+_MIDDLE = (0.3, 0.7)  # Shares of a photograph between which a principal point is plausible
+# Usual factors of a resize after the calibration.
+_RESIZES = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 1.0, 4 / 3, 1.5, 2.0, 3.0, 4.0)
 PERSON = (0.5, 2.5)  #: A person's largest extent in metres
+_UNITS = {"millimetres": 0.001, "centimetres": 0.01, "kilometres": 1000.0}
 # A part of a mask is another person where it has this share of the largest part's area, or more.
 _PART = 1 / 3
-_UNITS = {"millimetres": 0.001, "centimetres": 0.01, "metres": 1.0, "kilometres": 1000.0}
+# Two copies of a photograph, stored with losses: least common share of their masks, and mean
+# difference of levels of 255 within them.
+_SAME_MASK = 0.98
+_SAME_LEVELS = 2.0
+
+
+@dataclass(frozen=True)
+class StoredView:
+    """One photograph at a small size, its camera as stored, and what the camera's numbers mean."""
+
+    name: str
+    camera: StoredCamera
+    pixels: Pixels
+    mask: np.ndarray
+    convention: Convention
+    turned: StoredCamera  #: the camera, where the photograph's EXIF turn is read the other way
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A meaning of a calibration, and how well masks and cameras agree with it."""
+
+    says: str
+    option: str  #: of the command line, for this meaning; empty: none
+    views: tuple[StoredView, ...]
+    blames: tuple[str, ...] = ()  #: the cameras that are wrong by it; empty: all, or none
+    #: of each mask, in the hull of the others; all 0 where no camera can have this meaning
+    shares: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def score(self) -> float:
+        """The agreement of the worst view."""
+        return min(self.shares.values())
+
+    def photographs(self, folder: CaptureFolder) -> list[Photograph]:
+        """The small photographs, upright and without lens distortion, with cameras of this meaning.
+
+        Args:
+            folder: where the views come from.
+
+        Raises:
+            InputError: a photograph has another aspect ratio than its calibration.
+        """
+        photographs = []
+        for view in self.views:
+            matte = view.mask * np.uint8(255)
+            upright = folder.photograph(view.name, view.camera, view.pixels, matte, view.convention)
+            photographs.append(upright)
+        return photographs
+
+    def scored(self, folder: CaptureFolder) -> "Hypothesis":
+        """Measure the :attr:`shares`.
+
+        Args:
+            folder: where the views come from.
+        """
+        try:
+            shares = HullSearch().shares(_silhouettes(self.photographs(folder)))
+        except (InputError, np.linalg.LinAlgError):
+            shares = [0.0] * len(self.views)
+        return replace(self, shares={v.name: share for v, share in zip(self.views, shares, strict=True)})
 
 
 @dataclass(frozen=True)
@@ -45,9 +102,7 @@ class Diagnosis:
 
     consistent: bool
     lines: tuple[str, ...]
-    option: str  #: of the command line, for the best meaning; empty: none
-    ranking: tuple[Hypothesis, ...]  #: all meanings that were tried, the best first
-    size: float  #: the subject's largest extent in the user's unit, by the best meaning
+    best: Hypothesis  #: of all meanings that were tried
     #: views that disagree with the others; a few may also if consistent
     suspects: tuple[str, ...] = ()
 
@@ -63,46 +118,38 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
         instant: one of ``folder.instants``; None: the first.
 
     Returns:
-        Whether cameras and masks agree, with what was found and the meanings that were tried.
+        Whether cameras and masks agree, with what was found.
 
     Raises:
         InputError: a file cannot be read.
     """
     views = small_views(folder, folder.instants[0] if instant is None else instant)
-    given = Hypothesis("the calibration is right as it is", "", views).ranked(folder)
+    given = Hypothesis("the calibration is right as it is", "", views).scored(folder)
     same = twins({view.name: view.camera.pose for view in views})
+    if same is None and given.score > 0:
+        same = copies(given.photographs(folder))
     if same is not None:
-        line = f"{' and '.join(same)} have the same pose: one of them is a copy"
-        return Diagnosis(False, (line,), "", (given,), given.size(folder), same)
-    photographs = given.photographs(folder) if given.score > 0 else []
-    same = copies(photographs)
-    if same is not None:
-        line = f"{' and '.join(same)} are the same photograph: one of them is a copy"
-        return Diagnosis(False, (line,), "", (given,), given.size(folder), same)
+        line = f"{' and '.join(same)} have the same pose, or are the same photograph: one of them is a copy"
+        return Diagnosis(False, (line,), given, same)
     if given.score >= AGREES:
-        size = given.size(folder)
         agree = f"{given.score:.0%} of each mask or more lies in the hull of the others"
-        lines = [f"cameras and masks agree ({agree})", _size_line(size)]
-        for other in (hypothesis.ranked(folder) for hypothesis in for_turned(views)):
-            if other.score > given.score + _SAME:
-                lines.append(f"{other.option} agrees better, by {other.score:.0%}")
-        suspects, *suspicion = _suspected(given, folder) if given.score < _SOUND else ((),)
-        lines += [*suspicion, *placement_lines(photographs, [view.camera.pose for view in views])]
-        return Diagnosis(True, tuple(lines), "", (given,), size, suspects)
-    tried = [given, *(hypothesis.ranked(folder) for hypothesis in for_all(views))]
-    best = max(tried, key=lambda hypothesis: hypothesis.score)
+        lines = [f"cameras and masks agree ({agree})", _size_line(given, folder)]
+        suspects, line = _suspects(given, folder) if given.score < _SOUND else ((), "")
+        return Diagnosis(True, (*lines, line) if suspects else tuple(lines), given, suspects)
+    tried = [given, *(hypothesis.scored(folder) for hypothesis in _for_all(views))]
+    base = best = max(tried, key=lambda hypothesis: hypothesis.score)
+    if best.score <= given.score + BETTER:
+        base = given
     if best.score < AGREES:
         # A single wrong camera is sought with the best meaning for all.
-        base = best if best.score > given.score + BETTER else given
-        tried += [hypothesis.ranked(folder) for hypothesis in for_some(base.views)]
+        tried += [hypothesis.scored(folder) for hypothesis in _for_some(base.views)]
         best = max(tried, key=lambda hypothesis: hypothesis.score)
-    tried.sort(key=lambda hypothesis: -hypothesis.score)
-    if best.score >= max(AGREES, given.score + BETTER):
-        size = best.size(folder)
-        lines = [f"{best.says}: masks agree by {best.score:.0%} instead of {given.score:.0%}"]
-        lines += [f"try {best.option}"] if best.option else []
-        return Diagnosis(False, (*lines, _size_line(size)), best.option, tuple(tried), size, best.blames)
-    return _unexplained(folder, given, tried)
+    if best.score < max(AGREES, given.score + BETTER):
+        suspects, line = _suspects(base, folder)
+        return Diagnosis(False, (line,), best, suspects)
+    line = f"{best.says}: masks agree by {best.score:.0%} instead of {given.score:.0%}"
+    lines = [line, f"try {best.option}"] if best.option else [line]
+    return Diagnosis(False, (*lines, _size_line(best, folder)), best, best.blames)
 
 
 def small_views(folder: CaptureFolder, instant: str) -> tuple[StoredView, ...]:
@@ -154,87 +201,69 @@ def in_parts(views: Sequence[StoredView]) -> list[str]:
     return names
 
 
-def _size_line(size: float) -> str:
+def copies(photographs: Sequence[Photograph]) -> tuple[str, str] | None:
+    """Find two photographs that are the same picture, also if stored with losses.
+
+    Args:
+        photographs: of one instant, with their mattes.
+
+    Returns:
+        Their names; None: there are none.
+    """
+    for one, other in itertools.combinations(photographs, 2):
+        if one.image.shape != other.image.shape:
+            continue
+        both = one.mask & other.mask
+        either = one.mask | other.mask
+        differences = np.abs(one.image.astype(np.int16) - other.image)[both]
+        if both.sum() > _SAME_MASK * either.sum() and differences.mean() < _SAME_LEVELS:
+            return one.name, other.name
+    return None
+
+
+def _silhouettes(photographs: Sequence[Photograph]) -> list[Silhouette]:
+    return [Silhouette(p.mask, p.intrinsics, p.extrinsics) for p in photographs]
+
+
+def _size_line(hypothesis: Hypothesis, folder: CaptureFolder) -> str:
+    """The subject's largest extent in the user's unit, and the option that makes it metres."""
+    silhouettes = _silhouettes(hypothesis.photographs(folder))
+    focus, _ = subject_sphere(silhouettes)
+    size = float(np.median([silhouette.extent(focus).max() for silhouette in silhouettes]))
     if PERSON[0] <= size <= PERSON[1]:
         return f"the subject is {size:.3g} units tall: a person in metres"
-    unit = next((n for n, u in _UNITS.items() if PERSON[0] <= size * u <= PERSON[1]), None)
-    if unit is None:
-        return f"the subject is {size:.3g} units tall; it is scaled to a person's size inside, and back"
-    option = f"calibration.unit={_UNITS[unit]:g}"
-    return f"the subject is {size:.4g} units tall, a person in {unit}: {option} makes it metres"
+    for name, metres in _UNITS.items():
+        if PERSON[0] <= size * metres <= PERSON[1]:
+            option = f"calibration.unit={metres:g}"
+            return f"the subject is {size:.4g} units tall, a person in {name}: {option} makes it metres"
+    return f"the subject is {size:.3g} units tall; it is scaled to a person's size inside, and back"
 
 
-def _unexplained(folder: CaptureFolder, given: Hypothesis, tried: list[Hypothesis]) -> Diagnosis:
-    """The diagnosis where no meaning fits: the view without which the others agree,
-    if there is one."""
-    base = max((h for h in tried if not h.blames), key=lambda h: h.score)
-    base = base if base.score > given.score + BETTER else given
-    suspects, *lines = _suspected(base, folder)
-    shares = ", ".join(f"{name} {share:.0%}" for name, share in base.shares.items())
-    if not suspects:
-        lines = [f"masks and cameras disagree (share of each mask in the hull of the others: {shares})"]
-    return Diagnosis(False, tuple(lines), "", tuple(tried), base.size(folder), suspects)
-
-
-def _suspected(hypothesis: Hypothesis, folder: CaptureFolder) -> tuple[Any, ...]:
-    """The views that explain by themselves most of the disagreement, and a line about them;
-    () if none does.
+def _suspects(hypothesis: Hypothesis, folder: CaptureFolder) -> tuple[tuple[str, ...], str]:
+    """The views that explain by themselves most of the disagreement, and a line about it.
 
     A mask that lacks a part lies in the hull of the others, and theirs do not lie in that with it:
     what is compared are the others with and without it."""
     least = max(AGREES, 1 - (1 - hypothesis.score) * _REST)
-    without = {}
+    fitting = {}
     for left_out in hypothesis.views if len(hypothesis.views) > 2 else ():
         rest = tuple(view for view in hypothesis.views if view is not left_out)
-        without[left_out.name] = replace(hypothesis, views=rest).ranked(folder)
-    fitting = {name: others.score for name, others in without.items() if others.score >= least}
+        score = replace(hypothesis, views=rest).scored(folder).score
+        if score >= least:
+            fitting[left_out.name] = score
     readings = {name: _reading(hypothesis, name) for name in fitting}
     if len(hypothesis.views) == 3 and any(readings.values()):  # two views alone agree nearly always
-        fitting = {name: share for name, share in fitting.items() if readings[name]}
+        fitting = {name: score for name, score in fitting.items() if readings[name]}
     if not fitting:
-        return ((),)
+        shares = ", ".join(f"{name} {share:.0%}" for name, share in hypothesis.shares.items())
+        return (), f"masks and cameras disagree (share of each mask in the hull of the others: {shares})"
     best = max(fitting.values())
-    names = tuple(name for name, share in fitting.items() if share >= best - _SAME)
-    line = f"{' or '.join(names)} disagrees with the others, which agree by {best:.0%} without it"
-    if len(names) == 1:
-        return names, f"{line} and by {hypothesis.score:.0%} with it{readings[names[0]]}"
-    if len(names) == 2 and len(hypothesis.views) > 3:
-        names = tuple(sorted(names, key=_edges(hypothesis, names, folder).__getitem__))
-        return names, f"{line}: rather {names[0]}, by the edges of the photographs (silhouettes cannot tell)"
-    return names, f"{line} (silhouettes cannot tell for sure)"
-
-
-def _edges(hypothesis: Hypothesis, names: tuple[str, str], folder: CaptureFolder) -> dict[str, float]:
-    """Contrast of two photographs, of which one's mask has a part that the other's lacks, at that
-    part of the mask's outline, compared with the rest of it: the wrong mask's outline follows no
-    edge there."""
-    from scipy import ndimage  # here: it takes time to import
-
-    photographs = hypothesis.photographs(folder)
-    silhouettes = [Silhouette(p.mask, p.intrinsics, p.extrinsics) for p in photographs]
-    more = min(names, key=hypothesis.shares.__getitem__)
-    sphere = subject_sphere(silhouettes)
-    edges = {}
-    for place, view in enumerate(hypothesis.views):
-        if view.name not in names:
-            continue
-        one = silhouettes[place]
-        others = silhouettes[:place] + silhouettes[place + 1 :]
-        close = ndimage.binary_dilation(one.mask, iterations=_BESIDE)
-        around = ndimage.binary_dilation(one.mask, iterations=2 * _BESIDE)
-        cells = np.argwhere(one.mask if view.name == more else around & ~close)
-        meets = HullSearch().meets(one, cells[:, ::-1] + 0.5, others, *sphere)
-        part = np.zeros_like(one.mask)
-        part[tuple(cells[meets != (view.name == more)].T)] = True
-        near = ndimage.binary_dilation(part, iterations=2 * _BESIDE)
-        outline = outline_of(one.mask)
-        gradient = gradient_of(photographs[place].image)
-        here = gradient[outline & near]
-        elsewhere = gradient[outline & ~near]
-        edges[view.name] = (
-            here.sum() / max(len(here), 1) / max(elsewhere.sum() / max(len(elsewhere), 1), 1e-6)
-        )
-    return edges
+    names = tuple(name for name, score in fitting.items() if score >= best - _SAME)
+    line = (
+        f"{' or '.join(names)} disagrees with the others, which agree by {best:.0%} without it"
+        f" and by {hypothesis.score:.0%} with it"
+    )
+    return names, line + (readings[names[0]] if len(names) == 1 else "")
 
 
 def _reading(hypothesis: Hypothesis, name: str) -> str:
@@ -247,3 +276,82 @@ def _reading(hypothesis: Hypothesis, name: str) -> str:
     if others <= _REST * own:
         return ": its mask has a part that theirs lack, or its focal length is too short"
     return ""
+
+
+def _for_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
+    """Other meanings of all cameras: what poses map, axes, unit of the intrinsics, a resize, and
+    EXIF turns."""
+    given = views[0].convention
+    readings = [views]
+    if any(view.pixels.turns for view in views):
+        convention = replace(given, exif="shown" if given.exif == "stored" else "stored")
+        turned = (replace(view, camera=view.turned, convention=convention) for view in views)
+        readings.append(tuple(turned))
+    points = [view.camera.intrinsics[:2, 2] / np.array(view.camera.size)[::-1] for view in views]
+    scale = 0.5 / max(float(np.median(points)), 0.01)  # brings principal points to the middle
+    likely = min(_RESIZES, key=lambda resize: abs(np.log(resize / scale)))
+    meanings = itertools.product(readings, INTRINSICS, (given.resized, likely), EXTRINSICS, AXES)
+    for read, intrinsics, resized, extrinsics, axes in meanings:
+        numbers = {"intrinsics": intrinsics, "resized": resized, "extrinsics": extrinsics, "axes": axes}
+        convention = replace(read[0].convention, **numbers)
+        changed = tuple(replace(view, convention=convention) for view in read)
+        if convention == given or not all(map(_is_plausible, changed)):
+            continue
+        said = []
+        for key, value in vars(convention).items():
+            if value != getattr(given, key):
+                said.append(f"{key}={value if isinstance(value, str) else f'{value:.4g}'}")
+        option = " ".join(f"calibration.{each}" for each in said)
+        yield Hypothesis(f"all cameras: {', '.join(said)}", option, changed)
+
+
+def _is_plausible(view: StoredView) -> bool:
+    """Whether the principal point of a view lies in the middle part of its photograph
+    (``_MIDDLE``)."""
+    share = view.camera.intrinsics[:2, 2] * view.convention.resized
+    if view.convention.intrinsics == "pixels":
+        share = share / np.array(view.camera.size)[::-1]
+    return bool(((share >= _MIDDLE[0]) & (share <= _MIDDLE[1])).all())
+
+
+def _for_some(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
+    """Mistakes of one camera, and cameras (or masks, which look alike) that are exchanged."""
+    for i, view in enumerate(views):
+        for says, changed in _mistakes(view):
+            mended = (*views[:i], changed, *views[i + 1 :])
+            yield Hypothesis(f"{view.name} alone: {says}", "", mended, (view.name,))
+    orders = [views[1:] + views[:1], views[-1:] + views[:-1]] if len(views) > 2 else []
+    for i, j in itertools.combinations(range(len(views)), 2):
+        order = list(views)
+        order[i], order[j] = views[j], views[i]
+        orders.append(order)
+    for order in orders:
+        pairs = [(view, other) for view, other in zip(views, order, strict=True) if view is not other]
+        names = ", ".join(f"{view.name}: {other.name}" for view, other in pairs)
+        changed = (replace(view, camera=other.camera) for view, other in zip(views, order, strict=True))
+        says = f"cameras or masks of {' and '.join(view.name for view, _ in pairs)} are exchanged"
+        blames = tuple(view.name for view, _ in pairs)
+        yield Hypothesis(says, f"'calibration.names={{{names}}}'", tuple(changed), blames)
+
+
+def _mistakes(view: StoredView) -> Iterator[tuple[str, StoredView]]:
+    """Usual mistakes of a single camera in words, each with the view after mending it."""
+    given = view.convention
+    for extrinsics, axes in itertools.product(EXTRINSICS, AXES):
+        convention = replace(given, extrinsics=extrinsics, axes=axes)
+        if convention != given:
+            yield f"its extrinsics are {extrinsics} with axes of {axes}", replace(view, convention=convention)
+    camera = view.camera
+    for factor, says in ((0.001, "long"), (1000.0, "short")):
+        pose = camera.pose * [[1.0, 1.0, 1.0, factor]]
+        pose[3] = camera.pose[3]
+        yield f"its translation is 1000 times too {says}", replace(view, camera=replace(camera, pose=pose))
+    middle = camera.intrinsics.copy()
+    sides = np.array(camera.size)[::-1] if given.intrinsics == "pixels" else 1.0
+    middle[:2, 2] = sides / 2 / given.resized
+    lenses = {"its principal point should be near the middle": middle}
+    for factor in (0.5, 2.0):
+        says = f"its intrinsics are for photographs {1 / factor:g} times as large"
+        lenses[says] = camera.intrinsics * [[factor], [factor], [1.0]]
+    for says, intrinsics in lenses.items():
+        yield says, replace(view, camera=replace(camera, intrinsics=intrinsics))

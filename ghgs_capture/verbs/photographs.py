@@ -94,7 +94,7 @@ def check_cameras(folder: CaptureFolder) -> None:
     if not diagnoses:
         print("cameras are not checked: none of the instants looked at can be read", flush=True)
     for name, diagnosis in diagnoses.items():
-        parts = in_parts(diagnosis.ranking[0].views)
+        parts = in_parts(diagnosis.best.views)
         if len(parts) > 1:
             print(f"instant {name}: masks of {', '.join(parts)} have two large parts, taken for one subject")
         if not diagnosis.consistent and last:
@@ -103,7 +103,7 @@ def check_cameras(folder: CaptureFolder) -> None:
     for diagnosis in (sound or list(diagnoses.values()))[:1]:
         if not diagnosis.consistent:
             raise InputError(
-                "cameras: expected cameras that fit photographs and masks (ghgs doctor draws them,"
-                f" check_cameras=false goes on anyway); found {'; '.join(diagnosis.lines)}"
+                "cameras: expected cameras that fit photographs and masks"
+                f" (check_cameras=false goes on anyway); found {'; '.join(diagnosis.lines)}"
             )
         print("\n".join(diagnosis.lines), flush=True)

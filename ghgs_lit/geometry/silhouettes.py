@@ -150,23 +150,6 @@ class HullSearch:
         return (outside <= allowed).any(1)
 
 
-def hull_in_view(silhouettes: Sequence[Silhouette], index: int) -> np.ndarray:
-    """Cells of one silhouette that show the visual hull of the others.
-
-    Args:
-        silhouettes: of one subject at one instant.
-        index: number of the one.
-
-    Returns:
-        Bools [h, w].
-    """
-    one = silhouettes[index]
-    rows, columns = np.indices(one.mask.shape)
-    cells = np.stack((columns.ravel(), rows.ravel()), -1) + 0.5
-    others = [other for other in silhouettes if other is not one]
-    return HullSearch().meets(one, cells, others, *subject_sphere(silhouettes)).reshape(one.mask.shape)
-
-
 def subject_sphere(silhouettes: Sequence[Silhouette]) -> tuple[np.ndarray, float]:
     """Where the subject of silhouettes is, and how large.
 

@@ -145,8 +145,8 @@ def test_cameras_that_are_exchanged_half_way(place, capsys):
     assert "cameras and masks agree" in out
     wrong = [line for line in out.splitlines() if "masks do not fit" in line]
     assert [line.split()[1] for line in wrong] == ["000003:"]
-    assert all("cam0 and cam1 are exchanged" in line for line in wrong)
-    with pytest.raises(InputError, match="cam0 and cam1 are exchanged"):
+    assert all("of cam0 and cam1 are exchanged" in line for line in wrong)
+    with pytest.raises(InputError, match="of cam0 and cam1 are exchanged"):
         check_cameras(opened(place, sequence={"start": 4}))
 
 

@@ -111,10 +111,3 @@ def test_predict_leaves_what_it_is_told_to_leave(here, capsys):
     assert "gamma" not in capsys.readouterr().out
     with open("splats/report.json") as file:
         assert "tones" not in json.load(file)
-
-
-def test_the_doctor_says_it(here, capsys):
-    assert ghgs("doctor", "task=cameras", "images=images", here[0], "hydra.run.dir=found") == 0
-    said = capsys.readouterr().out
-    assert "photograph cam2 has a gamma of about 0.8" in said
-    assert said.count(" of its own, which ghgs predict undoes\n") == 1
