@@ -24,7 +24,7 @@ from ghgs_lit.method.bounds import SubjectBox, VisualHull
 from ghgs_lit.method.heads.attributes import FootprintAttributes, release_attributes
 from ghgs_lit.method.heads.depth import BOUNDED, bounded_depth, inverse_linear
 from ghgs_lit.method.plan.window import Span, Window
-from ghgs_lit.method.recalibration import SemanticAttention
+from ghgs_lit.method.recalibration import Neighborhood, SemanticAttention
 from ghgs_lit.ops.activation import confidence_of
 from ghgs_lit.ops.photo_consistency import photo_consistency
 from ghgs_lit.types import DepthBounds, DepthMaps
@@ -108,8 +108,8 @@ def test_the_gradient_of_attention_is_that_of_finite_differences(similarity):
     torch.manual_seed(0)
     block = SemanticAttention(16, 2, similarity).double()
     index = torch.stack([torch.randperm(6)[:3] for _ in range(6)])
-    cosines = None if similarity == "none" else [values(6, 3, low=0.1).detach()]
-    assert gradcheck(lambda x: block(x, [index], cosines), (values(6, 16),), fast_mode=True)
+    cosines = None if similarity == "none" else values(6, 3, low=0.1).detach()
+    assert gradcheck(lambda x: block(x, Neighborhood(index, cosines)), (values(6, 16),), fast_mode=True)
 
 
 @pytest.mark.parametrize("name", ["render_l1", "render_ssim", "chamfer", "depth"])

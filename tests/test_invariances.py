@@ -5,11 +5,11 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from ghgs_lit.method.recalibration import SemanticAttention, nearest_neighbors
-from ghgs_lit.method.recalibration.recalibration import neighbor_cosines
+from ghgs_lit.method.recalibration import Neighborhood, SemanticAttention
 from ghgs_lit.metrics.functional import ssim
 from ghgs_lit.ops.attention import cpu
 from ghgs_lit.ops.compile import processor_features
+from ghgs_lit.ops.neighbors import nearest_neighbors, neighbor_cosines
 from ghgs_lit.ops.photo_consistency import photo_consistency
 from ghgs_lit.types import DepthBounds
 from tests.helpers.literal_recalibration import literal_recalibration
@@ -57,7 +57,7 @@ def recalibration(g):
     @torch.no_grad()
     def ours(dtype):
         with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
-            return block(x, [near], [neighbor_cosines(semantic, near)])
+            return block(x, Neighborhood(near, neighbor_cosines(semantic, near)))
 
     @torch.no_grad()
     def plain(dtype):

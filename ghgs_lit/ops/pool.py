@@ -37,6 +37,29 @@ def even_parts(count: int, most: int) -> list[slice]:
     return [slice(count * i // parts, count * (i + 1) // parts) for i in range(parts)]
 
 
+def in_parts(function: Callable[[slice], Tensor], count: int, most: int) -> Tensor:
+    """A function of all rows, computed for a part of them at a time.
+
+    Args:
+        function: rows to values [..., m, c].
+        count: number of all rows.
+        most: of rows in a part; with a gradient all.
+
+    Returns:
+        Values [..., count, c].
+    """
+    parts = even_parts(count, most)
+    if len(parts) == 1:
+        return function(slice(None))
+    result = None
+    for rows in parts:
+        part = function(rows)
+        if result is None:  # filled, since small results between freed parts would fragment the memory
+            result = part.new_empty(*part.shape[:-2], count, part.shape[-1])
+        result[..., rows, :] = part
+    return result
+
+
 # Splats or entries that justify one more thread: about a millisecond of work.
 GRAIN = 8192
 

@@ -7,7 +7,7 @@ import torch
 
 from ghgs_lit.evaluation.measure import Estimate, ModelMethod, measure, not_finite
 from ghgs_lit.execution import Predictor
-from ghgs_lit.method.recalibration import inspection
+from ghgs_lit.method.recalibration import Recalibration
 from ghgs_lit.metrics import MetricsOptions, psnr
 from ghgs_lit.rendering import render
 from ghgs_lit.runs.provenance import config_hash
@@ -131,16 +131,20 @@ def test_seconds_are_those_of_a_subject(monkeypatch):
 def test_what_is_timed_searches_no_neighbors_of_the_other_setting(monkeypatch):
     """Seconds of a prediction are its own; the share of neighbours that an ablation keeps
     comes later."""
-    searched, search = [], inspection.nearest_neighbors
-    monkeypatch.setattr(inspection, "nearest_neighbors", lambda *args: searched.append(1) or search(*args))
+    searched, positions = [], Recalibration.positions
+    monkeypatch.setattr(
+        Recalibration,
+        "positions",
+        lambda stage, *args: searched.append(stage.neighborhood) or positions(stage, *args),
+    )
     batch = make_batch(1, 3)
     own = Targets(batch.images[:, :1], batch.masks[:, :1], batch.cameras[:, :1], (("a",),), ("midway",))
     batch = dataclasses.replace(batch, targets=own, subjects=("p0",))
     method = ModelMethod(Predictor(make_model("model=paper").eval()), render)
     with torch.no_grad():
         method(batch)
-    assert not searched
+    assert searched == ["xyz"]
     (row,) = measure(method, "model", [batch], OFF)
-    assert len(searched) == 2
+    assert searched[1:] == ["xyz", "xyz", "image_plane"]
     assert row["neighbors"] <= row["tokens"]
     assert 0 < row["shared_neighbors"] <= 1

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghgs_lit.extents import bucket_size, true_places
@@ -96,6 +96,37 @@ class Rows:
             return self
         counts = tuple(int(part.sum()) for part in stays.split(self.counts))
         return dataclasses.replace(self, index=self.index[stays], counts=counts)
+
+    @property
+    def tables(self) -> list[tuple[Int[Tensor, "*g n"], Bool[Tensor, "*g n"] | None]]:
+        """Indices in tables of equally many rows, and which of these count: one table for each group,
+        or one for all of filled rows."""
+        if self.real is None:
+            return [(part, None) for part in self.index.split(self.counts)]
+        shape = (len(self.counts), self.counts[0])
+        return [(self.index.view(shape), self.real.view(shape))]
+
+    def take(self, values: Float[Tensor, "t _"]) -> Float[Tensor, "n _"]:
+        """The values of the rows among those of all pixels or tokens."""
+        is_whole = self.real is None and len(self.index) == len(values)
+        return values if is_whole else values[self.index]
+
+    def put(
+        self, values: Sequence[Float[Tensor, "t _"]], new: Sequence[Float[Tensor, "n _"]]
+    ) -> tuple[Float[Tensor, "t _"], ...]:
+        """Tensors of all pixels or tokens with new values in the rows that count.
+
+        Args:
+            values: of all pixels or tokens.
+            new: of the rows.
+        """
+        if self.real is not None:
+            belongs, number = self.places(len(values[0]))
+            pairs = zip(values, new, strict=True)
+            return tuple(torch.where(belongs[:, None], y.index_select(0, number), x) for x, y in pairs)
+        if len(self.index) == len(values[0]):
+            return tuple(new)
+        return tuple(x.index_copy(0, self.index, y) for x, y in zip(values, new, strict=True))
 
     def places(self, total: int) -> tuple[Bool[Tensor, " t"], Int[Tensor, " t"]]:
         """Where pixels or tokens are among the rows.

@@ -1,7 +1,10 @@
 """The recalibration stage: attention across views between tokens that are close in space."""
 
-from ghgs_lit.method.recalibration.attention import SemanticAttention
-from ghgs_lit.method.recalibration.neighbors import nearest_neighbors
-from ghgs_lit.method.recalibration.recalibration import Recalibration, RecalibrationOptions
+from ghgs_lit.method.recalibration.recalibration import (
+    Neighborhood,
+    Recalibration,
+    RecalibrationOptions,
+    SemanticAttention,
+)
 
-__all__ = ["Recalibration", "RecalibrationOptions", "SemanticAttention", "nearest_neighbors"]
+__all__ = ["Neighborhood", "Recalibration", "RecalibrationOptions", "SemanticAttention"]

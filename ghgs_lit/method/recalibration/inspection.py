@@ -9,8 +9,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from ghgs_lit.method.recalibration.neighbors import nearest_neighbors
-from ghgs_lit.method.recalibration.recalibration import Recalibration, neighbor_cosines, neighbor_count
+from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.method.recalibration.recalibration import Recalibration
+from ghgs_lit.ops.neighbors import neighbor_weights
 from ghgs_lit.types import Points, Tokens
 
 
@@ -82,29 +83,8 @@ def attention_on_other_parts(
     return torch.cat(shares)
 
 
-def _near(
-    recalibration: Recalibration, tokens: Tokens, points: Points, chosen: Int[Tensor, " n"]
-) -> Int[Tensor, "n k"]:
-    """Neighbours of some tokens of an element.
-
-    Args:
-        recalibration: the stage.
-        tokens: inputs of the stage, as is the next.
-        points: of these tokens.
-        chosen: indices of the n packed tokens.
-
-    Returns:
-        Indices among the chosen ones [n, k].
-    """
-    places = recalibration.places(tokens)
-    positions = recalibration.positions(tokens, points)
-    places = None if places is None else places[chosen]
-    k = neighbor_count(recalibration.k, len(chosen))
-    return nearest_neighbors(positions[chosen], tokens.image[chosen], k, places, tokens.grid[1])
-
-
 @dataclass(frozen=True)
-class Neighborhood:
+class Overlap:
     """Whom the tokens of an element attend to. ``tokens``: that take part. ``neighbors``: of each,
     itself included. ``shared``: share of the neighbours that stay the same in the other setting of
     ``recalibration.neighborhood``; with nearly all tokens as neighbours that is nearly 1, and the
@@ -116,7 +96,7 @@ class Neighborhood:
 
 
 @torch.no_grad()
-def neighborhoods(recalibration: Recalibration, tokens: Tokens, points: Points) -> list[Neighborhood]:
+def neighborhoods(recalibration: Recalibration, tokens: Tokens, points: Points) -> list[Overlap]:
     """The neighbourhood of each element.
 
     Args:
@@ -129,15 +109,16 @@ def neighborhoods(recalibration: Recalibration, tokens: Tokens, points: Points) 
     """
     other = copy.copy(recalibration)
     other.neighborhood = "image_plane" if recalibration.neighborhood == "xyz" else "xyz"
+    pair = (recalibration, other)
     takes_part = recalibration.takes_part(points)
     element = tokens.image // tokens.grid[1]
     results = []
     for number in range(tokens.grid[0]):
         chosen = (takes_part & (element == number)).nonzero()[:, 0]
-        near, changed = (_near(stage, tokens, points, chosen) for stage in (recalibration, other))
+        near, changed = (stage.neighborhood_of(tokens, points, chosen).near for stage in pair)
         is_near = near.new_zeros(len(chosen), len(chosen), dtype=torch.bool).scatter_(1, near, True)
         shared = is_near.gather(1, changed).float().mean().item() if len(chosen) else 1.0
-        results.append(Neighborhood(len(chosen), near.shape[1], shared))
+        results.append(Overlap(len(chosen), near.shape[1], shared))
     return results
 
 
@@ -189,9 +170,13 @@ def _weights(
     Returns:
         Neighbours of all chosen ones, as indices among them [n, k], and weights [L, m, k, a].
     """
-    near = _near(recalibration, tokens, points, chosen)
+    near, cosines, *_ = recalibration.neighborhood_of(tokens, points, chosen)
     block = recalibration.block
-    plain |= block.similarity == "none"
-    cosines = None if plain else neighbor_cosines(tokens.semantic[chosen], near)
-    each = [block.attention_weights(layer[chosen], rows, near, cosines) for layer in tokens.latent]
+    changes = [values if values is None else values[rows] for values in block.factor_and_bias(cosines)]
+    each = []
+    for layer in tokens.latent:
+        normed = block.norm1(layer[chosen])
+        q = at_least_float32(block.q_proj(normed[rows]))
+        keys = at_least_float32(block.k_proj(normed))[near[rows]]
+        each.append(neighbor_weights(q, keys, block.num_heads, *([None, None] if plain else changes)))
     return near, torch.stack(each)

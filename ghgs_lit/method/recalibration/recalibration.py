@@ -1,7 +1,7 @@
 """Recalibration of latent embeddings by multi-view semantic consistency (paper, section 3.3)."""
 
 import dataclasses
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -9,20 +9,23 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from ghgs_lit.config.options import Count, Options, Width
+from ghgs_lit.errors import require
 from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.geometry.rotations import unit
 from ghgs_lit.method.plan import Plan
-from ghgs_lit.method.plan.rows import Rows
-from ghgs_lit.method.recalibration.attention import SemanticAttention, Similarity
-from ghgs_lit.method.recalibration.neighbors import nearest_neighbors
-from ghgs_lit.ops.linear import linear
-from ghgs_lit.ops.pool import at_once, even_parts
+from ghgs_lit.ops.linear import Linear
+from ghgs_lit.ops.neighbors import attend_to_neighbors, nearest_neighbors, neighbor_cosines
+from ghgs_lit.ops.pool import in_parts
 from ghgs_lit.types import DecodedPixels, Points, Tokens
 
-#: Cosines in memory at once.
-_COSINES = 1 << 21  # on a CPU
-_GPU_COSINES = 1 << 25
+#: How the similarity of two tokens changes their logit; see :class:`SemanticAttention`.
+Similarity = Literal["product", "product_clamped", "log", "none"]
+
+#: The smallest similarity with ``log``, as its logarithm would be infinite at 0.
+S_MIN = 0.01
+
+#: Tokens computed at once on a CPU without a gradient.
+_ROWS = 424
 
 
 class RecalibrationOptions(Options):
@@ -55,13 +58,7 @@ class RecalibrationOptions(Options):
         return self
 
     def build(self, dim_latent: int) -> "Recalibration":
-        """The stage.
-
-        Args:
-            dim_latent: width of the tokens.
-
-        Returns:
-            The stage with new weights.
+        """The stage with new weights for tokens of width ``dim_latent``.
 
         Raises:
             InputError: as :class:`SemanticAttention`.
@@ -69,9 +66,122 @@ class RecalibrationOptions(Options):
         return Recalibration(self, dim_latent)
 
 
+class Neighborhood(NamedTuple):
+    """Whom n tokens attend to.
+
+    Attributes:
+        near: their neighbours, as indices among them.
+        cosines: of their semantic features and the neighbours'; None: similarity is ignored (s = 1).
+        left_out: -inf where a neighbour does not count, else 0; None: all count.
+        places: of the tokens, in units of the subject; None: values know none.
+    """
+
+    near: Int[Tensor, "n k"]
+    cosines: Float[Tensor, "n k"] | None = None
+    left_out: Float[Tensor, "n k"] | None = None
+    places: Float[Tensor, "n 3"] | None = None
+
+
+class SemanticAttention(nn.Module):
+    """``x + o(softmax(q . k / sqrt(d) * s) v)``, then a residual MLP; parameters are named as published.
+
+    Args:
+        dim: width C of the tokens; queries, keys and values have C / 4 channels.
+        num_heads: number of heads, each with C / 4 / num_heads channels.
+        similarity: effect of the cosine s of two tokens' semantic features on the logit:
+            ``product`` multiplies by s (Eq. 3), ``product_clamped`` by max(s, 0) (the authors'
+            release), ``log`` adds log(max(s, S_MIN)), which lowers the weight of dissimilar
+            neighbours instead of pulling their logit to 0, ``none`` ignores it (s = 1).
+        has_places: whether the value of a neighbour also says where it lies from the query,
+            by a linear map of the difference of their places that starts at 0 (not the
+            paper's). By linearity that is the map of a head's mean place minus the query's:
+            no tensor of all pairs.
+
+    Raises:
+        InputError: the heads do not divide C / 4."""
+
+    def __init__(
+        self, dim: int, num_heads: int = 8, similarity: Similarity = "product", has_places: bool = False
+    ):
+        super().__init__()
+        expected = f"heads that divide a quarter of the token width ({dim} / 4)"
+        require(dim % (4 * num_heads) == 0, "recalibration.num_heads", expected, num_heads)
+        self.num_heads = num_heads
+        self.similarity = similarity
+        inner = dim // 4
+        self.norm1 = nn.LayerNorm(dim)
+        self.q_proj = Linear(dim, inner)
+        self.k_proj = Linear(dim, inner)
+        self.v_proj = Linear(dim, inner)
+        self.o_proj = Linear(inner, dim)
+        self.norm2 = nn.LayerNorm(dim)
+        self.mlp = nn.Sequential(Linear(dim, dim), nn.GELU(), Linear(dim, dim))
+        self.place_proj = None
+        if has_places:
+            self.place_proj = nn.Linear(3, inner, bias=False)
+            nn.init.zeros_(self.place_proj.weight)
+
+    def forward(self, x: Float[Tensor, "n C"], neighborhood: Neighborhood) -> Float[Tensor, "n C"]:
+        """Recalibrated tokens (Eqs. 3 and 5): keys and values of all first, then the tokens in parts.
+
+        Args:
+            x: the tokens of an element, or of several.
+            neighborhood: of these tokens.
+        """
+        near, cosines, left_out, places = neighborhood
+        factor, bias = self.factor_and_bias(cosines)
+        if left_out is not None:
+            bias = left_out if bias is None else bias + left_out
+        is_whole = torch.is_grad_enabled() or x.device.type != "cpu"
+        most = max(len(x), 1) if is_whole else _ROWS
+
+        def keys_values(rows: slice) -> Float[Tensor, "m kv"]:
+            normed = self.norm1(x[rows])
+            return at_least_float32(torch.cat((self.k_proj(normed), self.v_proj(normed)), dim=-1))
+
+        k, v = in_parts(keys_values, len(x), most).chunk(2, dim=-1)
+        if places is not None:
+            places = places.to(v.dtype)
+            v = self._with_places(v, places)
+
+        def recalibrate(rows: slice) -> Float[Tensor, "m C"]:
+            q = at_least_float32(self.q_proj(self.norm1(x[rows])))
+            changes = (None if values is None else values[rows] for values in (factor, bias))
+            y = attend_to_neighbors(q, k, v, near[rows], self.num_heads, *changes)
+            if places is not None:
+                y = self._moved(y, places[rows])
+            residual = x[rows] + self.o_proj(y)
+            return residual + self.mlp(self.norm2(residual))
+
+        return in_parts(recalibrate, len(x), most)
+
+    def factor_and_bias(self, cosines: Float[Tensor, "*n"] | None) -> tuple[Tensor | None, Tensor | None]:
+        """What the semantic similarity multiplies a logit by, and what it adds; None: nothing.
+
+        Args:
+            cosines: of tokens and neighbours, in [-1, 1]; None: similarity is ignored (s = 1).
+        """
+        if cosines is None:
+            return None, None
+        if self.similarity == "log":
+            return None, cosines.clamp(min=S_MIN).log()
+        return cosines.clamp(min=0) if self.similarity == "product_clamped" else cosines, None
+
+    def _with_places(self, v: Float[Tensor, "n i"], places: Float[Tensor, "n 3"]) -> Float[Tensor, "n j"]:
+        """Values with the place of their token behind the channels of each head, j = i + 3 a."""
+        heads = v.unflatten(1, (self.num_heads, -1))
+        return torch.cat((heads, places[:, None].expand(-1, self.num_heads, -1)), dim=-1).flatten(1)
+
+    def _moved(self, y: Float[Tensor, "m j"], places: Float[Tensor, "m 3"]) -> Float[Tensor, "m i"]:
+        """Weighted values of :meth:`_with_places` with what the neighbours' places add to them."""
+        values, mean = y.unflatten(1, (self.num_heads, -1)).tensor_split([-3], dim=-1)
+        weight = self.place_proj.weight.to(y.dtype).unflatten(0, (self.num_heads, -1))
+        with exact(y.device.type):
+            return (values + torch.einsum("max,aix->mai", mean - places[:, None], weight)).flatten(1)
+
+
 class Recalibration(nn.Module):
-    """One :class:`SemanticAttention` for all layers;
-    neighbours and cosines are computed once per forward."""
+    """One :class:`SemanticAttention` for all layers; neighbours and cosines are computed once per forward."""
 
     def __init__(self, options: RecalibrationOptions, dim_latent: int):
         super().__init__()
@@ -93,80 +203,56 @@ class Recalibration(nn.Module):
             Tokens of the same shapes and precision.
         """
         rows = plan.peers.only(self.takes_part(points))
-        if rows.real is not None:
-            return self._filled(tokens, points, rows)
-        batch_size = tokens.grid[0]
-        counts = rows.counts
-        chosen = rows.index
-
-        def part(values: Tensor) -> Tensor:
-            return values if len(chosen) == len(values) else values[chosen]
-
-        places = self.places(tokens)
-        places = [None] * batch_size if places is None else part(places).split(counts)
-        pairs = (part(values).split(counts) for values in (self.positions(tokens, points), tokens.image))
-        elements = zip(*pairs, places, strict=True)
-        neighbors = [
-            nearest_neighbors(where, view, neighbor_count(self.k, len(where)), number, tokens.grid[1])
-            for where, view, number in elements
-        ]
-        cosines = None
-        if self.block.similarity != "none":
-            semantic = part(tokens.semantic).split(counts)
-            cosines = [neighbor_cosines(*pair) for pair in zip(semantic, neighbors, strict=True)]
-        around = None
-        if self.has_places:
-            pairs = zip(*(part(x).split(counts) for x in (points.tokens, points.tokens_valid)), strict=True)
-            around = [places_around(*pair) for pair in pairs]
+        neighborhoods = [self.neighborhood_of(tokens, points, *table) for table in rows.tables]
+        counts = [len(each.near) for each in neighborhoods]
         layers = []
         for layer in tokens.latent:
-            new = self.block(part(layer), neighbors, cosines, places=around).to(layer.dtype)
-            layers.append(new if len(new) == len(layer) else layer.index_copy(0, chosen, new))
-        return dataclasses.replace(tokens, latent=tuple(layers))
+            parts = zip(rows.take(layer).split(counts), neighborhoods, strict=True)
+            layers.append(torch.cat([self.block(*part) for part in parts]).to(layer.dtype))
+        return dataclasses.replace(tokens, latent=rows.put(tokens.latent, layers))
 
-    def _filled(self, tokens: Tokens, points: Points, rows: Rows) -> Tokens:
-        """:meth:`forward` for elements with the same number of rows, all at once.
-
-        Rows that do not count are out of reach of the others, and their results are not read.
+    @torch.no_grad()
+    def neighborhood_of(
+        self,
+        tokens: Tokens,
+        points: Points,
+        index: Int[Tensor, "*g n"],
+        real: Bool[Tensor, "*g n"] | None = None,
+    ) -> Neighborhood:
+        """Whom some tokens of an element attend to, or of several elements (Eq. 4).
 
         Args:
             tokens: of the encoder.
             points: of these tokens.
-            rows: of packed tokens, the same number in each element, and which of them count.
-
-        Returns:
-            Tokens of the same shapes and precision.
+            index: of the tokens, by element.
+            real: which of these count; the others are out of reach. None: all.
         """
-        shape = (len(rows.counts), rows.counts[0])
-        places = self.places(tokens)
-        real = rows.real.view(shape)
-        of_tokens = (self.positions(tokens, points), tokens.image)
-        where, image = (values[rows.index].unflatten(0, shape) for values in of_tokens)
-        around = None
+        n = index.shape[-1]
+        places = None
         if self.has_places:
-            around = [places_around(where, real & points.tokens_valid[rows.index].view(shape)).flatten(0, 1)]
-        where = where.masked_fill(~real[..., None], torch.inf)
-        places = None if places is None else places[rows.index].view(shape)
-        most = min(neighbor_count(self.k, shape[1]), shape[1])
-        near = nearest_neighbors(where, image, most, places, tokens.grid[1])
+            is_subject = points.tokens_valid[index] if real is None else points.tokens_valid[index] & real
+            places = places_around(points.tokens[index], is_subject).flatten(0, -2)
+        where = self.positions(tokens, points)[index]
+        if real is not None:
+            where = where.masked_fill(~real[..., None], torch.inf)
+        number = self.places(tokens)
+        number = None if number is None else number[index]
+        near = nearest_neighbors(
+            where, tokens.image[index], neighbor_count(self.k, n), number, tokens.grid[1]
+        )
         cosines = None
         if self.block.similarity != "none":
-            semantic = tokens.semantic[rows.index].unflatten(0, shape)
-            cosines = [neighbor_cosines(semantic, near).flatten(0, 1)]
-        # Elements with fewer tokens have fewer neighbours.
-        wanted = real.sum(1, keepdim=True)
-        wanted = (wanted.double() * self.k).round().clamp(min=1) if self.k < 1 else wanted.clamp(1, most)
-        beyond = torch.arange(most, device=near.device) >= wanted[..., None]
-        left_out = torch.where(beyond, -torch.inf, 0.0).expand(*shape, most).flatten(0, 1)
-        if shape[0] > 1:
-            near = near + shape[1] * torch.arange(shape[0], device=near.device)[:, None, None]
-        takes_part, number = rows.places(len(tokens.image))
-        layers = []
-        for layer in tokens.latent:
-            new = self.block(layer[rows.index], [near.flatten(0, 1)], cosines, left_out, around)
-            new = new.to(layer.dtype)
-            layers.append(torch.where(takes_part[:, None], new.index_select(0, number), layer))
-        return dataclasses.replace(tokens, latent=tuple(layers))
+            cosines = neighbor_cosines(tokens.semantic[index], near).flatten(0, -2)
+        left_out = None
+        if real is not None:
+            # Elements with fewer tokens have fewer neighbours.
+            most = near.shape[-1]
+            wanted = real.sum(1, keepdim=True)
+            wanted = (wanted.double() * self.k).round().clamp(min=1) if self.k < 1 else wanted.clamp(1, most)
+            beyond = torch.arange(most, device=near.device) >= wanted[..., None]
+            left_out = torch.where(beyond, -torch.inf, 0.0).expand(*real.shape, most).flatten(0, -2)
+            near = near + n * torch.arange(len(index), device=near.device)[:, None, None]
+        return Neighborhood(near.flatten(0, -2), cosines, left_out, places)
 
     def takes_part(self, points: Points) -> Bool[Tensor, " N"]:
         """Tokens that are recalibrated and can be neighbours."""
@@ -236,35 +322,6 @@ def places_around(
     around = torch.where(is_finite[..., None], points - middle, 0)
     unit_length = (weights * around.square()).sum((-2, -1), keepdim=True).sqrt()
     return around / torch.where(unit_length > 0, unit_length, torch.inf)
-
-
-@torch.no_grad()
-def neighbor_cosines(
-    semantic: Float[Tensor, "*b n s"], near: Int[Tensor, "*b n k"]
-) -> Float[Tensor, "*b n k"]:
-    """Cosines of the semantic features of tokens and their neighbours (Eq. 4).
-
-    One element, or several with the same number of tokens.
-
-    Args:
-        semantic: features [..., n, s].
-        near: indices of neighbours [..., n, k].
-
-    Returns:
-        [..., n, k], float32 or wider; 0 for features of zeros.
-    """
-    with exact(semantic.device.type):
-        semantic = at_least_float32(semantic)
-        # Allocated before temporary tensors, so that their memory can be freed.
-        cosines = semantic.new_empty(near.shape)
-        directions = unit(semantic)
-        most = at_once(semantic.device, _COSINES, _GPU_COSINES)
-        count = directions.shape[-2]
-        for rows in even_parts(count, most // max(1, len(directions.flatten(0, -2)))):
-            queries = directions[..., rows, :]
-            products = linear(queries, directions) if queries.dim() == 2 else queries @ directions.mT
-            torch.gather(products, -1, near[..., rows, :], out=cosines[..., rows, :])
-    return cosines
 
 
 class NoRecalibrationOptions(Options):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from ghgs_lit.method.recalibration import nearest_neighbors
+from ghgs_lit.ops.neighbors import nearest_neighbors
 from tests.helpers.tokens import literal_neighbors, make_stage, scene
 
 
@@ -89,7 +89,7 @@ def test_blocks_do_not_change_the_neighbors(monkeypatch):
     points = torch.rand(90, 3)
     view = torch.arange(90) % 3
     expected = nearest_neighbors(points, view, 7)
-    monkeypatch.setattr("ghgs_lit.method.recalibration.neighbors._BLOCK", 1000)
+    monkeypatch.setattr("ghgs_lit.ops.neighbors._BLOCK", 1000)
     found = nearest_neighbors(points, view, 7)
     assert torch.equal(found, expected)
 

@@ -8,7 +8,7 @@ from torch.autograd import gradcheck
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.method.plan import planned
-from ghgs_lit.method.recalibration import SemanticAttention
+from ghgs_lit.method.recalibration import Neighborhood, SemanticAttention
 from ghgs_lit.method.recalibration.recalibration import places_around
 from tests.helpers.tokens import literal_neighbors, make_stage, scene
 
@@ -98,14 +98,14 @@ def test_the_order_of_neighbours_does_not_matter():
     near = torch.stack([torch.randperm(9)[:5] for _ in range(9)])
     cosines = torch.rand(9, 5, dtype=torch.float64)
     order = torch.randperm(5)
-    found = block(x, [near[:, order]], [cosines[:, order]], places=[places])
-    torch.testing.assert_close(found, block(x, [near], [cosines], places=[places]))
+    found = block(x, Neighborhood(near[:, order], cosines[:, order], places=places))
+    torch.testing.assert_close(found, block(x, Neighborhood(near, cosines, places=places)))
 
 
 @pytest.mark.parametrize("scores", [1 << 26, 0], ids=["product", "gathered"])
 def test_the_gradient_is_that_of_finite_differences(scores, monkeypatch):
     """With respect to tokens, places and their map."""
-    monkeypatch.setattr("ghgs_lit.method.recalibration.attention._SCORES", scores)
+    monkeypatch.setattr("ghgs_lit.ops.neighbors._SCORES", scores)
     torch.manual_seed(0)
     block = SemanticAttention(16, 2, has_places=True).double()
     near = torch.stack([torch.randperm(6)[:3] for _ in range(6)])
@@ -115,7 +115,7 @@ def test_the_gradient_is_that_of_finite_differences(scores, monkeypatch):
     weight = torch.randn(4, 3, dtype=torch.float64, requires_grad=True)
 
     def attend(x, places, weight):
-        arguments = (x, [near], [cosines], None, [places])
+        arguments = (x, Neighborhood(near, cosines, None, places))
         return torch.func.functional_call(block, {"place_proj.weight": weight}, arguments)
 
     assert gradcheck(attend, (x, places, weight), fast_mode=True)

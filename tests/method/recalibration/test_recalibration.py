@@ -9,10 +9,15 @@ import torch.nn.functional as F
 
 import ghgs_lit.method.recalibration.recalibration as stage
 from ghgs_lit.errors import InputError
-from ghgs_lit.method.recalibration import SemanticAttention, nearest_neighbors
-from ghgs_lit.method.recalibration.attention import S_MIN, Similarity
+from ghgs_lit.method.recalibration import Neighborhood, SemanticAttention
 from ghgs_lit.method.recalibration.inspection import neighborhoods, seen_calls
-from ghgs_lit.method.recalibration.recalibration import RecalibrationOptions, neighbor_cosines, neighbor_count
+from ghgs_lit.method.recalibration.recalibration import (
+    S_MIN,
+    RecalibrationOptions,
+    Similarity,
+    neighbor_count,
+)
+from ghgs_lit.ops.neighbors import attend_to_neighbors, nearest_neighbors, neighbor_cosines
 from tests.helpers.scenes import CASES, fixture
 from tests.helpers.tokens import literal_neighbors, make_stage, scene
 
@@ -62,7 +67,8 @@ def test_attention_matches_the_release(name, dtype):
     found = torch.stack([element.sort(1).values for element in neighbors])
     assert torch.equal(found, fixture(name, "out")["neighbours_sorted"])
     cosines = [neighbor_cosines(*pair) for pair in zip(inputs["feat_sem"], neighbors, strict=True)]
-    out = block(inputs["feats"].flatten(0, 1), neighbors, cosines).reshape(expected["out"].shape)
+    around = map(Neighborhood, neighbors, cosines)
+    out = torch.stack([block(*element) for element in zip(inputs["feats"], around, strict=True)])
     ordered = torch.stack([c.gather(1, n.argsort(1)) for c, n in zip(cosines, neighbors, strict=True)])
     bounds = CASES[name]["bounds"] if dtype == torch.float32 else {"out": 1e-9, "cosine_sorted": 1e-9}
     torch.testing.assert_close(
@@ -191,7 +197,7 @@ def test_dissimilar_neighbors_lose_their_weight_in_log_only():
     weights = {}
     for name in ("product_clamped", "log"):
         factor, bias = make_stage(similarity=name).block.factor_and_bias(torch.tensor([1.0, -1.0]))
-        weights[name] = (0 * factor + bias).softmax(-1)[1].item()
+        weights[name] = (torch.zeros(2) + (0 if bias is None else bias)).softmax(-1)[1].item()
     assert weights["product_clamped"] == 0.5
     assert weights["log"] == pytest.approx(0.01 / 1.01)
 
@@ -201,7 +207,7 @@ def test_blocks_of_queries_change_nothing(monkeypatch):
     tokens, points = scene()
     module = make_stage()
     expected = module(tokens, points)
-    monkeypatch.setattr("ghgs_lit.method.recalibration.attention._ROWS", 5)
+    monkeypatch.setattr("ghgs_lit.method.recalibration.recalibration._ROWS", 5)
     with torch.no_grad():
         found = module(tokens, points)
     torch.testing.assert_close(found.latent[3], expected.latent[3], atol=1e-6, rtol=0)
@@ -246,13 +252,13 @@ def test_gathered_neighbors_give_what_a_product_of_all_tokens_gives(similarity, 
     cosines = None if similarity == "none" else torch.rand(40, 9, dtype=torch.float64) * 2 - 1
 
     def results():
-        out = block._attend(*inputs, near, block.factor_and_bias(cosines))
+        out = attend_to_neighbors(*inputs, near, 2, *block.factor_and_bias(cosines))
         return out, *torch.autograd.grad(out.square().sum(), inputs)
 
     expected = results()
-    monkeypatch.setattr("ghgs_lit.method.recalibration.attention._SCORES", 0)
+    monkeypatch.setattr("ghgs_lit.ops.neighbors._SCORES", 0)
     for most in (1 << 25, 9 * 16 * 7):
-        monkeypatch.setattr("ghgs_lit.method.recalibration.attention._GATHERED", most)
+        monkeypatch.setattr("ghgs_lit.ops.neighbors._GATHERED", most)
         for a, b in zip(results(), expected, strict=True):
             torch.testing.assert_close(a, b)
 

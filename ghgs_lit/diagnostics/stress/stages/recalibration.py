@@ -6,10 +6,10 @@ from torch import Generator, Tensor
 
 from ghgs_lit.diagnostics.stress import inputs
 from ghgs_lit.diagnostics.stress.stage import Stage, Values, case_by_case
-from ghgs_lit.method.recalibration import SemanticAttention, nearest_neighbors
-from ghgs_lit.method.recalibration.recalibration import neighbor_cosines
+from ghgs_lit.method.recalibration import SemanticAttention
 from ghgs_lit.ops.attention.cpu import attend_heads
 from ghgs_lit.ops.compile import processor_features
+from ghgs_lit.ops.neighbors import attend_to_neighbors, nearest_neighbors, neighbor_cosines
 
 _K = 6
 _COUNT = {"few": 4, "single": 1}
@@ -73,8 +73,10 @@ _BLOCKS = {s: SemanticAttention(128, 2, s) for s in ("product", "product_clamped
 def _attention(v: Values) -> Values:
     """Eq. 3 with every use of the similarity."""
     inputs = [v[name] for name in ("q", "k", "v", "index")]
-    cosines = v["cosines"]
-    return {name: block._attend(*inputs, block.factor_and_bias(cosines)) for name, block in _BLOCKS.items()}
+    results = {}
+    for name, block in _BLOCKS.items():
+        results[name] = attend_to_neighbors(*inputs, block.num_heads, *block.factor_and_bias(v["cosines"]))
+    return results
 
 
 def _attention_slowly(v: Values) -> Values:
