@@ -212,6 +212,34 @@ def subject_center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Te
     return torch.linalg.solve_ex(matrix, (across @ offsets).sum(1)).result[..., 0] + origin
 
 
+@torch.no_grad()
+def places_around(
+    points: Float[Tensor, "*b n 3"], is_subject: Bool[Tensor, "*b n"]
+) -> Float[Tensor, "*b n 3"]:
+    """Places of tokens around the middle of the subject, in units of its size.
+
+    The middle is the mean of the subject's points, the unit their root mean square distance from
+    it, so that places depend neither on the world's origin nor on its unit.
+
+    Args:
+        points: of the tokens of an element, or of several with the same number.
+        is_subject: which points lie on the subject; middle and unit are of these.
+
+    Returns:
+        Places, float32 or wider; 0 for points that are not finite,
+        or if all of the subject's coincide.
+    """
+    points = at_least_float32(points)
+    is_finite = points.isfinite().all(-1)
+    weights = (is_subject & is_finite).to(points.dtype)
+    weights = (weights / weights.sum(-1, keepdim=True).clamp(min=1))[..., None]
+    points = torch.where(is_finite[..., None], points, 0)
+    middle = (weights * points).sum(-2, keepdim=True)
+    around = torch.where(is_finite[..., None], points - middle, 0)
+    unit_length = (weights * around.square()).sum((-2, -1), keepdim=True).sqrt()
+    return around / torch.where(unit_length > 0, unit_length, torch.inf)
+
+
 def in_cameras(points: Float[Tensor, "B 3"], extrinsics: Float[Tensor, "B V 4 4"]) -> Float[Tensor, "B V 3"]:
     """One point of each element in the axes of all its cameras.
 

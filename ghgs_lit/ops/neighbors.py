@@ -154,11 +154,11 @@ def _attend_by_gathering(
         weights = neighbor_weights(q[rows], k[near[rows]], heads, *of_rows)
         return (weights[..., None] * v[near[rows]].unflatten(-1, (heads, -1))).sum(1).flatten(1)
 
-    parts = even_parts(len(q), _GATHERED // max(1, near.shape[1] * q.shape[1]))
-    if len(parts) > 1 and torch.is_grad_enabled():
-        options = {"use_reentrant": False, "preserve_rng_state": False}
-        return torch.cat([checkpoint(attend, rows, **options) for rows in parts])
-    return torch.cat([attend(rows) for rows in parts])
+    most = _GATHERED // max(1, near.shape[1] * q.shape[1])
+    if len(q) <= most or not torch.is_grad_enabled():
+        return in_parts(attend, len(q), most)
+    options = {"use_reentrant": False, "preserve_rng_state": False}
+    return torch.cat([checkpoint(attend, rows, **options) for rows in even_parts(len(q), most)])
 
 
 def neighbor_weights(

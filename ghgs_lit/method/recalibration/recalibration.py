@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from ghgs_lit.config.options import Count, Options, Width
 from ghgs_lit.errors import require
+from ghgs_lit.geometry.frame import places_around
 from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.method.plan import Plan
@@ -208,7 +209,8 @@ class Recalibration(nn.Module):
         layers = []
         for layer in tokens.latent:
             parts = zip(rows.take(layer).split(counts), neighborhoods, strict=True)
-            layers.append(torch.cat([self.block(*part) for part in parts]).to(layer.dtype))
+            new = [self.block(*part) for part in parts]
+            layers.append((torch.cat(new) if len(new) > 1 else new[0]).to(layer.dtype))
         return dataclasses.replace(tokens, latent=rows.put(tokens.latent, layers))
 
     @torch.no_grad()
@@ -251,7 +253,8 @@ class Recalibration(nn.Module):
             wanted = (wanted.double() * self.k).round().clamp(min=1) if self.k < 1 else wanted.clamp(1, most)
             beyond = torch.arange(most, device=near.device) >= wanted[..., None]
             left_out = torch.where(beyond, -torch.inf, 0.0).expand(*real.shape, most).flatten(0, -2)
-            near = near + n * torch.arange(len(index), device=near.device)[:, None, None]
+            if len(index) > 1:
+                near = near + n * torch.arange(len(index), device=near.device)[:, None, None]
         return Neighborhood(near.flatten(0, -2), cosines, left_out, places)
 
     def takes_part(self, points: Points) -> Bool[Tensor, " N"]:
@@ -294,34 +297,6 @@ def neighbor_count(k: int | float, tokens: int) -> int:
         1 or more; a number ``k`` may exceed that of the tokens.
     """
     return max(round(k * tokens), 1) if k < 1 else int(k)
-
-
-@torch.no_grad()
-def places_around(
-    points: Float[Tensor, "*b n 3"], is_subject: Bool[Tensor, "*b n"]
-) -> Float[Tensor, "*b n 3"]:
-    """Places of tokens around the middle of the subject, in units of its size.
-
-    The middle is the mean of the subject's points, the unit their root mean square distance from
-    it, so that places depend neither on the world's origin nor on its unit.
-
-    Args:
-        points: of the tokens of an element, or of several with the same number.
-        is_subject: which points lie on the subject; middle and unit are of these.
-
-    Returns:
-        Places, float32 or wider; 0 for points that are not finite,
-        or if all of the subject's coincide.
-    """
-    points = at_least_float32(points)
-    is_finite = points.isfinite().all(-1)
-    weights = (is_subject & is_finite).to(points.dtype)
-    weights = (weights / weights.sum(-1, keepdim=True).clamp(min=1))[..., None]
-    points = torch.where(is_finite[..., None], points, 0)
-    middle = (weights * points).sum(-2, keepdim=True)
-    around = torch.where(is_finite[..., None], points - middle, 0)
-    unit_length = (weights * around.square()).sum((-2, -1), keepdim=True).sqrt()
-    return around / torch.where(unit_length > 0, unit_length, torch.inf)
 
 
 class NoRecalibrationOptions(Options):

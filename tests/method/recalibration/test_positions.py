@@ -7,9 +7,9 @@ import torch
 from torch.autograd import gradcheck
 
 from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.frame import places_around
 from ghgs_lit.method.plan import planned
 from ghgs_lit.method.recalibration import Neighborhood, SemanticAttention
-from ghgs_lit.method.recalibration.recalibration import places_around
 from tests.helpers.tokens import literal_neighbors, make_stage, scene
 
 

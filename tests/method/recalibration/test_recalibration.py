@@ -196,7 +196,7 @@ def test_dissimilar_neighbors_lose_their_weight_in_log_only():
     """``log`` lowers the weight of a dissimilar neighbour; clamping leaves it at 1/2."""
     weights = {}
     for name in ("product_clamped", "log"):
-        factor, bias = make_stage(similarity=name).block.factor_and_bias(torch.tensor([1.0, -1.0]))
+        _, bias = make_stage(similarity=name).block.factor_and_bias(torch.tensor([1.0, -1.0]))
         weights[name] = (torch.zeros(2) + (0 if bias is None else bias)).softmax(-1)[1].item()
     assert weights["product_clamped"] == 0.5
     assert weights["log"] == pytest.approx(0.01 / 1.01)
