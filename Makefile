@@ -57,7 +57,7 @@ format: setup ## Correct style
 
 bench: setup ## Measure the presets of skip on built-in people, and the rasterizer (minutes)
 	$(BIN)/ghgs benchmark data=synthetic data.people.train=1 data.people.val=4
-	$(BIN)/python benchmarks/rasterizer.py --quick
+	$(BIN)/python benchmarks/rasterizer.py
 
 clean: ## Remove the virtual environment and caches, keep runs
 	rm -rf $(VENV) .venv-* .pytest_cache .ruff_cache .hypothesis

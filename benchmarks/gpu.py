@@ -1,9 +1,9 @@
 r"""All that is worth measuring in the first minutes on a GPU: one prepared script for rented ones.
 
     python benchmarks/gpu.py --dry first second          # rehearse on the pretend device of the tests
-    python benchmarks/gpu.py first                       # 420 s: predictions, steps, graphs, loader
+    python benchmarks/gpu.py first                       # 420 s: predictions, steps, kernels, loader
     python benchmarks/gpu.py second                      # 240 s of training after at most 180 of preparation
-    python benchmarks/gpu.py --seconds 570 step prediction graphs loader training    # within ten minutes
+    python benchmarks/gpu.py --seconds 570 step prediction loader training    # within ten minutes
     python benchmarks/gpu.py --table runs/gpu            # the tables again, from the files alone
 
 Each section is a process of its own with a time limit. Findings are lines of JSON in
@@ -25,8 +25,6 @@ up to 9 channels):
     python benchmarks/gpu.py --gsplat gsplat_built first
 
 ``second`` trains ``experiment=shipped`` with batches of eight; further overrides follow its name.
-With ``--beside <run>/csv/metrics.csv`` its table has the scores of another run, such as a CPU's,
-after as many samples (``--beside-samples`` a step).
 """
 
 import argparse
@@ -51,7 +49,6 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.gpu_call import DRY, Call, Rows, Sizes
-from benchmarks.gpu_data import validations
 from benchmarks.gpu_measure import Gpu, reason, rehearsal
 from benchmarks.gpu_replay import WRONG
 from benchmarks.gpu_sections import SECTIONS
@@ -77,12 +74,10 @@ PLANS = {
     "machine": Plan(40),
     "step": Plan(100, (GSPLAT,), quiet=True),
     "prediction": Plan(100, (GSPLAT,), quiet=True),
-    "graphs": Plan(60, (GSPLAT,), quiet=True),
     "paper": Plan(75),
     "frozen": Plan(60, (GSPLAT,)),
     "loader": Plan(75, (GSPLAT, PEOPLE), quiet=True),
     "kernels": Plan(75, (GSPLAT,)),
-    "check": Plan(75, (GSPLAT,)),
     "training": Plan(240, (GSPLAT, PEOPLE), patience=150),
 }
 #: Runs: sections, and seconds in total.
@@ -134,7 +129,7 @@ class Session:
 
     def __init__(self, options: argparse.Namespace, rows: Rows, plans: dict[str, Plan], seconds: float):
         self.options, self.rows, self.plans = options, rows, plans
-        self.scale = 10 if options.dry else 1  # processors without a GPU take longer
+        self.scale = math.inf if options.dry else 1  # a rehearsal takes as long as the processor needs
         self.started, self.end = time.monotonic(), time.monotonic() + self.scale * seconds
         self.environment = environment_of(options)
         needs = {need for plan in plans.values() for need in plan.needs}
@@ -261,7 +256,7 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
     return lines + [f"| {' | '.join(shown(row.get(column, '')) for column in columns)} |" for row in rows]
 
 
-def report(found: list[dict[str, Any]], beside: list[dict[str, float]]) -> str:
+def report(found: list[dict[str, Any]]) -> str:
     """Tables of all sections, and the kernels that take most of the time of each row
     that has them."""
     lines, hidden = [], ("section", "status", "last_lines", "longest", "numbers")
@@ -271,8 +266,6 @@ def report(found: list[dict[str, Any]], beside: list[dict[str, float]]) -> str:
         title = (
             f"{section.__doc__.strip()} ({', '.join(row['status'] for row in ends) or 'in the background'})"
         )
-        if name == "training":
-            rows = [row | compared(row, beside) for row in rows]
         if own:
             lines.append(f"\n## {title}\n")
         if rows:
@@ -287,12 +280,6 @@ def report(found: list[dict[str, Any]], beside: list[dict[str, float]]) -> str:
     return "\n".join(lines)
 
 
-def compared(row: dict[str, Any], beside: list[dict[str, float]]) -> dict[str, float]:
-    """Scores of the other run at its last validation after at most as many samples."""
-    before = [other for other in beside if other["samples"] <= row["samples"]]
-    return {f"other's {name}": value for name, value in before[-1].items()} if before else {}
-
-
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("names", nargs="*", help=f"{', '.join(RUNS)}, sections, overrides of the training")
@@ -302,8 +289,6 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--dry", action="store_true", help="rehearse without a GPU, with small sizes")
     parser.add_argument("--table", type=Path, metavar="FOLDER", help="print the tables of files, no more")
     parser.add_argument("--seconds", type=float, default=math.inf, help="limit of a run")
-    parser.add_argument("--beside", type=Path, help="csv/metrics.csv of another training")
-    parser.add_argument("--beside-samples", type=int, default=2, help="its samples a step")
     parser.add_argument("--section", help=argparse.SUPPRESS)
     options = parser.parse_args()
     options.overrides = [name for name in options.names if "=" in name]
@@ -329,7 +314,7 @@ def main() -> None:
         run_section(options)
         return
     if options.table is not None:
-        show(options.table, options)
+        show(options.table)
         return
     if not options.dry and not torch.cuda.is_available():
         sys.exit("device: expected a CUDA device, or --dry; found none")
@@ -343,17 +328,15 @@ def main() -> None:
             plans = {section: PLANS[section] for section in sections}
             Session(options, Rows(file), plans, min(seconds, options.seconds)).run()
     finally:
-        show(options.out, options)
+        show(options.out)
 
 
-def show(folder: Path, options: argparse.Namespace) -> None:
+def show(folder: Path) -> None:
     """Print the tables of all files; the exit status is 1 if a verdict is wrong."""
-    beside = [] if options.beside is None else validations(options.beside)
-    beside = [row | {"samples": row["step"] * options.beside_samples} for row in beside]
     wrong = []
     for file in sorted(folder.glob("*.jsonl")):
         rows = Rows(file).read()
-        print(f"\n# {file.stem}\n{report(rows, beside)}")
+        print(f"\n# {file.stem}\n{report(rows)}")
         wrong += [f"{file.stem}: {row['row']}" for row in rows if row.get("verdict") == WRONG]
     if wrong:
         sys.exit("\nWRONG, played back is not as eager:\n" + "\n".join(wrong))

@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 
 from benchmarks.gpu_call import Call
-from benchmarks.loading import rate
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.data.datamodule import PhotographsDataModule
 
@@ -44,6 +43,17 @@ def loader(call: Call) -> None:
         photographs = "kept" if kept else "decoded anew"
         name = f"{workers} workers, photographs {photographs}"
         call.add(name, samples_s=found, ms_sample=1e3 / found, samples=samples)
+
+
+def rate(data: PhotographsDataModule, seconds: float) -> tuple[float, int]:
+    """Samples per second, and how many samples were counted; the first batch, which starts the
+    processes, does not count."""
+    batches = iter(data.train_dataloader())
+    next(batches)
+    started, samples = time.perf_counter(), 0
+    while time.perf_counter() - started < seconds:
+        samples += len(next(batches).images)
+    return samples / (time.perf_counter() - started), samples
 
 
 def training(call: Call) -> None:

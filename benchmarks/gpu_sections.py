@@ -1,7 +1,6 @@
 """What ``benchmarks/gpu.py`` measures: functions of a :class:`Call`; docstrings are titles of tables."""
 
 import gc
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -18,7 +17,6 @@ from benchmarks.gpu_measure import reason
 from benchmarks.gpu_replay import judge_optimizer, judge_prediction, judge_step
 from ghgs_lit.config.run import Run
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL, SecondsProbe, inside, top_level, watched
-from ghgs_lit.diagnostics.doctor.selfcheck import PASSED, selfcheck
 from ghgs_lit.diagnostics.machine import machine_facts
 from ghgs_lit.execution import Predictor
 from ghgs_lit.execution.graphs import GraphCache
@@ -26,11 +24,7 @@ from ghgs_lit.execution.step import CapturedStep
 from ghgs_lit.geometry.precision import keep_rounded, precision_of
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.method.rounds import NoRounds
-from ghgs_lit.method.stages import STAGES
 from ghgs_lit.ops.dispatch import OPERATORS
-from ghgs_lit.rendering.capacity import deferred
-from ghgs_lit.runtime.watching import Inputs, Watcher
-from ghgs_lit.runtime.watching import watched as stages_watched
 from ghgs_lit.training.optimization import hold_rates
 from ghgs_lit.types import Batch, map_tensors
 
@@ -56,16 +50,6 @@ def machine(call: Call) -> None:
         call.add(f"product, {name}", ms=ms, tflop_s=2 * sizes.product**3 / ms / 1e9)
 
 
-def check(call: Call) -> None:
-    """Self-check: what did not pass"""
-    count, passed = 0, 0
-    for outcome in selfcheck(call.run("encoder=vggt_nano", "model=hull"), call.gpu.device):
-        count, passed = count + 1, passed + (outcome.status == PASSED)
-        if outcome.status != PASSED:
-            call.add(outcome.check, outcome=outcome.status, found=outcome.found)
-    call.add("all", outcome=f"{passed} of {count} pass")
-
-
 def _built(call: Call, run: Run) -> GHGS:
     """A model with fresh weights, made on the device."""
     with call.gpu.device:
@@ -81,12 +65,15 @@ def _predicted(
         with torch.no_grad():
             run = partial(predictor, batch)
             ms = call.gpu.milliseconds(run, call.sizes.repeats)
-            probe = SecondsProbe(call.gpu.device)
-            with watched(predictor.model, probe), inside(TOTAL, probe):
-                run()
-            seconds = probe.seconds()
-            stages = {f"{stage}_ms": 1e3 * seconds[stage] for stage in top_level(seconds)}
-            call.add(f"{name}, {precision}", ms=ms, **call.gpu.work(run), **stages)
+            work = call.gpu.work(run)
+            stages = {}
+            if predictor.options.capture == "off":  # a probe keeps stages from being captured
+                probe = SecondsProbe(call.gpu.device)
+                with watched(predictor.model, probe), inside(TOTAL, probe):
+                    run()
+                seconds = probe.seconds()
+                stages = {f"{stage}_ms": 1e3 * seconds[stage] for stage in top_level(seconds)}
+            call.add(f"{name}, {precision}", ms=ms, **work, **stages)
 
 
 def prediction(call: Call) -> None:
@@ -113,6 +100,7 @@ def paper(call: Call) -> None:
     """A prediction of a large encoder, model=paper"""
     model = _built(call, call.run(f"encoder={call.sizes.encoder}", "model=paper")).eval()
     predictor = Predictor(model)
+    predictor.options = predictor.options.replace(capture="off")
     batch = replace(call.batch(1, call.sizes.large), targets=None).to(call.gpu.device)
     name = f"{call.sizes.encoder}, {call.sizes.large}²"
     _predicted(call, name, predictor, batch)
@@ -121,66 +109,6 @@ def paper(call: Call) -> None:
     _predicted(call, f"{name}, rounded weights", predictor, batch, ("bfloat16",))
     with sdpa_kernel([SDPBackend.CUDNN_ATTENTION, *ATTENTION], set_priority=True):
         _predicted(call, f"{name}, rounded weights, cuDNN's attention first", predictor, batch, ("bfloat16",))
-
-
-class _FirstInputs(Watcher):
-    """What each stage is called with first."""
-
-    def __init__(self) -> None:
-        self.inputs: dict[str, Inputs] = {}
-
-    def begin(self, stage: str, inputs: Inputs = ((), {})) -> None:
-        self.inputs.setdefault(stage, inputs)
-
-
-#: Parts of a prediction that are recorded by themselves, by their path in the model.
-PIECES = (*STAGES, "gaussian_head.activate", "rounds")
-
-
-@torch.no_grad()
-def graphs(call: Call) -> None:
-    """CUDA graphs: each piece of a prediction, then the whole"""
-    predictor = Predictor.from_checkpoint(map_location=call.gpu.device)
-    predictor.options = predictor.options.replace(capture="off")
-    model = predictor.model
-    for size in call.sizes.batches:
-        batch = replace(call.batch(size, call.sizes.side), targets=None).to(call.gpu.device)
-        seen = _FirstInputs()
-        with stages_watched(model, {piece: piece for piece in PIECES}, seen):
-            predictor(batch)
-        for piece, (arguments, options) in seen.inputs.items():
-            stage = model
-            for name in piece.split("."):
-                stage = getattr(stage, name)
-            _recorded(call, f"batch of {size}, {piece}", _Called(stage), (arguments, options))
-        _recorded(call, f"batch of {size}, all", _Called(predictor), ((batch,), {}))
-
-
-class _Called:
-    """A function of positional and named arguments as one of their pair; renderings have room enough."""
-
-    def __init__(self, function: Callable[..., Any]):
-        self.function = function
-
-    def __call__(self, inputs: Inputs) -> Any:
-        with deferred():
-            return self.function(*inputs[0], **inputs[1])
-
-
-def _recorded(call: Call, name: str, function: Callable[[Inputs], Any], inputs: Inputs) -> None:
-    """Row of a recording: eager and played back (with copies of inputs and results), or why it cannot be
-    recorded."""
-    eager = call.gpu.milliseconds(partial(function, inputs), call.sizes.repeats)
-    cache = GraphCache(eager=0, tape=call.gpu.tape())
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the row has the reason
-        cache(function, inputs)
-    if cache.reasons:
-        call.add(name, eager_ms=eager, refused=cache.reasons[-1])
-        return
-    play = partial(cache, function, inputs)
-    ms = call.gpu.milliseconds(play, call.sizes.repeats)
-    call.add(name, eager_ms=eager, graph_ms=ms, busy_ms=call.gpu.work(play)["busy_ms"])
 
 
 class _Step:
@@ -373,7 +301,7 @@ def _attention(call: Call) -> None:
 SECTIONS: dict[str, Callable[[Call], None]] = {
     section.__name__: section
     for section in (
-        *(machine, step, prediction, graphs, check, paper, frozen, kernels, loader),
+        *(machine, step, prediction, paper, frozen, kernels, loader),
         *(people, training),
     )
 }

@@ -79,7 +79,6 @@ NOT_RUN = [
     (r"ghgs stress$", "takes a quarter of an hour"),
     (r"python scripts/drill\.py", "trains twelve runs, killed ten times"),
     (r"SMPL_MODEL=…", "needs the licensed body model and both data sets"),
-    (r"python benchmarks/encoder\.py (?!--size vggt_small)", "measures models of the published size"),
 ]
 if importlib.util.find_spec("smplx") is None:
     NOT_RUN.append((r"ghgs .*data\.smpl_model=|SMPL_MODEL=/", "needs the package smplx"))
@@ -94,7 +93,7 @@ SMALL = [
     (r"^make demo$", f"bash scripts/demo.sh {TINY} {SHORT}", "without the set-up, two steps"),
     (r"^bash scripts/demo\.sh$", f"bash scripts/demo.sh {TINY} {SHORT}", "two steps"),
     (r"\btrainer=gpu\b", "trainer=cpu", "no GPU"),
-    (r"^make bench$", "python benchmarks/rasterizer.py --quick", "without the set-up"),
+    (r"^make bench$", "python benchmarks/rasterizer.py", "without the set-up"),
     (r"^(ghgs benchmark (?!.*-help).*)", r"\1 timing.repeats=1 subjects=1", "one round"),
     (r"^(ghgs benchmark data=synthetic .*)", rf"\1 {TINY}", "two people of 56 x 56 pixels"),
     (r"refine=15", "refine=2", "two steps"),
@@ -103,7 +102,6 @@ SMALL = [
     (r"(?<==)/data/", "", "folders beside this one"),
     (r"data\.active\.train=\d+", "data.active.train=1", "one person"),
     (r"^(ghgs pretext .*)", rf"\1 {TINY} {SHORT}", "two people of 56 x 56 pixels, two steps"),
-    (r"^(python benchmarks/part_awareness\.py.*)", rf"\1 {TINY}", "two people of 56 x 56 pixels"),
     (r"^(tensorboard .*)", r"timeout 20 \1 --port 0 || [ $? = 124 ]", "a server: stopped after 20 s"),
     (r" init_from=(?:start|vggt)\.ckpt", "", PUBLISHED),
     (r"^(ghgs view .*)", r"\1 seconds=1", "a server: stopped after 1 s"),
@@ -118,10 +116,7 @@ SMALL = [
      "small photographs"),
     (r"^(ghgs prepare task=render(?!.*render\.size).*)", r"\1 data.render.size=56", "small photographs"),
     (r"^(.*miniature\.py.*)", rf"\1 {FEW}", "few people"),
-    (r"^(python benchmarks/loading\.py.*)", r"\1 --seconds 1 --size 128 --workers 0,1", "one second"),
     (r"^(python benchmarks/captures\.py.*)", r"\1 --people 1", "one person"),
-    (r"^(python scripts/check_resume\.py)(?: --steps 40 --kill-at 20)?(.*)",
-     rf"\1\2 --steps 12 --kill-at 6 --every 3 {TINY}", "twelve steps"),
     (r"^(ghgs train (?!.*dry_run).*sweep=table\d.*)", r"\1 dry_run=true", "needs a GPU: planned only"),
     (r"^(ghgs train .*sweep=table\d.*dry_run=true.*)", r"\1 || [ $? = 1 ]", "says what it lacks here"),
     (r"(?<=seed=1,2),3(,4)?", "", "two seeds"),
