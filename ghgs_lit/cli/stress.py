@@ -1,23 +1,37 @@
 """``ghgs stress``: compare stages with float64 on adversarial inputs."""
 
+import itertools
+import json
 import sys
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+import torch
 
 from ghgs_lit.cli.inputs import choices
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
-from ghgs_lit.diagnostics.output import print_tables
-from ghgs_lit.diagnostics.stress import report
-from ghgs_lit.diagnostics.stress.run import run_tasks, tasks_of
-from ghgs_lit.errors import require
+from ghgs_lit.diagnostics.output import Tables, document, pivoted, print_tables
+from ghgs_lit.diagnostics.stress.families import FAMILIES
+from ghgs_lit.diagnostics.stress.measure import Row, measure
+from ghgs_lit.diagnostics.stress.whole import STAGES
+from ghgs_lit.errors import choice, require
+from ghgs_lit.files import write_text_atomically
+from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.runtime.cores import allowed_cores
 
 if TYPE_CHECKING:
     from ghgs_lit.cli.verbs import Stress
 
+Task = tuple[str, str, int]  #: Stage, family and number of cases
+
 
 def run(verb: "Stress") -> None:
-    """Compare stages with float64 and write the report.
+    """Compare stages with float64 and write ``stress.md`` and ``stress.json``.
 
     Args:
         verb: the run.
@@ -31,17 +45,101 @@ def run(verb: "Stress") -> None:
     tasks = tasks_of(verb.stages, verb.families, verb.quick)
     require(bool(tasks), "families", "a family that one of the stages has", verb.families)
     rows = run_tasks(tasks, allowed_cores() if verb.workers is None else verb.workers)
-    print_tables(report.tables_of(rows))
-    print(report.counts_of(rows))
-    source = provenance(verb.plain, seed=0, verb="stress", choices=choices())
-    announce(report.write(directory, rows, source))
+    cases = sum(row["cases"] for row in rows)
     failed = [row for row in rows if row["failures"]]
+    failures = sum(row["failures"] for row in failed)
+    summary = f"{cases} cases, {failures} failures"
+    tables = tables_of(rows)
+    print_tables(tables)
+    print(summary)
+    tables["Budgets"] = pd.DataFrame(
+        [(s, STAGES[s].reason) for s in _unique(rows, "stage")], columns=["stage", "reason"]
+    )
+    tables["Families"] = pd.DataFrame(
+        [(f, FAMILIES[f].text) for f in _unique(rows, "family")], columns=["family", "inputs"]
+    )
+    write_text_atomically(directory / "stress.md", document("Stress test", [f"{summary}."], tables))
+    source = provenance(verb.plain, seed=0, verb="stress", choices=choices())
+    content = {"cases": cases, "failures": failures, "cells": rows, "provenance": source}
+    path = directory / "stress.json"
+    write_text_atomically(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+    announce(path)
     for row in failed:
         cell = f"{row['stage']}, {row['family']}, {row['dtype']}"
+        error = "no bound" if row["error"] is None else f"{row['error']:.3g}"
         print(
             f"ghgs stress: {cell}: expected an error of at most {row['budget']:g}; found"
-            f" {report.bounded(row['error'])} in {row['failures']} of {row['cases']} cases ({row['worst']})",
+            f" {error} in {row['failures']} of {row['cases']} cases ({row['worst']})",
             file=sys.stderr,
         )
     if failed:
         raise SystemExit(1)
+
+
+def tasks_of(
+    stages: Sequence[str] | None = None, families: Sequence[str] | None = None, quick: bool = False
+) -> list[Task]:
+    """Tasks of the chosen stages and families.
+
+    Args:
+        stages: names; None: all.
+        families: names; None: all. A stage has no task of a family that does not apply to it.
+        quick: few cases of each: one of a stage that is slow, three of another.
+
+    Raises:
+        InputError: an unknown name.
+    """
+    for key, names, known in (("stages", stages, STAGES), ("families", families, FAMILIES)):
+        for name in names or ():
+            choice(key, name, tuple(known))
+    tasks = []
+    for name in STAGES if stages is None else stages:
+        stage = STAGES[name]
+        seeds = stage.seeds
+        if quick:
+            seeds = 1 if seeds < 25 else 3
+        chosen = [family for family in stage.families if families is None or family in families]
+        tasks += [(name, family, seeds) for family in chosen]
+    return tasks
+
+
+def cells(task: Task) -> list[Row]:
+    """The cells of a task, one for each dtype."""
+    name, family, seeds = task
+    return measure(STAGES[name], family, seeds)
+
+
+def run_tasks(tasks: Sequence[Task], workers: int) -> list[Row]:
+    """Cells of all tasks, in their order.
+
+    Args:
+        tasks: what to run.
+        workers: number of processes; 0: this one.
+    """
+    shown = track(tasks, "stages and families")
+    if workers == 0:
+        return list(itertools.chain.from_iterable(map(cells, shown)))
+    # Spawned: a forked child would inherit locks of threads that it does not have.
+    context = get_context("spawn")
+    pool = ProcessPoolExecutor(workers, context, initializer=torch.set_num_threads, initargs=(1,))
+    try:
+        return list(
+            itertools.chain.from_iterable(rows for _, rows in zip(shown, pool.map(cells, tasks), strict=True))
+        )
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def tables_of(rows: Sequence[Row]) -> Tables:
+    """Worst error of each stage and dtype, next to its cases and its budget."""
+    frame = pd.DataFrame(rows)
+    frame["error"] = frame.error.astype(float).fillna(np.inf)
+    worst = frame.groupby(["stage", "dtype"], sort=False).error.max().reset_index()
+    table = pivoted(worst, "stage", "dtype", "error", "{:.3g}").replace("inf", "no bound")
+    table.insert(1, "cases", list(frame.groupby("stage", sort=False).cases.sum()))
+    table.insert(2, "budget", [f"{STAGES[name].factor:g}" for name in table.stage])
+    return {"Worst error, in units of eps times the condition number": table}
+
+
+def _unique(rows: Sequence[Row], key: str) -> list[str]:
+    return list(dict.fromkeys(row[key] for row in rows))

@@ -1,1 +1,1 @@
-"""Stress test: every stage on adversarial inputs against float64, forward and backward."""
+"""Stress test: numerical errors of all stages on adversarial inputs."""

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ghgs_lit.diagnostics.stress import stages
 from ghgs_lit.diagnostics.stress.measure import measure
-from ghgs_lit.diagnostics.stress.stages import STAGES, heads
+from ghgs_lit.diagnostics.stress.whole import STAGES
 from ghgs_lit.ops.rasterization import cpu
 from tests.helpers.planting import CODE, change_code, found
 
@@ -24,7 +25,7 @@ DEFECTS = json.loads(Path(__file__).with_name("planted.json").read_text())
 def plant(at: str, change: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Change a function wherever it is known, until the test ends."""
     file, name = found(CODE, at)
-    module = importlib.import_module(file.removesuffix(".py").replace("/", "."))
+    module = importlib.import_module(file.removesuffix(".py").removesuffix("/__init__").replace("/", "."))
     function = inspect.unwrap(attrgetter(name)(module))
     tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     change_code(tree, change)
@@ -35,7 +36,7 @@ def plant(at: str, change: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def failures(stage: str, family: str, dtype: str) -> int:
     """How many of three cases fail."""
-    return sum(row["failures"] for row in measure(STAGES[stage], family, range(3), [dtype]))
+    return sum(row["failures"] for row in measure(STAGES[stage], family, 3, [dtype]))
 
 
 @pytest.mark.parametrize("defect", DEFECTS, ids=lambda defect: defect["what"])
@@ -49,13 +50,13 @@ def test_a_changed_line_is_reported(defect, monkeypatch):
 
 def test_a_confidence_without_its_limit_is_reported(monkeypatch):
     """exp(100) is infinite in float32, and is not in float64."""
-    monkeypatch.setattr(heads, "confidence_of", lambda c: 1 + c.exp())
+    monkeypatch.setattr(stages, "confidence_of", lambda c: 1 + c.exp())
     assert failures("depth activation", "saturated", "float32") > 0
 
 
 def test_a_norm_without_its_epsilon_is_reported(monkeypatch):
     """Tokens of 0 have no direction."""
-    for head in heads._HEADS.values():
+    for head in stages.HEADS.values():
         monkeypatch.setattr(head.norm, "eps", 0.0)
     assert failures("dense head", "zero_features", "float32") > 0
 
