@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 from ghgs_lit.cli.runtime import announce, output_dir
 from ghgs_lit.config.nodes import Check
 from ghgs_lit.data.check import inspect
-from ghgs_lit.data.check_report import show, write
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.reader import PHASES
 from ghgs_lit.errors import InputError
@@ -52,19 +51,21 @@ def render(data: PhotographsDataModule) -> None:
 
 
 def check(data: PhotographsDataModule, folder: Path, expected: Check) -> None:
-    """Read all data once, print tables, write ``check.json`` and a contact sheet.
+    """Read all data once, print what was found, and write ``check.json``.
 
     Args:
         data: what is read.
-        folder: for the files.
+        folder: for the file.
         expected: limits of good data.
 
     Raises:
         InputError: something is missing or broken.
     """
     report = inspect(data, expected.min_iou, expected.min_agreement)
-    show(report)
-    announce(write(report, folder))
+    report.show()
+    folder.mkdir(parents=True, exist_ok=True)
+    report.write(folder / "check.json")
+    announce(folder)
     if report.problems:
         name = data.dataset.name
         count = len(report.problems)

@@ -170,8 +170,7 @@ class Prepare(Verb):
     example = "ghgs prepare task=render data=scans data.source=scans data.root=rendered"
 
     task: Literal["render", "check"] = "render"
-    """render: render what is missing. check: read every photograph and camera once, with tables and
-    a contact sheet."""
+    """render: render what is missing. check: read every photograph and camera once."""
     check: Check = Check()
     """What task=check expects of data."""
     seed: Seed = 0

@@ -1,10 +1,11 @@
-"""Checks of a person's masks without a body: each by itself, and against the others."""
+"""Checks of a person's masks: each by itself, against the body, and against the others."""
 
 import itertools
 from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
 import numpy as np
+from scipy import ndimage
 
 from ghgs_lit.data.view import View, area_mask
 from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, subject_sphere
@@ -17,6 +18,10 @@ SEARCH = HullSearch(rays=200, depths=64, reach=1.0, others=12, wrong=0.25)
 # Least share of a photograph and greatest share of its border that a person covers.
 _LEAST_SHARE = 1e-3
 _MOST_BORDER = 0.5
+# Fewer vertices do not fill a silhouette.
+_LEAST_VERTICES = 500
+# Height of a body in cells; with more, cells between vertices of SMPL's torso would stay empty.
+_BODY_CELLS = 96
 
 
 def silhouette(view: View) -> Silhouette:
@@ -69,3 +74,42 @@ def twins(poses: Mapping[_T, np.ndarray]) -> tuple[_T, _T] | None:
     """
     pairs = itertools.combinations(poses, 2)
     return next((p for p in pairs if np.allclose(poses[p[0]], poses[p[1]], rtol=1e-6, atol=1e-6)), None)
+
+
+def overlap(vertices: np.ndarray, view: View) -> float | None:
+    """IoU of the silhouette of a body and a mask.
+
+    The silhouette is taken on a grid so coarse that vertices can be joined without faces. Parts
+    outside the photograph do not count.
+
+    Args:
+        vertices: [n, 3] in the world, metres.
+        view: the photograph; its mask and camera are read.
+
+    Returns:
+        IoU in [0, 1]; None with fewer than 500 vertices.
+    """
+    if len(vertices) < _LEAST_VERTICES:
+        return None
+    height, width = view.mask.shape
+    pose = view.extrinsics.astype(np.float64)
+    points = vertices.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
+    points = points[points[:, 2] > 1e-6] @ view.intrinsics.astype(np.float64).T
+    pixels = points[:, :2] / points[:, 2:]
+    pixels = pixels[((pixels >= 0) & (pixels < (width, height))).all(-1)]
+    if not len(pixels):
+        return 0.0
+    cells = min(_BODY_CELLS, int(1.2 * np.sqrt(len(vertices))))
+    cell = max(np.ptp(pixels[:, 1]) / cells, 1.0)
+    rows = max(round(height / cell), 1)
+    columns = max(round(width / cell), 1)
+    margin = 3
+    hit = np.zeros((rows + 2 * margin, columns + 2 * margin), bool)
+    row = (pixels[:, 1] * rows / height).astype(int)
+    column = (pixels[:, 0] * columns / width).astype(int)
+    hit[row + margin, column + margin] = True
+    # Gaps of up to four cells are closed, holes filled.
+    closed = ndimage.binary_closing(hit, np.ones((3, 3)), iterations=2)
+    body = ndimage.binary_fill_holes(closed)[margin:-margin, margin:-margin]
+    subject = area_mask(view.mask, rows, columns)
+    return float((body & subject).sum() / max((body | subject).sum(), 1))

@@ -1,14 +1,12 @@
 """What task=check finds without a body's help: masks, cameras, units, leakage."""
 
-import json
 import shutil
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from ghgs_lit.data.check import Report, inspect
-from ghgs_lit.data.check_report import show, write
+from ghgs_lit.data.check import inspect
 from ghgs_lit.errors import InputError
 from tests.helpers.people import TINY, render_boxes, rendered
 
@@ -93,7 +91,7 @@ def test_sound_data_agrees(root):
     found = report(root)
     assert found.problems == []
     assert found.notes == []
-    assert [phase.bodies for phase in found.phases.values()] == [2, 1]
+    assert [phase.figures["bodies"] for phase in found.phases.values()] == [2, 1]
     assert all(min(phase.known("agreement")) > 0.97 for phase in found.phases.values())
 
 
@@ -151,44 +149,5 @@ def test_bodies_are_counted_where_photographs_are_missing(root):
         path.unlink()
     found = report(root)
     assert len(found.problems) == 4
-    assert found.phases["train"].bodies == 2
+    assert found.phases["train"].figures["bodies"] == 2
     assert not any("a body for each" in note for note in found.notes)
-
-
-def test_brackets_in_a_problem_are_no_markup(capsys):
-    """The command that installs an extra has some."""
-    show(Report(problems=["smpl_model: expected smplx (pip install 'ghgs-lit[smpl]'); found none"]))
-    assert "pip install 'ghgs-lit[smpl]'" in capsys.readouterr().out
-
-
-def test_lights_of_renders_and_how_bright_they_are_is_said(root, capsys, tmp_path):
-    """Lit boxes read as scans, whose textures have light: a note. As configured: a line."""
-    unlit = TINY.replace(lights="none")
-    found = report(root, render=unlit)
-    assert found.lights == "studio"
-    notes = [note for note in found.notes if "lights" in note]
-    assert len(notes) == 2
-    seen = found.phases["train"].seen
-    image = np.asarray(Image.open(root / "train/img/s0_000/0.jpg"))
-    mask = np.asarray(Image.open(root / "train/mask/s0_000/0.png"))[..., 0] > 127
-    assert seen[0].bright == pytest.approx(image[mask].mean() / 255, abs=1e-6)
-    mean = np.mean([one.bright for one in seen])
-    line = "train: expected renders with data.render.lights=none; found studio (lit again where textures have"
-    assert notes[0].startswith(line)
-    assert f"subjects of {mean:.3f} of full brightness" in notes[0]
-    lit = report(root)
-    assert not [note for note in lit.notes if "lights" in note]
-    show(lit)
-    line = f"lights=studio; mean brightness of subjects (1 is white): train {mean:.3f}, val "
-    out = capsys.readouterr().out
-    assert f"rendered with data.render.{line}" in out
-    for heading in ("subjects", "mean IoU", "agree"):  # none is cut on a terminal of 80 columns
-        assert heading in out
-    write(lit, tmp_path / "check")
-    content = json.loads((tmp_path / "check" / "check.json").read_text())
-    assert content["lights"] == "studio"
-    assert content["phases"]["train"]["seen"][0]["bright"] == seen[0].bright
-    shutil.rmtree(root / "rendering")
-    elsewhere = report(root, render=unlit)
-    assert elsewhere.lights is None
-    assert not [note for note in elsewhere.notes if "lights" in note]

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from ghgs_lit.config import build, compose
-from ghgs_lit.data.overlap import overlap
+from ghgs_lit.data.mask_checks import overlap
 from ghgs_lit.data.sampling import subject_rng
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.types import Cameras
