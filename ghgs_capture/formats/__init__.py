@@ -1,14 +1,12 @@
-"""Files of cameras: one module a format, each a function from a path to a :class:`CameraFile`."""
+"""Files of cameras: each format a function from a path to a :class:`CameraFile`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from ghgs_capture.formats.camera_file import CameraFile
 from ghgs_capture.formats.colmap import model_folder, read_colmap
-from ghgs_capture.formats.json_and_toml import read_json, read_json_file, read_toml
+from ghgs_capture.formats.entries import CameraFile
+from ghgs_capture.formats.matrices import EASYMOCAP, QUALISYS, read_mapping, read_matrices, yaml_files
 from ghgs_capture.formats.nerfstudio import read_nerfstudio
-from ghgs_capture.formats.opencv import EASYMOCAP, read_easymocap, read_opencv, yaml_files
-from ghgs_capture.formats.qualisys import read_qualisys
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.parsing import find_path
 
@@ -16,17 +14,15 @@ __all__ = ["FORMATS", "CameraFile", "read_cameras"]
 
 #: Readers by the format's name; ``ghgs`` is this package's JSON.
 FORMATS: dict[str, Callable[[Path], CameraFile]] = {
-    "ghgs": read_json,
+    "ghgs": read_matrices,
     "colmap": read_colmap,
     "nerfstudio": read_nerfstudio,
-    "opencv": read_opencv,
-    "easymocap": read_easymocap,
-    "toml": read_toml,
-    "qualisys": read_qualisys,
+    "opencv": read_matrices,
+    "easymocap": read_matrices,
+    "toml": read_matrices,
+    "qualisys": read_matrices,
 }
-#: Formats that may have several files, and endings of those of one.
-_OF_FOLDERS = ("colmap", "opencv", "easymocap")
-_SINGLE = (".json", ".toml", ".qca.txt")
+_SINGLE = (".json", ".toml", QUALISYS)  # Endings of formats of one file
 
 
 def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
@@ -47,49 +43,40 @@ def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
     choice("calibration.format", format, ("auto", *FORMATS))
     if not path.exists():
         raise InputError(f"{path}: expected a file or folder of cameras; found no such path")
-    path = _file_in(path, format) if path.is_dir() else path
-    return FORMATS[_format_of(path) if format == "auto" else format](path)
-
-
-def _file_in(folder: Path, format: str) -> Path:
-    """The file of a folder that holds the cameras; the folder itself for formats of several files.
-    InputError: there are several."""
-    of_folder = format in _OF_FOLDERS or find_path(folder, EASYMOCAP[0]) is not None
-    if of_folder or (format == "auto" and (model_folder(folder) is not None or yaml_files(folder))):
-        return folder
-    transforms = find_path(folder, "transforms.json")
-    if transforms is not None and format in ("auto", "nerfstudio"):
-        return transforms
-    files = [path for path in sorted(folder.iterdir()) if path.name.lower().endswith(_SINGLE)]
-    expected = "one file of cameras, or transforms.json"
-    require(len(files) < 2, str(folder), expected, ", ".join(path.name for path in files))
-    return files[0] if files else folder
-
-
-def _format_of(path: Path) -> str:
-    """The format of a path, by names of files and keys of JSON.
-    InputError: it is none that is known."""
-    suffix = path.suffix.lower()
-    folder = path if path.is_dir() else path.parent
-    if path.name.lower() in EASYMOCAP or (path.is_dir() and find_path(path, EASYMOCAP[0]) is not None):
-        return "easymocap"
-    if path.is_dir():
-        if model_folder(path) is not None:
-            return "colmap"
-        if yaml_files(path):
-            return "opencv"
-    elif suffix in (".yml", ".yaml"):
-        return "opencv"
-    elif suffix == ".toml":
-        return "toml"
-    elif suffix == ".json":
-        return "nerfstudio" if "frames" in read_json_file(path) else "ghgs"
-    elif path.name.lower().endswith(".qca.txt"):
-        return "qualisys"
-    elif suffix in (".bin", ".txt") and model_folder(folder) is not None:
-        return "colmap"
+    if format != "auto" and path.is_file():
+        return FORMATS[format](path)
+    for name, file in _candidates(path):
+        if format == "auto" or FORMATS[name] is FORMATS[format]:
+            return FORMATS[name](file)
     raise InputError(
         f"{path}: expected JSON, transforms.json, a COLMAP model, YAML of OpenCV or EasyMocap,"
         " TOML, or Qualisys' .qca.txt; found"
         f" {'a folder without any' if path.is_dir() else repr(path.suffix)}"
     )
+
+
+def _candidates(path: Path) -> Iterator[tuple[str, Path]]:
+    """Formats that a path may have, and the file or folder of each, the preferred first.
+
+    InputError: a folder holds several files of cameras."""
+    name = path.name.lower()
+    if path.is_dir():
+        if find_path(path, EASYMOCAP[0]) is not None:
+            yield "easymocap", path
+        if model_folder(path) is not None:
+            yield "colmap", path
+        if yaml_files(path):
+            yield "opencv", path
+        if (transforms := find_path(path, "transforms.json")) is not None:
+            yield "nerfstudio", transforms
+        files = [file for file in sorted(path.iterdir()) if file.name.lower().endswith(_SINGLE)]
+        expected = "one file of cameras, or transforms.json"
+        require(len(files) < 2, str(path), expected, ", ".join(file.name for file in files))
+        for file in files:
+            yield from _candidates(file)
+    elif name.endswith(".json"):
+        yield "nerfstudio" if "frames" in read_mapping(path)[0] else "ghgs", path
+    elif name.endswith((".yml", ".yaml", ".toml", QUALISYS)):
+        yield "opencv", path
+    elif name.endswith((".bin", ".txt")) and model_folder(path.parent) is not None:
+        yield "colmap", path

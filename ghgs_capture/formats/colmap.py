@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from ghgs_capture.calibration import Convention, StoredCamera
-from ghgs_capture.formats.camera_file import CameraFile, pinhole
-from ghgs_capture.formats.entries import FISHEYE, PERSPECTIVE, coefficients
+from ghgs_capture.formats.entries import FISHEYE, PERSPECTIVE, CameraFile, coefficients, pinhole
 from ghgs_lit.errors import InputError, installed, require
 from ghgs_lit.parsing import require_file
 
@@ -71,7 +70,7 @@ def read_colmap(path: Path) -> CameraFile:
         _camera(folder, names.get(image.image_id, image.name), image, model.cameras[image.camera_id])
         for image in images
     ]
-    return CameraFile.of(cameras, Convention(), "colmap")
+    return CameraFile.of(cameras, Convention())
 
 
 def _names(folder: Path) -> dict[int, str]:

@@ -1,14 +1,21 @@
-"""Entries of a camera in a file: read under any usual spelling, of the right type, or named."""
+"""Cameras of a file, and the entries of each: read under any usual spelling, of the right type,
+or named."""
 
 import math
 import re
-from collections.abc import Collection, Mapping
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ghgs_capture.calibration import Convention, StoredCamera
+from ghgs_capture.photographs import PICTURES, SUFFIXES
 from ghgs_lit.data.decoding import check_array
-from ghgs_lit.errors import require
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.parsing import composed, parts_of
 
 #: What files call the same thing, as :func:`plain` spells it.
 NAMES = {
@@ -38,6 +45,12 @@ _FISHEYES += ("kannalabrandt", "kannalabrandt4", "kb4")
 _KINDS = "fisheye|omni|spheric|equirect|latlong|theta|panoram|orthogr|cylind|catadiop|stereograph"
 _LENS = re.compile(f"(?<!un)dist(?!ance)|lens|radial|tangent|model|^k$|^[kps][0-9]$|^xi$|{_KINDS}")
 _MODELS = re.compile(f"equidist|kannala|division|prism|fov|ucm|doublesphere|vr180|360|{_KINDS}")
+#: Entries of a camera, or beside cameras, that do not matter, as :func:`plain` spells them.
+IRRELEVANT = (
+    *("name", "names", "id", "camid", "port", "serial", "rotationcount", "error", "exposure", "gridcount"),
+    *("ignore", "verifiedresolutions", "rectifyalpha", "metadata", "cameras"),
+    *("time", "n", "f", "v", "ccm", "bounds"),
+)
 
 
 def plain(key: str) -> str:
@@ -52,19 +65,8 @@ def plain(key: str) -> str:
     return re.sub(r"(coef|param)\w*$", "", "".join(filter(str.isalnum, str(key).lower())))
 
 
-def finite(place: str, value: Any) -> float:
-    """An entry as a number.
-
-    Args:
-        place: file and key, for the message.
-        value: as the file has it; text that spells a number is one.
-
-    Returns:
-        The number.
-
-    Raises:
-        InputError: it is not finite, or no number.
-    """
+def _finite(place: str, value: Any) -> float:
+    """An entry as a number; text that spells a number is one."""
     try:
         number = math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):
@@ -73,9 +75,22 @@ def finite(place: str, value: Any) -> float:
     return number
 
 
+def _true_or_false(place: str, value: Any) -> bool:
+    is_flag = isinstance(value, bool | int | float) and value in (0, 1)
+    require(is_flag, place, "true or false", value)
+    return bool(value)
+
+
+def _text(place: str, value: Any) -> str:
+    require(isinstance(value, str), place, "text", value)
+    return value
+
+
 class Entries:
     """The entries of a camera. A null counts as missing. Methods give None where an entry is
     missing, and refuse (InputError) one of a wrong type, and two that mean the same and differ.
+
+    ``what`` is one of :data:`NAMES`, or another key.
 
     Attributes:
         origin: file and camera, for messages.
@@ -87,191 +102,92 @@ class Entries:
         self._read: set[str] = set()
 
     def keys(self, what: str) -> list[str]:
-        """Find the keys that spell one thing.
-
-        Args:
-            what: one of :data:`NAMES`, or another key.
-
-        Returns:
-            Keys as the file has them, the preferred first.
-        """
+        """The keys of the file that spell ``what``, the preferred first."""
         names = NAMES.get(what, (plain(what),))
         spelled = [key for key in self.fields if plain(key) in names]
         return sorted(spelled, key=lambda key: names.index(plain(key)))
 
     def number(self, what: str) -> float | None:
-        """A finite number.
-
-        Args:
-            what: as for :meth:`keys`.
-
-        Returns:
-            The number; None: there is no such entry.
-
-        Raises:
-            InputError: an entry is no finite number, or two differ.
-        """
-        return self._one(
-            what, {key: finite(f"{self.origin}: {key}", self.fields[key]) for key in self.keys(what)}
-        )
-
-    def whole(self, what: str) -> int | None:
-        """A whole number above 0.
-
-        Args:
-            what: as for :meth:`keys`.
-
-        Returns:
-            The number; None: there is no such entry.
-
-        Raises:
-            InputError: an entry is no such number, or two differ.
-        """
-        number = self.number(what)
-        if number is None:
-            return None
-        expected = "a whole number above 0"
-        require(number > 0 and number == int(number), f"{self.origin}: {what}", expected, number)
-        return int(number)
+        """A finite number."""
+        return self._value(what, _finite)
 
     def flag(self, what: str) -> bool | None:
-        """True or false, also as 1 or 0.
-
-        Args:
-            what: as for :meth:`keys`.
-
-        Returns:
-            The value; None: there is no such entry.
-
-        Raises:
-            InputError: an entry is anything else, such as the text "no", or two differ.
-        """
-        values = {}
-        for key in self.keys(what):
-            value = self.fields[key]
-            is_flag = isinstance(value, bool | int | float) and value in (0, 1)
-            require(is_flag, f"{self.origin}: {key}", "true or false", value)
-            values[key] = bool(value)
-        return self._one(what, values)
+        """True or false, also as 1 or 0; anything else, such as the text "no", is refused."""
+        return self._value(what, _true_or_false)
 
     def text(self, what: str) -> str | None:
-        """Text that is not empty.
-
-        Args:
-            what: as for :meth:`keys`.
-
-        Returns:
-            The text; None: there is no such entry, or it is empty.
-
-        Raises:
-            InputError: an entry is no text, or two differ.
-        """
-        values = {key: self.fields[key] for key in self.keys(what)}
-        for key, value in values.items():
-            require(isinstance(value, str), f"{self.origin}: {key}", "text", value)
-        return self._one(what, values) or None
+        """Text; None also where it is empty."""
+        return self._value(what, _text) or None
 
     def has(self, what: str, *shapes: tuple[int | None, ...]) -> bool:
-        """Whether there is an array of one of several shapes.
-
-        Args:
-            what: as for :meth:`keys`.
-            shapes: lengths of the axes; None is any length.
-        """
+        """Whether there is an array of one of several shapes; None is any length of an axis."""
         return any(_fits(self.fields[key], shapes) for key in self.keys(what))
 
     def array(self, what: str, *shapes: tuple[int | None, ...]) -> np.ndarray | None:
-        """An array of one of several shapes.
+        """An array of one of several shapes, as of :meth:`has`.
 
         Of several entries those count that have such a shape: ``K`` is a matrix beside ``k``,
-        coefficients of a lens.
+        coefficients of a lens."""
 
-        Args:
-            what: as for :meth:`keys`.
-            shapes: lengths of the axes; None is any length.
+        def numbers(place: str, value: Any) -> np.ndarray:
+            require(not _has_flags(value), place, "numbers", value)
+            return check_array(place, value, shapes)
 
-        Returns:
-            The array; None: there is no such entry.
-
-        Raises:
-            InputError: an entry has another shape or no finite numbers, or two differ.
-        """
         keys = self.keys(what)
-        fitting = [key for key in keys if _fits(self.fields[key], shapes)]
-        values = {}
-        for key in fitting or keys[:1]:
-            value = self.fields[key]
-            require(not _has_flags(value), f"{self.origin}: {key}", "numbers", value)
-            values[key] = check_array(f"{self.origin}: {key}", value, shapes)
-        return self._one(what, values)
+        return self._value(
+            what, numbers, [key for key in keys if _fits(self.fields[key], shapes)] or keys[:1]
+        )
 
     def needed(self, what: str, *shapes: tuple[int | None, ...]) -> np.ndarray:
-        """As :meth:`array`, of an entry that must be there.
-
-        Args:
-            what: as for :meth:`keys`.
-            shapes: as for :meth:`array`.
-
-        Returns:
-            The array.
-
-        Raises:
-            InputError: there is none; or as for :meth:`array`.
-        """
+        """As :meth:`array`, of an entry that must be there."""
         value = self.array(what, *shapes)
         names = NAMES.get(what, (what,))
         require(value is not None, self.origin, f"{what} ({' or '.join(names)})", sorted(self.fields))
         return value
 
-    def _one(self, what: str, values: Mapping[str, Any]) -> Any:
-        """The value of all ``values`` by key, which are equal."""
-        self._read |= values.keys()
-        first = next(iter(values.values()), None)
-        same = all(np.array_equal(np.ravel(value), np.ravel(first)) for value in values.values())
-        require(same, self.origin, f"one {what}", f"different ones: {' and '.join(values)}")
-        return first
+    def _value(self, what: str, convert: Callable[[str, Any], Any], keys: Sequence[str] | None = None) -> Any:
+        """The one value of all entries that spell ``what``, or of some ``keys`` of these."""
+        keys = self.keys(what) if keys is None else keys
+        self._read |= set(keys)
+        values = [convert(f"{self.origin}: {key}", self.fields[key]) for key in keys]
+        same = all(np.array_equal(np.ravel(value), np.ravel(values[0])) for value in values)
+        require(same, self.origin, f"one {what}", f"different ones: {' and '.join(keys)}")
+        return values[0] if values else None
 
     @property
     def size(self) -> tuple[int, int] | None:
         """(height, width) in pixels, given as two numbers or as a list (width, height)."""
-        width = self.whole("width")
-        height = self.whole("height")
         both = self.array("size", (2,), (2, 1), (1, 2))
-        if both is not None:
-            listed = tuple(int(side) for side in both.ravel())
-            is_whole = bool((both.ravel() == listed).all()) and min(listed) > 0
-            require(is_whole, f"{self.origin}: size", "whole numbers above 0", both.ravel().tolist())
-            same = width in (None, listed[0]) and height in (None, listed[1])
-            require(same, f"{self.origin}: size", f"width and height {width} x {height}", list(listed))
-            width, height = listed
-        return None if width is None or height is None else (height, width)
+        sides = []
+        for name, listed in zip(
+            ("width", "height"), (None, None) if both is None else both.ravel(), strict=True
+        ):
+            single = self.number(name)
+            side = single if listed is None else listed
+            is_whole = side is None or (side > 0 and side == int(side))
+            require(is_whole, f"{self.origin}: {name}", "a whole number above 0", side)
+            require(single in (None, side), f"{self.origin}: size", f"a {name} of {single}", side)
+            sides.append(side)
+        return None if None in sides else (int(sides[1]), int(sides[0]))
 
     @property
     def is_fisheye(self) -> bool:
-        """Whether flag or model say so.
-
-        Raises:
-            InputError: they differ, or a model is not read.
-        """
+        """Whether flag or model say so; they must not differ."""
         flag = self.flag("fisheye")
         models = {key: str(self.fields[key]) for key in self.keys("model")}
         self._read |= models.keys()
-        expected = f"a camera model among {', '.join((*_PINHOLES, *_BROWN, *_FISHEYES))}"
+        known = (*_PINHOLES, *_BROWN, *_FISHEYES)
         for key, model in models.items():
-            is_known = plain(model) in (*_PINHOLES, *_BROWN, *_FISHEYES)
-            require(is_known, f"{self.origin}: {key}", expected, model)
-        fisheyes = [plain(model) in _FISHEYES for model in models.values()]
+            expected = f"a camera model among {', '.join(known)}"
+            require(plain(model) in known, f"{self.origin}: {key}", expected, model)
+        kinds = {plain(model) for model in models.values()}
+        is_fisheye = not kinds.isdisjoint(_FISHEYES)
         named = " and ".join(models.values())
-        mixed = any(fisheyes) and any(plain(model) in _BROWN for model in models.values())
-        require(not mixed, self.origin, "one model of the lens", named)
-        differ = flag is not None and models and flag != any(fisheyes)
-        require(
-            not differ,
-            f"{self.origin}: {' and '.join(self.keys('fisheye'))}",
-            f"{any(fisheyes)} beside {named}",
-            flag,
-        )
-        return any(fisheyes) if flag is None else flag
+        require(not is_fisheye or kinds.isdisjoint(_BROWN), self.origin, "one model of the lens", named)
+        place = f"{self.origin}: {' and '.join(self.keys('fisheye'))}"
+        agree = flag is None or not models or flag == is_fisheye
+        require(agree, place, f"{is_fisheye} beside {named}", flag)
+        return is_fisheye if flag is None else flag
 
     def distortion(self, order: str) -> np.ndarray:
         """Distortion coefficients, as a list or with an entry each.
@@ -291,34 +207,26 @@ class Entries:
         single = {name: number for name, number in numbers.items() if number is not None}
         beyond = [name for name, number in single.items() if number and name not in order.split()]
         require(not beyond, self.origin, f"distortion {order}", beyond)
-        values = coefficients(single, order)
         if listed is None:
-            return values
+            return coefficients(single, order)
         listed = listed.ravel()
         known = dict(zip(order.split(), listed, strict=False))
         same = all(known.get(name, 0.0) == number for name, number in single.items())
         require(same, self.origin, f"one distortion, {listed.tolist()}", f"another: {single}")
         return listed
 
-    def unread(self, irrelevant: Collection[str]) -> tuple[str, ...]:
+    def unread(self, irrelevant: Sequence[str] = IRRELEVANT) -> tuple[str, ...]:
         """Keys of entries that nothing has read so far.
 
         Args:
             irrelevant: keys that do not matter, spelled as :func:`plain` does.
 
-        Returns:
-            The keys as the file has them.
-
         Raises:
             InputError: one about the lens is neither empty nor 0: without it the picture would be
                 bent.
         """
-        left = {
-            key: value
-            for key, value in self.fields.items()
-            if key not in self._read and plain(key) not in irrelevant
-        }
-        lens = [key for key, value in left.items() if _bends(plain(key), value)]
+        left = [key for key in self.fields if key not in self._read and plain(key) not in irrelevant]
+        lens = [key for key in left if _bends(plain(key), self.fields[key])]
         expected = (
             "lens distortion as D or dist: k1 k2 p1 p2 k3 k4 k5 k6, with fisheye k1 k2 k3 k4, and"
             " no other camera model"
@@ -368,3 +276,71 @@ def _fits(value: Any, shapes: tuple[tuple[int | None, ...], ...]) -> bool:
 def _has_flags(value: Any) -> bool:
     """Whether true or false is among the numbers of nested lists."""
     return any(map(_has_flags, value)) if isinstance(value, list | tuple) else isinstance(value, bool)
+
+
+def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+    """Intrinsics of a pinhole camera.
+
+    Args:
+        fx: horizontal focal length in pixels.
+        fy: vertical focal length in pixels.
+        cx: column of the principal point, in pixels.
+        cy: row of the principal point, in pixels.
+
+    Returns:
+        The matrix [3, 3] float64.
+    """
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """The cameras of a file by name, and the meaning of their numbers by its format."""
+
+    cameras: dict[str, StoredCamera]
+    convention: Convention
+
+    @classmethod
+    def of(
+        cls, cameras: Sequence[StoredCamera], convention: Convention, unread: Sequence[str] = ()
+    ) -> "CameraFile":
+        """Name cameras by their photographs, without folder and suffix, in their order.
+
+        Where different cameras share such a name (that of an instant), all are named by their
+        folders, or as the file has it. A camera that is listed for several photographs is one,
+        without their masks. One warning names all entries that are not read.
+
+        Args:
+            cameras: with names as the file has them.
+            convention: meaning of their numbers by the format.
+            unread: keys beside the cameras that are not read.
+
+        Returns:
+            The cameras by name.
+
+        Raises:
+            InputError: two different cameras have one name.
+        """
+        if unread := sorted(set(unread).union(*(camera.unread for camera in cameras))):
+            warnings.warn(f"cameras: entries that are not read: {', '.join(unread)}", stacklevel=3)
+        for part in (-1, -2, 0):
+            named: dict[str, StoredCamera] = {}
+            for camera in cameras:
+                name = _parts(camera.name)[part:][0] if part else composed(camera.name)
+                if name not in named:
+                    named[name] = camera
+                elif named[name].has_numbers_of(camera):
+                    named[name] = replace(camera, mask=None)
+                else:
+                    break
+            else:
+                return cls(named, convention)
+        raise InputError(f"{camera.origin}: expected cameras of different names; found {name} twice")
+
+
+def _parts(name: str) -> list[str]:
+    *folders, last = parts_of(name)
+    path = Path(last)
+    suffix = path.suffix.lower()
+    is_picture = suffix in SUFFIXES or suffix[1:] in PICTURES.split()
+    return [*folders, path.stem if is_picture else last]

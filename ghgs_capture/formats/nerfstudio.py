@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from ghgs_capture.calibration import Convention, PartialIntrinsics, StoredCamera
-from ghgs_capture.formats.camera_file import CameraFile
-from ghgs_capture.formats.entries import FISHEYE, Entries
-from ghgs_capture.formats.json_and_toml import read_json_file
+from ghgs_capture.formats.entries import FISHEYE, CameraFile, Entries
+from ghgs_capture.formats.matrices import read_mapping
 from ghgs_lit.errors import require
 from ghgs_lit.parsing import find_path
 
@@ -37,12 +36,12 @@ def read_nerfstudio(path: Path) -> CameraFile:
     Raises:
         InputError: a frame is missing or wrong.
     """
-    content = read_json_file(path)
+    content, _ = read_mapping(path)
     frames = content.get("frames")
     require(isinstance(frames, list) and len(frames) > 0, f"{path}: frames", "a list of frames", frames)
     cameras = [_camera(path, f"{path}: frames[{i}]", content, frame) for i, frame in enumerate(frames)]
     convention = Convention(extrinsics="camera_to_world", axes="opengl")
-    return CameraFile.of(cameras, convention, "nerfstudio")
+    return CameraFile.of(cameras, convention)
 
 
 def _camera(path: Path, origin: str, shared: Mapping[str, Any], frame: Any) -> StoredCamera:

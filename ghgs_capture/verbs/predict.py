@@ -15,7 +15,7 @@ from ghgs_capture import export
 from ghgs_capture.backgrounds import BACKGROUND_INSTANTS, Backgrounds
 from ghgs_capture.capture import Capture
 from ghgs_capture.folder import CaptureFolder
-from ghgs_capture.formats.json_and_toml import json_text
+from ghgs_capture.formats.matrices import json_text
 from ghgs_capture.prediction import TimedPrediction, crop_size, predict, predict_batch
 from ghgs_capture.rig import INSTANTS, Rig, corrected_rig, spread
 from ghgs_capture.tones import without_tones

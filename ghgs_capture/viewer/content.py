@@ -12,7 +12,7 @@ from torch import Tensor
 from ghgs_capture.calibration import calibrate
 from ghgs_capture.export.compact import visible_first
 from ghgs_capture.export.subject import AXES
-from ghgs_capture.formats.json_and_toml import read_json
+from ghgs_capture.formats.matrices import read_matrices
 from ghgs_lit.data.images import read_image
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.geometry.projection import unproject_maps
@@ -93,7 +93,7 @@ def read_content(path: str | Path, up: str | None) -> Content:
 def _read_inputs(directory: Path) -> Batch:
     """Photographs, masks and cameras of the format ``inputs``.
     InputError: one is missing or wrong."""
-    stored = read_json(directory / "cameras.json")
+    stored = read_matrices(directory / "cameras.json")
     pictures = []
     cameras = []
     for name, camera in stored.cameras.items():

@@ -16,11 +16,14 @@ from ghgs_capture.calibration import (
     quarter_turned,
 )
 from ghgs_capture.formats import FORMATS, read_cameras
-from ghgs_capture.formats.json_and_toml import json_text
+from ghgs_capture.formats.matrices import json_text
 from ghgs_lit.config import nodes
 from ghgs_lit.errors import InputError
+from tests.helpers.calibrations import CAMERA, frame, one_camera, transforms, write
 from tests.helpers.rigs import POINTS, SIZE, opencv_pixels, rig
 from tests.helpers.scenes import FIXTURES
+
+ANIPOSE = FIXTURES / "cameras" / "anipose.toml"
 
 
 def expected(camera) -> np.ndarray:
@@ -30,19 +33,18 @@ def expected(camera) -> np.ndarray:
 
 def projected(calibration: Calibration, points=POINTS) -> np.ndarray:
     e = calibration.extrinsics
-    return opencv_pixels(
-        points, e[:3, :3], e[:3, 3], calibration.intrinsics, calibration.distortion, calibration.fisheye
-    )
+    lens = calibration.intrinsics, calibration.distortion, calibration.fisheye
+    return opencv_pixels(points, e[:3, :3], e[:3, 3], *lens)
 
 
-def check(path, format, points=POINTS, cameras=None, names=None):
+def check(path, points=POINTS, cameras=None):
     """Every camera of the file projects as the rig's does."""
     found, cameras = read_cameras(path), cameras or rig()
-    assert found.format == format
-    assert list(found.cameras) == (names or list(cameras))
+    assert list(found.cameras) == list(cameras)
     for stored, camera in zip(found.cameras.values(), cameras.values(), strict=True):
         error = np.abs(projected(calibrate(stored, found.convention, SIZE), points) - expected(camera)).max()
         assert error < 0.01
+        assert stored.size in (None, SIZE)
 
 
 def write_yaml(path, fields):
@@ -56,35 +58,91 @@ def write_yaml(path, fields):
         else:
             file.write(key, value)
     file.release()
+    return path
 
 
-def test_opencv_writes_a_file_for_each_camera(tmp_path):
+def lists():
+    return {name: {key: value.tolist() for key, value in c.items()} for name, c in rig().items()}
+
+
+def a_file_for_each_camera(path):
     for name, c in rig().items():
         pose = {"rvec": cv2.Rodrigues(c["R"])[0], "tvec": c["T"]}
         size = {"image_width": SIZE[1], "image_height": SIZE[0]}
-        write_yaml(tmp_path / f"{name}.yml", {"camera_matrix": c["K"], "dist_coeffs": c["D"], **pose, **size})
-    check(tmp_path, "opencv")
-    assert read_cameras(tmp_path).cameras["cam_01"].size == SIZE
+        write_yaml(path / f"{name}.yml", {"camera_matrix": c["K"], "dist_coeffs": c["D"], **pose, **size})
+    return path
 
 
-def test_opencv_writes_all_cameras_into_one_file(tmp_path):
-    fields = {f"{key}_{name}": c[key] for name, c in rig().items() for key in "KDRT"}
-    write_yaml(tmp_path / "rig.yaml", fields)
-    check(tmp_path / "rig.yaml", "opencv")
+def all_in_one_file(path):
+    return write_yaml(path / "rig.yaml", {f"{k}_{name}": c[k] for name, c in rig().items() for k in "KDRT"})
+
+
+def own_json(path):
+    read = read_cameras(ANIPOSE)
+    calibrations = {n: (calibrate(c, read.convention, SIZE), SIZE) for n, c in read.cameras.items()}
+    return write(path / "cameras.json", json_text(calibrations))
+
+
+QUALISYS = """<camera serial="{name}"><fov_video left="0" top="0" right="{right}" bottom="{bottom}"/>
+<transform x="{x}" y="{y}" z="{z}" {turn}/>
+<intrinsic focalLengthU="{fx}" focalLengthV="{fy}" centerPointU="{cx}" centerPointV="{cy}"
+ radialDistortion1="{k1}" radialDistortion2="{k2}" radialDistortion3="{k3}"
+ tangentalDistortion1="{p1}" tangentalDistortion2="{p2}"/></camera>"""
+
+
+def qualisys(path):
+    """Millimetres, 1/64 pixels, y up and z backward, as its own program writes them."""
+    cameras = ""
+    for name, camera in rig().items():
+        eye = -1000 * camera["R"].T @ camera["T"]
+        turn = np.diag([1, -1, -1]) @ camera["R"]
+        lens = dict(zip(("k1", "k2", "p1", "p2", "k3"), camera["D"], strict=True))
+        k = 64 * camera["K"]
+        cameras += QUALISYS.format(
+            name=name, right=SIZE[1] - 1, bottom=SIZE[0] - 1,
+            turn=" ".join(f'r{i + 1}{j + 1}="{turn[i, j]}"' for i in range(3) for j in range(3)),
+            **dict(zip("xyz", eye, strict=True)), **lens,
+            fx=k[0, 0], fy=k[1, 1], cx=k[0, 2], cy=k[1, 2],
+        )  # fmt: skip
+    return write(path / "Calib.qca.txt", f"<calibration><cameras>{cameras}</cameras></calibration>")
+
+
+WRITERS = {
+    "opencv, a file each": a_file_for_each_camera,
+    "opencv, one file": all_in_one_file,
+    "opencv, JSON": lambda path: write(path / "cameras.json", lists()),
+    "anipose and pose2sim": lambda path: ANIPOSE,
+    "own": own_json,
+    "qualisys": qualisys,
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_files_of_programs(tmp_path, name):
+    check(WRITERS[name](tmp_path))
+
+
+def test_own_json_has_the_size_of_photographs(tmp_path):
+    stored = json.loads(own_json(tmp_path).read_text())["cameras"]
+    assert {(camera["height"], camera["width"]) for camera in stored.values()} == {SIZE}
+
+
+def test_entries_beside_cameras_are_named(tmp_path):
+    with pytest.warns(UserWarning, match="entries that are not read: units"):
+        check(write(tmp_path / "cameras.json", {"cameras": lists(), "units": "metre"}))
 
 
 @pytest.mark.parametrize("place", ["", "intri.yml", "extri.yml"])
 def test_easymocap(tmp_path, place):
     """Both the rotation vector R and the matrix Rot are written; numbers are names, too."""
     cameras = {name.removeprefix("cam_"): c for name, c in rig().items()}
-    intrinsics = {f"K_{n}": c["K"] for n, c in cameras.items()} | {
-        f"dist_{n}": c["D"] for n, c in cameras.items()
-    }
-    write_yaml(tmp_path / "intri.yml", {"names": list(cameras), **intrinsics})
-    poses = {f"R_{n}": cv2.Rodrigues(c["R"])[0] for n, c in cameras.items()}
-    poses |= {f"Rot_{n}": c["R"] for n, c in cameras.items()} | {f"T_{n}": c["T"] for n, c in cameras.items()}
-    write_yaml(tmp_path / "extri.yml", {"names": list(cameras), **poses})
-    check(tmp_path / place, "easymocap", cameras=cameras)
+    lens, poses = {"names": list(cameras)}, {"names": list(cameras)}
+    for n, c in cameras.items():
+        lens |= {f"K_{n}": c["K"], f"dist_{n}": c["D"]}
+        poses |= {f"R_{n}": cv2.Rodrigues(c["R"])[0], f"Rot_{n}": c["R"], f"T_{n}": c["T"]}
+    write_yaml(tmp_path / "intri.yml", lens)
+    write_yaml(tmp_path / "extri.yml", poses)
+    check(tmp_path / place, cameras=cameras)
 
 
 COLMAP = {
@@ -114,7 +172,6 @@ def test_colmap(tmp_path, binary):
     folder.mkdir(parents=True)
     (model.write_binary if binary else model.write_text)(str(folder))
     found = read_cameras(tmp_path)
-    assert found.format == "colmap"
     assert set(found.cameras) == set(COLMAP)
     for image in model.images.values():
         local = image.cam_from_world() * POINTS
@@ -129,55 +186,83 @@ def test_nerfstudio():
     path = FIXTURES / "cameras" / "transforms.json"
     turn = np.array(json.loads(path.read_text())["applied_transform"])
     cameras = {name: c | {"D": c["D"][:4]} for name, c in rig().items()}
-    check(path, "nerfstudio", POINTS @ turn[:, :3].T, cameras)
+    check(path, POINTS @ turn[:, :3].T, cameras)
 
 
-def test_nerfstudio_with_an_angle_of_view(tmp_path):
-    """Instant NGP and Blender say the angle in place of the focal length,
-    and nothing of the middle."""
-    frame = {"file_path": "./train/r_0", "transform_matrix": np.eye(4).tolist()}
-    content = {"camera_angle_x": 2 * np.arctan(0.4), "w": 800, "h": 600, "frames": [frame]}
-    (tmp_path / "transforms_train.json").write_text(json.dumps(content))
-    found = read_cameras(tmp_path / "transforms_train.json").cameras["r_0"]
-    np.testing.assert_allclose(found.intrinsics, [[1000, 0, 400], [0, 1000, 300], [0, 0, 1]])
+FRAMES = [frame("a.png"), frame("b.png", fl_x=500, cy=90)]
+SHARED = {"fl_x": 1000, "fl_y": 900, "cx": 100, "cy": 80, "w": 200, "h": 160, "frames": FRAMES}
+ANGLE = {"camera_angle_x": 2 * np.arctan(0.4), "w": 800, "h": 600, "frames": [frame("./train/r_0")]}
 
 
-def test_anipose_and_pose2sim():
-    check(FIXTURES / "cameras" / "anipose.toml", "toml")
+@pytest.mark.parametrize(
+    ("content", "name", "intrinsics"),
+    [
+        (SHARED, "a", [[1000, 0, 100], [0, 900, 80], [0, 0, 1]]),
+        (SHARED, "b", [[500, 0, 100], [0, 900, 90], [0, 0, 1]]),  # a frame's own numbers win
+        (ANGLE, "r_0", [[1000, 0, 400], [0, 1000, 300], [0, 0, 1]]),  # Instant NGP and Blender
+    ],
+)
+def test_intrinsics_of_nerfstudio(tmp_path, content, name, intrinsics):
+    cameras = read_cameras(write(tmp_path / "transforms_train.json", content)).cameras
+    np.testing.assert_allclose(cameras[name].intrinsics, intrinsics)
 
 
-def test_json_of_opencv_matrices(tmp_path):
-    cameras = {name: {key: value.tolist() for key, value in c.items()} for name, c in rig().items()}
-    (tmp_path / "cameras.json").write_text(json.dumps(cameras))
-    check(tmp_path / "cameras.json", "opencv")
-    (tmp_path / "cameras.json").write_text(json.dumps({"cameras": cameras, "units": "metre"}))
-    with pytest.warns(UserWarning, match="entries that are not read: units"):
-        check(tmp_path / "cameras.json", "opencv")
+def test_an_angle_of_view_alone_is_of_the_photograph(tmp_path):
+    """NeRF's and Blender's files have no size: the photographs have one,
+    before and after a quarter turn."""
+    poses = rig()
+    angle, frames = 2 * np.arctan(0.5), []
+    for name, camera in poses.items():
+        pose = np.eye(4)
+        pose[:3, :3] = camera["R"].T @ np.diag([1, -1, -1])
+        pose[:3, 3] = -camera["R"].T @ camera["T"]
+        frames.append(frame(f"./train\\{name}", transform_matrix=pose.tolist()))
+    path = tmp_path / "transforms.json"
+    file = read_cameras(write(path, {"camera_angle_x": angle, "frames": frames}))
+    assert list(file.cameras) == list(poses)
+    stored = file.cameras["cam_01"]
+    for height, width in (SIZE, SIZE[::-1]):
+        found = calibrate(stored, file.convention, (height, width))
+        np.testing.assert_allclose(
+            found.intrinsics, [[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], rtol=1e-12
+        )
+        np.testing.assert_allclose(found.extrinsics[:3, :3], poses["cam_01"]["R"], atol=1e-12)
+    assert not stored.has_numbers_of(read_cameras(transforms(tmp_path, frame("cam_01"))).cameras["cam_01"])
+    vertical = read_cameras(write(path, {"camera_angle_y": angle, "frames": frames})).cameras["cam_01"]
+    assert calibrate(vertical, file.convention, SIZE).intrinsics[0, 0] == pytest.approx(SIZE[0])
+    for wrong, line in (
+        ({"camera_angle_x": 0}, "camera_angle_x: expected radians between 0 and pi"),
+        ({"camera_angle_x": 4}, "camera_angle_x: expected radians between 0 and pi"),
+        ({"camera_angle_x": "wide"}, "camera_angle_x: expected a finite"),
+        ({"cx": 3}, r"frames\[0\]: expected fl_x or camera_angle_x; found"),
+    ):
+        with pytest.raises(InputError, match=line):
+            read_cameras(write(path, {**wrong, "frames": frames}))
 
 
-def test_own_json_comes_back(tmp_path):
-    read = read_cameras(FIXTURES / "cameras" / "anipose.toml")
-    calibrations = {n: (calibrate(c, read.convention, SIZE), SIZE) for n, c in read.cameras.items()}
-    (tmp_path / "cameras.json").write_text(json_text(calibrations))
-    check(tmp_path / "cameras.json", "ghgs")
-    stored = json.loads((tmp_path / "cameras.json").read_text())["cameras"]
-    assert {(camera["height"], camera["width"]) for camera in stored.values()} == {SIZE}
-
-
-def test_a_photograph_of_another_size_scales_the_intrinsics():
-    found = read_cameras(FIXTURES / "cameras" / "anipose.toml")
+def test_a_photograph_of_another_size_scales_the_intrinsics(tmp_path):
+    found = read_cameras(ANIPOSE)
     half = calibrate(found.cameras["cam_02"], found.convention, (SIZE[0] // 2, SIZE[1] // 2))
     assert np.abs(projected(half) - expected(rig()["cam_02"]) / 2).max() < 0.01
     with pytest.raises(InputError, match=r"cam_02: expected a photograph of 854x640 .*found 640x854"):
         calibrate(found.cameras["cam_02"], found.convention, SIZE[::-1])
+    # Video of 1080 pixels of a sensor of 1088.
+    camera = one_camera(tmp_path, width=1088, height=1920)
+    assert calibrate(camera, found.convention, (960, 540)).intrinsics[0, 0] == pytest.approx(500)
+    with pytest.raises(InputError, match="expected a photograph of 1920x1088"):
+        calibrate(camera, found.convention, (960, 500))
+
+
+def pose_of(camera):
+    return np.vstack((np.column_stack((camera["R"], camera["T"])), [0, 0, 0, 1]))
 
 
 @pytest.mark.parametrize("turns", [1, 2, 3, 4, -1])
 def test_a_turned_photograph_turns_its_camera(turns):
     """A spot of the photograph is where the turned camera says, after ``numpy.rot90``."""
     camera = rig()["cam_01"]
-    pose = np.vstack((np.column_stack((camera["R"], camera["T"])), [0, 0, 0, 1]))
-    straight = Calibration(camera["K"] + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], pose, np.zeros(0), False)
+    lens = camera["K"] + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    straight = Calibration(lens, pose_of(camera), np.zeros(0), False)
     for point in POINTS[:4]:
         column, row = np.floor(projected(straight, point[None])[0]).astype(int)
         spot = np.zeros(SIZE, bool)
@@ -187,22 +272,10 @@ def test_a_turned_photograph_turns_its_camera(turns):
         assert np.abs(pixel - [turned_column + 0.5, turned_row + 0.5]).max() <= 0.5 + 1e-9
 
 
-def test_a_frames_own_intrinsics_win_over_those_of_the_file(tmp_path):
-    """Of nerfstudio, where cameras differ: each number by itself."""
-    frame = {"transform_matrix": np.eye(4).tolist()}
-    frames = [{**frame, "file_path": "a.png"}, {**frame, "file_path": "b.png", "fl_x": 500, "cy": 90}]
-    shared = {"fl_x": 1000, "fl_y": 900, "cx": 100, "cy": 80, "w": 200, "h": 160}
-    (tmp_path / "transforms.json").write_text(json.dumps({**shared, "frames": frames}))
-    cameras = read_cameras(tmp_path / "transforms.json").cameras
-    np.testing.assert_array_equal(cameras["a"].intrinsics, [[1000, 0, 100], [0, 900, 80], [0, 0, 1]])
-    np.testing.assert_array_equal(cameras["b"].intrinsics, [[500, 0, 100], [0, 900, 90], [0, 0, 1]])
-
-
 @pytest.mark.parametrize("extrinsics", ["world_to_camera", "camera_to_world"])
 def test_a_unit_is_metres_of_one_unit_of_length(extrinsics):
     """A rig in millimetres: cameras stand a thousandth as far away."""
-    camera = rig()["cam_01"]
-    pose = np.vstack((np.column_stack((camera["R"], camera["T"])), [0, 0, 0, 1]))
+    pose = pose_of(rig()["cam_01"])
     metres, millimetres = (
         extrinsics_of(pose, Convention(extrinsics=extrinsics, unit=unit)) for unit in (1.0, 0.001)
     )
@@ -225,5 +298,9 @@ def test_rotations_of_seven_digits_far_away(extrinsics):
     assert np.abs(local - POINTS @ rotation.T).max() < 1e-5
 
 
-def test_every_format_can_be_said():
+def test_every_format_can_be_said(tmp_path):
     assert get_args(nodes.Calibration.model_fields["format"].annotation) == ("auto", *FORMATS)
+    write(tmp_path / "cameras.json", {"a": CAMERA})
+    transforms(tmp_path, frame("b.png"))
+    for place, said, name in (("", "auto", "b"), ("cameras.json", "ghgs", "a"), ("", "nerfstudio", "b")):
+        assert list(read_cameras(tmp_path / place, said).cameras) == [name]

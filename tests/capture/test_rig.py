@@ -12,7 +12,7 @@ from PIL import Image
 from ghgs_capture import rig as rig_module
 from ghgs_capture.capture import Capture
 from ghgs_capture.folder import CaptureFolder
-from ghgs_capture.formats.json_and_toml import json_text
+from ghgs_capture.formats.matrices import json_text
 from ghgs_capture.prediction import predict
 from ghgs_capture.rig import Rig, corrected_rig, shared_gains
 from ghgs_lit.errors import InputError

@@ -25,7 +25,7 @@ from ghgs_capture.export.subject import (
     rotate_world,
     turn,
 )
-from ghgs_capture.formats.json_and_toml import read_json
+from ghgs_capture.formats.matrices import read_matrices
 from ghgs_capture.verbs import Predict
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import project
@@ -90,7 +90,7 @@ def test_everything_is_written_and_reported(subject, tmp_path):
     photograph = iio.imread(tmp_path / "inputs" / "000_0.png")
     assert np.array_equal(photograph[..., 3] > 0, valid[0])
     cameras = json.loads((tmp_path / "cameras.json").read_text())["cameras"]
-    stored = read_json(tmp_path / "cameras.json")
+    stored = read_matrices(tmp_path / "cameras.json")
     read = calibrate(stored.cameras["001_0"], stored.convention, (16, 16))
     assert np.allclose(read.intrinsics, batch.cameras.intrinsics[0, 1], atol=1e-6)
     assert np.allclose(cameras["001_0"]["extrinsics"], batch.cameras.extrinsics[0, 1], atol=1e-7)

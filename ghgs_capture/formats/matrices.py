@@ -1,0 +1,287 @@
+"""Cameras with named matrices: this package's JSON, and OpenCV's as YAML, JSON, TOML or XML.
+
+YAML of ``cv2.FileStorage`` is a file for each camera, all cameras in one, or EasyMocap's pair; TOML is
+of Pose2Sim, Anipose and Caliscope; XML is Qualisys' ``.qca.txt``. Files differ in spelling:
+``camera_matrix`` or ``K``, ``distortion_coefficients`` or ``dist``, ``rvec`` or ``R``. OpenCV's poses
+map the world to the camera; pixel centres are at integers."""
+
+import json
+import re
+import tomllib
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from ghgs_capture.calibration import Calibration, Convention, StoredCamera
+from ghgs_capture.formats.entries import FISHEYE, PERSPECTIVE, CameraFile, Entries, pinhole
+from ghgs_lit.errors import require
+from ghgs_lit.parsing import check_yaml, find_path, read_parsed
+
+EASYMOCAP = ("intri.yml", "extri.yml")  #: The files of EasyMocap: intrinsics and poses
+QUALISYS = ".qca.txt"
+_VECTORS = (3,), (3, 1), (1, 3)
+_SUBPIXELS = 64  # of Qualisys in a pixel
+_LENS = {"k1": "radialDistortion1", "k2": "radialDistortion2", "p1": "tangentalDistortion1"}
+_LENS |= {"p2": "tangentalDistortion2", "k3": "radialDistortion3"}
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML with OpenCV's tag for matrices, and keys that stay text: 01 is the name of a camera."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and not key.tag.endswith(":merge"):
+                key.tag = self.DEFAULT_SCALAR_TAG
+        return super().construct_mapping(node, deep)
+
+
+def _matrix(loader: _Loader, node: yaml.Node) -> np.ndarray:
+    """The node ``{rows, cols, dt, data}``, or ``{sizes, dt, data}`` as OpenCV 5 writes arrays
+    of one axis."""
+    fields = loader.construct_mapping(node, deep=True)
+    sizes = fields["sizes"] if "sizes" in fields else (fields["rows"], fields["cols"])
+    return np.array(fields["data"], np.float64).reshape(tuple(map(int, sizes)))
+
+
+for _name in ("opencv-matrix", "opencv-nd-matrix"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_name}", _matrix)
+
+
+def _yaml(text: str) -> Any:
+    text = re.sub(r"\A%YAML[^\n]*\n", "", text)  # OpenCV's "%YAML:1.0" is no directive of YAML
+    check_yaml(text)
+    return yaml.load(text, _Loader)
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        names = [key for key, _ in pairs]
+        raise ValueError(f"the key {next(key for key in names if names.count(key) > 1)!r} twice")
+    return content
+
+
+def _json(text: str) -> Any:
+    return json.loads(text, object_pairs_hook=_once)
+
+
+def _qualisys(text: str) -> dict[str, Any]:
+    """Cameras of Qualisys by serial number, with OpenCV's names: its pose maps the camera to
+    the world."""
+    cameras = {}
+    try:
+        for camera in ElementTree.fromstring(text).iter("camera"):
+            numbers = {}
+            for part in ("fov_video", "transform", "intrinsic"):
+                numbers |= {key: float(value) for key, value in camera.find(part).attrib.items()}
+            fx, fy, cx, cy = (
+                numbers.pop(key) / _SUBPIXELS
+                for key in ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV")
+            )
+            left, top, right, bottom = (numbers.pop(key) for key in ("left", "top", "right", "bottom"))
+            rotation = np.array([[numbers.pop(f"r{row}{column}") for column in "123"] for row in "123"])
+            center = [numbers.pop(axis) for axis in "xyz"]
+            lens = {name: numbers.pop(key, 0.0) for name, key in _LENS.items()}
+            cameras[camera.attrib["serial"]] = {
+                "K": pinhole(fx, fy, cx - left, cy - top),
+                "R": rotation,
+                "T": -rotation @ center,
+                "D": list(lens.values()) if any(lens.values()) else None,
+                "size": [right - left + 1, bottom - top + 1],
+                **numbers,
+            }
+    except (ElementTree.ParseError, AttributeError) as error:
+        raise ValueError(repr(error)) from error
+    return cameras
+
+
+#: By ending: the parser, what the file should be, and the meaning of its numbers.
+_KINDS = {
+    ".json": (_json, "JSON", Convention(pixel_centers="integer")),
+    ".toml": (tomllib.loads, "TOML", Convention(pixel_centers="integer")),
+    QUALISYS: (
+        _qualisys,
+        "cameras of Qualisys",
+        Convention(axes="opengl", pixel_centers="integer", unit=0.001),
+    ),
+    "": (_yaml, "YAML of OpenCV", Convention(pixel_centers="integer")),
+}
+
+
+def read_mapping(path: Path) -> tuple[dict[str, Any], Convention]:
+    """The mapping in a file of JSON, TOML, Qualisys' XML or else YAML.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        The mapping, and what OpenCV's matrices in it mean.
+
+    Raises:
+        InputError: the file cannot be read or parsed, holds no mapping, or JSON with a key twice.
+    """
+    kind = next(ending for ending in _KINDS if path.name.lower().endswith(ending))
+    parse, expected, convention = _KINDS[kind]
+    content = read_parsed(path, expected, parse)
+    require(isinstance(content, dict), str(path), f"{expected} with named entries", type(content).__name__)
+    return content, convention
+
+
+def yaml_files(folder: Path) -> list[Path]:
+    """The YAML files of a folder, sorted by name.
+
+    Args:
+        folder: where they lie.
+    """
+    return [path for path in sorted(folder.iterdir()) if path.suffix.lower() in (".yml", ".yaml")]
+
+
+def read_matrices(path: Path) -> CameraFile:
+    """Cameras of a file, of all YAML files of a folder, or of EasyMocap's pair.
+
+    This package's JSON is ``{"cameras": {<name>: {...}}}``, or that mapping alone, with ``intrinsics``
+    [3, 3], ``extrinsics`` [4, 4] or [3, 4], ``width``, ``height``, ``distortion``, ``fisheye`` and
+    ``gains`` in the conventions of :mod:`ghgs_lit.types`; only the first two must be there. Other
+    cameras have ``K``, ``R``, ``T``, ``D``: OpenCV's.
+
+    Args:
+        path: of the file or folder.
+
+    Returns:
+        The cameras, named by their files or entries.
+
+    Raises:
+        InputError: a camera or file is missing or wrong.
+    """
+    cameras: list[StoredCamera] = []
+    unread: list[str] = []
+    for file, content, convention in _contents(path):
+        named = _by_name(file, content)
+        own = {}
+        if file.suffix.lower() == ".json":
+            own = {n: c for n, c in named.items() if isinstance(c, Mapping) and "extrinsics" in c}
+        convention = Convention() if own else convention
+        read = own or {name: camera for name, camera in named.items() if _has_intrinsics(camera)}
+        others = {name: camera for name, camera in named.items() if name not in read}
+        if not read:
+            read, others = _by_suffix(content)
+        expected = "cameras with intrinsics and extrinsics (or K, R and T)"
+        require(bool(read), str(file), expected, sorted(content))
+        cameras += [_camera(name, Entries(f"{file}: {name}", camera)) for name, camera in read.items()]
+        for fields in (others, content if "cameras" in content else {}):
+            unread += Entries(str(file), fields).unread()
+    return CameraFile.of(cameras, convention, unread)
+
+
+def _contents(path: Path) -> Iterator[tuple[Path, dict[str, Any], Convention]]:
+    """Files with the mappings in them; EasyMocap's two are one."""
+    folder = path if path.is_dir() else path.parent
+    is_pair = find_path(folder, EASYMOCAP[0]) is not None if path.is_dir() else path.name.lower() in EASYMOCAP
+    if not is_pair:
+        for file in yaml_files(path) if path.is_dir() else [path]:
+            yield file, *read_mapping(file)
+        return
+    fields: dict[str, Any] = {}
+    for name in EASYMOCAP:
+        file = find_path(folder, name)
+        require(file is not None, str(folder / name), "EasyMocap's file beside the other", "no such file")
+        content, convention = read_mapping(file)
+        fields |= content
+    yield folder, fields, convention
+
+
+def _by_name(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
+    """What may be cameras by name: the file itself, those of the entry ``cameras`` (a mapping or a
+    list), or all entries; tables of TOML are named by their key ``name``."""
+    if _has_intrinsics(content):
+        return {path.stem: content}
+    cameras = content.get("cameras", content)
+    if isinstance(cameras, list) and all(isinstance(camera, Mapping) for camera in cameras):
+        cameras = {str(camera.get("name", i)): camera for i, camera in enumerate(cameras)}
+    require(isinstance(cameras, dict), f"{path}: cameras", "cameras by name", type(cameras).__name__)
+    if path.suffix.lower() != ".toml":
+        return cameras
+    named: dict[str, Any] = {}
+    for key, table in cameras.items():
+        name = str(table.get("name", key)) if isinstance(table, dict) else key
+        require(name not in named, f"{path}: {key}", "a name that no other table has", name)
+        named[name] = table
+    return named
+
+
+def _by_suffix(fields: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
+    """Cameras whose keys carry their names: K_01, dist_01, R_01 (vector), Rot_01 (matrix), T_01;
+    and the other entries."""
+    cameras: dict[str, dict[str, Any]] = {key[2:]: {} for key in fields if key.startswith("K_")}
+    others: dict[str, Any] = {}
+    for key, value in fields.items():
+        # The longest name: K_1 beside K_cam_1.
+        name = max((name for name in cameras if key.endswith(f"_{name}")), key=len, default="")
+        field = key.removesuffix(f"_{name}")
+        # EasyVolcap's t is a time
+        cameras.get(name, others)["time" if field == "t" else field] = value
+    return cameras, others
+
+
+def _has_intrinsics(fields: Any) -> bool:
+    return isinstance(fields, Mapping) and bool(Entries("", fields).keys("intrinsics"))
+
+
+def _camera(name: str, entries: Entries) -> StoredCamera:
+    """One camera with matrices under any usual names; a rotation is a matrix or a vector.
+
+    InputError: an entry is missing or wrong."""
+    pose = np.eye(4)
+    if entries.keys("extrinsics"):
+        extrinsics = entries.needed("extrinsics", (4, 4), (3, 4))
+        pose[: len(extrinsics)] = extrinsics
+    else:
+        pose[:3, :3] = _rotation(entries)
+        pose[:3, 3] = entries.needed("translation", *_VECTORS).ravel()
+    intrinsics = entries.needed("intrinsics", (3, 3))
+    fisheye = entries.is_fisheye
+    return StoredCamera(
+        name,
+        entries.origin,
+        intrinsics,
+        pose,
+        size=entries.size,
+        distortion=entries.distortion(FISHEYE if fisheye else PERSPECTIVE),
+        fisheye=fisheye,
+        gains=entries.array("gains", (3,)),
+        unread=entries.unread(),
+    )
+
+
+def _rotation(entries: Entries) -> np.ndarray:
+    """A matrix is preferred to a vector, which then counts as read."""
+    vector = entries.array("rotation", *_VECTORS) if entries.has("rotation", *_VECTORS) else None
+    if vector is None or entries.has("rotation", (3, 3)):
+        return entries.needed("rotation", (3, 3))
+    from scipy.spatial.transform import Rotation  # here: a twentieth of a second for rare files
+
+    return Rotation.from_rotvec(vector.ravel()).as_matrix()
+
+
+def json_text(cameras: Mapping[str, tuple[Calibration, tuple[int, int]]]) -> str:
+    """Cameras as text that :func:`read_matrices` reads.
+
+    Args:
+        cameras: each with the (height, width) of its photographs in pixels.
+
+    Returns:
+        The content of a file.
+    """
+    from ghgs_capture.export.maps import camera_entry, cameras_json  # here: it imports PyTorch
+
+    entries = {}
+    for name, (camera, size) in cameras.items():
+        entries[name] = camera_entry(camera.intrinsics, camera.extrinsics, size)
+        entries[name] |= {"distortion": camera.distortion.tolist(), "fisheye": camera.fisheye}
+        if camera.gains is not None:
+            entries[name]["gains"] = camera.gains.tolist()
+    return cameras_json(entries) + "\n"
