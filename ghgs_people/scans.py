@@ -18,13 +18,15 @@ from ghgs_lit.data.images import listed_formats, read_image
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.parsing import find_path, parts_of, require_folder
 from ghgs_people.figures.mesh import Person, TexturedMesh
-from ghgs_people.gltf import posed
 
 log = logging.getLogger(__name__)
 
 _MESH_SUFFIXES = (".glb", ".gltf", ".obj")
 #: Options of map_Kd that say where an image is read, but for those that change nothing.
 _MOVES = r"(-\w+ \S+ )*-(s(?! 1(\.0*)? 1(\.0*)? )|o(?! 0(\.0*)? 0(\.0*)? )|t|clamp on) "
+#: Extensions without which a mesh can be read, though a file may require them.
+_READ_EXTENSIONS = ("EXT_texture_webp", "KHR_lights_punctual", "KHR_materials_")
+_FLOAT = 5126  #: Numbers of a glTF accessor that trimesh reads as coordinates of textures
 _IMAGE_SUFFIXES = (".jpeg", ".jpg", ".png")
 
 
@@ -123,25 +125,25 @@ class _Beside(trimesh.resolvers.FilePathResolver):
 
 
 def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
-    """Read all textured meshes of a file in its world frame,
-    where joints and morph targets put them.
+    """Read all textured meshes of a file in its world frame.
 
     Args:
         path: of an ``.obj``, ``.glb`` or ``.gltf`` file.
 
     Raises:
-        InputError: the file cannot be read, has no triangles,
+        InputError: the file cannot be read, has no triangles, is rigged or compressed,
             or a mesh lacks texture or coordinates.
     """
     kind = path.suffix.lower()[1:]
-    tree = None if kind == "obj" else posed(path)
-    content = path.read_bytes() if tree is None else json.dumps(tree).encode()
+    content = path.read_bytes()
+    beside = _Beside(str(path))
     try:
+        if kind != "obj":
+            _check_gltf(path, content)
         with listed_formats():
-            file = io.BytesIO(content)
-            kind = kind if tree is None else "gltf"
-            beside = _Beside(str(path))
-            scene = trimesh.load_scene(file, kind, beside, process=False)
+            scene = trimesh.load_scene(io.BytesIO(content), kind, beside, process=False)
+    except InputError:
+        raise
     except Exception as error:  # trimesh raises whatever its parsers raise
         raise InputError(f"{path}: expected a readable mesh; found {error!r}") from error
     require(not beside.moved, str(path), "map_Kd without -s, -o, -t and -clamp", beside.moved)
@@ -154,6 +156,42 @@ def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
     if not parts:
         raise InputError(f"{path}: expected triangles; found none")
     return tuple(parts)
+
+
+def _check_gltf(path: Path, content: bytes) -> None:
+    """Refuse a glTF or GLB file that trimesh would read as another mesh or with other textures.
+
+    Raises:
+        InputError: names what it has, and the cure.
+    """
+    if content[:4] == b"glTF":  # a GLB file begins with a header of 20 bytes and its JSON
+        content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
+    tree = json.loads(content)
+    required = [name for name in tree.get("extensionsRequired", []) if not name.startswith(_READ_EXTENSIONS)]
+    expected = "a mesh without extensions (npx @gltf-transform/cli dequantize in.glb out.glb removes"
+    require(
+        not required, str(path), f"{expected} compression, or export it uncompressed)", ", ".join(required)
+    )
+    found = [name for name in ("skins", "animations") if tree.get(name)]
+    if "KHR_texture_transform" in tree.get("extensionsUsed", []):
+        found.append("KHR_texture_transform")
+    for mesh in tree.get("meshes", []):
+        for primitive in mesh["primitives"]:
+            coordinates = primitive["attributes"].get("TEXCOORD_0")
+            if primitive.get("targets"):
+                found.append("morph targets")
+            if coordinates is not None and tree["accessors"][coordinates]["componentType"] != _FLOAT:
+                found.append("TEXCOORD_0 of whole numbers")
+    for material in tree.get("materials", []):
+        texture = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
+        if texture.get("texCoord", 0):
+            found.append("texCoord above 0")
+    expected = (
+        "a mesh at rest with one set of texture coordinates (in Blender: Object > Convert > Mesh, then export"
+    )
+    require(
+        not found, str(path), f"{expected} without animation and skinning)", ", ".join(dict.fromkeys(found))
+    )
 
 
 def _part(

@@ -114,17 +114,45 @@ def test_glb_scans_keep_parts_and_frames(tmp_path):
         ScanSource(tmp_path).load("g")
 
 
+RIGGED = "expected a mesh at rest with one set of texture coordinates"
+COMPRESSED = r"expected a mesh without extensions \(npx @gltf-transform/cli dequantize "
+
+
 @pytest.mark.parametrize(
-    "required", [["EXT_meshopt_compression", "KHR_mesh_quantization"], ["KHR_draco_mesh_compression"]]
+    ("change", "line"),
+    [
+        (
+            {"extensionsRequired": ["KHR_materials_unlit", "KHR_draco_mesh_compression"]},
+            f"{COMPRESSED}.*'KHR_draco",
+        ),
+        ({"skins": [{"joints": [0]}]}, f"{RIGGED}.*; found 'skins'"),
+        ({"animations": [{}]}, f"{RIGGED}.*; found 'animations'"),
+        ({"meshes": [{"primitives": [{"attributes": {}, "targets": [{}]}]}]}, f"{RIGGED}.*'morph targets'"),
+        ({"extensionsUsed": ["KHR_texture_transform"]}, f"{RIGGED}.*'KHR_texture_transform'"),
+        (
+            {
+                "accessors": [{"componentType": 5121}],
+                "meshes": [{"primitives": [{"attributes": {"TEXCOORD_0": 0}}]}],
+            },
+            f"{RIGGED}.*'TEXCOORD_0 of whole numbers'",
+        ),
+        (
+            {"materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"texCoord": 1}}}]},
+            f"{RIGGED}.*'texCoord above 0'",
+        ),
+        ({"meshes": [{}]}, "expected a readable mesh; found KeyError"),
+    ],
 )
-def test_compression_that_is_not_read_is_named_with_its_cure(tmp_path, required):
-    (tmp_path / "g").mkdir()
-    content = json.dumps({"extensionsRequired": ["KHR_materials_unlit", *required]}).encode()
+@pytest.mark.parametrize("binary", [True, False])
+def test_a_gltf_file_that_would_be_read_as_another_mesh_is_named_with_its_cure(
+    tmp_path, change, line, binary
+):
+    path = tmp_path / "g" / ("g.glb" if binary else "g.gltf")
+    path.parent.mkdir()
+    content = json.dumps(change).encode()
     header = b"glTF" + np.array([2, 20 + len(content), len(content)], "<u4").tobytes() + b"JSON"
-    (tmp_path / "g" / "g.glb").write_bytes(header + content)
-    cure = r"g\.glb: expected a mesh without extensions \(npx @gltf-transform/cli dequantize "
-    line = rf"{cure}.*; found '{', '.join(required)}'"
-    with pytest.raises(InputError, match=line):
+    path.write_bytes((header if binary else b"") + content)
+    with pytest.raises(InputError, match=rf"{path.name}: {line}"):
         ScanSource(tmp_path).load("g")
 
 
