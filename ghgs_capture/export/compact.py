@@ -3,8 +3,6 @@
 
 from dataclasses import replace
 
-from torch import Tensor
-
 from ghgs_lit.errors import InputError
 from ghgs_lit.ply import ply_bytes
 from ghgs_lit.types import Gaussians
@@ -53,16 +51,3 @@ def converted(name: str, gaussians: Gaussians) -> bytes:
         expected = "formats: expected Gaussians that gaussforge converts to"
         raise InputError(f"{expected} {name}; found {len(gaussians)}: {answer['error']}")
     return answer["data"]
-
-
-def visible_first(gaussians: Gaussians) -> Tensor:
-    """Sort Gaussians by volume times opacity.
-
-    Args:
-        gaussians: of one subject.
-
-    Returns:
-        Indices [N] of the Gaussians, large and opaque ones first.
-    """
-    size = gaussians.scales.double().prod(-1) * gaussians.opacities
-    return size.argsort(descending=True, stable=True)

@@ -3,7 +3,6 @@
 import math
 import os
 import shutil
-import time
 from collections.abc import Iterable
 from functools import partial
 from itertools import chain
@@ -44,7 +43,6 @@ class Instants:
     def __init__(self, count: int, options: OutputOptions, others: Iterable[str] = ()):
         self.count = count
         self.options = options
-        self._seconds = 0.0
         self.others: dict[str, bytes] = dict.fromkeys(others, b"")
         self.folders: list[Path] = []
         self._first: ExportedSubject | None = None
@@ -75,14 +73,12 @@ class Instants:
         self.folders.append(folder)
         if not {"html", "mp4"} & {*self.options.formats}:
             return
-        begin = time.perf_counter()
         subject = exported_subject(batch, prediction, renderer, self.options)
         self._first = self._first or subject
         self._packed.append(pack(subject.gaussians, self._first.pixel, self._first.center, COARSE))
         points = subject.body if len(subject.body) else subject.center[None]
         self._means.append(points.mean(0).cpu().numpy())
         self._boxes.append(torch.stack((points.amin(0), points.amax(0))).cpu().numpy())
-        self._seconds += time.perf_counter() - begin
 
     def write(self, directory: Path) -> list[Path]:
         """Write the files, after all instants are added and their own files written.
@@ -107,15 +103,13 @@ class Instants:
                 (directory / name).unlink()
         contents = {name: partial(self.others.get, name) for name in self.others}
         contents |= {"viewer.html": self._page, "instants.mp4": self._video}
-        seconds = {"code": self._seconds}
         sources = iter(self.folders)
         for name in names:
             if name in contents:
-                seconds[f"write {name}"] = write_file(directory / name, contents[name])
+                write_file(directory / name, contents[name])
             else:
                 write_atomically(directory / name, partial(_link, next(sources) / "gaussians.ply"))
-        report = {"instants": [folder.name for folder in self.folders], "seconds": seconds}
-        return end_files(directory, names, report)
+        return end_files(directory, names, {"instants": [folder.name for folder in self.folders]})
 
     def _path(self) -> np.ndarray:
         """Shift of page and video at each instant [instants, 3]: the smoothed path of the

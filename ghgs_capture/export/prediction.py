@@ -1,6 +1,5 @@
 """The files of a prediction: one entry of ``FORMATS`` for each format."""
 
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ import torch
 
 from ghgs_capture.export.compact import CONVERTED, converted
 from ghgs_capture.export.instants import mp4_bytes
-from ghgs_capture.export.maps import depth_files, depth_unit, input_files, png, points_ply
+from ghgs_capture.export.maps import depth_file, input_files, png
 from ghgs_capture.export.page import page
 from ghgs_capture.export.reports import begin_files, end_files, write_file
 from ghgs_capture.export.subject import ExportedSubject, OutputOptions, exported_subject, file_names
@@ -85,8 +84,7 @@ FORMATS: dict[str, Format] = {
         "imageio_ffmpeg",
         "video",
     ),
-    "depth": Format(("depth/{view}.png", "depth.npz"), depth_files),
-    "points": Format(("points.ply",), _one(points_ply)),
+    "depth": Format(("depth.npz",), _one(depth_file)),
     "inputs": Format(("inputs/{view}.png", "cameras.json"), input_files),
 }
 
@@ -161,26 +159,21 @@ def write_prediction(
     """
     subject = exported_subject(batch, prediction, renderer, options)
     names = output_files(options, subject.views)
-    seconds = {}
     begin_files(directory, names)
     with ThreadPoolExecutor(allowed_cores()) as pool:
         pool.submit(palette, "turbo")  # imports matplotlib, which the sheet needs, meanwhile
-        tasks = {}
+        tasks = []
         for name in options.formats:
-            begin = time.perf_counter()
             files = FORMATS[name].names(subject.views, options.frames)
-            contents = zip(files, FORMATS[name].contents(subject), strict=True)
-            tasks[name] = [pool.submit(write_file, directory / file, made) for file, made in contents]
-            seconds[f"write {name}"] = time.perf_counter() - begin
+            for file, made in zip(files, FORMATS[name].contents(subject), strict=True):
+                tasks.append(pool.submit(write_file, directory / file, made))
         seen = batch.cameras if batch.targets is None else batch.targets.cameras
         image = renderer(prediction.gaussians, seen).image
         overview = sheet(batch, image, 0, prediction.depth, prediction.depth_valid)
         write_file(directory / SHEET, partial(png, overview))
-        facts = dict(facts or {})
-        report = {**_report(subject), **facts}
-        for name, begun in tasks.items():
-            seconds[f"write {name}"] += sum(task.result() for task in begun)
-    report["seconds"] = {**facts.get("seconds", {}), **seconds}
+        report = {**_report(subject), **(facts or {})}
+        for task in tasks:
+            task.result()
     return end_files(directory, names, report)
 
 
@@ -188,8 +181,6 @@ def _report(subject: ExportedSubject) -> dict[str, Any]:
     """Plain data about a prediction: counts, lengths in the unit of the cameras,
     PSNR of the inputs."""
     gaussians = subject.gaussians
-    valid = subject.depth_valid
-    lost = subject.masks & ~valid
     drawn = subject.renderer(gaussians, subject.cameras[None])
     image = drawn.image[0].clamp(0, 1)
     quality = psnr(image, subject.images, box_of(subject.masks)).tolist()
@@ -204,9 +195,6 @@ def _report(subject: ExportedSubject) -> dict[str, Any]:
         "subject_size": None if gaussians.metre is None else HEIGHT * float(gaussians.metre[0]),
         "smallest": means.amin(0).tolist(),
         "largest": means.amax(0).tolist(),
-        "depths_not_finite": dict(zip(subject.views, lost.flatten(1).sum(1).tolist(), strict=True)),
-        "depth_pixels": dict(zip(subject.views, valid.flatten(1).sum(1).tolist(), strict=True)),
-        "depth_png_unit": depth_unit(float(torch.where(valid, subject.depth, 0).max())),
         "psnr_box_of_inputs": dict(zip(subject.views, quality, strict=True)),
         "versions": versions(),
     }

@@ -2,7 +2,6 @@
 
 import json
 import os
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -77,20 +76,15 @@ def end_files(directory: Path, names: Sequence[str], report: Mapping[str, Any]) 
     return [*paths, directory / REPORT]
 
 
-def write_file(path: Path, content: Callable[[], bytes]) -> float:
+def write_file(path: Path, content: Callable[[], bytes]) -> None:
     """Make and write a file.
 
     Args:
         path: of the file, which is written whole or not at all.
         content: makes what is written.
-
-    Returns:
-        The seconds that both took.
     """
-    begin = time.perf_counter()
     made = content()
     write_atomically(path, lambda temporary: temporary.write_bytes(made))
-    return time.perf_counter() - begin
 
 
 def _beside(directory: Path, names: Sequence[str]) -> list[str]:

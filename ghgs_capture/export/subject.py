@@ -11,8 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.errors import require
-from ghgs_lit.geometry.masks import coverage, surface_colors
-from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.geometry.masks import coverage
 from ghgs_lit.geometry.rotations import multiply_quaternions, quaternion_to_matrix
 from ghgs_lit.refinement import Change, Descent
 from ghgs_lit.rendering import Renderer
@@ -165,9 +164,8 @@ def fitted(theirs: Gaussians, ours: Gaussians, cameras: Sequence[Cameras], rende
 class ExportedSubject:
     """One subject. Lengths are in the unit of the cameras; ``up`` is the upward unit vector.
 
-    ``images`` are premultiplied by ``mattes`` (the masks, where there are none). ``points`` are the
-    subject's unprojected pixels with their ``colors``; ``dropped`` counts Gaussians that are not
-    finite, which no renderer draws and no file holds."""
+    ``images`` are premultiplied by ``mattes`` (the masks, where there are none). ``dropped`` counts
+    Gaussians that are not finite, which no renderer draws and no file holds."""
 
     name: str
     views: tuple[str, ...]
@@ -179,16 +177,9 @@ class ExportedSubject:
     mattes: Float[Tensor, "V H W"]
     depth: Float[Tensor, "V H W"]
     depth_valid: Bool[Tensor, "V H W"]
-    points: Float[Tensor, "n 3"]
-    colors: Float[Tensor, "n 3"]
     up: Float[Tensor, "3"]
     renderer: Renderer
     options: OutputOptions
-
-    @property
-    def file_names(self) -> list[str]:
-        """:func:`file_names` of the views."""
-        return file_names(self.views)
 
     @cached_property
     def stored(self) -> Gaussians:
@@ -278,8 +269,6 @@ def exported_subject(
         mattes=coverage(batch)[0],
         depth=depth,
         depth_valid=valid,
-        points=unproject_maps(depth, cameras)[valid],
-        colors=surface_colors(batch)[0].movedim(1, -1)[valid],
         up=up,
         renderer=renderer,
         options=options,

@@ -78,8 +78,8 @@ class Predict(OfPhotographs, Measured):
     """Without images: name of the subject, or its number in the split."""
     split: Literal["train", "val"] = "val"
     """Without images: where the subject is."""
-    formats: Texts = ("ply", "html", "turntable", "depth", "points", "inputs")
-    """What is written: ply, html, turntable, depth, points, inputs; with the extra formats:
+    formats: Texts = ("ply", "html", "turntable", "depth", "inputs")
+    """What is written: ply, html, turntable, depth, inputs; with the extra formats:
     compressed_ply, spz, sog; with the extra video: mp4; or all."""
     up: Axis | None = None
     """Axis that points up in all files, such as -y for SuperSplat; null: that of the cameras' world."""

@@ -1,12 +1,11 @@
 """``ghgs view``: show a prediction with its photographs and cameras in the browser."""
 
-import ipaddress
 import math
 import time
 from typing import TYPE_CHECKING
 
 from ghgs_capture.verbs import predict
-from ghgs_capture.viewer.content import Content, read_content
+from ghgs_capture.viewer.content import read_content
 from ghgs_capture.viewer.server import Viewer
 from ghgs_lit.cli.runtime import output_dir, write_config
 from ghgs_lit.errors import require
@@ -36,24 +35,11 @@ def run(verb: "View") -> None:
         write_config(verb, output_dir())
     # A new prediction is already in the frame of ``up``, and its cameras tell which axis that is.
     content = read_content(verb.path or output_dir(), verb.up if verb.path else None)
-    viewer = _opened(verb, content)
+    viewer = Viewer(content, verb.host, verb.port)
+    print(f"viewer: {viewer.address}; Ctrl-C ends it", flush=True)
     end = time.monotonic() + (verb.seconds or math.inf)
     try:
         while time.monotonic() < end:
             time.sleep(0.2)
     finally:
         viewer.stop()
-
-
-def _opened(run: "View", content: Content) -> Viewer:
-    viewer = Viewer(content, run.host, run.port)
-    print(f"viewer: {viewer.address} ({_reach(run.host)}); Ctrl-C ends it", flush=True)
-    return viewer
-
-
-def _reach(host: str) -> str:
-    try:
-        is_own = host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        is_own = False
-    return "for this machine only; host=0.0.0.0 opens it to the network" if is_own else "open to the network"

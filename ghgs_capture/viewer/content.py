@@ -10,7 +10,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ghgs_capture.calibration import calibrate
-from ghgs_capture.export.compact import visible_first
 from ghgs_capture.export.subject import AXES
 from ghgs_capture.formats.matrices import read_matrices
 from ghgs_lit.data.images import read_image
@@ -42,17 +41,6 @@ class Content:
     def center(self) -> Float[Tensor, "3"]:
         """The middle of the subject."""
         return center_of(subject_points(self.gaussians), self.cameras)
-
-    @cached_property
-    def order(self) -> Tensor:
-        """Indices of the Gaussians, large and opaque ones first."""
-        return visible_first(self.gaussians)
-
-    @cached_property
-    def points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Centres [N, 3] and colours [N, 3] uint8 of the Gaussians, in ``order``."""
-        colors = (self.gaussians.colors[self.order].clamp(0, 1) * 255).round().byte()
-        return self.gaussians.means[self.order].numpy(), colors.numpy()
 
     @cached_property
     def hull(self) -> np.ndarray:

@@ -1,11 +1,10 @@
-"""The page: a viser server with the Gaussians, cameras, points and hull, and controls for them."""
+"""The page: a viser server with the Gaussians, cameras and hull, and a switch for each."""
 
 import contextlib
 import logging
 import math
 import re
 import socket
-import threading
 from collections.abc import Iterator
 from functools import partial
 from typing import Any
@@ -71,19 +70,15 @@ class Viewer:
         viser = installed("viser", "viewer", "ghgs view")
         _require_address(host)
         self.content = content
-        self._lock = threading.Lock()  # controls are answered by several threads
         logging.getLogger("websockets").setLevel(logging.WARNING)  # else a line for each visitor
         with _own_pages_only(host):
             self.server = viser.ViserServer(host, port, label="ghgs", verbose=False)
         self.server.scene.set_up_direction(content.up.numpy())
-        self._prepare()
-        with self.server.gui.add_folder("Gaussians"):
-            self._add_splat_controls()
-        self._add_points()
+        self._add_splats()
         if content.batch is not None:
+            self._add_hull()
             self._place_visitors()
             self._add_cameras()
-        self.show_splats()
 
     @property
     def address(self) -> str:
@@ -94,53 +89,26 @@ class Viewer:
         """Close the page."""
         self.server.stop()
 
-    def _prepare(self) -> None:
-        """Compute what viser draws of the Gaussians: covariances, colours and opacities."""
+    def _add_splats(self) -> None:
+        """Add the Gaussians; those of a prediction as large as the photographs' pixels, else a larger
+        screen shows gaps."""
         g = self.content.gaussians
-        order = self.content.order
         if self.content.batch is not None:
-            # Else a screen larger than the photographs shows gaps.
             g = smoothed(g, pixel_size(self.content.cameras, self.content.center))
-        root = quaternion_to_matrix(g.quaternions[order]) * g.scales[order][:, None, :]
-        self._covariances = (root @ root.mT).numpy()
-        self._colors = g.colors[order].clamp(0, 1).numpy()
-        self._opacities = g.opacities[order][:, None].numpy()
+        root = quaternion_to_matrix(g.quaternions) * g.scales[:, None, :]
+        colors, opacities = g.colors.clamp(0, 1), g.opacities[:, None].clamp(0, 1)
+        drawn = (each.numpy() for each in (g.means, root @ root.mT, colors, opacities))
+        self._switch("Gaussians", self.server.scene.add_gaussian_splats("/gaussians", *drawn))
 
-    def _add_splat_controls(self) -> None:
-        gui = self.server.gui
-        count = len(self.content.gaussians)
-        self.visible = gui.add_checkbox("show", True)
-        self.opacity = gui.add_slider("opacity", 0.0, 2.0, 0.05, 1.0, hint="factor of all opacities")
-        self.count = gui.add_slider("count", min(1, count), max(1, count), 1, max(1, count))
-        for control in (self.visible, self.opacity, self.count):
-            control.on_update(lambda _: self.show_splats())
-
-    def show_splats(self) -> None:
-        """Show the Gaussians with the count and the opacity of the controls."""
-        with self._lock:
-            n = self.count.value
-            self.splats = self.server.scene.add_gaussian_splats(
-                "/gaussians",
-                self.content.points[0][:n],
-                self._covariances[:n],
-                self._colors[:n],
-                (self._opacities[:n] * self.opacity.value).clip(0, 1),
-                visible=self.visible.value,
-            )
-
-    def _add_points(self) -> None:
-        """Add the layers of centres and visual hull, which are hidden at first."""
-        means, colors = self.content.points
-        extent = np.ptp(means, axis=0).max() if len(means) else 1.0
-        clouds = {"points": (means, colors)}
-        if self.content.batch is not None:
-            clouds["hull"] = (self.content.hull, np.array([90, 160, 255], np.uint8))
-        with self.server.gui.add_folder("Layers"):
-            for name, cloud in clouds.items():
-                node = self.server.scene.add_point_cloud(
-                    f"/{name}", *cloud, point_size=float(extent) / 400, precision="float32", visible=False
-                )
-                self._switch(name, node)
+    def _add_hull(self) -> None:
+        """Add the points of the visual hull, which are hidden at first."""
+        points = self.content.hull
+        size = float(np.ptp(points, axis=0).max(initial=0.0)) / 400
+        blue = np.array([90, 160, 255], np.uint8)
+        node = self.server.scene.add_point_cloud(
+            "/hull", points, blue, point_size=size, precision="float32", visible=False
+        )
+        self._switch("hull", node)
 
     def _switch(self, name: str, node: Any) -> None:
         box = self.server.gui.add_checkbox(name, node.visible)

@@ -154,7 +154,7 @@ def test_cameras_say_the_height_and_width_of_their_photographs():
     cameras = camera_ring(2, 30, 20)[0]
     images, mattes = torch.rand(2, 3, 30, 20), torch.ones(2, 30, 20)
     names = ("front", "back")
-    subject = SimpleNamespace(images=images, mattes=mattes, cameras=cameras, file_names=names)
+    subject = SimpleNamespace(images=images, mattes=mattes, cameras=cameras, views=names)
     *pictures, text = (make() for make in input_files(subject))
     assert [Image.open(io.BytesIO(picture)).size for picture in pictures] == [(20, 30)] * 2
     stored = json.loads(text)["cameras"]

@@ -64,7 +64,7 @@ def test_photographs_become_a_splat_where_the_subject_is(here, checkpoint, capsy
     ]
     assert not list(closed.iterdir())
     out = capsys.readouterr().out
-    assert f"{here / 'splat' / 'depth'}/ (4 files)" in out
+    assert f"{here / 'splat' / 'depth.npz'}" in out
     assert "gaussians.ply" in out
     assert "calibration.unit=0.001" in out
     assert inside_the_figure(here / "splat" / "gaussians.ply", 1000.0) > 0.95

@@ -60,16 +60,13 @@ def test_the_page_is_served_on_this_machine_and_its_controls_work(directory):
         with urllib.request.urlopen(viewer.address, timeout=5) as answer:
             assert b"<html" in answer.read()
         nodes = set(viewer.server.scene._handle_from_node_name)
-        assert {"/gaussians", "/points", "/hull", "/cameras/0", "/cameras/2"} <= nodes
+        assert {"/gaussians", "/hull", "/cameras/0", "/cameras/2"} <= nodes
         pose, fov = viewer._poses[1]
         extrinsics = content.cameras.extrinsics[1].numpy()
         rotation = Rotation.from_quat(pose["wxyz"], scalar_first=True).as_matrix()
         assert np.allclose(rotation.T, extrinsics[:3, :3], atol=1e-5)
         assert np.allclose(extrinsics[:3, :3] @ pose["position"] + extrinsics[:3, 3], 0, atol=1e-5)
         assert np.tan(fov / 2) * content.cameras.intrinsics[1, 1, 1] == pytest.approx(25, rel=1e-5)
-        viewer.count.value, viewer.opacity.value = 7, 0.5
-        viewer.show_splats()
-        assert viewer.splats.buffer.shape[0] == 7
         assert all(frustum.visible for frustum in viewer._frustums)
         viewer.go_to(0)
         assert [frustum.visible for frustum in viewer._frustums] == [False, True, True]
@@ -100,11 +97,10 @@ def test_what_cannot_be_shown_is_one_line(directory, tmp_path, capsys):
         read_content(tmp_path / "b.ply", None)
 
 
-def test_the_verb_says_who_can_open_the_page(directory, tmp_path, capsys):
+def test_the_verb_opens_the_page(directory, tmp_path, capsys):
     arguments = [f"path={directory}", f"hydra.run.dir={tmp_path}", f"port={PORT}", "seconds=0.1"]
     assert ghgs("view", *arguments) == 0
-    text = "(for this machine only; host=0.0.0.0 opens it to the network); Ctrl-C ends it"
-    assert text in capsys.readouterr().out
+    assert "viewer: http://127.0.0.1:" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("host", ["192.0.2.7", "no.such.host.invalid", ".", "a" * 300])
