@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ghgs_lit.cli.verb import Budgets, Device, Measured, Training, Verb
+from ghgs_lit.cli.verb import Device, Measured, Training, Verb
 from ghgs_lit.config.nodes import SequenceOptions, Texts, Turntable
-from ghgs_lit.config.options import CropSize, PathText, Positive, Seed, Text
+from ghgs_lit.config.options import CropSize, PathText, Positive, Text
 
 Axis = Literal["y", "-y", "z"]
 
@@ -150,20 +150,15 @@ class Adapt(OfPhotographs, Training):
 
 
 class Doctor(OfPhotographs):
-    """Whether cameras and masks fit together, what this machine lacks, whether a GPU computes well."""
+    """Whether cameras and masks fit together, and what this machine lacks."""
 
     example = "ghgs doctor task=cameras images=photographs cameras=cameras.json masks=masks"
 
-    task: Literal["cameras", "machine", "selfcheck"] = "cameras"
+    task: Literal["cameras", "machine"] = "cameras"
     """cameras: whether photographs, masks and calibration fit together, and what would fit.
-    machine: what there is, and what is missing for which feature. selfcheck: whether ``device``
-    computes as the CPU does in float64: a table for a bug report."""
+    machine: what there is, and what is missing for which feature."""
     device: Device = "auto"
-    """Of task=machine and selfcheck."""
-    seed: Seed = 1
-    """Of random weights."""
-    token_budgets: Budgets | None = None
-    """As for ``ghgs train``."""
+    """Of task=machine."""
 
     def reads_at_once(self) -> bool:
         return self.task == "cameras"

@@ -1,4 +1,4 @@
-"""``ghgs doctor``: diagnose cameras, this machine or a device; one function for each task."""
+"""``ghgs doctor``: diagnose cameras or this machine; one function for each task."""
 
 from typing import TYPE_CHECKING
 
@@ -9,11 +9,9 @@ from rich.table import Table
 from ghgs_capture.camera_report import diagnose
 from ghgs_capture.verbs.photographs import capture_folder
 from ghgs_lit.cli.inputs import pick_device
-from ghgs_lit.cli.runtime import announce, output_dir, write_config
-from ghgs_lit.diagnostics.doctor.selfcheck import FAILED, selfcheck, table
+from ghgs_lit.cli.runtime import output_dir, write_config
 from ghgs_lit.diagnostics.machine import machine_lines, missing_extras
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.files import write_text_atomically
 
 if TYPE_CHECKING:
     from ghgs_capture.verbs import Doctor
@@ -28,7 +26,7 @@ def run(verb: "Doctor") -> None:
     Raises:
         InputError: as for the task.
     """
-    tasks = {"cameras": cameras, "machine": machine, "selfcheck": selfcheck_device}
+    tasks = {"cameras": cameras, "machine": machine}
     tasks[verb.task](verb)
 
 
@@ -41,7 +39,7 @@ def cameras(run: "Doctor") -> None:
     Raises:
         InputError: the cameras do not fit the masks, or a file is missing or wrong.
     """
-    tasks = "images=<folder of photographs> cameras=<calibration>, task=machine or task=selfcheck"
+    tasks = "images=<folder of photographs> cameras=<calibration>, or task=machine"
     require(run.images is not None, "images", tasks, None)
     write_config(run, output_dir())
     diagnosis = diagnose(capture_folder(run))
@@ -66,28 +64,3 @@ def machine(run: "Doctor") -> None:
         for line in lines:
             listing.add_row(*map(escape, line))
         console.print(listing)
-
-
-def selfcheck_device(run: "Doctor") -> None:
-    """Check whether a device computes as the CPU does.
-
-    Prints each outcome, and writes all of them with facts of the machine to ``selfcheck.md``.
-
-    Args:
-        run: as configured.
-
-    Raises:
-        InputError: a check failed.
-    """
-    device = pick_device(run.device)
-    outcomes = []
-    for outcome in selfcheck(run, device):
-        outcomes.append(outcome)
-        print(f"{outcome.status} {outcome.check}: {outcome.found}", flush=True)
-    facts = "\n".join(f"- {name}: {value}" for name, value in machine_lines(device))
-    path = output_dir() / "selfcheck.md"
-    write_text_atomically(path, f"{facts}\n\n{table(outcomes)}\n")
-    announce(path)
-    failed = [outcome.check for outcome in outcomes if outcome.status == FAILED]
-    if failed:
-        raise InputError(f"selfcheck: expected no failed check; found {len(failed)}: {', '.join(failed)}")

@@ -106,7 +106,7 @@ MISSING = [
         1,
         "{empty}: expected sequences such as",
     ),
-    ("doctor", 1, "images: expected images=<folder", "task=machine or task=selfcheck; found None"),
+    ("doctor", 1, "images: expected images=<folder", "or task=machine; found None"),
     ("evaluate", 1, "data: expected data=<option>"),
     ("evaluate data=synthetic", 1, "checkpoint: expected a checkpoint or baselines=[...]; found neither"),
     (

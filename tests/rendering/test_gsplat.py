@@ -2,6 +2,7 @@
 and its image on a GPU."""
 
 import contextlib
+import dataclasses
 import inspect
 import sys
 import types
@@ -14,7 +15,15 @@ from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.rendering import BackendUnavailable, RasterSettings, capacity, gsplat_backend, reference, render
 from ghgs_lit.types import Cameras
 from tests.helpers.gsplat import Documented, InParts, functions
-from tests.helpers.splats import FIELDS, camera_ring, cloud, differentiate, relative_error, with_gradients
+from tests.helpers.splats import (
+    FIELDS,
+    camera_ring,
+    cloud,
+    differentiate,
+    few,
+    relative_error,
+    with_gradients,
+)
 
 
 def test_covariances_are_those_of_gsplat():
@@ -165,12 +174,26 @@ def test_every_argument_is_one_of_gsplat():
     assert {name: parameters[name].default for name in defaults} == defaults
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def at_thresholds():
+    """Opacities just below and above 1/255; ten opaque splats behind one another, which saturate before the
+    last; one nearer than ``near``; one behind the camera."""
+    z = [0.0, 0.0, *(0.2 + 0.05 * i for i in range(10)), -2.995, -4.0]
+    x = [-0.4, 0.4, *(0.02 * i for i in range(10)), 0.0, 0.0]
+    means = torch.tensor([x, [0.01] * len(x), z]).T
+    opacities = [0.9 / 255, 1.2 / 255, *[0.9, 1.0] * 5, 1.0, 1.0]
+    colors = torch.rand(len(x), 3, generator=torch.Generator().manual_seed(0))
+    # Three lengths: the rotation of a ball has no gradient.
+    gaussians = few(means=means, opacities=opacities, colors=colors, scales=[[0.06, 0.1, 0.14]])
+    return dataclasses.replace(gaussians, splits=(0, len(x), 0))
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("gaussians", [cloud(500, splits=(200, 0, 300)), at_thresholds()])
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_gsplat_draws_the_same_image_with_the_same_gradients(antialiased):
+def test_gsplat_draws_the_same_image_with_the_same_gradients(antialiased, gaussians):
     """On a GPU, gsplat gives the CPU backend's image and gradients."""
     pytest.importorskip("gsplat")
-    gaussians, views = cloud(500, splits=(200, 0, 300)), camera_ring(2, 45, 70, batch=3)
+    views = camera_ring(2, 45, 70, batch=3)
     options = {"settings": RasterSettings(antialiased=antialiased), "background": (0.1, 0.5, 0.9)}
     generator = torch.Generator().manual_seed(7)
     weights = [torch.randn(3, 2, c, 45, 70, generator=generator, dtype=torch.float64) for c in (3, 1, 1)]

@@ -1,1 +1,0 @@
-"""Diagnosis of a machine and its devices."""
