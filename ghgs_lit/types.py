@@ -104,6 +104,10 @@ class Cameras(TensorStruct):
         """:attr:`has_skew` where the cameras are, without a wait."""
         return (self.intrinsics[..., 0, 1] != 0).any()
 
+    def note_skew(self, has_skew: bool) -> None:
+        """Keep :attr:`has_skew`, which was read together with other values."""
+        self.__dict__.update(has_skew=has_skew)
+
     def __getitem__(self, index) -> "Cameras":
         return dataclasses.replace(self, intrinsics=self.intrinsics[index], extrinsics=self.extrinsics[index])
 
@@ -214,7 +218,7 @@ class Batch(TensorStruct):
             has_skew: :attr:`Cameras.has_skew` of the input cameras.
         """
         self.__dict__.update(extents=list(extents), _pixels=pixels)
-        self.cameras.__dict__.update(has_skew=has_skew)
+        self.cameras.note_skew(has_skew)
 
     @cached_property
     def extents(self) -> list[Extent]:

@@ -16,7 +16,7 @@ from ghgs_lit.execution.state import ModelState, NotCapturable, state_of
 from ghgs_lit.geometry.padding import PaddedBatch
 from ghgs_lit.geometry.precision import PRECISIONS, precision_of
 from ghgs_lit.method.model import GHGS
-from ghgs_lit.method.plan import Measured, Plan, Sizes
+from ghgs_lit.method.plan import MaskStatistics, Plan, Sizes
 from ghgs_lit.method.rounds import Coarse, coarse_of, coarse_sizes
 from ghgs_lit.rendering.capacity import settled
 from ghgs_lit.types import Batch, Prediction
@@ -156,14 +156,14 @@ class Predictor:
             self.graphs.note(str(reason))
             return None
 
-    def _enter(self, batch: Batch) -> tuple[Batch, Preprocessing, list[Finding], Measured]:
+    def _enter(self, batch: Batch) -> tuple[Batch, Preprocessing, list[Finding], MaskStatistics]:
         patch_size = self.model.encoder.patch_size
         inside, done, findings = preprocess(batch, self.options, patch_size, self.checks_values)
         return inside, done, findings, self.model.measure(inside, [any_bad(findings)])
 
     def _captured(
         self, batch: Batch, state: ModelState
-    ) -> tuple[Batch, Preprocessing, list[Finding], Measured]:
+    ) -> tuple[Batch, Preprocessing, list[Finding], MaskStatistics]:
         """:meth:`_enter`, captured where no gradient is wanted."""
         tensors: list[torch.Tensor] = []
         described(batch, tensors)
@@ -175,9 +175,8 @@ class Predictor:
         key = ("enter", self.options, self.checks_values, state.encoder)
         with torch.no_grad():
             inside, *others = self.graphs(self._enter, bare, key)
-        # Targets and names take no part; what was computed of the batch stays with it.
-        vars(inside).update(targets=batch.targets, subjects=batch.subjects, views=batch.views)
-        return inside, *others
+        # Targets and names take no part.
+        return replace(inside, targets=batch.targets, subjects=batch.subjects, views=batch.views), *others
 
     def _predict(self, prepared: Prepared, coarse: Coarse | None) -> Prediction:
         """The stages and what is undone after them; renderings have room enough."""
@@ -207,7 +206,7 @@ class Predictor:
         """
         if type(batch) not in (Batch, PaddedBatch):
             self.graphs.note(f"a batch of the class {type(batch).__name__}")
-        elif not plan.is_of_class:
+        elif not plan.is_bucket:
             self.graphs.note("subjects of fewer pixels than views")
         else:
             return True

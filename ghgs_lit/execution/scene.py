@@ -35,17 +35,17 @@ class Scene:
         """The inputs that the stages read; what only losses read is left out."""
         kept = None if plan.kept.is_whole else plan.kept.mask
         facts = (plan.patch_size, plan.pixels, plan.tokens, plan.sizes, batch.cameras.has_skew)
-        return cls(without_targets(batch), plan.shown, kept, *plan.extents_of_class(), *facts)
+        return cls(without_targets(batch), plan.shown, kept, *plan.bucket_extents(), *facts)
 
     def read(self) -> tuple[Batch, Plan]:
         """A batch and its plan, for which no value of a tensor is needed."""
         batch = without_targets(self.batch)
-        facts = (self.extents, self.shown_extents, self.patch_size, self.pixels, self.tokens, True)
+        facts = (self.extents, self.shown_extents, self.patch_size, self.pixels, self.tokens, (), self.sizes)
         device = self.shown.device
         if self.kept is None:
             kept = KeptPatches.whole(self.shown.shape, device)
         else:
             kept = KeptPatches(self.kept, device, size=self.sizes.kept)
-        plan = Plan(batch.masks, self.shown, kept, *facts, least=self.sizes, is_least=True)
+        plan = Plan(batch.masks, self.shown, kept, *facts)
         batch.note(plan.extents, lambda: plan.subject.index, self.has_skew)
         return batch, plan

@@ -169,7 +169,7 @@ class CapturedStep:
         if least is not None:
             least = dataclasses.replace(least, kept=self.buckets[view].kept if view in self.buckets else 0)
         prepared = self.predictor.prepare(batch, least)
-        if prepared.plan.is_of_class:
+        if prepared.plan.is_bucket:
             self.buckets[shape] = self.buckets[view] = prepared.plan.sizes
         return prepared
 

@@ -100,7 +100,7 @@ def _rows_of_gaussians(
     """Points of the pixels that Gaussians belong to, whose number is known without a wait.
 
     Args:
-        prediction: each of its valid pixels has a Gaussian; a size class may be filled by Gaussians
+        prediction: each of its valid pixels has a Gaussian; a shape bucket may be filled by Gaussians
             of pixels that precede them.
         used: pixels that count.
 

@@ -17,7 +17,7 @@ from ghgs_lit.errors import require
 from ghgs_lit.geometry.padding import bounds_of
 from ghgs_lit.method import stages
 from ghgs_lit.method.heads.dpt import LEVELS, DPTHead
-from ghgs_lit.method.plan import Measured, Plan, Sizes, SkipOptions, planned
+from ghgs_lit.method.plan import MaskStatistics, Plan, Sizes, SkipOptions, make_plan
 from ghgs_lit.method.rounds import Coarse, NoRounds, Rounds, State, prediction_of
 from ghgs_lit.method.rounds.coarse import FILLED
 from ghgs_lit.method.stages import HEADS, OPTIONS, STAGES
@@ -99,7 +99,7 @@ class GHGS(nn.Module):
         parameters = itertools.chain.from_iterable(getattr(self, name).parameters() for name in HEADS)
         return tokens.in_precision(next(parameters, tokens.semantic).dtype)
 
-    def measure(self, batch: Batch, flags: Sequence[Bool[Tensor, ""]] = ()) -> Measured:
+    def measure(self, batch: Batch, flags: Sequence[Bool[Tensor, ""]] = ()) -> MaskStatistics:
         """What a plan reads, where it is: a function of tensors.
 
         Args:
@@ -107,9 +107,9 @@ class GHGS(nn.Module):
             flags: further values that are to be read with it.
         """
         flags = [batch.cameras.any_skew, *flags]
-        return Measured.of(batch.masks, self.encoder.patch_size, self.encoder.keeps(batch.masks), flags)
+        return MaskStatistics.of(batch.masks, self.encoder.patch_size, self.encoder.keeps(batch.masks), flags)
 
-    def plan(self, batch: Batch, measured: Measured | None = None, least: Sizes | None = None) -> Plan:
+    def plan(self, batch: Batch, measured: MaskStatistics | None = None, least: Sizes | None = None) -> Plan:
         """What the stages work on; the only device-to-host synchronisation before them.
 
         Args:
@@ -118,7 +118,7 @@ class GHGS(nn.Module):
             least: sizes that are kept as long as they are enough; None: those of the scene.
         """
         targets = [] if batch.targets is None else [batch.targets.cameras]
-        plan = planned(
+        plan = make_plan(
             batch.masks,
             self.encoder.patch_size,
             measured or self.measure(batch),
@@ -128,7 +128,7 @@ class GHGS(nn.Module):
             least=least,
         )
         for cameras in targets:
-            vars(cameras)["has_skew"] = plan.flags[-1]
+            cameras.note_skew(plan.flags[-1])
         batch.note(plan.extents, lambda: plan.subject.index, plan.flags[0])
         return plan
 

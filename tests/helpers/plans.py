@@ -2,14 +2,14 @@
 
 import torch
 
-from ghgs_lit.method.plan import planned
+from ghgs_lit.method.plan import make_plan
 
 
 def plan_of(masks, patch_size=14, pixels="subject", tokens="subject"):
     """The plan of masks [B, V, H, W] if all patches become tokens."""
     b, v, height, width = masks.shape
     kept = torch.ones(b, v, height // patch_size, width // patch_size, dtype=torch.bool)
-    return planned(masks, patch_size, kept, pixels, tokens)
+    return make_plan(masks, patch_size, kept, pixels, tokens)
 
 
 def with_plan(stage):

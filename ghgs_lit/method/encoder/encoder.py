@@ -24,7 +24,7 @@ from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.method.encoder.block import REGISTERS, Block, draw_normal_, rotary_tables, run_block
 from ghgs_lit.method.encoder.semantic import PARTS, SemanticOptions
 from ghgs_lit.method.encoder.vit import ConvStem, PatchEmbed, VisionTransformer
-from ghgs_lit.method.plan import Plan, planned
+from ghgs_lit.method.plan import Plan, make_plan
 from ghgs_lit.method.plan.patches import KeptPatches
 from ghgs_lit.types import DepthBounds, Tokens
 
@@ -283,7 +283,7 @@ class VGGTEncoder(nn.Module):
         """
         narrow = images.dtype != torch.float64 or self.aggregator.camera_token.dtype == torch.float64
         require(narrow, "images", "float32 where the weights are no float64", images.dtype)
-        plan = planned(masks, self.patch_size, self.keeps(masks)) if plan is None else plan
+        plan = make_plan(masks, self.patch_size, self.keeps(masks)) if plan is None else plan
         kept = plan.kept
         with bfloat16_where_possible(images.device) if self.precision == "bfloat16" else nullcontext():
             pairs, patches = self.aggregator(self._normalized(images, masks, bounds), kept)

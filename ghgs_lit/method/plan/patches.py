@@ -1,6 +1,6 @@
 """Sequences of different lengths packed into one tensor: views keep different numbers of patches.
 Only the attention of a block mixes tokens, so views need no padding. Where shapes must repeat, on a
-GPU, each view's rows are filled up to a size class, and nothing attends to what fills them."""
+GPU, each view's rows are filled up to a shape bucket, and nothing attends to what fills them."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -62,7 +62,7 @@ class KeptPatches:
     @cached_property
     def _rows(self) -> Rows:
         """Rows of one number for each image."""
-        return Rows.filled(self.mask.flatten(0, 1).flatten(1), (self.size,), 1)
+        return Rows.filled(self.mask.flatten(0, 1).flatten(1), self.size, 1)
 
     @property
     def real(self) -> Bool[Tensor, " N"] | None:

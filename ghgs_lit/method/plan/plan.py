@@ -16,21 +16,24 @@ from torch import Tensor
 from ghgs_lit.extents import Extent, bucket_size, extent_numbers, true_places
 from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.method.plan.patches import KeptPatches
-from ghgs_lit.method.plan.rows import Rows, rounds_up, rows_of_group
+from ghgs_lit.method.plan.rows import Rows, rounds_up
 from ghgs_lit.method.plan.window import Span, Window, subject_windows
 from ghgs_lit.types import DecodedPixels, Prediction
+
+#: Room that sizes get where those before were too small.
+_SPARE = 1.15
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """What is the same for all scenes of a class.
+    """A shape bucket: what is the same for all scenes of it.
 
     Attributes:
         pixels: rows of the subject's pixels, of each element.
         peers: rows of the tokens that are recalibrated, of each element.
         kept: rows of the patches that become tokens, of each image; 0: all patches do.
         shown: rows of the patches that show the subject, of each image.
-        window: patches in which every subject lies; None: it is not known yet.
+        window: patches in which every subject lies.
     """
 
     pixels: int
@@ -38,22 +41,6 @@ class Sizes:
     kept: int
     shown: int
     window: Window
-
-    def held(self, name: str, needed: int) -> int:
-        """A size as long as it is enough, then what is needed with room to spare.
-
-        Args:
-            name: of the size.
-            needed: rows.
-        """
-        own = getattr(self, name)
-        return own if own >= needed else math.ceil(_SPARE * needed) if own else needed
-
-
-#: Room that sizes get where those before were too small.
-_SPARE = 1.15
-#: Nothing is held.
-_NOTHING = Sizes(0, 0, 0, 0, None)
 
 
 @dataclass(frozen=True)
@@ -70,10 +57,8 @@ class Plan:
         pixels: pixels that dense heads decode; ``all``: whole views.
         tokens: tokens that are recalibrated;
             ``all``: with those of the background, which need depths, too.
-        classes: numbers of rows, and windows, are size classes (:mod:`ghgs_lit.method.plan.rows`).
         flags: values of further tensors that were read with the masks.
-        least: sizes that are kept as long as they are enough.
-        is_least: sizes are these, whatever the scene."""
+        sizes: numbers of rows, and windows (:mod:`ghgs_lit.method.plan.rows`); None: those of the scene."""
 
     masks: Bool[Tensor, "B V H W"]
     shown: Bool[Tensor, "B V h w"]
@@ -83,68 +68,36 @@ class Plan:
     patch_size: int
     pixels: DecodedPixels = "subject"
     tokens: DecodedPixels = "subject"
-    classes: bool = False
     flags: tuple[bool, ...] = ()
-    least: Sizes = _NOTHING
-    is_least: bool = False
-
-    def _held(self, name: str, counts: Sequence[int]) -> int:
-        """Number of rows for groups of some counts."""
-        if self.is_least:
-            return getattr(self.least, name)
-        return self.least.held(name, max(1, *counts))
+    sizes: Sizes | None = None
 
     @cached_property
     def shown_patches(self) -> KeptPatches:
         """The patches ``shown``, each of which has a token."""
-        size = self._shown_size if self.classes else None
+        size = None if self.sizes is None else self.sizes.shown
         return KeptPatches(self.shown, self.kept.device, self.shown_extents, size)
-
-    @property
-    def sizes(self) -> Sizes:
-        """The sizes of the scene's class."""
-        rows = (self._pixel_rows, self._peer_rows)
-        return Sizes(*rows, self.kept.size or 0, self._shown_size, self._patches)
-
-    @property
-    def _pixel_rows(self) -> int:
-        """Rows of each element's pixels in ``classes``."""
-        return rows_of_group([self._held("pixels", self.counts)], self.masks[0].numel())
-
-    @property
-    def _peer_rows(self) -> int:
-        """Rows of each element's recalibrated tokens in ``classes``."""
-        return rows_of_group([self._held("peers", self._peer_counts)], self.shown[0].numel())
-
-    @property
-    def _peer_counts(self) -> Sequence[int]:
-        """Number of tokens of each element that are recalibrated."""
-        everyone = self.tokens == "all"
-        return self.kept.element_lengths(0) if everyone else self._of_elements(self.shown_extents)
-
-    @property
-    def _shown_size(self) -> int:
-        return _of_image(self._held("shown", [extent.count for extent in self.shown_extents]), self.shown)
 
     @cached_property
     def subject(self) -> Rows:
         """The subject's pixels among those of all images."""
-        if self.classes:
-            return Rows.filled(self.masks.flatten(1), [self._pixel_rows], self.views)
+        if self.sizes is not None:
+            return Rows.filled(self.masks.flatten(1), self.sizes.pixels, self.views)
         return Rows.exact(self.masks, [extent.count for extent in self.extents], 1)
 
     @cached_property
     def peers(self) -> Rows:
         """Tokens that are recalibrated, among the packed ones, by element."""
+        kept = self.kept
         everyone = self.tokens == "all"
-        if self.classes:
-            wanted = self.kept.mask if everyone else self.shown
-            rows = Rows.filled(wanted.flatten(1), [self._peer_rows], self.views)
-            kept = self.kept
+        if self.sizes is not None:
+            wanted = kept.mask if everyone else self.shown
+            rows = Rows.filled(wanted.flatten(1), self.sizes.peers, self.views)
             return rows if kept.is_whole else dataclasses.replace(rows, index=kept.number[rows.index])
-        every = torch.ones_like(self.kept.index, dtype=torch.bool)
-        wanted = every if everyone else self.shown.flatten()[self.kept.index]
-        return Rows.exact(wanted, self._peer_counts, self.views)
+        if everyone:
+            every = torch.ones_like(kept.index, dtype=torch.bool)
+            return Rows.exact(every, kept.element_lengths(0), self.views)
+        counts = _of_elements(self.shown_extents, self.views)
+        return Rows.exact(self.shown.flatten()[kept.index], counts, self.views)
 
     @property
     def views(self) -> int:
@@ -154,103 +107,84 @@ class Plan:
     @property
     def counts(self) -> tuple[int, ...]:
         """Number of the subject's pixels in each element."""
-        return self._of_elements(self.extents)
-
-    def _of_elements(self, extents: Sequence[Extent]) -> tuple[int, ...]:
-        """Sums of the counts of each element's images."""
-        each = [extent.count for extent in extents]
-        return tuple(sum(each[first : first + self.views]) for first in range(0, len(each), self.views))
+        return _of_elements(self.extents, self.views)
 
     def trimmed(self, prediction: Prediction) -> Prediction:
         """The prediction with Gaussians for the subject's pixels alone.
 
         Args:
-            prediction: Gaussians, and drafts of the rounds, may fill a size class.
+            prediction: Gaussians, and drafts of the rounds, may fill a shape bucket.
 
         Returns:
             On a GPU those of pixels whose depth is not finite stay, with opacity 0.
         """
-        filled = (self._pixel_rows,) * len(self.counts) if self.classes else None
-        if prediction.gaussians.splits != filled:
+        counts = self.counts
+        if self.sizes is None or prediction.gaussians.splits != (self.sizes.pixels,) * len(counts):
             return prediction
-        if len(self.counts) == 1:
-            index = slice(0, self.counts[0])
-        else:
-            index = true_places(self.subject.real, sum(self.counts))
+        index = slice(0, counts[0]) if len(counts) == 1 else true_places(self.subject.real, sum(counts))
         every = (prediction.gaussians, *prediction.drafts)
-        gaussians, *drafts = (each.select(index, self.counts) for each in every)
+        gaussians, *drafts = (each.select(index, counts) for each in every)
         return dataclasses.replace(prediction, gaussians=gaussians, drafts=tuple(drafts))
 
     @property
-    def is_of_class(self) -> bool:
-        """Whether sizes are those of a class, and every image can have a row of it."""
-        return self.classes and min(self._pixel_rows, self._peer_rows) >= self.views
+    def is_bucket(self) -> bool:
+        """Whether sizes are those of a shape bucket, and every image can have a row of it."""
+        return self.sizes is not None and min(self.sizes.pixels, self.sizes.peers) >= self.views
 
-    def extents_of_class(self) -> tuple[tuple[Extent, ...], tuple[Extent, ...]]:
-        """Extents with which a plan has the same sizes and windows for every scene of the class.
+    def bucket_extents(self) -> tuple[tuple[Extent, ...], tuple[Extent, ...]]:
+        """Extents that are the same for every scene of the shape bucket.
 
         Each image has a share of its element's rows, in the window of all.
 
         Returns:
             Extents of the subject in pixels, and of the patches that show it, of each image.
         """
-        window = self._windows(self.patch_size)[0]
         grid = Window.whole(tuple(self.shown.shape[2:]))
-        return self._shared(self._pixel_rows, window), self._shared(self._peer_rows, grid)
-
-    def _shared(self, size: int, window: Window) -> tuple[Extent, ...]:
-        """Rows of each element, ``size`` in number, shared by its images in one window."""
-        share = Extent(size // self.views, *window.rows[:2], *window.columns[:2])
-        first = share._replace(count=size - (self.views - 1) * share.count)
-        return (first, *[share] * (self.views - 1)) * len(self.counts)
+        parts = ((self.sizes.pixels, self.windows_of(self.patch_size)[0]), (self.sizes.peers, grid))
+        shared = []
+        for size, window in parts:
+            share = Extent(size // self.views, *window.rows[:2], *window.columns[:2])
+            first = share._replace(count=size - (self.views - 1) * share.count)
+            shared.append((first, *[share] * (self.views - 1)) * len(self.masks))
+        return tuple(shared)
 
     @property
     def together(self) -> int:
         """Number of consecutive images whose maps are decoded in one part."""
-        return self.views if self.classes else 1
+        return 1 if self.sizes is None else self.views
 
     @property
     def depth_windows(self) -> list[Window | None] | None:
         """Windows in which depths are needed, of whole patches; None: everywhere."""
         # Whole patches: the token points of the release depend on pixels beside the mask.
-        return None if "all" in (self.pixels, self.tokens) else self._windows(self.patch_size)
+        return None if "all" in (self.pixels, self.tokens) else self.windows_of(self.patch_size)
 
     @property
     def windows(self) -> list[Window | None] | None:
         """Windows with the subject's pixels of each image; None: whole images are decoded."""
-        return None if self.pixels == "all" else self._windows(self.patch_size if self.classes else 1)
+        return None if self.pixels == "all" else self.windows_of(1)
 
-    def _windows(self, cell: int) -> list[Window | None]:
-        """Windows of whole cells around the subject, None without one;
-        of ``classes`` the same for all."""
+    def windows_of(self, cell: int) -> list[Window | None]:
+        """Windows of whole cells around the subject of each image, None without one; of a shape bucket
+        all patches of its window."""
         size = tuple(self.masks.shape[2:])
-        each = subject_windows(self.extents, size)
-        whole_cells = [window and window.coarser(cell).finer(cell, size) for window in each]
-        if not self.classes:
-            return whole_cells
-        return [self._patches.finer(cell, size)] * len(whole_cells)
-
-    @cached_property
-    def _patches(self) -> Window:
-        """Patches around all subjects, as many as a size class has."""
-        size = tuple(self.masks.shape[2:])
-        seen = [window.coarser(self.patch_size) for window in subject_windows(self.extents, size) if window]
-        grid = tuple(self.shown.shape[2:])
-        spans = functools.reduce(Window.hull, seen) if seen else Window(*(Span(0, 1, full) for full in grid))
-        if self.least.window is not None:
-            both = self.least.window.hull(spans)
-            spans = both if both == self.least.window else both.grown(1)
-        return Window(*(span.widened() for span in spans))
+        if self.sizes is not None:
+            return [self.sizes.window.finer(self.patch_size, size)] * len(self.extents)
+        return [
+            window and window.coarser(cell).finer(cell, size)
+            for window in subject_windows(self.extents, size)
+        ]
 
 
-def _of_image(rows: int, patches: Bool[Tensor, "B V h w"]) -> int:
-    """The size class of rows of an image, which needs no more than it has patches."""
-    return min(bucket_size(rows), patches.shape[-2] * patches.shape[-1])
+def _of_elements(extents: Sequence[Extent], views: int) -> tuple[int, ...]:
+    """Sums of the counts of each element's images."""
+    each = [extent.count for extent in extents]
+    return tuple([sum(each[first : first + views]) for first in range(0, len(each), views)])
 
 
 @dataclass(frozen=True)
-class Measured:
-    """What masks say, where they are: a function of tensors, before anything is read.
+class MaskStatistics:
+    """What a plan reads of masks, where they are: a function of tensors, before anything is read.
 
     Attributes:
         shown: patches with a pixel of the subject.
@@ -272,8 +206,8 @@ class Measured:
         patch_size: int,
         kept: Bool[Tensor, "B V h w"],
         flags: Sequence[Bool[Tensor, ""]] = (),
-    ) -> "Measured":
-        """What these masks say.
+    ) -> "MaskStatistics":
+        """Statistics of masks.
 
         Args:
             masks: the subject's pixels; sides are divisible by the patch size.
@@ -282,54 +216,101 @@ class Measured:
             flags: further values that are read with them.
         """
         shown = patches_around_subject(masks, patch_size, 0)
-        numbers = [shown.flatten(2).sum(-1)]
-        numbers += [extent_numbers(each.flatten(0, 1)) for each in (masks, kept)]
-        return cls(shown, kept, tuple(numbers), tuple(flags))
+        extents = (extent_numbers(masks.flatten(0, 1)), extent_numbers(kept.flatten(0, 1)))
+        return cls(shown, kept, (shown.flatten(2).sum(-1), *extents), tuple(flags))
 
 
-def planned(
+def make_plan(
     masks: Bool[Tensor, "B V H W"],
     patch_size: int,
-    kept: Bool[Tensor, "B V h w"] | Measured,
+    kept: Bool[Tensor, "B V h w"] | MaskStatistics,
     pixels: DecodedPixels = "subject",
     tokens: DecodedPixels = "subject",
     flags: Sequence[Bool[Tensor, ""]] = (),
-    classes: bool | None = None,
+    in_buckets: bool | None = None,
     least: Sizes | None = None,
 ) -> Plan:
-    """The plan of a batch. The host waits for a GPU once.
+    """The plan of a batch; the only device-to-host synchronisation.
 
     Args:
         masks: the subject's pixels; sides are divisible by the patch size.
         patch_size: in pixels.
-        kept: patches that become tokens; or all that is measured of them and the masks.
+        kept: patches that become tokens; or all statistics of them and the masks.
         pixels: of the preset.
         tokens: which ones the recalibration works on.
-        flags: tensors whose values are to be read with those that are measured, and after them.
-        classes: whether numbers of rows are size classes; None: as the masks' device needs it.
-        least: as of :class:`Plan`; None: nothing is held.
+        flags: tensors whose values are to be read with the statistics, and after them.
+        in_buckets: whether sizes are rounded up to shape buckets; None: as the masks' device needs it.
+        least: sizes that are kept as long as they are enough; None: those of the scene.
     """
-    least = least or _NOTHING
-    measured = kept if isinstance(kept, Measured) else Measured.of(masks, patch_size, kept)
-    shown = measured.shown
-    kept = measured.kept
-    flags = (*measured.flags, *flags)
-    counts, *values = _read([*measured.numbers, *([torch.stack(flags)] if flags else [])])
-    of_masks = []
-    for rows in values[:2]:
-        firsts = range(0, len(rows), 5)
-        of_masks.append(tuple(Extent(*rows[first : first + 5]) for first in firsts))
-    extents, kept_extents = of_masks
-    shown_extents = tuple(e.coarser(patch_size, n) for e, n in zip(extents, counts, strict=True))
-    known = tuple(map(bool, values[-1])) if flags else ()
-    classes = rounds_up(masks.device) if classes is None else classes
-    is_whole = sum(extent.count for extent in kept_extents) == kept.numel()
-    size = None
-    if classes and not is_whole:
-        size = _of_image(least.held("kept", max(1, *(extent.count for extent in kept_extents))), kept)
-    patches = KeptPatches(kept, masks.device, kept_extents, size)
-    facts = (extents, shown_extents, patch_size, pixels, tokens, classes, known, least)
-    return Plan(masks, shown, patches, *facts)
+    of_masks = kept if isinstance(kept, MaskStatistics) else MaskStatistics.of(masks, patch_size, kept)
+    flags = (*of_masks.flags, *flags)
+    stacked = [torch.stack(flags)] if flags else []
+    counts, numbers, kept_numbers, *values = _read([*of_masks.numbers, *stacked])
+    extents = _extents(numbers)
+    kept_extents = _extents(kept_numbers)
+    shown_extents = []
+    for extent, count in zip(extents, counts, strict=True):
+        shown_extents.append(extent.coarser(patch_size, count))
+    is_whole = sum([extent.count for extent in kept_extents]) == of_masks.kept.numel()
+    in_buckets = rounds_up(masks.device) if in_buckets is None else in_buckets
+    sizes = None
+    if in_buckets:
+        kept_counts = [] if is_whole else [extent.count for extent in kept_extents]
+        sizes = _bucket(tuple(masks.shape), patch_size, extents, shown_extents, kept_counts, tokens, least)
+    patches = KeptPatches(of_masks.kept, masks.device, kept_extents, sizes and (sizes.kept or None))
+    facts = (patch_size, pixels, tokens, tuple(map(bool, values[0])) if flags else (), sizes)
+    return Plan(masks, of_masks.shown, patches, tuple(extents), tuple(shown_extents), *facts)
+
+
+def _extents(numbers: Sequence[int]) -> list[Extent]:
+    return [Extent(*numbers[first : first + 5]) for first in range(0, len(numbers), 5)]
+
+
+def _bucket(
+    shape: tuple[int, int, int, int],
+    patch_size: int,
+    extents: Sequence[Extent],
+    shown: Sequence[Extent],
+    kept: Sequence[int],
+    tokens: DecodedPixels,
+    least: Sizes | None,
+) -> Sizes:
+    """The shape bucket of a scene; arguments as of :func:`make_plan`.
+
+    Args:
+        shape: of the masks [B, V, H, W].
+        patch_size: in pixels.
+        extents: of the masks.
+        shown: of the patches that show the subject.
+        kept: numbers of the patches that become tokens, of each image; empty: all do.
+        tokens: which ones the recalibration works on.
+        least: sizes that are kept as long as they are enough.
+    """
+
+    def rows(name: str, counts: Sequence[int], most: int) -> int:
+        needed = max(1, *counts)
+        known = 0 if least is None else getattr(least, name)
+        if known < needed:
+            known = math.ceil(_SPARE * needed) if known else needed
+        return min(bucket_size(known), most)
+
+    views, *size = shape[1:]
+    grid = (size[0] // patch_size, size[1] // patch_size)
+    patches = grid[0] * grid[1]
+    of_image = rows("kept", kept, patches) if kept else 0
+    peers = [views * (of_image or patches)] if tokens == "all" else _of_elements(shown, views)
+    seen = [window.coarser(patch_size) for window in subject_windows(extents, tuple(size)) if window]
+    window = functools.reduce(Window.hull, seen) if seen else Window(*(Span(0, 1, full) for full in grid))
+    if least is not None:
+        both = least.window.hull(window)
+        window = both if both == least.window else both.grown(1)
+    return Sizes(
+        rows("pixels", _of_elements(extents, views), views * size[0] * size[1]),
+        rows("peers", peers, views * patches),
+        of_image,
+        rows("shown", [extent.count for extent in shown], patches),
+        Window(*(span.widened() for span in window)),
+    )
 
 
 def _read(tensors: Sequence[Tensor]) -> list[list[int]]:

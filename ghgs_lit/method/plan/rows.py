@@ -9,23 +9,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghgs_lit.extents import bucket_size, true_places
+from ghgs_lit.extents import true_places
 
 
 def rounds_up(device: torch.device) -> bool:
-    """Whether numbers of rows are size classes: a GPU repeats shapes,
+    """Whether numbers of rows are rounded up to shape buckets: a GPU repeats shapes,
     a CPU computes what counts."""
     return device.type != "cpu"
-
-
-def rows_of_group(counts: Sequence[int], most: int) -> int:
-    """The number of rows of each group where rows are filled.
-
-    Args:
-        counts: how many rows of each group are wanted.
-        most: rows that a group has.
-    """
-    return min(bucket_size(max(max(counts, default=0), 1)), most)
 
 
 @dataclass(frozen=True)
@@ -33,7 +23,7 @@ class Rows:
     """Rows of each group (an image, or an element of the batch), one group after another.
 
     Exact rows (``real`` is None) are those that count. Filled ones have the same number in each
-    group, a size class: what counts comes first, then its last row is repeated, or the group's
+    group: what counts comes first, then its last row is repeated, or the group's
     first row if none counts.
 
     Attributes:
@@ -59,16 +49,15 @@ class Rows:
         return cls(true_places(wanted, sum(counts)), tuple(counts), images)
 
     @classmethod
-    def filled(cls, wanted: Bool[Tensor, "g m"], counts: Sequence[int], images: int) -> "Rows":
-        """The rows that are wanted, filled up to the size class of the largest group.
+    def filled(cls, wanted: Bool[Tensor, "g m"], size: int, images: int) -> "Rows":
+        """The rows that are wanted, filled up to ``size`` in each group.
 
         Args:
             wanted: m pixels or tokens of each of g groups.
-            counts: how many of each group are wanted.
+            size: number of rows of each group, at least that of the wanted ones.
             images: number of images of a group.
         """
         groups, of_group = wanted.shape
-        size = rows_of_group(counts, of_group)
         number = torch.arange(of_group, device=wanted.device)
         # One long sum: a GPU sums rows of a table with a block of threads each.
         ranks = wanted.flatten().cumsum(0).view_as(wanted)

@@ -40,7 +40,7 @@ class Span(NamedTuple):
         return Span(self.start * factor, min(self.stop * factor, full), full)
 
     def widened(self) -> "Span":
-        """These and more cells, so that their number is a size class."""
+        """These and more cells, so that their number is a shape bucket."""
         length = min(bucket_size(self.stop - self.start), self.full)
         start = min(self.start, self.full - length)
         return Span(start, start + length, self.full)

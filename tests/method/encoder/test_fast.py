@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from ghgs_lit.geometry.masks import patches_around_subject, patches_in_window
 from ghgs_lit.method.encoder import VGGTEncoder
 from ghgs_lit.method.encoder.block import rotary_tables, rotate
-from ghgs_lit.method.plan import planned
+from ghgs_lit.method.plan import make_plan
 from ghgs_lit.method.plan.patches import KeptPatches
 from tests.helpers.encoders import make_encoder
 
@@ -168,7 +168,7 @@ def test_kept_patches_that_are_given_take_part():
     """Patches of the plan, not the encoder's own choice, become tokens."""
     encoder, (images, masks) = _encoder(VITS[2]), _people()
     kept = torch.stack((patches_in_window(masks, PATCH, 0)[0], patches_around_subject(masks, PATCH, 1)[1]))
-    found = encoder(images, masks, plan=planned(masks, PATCH, kept))
+    found = encoder(images, masks, plan=make_plan(masks, PATCH, kept))
     for b, tokens in enumerate(("window", "subject")):
         own = slice(b, b + 1)
         expected = _encoder(VITS[2], tokens=tokens, margin=b)(images[own], masks[own])

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from ghgs_lit.extents import bucket_size
-from ghgs_lit.method.plan import plan, planned
+from ghgs_lit.method.plan import make_plan, plan
 from ghgs_lit.method.plan.rows import Rows
 from ghgs_lit.rendering import render
 from tests.helpers.losses import losses_of
@@ -49,8 +49,8 @@ def test_filled_rows_repeat_a_row_that_counts():
     """Against a loop; a group without any has the first of its pixels."""
     wanted = torch.rand(4, 50, generator=torch.Generator().manual_seed(0)) < 0.4
     wanted[2] = False
-    rows = Rows.filled(wanted, wanted.sum(1).tolist(), 1)
     size = bucket_size(int(wanted.sum(1).max()))
+    rows = Rows.filled(wanted, size, 1)
     assert rows.counts == (size,) * 4
     for group, (index, real) in enumerate(zip(rows.index.view(4, -1), rows.real.view(4, -1), strict=True)):
         own = (50 * group + wanted[group].nonzero()[:, 0]).tolist()
@@ -66,8 +66,8 @@ def test_shapes_repeat_where_subjects_differ_a_little():
     """Of photographs of another instant: a recorded graph needs the same shapes."""
     masks = make_batch(2, 3, 112, 112).masks
     other = masks & (torch.rand(masks.shape, generator=torch.Generator().manual_seed(0)) < 0.995)
-    counted = [planned(each, 14, kept_of(each), classes=False) for each in (masks, other)]
-    rounded = [planned(each, 14, kept_of(each), classes=True) for each in (masks, other)]
+    counted = [make_plan(each, 14, kept_of(each), in_buckets=False) for each in (masks, other)]
+    rounded = [make_plan(each, 14, kept_of(each), in_buckets=True) for each in (masks, other)]
     assert counted[0].subject.counts != counted[1].subject.counts
     assert rounded[0].subject.counts == rounded[1].subject.counts
     assert rounded[0].peers.counts == rounded[1].peers.counts

@@ -8,7 +8,7 @@ from torch.autograd import gradcheck
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.frame import places_around
-from ghgs_lit.method.plan import planned
+from ghgs_lit.method.plan import make_plan
 from ghgs_lit.method.recalibration import Neighborhood, SemanticAttention
 from tests.helpers.tokens import literal_neighbors, make_stage, scene
 
@@ -131,7 +131,7 @@ def test_rows_that_fill_up_a_size_class_say_nothing(options):
     points = at(points, places)
     stage = relative_stage(**options)
     kept = torch.ones(2, 3, 4, 4, dtype=torch.bool)
-    plan = planned(points.valid, tokens.patch_size, kept, classes=True)
+    plan = make_plan(points.valid, tokens.patch_size, kept, in_buckets=True)
     assert plan.peers.real is not None
     found, expected = stage(tokens, points, plan), stage(tokens, points)
     torch.testing.assert_close(found.latent[0], expected.latent[0], atol=1e-12, rtol=0)
