@@ -1,7 +1,6 @@
 """Gaussians of a capture in the user's world, and of any batch, with corrected cameras."""
 
 import functools
-import time
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -27,13 +26,12 @@ from ghgs_lit.weights.reading import SHIPPED, file_of
 
 
 @dataclass(frozen=True)
-class TimedPrediction:
+class CapturePrediction:
     """A prediction with the batch that the model saw."""
 
     #: photographs or crops around the subject, masks and cameras, corrected where asked
     batch: Batch
     prediction: Prediction  #: of this batch, in the world and unit of its cameras
-    seconds: dict[str, float] = field(default_factory=dict)
     #: pixels that correcting cameras moved the subject by in each photograph
     moved: tuple[float, ...] = ()
     #: share of the subject that refining masks changed in each crop
@@ -59,7 +57,7 @@ def predict(
     refine: int = 0,
     renderer: Renderer | None = None,
     tones: Mapping[str, float] | Literal["auto"] = "auto",
-) -> TimedPrediction:
+) -> CapturePrediction:
     """The Gaussians of a capture, in the user's world.
 
     Args:
@@ -98,9 +96,7 @@ def predict(
     tones = own_tones(result.batch, result.gaussians)
     if not tones:
         return result
-    again = _predicted(without_tones(capture, tones), *keys)
-    seconds = again.seconds | {"tones": sum(result.seconds.values())}
-    return replace(again, seconds=seconds, tones=tones)
+    return replace(_predicted(without_tones(capture, tones), *keys), tones=tones)
 
 
 def _predicted(
@@ -111,7 +107,7 @@ def _predicted(
     refine_masks: int | Literal["auto"],
     refine: int,
     renderer: Renderer,
-) -> TimedPrediction:
+) -> CapturePrediction:
     """:func:`predict` of photographs with their colours as they are.
 
     Args:
@@ -126,20 +122,22 @@ def _predicted(
     Returns:
         As of :func:`predict`, without ``tones``.
     """
-    seconds = {}
     why = {}
     if refine_masks == "auto":
         why["refine_masks"] = doubt_of_masks(capture, size)
         refine_masks = CORRECTION if why["refine_masks"] else 0
-    batch, changed = _crops(capture, size, refine_masks, seconds)
+    batch = capture.batch(size, refine_masks)
+    changed = ()
+    if refine_masks:
+        given = capture.batch(size).alpha
+        changed = tuple(((batch.alpha - given).abs().sum((-2, -1)) / given.sum((-2, -1)))[0].tolist())
     if refine_cameras == "auto":
         why["refine_cameras"] = doubt_of_cameras(capture, batch)
         refine_cameras = CORRECTION if why["refine_cameras"] else 0
     batch = batch.to(next(model.model.parameters()).device)
     forward = functools.partial(in_frame, model)
     result = predict_batch(batch, model, renderer, refine_cameras, refine, forward)
-    why = {name: doubt for name, doubt in why.items() if doubt}
-    return replace(result, seconds=seconds | result.seconds, changed=changed, why=why)
+    return replace(result, changed=changed, why={name: doubt for name, doubt in why.items() if doubt})
 
 
 def in_frame(model: Predictor, batch: Batch) -> Prediction:
@@ -164,7 +162,7 @@ def predict_batch(
     refine_cameras: int = 0,
     refine: int = 0,
     forward: Callable[[Batch], Prediction] | None = None,
-) -> TimedPrediction:
+) -> CapturePrediction:
     """The Gaussians of a batch of one subject, which keeps its targets.
 
     Args:
@@ -177,59 +175,23 @@ def predict_batch(
         forward: predicts a batch without targets; None: the model.
 
     Returns:
-        The prediction, with the batch as corrected and the seconds of each stage.
+        The prediction, with the batch as corrected.
     """
     forward = forward or model
     moved = ()
-    seconds = {}
-    start = time.perf_counter()
+    refined = None
     if refine_cameras:
         given = batch
         batch = CameraRefinement(refine_cameras, model, renderer)(batch)
         moved = tuple(pixels_moved(given, batch)[0])
-        seconds["refine_cameras"] = time.perf_counter() - start
-        start = time.perf_counter()
-    prediction = forward(replace(batch, targets=None))
-    if batch.images.device.type == "cuda":
-        torch.cuda.synchronize()
-    seconds["predict"] = time.perf_counter() - start
-    refined = None
+    inputs = replace(batch, targets=None)
+    prediction = forward(inputs)
     if refine:
         refinement = Refinement(refine, renderer)
         before = prediction.gaussians
-        start = time.perf_counter()
         prediction = replace(prediction, gaussians=refinement(before, batch))
-        seconds["refine"] = time.perf_counter() - start
-        untold = replace(batch, targets=None)
-        refined = refinement.report(before, prediction.gaussians, untold, lambda b: forward(b).gaussians)
-    return TimedPrediction(batch, prediction, seconds, moved, refined=refined)
-
-
-def _crops(
-    capture: Capture, size: tuple[int, int], refine_masks: int, seconds: dict[str, float]
-) -> tuple[Batch, tuple[float, ...]]:
-    """Crops of a capture, with refined mattes where asked for.
-
-    Args:
-        capture: photographs of one instant.
-        size: (height, width) of the crops in pixels.
-        refine_masks: pixels of a crop by which masks may be wrong; 0: they are right.
-        seconds: run times by stage, to which those of ``crop`` and ``refine_masks`` are added.
-
-    Returns:
-        The batch that the model sees, and the share of the subject that refining changed in each
-        crop; () without refining.
-    """
-    start = time.perf_counter()
-    given = capture.batch(size)
-    seconds["crop"] = time.perf_counter() - start
-    if not refine_masks:
-        return given, ()
-    start = time.perf_counter()
-    batch = capture.batch(size, refine_masks)
-    seconds["refine_masks"] = time.perf_counter() - start
-    changed = (batch.alpha - given.alpha).abs().sum((-2, -1)) / given.alpha.sum((-2, -1))
-    return batch, tuple(changed[0].tolist())
+        refined = refinement.report(before, prediction.gaussians, inputs, lambda b: forward(b).gaussians)
+    return CapturePrediction(batch, prediction, moved, refined=refined)
 
 
 def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:

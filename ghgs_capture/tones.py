@@ -2,7 +2,7 @@
 said and undone."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -55,23 +55,6 @@ def without_tones(capture: Capture, tones: Mapping[str, float]) -> Capture:
         return capture
     photographs = (_without(one, tones.get(one.name, 1.0)) for one in capture.photographs)
     return replace(capture, photographs=tuple(photographs))
-
-
-def tone_lines(tones: Mapping[str, float], what_is_done: str) -> Iterator[str]:
-    """A line for each camera with a tone curve of its own.
-
-    Args:
-        tones: gammas by camera.
-        what_is_done: end of the line, such as "undone".
-
-    Yields:
-        The lines.
-    """
-    for name, gamma in tones.items():
-        yield (
-            f"photograph {name} has a gamma of about {gamma:.2f} beside the others: a tone curve,"
-            f" profile or contrast of its own, {what_is_done}"
-        )
 
 
 def _without(photograph: Photograph, gamma: float) -> Photograph:

@@ -2,8 +2,7 @@
 
 import contextlib
 import time
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
@@ -14,23 +13,27 @@ import torch
 from ghgs_capture import export
 from ghgs_capture.backgrounds import BACKGROUND_INSTANTS, Backgrounds
 from ghgs_capture.capture import Capture
+from ghgs_capture.export.reports import REPORT
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.formats.matrices import json_text
-from ghgs_capture.prediction import TimedPrediction, crop_size, predict, predict_batch
+from ghgs_capture.prediction import CapturePrediction, crop_size, predict, predict_batch
 from ghgs_capture.rig import INSTANTS, Rig, corrected_rig, spread
 from ghgs_capture.tones import without_tones
-from ghgs_capture.verbs.advice import advice_of, moved_line
 from ghgs_capture.verbs.photographs import capture_folder, check_cameras
 from ghgs_lit.cli import inputs
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.execution import Predictor
 from ghgs_lit.files import resolved
+from ghgs_lit.parsing import read_json
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.weights.checkpoint import read_config
 
 if TYPE_CHECKING:  # it would import Lightning, which takes seconds
     from ghgs_capture.verbs import Predict
+
+#: PSNR in dB, in the subject's box, below which the render of an input counts as poor.
+LOW_PSNR = 25.0
 
 
 @torch.no_grad()
@@ -109,7 +112,6 @@ def predict_photographs(run: "Predict", directory: Path) -> None:
         "refine": run.refine,
         "tones": run.refine_tones or {},
     }
-    totals: Counter[str] = Counter()
     count = 0
     rig = None
     backgrounds = Backgrounds({})
@@ -118,31 +120,48 @@ def predict_photographs(run: "Predict", directory: Path) -> None:
         refining["tones"], backgrounds, rig, together.others["rig.json"] = shared
         refining["refine_cameras"] = 0
     begin = time.perf_counter()
-    for given, waited in captures_of(folder):
+    for given in captures_of(folder):
         capture = mended_by(backgrounds, given)
         capture = rig.applied(capture) if rig else capture
         result = predict(capture, model, size, **refining, renderer=renderer)
-        result.seconds["read"] = waited
         place = directories[capture.name]
-        seconds = write_result(place, result, renderer, run.checkpoint, output, lists_files=not together)
+        write_result(place, result, renderer, run.checkpoint, output)
         if together:
             print(place, flush=True)
             together.add(place, result.batch, result.prediction, renderer)
         count += 1
         if count == 1:
-            for line in advice_of(place):
-                print(line, flush=True)
-        totals.update(seconds)
+            _warn_of(place)
     left_out = len(folder.instants) - count
     require(count > 0, str(folder.images), "an instant that can be read", f"none of {left_out}")
     if together:
-        paths = together.write(directory)
-        print("\n".join(_listing(directory, paths)), flush=True)
-        total = time.perf_counter() - begin
-        stages = ", ".join(f"{stage} {value / count:.3g} s" for stage, value in totals.items())
-        print(f"{count} instants, {count / total:.3g} a second (each: {stages})", flush=True)
+        together.write(directory)
+        print(f"{count} instants, {count / (time.perf_counter() - begin):.3g} a second", flush=True)
     if left_out:
         print(f"left out: {left_out} of {len(folder.instants)} instants", flush=True)
+
+
+def _warn_of(directory: Path) -> None:
+    """Print what a prediction's report tells of tone curves, and of inputs that do not come back."""
+    report = read_json(directory / REPORT)
+    for name, gamma in report.get("tones", {}).items():
+        print(
+            f"photograph {name} has a gamma of about {gamma:.2f} beside the others:"
+            " undone (refine_tones=0 leaves it)",
+            flush=True,
+        )
+    quality = [psnr for psnr in report["psnr_box_of_inputs"].values() if psnr is not None]
+    if quality and min(quality) < LOW_PSNR:
+        print(
+            f"photographs come back at {min(quality):.1f} to {max(quality):.1f} dB only, sound ones at 30 or"
+            f" more: mostly cameras or masks are off; {directory / export.SHEET} shows where",
+            flush=True,
+        )
+
+
+def _moved_line(moved: Mapping[str, float]) -> str:
+    """The message about corrected cameras: pixels by which the subject moved in each photograph."""
+    return f"refine_cameras: moved by {', '.join(f'{name} {p:.2f}' for name, p in moved.items())} pixels"
 
 
 def _free_places(
@@ -218,7 +237,7 @@ def shared_by(
         return tones, backgrounds, None, b""
     why = f"; {rig.why} (refine_cameras=0 leaves them)" if rig.why else ""
     took = time.perf_counter() - begin
-    print(f"{moved_line(rig.moved)} in all instants{why}; {took:.3g} s", flush=True)
+    print(f"{_moved_line(rig.moved)} in all instants{why}; {took:.3g} s", flush=True)
     return tones, backgrounds, rig, json_text(rig.calibrations(folder, captures)).encode()
 
 
@@ -240,7 +259,7 @@ def mended_by(backgrounds: Backgrounds, given: Capture) -> Capture:
     return capture
 
 
-def captures_of(folder: CaptureFolder) -> Iterator[tuple[Capture, float]]:
+def captures_of(folder: CaptureFolder) -> Iterator[Capture]:
     """Read the instants of a folder one by one; the next one is decoded meanwhile.
 
     Of several instants, those that cannot be read are left out with a message.
@@ -249,7 +268,7 @@ def captures_of(folder: CaptureFolder) -> Iterator[tuple[Capture, float]]:
         folder: of one instant or several.
 
     Yields:
-        The capture of each instant and the seconds of waiting for it.
+        The capture of each instant.
 
     Raises:
         InputError: the only instant cannot be read.
@@ -258,7 +277,6 @@ def captures_of(folder: CaptureFolder) -> Iterator[tuple[Capture, float]]:
     with ThreadPoolExecutor(1) as pool:
         following = pool.submit(folder.photographs, names[0])
         for name, after in zip(names, [*names[1:], None], strict=True):
-            start = time.perf_counter()
             photographs = ()
             missing = folder.missing[name]
             try:
@@ -267,24 +285,22 @@ def captures_of(folder: CaptureFolder) -> Iterator[tuple[Capture, float]]:
                 if len(names) == 1:
                     raise
                 print(f"instant {name} is left out: {error}", flush=True)
-            waited = time.perf_counter() - start
             if after is not None:
                 following = pool.submit(folder.photographs, after)
             if not photographs:
                 continue
             for camera, why in missing.items() if len(names) > 1 else ():
                 print(f"instant {name} is without {camera}: {why}", flush=True)
-            yield Capture(name, photographs), waited
+            yield Capture(name, photographs)
 
 
 def write_result(
     directory: Path,
-    result: TimedPrediction,
+    result: CapturePrediction,
     renderer: Renderer,
     checkpoint: str,
     options: export.OutputOptions,
-    lists_files: bool = True,
-) -> dict[str, float]:
+) -> None:
     """Write the files of a result and print what was done.
 
     Args:
@@ -293,14 +309,8 @@ def write_result(
         renderer: draws pictures of the files.
         checkpoint: name of the weights, for the report.
         options: formats and choices for them.
-        lists_files: whether the files are printed, too.
-
-    Returns:
-        The seconds of each stage, with those of writing.
     """
-    prediction = result.prediction
-    seconds = dict(result.seconds)
-    facts: dict[str, Any] = {"checkpoint": checkpoint, "seconds": seconds, "why": result.why}
+    facts: dict[str, Any] = {"checkpoint": checkpoint, "why": result.why}
     why = {name: f"; {doubt} ({name}=0 leaves it)" for name, doubt in result.why.items()}
     if result.changed:
         shares = ", ".join(f"{share:.1%}" for share in result.changed)
@@ -308,7 +318,7 @@ def write_result(
         facts["refine_masks"] = list(result.changed)
     if result.moved:
         facts["refine_cameras"] = dict(zip(result.batch.views[0], result.moved, strict=True))
-        print(moved_line(facts["refine_cameras"]) + why.get("refine_cameras", ""), flush=True)
+        print(_moved_line(facts["refine_cameras"]) + why.get("refine_cameras", ""), flush=True)
     if result.batch.log_gains is not None:
         gains = result.batch.log_gains[0].exp().tolist()
         facts["gains"] = dict(zip(result.batch.views[0], gains, strict=True))
@@ -317,18 +327,4 @@ def write_result(
     if result.refined is not None:
         facts["refine"] = asdict(result.refined)
         print(result.refined, flush=True)
-    begin = time.perf_counter()
-    paths = export.write_prediction(directory, result.batch, prediction, renderer, options, facts)
-    if lists_files:
-        print("\n".join(_listing(directory, paths)), flush=True)
-    return {**seconds, "write": time.perf_counter() - begin}
-
-
-def _listing(directory: Path, paths: Iterable[Path]) -> list[str]:
-    """Lines of files in a directory, and of its folders with the numbers of files in them."""
-    counts = Counter(path.relative_to(directory).parts[0] for path in paths)
-    lines = []
-    for name, count in counts.items():
-        path = directory / name
-        lines.append(f"{path}/ ({count} files)" if path.is_dir() else str(path))
-    return lines
+    export.write_prediction(directory, result.batch, result.prediction, renderer, options, facts)

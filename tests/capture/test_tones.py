@@ -44,7 +44,6 @@ def test_the_gamma_of_one_camera_is_named_and_undone(taken, view, gamma):
     assert result.tones == {NAMES[view]: pytest.approx(gamma, rel=0.03)}
     right = taken.batch((112, 112)).images
     assert (result.batch.images - right).abs().max() < 0.02
-    assert result.seconds["tones"] > 0
 
 
 @pytest.mark.parametrize("gains", [(1, 1, 1, 1), (0.7, 1, 1, 1), (0.6, 0.9, 1.1, 0.75)])
@@ -94,13 +93,13 @@ PREDICTED = (
     "refine_masks=0",
     "refine_cameras=0",
 )
-LINE = "photograph cam2 has a gamma of about 0.80 beside the others: a tone curve, profile or contrast of its"
+LINE = "photograph cam2 has a gamma of about 0.80 beside the others: undone (refine_tones=0 leaves it)\n"
 
 
 @pytest.mark.parametrize(("images", "folders"), [("images/000", ["."]), ("images", ["000", "001"])])
 def test_predict_says_what_it_undoes_once_and_reports_it_of_each_instant(here, capsys, images, folders):
     assert ghgs("predict", f"images={images}", *here, *PREDICTED) == 0
-    assert capsys.readouterr().out.count(f"{LINE} own, undone (refine_tones=0 leaves it)\n") == 1
+    assert capsys.readouterr().out.count(LINE) == 1
     for folder in folders:
         with open(f"splats/{folder}/report.json") as file:
             assert json.load(file)["tones"] == {"cam2": pytest.approx(0.8, rel=0.03)}

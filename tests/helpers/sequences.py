@@ -41,7 +41,7 @@ def numbers(photographs):
 
 def all_numbers(folder):
     """What is predicted of a sequence: numbers by camera, by instant."""
-    return {capture.name: numbers(capture.photographs) for capture, _ in captures_of(folder)}
+    return {capture.name: numbers(capture.photographs) for capture in captures_of(folder)}
 
 
 def alike(number, names=FIGURE.names):
