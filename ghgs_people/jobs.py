@@ -1,12 +1,16 @@
 """Rendering of many people in several processes: resumable, with the same files for the same seed.
+
 Workers are spawned (a fork of a process that runs threads may hang): each imports the script that
 called :func:`render_people`, which therefore needs ``if __name__ == "__main__":``. Workers write to
-workspaces; the process that holds the lock moves finished subjects to their place."""
+workspaces; the process that holds the lock moves finished subjects to their place
+(:mod:`ghgs_lit.data.layout`). Besides the files described there, ``<root>/rendering/`` has
+``settings.json`` (the settings of the files), ``lock`` and ``tmp/`` (workspaces)."""
 
-import contextlib
+import json
 import logging
 import multiprocessing
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -16,36 +20,42 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal, Protocol
+from unittest import mock
 
 import numpy as np
 import torch
+from PIL import Image
 from pydantic import Field
 from rich.console import Console
 from rich.progress import track
 
+from ghgs_lit.config.keys import flatten
 from ghgs_lit.config.options import Index, Options, Size
-from ghgs_lit.data.layout import position_name
+from ghgs_lit.data.layout import Completeness, position_name
 from ghgs_lit.data.sampling import RING_VIEW, ViewNumber, subject_rng
 from ghgs_lit.data.view import View, encode_depth
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.files import naming
+from ghgs_lit.files import lock, naming, write_text_atomically
+from ghgs_lit.parsing import read_json
 from ghgs_lit.runtime.cores import allowed_cores, use_known_start_method
 from ghgs_people import figures
 from ghgs_people.cpu.kernel import compile_kernels
 from ghgs_people.figures.mesh import Person
 from ghgs_people.lights import Lights
 from ghgs_people.photograph import Studio
-from ghgs_people.progress import Progress
-from ghgs_people.rig import STILL, Poses, Rig
-from ghgs_people.writing import write_body, write_view
+from ghgs_people.rig import STILL, Rig
 
 log = logging.getLogger(__name__)
 
 _GUARD = 'if __name__ == "__main__":'
 # Part of every cache key: to be increased when photographs of the same settings change.
 RENDER_VERSION = 3
-# Numbers of threads of the libraries that NumPy and PyTorch compute with.
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+#: Workers compute with one thread each: those of NumPy's products wait by spinning.
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+# Runs of equal bytes (Z_RLE of zlib): half the time of the default, and files are no larger.
+_PNG = {"compress_type": 3}
+#: Folders of the files of a subject, in the order in which they are moved to their place.
+_KINDS = ("mask", "alpha", "depth", "parm", "img", "smpl")
 #: Lights of all people.
 LIGHTS = Lights()
 
@@ -180,38 +190,15 @@ def render_subject(job: _Job) -> tuple[_Job, str]:
 
 
 def _render(job: _Job) -> None:
+    settings = job.settings
     rng = subject_rng(job.seed, job.name)
     person = job.rig.place(job.source.load(job.name), rng)
     yaws = job.rig.yaws(rng) + job.source.facing(job.name)
     lights = LIGHTS.draw(rng)
-    if job.settings.lights == "none":
-        lights = None
-    height, width = job.settings.size
+    height, width = settings.size
     # A separate generator: heights, yaws and lights do not depend on what is varied.
     rig, poses = job.rig.drawn(person, yaws, width / height, rng.spawn(1)[0])
-    studio = Studio(person, lights, job.settings.samples)
-    for position, number, view in photographs(studio, rig, job.settings, yaws, poses):
-        write_view(job.workspace, position_name(job.name, position), number, view, job.settings.quality)
-    if person.body_vertices is not None:
-        write_body(job.workspace, job.name, person.body_vertices)
-
-
-def photographs(
-    studio: Studio, rig: Rig, settings: RenderOptions, yaws: np.ndarray, poses: Poses
-) -> Iterator[tuple[int, int, View]]:
-    """Photograph a person from every position and view of ``settings``.
-
-    Args:
-        studio: the person under its lights.
-        rig: the cameras around this person.
-        settings: positions, views and size.
-        yaws: [positions, 5] of all views, rendered or not (:meth:`ghgs_people.rig.Rig.yaws`).
-        poses: deviations of the cameras of all views.
-
-    Yields:
-        Ring position, number and content of each view.
-    """
-    height, width = settings.size
+    studio = Studio(person, None if settings.lights == "none" else lights, settings.samples)
     for position in range(len(yaws)) if settings.positions is None else settings.positions:
         index = (position, list(settings.views))
         cameras = rig.cameras(yaws[index], height, width, poses[index])
@@ -225,7 +212,49 @@ def photographs(
                 extrinsics=cameras.extrinsics[n].numpy(),
                 matte=np.round(shot.alphas[n] * 255).astype(np.uint8),
             )
-            yield position, number, view
+            write_view(job.workspace, position_name(job.name, position), number, view, settings.quality)
+    if person.body_vertices is not None:
+        write_body(job.workspace, job.name, person.body_vertices)
+
+
+def write_view(phase: Path, folder: str, number: int, view: View, quality: int = 98) -> None:
+    """Write one view of a subject.
+
+    The JPEG keeps the full resolution of colours. The mask has three equal channels, as the
+    authors' loader reads channel 0.
+
+    Args:
+        phase: folder of the phase, or a workspace.
+        folder: name of the subject's position, ``<id>_<position>``.
+        number: of the view at its position.
+        view: image, mask and cameras; matte and inverse depth where there are any.
+        quality: of the JPEG, 1 to 100.
+    """
+    folders = {kind: phase / kind / folder for kind in ("img", "mask", "alpha", "depth", "parm")}
+    for path in folders.values():
+        path.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(view.image).save(folders["img"] / f"{number}.jpg", quality=quality, subsampling=0)
+    mask = np.repeat(view.mask[..., None].astype(np.uint8) * 255, 3, axis=-1)
+    Image.fromarray(mask).save(folders["mask"] / f"{number}.png", **_PNG)
+    if view.matte is not None:
+        Image.fromarray(view.matte).save(folders["alpha"] / f"{number}.png", **_PNG)
+    if view.inverse_depth is not None:
+        Image.fromarray(view.inverse_depth).save(folders["depth"] / f"{number}.png", **_PNG)
+    np.save(folders["parm"] / f"{number}_intrinsic.npy", view.intrinsics.astype(np.float64))
+    np.save(folders["parm"] / f"{number}_extrinsic.npy", view.extrinsics[:3].astype(np.float64))
+
+
+def write_body(phase: Path, name: str, vertices: np.ndarray) -> None:
+    """Write the vertices of a subject's body.
+
+    Args:
+        phase: folder of the phase, or a workspace.
+        name: of the subject.
+        vertices: [n, 3], metres.
+    """
+    folder = phase / "smpl" / name
+    folder.mkdir(parents=True, exist_ok=True)
+    np.save(folder / "vertices.npy", vertices.astype(np.float32))
 
 
 def render_people(
@@ -260,44 +289,96 @@ def render_people(
             main guard, or people are bad: the others are rendered, then these are named.
         RuntimeError: a rendering process died.
     """
-    _check_main_guard()
+    # A worker that imports a script without a main guard would wait for its parent forever.
+    expected = (
+        f"`{_GUARD}` around what a script does (rendering processes import it), or data.render_workers=0"
+    )
+    is_imported = getattr(multiprocessing.current_process(), "_inheriting", False)
+    require(not is_imported, sys.argv[0], expected, None)
     positions = settings.positions
     fits = positions is None or set(positions) <= set(range(rig.positions))
     require(fits, "data.render.positions", f"some of 0 to {rig.positions - 1}", positions)
-    progress = Progress(Path(root))
+    notes = Completeness(Path(root))
     made_with = identity(rig, settings, seed)
-    progress.check_settings(made_with)
-    if not any(progress.missing(phase, listed) for phase, listed in names.items()):
+    check_settings(notes, made_with)
+    if not any(notes.missing(phase, listed) for phase, listed in names.items()):
         return 0
-    with progress.lock(), naming(progress.root):
-        progress.check_settings(made_with)  # another process may have written others meanwhile
-        progress.clear_workspaces()
-        progress.request(names)
+    workspaces = notes.folder / "tmp"
+    with lock(notes.folder / "lock", wait=True) as held, naming(notes.root):
+        require(held, str(root), "one rendering at a time in a process", "another")
+        check_settings(notes, made_with)  # another process may have written others meanwhile
+        shutil.rmtree(workspaces, ignore_errors=True)  # of killed runs
+        _request(notes, names)
         todo = []
         for phase, listed in names.items():
-            for name in progress.missing(phase, listed):
-                workspace = progress.workspace(phase, name)
-                todo.append(_Job(source, rig, settings, seed, phase, name, workspace))
+            for name in notes.missing(phase, listed):
+                todo.append(_Job(source, rig, settings, seed, phase, name, workspaces / f"{phase}-{name}"))
         console = Console(stderr=True)
         label = f"rendering into {root}"
         bad = []
+        finished = _run(todo, workers)
         try:
-            with contextlib.closing(_run(todo, workers)) as finished:
-                for job, why in track(finished, label, total=len(todo), console=console, disable=not shown):
-                    if why:
-                        bad.append(why)
-                        log.warning("%s is not rendered: %s", job.name, why)
-                    else:
-                        progress.publish(job.workspace, job.phase, job.name)
+            for job, why in track(finished, label, total=len(todo), console=console, disable=not shown):
+                if why:
+                    bad.append(why)
+                    log.warning("%s is not rendered: %s", job.name, why)
+                else:
+                    _publish(notes, job)
         finally:
-            progress.clear_workspaces()
+            finished.close()
+            shutil.rmtree(workspaces, ignore_errors=True)
     if bad:
-        others = f" (and {len(bad) - 1} more, named above)" if len(bad) > 1 else ""
-        rest = (
-            f"; the other {len(todo) - len(bad)} of {len(todo)} are rendered" if len(todo) > len(bad) else ""
-        )
-        raise InputError(f"{sorted(bad)[0]}{others}{rest}")
+        raise InputError(f"{min(bad)} ({len(bad)} of {len(todo)} people are bad; the others are rendered)")
     return len(todo)
+
+
+def check_settings(notes: Completeness, settings: dict) -> None:
+    """Store the settings in an empty data set; refuse a data set with others.
+
+    Args:
+        notes: of the data set.
+        settings: nested plain data (:func:`identity`).
+
+    Raises:
+        InputError: the data set has other settings, or files that were not rendered here.
+    """
+    path = notes.folder / "settings.json"
+    if not path.exists():
+        is_empty = not notes.root.is_dir() or set(notes.root.iterdir()) <= {notes.folder}
+        require(is_empty, str(notes.root), "an empty folder or one rendered here before", "other files")
+        write_text_atomically(path, json.dumps(settings, indent=1))
+    stored = flatten(read_json(path))
+    settings = flatten(json.loads(json.dumps(settings)))  # tuples to lists, as they were stored
+    for key in sorted(settings.keys() | stored.keys()):
+        if settings.get(key) != stored.get(key):
+            raise InputError(
+                f"{path}: expected {key} = {settings.get(key)}; found {stored.get(key)} "
+                "(render into another folder, or delete this one)"
+            )
+
+
+def _request(notes: Completeness, names: Mapping[str, Sequence[str]]) -> None:
+    """Store which subjects of each phase were requested."""
+    known = notes.plan
+    plan = {}
+    for phase in known.keys() | names.keys():
+        plan[phase] = sorted({*known.get(phase, []), *names.get(phase, [])})
+    write_text_atomically(notes.folder / "plan.json", json.dumps(plan, indent=1))
+
+
+def _publish(notes: Completeness, job: _Job) -> None:
+    """Move a subject to its place, then mark it as complete."""
+    for kind in _KINDS:
+        for source in sorted((job.workspace / kind).glob("*")):
+            target = notes.root / job.phase / kind / source.name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if target.exists():  # left by a run that was killed between two moves
+                shutil.rmtree(target)
+            os.replace(source, target)
+    marker = notes.marker(job.phase, job.name)
+    marker.parent.mkdir(parents=True, exist_ok=True)
+    marker.touch()
+    shutil.rmtree(job.workspace)
 
 
 def _run(jobs: list[_Job], workers: int | None) -> Iterator[tuple[_Job, str]]:
@@ -320,7 +401,10 @@ def _run(jobs: list[_Job], workers: int | None) -> Iterator[tuple[_Job, str]]:
     compile_kernels()  # before the workers would, each for itself
     use_known_start_method()
     context = multiprocessing.get_context("spawn")
-    with one_thread_each(), ProcessPoolExecutor(workers, context, initializer=start_worker) as pool:
+    with (
+        mock.patch.dict(os.environ, _ONE_THREAD),
+        ProcessPoolExecutor(workers, context, initializer=start_worker) as pool,
+    ):
         try:
             futures = [pool.submit(render_subject, job) for job in jobs]
             for future in as_completed(futures):
@@ -331,32 +415,6 @@ def _run(jobs: list[_Job], workers: int | None) -> Iterator[tuple[_Job, str]]:
             ) from error
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
-
-
-@contextlib.contextmanager
-def one_thread_each() -> Iterator[None]:
-    """Processes that start meanwhile compute with one thread:
-    those of NumPy's products wait by spinning."""
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name)
-            if value is not None:
-                os.environ[name] = value
-
-
-def _check_main_guard() -> None:
-    """Refuse to run in a worker that imports the calling script,
-    which would wait for its parent forever."""
-    # Set by multiprocessing while a spawned process imports the main module of its parent.
-    if getattr(multiprocessing.current_process(), "_inheriting", False):
-        raise InputError(
-            f"{sys.argv[0]}: expected `{_GUARD}` around what a script does (rendering processes "
-            "import it), or data.render_workers=0; found neither"
-        )
 
 
 def start_worker() -> None:

@@ -19,7 +19,7 @@ from ghgs_lit.evaluation.tables.records import read_sweep
 from ghgs_lit.parsing import LARGEST, read_json, read_lines_of_json, read_npy, read_rows, read_text, read_yaml
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
-from ghgs_people.progress import Progress
+from ghgs_people.jobs import check_settings
 
 READERS = (read_text, read_json, read_yaml, read_rows, read_npy)
 
@@ -137,7 +137,9 @@ def test_foreign_content_of_files_of_this_program(tmp_path):
     folder.mkdir()
     readers = {
         folder / "plan.json": lambda: Completeness(tmp_path).plan,
-        folder / "settings.json": lambda: Progress(tmp_path).check_settings({"render": {"lights": "none"}}),
+        folder / "settings.json": lambda: check_settings(
+            Completeness(tmp_path), {"render": {"lights": "none"}}
+        ),
         tmp_path / "metrics.json": lambda: read_results(tmp_path / "metrics.json"),
         tmp_path / "other.json": lambda: read_others(tmp_path / "other.json"),
     }
