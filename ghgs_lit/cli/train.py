@@ -260,7 +260,7 @@ def fit(
             even if training is interrupted.
 
     Raises:
-        InputError: options of the Trainer do not fit the data.
+        InputError: options of the Trainer do not fit the data, or ``resume`` the optimizer.
     """
     loggers.begin(trainer.loggers, saved_text(module.config), step)
     started = time.perf_counter()
@@ -268,6 +268,12 @@ def fit(
         trainer.fit(module, data, ckpt_path=resume and file_of(resume))
     except MisconfigurationException as error:  # of options that do not fit the data
         raise InputError(f"trainer: {error}") from None
+    except Exception as error:
+        # Lightning reads the state of a training, which may be damaged, before it asks for data.
+        if resume is None or trainer.train_dataloader is not None or isinstance(error, InputError):
+            raise
+        found = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise InputError(f"{resume}: expected the state of a training run; found {found}") from error
     finally:
         stats |= {
             "steps": max(trainer.global_step - (step or 0), 0),

@@ -11,7 +11,7 @@ from lightning.pytorch.callbacks import Timer
 from torch import nn
 from torchmetrics import MeanMetric
 
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.runtime.watching import time_mark
 from ghgs_lit.training.optimization import Optimization, hold_rates, plain_rates
 from ghgs_lit.types import Batch
@@ -174,6 +174,20 @@ class BudgetedModule(L.LightningModule):
     def on_validation_end(self) -> None:
         """The next step does not wait for data as long as the validation took."""
         self.on_train_batch_end()
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuse to resume with Muon from AdamW's state, or the reverse.
+
+        Args:
+            checkpoint: of Lightning.
+
+        Raises:
+            InputError: names ``optimizer.matrix_scale``."""
+        scale = getattr(self.optimization, "matrix_scale", None)  # a plug-in's may have none
+        for state in checkpoint.get("optimizer_states", ()):
+            by_muon = any("orthogonal" in group for group in state["param_groups"])
+            expected = f"{'a number' if by_muon else 'null'}, as in {self.trainer.ckpt_path}"
+            require(by_muon == (scale is not None), "optimizer.matrix_scale", expected, scale)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add plain data only, so that the file loads with ``torch.load(weights_only=True)``.

@@ -17,7 +17,6 @@ from pydantic import Field
 from ghgs_lit.config.options import Index, Options, Text, Words
 from ghgs_lit.files import write_atomically
 from ghgs_lit.runs.signals import handle, handlers, interrupt
-from ghgs_lit.training.restoring import check_restored
 from ghgs_lit.weights import frozen
 from ghgs_lit.weights.reading import open_file
 
@@ -194,12 +193,6 @@ class StopAtStep(Checkpoint):
         self._step = 0
         self._saved = 0  # the signal, once the checkpoint is written
         self._before = handlers()
-
-    def on_load_checkpoint(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
-    ) -> None:
-        """Check the states of loops and callbacks, which Lightning loads next."""
-        check_restored(trainer, checkpoint)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Replace Lightning's signal handlers, which save no checkpoint;

@@ -1,8 +1,11 @@
-"""Guard against training steps that are not finite: they are explained, saved and skipped."""
+"""Guard against training steps that are not finite: their stage is named, their batch saved, and they
+are skipped."""
 
 import dataclasses
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import lightning.pytorch as L
 import torch
@@ -10,17 +13,110 @@ from torch import Tensor
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.files import write_atomically
-from ghgs_lit.training.faults import Step, first_fault
+from ghgs_lit.method.model import STAGES
+from ghgs_lit.runtime.watching import Inputs, Watcher, watched
+from ghgs_lit.training.optimization import named_weights
+from ghgs_lit.types import Batch, map_tensors
+
+#: Dotted paths of the stages that faults are assigned to.
+_STAGES = {name: f"model.{name}" for name in (*STAGES, "rounds")} | {
+    "renderer": "renderer",
+    "losses": "losses",
+}
+#: Batches that a run saves at most.
+_SAVED = 10
 
 
 class DivergedError(InputError):
     """A loss or a gradient is not finite."""
 
 
+@dataclass(frozen=True)
+class Step:
+    """All inputs of a forward pass except the weights.
+
+    Args:
+        batch: of this process.
+        seed: of all random numbers that the step draws.
+        budget: which patches the encoder sees (:func:`~ghgs_lit.training.module.drawn_budget`);
+            None: as configured.
+        rounds: number of rounds; None: drawn by the seed."""
+
+    batch: Batch
+    seed: int
+    budget: str | int | None = None
+    rounds: int | None = None
+
+
+class _FirstFault(Watcher):
+    """The first values that are not finite, in words; "" where there are none."""
+
+    def __init__(self) -> None:
+        self.text = ""
+
+    def begin(self, stage: str, inputs: Inputs = ((), {})) -> Inputs:
+        """Views of the inputs, whose gradients come from this stage alone."""
+
+        def view(value: Tensor) -> Tensor:
+            if not value.requires_grad:
+                return value
+            value = value.view_as(value)
+            value.register_hook(lambda slope: self.check(f"gradient from {stage}", slope))
+            return value
+
+        return map_tensors(inputs, view)
+
+    def end(self, stage: str, result: Any = None) -> None:
+        self.check(f"result of {stage}", result)
+
+    def check(self, place: str, value: Any) -> None:
+        """Note a value in which numbers are not finite, unless another was noted before."""
+
+        def check(tensor: Tensor) -> Tensor:
+            broken = int((~tensor.isfinite()).sum())
+            if broken and not self.text:
+                self.text = f"{broken} of {tensor.numel()} values are not finite in the {place}"
+            return tensor
+
+        map_tensors(value, check)
+
+
+def first_fault(module: L.LightningModule, step: Step, scale: float = 1.0) -> str:
+    """Run a step again, and find the first values that are not finite in weights, batch, results of
+    stages, and gradients. Weights and their gradients are not changed.
+
+    Args:
+        module: with ``model``, ``renderer``, ``losses`` and ``forward_losses``, as
+            :class:`~ghgs_lit.training.module.GHGSModule`.
+        step: the inputs.
+        scale: factor of the loss (``16-mixed``).
+
+    Returns:
+        How many values of what; "": all are finite."""
+    fault = _FirstFault()
+    trained = {}
+    for name, weight in named_weights(module):
+        fault.check(f"weights {name}", weight)
+        if weight.requires_grad:
+            trained[name] = weight
+    fault.check("batch", step.batch)
+    precision = module.trainer.precision_plugin
+    try:
+        with torch.enable_grad(), watched(module, _STAGES, fault), precision.train_step_context():
+            total = module.forward_losses(step)[1]
+            slopes = torch.autograd.grad(total * scale, list(trained.values()), allow_unused=True)
+    except Exception:  # a stage may refuse values that are not finite
+        if not fault.text:
+            raise
+        return fault.text
+    for name, slope in zip(trained, slopes, strict=True):
+        fault.check(f"gradient of {name}", slope)
+    return fault.text
+
+
 class Guard:
     """Checks each step of the optimizer, and runs the step again only if it is not finite. All
-    processes decide alike. The inputs of the step are saved to ``<run>/faults/step_<n>.pt``, once
-    for each stage.
+    processes decide alike. The inputs of the step are saved to ``<run>/faults/step_<n>.pt``.
 
     Args:
         limit: steps in a row that are skipped before the run stops.
@@ -33,7 +129,6 @@ class Guard:
         self.skipped = 0
         self._in_a_row = 0
         self._steps: list[tuple[Step, Tensor]] = []
-        self._saved: set[str] = set()
 
     def note(self, step: Step, loss: Tensor) -> None:
         """Store a forward pass of the optimizer's next step; does not wait for the device.
@@ -70,43 +165,39 @@ class Guard:
         so that the optimizer changes nothing.
 
         Args:
-            module: that of :func:`~ghgs_lit.training.faults.first_fault`.
+            module: that of :func:`first_fault`.
             scale: factor of the loss.
 
         Raises:
             DivergedError: more than ``limit`` steps in a row were not finite."""
         trainer = module.trainer
-        line = self._explain(module, scale)
+        faults = [self._explain(module, scale)]
         self._steps.clear()
-        lines = [line]
         if trainer.world_size > 1:
-            lines = [""] * trainer.world_size
-            torch.distributed.all_gather_object(lines, line)
-        faults = "; ".join(filter(None, lines)) or "a value that is finite when the step is run again"
-        message = f"step {module.global_step}: expected a finite loss and gradient; found {faults}"
+            (mine,) = faults
+            faults = [""] * trainer.world_size
+            torch.distributed.all_gather_object(faults, mine)
+        found = "; ".join(filter(None, faults)) or "values that are finite one by one, or when run again"
+        message = f"step {module.global_step}: expected a finite loss and gradient; found {found}"
         if self._in_a_row >= self.limit:
             raise DivergedError(message)
         self._in_a_row += 1
         self.skipped += 1
-        for parameter in module.parameters():
-            parameter.grad = None
+        module.zero_grad()
         if trainer.is_global_zero:
             print(f"{message}; the step is skipped", flush=True)
 
     def _explain(self, module: L.LightningModule, scale: float) -> str:
-        """The first fault of this process, "" if none, and, for the first fault of a stage,
-        its file."""
+        """The first fault of this process, "" if none, and the file that has its batch."""
         for step, _ in self._steps:
-            step = dataclasses.replace(step, scale=scale)
-            if (fault := first_fault(module, step)) is None:
+            if not (fault := first_fault(module, step, scale)):
                 continue
-            if fault.stage in self._saved:
-                return str(fault)
-            self._saved.add(fault.stage)
-            rank = f"_process_{module.global_rank}" if module.global_rank else ""
             folder = Path(module.trainer.default_root_dir) / "faults"
+            if len(list(folder.glob("*.pt"))) >= _SAVED:
+                return fault
+            rank = f"_process_{module.global_rank}" if module.global_rank else ""
             path = folder / f"step_{module.global_step:06d}{rank}.pt"
-            content = {**dataclasses.asdict(step), "autocast": str(step.autocast), "fault": str(fault)}
+            content = dataclasses.asdict(step) | {"fault": fault}
             write_atomically(path, partial(torch.save, content))
             return f"{fault}; its batch is in {path}"
         return ""

@@ -22,8 +22,7 @@ from ghgs_lit.method.plan.presets import KeptTokens, seeing
 from ghgs_lit.method.rounds import Rounds
 from ghgs_lit.metrics import FURTHER, MetricsOptions, depth_error_mm, surface_error_mm
 from ghgs_lit.training.base import BudgetedModule, image_mean
-from ghgs_lit.training.faults import Step
-from ghgs_lit.training.guard import Guard
+from ghgs_lit.training.guard import Guard, Step
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch, Cameras, DepthMaps, Gaussians, Prediction, Rendering, Targets
 from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint
@@ -200,8 +199,6 @@ class GHGSModule(BudgetedModule):
 
     def _step(self, batch: Batch, batch_idx: int) -> Step:
         """All inputs of a training step."""
-        device = self.device.type
-        autocast = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else None
         budget = count = None
         shared = self.class_numbers(batch_idx)
         # the same in all processes, so that none waits for another
@@ -209,7 +206,7 @@ class GHGSModule(BudgetedModule):
             budget = drawn_budget(self.token_budgets, shared or self.step_numbers(batch_idx))
         if shared and isinstance(getattr(self.model, "rounds", None), Rounds):
             count = drawn_budget(self.model.rounds.options.training_counts, shared, stream=2)
-        return Step(batch, self.step_seed(batch_idx), budget, autocast, rounds=count)
+        return Step(batch, self.step_seed(batch_idx), budget, count)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Run a step and log its loss, without a wait for the device.
@@ -310,6 +307,7 @@ class GHGSModule(BudgetedModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Go on counting skipped steps, and with the same shape buckets."""
+        super().on_load_checkpoint(checkpoint)
         self.guard.skipped = checkpoint.get("skipped_steps", 0)
         if self.captured_step is not None:
             self.captured_step.load_state_dict(checkpoint.get("shape_buckets", ()))

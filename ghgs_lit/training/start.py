@@ -1,6 +1,5 @@
 """Start of training: from nothing, from the weights of another run, or from an interrupted run."""
 
-import itertools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,6 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import resolved
 from ghgs_lit.method.stages import STAGES
 from ghgs_lit.runs.provenance import differences
-from ghgs_lit.training.restoring import check_optimizer_state, check_schedules, check_training_state
 from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint, require_finite, shape_of
 
 if TYPE_CHECKING:
@@ -53,36 +51,18 @@ def check_resume(
         InputError: not a checkpoint of a training run, of another model or loss (names the tensor)
             or optimizer, or damaged."""
     checkpoint = read_checkpoint(path, whole=True)
-    for key in ("global_step", "optimizer_states"):
-        if key not in checkpoint:
-            raise InputError(
-                f"{path}: expected a checkpoint of a training run; found none of its {key!r}"
-                " (init_from=... starts from weights alone)"
-            )
-    check_training_state(path, checkpoint)
+    step = checkpoint.get("global_step")
+    for key, kind in (("global_step", int), ("optimizer_states", list)):
+        expected = "that of a training run (init_from=... starts from weights alone)"
+        value = checkpoint.get(key)
+        require(isinstance(value, kind), f"{path}: {key}", expected, type(value).__name__)
     parts = dict(module.named_children())
     for key in checkpoint["state_dict"]:
         expected = f"weights of {' or '.join(parts)}"
         require(str(key).split(".")[0] in parts, f"{path}: {key}", expected, "those of another part")
     for name, part in parts.items():
         load_strictly(part, model_state(checkpoint, f"{name}."), path)
-    _check_optimizer(path, checkpoint, module)
-    return checkpoint["global_step"], differences(checkpoint["config"], config, MAY_CHANGE_ON_RESUME)
-
-
-def _check_optimizer(path: str | Path, checkpoint: Mapping[str, Any], module: "BudgetedModule") -> None:
-    """Refuse to resume with Muon from AdamW's state, the reverse,
-    or with other parameter groups."""
-    states = checkpoint["optimizer_states"]
-    stored = itertools.chain.from_iterable(state["param_groups"] for state in states)
-    by_muon = any("orthogonal" in group for group in stored)
-    scale = getattr(module.optimization, "matrix_scale", None)  # a plug-in's may have none
-    expected = f"{'a number' if by_muon else 'null'}, as in {path}"
-    require(by_muon == (scale is not None), "optimizer.matrix_scale", expected, scale)
-    groups = module.optimization.optimizer(module).param_groups
-    for state in states:
-        check_optimizer_state(path, state, groups)
-    check_schedules(path, checkpoint.get("lr_schedulers"), len(groups))
+    return step, differences(checkpoint["config"], config, MAY_CHANGE_ON_RESUME)
 
 
 def initialize(

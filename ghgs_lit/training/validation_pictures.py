@@ -1,5 +1,6 @@
 """Pictures, attention and point clouds of the first validation subjects."""
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -7,14 +8,12 @@ import lightning.pytorch as L
 import numpy as np
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
-from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
 
 from ghgs_lit.config.options import Index, Options
 from ghgs_lit.geometry.padding import pad_to_patches
-from ghgs_lit.method.recalibration import Recalibration
-from ghgs_lit.method.recalibration.inspection import attention_of, attention_on_other_parts
-from ghgs_lit.training.pretext.labels import has_parts, part_shares, token_parts
+from ghgs_lit.method.recalibration.inspection import Call, attention_of, seen_calls
 from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.attention import attention_sheet, chosen_token
 from ghgs_lit.visualization.clouds import clouds
@@ -54,22 +53,14 @@ class Pictures(Callback):
 
     def __init__(self, options: PicturesOptions):
         self.options = options
-        self._left = 0
-        self._hook = None
-        self._seen = None
+        self._stack = ExitStack()
 
-    def on_validation_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Watch the recalibration while there are subjects to draw."""
-        self._left = 0 if trainer.sanity_checking else self.options.subjects
+    def on_validation_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Watch the recalibration for the first batch."""
+        self._number = 0
         stage = getattr(pl_module.model, "recalibration", None)
-        if self._left and isinstance(stage, Recalibration):
-            self._hook = stage.register_forward_pre_hook(self._see)
+        self._calls = self._stack.enter_context(seen_calls(stage if self.options.subjects else None))
 
-    def _see(self, stage: Recalibration, inputs: tuple) -> None:
-        """Keep the tokens and points that the recalibration gets."""
-        self._seen = (stage, *inputs[:2])
-
-    @rank_zero_only
     def on_validation_batch_end(
         self,
         trainer: L.Trainer,
@@ -85,62 +76,32 @@ class Pictures(Callback):
             outputs: of :meth:`ghgs_lit.training.module.GHGSModule.validation_step`.
             batch: that was validated.
             *args: not used."""
+        self._stack.close()
         prediction = outputs["prediction"]
         image = outputs["rendering"].image
-        for element in range(min(self._left, len(batch.images))):
-            number = self.options.subjects - self._left
-            name = batch.subjects[element] if batch.subjects else f"subject_{number}"
+        count = min(self.options.subjects - self._number, len(batch.images))
+        for element in range(count if trainer.is_global_zero else 0):
+            name = batch.subjects[element] if batch.subjects else f"subject_{self._number}"
             picture = sheet(batch, image, element, prediction.depth, prediction.depth_valid)
             _publish(trainer, f"view/sheet/{name}", picture, name)
-            if number == 0:
-                self._show_attention(trainer, batch, element, name)
-                self._log_other_parts(pl_module, batch)
-                _show_clouds(trainer, batch, prediction, element, name)
-                _show_distributions(trainer, prediction)
-            self._left -= 1
-        self._forget()
+            if self._number == 0:
+                for call in self._calls[-1:]:
+                    self._show_attention(trainer, batch, call, name)
+                for logger in trainer.loggers:
+                    if isinstance(logger, TensorBoardLogger):
+                        _log_values(logger.experiment, batch, prediction, name, trainer.global_step)
+            self._number += 1
+        self._calls = []
 
-    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Watch no longer."""
-        self._forget()
-
-    def _forget(self) -> None:
-        if self._hook is not None:
-            self._hook.remove()
-        self._hook = None
-        self._seen = None
-
-    def _show_attention(self, trainer: L.Trainer, batch: Batch, element: int, name: str) -> None:
-        """Publish whom the chosen token of an element attends to.
-
-        Args:
-            trainer: with the loggers and the folder of the run.
-            batch: that the model was called with last.
-            element: of the batch.
-            name: of its subject, in the names of pictures.
-        """
-        if self._seen is None:
-            return
-        stage, tokens, points = self._seen
-        token = chosen_token(tokens, points, element, self.options.token)
-        attention = None if token is None else attention_of(stage, tokens, points, token)
+    def _show_attention(self, trainer: L.Trainer, batch: Batch, call: Call, name: str) -> None:
+        """Publish whom the chosen token of the first subject attends to."""
+        _, tokens, points = call
+        token = chosen_token(tokens, points, 0, self.options.token)
+        attention = None if token is None else attention_of(*call, token)
         if attention is not None:
             padding = pad_to_patches(batch.masks, tokens.patch_size)
             picture = attention_sheet(padding.pad_batch(batch) if padding else batch, tokens, attention)
             _publish(trainer, f"view/attention/{name}", picture, f"{name}_attention")
-
-    def _log_other_parts(self, pl_module: L.LightningModule, batch: Batch) -> None:
-        """Log the share of attention on other body parts, for built-in people with true depths."""
-        if self._seen is None or batch.depths is None or not has_parts(batch):
-            return
-        stage, tokens, points = self._seen
-        padding = pad_to_patches(batch.masks, tokens.patch_size)
-        shares = part_shares(padding.pad_batch(batch) if padding else batch, tokens.patch_size)
-        part = token_parts(shares, tokens)
-        share = attention_on_other_parts(stage, tokens, points, part)
-        pl_module.log(
-            "val/attention_on_other_parts", share.mean(), batch_size=len(batch.images), rank_zero_only=True
-        )
 
 
 def distributions(prediction: Prediction) -> dict[str, Tensor]:
@@ -160,12 +121,14 @@ def distributions(prediction: Prediction) -> dict[str, Tensor]:
     return {name: values[values.isfinite()] for name, values in known.items()}
 
 
-def _show_distributions(trainer: L.Trainer, prediction: Prediction) -> None:
-    """Log the :func:`distributions` to TensorBoard."""
-    loggers = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
-    for name, values in distributions(prediction).items() if loggers else ():
-        for logger in loggers if len(values) else ():
-            logger.experiment.add_histogram(f"values/{name}", values, trainer.global_step)
+def _log_values(writer: SummaryWriter, batch: Batch, prediction: Prediction, name: str, step: int) -> None:
+    """Log the :func:`distributions`, and the point clouds of the first subject."""
+    for kind, values in distributions(prediction).items():
+        if len(values):
+            writer.add_histogram(f"values/{kind}", values, step)
+    for kind, (positions, colors) in clouds(batch, prediction, 0).items():
+        colors = (255 * colors[None]).byte()
+        writer.add_mesh(f"{name}/{kind}", positions[None], colors, config_dict=CLOUD_VIEW, global_step=step)
 
 
 def _publish(trainer: L.Trainer, tag: str, picture: np.ndarray, file: str) -> None:
@@ -184,25 +147,3 @@ def _publish(trainer: L.Trainer, tag: str, picture: np.ndarray, file: str) -> No
             logger.experiment.add_image(tag, picture, step, dataformats="HWC")
         elif isinstance(logger, WandbLogger):
             logger.log_image(tag, [picture])
-
-
-def _show_clouds(trainer: L.Trainer, batch: Batch, prediction: Prediction, element: int, name: str) -> None:
-    """Log the point clouds of an element to TensorBoard.
-
-    Args:
-        trainer: with the loggers and the step.
-        batch: with the photographs.
-        prediction: of the batch.
-        element: of the batch.
-        name: of its subject.
-    """
-    loggers = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
-    for kind, (positions, colors) in clouds(batch, prediction, element).items() if loggers else ():
-        for logger in loggers:
-            logger.experiment.add_mesh(
-                f"{name}/{kind}",
-                positions[None],
-                (255 * colors[None]).byte(),
-                config_dict=CLOUD_VIEW,
-                global_step=trainer.global_step,
-            )

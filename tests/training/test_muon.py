@@ -8,11 +8,9 @@ import torch
 from torch import nn
 
 from ghgs_lit.execution.graphs import GraphCache
-from ghgs_lit.training import Optimization, muon
+from ghgs_lit.training import Optimization
 from ghgs_lit.training.muon import Muon, is_matrix, orthogonalized
 from ghgs_lit.training.optimization import hold_rates, plain_rates
-from ghgs_lit.training.restoring import check_optimizer_state, check_schedules
-from tests.helpers.models import load_model
 from tests.helpers.pretend_device import DEVICE, pretend_device
 from tests.helpers.tape import OperatorTape
 
@@ -73,76 +71,14 @@ def test_float32_is_enough():
         torch.testing.assert_close(found, expected.float(), atol=5e-4, rtol=0)
 
 
-@pytest.mark.parametrize("scale", [0.0, 1e-30, 1e12])
-def test_scale_does_not_matter(scale):
-    """Zeros stay zeros; tiny and huge gradients give the steps of others."""
-    matrix = torch.randn(16, 20, generator=torch.Generator().manual_seed(2))
-    expected = orthogonalized([matrix]) if scale else [torch.zeros(16, 20)]
-    torch.testing.assert_close(orthogonalized([scale * matrix]), expected, atol=1e-4, rtol=0)
-
-
-def test_matrices_of_one_size_do_not_meet():
-    """One whose squares underflow beside an ordinary one, a tall one and a longer one."""
+def test_neither_scale_nor_company_matters():
+    """Zeros stay zeros; one whose squares underflow beside ordinary ones, a tall one and a longer one."""
     generator = torch.Generator().manual_seed(4)
     several = [torch.randn(shape, generator=generator) for shape in ((16, 20), (16, 20), (20, 16), (16, 99))]
     alone = [orthogonalized([matrix])[0] for matrix in several]
-    scaled = [scale * matrix for scale, matrix in zip((1, 1e-30, 1, 1), several, strict=True)]
-    torch.testing.assert_close(orthogonalized(scaled), alone, atol=1e-4, rtol=0)
-
-
-@pytest.mark.parametrize("kind", ["cpu", "gpu"])
-def test_padding_and_company_change_nothing(kind, monkeypatch):
-    """Small ones of all shapes together, as on a CPU and on a GPU, and large ones beside them;
-    float64."""
-    if kind == "gpu":
-        monkeypatch.setattr(muon, "_power_of_two", lambda count: 128)
-    muon._packing.cache_clear()
-    generator = torch.Generator().manual_seed(5)
-    shapes = [
-        (3, 3),
-        (5, 7),
-        (7, 5),
-        (16, 16),
-        (16, 576),
-        (17, 40),
-        (128, 64),
-        (64, 1176),
-        (130, 129),
-        (129, 130),
-    ]
-    shapes += [(131, 140), (131, 140)]
-    several = [torch.randn(shape, dtype=torch.float64, generator=generator) for shape in shapes]
-    for matrix, found in zip(several, orthogonalized(several), strict=True):
-        torch.testing.assert_close(found, muon._orthogonalized(matrix[None])[0], atol=1e-10, rtol=0)
-    muon._packing.cache_clear()
-
-
-@pytest.mark.parametrize(("ours", "most"), [(True, 150), (False, 1500)])
-def test_a_gpu_is_asked_for_a_tenth_of_pytorchs_launches(ours, most):
-    """Of a step with the weights that come with the package: 134 matrices,
-    of which PyTorch's takes 61."""
-    model = load_model()
-    with pretend_device() as log:
-        trained = [p for p in model.to(DEVICE).parameters() if p.requires_grad]
-        options = Optimization(lr=1e-3, matrix_scale=1.0)
-        if ours:
-            optimizer = options.optimizer(model)
-            hold_rates(optimizer)
-        else:
-            flat = [p for p in trained if is_matrix(p) and p.dim() == 2]
-            optimizer = torch.optim.Muon(flat, lr=1e-3, adjust_lr_fn="match_rms_adamw")
-        for _ in range(2):  # the first makes the state
-            for parameter in trained:
-                parameter.grad = torch.ones_like(parameter)
-            log.clear()
-            options.clip_gradients(model)
-            optimizer.step()
-    assert log.waits.total() == 0
-    assert most * 0.9 < log.launches <= most
-    if ours:  # as a recorded step needs it
-        assert all(group["lr"].device == DEVICE for group in optimizer.param_groups)
-        counts = [state["step"] for state in optimizer.state.values() if "exp_avg" in state]
-        assert all(count.device == DEVICE for count in counts)
+    scaled = [scale * matrix for scale, matrix in zip((1, 1e-30, 1e12, 1), several, strict=True)]
+    zeros = torch.zeros(16, 20)
+    torch.testing.assert_close(orthogonalized([*scaled, zeros]), [*alone, zeros], atol=1e-4, rtol=0)
 
 
 def test_rates_on_the_device_follow_the_schedule_and_are_saved_as_numbers():
@@ -166,9 +102,7 @@ def test_rates_on_the_device_follow_the_schedule_and_are_saved_as_numbers():
         [0.01 / 3, 0.02 / 3]
     )
     assert files["lr_schedulers"][0]["_last_lr"] == pytest.approx([0.01 / 3, 0.02 / 3])
-    check_schedules("a.ckpt", files["lr_schedulers"], 2)
-    groups = Optimization(lr=0.01, matrix_scale=2.0).optimizer(Small()).param_groups
-    check_optimizer_state("a.ckpt", files["optimizer_states"][0], groups)
+    Optimization(lr=0.01, matrix_scale=2.0).optimizer(Small()).load_state_dict(files["optimizer_states"][0])
 
 
 def test_matrices_move_as_with_pytorchs_muon():

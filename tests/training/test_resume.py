@@ -3,12 +3,14 @@ its files stay complete."""
 
 import csv
 import shutil
+from types import SimpleNamespace
 
 import lightning.pytorch as L
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from ghgs_lit.cli import train as train_verb
 from ghgs_lit.config import run_of
 from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME
 from ghgs_lit.errors import InputError
@@ -22,7 +24,7 @@ from ghgs_lit.training.validation_pictures import PicturesOptions
 from ghgs_lit.weights import frozen
 from ghgs_lit.weights.checkpoint import read_checkpoint
 from tests.helpers.losses import losses_of
-from tests.helpers.training import Standin, StepData, _Steps, flat_renderer, held
+from tests.helpers.training import Standin, StepData, _Steps, flat_renderer, held, trainer
 
 STEPS = 16
 CONFIG = {"seed": 3, "resume": None, "init_from": None, "optimizer": {"lr": 0.05}}
@@ -290,27 +292,43 @@ def test_changed_options_of_the_optimizer_apply(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("old", "new"), [(None, 2.5), (2.5, None)])
 def test_averages_of_another_optimizer_are_refused(tmp_path, old, new):
     """Muon cannot go on from the averages of AdamW, nor AdamW from Muon's."""
-    path = tmp_path / "a.ckpt"
-    content = {"state_dict": {f"model.{k}": v for k, v in Standin().state_dict().items()}}
     before, now = (Optimization(lr=0.05, matrix_scale=scale) for scale in (old, new))
-    states = [before.optimizer(Standin()).state_dict()]
-    content |= {"config": CONFIG, "format_version": 1, "global_step": 5, "optimizer_states": states}
-    torch.save(content, path)
+    subject = held(Standin(), now)
+    subject._trainer = SimpleNamespace(ckpt_path=tmp_path / "a.ckpt")
     with pytest.raises(InputError, match=r"optimizer\.matrix_scale: expected .*a\.ckpt; found"):
-        check_resume(path, held(Standin(), now), {**CONFIG, "optimizer": dict(now)})
+        subject.on_load_checkpoint({"optimizer_states": [before.optimizer(Standin()).state_dict()]})
 
 
-def test_groups_of_another_optimizer_are_refused(tmp_path):
-    """PyTorch raised a ValueError hours into the queue, which named no file."""
-    path, model = tmp_path / "a.ckpt", Standin()
-    state = Optimization(lr=0.05).optimizer(model).state_dict()
-    state["param_groups"] *= 2
-    content = {"state_dict": {f"model.{k}": v for k, v in model.state_dict().items()}}
-    now = {**CONFIG, "optimizer": {"kind": "adamw", "lr": 0.05}}
-    content |= {"config": now, "format_version": 1, "global_step": 5, "optimizer_states": [state]}
-    torch.save(content, path)
-    with pytest.raises(InputError, match=r"a\.ckpt: optimizer_states\.param_groups: expected .*; found \["):
-        check_resume(path, held(model), now)
+#: Places in a checkpoint, and what damages it there; None: they are deleted.
+DAMAGED = [
+    ("optimizer_states/0/param_groups/0/params", [0]),
+    ("optimizer_states/0/param_groups", 3),
+    ("optimizer_states/0/state", None),
+    ("lr_schedulers", None),
+    ("lr_schedulers/0", 3),
+    ("loops", {}),
+    ("loops/fit_loop/epoch_loop.batch_progress", 3),
+    ("loops/fit_loop/epoch_loop.batch_progress/total/ready", None),
+    ("callbacks/TrainingCost", 3),
+]
+
+
+@pytest.mark.parametrize(("place", "value"), DAMAGED)
+def test_a_damaged_state_of_training_is_one_line(whole, tmp_path, place, value):
+    checkpoint = torch.load(whole[0] / "checkpoints" / "last.ckpt", weights_only=True)
+    checkpoint["callbacks"]["TrainingCost"] = TrainingCost().state_dict()
+    part = checkpoint
+    *before, last = [int(key) if key.isdecimal() else key for key in place.split("/")]
+    for key in before:
+        part = part[key]
+    if value is None:
+        del part[last]
+    else:
+        part[last] = value
+    torch.save(checkpoint, tmp_path / "a.ckpt")
+    run = trainer(tmp_path, callbacks=[TrainingCost()], plugins=[AtomicCheckpointIO()])
+    with pytest.raises(InputError, match=r"a\.ckpt: expected the state of a training run; found \w+:"):
+        train_verb.fit(run, module(), StepData(), str(tmp_path / "a.ckpt"), 15, {})
 
 
 def test_an_optimizer_whose_state_was_damaged_is_refused(tmp_path):

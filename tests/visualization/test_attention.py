@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.method.recalibration.inspection import attention_of, attention_on_other_parts
+from ghgs_lit.method.recalibration.inspection import attention_of
 from ghgs_lit.visualization.attention import attention_sheet, chosen_token
 from ghgs_lit.visualization.clouds import clouds
 from tests.helpers.models import make_model, predict
@@ -59,26 +59,6 @@ def test_the_weights_are_those_of_the_forward(overrides):
             y = x[query] + block.o_proj(torch.einsum("ak,kad->ad", weights, v).flatten())
             expected = y + block.mlp(block.norm2(y))
             assert torch.allclose(output.latent[layer][query], expected, atol=2e-5)
-
-
-def test_attention_on_other_parts_is_the_sum_over_tokens_one_by_one():
-    """Parts by chance, some unknown; tokens of the background and of the other person
-    count nowhere."""
-    model, batch = make_model("skip=none", "recalibration.similarity=log").eval(), make_batch(2, 3)
-    (tokens, points), _, _ = seen(model, batch)
-    part = torch.randint(-1, 3, tokens.image.shape, generator=torch.Generator().manual_seed(5))
-    expected = []
-    for query in range(len(part)):
-        attention = attention_of(model.recalibration, tokens, points, query)
-        if attention is not None and part[query] >= 0:
-            there = part[attention.neighbors]
-            other = (there != part[query]) & (there >= 0)
-            expected.append(attention.weights.mean(1)[:, other].sum(1))
-    found = attention_on_other_parts(model.recalibration, tokens, points, part)
-    assert 0.2 < found.mean() < 0.8
-    torch.testing.assert_close(found, torch.stack(expected))
-    same = attention_on_other_parts(model.recalibration, tokens, points, torch.zeros_like(part))
-    assert not same.any()
 
 
 def test_the_chosen_token_is_of_its_element_and_has_a_point():

@@ -15,7 +15,7 @@ from ghgs_lit.config.options import Options
 from ghgs_lit.config.registry import class_of, kinds_of
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.projection import unproject_maps
-from ghgs_lit.types import Batch, Tokens
+from ghgs_lit.types import Batch
 
 #: Parts of a body that patches are labelled with.
 PARTS = (
@@ -64,26 +64,6 @@ def parts_of_points(points: Float[Tensor, "n 3"], vertices: Float[Tensor, "m 3"]
     tree = cKDTree(vertices.double().cpu().numpy(), balanced_tree=False, compact_nodes=False)
     nearest = tree.query(points.double().cpu().numpy())[1]
     return torch.from_numpy(parts[nearest]).to(points.device)
-
-
-def has_parts(batch: Batch) -> bool:
-    """Whether the parts of all bodies of a batch are known."""
-    bodies = batch.body_vertices or ()
-    return len(bodies) > 0 and all(_vertex_parts(len(body)) is not None for body in bodies)
-
-
-def token_parts(shares: Float[Tensor, "n P"], tokens: Tokens) -> Int[Tensor, " N"]:
-    """The part that the patch of each token shows.
-
-    Args:
-        shares: of :func:`part_shares`.
-        tokens: of the same batch.
-
-    Returns:
-        An index into :data:`PARTS`, of the largest share; -1: none."""
-    _, _, h, w = tokens.grid
-    own = shares[(tokens.image * h + tokens.row) * w + tokens.column]
-    return torch.where(own.any(1), own.argmax(1), -1)
 
 
 def part_shares(batch: Batch, patch_size: int) -> Float[Tensor, "n P"]:

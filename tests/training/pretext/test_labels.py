@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,11 +11,9 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.method.plan.patches import KeptPatches
 from ghgs_lit.training.pretext.labels import PARTS, part_shares, parts_of_points
-from ghgs_lit.training.validation_pictures import PicturesOptions
 from ghgs_people.figures.body import BODY_VERTICES, load_body
 from ghgs_people.figures.parts import vertex_parts
 from tests.helpers.bodies import body_batch
-from tests.helpers.models import make_model, predict
 
 SIZE = 14
 scene = functools.cache(body_batch)
@@ -77,26 +74,6 @@ def test_shares_are_those_of_a_patchs_pixels():
     # A vertex is not exactly at its pixel's centre,
     # so that another one may be nearer at a border of parts.
     assert (shares - expected).abs().sum(1).mean() < 0.05
-
-
-@pytest.mark.parametrize("size", [(84, 70), (90, 78)])
-def test_validation_logs_the_share_of_attention_on_other_parts(size):
-    """Of built-in people, padded or not; of others there is no such number."""
-    batch, _ = scene(2, 2, *size)
-    model = make_model("model=paper", "model.pad=multiple").eval()
-    logged, seen = {}, []
-    model.recalibration.register_forward_pre_hook(lambda stage, inputs: seen.append((stage, *inputs[:2])))
-    with torch.no_grad():
-        predict(model, batch)
-    pictures = PicturesOptions().build()
-    pictures._seen, module = (
-        seen[0],
-        SimpleNamespace(log=lambda name, value, **_: logged.update({name: value})),
-    )
-    pictures._log_other_parts(module, dataclasses.replace(batch, body_vertices=None))
-    assert logged == {}
-    pictures._log_other_parts(module, batch)
-    assert 0.05 < logged["val/attention_on_other_parts"] < 0.95
 
 
 @pytest.mark.parametrize(
