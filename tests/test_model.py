@@ -22,7 +22,7 @@ from ghgs_lit.method.heads.gaussian import GaussianHeadOptions
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.method.recalibration import RecalibrationOptions
 from ghgs_lit.types import Batch, Cameras, Tokens
-from ghgs_lit.weights.names import RELEASE, to_ours
+from ghgs_lit.weights.published import RELEASE, to_ours
 from tests.helpers.configs import composed
 from tests.helpers.models import ATTRIBUTES, close, config, make_model, predict
 from tests.helpers.scenes import CASES, fixture, hard_subjects, in_dtype, make_batch, stack

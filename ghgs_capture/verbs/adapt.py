@@ -35,7 +35,7 @@ from ghgs_lit.evaluation.report import measure_and_write
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
-from ghgs_lit.weights.exporting import write_inference
+from ghgs_lit.weights.checkpoint import write_inference
 from ghgs_lit.weights.reading import file_of
 
 _INSTANTS = 60  #: Instants, spread over a sequence, that are read to learn from

@@ -10,8 +10,8 @@ from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.errors import require
 from ghgs_lit.execution import Predictor
 from ghgs_lit.rendering import render
-from ghgs_lit.weights.checkpoint import read_config
-from ghgs_lit.weights.exporting import export_weights, write_inference
+from ghgs_lit.weights.checkpoint import read_config, write_inference
+from ghgs_lit.weights.published import export_weights
 from ghgs_lit.weights.reading import file_of
 from ghgs_lit.weights.switches import differences
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from ghgs_lit.cli.inputs import MODEL_NODES
 from ghgs_lit.cli.runtime import announce, files_to_write, output_dir, write_config
 from ghgs_lit.method.model import GHGS
-from ghgs_lit.weights.importing import import_weights
+from ghgs_lit.weights.published import import_weights
 from ghgs_lit.weights.switches import differences
 
 if TYPE_CHECKING:

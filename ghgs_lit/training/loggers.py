@@ -81,32 +81,13 @@ class TensorBoardLog(_StepsTaken, TensorBoardLogger):
         Args:
             metrics: values by name; what is no loss or validation comes below ``work/``.
             step: of Lightning."""
-        shown = {_sorted_last(name): value for name, value in metrics.items() if name != "epoch"}
+        shown = {}
+        for name, value in metrics.items():
+            is_first = name.split("/")[0] in _FIRST
+            shown[name if is_first else f"work/{name}"] = value
+        shown.pop("work/epoch", None)
         super().log_metrics(shown, step)
         self.experiment.flush()
-
-    def log_results(
-        self, values: Mapping[str, Value], summary: Sequence[Mapping[str, Any]], table: str, step: int
-    ) -> None:
-        """Describe the run for the tab HParams, which shows the measurement at one number of views
-        beside the settings, and write the whole measurement to the tab Text.
-
-        Args:
-            values: of :func:`hyperparameters`.
-            summary: of ``metrics.json``.
-            table: the same in Markdown.
-            step: of Lightning."""
-        row = next((row for row in summary if row["views"] == _VIEWS), summary[0])
-        numbers = final_numbers([row])
-        for part in hparams(dict(values), numbers):
-            self.experiment._get_file_writer().add_summary(part)
-        self.experiment.add_text("measurement", table, step + 1)
-        self.log_metrics(numbers, step)  # HParams reads scalars alone
-
-
-def _sorted_last(name: str) -> str:
-    """A tag that TensorBoard shows below losses and validations."""
-    return name if name.split("/")[0] in _FIRST else f"work/{name}"
 
 
 def _drop_events_after(path: Path, step: int) -> None:
@@ -200,14 +181,17 @@ def log_results(
         summary: of ``metrics.json``.
         table: the same in Markdown.
         step: number of steps after which the weights were measured."""
-    results = final_numbers(summary)
     for logger in loggers:
+        rows = summary
         if isinstance(logger, TensorBoardLog):
-            logger.log_results(values, summary, table, step - 1)
-            continue
-        if not isinstance(logger, CSVLogger):
+            # Its tab HParams compares runs at one number of views, its tab Text has the whole measurement.
+            rows = [next((row for row in summary if row["views"] == _VIEWS), summary[0])]
+            for part in hparams(dict(values), final_numbers(rows)):
+                logger.experiment._get_file_writer().add_summary(part)
+            logger.experiment.add_text("measurement", table, step)
+        elif not isinstance(logger, CSVLogger):
             logger.log_hyperparams(dict(values))
-        logger.log_metrics(results, step - 1)
+        logger.log_metrics(final_numbers(rows), step - 1)
         logger.save()
 
 

@@ -1,8 +1,6 @@
 """Checkpoints of this package: plain data with the whole configuration,
 enough to rebuild the model."""
 
-import copy
-import functools
 import warnings
 import zipfile
 from collections.abc import Mapping
@@ -15,11 +13,10 @@ from torch import Tensor, nn
 from ghgs_lit.config.keys import flatten, require_plain
 from ghgs_lit.config.registry import KINDS
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.files import write_atomically
+from ghgs_lit.files import resolved, write_atomically
 from ghgs_lit.geometry.precision import fast_precision
 from ghgs_lit.weights.frozen import SHARING, joined
-from ghgs_lit.weights.names import RELEASE_ENTRY, VGGT
-from ghgs_lit.weights.reading import cast, file_of, open_file, require_dense
+from ghgs_lit.weights.reading import file_of, open_file, require_dense
 
 FORMAT_VERSION = 2  #: Version of self-contained checkpoints; version 1 is read too
 
@@ -47,11 +44,9 @@ def read_checkpoint(path: str | Path, whole: bool = False) -> dict[str, Any]:
     for key, kind in (("state_dict", Mapping), ("config", Mapping), ("format_version", int)):
         value = checkpoint.get(key) if isinstance(checkpoint, Mapping) else None
         if not isinstance(value, kind):
-            names = map(str, checkpoint) if isinstance(checkpoint, Mapping) else ()
-            is_published = any(name == RELEASE_ENTRY or name.startswith(tuple(VGGT)) for name in names)
-            hint = " (`ghgs import` makes a checkpoint of published weights)" * is_published
+            hint = "; `ghgs import` makes one of published weights"
             raise InputError(
-                f"{path}: expected a checkpoint with {key!r}; found {describe(checkpoint)}{hint}"
+                f"{path}: expected a checkpoint with {key!r}{hint}; found {describe(checkpoint)}"
             )
     version = checkpoint["format_version"]
     if not 1 <= version <= SHARING:
@@ -65,25 +60,16 @@ def read_checkpoint(path: str | Path, whole: bool = False) -> dict[str, Any]:
 def read_config(path: str | Path) -> dict[str, Any]:
     """The configuration in a checkpoint.
 
-    The file is read once until it changes: commands ask several times.
-
     Args:
         path: as for :func:`read_checkpoint`.
 
     Returns:
-        A copy, as nested mappings of plain values.
+        Nested mappings of plain values.
 
     Raises:
         FileNotFoundError: as :func:`read_checkpoint`.
         InputError: as :func:`read_checkpoint`.
     """
-    file = file_of(path)
-    known = file.stat() if file.is_file() else None  # None: reading says what is wrong
-    return copy.deepcopy(_config(str(path), known and (known.st_ino, known.st_mtime_ns, known.st_size)))
-
-
-@functools.lru_cache(maxsize=8)
-def _config(path: str, stamp: tuple[int, ...] | None) -> dict[str, Any]:
     return read_checkpoint(path)["config"]
 
 
@@ -244,6 +230,30 @@ def write_checkpoint(
     write_atomically(path, lambda temporary: torch.save(content, temporary))
 
 
+def write_inference(checkpoint: str | Path, path: str | Path, dtype: str) -> None:
+    """Write the model of a checkpoint without optimizer, losses and progress.
+
+    Args:
+        checkpoint: of a whole model.
+        path: of the file to write.
+        dtype: of all weights: ``float16``, ``bfloat16`` or ``float32``.
+
+    Raises:
+        InputError: a weight overflows the dtype, both are one file, or the checkpoint holds the
+            encoder alone.
+    """
+    if resolved(checkpoint) == resolved(path):
+        raise InputError(f"inference={path}: expected another file than the checkpoint; found the same")
+    content = read_checkpoint(checkpoint, whole=True)
+    require("depth_head" in content["config"], str(checkpoint), "a whole model", "the encoder alone")
+    state = {name: tensor.to(getattr(torch, dtype)) for name, tensor in model_state(content).items()}
+    require_finite(state, f"{checkpoint} as {dtype}")
+    # Paths of the machine that trained it are dropped; loading reads ``imported``.
+    config = {**content["config"], "resume": None, "init_from": None}
+    facts = {"imported": content["imported"]} if "imported" in content else {}
+    write_checkpoint(path, state, config, **facts)
+
+
 def load_weights(
     model: nn.Module, path: str | Path, dtype: torch.dtype | None = None, device: Any = "cpu"
 ) -> None:
@@ -263,16 +273,15 @@ def load_weights(
             fit the model.
     """
     checkpoint = read_checkpoint(path, whole=True)
-    require_fit(model, model_state(checkpoint), path)
+    state = model_state(checkpoint)
+    require_fit(model, state, path)
     check_preset(model, checkpoint, path)
-
-    def precision(name: str, stored: torch.dtype) -> torch.dtype:
-        if not name.startswith("encoder."):
-            return torch.float32
-        single = torch.float32 if stored == torch.float64 else stored
-        return dtype or fast_precision(single, torch.device(device))
-
-    state = cast(lambda: model_state(read_checkpoint(path)), precision)
+    for name, tensor in state.items():
+        wanted = torch.float32
+        if name.startswith("encoder."):
+            single = torch.float32 if tensor.dtype == torch.float64 else tensor.dtype
+            wanted = dtype or fast_precision(single, torch.device(device))
+        state[name] = tensor.to(wanted)
     require_finite(state, path)
     model.load_state_dict(state, assign=True)
 

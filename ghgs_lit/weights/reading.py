@@ -8,7 +8,7 @@ import pickle
 import re
 import warnings
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,17 +16,8 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.files import resolved
 
 if TYPE_CHECKING:  # a missing file is refused before PyTorch is imported
-    import torch
     from torch import Tensor
 
-_WEB_PAGE = "a web page; the address asked for a login or redirected"
-#: First bytes of what failed downloads leave, and their meaning.
-FAILED_DOWNLOADS = (
-    (b"version https://git-lfs", "a git-lfs pointer; `git lfs pull` downloads the file itself"),
-    (b"<!doctype html", _WEB_PAGE),
-    (b"<html", _WEB_PAGE),
-    (b"<?xml", "an XML document, as servers send it for an error"),
-)
 #: Name of the checkpoint that comes with the package (docs/model_card.md).
 SHIPPED = "shipped"
 #: Its file.
@@ -35,8 +26,6 @@ ZIP = b"PK"  #: First bytes of a PyTorch file
 PICKLE = b"\x80"  #: First byte of a file of PyTorch before 1.6
 _ENCRYPTED = 1  # flag of a record
 _FLOATS = ("float64", "float32", "float16", "bfloat16")  # precisions of weights
-
-_CHUNK = 1 << 28  #: Bytes of tensors that are converted before the file is mapped again
 
 
 def file_of(path: str | Path) -> Path:
@@ -91,7 +80,7 @@ def require_weights(path: str | Path) -> bytes:
 
     Raises:
         FileNotFoundError: there is no such file.
-        InputError: it is a directory, empty, or what a failed download leaves.
+        InputError: it is a directory, or empty.
     """
     path = file_of(path)
     if path.is_dir():
@@ -103,9 +92,6 @@ def require_weights(path: str | Path) -> bytes:
         start = file.read(64)
     if not start:
         raise _unfit(path, "an empty file")
-    for magic, meaning in FAILED_DOWNLOADS:
-        if start.lstrip().lower().startswith(magic):
-            raise _unfit(path, meaning)
     return start
 
 
@@ -146,28 +132,21 @@ def _open_torch(path: Path, mmap: bool) -> Any:
             return torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
     except Exception as error:
         text = str(error)
-        code = re.search(r"GLOBAL ([\w.]+)", text)
-        if code:
-            found = f"plain data mixed with code ({code[1]}), which is never run"
-        elif isinstance(error, pickle.UnpicklingError):
-            found = "a pickle that PyTorch did not write or that holds code, which is never run"
-        else:
-            found = f"one that cannot be read ({(text.strip() or type(error).__name__).splitlines()[0]})"
+        found = f"one that cannot be read ({(text.strip() or type(error).__name__).splitlines()[0]})"
+        if isinstance(error, pickle.UnpicklingError):
+            name = re.search(r"GLOBAL ([\w.]+)", text)
+            found = f"a pickle with code ({name[1] if name else 'not of PyTorch'}), which is never run"
         raise _unfit(path, found) from error
 
 
 def _open_safetensors(path: Path) -> "dict[str, Tensor]":
-    from safetensors import SafetensorError, safe_open
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
 
     try:
-        with safe_open(path, "pt") as file:
-            return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        return load_file(path)
     except SafetensorError as error:
-        text = str(error)
-        # "not fully covered": data is missing; "header length": a part of the header is missing.
-        cut = "not fully covered" in text or "header length" in text
-        why = "the beginning of a safetensors file whose end is missing (truncated)" if cut else text
-        raise _unfit(path, why) from error
+        raise _unfit(path, f"one that cannot be read ({error})") from error
 
 
 def require_dense(tensors: "Mapping[str, Any]", path: str | Path) -> None:
@@ -200,36 +179,3 @@ def require_dense(tensors: "Mapping[str, Any]", path: str | Path) -> None:
             shape = tuple(value.shape)
             stored = value.untyped_storage().nbytes()
             raise InputError(f"{path}: {name}: expected as many bytes as {shape} takes; found {stored}")
-
-
-def cast(
-    open_tensors: "Callable[[], Mapping[str, Tensor]]", dtype_of: "Callable[[str, torch.dtype], torch.dtype]"
-) -> "dict[str, Tensor]":
-    """Tensors of a mapped file in other precisions.
-
-    Pages that were read count as memory, so the file is mapped again after every 256 MB: only the
-    result and one chunk are held.
-
-    Args:
-        open_tensors: maps the file and returns its tensors by name.
-        dtype_of: a tensor's name and stored precision to the wanted one.
-
-    Returns:
-        Tensors by name, each converted unless it has its precision.
-    """
-    tensors = open_tensors()
-    names = list(tensors)
-    target = {name: dtype_of(name, tensor.dtype) for name, tensor in tensors.items()}
-    changed = [name for name in names if tensors[name].dtype != target[name]]
-    result: dict[str, Tensor] = {}
-    used = 0
-    for name in changed:
-        if used > _CHUNK:
-            tensors = {}
-            used = 0
-            tensors = open_tensors()
-        used += tensors[name].nbytes
-        result[name] = tensors[name].to(target[name])
-    if changed:
-        tensors = open_tensors() if len(result) < len(names) else {}
-    return {name: result[name] if name in result else tensors[name] for name in names}

@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 from ghgs_lit.cli.import_ import MODEL_NODES, empty_state
 from ghgs_lit.config import compose
 from ghgs_lit.method.model import GHGS
-from ghgs_lit.weights import importing, names
+from ghgs_lit.weights import published
 
 with gzip.open(Path(__file__).parents[1] / "fixtures" / "published_keys.json.gz") as file:
     PUBLISHED = json.load(file)
@@ -40,7 +40,7 @@ def _composed(overrides):
 def import_weights(config, out, vggt, release=None, *args, **kwargs):
     """Import as the verb does; returns the report."""
     state = empty_state(config, release)
-    return importing.import_weights(state, config, out, vggt, release, *args, **kwargs)
+    return published.import_weights(state, config, out, vggt, release, *args, **kwargs)
 
 
 def published_tensors(seed=0, **changes):
@@ -50,9 +50,9 @@ def published_tensors(seed=0, **changes):
     for name, tensor in GHGS.from_config(config(**changes)).state_dict().items():
         value = torch.randn(tensor.shape, generator=generator) * 0.1
         if name.startswith("encoder."):
-            vggt[names.to_published(name, names.VGGT)] = value
+            vggt[published.to_published(name, published.VGGT)] = value
         else:
-            network[names.to_published(name, names.RELEASE)] = value
+            network[published.to_published(name, published.RELEASE)] = value
     for name in [name for name in network if name.startswith("pos_head.")]:
         depth = torch.randn(network[name].shape, generator=generator)
         vggt[name.replace("pos_head.", "depth_head.")] = depth

@@ -6,7 +6,7 @@ import torch
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.precision import round_products
 from ghgs_lit.method.encoder import encoder as encoder_module
-from ghgs_lit.training.feature_cache import FeatureCache
+from ghgs_lit.training.features import FeatureCache
 from tests.helpers.encoders import SMALL_VGGT, make_encoder
 from tests.helpers.scenes import make_batch
 

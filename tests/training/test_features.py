@@ -32,14 +32,14 @@ def test_it_says_how_much_room_it_needs_before_it_writes(tmp_path, caplog, monke
     model = SimpleNamespace(encoder=make_encoder(**SMALL_VGGT))
     options = DiskFeatureCache(folder=tmp_path / "features")
     options.attach(model, data_of())
-    assert "tokens of 32 photographs of training, 0.0028 GB, of which 0 GB are there" in caplog.text
+    assert "tokens of 32 photographs of training, 0.0028 GB" in caplog.text
     vit = model.encoder.aggregator.patch_embed
     assert vit.cache.folder == tmp_path / "features"
     other = SimpleNamespace(encoder=make_encoder(**SMALL_VGGT))
     options.attach(other, data_of())
     assert other.encoder.aggregator.patch_embed.cache.network != vit.cache.network
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1_000_000))
-    with pytest.raises(InputError, match=r"expected 0.0028 GB of room for tokens; found 0.001"):
+    with pytest.raises(InputError, match=r"expected 0.0028 GB of room for tokens; found '0.001 GB"):
         options.attach(model, data_of())
 
 

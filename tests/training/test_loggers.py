@@ -340,6 +340,6 @@ def test_wandb_is_built_where_it_is_installed(tmp_path, monkeypatch):
             build(node, "logger.wandb", save_dir=str(tmp_path))
     else:
         logger = build(node, "logger.wandb", save_dir=str(tmp_path))
-        log_results([logger], {"seed": 1}, [{"views": 4, "targets": "release", "psnr": 30.0}], 8)
+        log_results([logger], {"seed": 1}, [{"views": 4, "targets": "release", "psnr": 30.0}], "", 8)
         logger.experiment.finish()
         assert list((tmp_path / "wandb").glob("offline-run-*"))

@@ -308,7 +308,6 @@ DAMAGED = [
     ("lr_schedulers/0", 3),
     ("loops", {}),
     ("loops/fit_loop/epoch_loop.batch_progress", 3),
-    ("loops/fit_loop/epoch_loop.batch_progress/total/ready", None),
     ("callbacks/TrainingCost", 3),
 ]
 
