@@ -15,7 +15,7 @@ from ghgs_lit.config.keys import ABLATIONS
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.method.stages import STAGES
-from ghgs_lit.training.pretext.labels import PARTS
+from ghgs_lit.training.pretext import PARTS
 from tests.helpers.models import predict
 from tests.helpers.scenes import training_batch
 

@@ -21,7 +21,7 @@ from ghgs_lit.config import register
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.method.recalibration import Recalibration, RecalibrationOptions
-from ghgs_lit.training.pretext.labels import part_shares
+from ghgs_lit.training.pretext import part_shares
 from ghgs_lit.types import Batch, DepthMaps, Points, Tokens
 
 #: A residual of this length, in metres, is a value of 1 in the tokens,

@@ -14,7 +14,7 @@ from ghgs_lit.errors import require
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.training import loggers
 from ghgs_lit.training.checkpoints import StopAtStep
-from ghgs_lit.training.pretext.module import Pretext, PretextModule
+from ghgs_lit.training.pretext import Pretext, PretextModule
 
 
 def run(verb: Training) -> float | str | None:

@@ -128,7 +128,7 @@ KINDS: dict[str, dict[str | None, str]] = {
     "callbacks": {
         "checkpoints": "ghgs_lit.training.checkpoints.CheckpointOptions",
         "costs": "ghgs_lit.training.cost.CostsOptions",
-        "ema": "ghgs_lit.training.averaging.AveragingOptions",
+        "ema": "ghgs_lit.training.callbacks.AveragingOptions",
         "pictures": "ghgs_lit.training.validation_pictures.PicturesOptions",
         "progress": "ghgs_lit.training.callbacks.ProgressOptions",
     },

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ghgs_lit.training.pretext.labels import PARTS, BodyParts
+from ghgs_lit.training.pretext import PARTS, BodyParts
 from ghgs_people.figures.body import BODY_VERTICES, load_body
 
 # Prefixes of the names of a part's bones. Bones of limbs end with .L or .R,

@@ -17,7 +17,7 @@ from ghgs_lit.execution.step import CapturedStep
 from ghgs_lit.rendering import capacity
 from ghgs_lit.rendering.api import Renderer
 from ghgs_lit.training import GHGSModule, Optimization
-from ghgs_lit.training.averaging import Averaging
+from ghgs_lit.training.callbacks import Averaging
 from ghgs_lit.training.cost import Costs
 from tests.helpers.losses import losses_of
 from tests.helpers.models import make_model

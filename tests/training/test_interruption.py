@@ -1,6 +1,5 @@
 """Ctrl-C and SIGTERM while training: a checkpoint after the step, exit codes, and the same end."""
 
-import functools
 import os
 import signal
 import threading
@@ -41,18 +40,6 @@ def stopped(folder, sender: Signal) -> int:
     with pytest.raises(Interrupted) as stop, interruptible():
         fit(folder, Cut(), more=[sender, StopAtStep()])
     return stop.value.code
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """Trains with a number of batches in a step, once: the folder, the weights, the validations."""
-
-    @functools.cache
-    def run(accumulate: int):
-        folder, cut = tmp_path_factory.mktemp("whole"), Cut()
-        return folder, fit(folder, cut, accumulate_grad_batches=accumulate), cut.validations
-
-    return run
 
 
 @pytest.mark.parametrize(

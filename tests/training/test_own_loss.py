@@ -13,7 +13,7 @@ import torch
 from ghgs_lit.config import build, registry, run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.training import GHGSModule, Optimization
-from ghgs_lit.training.averaging import AveragingOptions
+from ghgs_lit.training.callbacks import AveragingOptions
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO
 from ghgs_lit.training.start import check_resume
 from tests.helpers.models import config, load_model, make_model, predict

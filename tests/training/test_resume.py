@@ -20,7 +20,6 @@ from ghgs_lit.training.checkpoints import AtomicCheckpointIO, CheckpointOptions
 from ghgs_lit.training.cost import TrainingCost
 from ghgs_lit.training.loggers import CsvLog, TensorBoardLog, begin
 from ghgs_lit.training.start import check_resume, check_start
-from ghgs_lit.training.validation_pictures import PicturesOptions
 from ghgs_lit.weights import frozen
 from ghgs_lit.weights.checkpoint import read_checkpoint
 from tests.helpers.losses import losses_of
@@ -89,16 +88,9 @@ def score(folder) -> tuple[float, int]:
     return state["best_model_score"].item(), content["global_step"]
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("whole")
-    cut = Cut()
-    return folder, fit(folder, cut), cut.validations
-
-
 def test_the_best_checkpoint_has_the_highest_psnr(whole):
     """Of the four validations, whose values differ."""
-    folder, _, validations = whole
+    folder, _, validations = whole(1)
     found = [float(row["val/psnr"]) for row in rows(folder) if "val/psnr" in row]
     assert len(set(found)) == len(validations)
     best, step = score(folder)
@@ -106,48 +98,36 @@ def test_the_best_checkpoint_has_the_highest_psnr(whole):
     assert step == validations[found.index(max(found))]
 
 
-@pytest.mark.parametrize(("at", "validating"), [(5, False), (8, False), (8, True), (12, True), (13, False)])
-def test_a_cut_run_ends_as_the_whole_one_does(whole, tmp_path, at, validating):
-    """Cut within an epoch of 5, at a validation (every 4), within one; saved every 3 steps."""
-    first = Cut(at, validating)
+@pytest.mark.parametrize(
+    ("at", "validating", "every", "accumulate", "saved"),
+    [
+        (5, False, 3, 1, 3),
+        (8, False, 3, 1, 6),
+        (8, True, 3, 1, 6),
+        (12, True, 3, 1, 9),
+        (13, False, 3, 1, 12),
+        (10, False, 4, 1, 8),
+        (10, False, 3, 2, 9),
+    ],
+)
+def test_a_cut_run_ends_as_the_whole_one_does(whole, tmp_path, at, validating, every, accumulate, saved):
+    """Cut within an epoch of 5, at a validation (every 4), within one. A checkpoint that is due at a
+    validation comes after it: a restart does not repeat it. None is written between two batches of one
+    step, where gradients would be lost."""
+    first, options = Cut(at, validating), {"every": every, "accumulate_grad_batches": accumulate}
     with pytest.raises(PowerCut):
-        fit(tmp_path, first)
+        fit(tmp_path, first, **options)
     last = tmp_path / "checkpoints" / "last.ckpt"
     step = torch.load(last, weights_only=True)["global_step"]
-    assert step == (at - 1) // 3 * 3  # the cut comes before what is due at its own step
+    assert step == saved  # the cut comes before what is due at its own step
     second = Cut()
-    subject = fit(tmp_path, second, resume=last)
-    folder, expected, validations = whole
+    subject = fit(tmp_path, second, resume=last, **options)
+    folder, expected, validations = whole(accumulate)
     for a, b in zip(expected.parameters(), subject.parameters(), strict=True):
         assert torch.equal(a, b)
-    seen = [s for s in first.validations if s <= step] + second.validations
-    assert seen == validations == [4, 8, 12, 16]
+    assert [s for s in first.validations if s <= step] + second.validations == validations
     assert score(tmp_path) == score(folder)
     assert rows(tmp_path) == rows(folder)
-
-
-def test_a_checkpoint_that_is_due_at_a_validation_comes_after_it(tmp_path):
-    """A restart does not repeat the validation, which the best checkpoint has seen."""
-    first = Cut(10)
-    with pytest.raises(PowerCut):
-        fit(tmp_path, first, every=4)
-    last = tmp_path / "checkpoints" / "last.ckpt"
-    assert torch.load(last, weights_only=True)["global_step"] == 8
-    second = Cut()
-    fit(tmp_path, second, resume=last, every=4)
-    assert first.validations == [4, 8]
-    assert second.validations == [12, 16]
-
-
-def test_accumulated_steps_are_saved_whole(whole, tmp_path):
-    """No checkpoint is written between two batches of one step, where gradients would be lost."""
-    expected = fit(tmp_path / "whole", Cut(), accumulate_grad_batches=2)
-    with pytest.raises(PowerCut):
-        fit(tmp_path / "cut", Cut(10), accumulate_grad_batches=2)
-    last = tmp_path / "cut" / "checkpoints" / "last.ckpt"
-    subject = fit(tmp_path / "cut", Cut(), resume=last, accumulate_grad_batches=2)
-    for a, b in zip(expected.parameters(), subject.parameters(), strict=True):
-        assert torch.equal(a, b)
 
 
 @pytest.mark.parametrize(("accumulate", "cut"), [(2, None), (2, 4), (2, 5), (3, 3), (1, 7)])
@@ -156,23 +136,17 @@ def test_every_batch_is_trained_once_and_in_order(tmp_path, monkeypatch, accumul
     drawn = []
     real = _Steps.__getitem__
     monkeypatch.setattr(_Steps, "__getitem__", lambda self, step: (drawn.append(step), real(self, step))[1])
-    if cut is None:
-        fit(tmp_path, Cut(), accumulate_grad_batches=accumulate)
-    else:
+    in_epoch, last = -(-5 // accumulate), None
+    if cut is not None:
         with pytest.raises(PowerCut):
             fit(tmp_path, Cut(cut), every=1, accumulate_grad_batches=accumulate)
         last = tmp_path / "checkpoints" / "last.ckpt"
         # The checkpoint of the step before the cut: that step's batches come again.
         steps = torch.load(last, weights_only=True)["global_step"]
-        in_epoch = -(-5 // accumulate)
-        trained = steps // in_epoch * 5 + steps % in_epoch * accumulate
-        drawn = drawn[:trained]
-        monkeypatch.setattr(
-            _Steps, "__getitem__", lambda self, step: (drawn.append(step), real(self, step))[1]
-        )
-        fit(tmp_path, Cut(), resume=last, accumulate_grad_batches=accumulate)
+        del drawn[steps // in_epoch * 5 + steps % in_epoch * accumulate :]
+    fit(tmp_path, Cut(), resume=last, accumulate_grad_batches=accumulate)
     # 16 steps: full epochs of 5 batches, then what is left.
-    epochs, rest = divmod(STEPS, -(-5 // accumulate))
+    epochs, rest = divmod(STEPS, in_epoch)
     assert drawn[: 5 * epochs + rest * accumulate] == list(range(5 * epochs + rest * accumulate))
 
 
@@ -314,7 +288,7 @@ DAMAGED = [
 
 @pytest.mark.parametrize(("place", "value"), DAMAGED)
 def test_a_damaged_state_of_training_is_one_line(whole, tmp_path, place, value):
-    checkpoint = torch.load(whole[0] / "checkpoints" / "last.ckpt", weights_only=True)
+    checkpoint = torch.load(whole(1)[0] / "checkpoints" / "last.ckpt", weights_only=True)
     checkpoint["callbacks"]["TrainingCost"] = TrainingCost().state_dict()
     part = checkpoint
     *before, last = [int(key) if key.isdecimal() else key for key in place.split("/")]
@@ -362,18 +336,6 @@ def test_a_run_counts_the_cost_of_all_its_sessions(tmp_path):
     fit(tmp_path, Cut(), resume=last, more=[third])
     assert third.seconds > saved["seconds"]
     assert third.peak_bytes >= saved["peak_bytes"]
-
-
-def test_the_pictures_of_the_checkpoints_own_step_stay(tmp_path):
-    """TensorBoard drops what is logged again after a restart,
-    and no picture of an earlier validation."""
-    with pytest.raises(PowerCut):
-        fit(tmp_path, Cut(10), every=4, more=[PicturesOptions(subjects=1).build()])
-    last = tmp_path / "checkpoints" / "last.ckpt"
-    assert torch.load(last, weights_only=True)["global_step"] == 8
-    fit(tmp_path, Cut(), resume=last, every=4, more=[PicturesOptions(subjects=1).build()])
-    found = EventAccumulator(str(tmp_path / "tensorboard"), size_guidance={"images": 0}).Reload()
-    assert [e.step for e in found.Images("view/sheet/p0")] == [4, 8, 12, 16]
 
 
 def test_a_longer_budget_is_no_difference():

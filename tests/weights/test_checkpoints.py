@@ -1,10 +1,15 @@
-"""Checkpoints rebuild their models; files that do not fit are refused by name."""
+"""Checkpoints rebuild their models; files that do not fit or that changed are refused by name; and
+checkpoints for prediction alone."""
 
 import os
 import pickle
+import re
+import tracemalloc
 import warnings
+import zipfile
 from pathlib import Path
 
+import lightning.pytorch
 import pytest
 import torch
 from omegaconf import OmegaConf
@@ -13,46 +18,56 @@ from safetensors.torch import save_file
 from ghgs_lit.cli.inputs import with_trained_data
 from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
+from ghgs_lit.geometry import precision
+from ghgs_lit.training.checkpoints import AtomicCheckpointIO
 from ghgs_lit.training.optimization import Optimization
-from ghgs_lit.weights.checkpoint import FORMAT_VERSION, read_config, write_checkpoint
+from ghgs_lit.training.start import check_resume, initialize
+from ghgs_lit.weights.checkpoint import (
+    FORMAT_VERSION,
+    model_state,
+    read_checkpoint,
+    read_config,
+    write_checkpoint,
+    write_inference,
+)
 from ghgs_lit.weights.frozen import SHARING
+from ghgs_lit.weights.published import export_weights
+from ghgs_lit.weights.reading import SHIPPED_FILE, open_file
 from tests.helpers.models import close, config, load_model, make_model, predict
 from tests.helpers.scenes import make_batch
+from tests.helpers.training import held
+from tests.helpers.verbs import ghgs
+
+TRAINING = {"global_step": 5, "optimizer_states": [], "lr_schedulers": [], "loops": {}, "callbacks": {}}
+
+
+def content(**changes):
+    """Of a checkpoint of a training; what is None is left out."""
+    state = {f"model.{key}": value for key, value in make_model().state_dict().items()}
+    made = {"state_dict": state, "config": config(), "format_version": FORMAT_VERSION, **TRAINING, **changes}
+    return {key: value for key, value in made.items() if value is not None}
 
 
 def checkpoint(path, **changes):
-    model = make_model()
-    content = {
-        "state_dict": {f"model.{k}": v for k, v in model.state_dict().items()}
-        | {"loss.weight": torch.ones(1)},
-        "config": config(),
-        "format_version": FORMAT_VERSION,
-    }
-    torch.save({k: v for k, v in (content | changes).items() if v is not None}, path)
-    return model
+    torch.save(content(**changes), path)
+    return path
 
 
-def test_a_checkpoint_rebuilds_its_model(tmp_path):
-    """A checkpoint alone must give the same Gaussians, without any YAML."""
-    model = checkpoint(tmp_path / "a.ckpt").eval()
-    loaded = load_model(tmp_path / "a.ckpt")
+def test_a_checkpoint_rebuilds_its_model_without_any_yaml(tmp_path):
+    """The same Gaussians; weights are mapped, not copied, and training does not write to the file."""
+    path, model = checkpoint(tmp_path / "a.ckpt"), make_model().eval()
+    before, loaded = path.read_bytes(), load_model(path)
     assert not loaded.training
+    assert not any(t.is_meta for t in (*loaded.parameters(), *loaded.buffers()))
     batch = make_batch(1, 3)
     with torch.no_grad():
         close(predict(loaded, batch).gaussians, predict(model, batch).gaussians, 0)
-
-
-def test_a_checkpoint_that_does_not_fit_names_key_and_shapes(tmp_path):
-    """Weights of another model must not load in part."""
-    path = tmp_path / "a.ckpt"
-    checkpoint(path, config=config("gaussian_head.hidden=[64,32]"))
-    with pytest.raises(
-        InputError, match=r"a\.ckpt: gaussian_head\.\w+_header\.0\.weight.*\(64, 16\).*\(32, 16\)"
-    ):
-        load_model(path)
-    checkpoint(path, state_dict={})
-    with pytest.raises(InputError, match=r"a\.ckpt: encoder.*expected a tensor of shape"):
-        load_model(path)
+        mapped = Path("/proc/self/maps")
+        if mapped.exists():
+            assert str(path) in mapped.read_text()
+        for parameter in loaded.parameters():
+            parameter.add_(1)
+    assert path.read_bytes() == before
 
 
 class Foreign:
@@ -62,33 +77,8 @@ class Foreign:
         return os.system, ("false",)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"config": None}, "'config'"),
-        ({"state_dict": None}, "'state_dict'"),
-        ({"format_version": None}, "'format_version'"),
-        ({"format_version": SHARING + 1}, "of a newer version"),
-        ({"format_version": 0}, "format_version 1 to"),
-        ({"config": {"encoder": {}}}, "bounds"),
-        (
-            {"config": {**config(), "encoder": "vggt_nano"}},
-            r"encoder: expected a mapping .*; found 'vggt_nano'",
-        ),
-    ],
-)
-def test_a_foreign_file_is_refused_by_its_path(tmp_path, changes, message):
-    """A file without the keys of a checkpoint must be named, not end in a KeyError."""
-    path = tmp_path / "b.ckpt"
-    checkpoint(path, **changes)
-    with pytest.raises(InputError, match=message) as error:
-        load_model(path)
-    assert "b.ckpt" in str(error.value) or "bounds" in message or "encoder" in message
-
-
 def a_checkpoint(folder):
-    checkpoint(folder / "whole.ckpt")
-    return (folder / "whole.ckpt").read_bytes()
+    return checkpoint(folder / "whole.ckpt").read_bytes()
 
 
 def a_safetensors(folder):
@@ -106,35 +96,47 @@ def of_torch(content):
     return make
 
 
+def changed(**changes):
+    """The bytes of a checkpoint with other entries."""
+    return lambda folder: checkpoint(folder / "changed.ckpt", **changes).read_bytes()
+
+
 def changed_state(change):
     def make(folder):
-        checkpoint(folder / "changed.ckpt")
-        content = torch.load(folder / "changed.ckpt", weights_only=True)
-        change(content["state_dict"])
-        return of_torch(content)(folder)
+        made = content()
+        change(made["state_dict"])
+        return of_torch(made)(folder)
 
     return make
 
 
 TOKEN = "model.encoder.aggregator.camera_token"
+TENSOR = torch.ones(2, 2)
 
 #: name: (content, part of the message); docs/evidence/broken_files.md lists the messages.
 BAD_FILES = {
     "empty": (lambda _: b"", "found an empty file"),
-    "web page": (lambda _: b"<!DOCTYPE html><html><title>Sign in</title>", "found a web page"),
-    "git-lfs pointer": (lambda _: b"version https://git-lfs.github.com/spec/v1\noid 0", "git lfs pull"),
-    "something else": (lambda _: b"no weights at all", "its first bytes are b'no weights at al'"),
+    "web page": (lambda _: b"<!DOCTYPE html><html><title>Sign in", "first bytes are b'<!DOCTYPE html>"),
+    "git-lfs pointer": (lambda _: b"version https://git-lfs.github.com/spec/v1\noid 0", "b'version https:/"),
     "truncated .pt": (lambda f: a_checkpoint(f)[:-4000], "end is missing"),
-    "truncated .safetensors": (lambda f: a_safetensors(f)[:-4000], "end is missing"),
-    "truncated header": (lambda f: a_safetensors(f)[:500], "end is missing"),
+    "truncated .safetensors": (lambda f: a_safetensors(f)[:-4000], "cannot be read .*not fully covered"),
     "broken header": (lambda _: (9).to_bytes(8, "little") + b"{nonsense", "invalid JSON"),
     "code": (of_torch({"state_dict": Foreign()}), r"code \(\w+\.system\), which is never run"),
-    "pickled code": (lambda _: pickle.dumps(Foreign()), "found a pickle that PyTorch did not write"),
-    "a plain pickle": (lambda _: pickle.dumps([1, 2]), "found a pickle that PyTorch did not write"),
-    "foreign state dict": (of_torch({"layer.weight": torch.ones(2)}), r"'state_dict'; found 'layer\.weight'"),
-    "a safetensors model": (a_safetensors, r"'state_dict'; found 'depth_head.* and \d+ more"),
-    "published weights": (of_torch({"network": {}, "optimizer": {}}), "`ghgs import` makes a checkpoint"),
-    "a bare tensor": (of_torch(torch.ones(2)), "'state_dict'; found a Tensor"),
+    "pickled code": (lambda _: pickle.dumps(Foreign()), "found a pickle with code"),
+    "a plain pickle": (lambda _: pickle.dumps([1, 2]), "found a pickle with code"),
+    "foreign state dict": (of_torch({"layer.w": torch.ones(2)}), r"'state_dict'.*; found 'layer\.w'"),
+    "a safetensors model": (a_safetensors, r"'state_dict'.*; found 'depth_head.* and \d+ more"),
+    "published weights": (of_torch({"network": {}, "optimizer": {}}), "`ghgs import` makes one"),
+    "a bare tensor": (of_torch(torch.ones(2)), "'state_dict'.*; found a Tensor"),
+    "no config": (changed(config=None), "'config'"),
+    "no version": (changed(format_version=None), "'format_version'"),
+    "newer": (changed(format_version=SHARING + 1), "of a newer version"),
+    "version 0": (changed(format_version=0), "format_version 1 to"),
+    "other model": (
+        changed(config=config("gaussian_head.hidden=[64,32]")),
+        r"gaussian_head\.\w+_header\.0\.weight.*\(64, 16\).*\(32, 16\)",
+    ),
+    "no tensors": (changed(state_dict={}), "encoder.*expected a tensor of shape"),
     "wrong shape": (
         changed_state(lambda s: s.update({TOKEN: torch.ones(3)})),
         r"camera_token: expected shape \(1, 2, 1, 32\) .*; found \(3,\)",
@@ -142,18 +144,34 @@ BAD_FILES = {
     "missing key": (changed_state(lambda s: s.pop(TOKEN)), "camera_token: expected a .*; found 'nothing'"),
     "extra key": (changed_state(lambda s: s.update({"model.x": torch.ones(3)})), "x: expected no such key"),
     "no tensor": (changed_state(lambda s: s.update({TOKEN: 3})), "camera_token: .* found 'int'"),
-    "not finite": (
-        changed_state(lambda s: s.update({TOKEN: torch.full((1, 2, 1, 32), float("nan"))})),
-        "camera_token: expected finite numbers; found 'NaN or infinity'",
-    ),
     "infinite": (
         changed_state(lambda s: s[TOKEN].view(-1)[3].fill_(float("inf"))),
+        "camera_token: expected finite numbers; found 'NaN or infinity'",
+    ),
+    "not finite": (
+        changed_state(lambda s: s[TOKEN].view(-1)[3].fill_(float("nan"))),
         "camera_token: expected finite numbers; found 'NaN or infinity'",
     ),
     "whole numbers": (
         changed_state(lambda s: s.update({TOKEN: torch.ones(1, 2, 1, 32).int()})),
         "expected floating point numbers; found torch.int32",
     ),
+    "no names": (changed(state_dict={3: TENSOR}), "state_dict: expected names of tensors; found 3"),
+    "sparse": (changed(state_dict={"model.a": TENSOR.to_sparse()}), "model.a: expected a dense tensor"),
+    "on no device": (changed(state_dict={"model.a": TENSOR.to("meta")}), "model.a: expected a dense tensor"),
+    "8 bits": (changed(state_dict={"model.a": TENSOR.to(torch.float8_e4m3fn)}), "model.a: .*float8"),
+    "expanded": (
+        changed(state_dict={"model.a": torch.zeros(1).expand(1 << 40)}),
+        "model.a: expected as many bytes as .*; found 4",
+    ),
+    "config of numbers": (changed(config={3: {}}), "config: expected keys of text; found 3"),
+    **{
+        f"config.{node}": (
+            changed(config={**config(), node: value}),
+            rf"config\.{node}: expected a mapping",
+        )
+        for node, value in (("data", []), ("model", "text"), ("skip", 3), ("encoder", "vggt_nano"))
+    },
 }  # fmt: skip
 
 
@@ -180,24 +198,8 @@ def test_a_path_without_a_file_is_refused(tmp_path):
         load_model(tmp_path / "c.ckpt")
     with pytest.raises(InputError, match="found a directory"):
         load_model(tmp_path)
-
-
-def test_weights_are_mapped_and_can_be_trained(tmp_path):
-    """Loading must not copy 4 GB, and training must not write to the mapped file."""
-    path = tmp_path / "a.ckpt"
-    checkpoint(path)
-    before = path.read_bytes()
-    model = load_model(path)
-    assert not any(t.is_meta for t in (*model.parameters(), *model.buffers()))
-    mapped = Path("/proc/self/maps")
-    if mapped.exists():
-        assert str(path) in mapped.read_text()
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.add_(1)
-    assert path.read_bytes() == before
-    path.unlink()
-    assert all(p.isfinite().all() for p in model.parameters())
+    with pytest.raises(InputError, match="bounds"):
+        load_model(checkpoint(tmp_path / "a.ckpt", config={"encoder": {}}))
 
 
 @pytest.mark.parametrize("trainable", ["none", "last_1", "last_2", "all"])
@@ -278,15 +280,216 @@ def test_a_configuration_of_other_things_than_yaml_says_is_refused(tmp_path):
             read_config(path)
 
 
-def test_a_configuration_is_read_again_where_its_file_has_changed(tmp_path):
-    """Commands ask several times, and a sweep's next run may have replaced the file."""
-    path, found = tmp_path / "a.ckpt", []
-    for width in (32, 32, 48):
-        write_checkpoint(path, {}, {"encoder": {"width": width}})
-        found.append(read_config(path))
-        found[-1]["encoder"]["heads"] = 2  # a caller's own copy
-    assert [each["encoder"]["width"] for each in found] == [32, 32, 48]
-    assert read_config(path) == {"encoder": {"width": 48}}
-    path.unlink()
-    with pytest.raises(FileNotFoundError):
-        read_config(path)
+def flip(path, near):
+    """Flip one bit of the bytes ``near``, which are in the file once."""
+    data = bytearray(path.read_bytes())
+    data[data.index(near) + 1] ^= 0x08
+    path.write_bytes(data)
+
+
+READERS = {
+    "predict and evaluate": lambda path: load_model(path),
+    "init_from": lambda path: initialize(make_model(), path),
+    "resume": lambda path: check_resume(path, held(make_model()), config()),
+    "export": lambda path: export_weights(path, None, path.with_name("release.pth")),
+    "inference": lambda path: write_inference(path, path.with_name("b.ckpt"), "float16"),
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize(
+    ("save", "where"),
+    [(AtomicCheckpointIO().save_checkpoint, "weights"), (torch.save, "configuration")],
+)
+def test_one_changed_bit_is_refused_by_every_reader(tmp_path, reader, save, where):
+    """A flipped bit would be a slightly other model in silence."""
+    path, made = tmp_path / "last.ckpt", content()
+    name = "model.gaussian_head.dpt.projections.0.weight"
+    name = name if name in made["state_dict"] else next(n for n in made["state_dict"] if "head" in n)
+    save(made, path)
+    read_checkpoint(path, whole=True)
+    near = made["state_dict"][name].numpy().tobytes()[:64]
+    flip(path, near if where == "weights" else b"neighborhood")
+    with pytest.raises(InputError, match=r"last\.ckpt: expected .*written; found"):
+        READERS[reader](path)
+
+
+def test_the_shipped_file_has_checksums(tmp_path):
+    path = tmp_path / "shipped.ckpt"
+    with zipfile.ZipFile(SHIPPED_FILE) as archive:
+        sizes = sorted(archive.infolist(), key=lambda record: record.file_size)
+        records = [*sizes[-3:], *(record for record in sizes if record.filename.endswith("data.pkl"))]
+        contents = [archive.read(record) for record in records]
+    for data in contents:
+        path.write_bytes(SHIPPED_FILE.read_bytes())
+        flip(path, data[len(data) // 2 :][:256])
+        with pytest.raises(InputError, match=r"shipped\.ckpt: expected"):
+            load_model(path)
+
+
+def packed_again(path, compression):
+    """Write the records of a PyTorch file again, as a program that repairs archives does."""
+    with zipfile.ZipFile(path) as archive:
+        records = {record.filename: archive.read(record) for record in archive.infolist()}
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        for name, data in records.items():
+            archive.writestr(name, data)
+
+
+def claim(path, size):
+    """Let the last record of a PyTorch file say that it has ``size`` bytes,
+    in both of its headers."""
+    with zipfile.ZipFile(path) as archive:
+        last = archive.infolist()[-1]
+    data, name = bytearray(path.read_bytes()), last.filename.encode()
+    sizes = 2 * last.file_size.to_bytes(4, "little")
+    for place in (data.index(sizes, last.header_offset), data.index(sizes, data.rindex(name) - 46)):
+        data[place : place + 8] = 2 * size.to_bytes(4, "little")
+    path.write_bytes(data)
+
+
+FILES_OF_WEIGHTS = {**READERS, "any file of weights": open_file}
+
+
+@pytest.mark.parametrize("reader", FILES_OF_WEIGHTS)
+def test_compressed_records_are_refused_by_every_reader(tmp_path, reader):
+    """PyTorch maps records as they lie on the disk: all weights would be other numbers,
+    in silence."""
+    path = tmp_path / "a.ckpt"
+    torch.save(content(), path)
+    packed_again(path, zipfile.ZIP_STORED)
+    assert load_model(path)
+    kinds = (zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
+    for compression in kinds if reader == "any file of weights" else kinds[:1]:
+        packed_again(path, compression)
+        with pytest.raises(
+            InputError, match=r"a\.ckpt: expected .*; found a compressed or encrypted record \(a/"
+        ):
+            FILES_OF_WEIGHTS[reader](path)
+
+
+def test_a_file_that_unpacks_without_limit_is_refused_before_it_is_read(tmp_path):
+    path = tmp_path / "a.ckpt"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in ("data.pkl", "version"):
+            archive.writestr(f"a/{name}", bytes(1 << 26))
+    tracemalloc.start()
+    with pytest.raises(InputError, match="found a compressed"):
+        read_checkpoint(path, whole=True)
+    assert tracemalloc.get_traced_memory()[1] < 1 << 24
+    tracemalloc.stop()
+    torch.save(content(), path)
+    claim(path, 1 << 30)
+    with pytest.raises(InputError, match=r"a\.ckpt: expected .*; found"):
+        read_checkpoint(path)
+
+
+def test_weights_in_double_precision_are_read_in_single(tmp_path):
+    """A converter, or a run with ``trainer.precision=64-true``, writes them;
+    the model computes in single."""
+    made = content()
+    double = {key: value.double() for key, value in made["state_dict"].items() if value.is_floating_point()}
+    torch.save({**made, "state_dict": {**made["state_dict"], **double}}, tmp_path / "a.ckpt")
+    model = load_model(tmp_path / "a.ckpt")
+    assert {p.dtype for p in model.parameters()} == {torch.float32}
+    for key, value in model.state_dict().items():
+        assert torch.equal(value, made["state_dict"][f"model.{key}"])
+    initialize(started := make_model(), tmp_path / "a.ckpt")
+    assert {p.dtype for p in started.parameters()} == {torch.float32}
+    too_large = {**double, next(iter(double)): next(iter(double.values())) + 1e300}
+    torch.save({**made, "state_dict": {**made["state_dict"], **too_large}}, tmp_path / "a.ckpt")
+    with pytest.raises(InputError, match=r"a\.ckpt: .*: expected finite numbers"):
+        load_model(tmp_path / "a.ckpt")
+
+
+@pytest.mark.parametrize(("key", "value"), [("global_step", "5"), ("optimizer_states", {})])
+def test_a_state_of_training_of_another_form_is_refused(tmp_path, key, value):
+    torch.save(content(**{key: value}), tmp_path / "a.ckpt")
+    with pytest.raises(InputError, match=rf"a\.ckpt: {key}.*: expected .*; found"):
+        check_resume(tmp_path / "a.ckpt", held(make_model()), config())
+
+
+@pytest.mark.parametrize("version", [{}, *({"pytorch-lightning_version": odd} for odd in ("x", 3, None))])
+def test_a_missing_or_odd_version_of_lightning_is_this_one(tmp_path, version):
+    """Lightning would parse it."""
+    torch.save(content(**version), tmp_path / "a.ckpt")
+    loaded = AtomicCheckpointIO().load_checkpoint(tmp_path / "a.ckpt")
+    assert loaded["pytorch-lightning_version"] == lightning.pytorch.__version__
+
+
+@pytest.fixture
+def trained(tmp_path):
+    """A checkpoint with what training adds to it."""
+    path, state = tmp_path / "a.ckpt", make_model().state_dict()
+    moments = [{name: tensor.clone() for name, tensor in state.items()} for _ in range(2)]
+    write_checkpoint(path, state, config(), optimizer_states=moments, global_step=7)
+    return path
+
+
+@pytest.mark.parametrize("dtype", ["float16", "bfloat16", "float32"])
+def test_weights_and_configuration_alone_are_written(trained, tmp_path, dtype):
+    """Every tensor is the rounded one; optimizer and progress are gone;
+    the model is built without a YAML."""
+    write_inference(trained, tmp_path / "b.ckpt", dtype)
+    before, after = read_checkpoint(trained), read_checkpoint(tmp_path / "b.ckpt")
+    assert set(after) == {"state_dict", "config", "format_version"}
+    assert after["config"] == {**before["config"], "resume": None, "init_from": None}
+    assert after["state_dict"].keys() == before["state_dict"].keys()
+    for name, tensor in before["state_dict"].items():
+        assert torch.equal(after["state_dict"][name], tensor.to(getattr(torch, dtype)))
+    share = (tmp_path / "b.ckpt").stat().st_size / trained.stat().st_size
+    assert share < (0.4 if dtype == "float32" else 0.25)
+    load_model(tmp_path / "b.ckpt")
+
+
+def test_the_verb_prints_how_far_predictions_are(trained, tmp_path, capsys):
+    arguments = [f"checkpoint={trained}", f"hydra.run.dir={tmp_path / 'r'}"]
+    assert ghgs("export", *arguments, f"inference={tmp_path / 'b.ckpt'}", "dtype=float32") == 0
+    text = capsys.readouterr().out
+    assert "against the checkpoint, on an ellipsoid: 100.0 dB between renders" in text
+    assert text.rstrip().endswith(f"wrote {tmp_path / 'b.ckpt'}")
+    arguments.append(f"inference={tmp_path / 'b.ckpt'}")
+    assert ghgs("export", *arguments) == 1
+    expected = "inference: expected a path where there is no file, or overwrite=true"
+    assert expected in capsys.readouterr().err
+    assert ghgs("export", *arguments, "overwrite=true") == 0
+    decibels = float(capsys.readouterr().out.split("ellipsoid: ")[1].split(" dB")[0])
+    assert 40 < decibels < 100  # half precision is near, and not the same
+
+
+def test_what_half_precision_cannot_hold_is_refused(tmp_path):
+    path, state = tmp_path / "a.ckpt", make_model().state_dict()
+    name = next(name for name in state if name.startswith("gaussian_head"))
+    state[name] = torch.full_like(state[name], 1e6)
+    write_checkpoint(path, state, config())
+    with pytest.raises(InputError, match=rf"a\.ckpt as float16: {name}: expected finite numbers"):
+        write_inference(path, tmp_path / "b.ckpt", "float16")
+    write_inference(path, tmp_path / "b.ckpt", "bfloat16")
+    with pytest.raises(InputError, match="expected another file than the checkpoint"):
+        write_inference(path, path, "float16")
+
+
+@pytest.mark.parametrize("has_bfloat16", [True, False])
+@pytest.mark.parametrize("stored", [torch.float16, torch.bfloat16, torch.float32])
+def test_half_precision_is_computed_where_the_processor_has_it(
+    checkpoint, tmp_path, monkeypatch, stored, has_bfloat16
+):
+    """An encoder in float16 is slow on a CPU; a GPU keeps it, and who asks for it."""
+    monkeypatch.setattr(precision, "has_bfloat16", lambda _: has_bfloat16)
+    write_inference(trained, tmp_path / "b.ckpt", str(stored).removeprefix("torch."))
+    kept = stored == torch.bfloat16 and has_bfloat16
+    model, asked = (load_model(tmp_path / "b.ckpt", dtype=dtype) for dtype in (None, stored))
+    assert {p.dtype for p in model.encoder.parameters()} == {stored if kept else torch.float32}
+    assert {p.dtype for p in asked.encoder.parameters()} == {stored}
+    elsewhere = load_model(tmp_path / "b.ckpt", map_location="meta")
+    assert {p.dtype for p in elsewhere.encoder.parameters()} == {stored}
+    for name, tensor in model_state(read_checkpoint(tmp_path / "b.ckpt")).items():
+        assert torch.equal(model.state_dict()[name].float(), tensor.float())
+
+
+def test_the_weights_of_the_package_are_exported_by_name(tmp_path, monkeypatch, capsys):
+    """``checkpoint=shipped`` is no file's path."""
+    monkeypatch.chdir(tmp_path)
+    assert ghgs("export", "checkpoint=shipped", "inference=half.ckpt", "dtype=float16") == 0
+    assert re.search(r"^[\d.]+ MB to [\d.]+ MB$", capsys.readouterr().out, re.MULTILINE)
+    assert (tmp_path / "half.ckpt").stat().st_size < 2.5e6

@@ -15,7 +15,7 @@ from ghgs_lit.method.plan import Plan
 from ghgs_lit.method.plan.patches import KeptPatches
 
 NORM_EPS = 1e-5
-#: Body parts that ``ghgs pretext`` distinguishes (``training.pretext.labels``):
+#: Body parts that ``ghgs pretext`` distinguishes (``training.pretext``):
 #: channels of a feature.
 PARTS = 16
 

@@ -53,36 +53,6 @@ def attention_of(
     return TokenAttention(query, chosen[near[row]], weights[:, 0].mT, plain[:, 0].mT)
 
 
-@torch.no_grad()
-def attention_on_other_parts(
-    recalibration: Recalibration, tokens: Tokens, points: Points, part: Int[Tensor, " N"]
-) -> Float[Tensor, "m L"]:
-    """Share of each token's attention, in each layer, on tokens that show another body part;
-    mean over heads.
-
-    Args:
-        recalibration: the stage.
-        tokens: inputs of the stage, as is the next.
-        points: of these tokens.
-        part: number of the part that a token shows [N]; -1: unknown: such tokens are no queries,
-            and attention to them does not count.
-
-    Returns:
-        Shares [m, L] of the m tokens that take part and whose part is known.
-    """
-    takes_part = recalibration.takes_part(points)
-    element = tokens.image // tokens.grid[1]
-    shares = []
-    for number in range(tokens.grid[0]):
-        chosen = (takes_part & (element == number)).nonzero()[:, 0]
-        near, weights = _weights(recalibration, tokens, points, chosen, slice(None))
-        query_part = part[chosen, None]
-        others = part[chosen][near]
-        differs = (query_part != others) & (others >= 0)
-        shares.append((weights.mean(-1) * differs).sum(-1).T[query_part[:, 0] >= 0])
-    return torch.cat(shares)
-
-
 @dataclass(frozen=True)
 class Overlap:
     """Whom the tokens of an element attend to. ``tokens``: that take part. ``neighbors``: of each,

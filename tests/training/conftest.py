@@ -1,0 +1,19 @@
+"""Trainings that several files of tests share."""
+
+import functools
+
+import pytest
+
+from tests.training.test_resume import Cut, fit
+
+
+@pytest.fixture(scope="session")
+def whole(tmp_path_factory):
+    """Trains with a number of batches in a step, once: the folder, the module, the validations."""
+
+    @functools.cache
+    def run(accumulate: int):
+        folder, cut = tmp_path_factory.mktemp("whole"), Cut()
+        return folder, fit(folder, cut, accumulate_grad_batches=accumulate), cut.validations
+
+    return run
