@@ -100,19 +100,6 @@ def test_correlations_are_those_of_a_literal_loop(stereo):
         np.testing.assert_allclose(row, expected, atol=1e-5)
 
 
-def test_looking_up_is_linear_interpolation(stereo):
-    """As ``grid_sample`` between the centres of the steps; the ends are repeated."""
-    level = torch.rand(2, 12, 3, 4, generator=torch.Generator().manual_seed(1))
-    fraction = torch.rand(2, 1, 3, 4, generator=torch.Generator().manual_seed(2))
-    found = stereo.look_up(level, fraction)
-    for i, offset in enumerate(range(-stereo.RADIUS, stereo.RADIUS + 1)):
-        along = (2 * (fraction[:, 0] * 11 + offset) / 11 - 1).flatten()
-        column = level.movedim(1, -1).reshape(-1, 1, 12, 1)  # a picture of one column for each cell
-        grid = torch.stack((torch.zeros_like(along), along), -1)[:, None, None]
-        expected = F.grid_sample(column, grid, padding_mode="border", align_corners=True)
-        torch.testing.assert_close(found[:, i].flatten(), expected.flatten())
-
-
 def test_upsampled_maps_are_convex_combinations(stereo):
     """With all weight on the own cell it is repeated;
     with equal weights it is the mean of 3 x 3."""
@@ -173,29 +160,6 @@ def test_depths_lie_between_the_bounds_of_the_subject(stereo):
         assert ((depth >= near * (1 - 1e-6)) & (depth <= far * (1 + 1e-6))).all()
         (depth * change).sum().backward()
         assert (model.depth_head.update.change[-1].bias.grad * change > 0).all()
-
-
-def test_half_precision_stays_near():
-    """Correlations and the estimate stay in float32 under autocast; gradients stay finite."""
-    batch, model = make_batch(1, 3, 56, 56), peer("gps")
-    expected = predict(model, batch).depth
-    with torch.autocast("cpu", torch.bfloat16):
-        found = predict(model, batch).depth
-    assert found.dtype == torch.float32
-    error = (found - expected)[batch.masks].abs().mean() / expected[batch.masks].std()
-    assert 0 < error < 0.1
-    found[batch.masks].square().sum().backward()
-    assert all(p.grad.isfinite().all() for p in model.depth_head.parameters() if p.grad is not None)
-
-
-@pytest.mark.parametrize("name", PEERS)
-def test_every_weight_learns(name):
-    """Of the depth head, from the Gaussians."""
-    model = peer(name).train()
-    gaussians = predict(model, make_batch(1, 3, 42, 56)).gaussians
-    sum(getattr(gaussians, name).square().sum() for name in ("means", "scales", "opacities")).backward()
-    still = [key for key, p in model.depth_head.named_parameters() if p.grad is None or not p.grad.any()]
-    assert still == []
 
 
 def test_a_sweep_and_its_table_compare_it_with_others(tmp_path, monkeypatch, capsys):

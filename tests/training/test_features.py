@@ -1,4 +1,4 @@
-"""Which trainings keep tokens on disk, and what they say before."""
+"""Tokens of frozen ViTs on disk, and products of the encoder alone in bfloat16."""
 
 import json
 import logging
@@ -7,13 +7,153 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.errors import InputError
-from ghgs_lit.training.features import DiskFeatureCache
+from ghgs_lit.geometry.precision import round_products
+from ghgs_lit.method.encoder import encoder as encoder_module
+from ghgs_lit.training.features import DiskFeatureCache, FeatureCache
 from tests.helpers.encoders import SMALL_VGGT, make_encoder
 from tests.helpers.people import render_boxes
+from tests.helpers.scenes import make_batch
 from tests.helpers.verbs import ghgs
+
+
+def frozen_encoder(seed=0, tokens="all", **options):
+    """An encoder whose ViT does not learn, in training."""
+    torch.manual_seed(seed)
+    encoder = make_encoder(tokens, **{**SMALL_VGGT, **options}).train()
+    for parameter in encoder.aggregator.patch_embed.parameters():
+        torch.nn.init.normal_(parameter, std=0.2)
+    return encoder
+
+
+def with_cache(encoder, folder, dtype=torch.float16, network="small"):
+    encoder.aggregator.patch_embed.cache = FeatureCache(folder, network, dtype)
+    return encoder
+
+
+@pytest.fixture
+def batch():
+    return make_batch(2, 3, 42, 56)
+
+
+@pytest.mark.parametrize(("dtype", "bits"), [(torch.float16, 11), (torch.bfloat16, 8)])
+def test_tokens_from_disk_are_those_that_are_computed_up_to_rounding(tmp_path, batch, dtype, bits):
+    """And the same to the bit whether they were computed or read."""
+    exact = frozen_encoder()(batch.images, batch.masks)
+    encoder = with_cache(frozen_encoder(), tmp_path, dtype)
+    cache = encoder.aggregator.patch_embed.cache
+    computed = encoder(batch.images, batch.masks)
+    assert (cache.computed, cache.read) == (6, 0)
+    found = encoder(batch.images, batch.masks)
+    assert (cache.computed, cache.read) == (6, 6)
+    assert torch.equal(found.semantic, computed.semantic)
+    assert all(torch.equal(a, b) for a, b in zip(found.latent, computed.latent, strict=True))
+    assert found.semantic.dtype == torch.float32
+    error = (found.semantic - exact.semantic).abs()
+    assert error.max() > 0
+    assert (error <= exact.semantic.abs() * 2.0**-bits + 2.0**-24).all()
+    for layer, expected in zip(found.latent, exact.latent, strict=True):
+        assert (layer - expected).abs().max() <= 20 * 2.0**-bits * expected.abs().max()
+
+
+def test_what_learns_behind_the_cache_has_the_same_gradient(tmp_path, batch):
+    gradients = []
+    for encoder in (frozen_encoder(), with_cache(frozen_encoder(), tmp_path)):
+        encoder(batch.images, batch.masks).latent[1].square().mean().backward()
+        gradients.append(encoder.aggregator.global_blocks[1].mlp.fc1.weight.grad)
+    assert (gradients[0] - gradients[1]).norm() < 1e-2 * gradients[0].norm()
+
+
+def test_photographs_are_recognised_by_their_pixels(tmp_path, batch):
+    """In another order, in another batch, of another step;
+    one changed value is another photograph."""
+    encoder = with_cache(frozen_encoder(), tmp_path)
+    cache = encoder.aggregator.patch_embed.cache
+    first = encoder(batch.images, batch.masks)
+    order = torch.tensor([2, 0, 1])
+    found = encoder(batch.images[1:, order], batch.masks[1:, order])
+    assert cache.computed == 6
+    tokens = first.semantic.unflatten(0, (2, 3, -1))[1, order]
+    assert torch.equal(found.semantic.unflatten(0, (3, -1)), tokens)
+    changed = batch.images.clone()
+    changed[0, 0, 0, 0, 0] = changed[0, 0, 0, 0, 0] + 1e-3
+    encoder(changed, batch.masks)
+    assert cache.computed == 7
+
+
+def test_a_training_that_was_killed_goes_on_with_what_is_there(tmp_path, batch):
+    """Files that were lost, cut short by a full disk or left behind by a process that died."""
+    encoder = with_cache(frozen_encoder(), tmp_path)
+    cache = encoder.aggregator.patch_embed.cache
+    expected = encoder(batch.images, batch.masks)
+    files = sorted(tmp_path.rglob("*.npy"))
+    assert len(files) == 6
+    files[0].unlink()
+    content = files[1].read_bytes()
+    files[1].write_bytes(content[:-100])
+    files[2].write_bytes(b"")
+    files[3].with_name(f".{files[3].name}.elsewhere.1.tmp").write_bytes(content[:50])
+    found = encoder(batch.images, batch.masks)
+    assert cache.computed == 6 + 3
+    assert torch.equal(found.semantic, expected.semantic)
+    assert files[1].read_bytes() == content
+    encoder(batch.images, batch.masks)
+    assert cache.computed == 9
+
+
+def test_other_networks_and_precisions_have_other_tokens(tmp_path, batch):
+    """In folders of their own."""
+    round_products(False)  # whatever a trainer in this process has left
+    round_products(False, "cpu")
+    for network, dtype, half in (
+        ("small", torch.float16, False), ("other", torch.float16, False), ("small", torch.bfloat16, False),
+        ("small", torch.float16, True),
+    ):  # fmt: skip
+        encoder = with_cache(frozen_encoder(), tmp_path, dtype, network)
+        with torch.autocast("cpu", torch.bfloat16, enabled=half):
+            encoder(batch.images, batch.masks)
+        assert encoder.aggregator.patch_embed.cache.read == 0
+    names = {"small-float32-float16", "other-float32-float16", "small-float32-bfloat16"}
+    assert {path.name for path in tmp_path.iterdir()} == names | {"small-bfloat16-float16"}
+
+
+def test_predictions_and_parts_of_photographs_are_computed(tmp_path, batch):
+    """The cache is for training on whole photographs."""
+    encoder = with_cache(frozen_encoder(), tmp_path)
+    exact = frozen_encoder()
+    found = encoder.eval()(batch.images, batch.masks)
+    assert torch.equal(found.semantic, exact.eval()(batch.images, batch.masks).semantic)
+    with_cache(frozen_encoder(tokens="subject", margin=0), tmp_path)(batch.images, batch.masks)
+    assert not list(tmp_path.iterdir())
+
+
+def test_values_beyond_half_precision_are_refused(tmp_path, batch):
+    encoder = with_cache(frozen_encoder(), tmp_path)
+    torch.nn.init.constant_(encoder.aggregator.patch_embed.norm.bias, 1e5)
+    with pytest.raises(InputError, match=r"feature_cache.dtype: expected tokens that float16 can hold"):
+        encoder(batch.images, batch.masks)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_encoder_alone_runs_in_bfloat16_where_the_device_has_it(batch, monkeypatch):
+    """Elsewhere in float32, with the same numbers as without the option."""
+    expected = frozen_encoder()(batch.images, batch.masks)
+    encoder = frozen_encoder(precision="bfloat16")
+    seen = []
+    layer = encoder.aggregator.global_blocks[0].mlp.fc2
+    layer.register_forward_hook(lambda module, inputs, out: seen.append(out.dtype))
+    for has, dtype in ((False, torch.float32), (True, torch.bfloat16)):
+        monkeypatch.setattr("ghgs_lit.geometry.precision.has_bfloat16", lambda device, has=has: has)
+        found = encoder(batch.images, batch.masks)
+        assert seen.pop() == dtype
+        error = (found.latent[1].float() - expected.latent[1]).abs().max()
+        assert (error == 0) == (not has)
+        assert error < 0.1 * expected.latent[1].abs().max()
+    assert encoder_module.bfloat16_where_possible(torch.device("cpu")) is not None
+    assert all(parameter.dtype == torch.float32 for parameter in encoder.parameters())
 
 
 def data_of(**augmentation):
