@@ -35,13 +35,14 @@ def file_of(path: str | Path) -> Path:
     return last if last.is_file() else file
 
 
-def open_file(path: str | Path) -> Any:
+def open_file(path: str | Path, whole: bool = False) -> Any:
     """Content of a safetensors or PyTorch file; the first bytes tell the format.
 
     No code in it is executed (``weights_only=True``).
 
     Args:
         path: of the file, :data:`SHIPPED`, or the folder of a run, whose last weights count.
+        whole: read every byte of a PyTorch file once and refuse a damaged one (2 s for 1 GB).
 
     Returns:
         What the file holds; tensors are mapped from the disk,
@@ -56,7 +57,7 @@ def open_file(path: str | Path) -> Any:
     if start.startswith(ZIP):
         if not zipfile.is_zipfile(path):
             raise _unfit(path, "the beginning of a PyTorch file whose end is missing (truncated)")
-        require_stored(path)
+        require_records(path, whole)
         return _open_torch(path, mmap=True)
     if start.startswith(PICKLE):  # files of PyTorch before 1.6 cannot be mapped
         return _open_torch(path, mmap=False)
@@ -95,32 +96,42 @@ def require_weights(path: str | Path) -> bytes:
     return start
 
 
-def require_stored(path: Path) -> None:
-    """Refuse a PyTorch file whose records are not stored as they are, as PyTorch writes them.
+def require_records(path: Path, whole: bool) -> None:
+    """Refuse a PyTorch file whose records are not stored as they are, as PyTorch writes them, or do not
+    fit their checksums.
 
     Mapped from the disk, compressed ones would be other numbers,
     and unpacked they may fill the memory.
 
     Args:
         path: of a file in ZIP format.
+        whole: check those of tensors, too.
 
     Raises:
-        InputError: a record is compressed or encrypted,
+        InputError: a record is compressed, encrypted or damaged,
             or records claim more bytes than the file has.
     """
     try:
         with zipfile.ZipFile(path) as archive:
             records = archive.infolist()
-    except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
-        raise _unfit(path, f"one that cannot be read ({error})") from error
-    for record in records:
-        is_stored = record.compress_type == zipfile.ZIP_STORED and record.compress_size == record.file_size
-        if not is_stored or record.flag_bits & _ENCRYPTED:
-            raise _unfit(path, f"a compressed or encrypted record ({record.filename})")
-    claimed = sum(record.file_size for record in records)
-    size = path.stat().st_size
-    if claimed > size:
-        raise _unfit(path, f"records of {claimed} bytes in a file of {size}")
+            for record in records:
+                is_stored = record.compress_type == zipfile.ZIP_STORED
+                is_stored &= record.compress_size == record.file_size
+                if not is_stored or record.flag_bits & _ENCRYPTED:
+                    raise _unfit(path, f"a compressed or encrypted record ({record.filename})")
+            claimed = sum(record.file_size for record in records)
+            size = path.stat().st_size
+            if claimed > size:
+                raise _unfit(path, f"records of {claimed} bytes in a file of {size}")
+            for record in records:
+                if whole or "/data/" not in record.filename:
+                    with archive.open(record) as stream:
+                        while stream.read(1 << 24):
+                            pass
+    except InputError:
+        raise
+    except (zipfile.BadZipFile, EOFError, ValueError, NotImplementedError, RuntimeError) as error:
+        raise _unfit(path, f"one that was damaged ({error})") from error
 
 
 def _open_torch(path: Path, mmap: bool) -> Any:

@@ -315,7 +315,7 @@ def test_an_optimizer_whose_state_was_damaged_is_refused(tmp_path):
     content, average = path.read_bytes(), state["exp_avg"].numpy().tobytes()
     assert content.count(average) == 1
     path.write_bytes(content.replace(average, bytes(reversed(average))))
-    with pytest.raises(InputError, match=r"last\.ckpt: expected .* written; found"):
+    with pytest.raises(InputError, match=r"last\.ckpt: expected .* damaged"):
         check_resume(path, held(Standin()), CONFIG)
 
 

@@ -310,7 +310,7 @@ def test_one_changed_bit_is_refused_by_every_reader(tmp_path, reader, save, wher
     read_checkpoint(path, whole=True)
     near = made["state_dict"][name].numpy().tobytes()[:64]
     flip(path, near if where == "weights" else b"neighborhood")
-    with pytest.raises(InputError, match=r"last\.ckpt: expected .*written; found"):
+    with pytest.raises(InputError, match=r"last\.ckpt: expected .* damaged"):
         READERS[reader](path)
 
 
@@ -472,7 +472,7 @@ def test_what_half_precision_cannot_hold_is_refused(tmp_path):
 @pytest.mark.parametrize("has_bfloat16", [True, False])
 @pytest.mark.parametrize("stored", [torch.float16, torch.bfloat16, torch.float32])
 def test_half_precision_is_computed_where_the_processor_has_it(
-    checkpoint, tmp_path, monkeypatch, stored, has_bfloat16
+    trained, tmp_path, monkeypatch, stored, has_bfloat16
 ):
     """An encoder in float16 is slow on a CPU; a GPU keeps it, and who asks for it."""
     monkeypatch.setattr(precision, "has_bfloat16", lambda _: has_bfloat16)
