@@ -113,14 +113,6 @@ def test_a_class_of_steps_has_one_budget_and_one_number_of_rounds(tmp_path):
     assert model.rounds._known_count is None
 
 
-def test_without_budgets_the_model_stays_as_it_is_configured():
-    """The default must not change what training sees."""
-    model = Watched()
-    with token_budget(model, None):
-        model(example_batch())
-    assert model.trained == [("subject", 7)]
-
-
 @pytest.mark.parametrize("choices", [[], ["windows"], [-1], ["all", "1"]])
 def test_budgets_that_do_not_exist_are_refused(choices):
     """A typing error must not become another training."""

@@ -15,10 +15,12 @@ from torch.utils.data import DataLoader
 from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.precision import exact
+from ghgs_lit.metrics.functional import psnr, ssim
+from ghgs_lit.metrics.regions import box_of
 from ghgs_lit.training import DivergedError, GHGSModule, Optimization
 from ghgs_lit.training.checkpoints import CheckpointOptions
 from ghgs_lit.training.trainer import TrainerOptions
-from ghgs_lit.types import Targets
+from ghgs_lit.types import DepthMaps, Targets
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION, write_checkpoint
 from tests.helpers.losses import losses_of
 from tests.helpers.models import config, load_model, make_model
@@ -98,25 +100,6 @@ def test_checkpoints_are_plain(tmp_path):
     assert "hyper_parameters" not in content
 
 
-def test_the_gradient_is_clipped(tmp_path):
-    """One bad batch moves the weights by a bounded gradient."""
-    subject = GHGSModule(
-        Standin(), flat_renderer, losses_of({"depth": 100.0}), Optimization(lr=0.1, clip=0.5), CONFIG
-    )
-    norms = []
-
-    class Look(L.Callback):
-        def on_before_optimizer_step(self, run, pl_module, optimizer):
-            norms.append(pl_module.model.depth.grad.norm().item())
-
-    trainer(tmp_path, steps=2, callbacks=[Look()]).fit(subject, loader())
-    assert norms[0] > 0  # before clipping
-    subject.model.depth.grad = torch.tensor(7.0)
-    subject.log = lambda *_, **__: None
-    subject.configure_gradient_clipping(None)
-    assert subject.model.depth.grad.item() == pytest.approx(0.5, rel=1e-4)
-
-
 def scaled(folder, scale: float, steps: int = 3, renderer=flat_renderer, **weights):
     """Train in float16 with a scaled loss, on a CPU;
     returns the norms before clipping, module and scaler."""
@@ -178,24 +161,6 @@ def test_tf32_is_for_networks_alone():
         assert matmul.fp32_precision == "tf32"
     finally:
         torch.set_float32_matmul_precision("highest")
-
-
-def test_frozen_parameters_stay_for_their_share_of_the_run(tmp_path):
-    """Neither gradient nor weight decay moves frozen parameters; an unknown prefix is an error."""
-    seen = []
-
-    class Look(L.Callback):
-        def on_train_batch_end(self, run, pl_module, *_):
-            seen.append((pl_module.model.depth.item(), pl_module.model.shift.detach().clone()))
-
-    subject = module()
-    subject.optimization = Optimization(lr=0.05, weight_decay=0.1, freeze_until={"shift": 0.5})
-    trainer(tmp_path, steps=6, callbacks=[Look()]).fit(subject, loader(1))
-    assert [bool(shift.abs().max() > 0) for _, shift in seen] == [False] * 3 + [True] * 3
-    assert seen[0][0] != seen[1][0]
-    subject.optimization = Optimization(lr=0.05, freeze_until={"nothing": 0.5})
-    with pytest.raises(InputError, match=r"optimizer\.freeze_until\.nothing"):
-        trainer(tmp_path, steps=6).fit(subject, loader(1))
 
 
 @pytest.mark.parametrize(
@@ -283,3 +248,59 @@ def test_the_module_of_a_run_is_read_with_its_parts(tmp_path):
     assert module.losses.weights.depth == 0.25
     assert module.optimization.lr == 0.003
     assert module.config["seed"] == 7
+
+
+def test_validation_measures_clamped_renders(tmp_path):
+    """PSNR and SSIM are of the pictures that are seen, as `ghgs evaluate` measures them."""
+
+    def brighter(gaussians, cameras, by=3.0):
+        drawn = flat_renderer(gaussians, cameras)
+        pattern = torch.linspace(-1, by, drawn.image.shape[-1])
+        return dataclasses.replace(drawn, image=drawn.image + pattern)
+
+    subject, batch = module(brighter), example_batch()
+    run = trainer(tmp_path, steps=1)
+    (found,) = run.validate(
+        subject, DataLoader([batch], batch_size=None, collate_fn=lambda b: b), verbose=False
+    )
+    image = subject(batch)[1].image.detach().clamp(0, 1).flatten(0, 1)
+    target = batch.targets.images.flatten(0, 1)
+    assert found["val/ssim"] == pytest.approx(float(ssim(image, target, "reflect").mean()), rel=1e-4)
+    assert found["val/psnr"] == pytest.approx(float(psnr(image, target).mean()), rel=1e-4)
+    box = box_of(batch.targets.masks.flatten(0, 1))
+    assert found["val/psnr_box"] == pytest.approx(float(psnr(image, target, box).mean()), rel=1e-4)
+
+
+def test_depth_error_is_of_pixels_with_a_prediction(tmp_path):
+    """Where the model says that a depth is not valid, it has none that could be wrong."""
+
+    class Half(Standin):
+        def forward(self, batch):
+            found = super().forward(batch)
+            valid = batch.masks & (torch.arange(batch.masks.shape[-1]) < 8)
+            depth = torch.where(valid, 2.15, 9.0)
+            return dataclasses.replace(found, depth_maps=DepthMaps(depth, valid, torch.ones_like(depth)))
+
+    subject = GHGSModule(Half(), flat_renderer, losses_of({"render_l1": 1.0}), Optimization(lr=0.05), CONFIG)
+    (found,) = trainer(tmp_path, steps=1).validate(subject, loader(1), verbose=False)
+    assert found["val/depth_error_mm"] == pytest.approx(50, abs=0.01)  # the truth is 2.1 m
+
+
+def test_rounds_are_measured_as_the_result_is(tmp_path):
+    """Renders of the Gaussians before each round are clamped, too,
+    and depths are those before it."""
+
+    def brighter(gaussians, cameras):
+        drawn = flat_renderer(gaussians, cameras)
+        return dataclasses.replace(drawn, image=drawn.image + torch.linspace(-1, 2, drawn.image.shape[-1]))
+
+    class Twice(Standin):
+        def forward(self, batch):
+            found = super().forward(batch)
+            maps = DepthMaps(torch.full_like(found.depth, 2.2), batch.masks, torch.ones_like(found.depth))
+            return dataclasses.replace(found, drafts=(found.gaussians,), rounds=(maps, found.depth_maps))
+
+    subject = GHGSModule(Twice(), brighter, losses_of({"render_l1": 1.0}), Optimization(lr=0.05), CONFIG)
+    (found,) = trainer(tmp_path, steps=1).validate(subject, loader(1), verbose=False)
+    assert found["val/psnr_before_round_1"] == pytest.approx(found["val/psnr"], rel=1e-6)
+    assert found["val/depth_error_mm_before_round_1"] == pytest.approx(100, abs=0.01)

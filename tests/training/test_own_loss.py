@@ -104,9 +104,10 @@ def test_the_norm_that_is_clipped_is_that_of_all_weights(tmp_path):
 
 
 def test_its_weights_can_be_frozen_for_a_share_of_the_run(tmp_path):
-    """By their names in the checkpoint; those of the model keep the names that they have in it."""
+    """By their names in the checkpoint; those of the model keep the names that they have in it. Neither
+    gradient nor weight decay moves them; an unknown prefix is an error."""
     until = {"losses.mixing": 0.5, "shift": 0.5}
-    subject, seen = module(freeze_until=until), Seen()
+    subject, seen = module(freeze_until=until, weight_decay=0.1), Seen()
     before = weights(subject)
     trainer(tmp_path, 4, seen).fit(subject, StepData())
     for name, changes in (("losses.mixing", 2), ("model.shift", 2), ("losses.log_variance", 4)):
