@@ -32,11 +32,10 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from ghgs_capture.agreement import MISSED, Agreement, reach_of
+from ghgs_capture.agreement import CORRECTION, MISSED, Agreement, doubt_of_masks, reach_of
 from ghgs_capture.backgrounds import BACKGROUND_INSTANTS, UNLIKE, Background, Backgrounds
 from ghgs_capture.capture import Capture
 from ghgs_capture.crops import Photograph, shrunk
-from ghgs_capture.doubts import CORRECTION, doubt_of_masks
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.prediction import crop_size, in_frame
 from ghgs_capture.rig import INSTANTS, Rig, corrected_rig, spread

@@ -11,9 +11,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from ghgs_capture.agreement import Agreement
+from ghgs_capture.agreement import CORRECTION, Agreement, doubt_of_masks
 from ghgs_capture.capture import Capture
-from ghgs_capture.doubts import CORRECTION, doubt_of_masks
 from ghgs_lit.config.options import PathText, Size, Text
 from ghgs_lit.data.dataset import DataOptions
 from ghgs_lit.data.reader import Reader

@@ -13,10 +13,10 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from ghgs_capture.agreement import CORRECTION, doubt_of_cameras, doubt_of_masks
 from ghgs_capture.calibration import MOST_GAIN, Calibration, calibrate
 from ghgs_capture.capture import Capture
 from ghgs_capture.crops import Photograph
-from ghgs_capture.doubts import CORRECTION, doubt_of_cameras, doubt_of_masks
 from ghgs_capture.folder import CaptureFolder
 from ghgs_lit.execution import Predictor
 from ghgs_lit.geometry.frame import Frame

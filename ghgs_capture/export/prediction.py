@@ -2,20 +2,19 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from ghgs_capture.export.compact import CONVERTED, converted
 from ghgs_capture.export.instants import mp4_bytes
 from ghgs_capture.export.maps import depth_file, input_files, png
 from ghgs_capture.export.page import page
 from ghgs_capture.export.reports import begin_files, end_files, write_file
 from ghgs_capture.export.subject import ExportedSubject, OutputOptions, exported_subject, file_names
-from ghgs_lit.errors import choice, installed, require
+from ghgs_lit.errors import InputError, choice, installed, require
 from ghgs_lit.geometry.frame import HEIGHT
 from ghgs_lit.metrics import psnr
 from ghgs_lit.metrics.regions import box_of
@@ -30,6 +29,51 @@ if TYPE_CHECKING:
     from ghgs_capture.verbs import Predict
 
 SHEET = "sheet.png"  #: The picture to look at
+
+
+#: Formats that the package gaussforge makes from a PLY; what it, and the suffix of files, calls each.
+CONVERTED = {"compressed_ply": "compressed.ply", "spz": "spz", "sog": "sog"}
+
+
+def half_turned(gaussians: Gaussians) -> Gaussians:
+    """Turn Gaussians by half a turn about x: from a PLY's axes (right, down, front) to those in
+    which SPZ is stored (right, up, back), or back.
+
+    https://github.com/nianticlabs/spz, "Coordinate System"; gaussforge stores numbers as they are.
+
+    Args:
+        gaussians: of any number of subjects; their colours must not depend on direction.
+
+    Returns:
+        The same with y and z of places, and with them those of quaternions, negated.
+    """
+    means = gaussians.means * gaussians.means.new_tensor([1, -1, -1])
+    quaternions = gaussians.quaternions * gaussians.quaternions.new_tensor([1, 1, -1, -1])
+    return replace(gaussians, means=means, quaternions=quaternions)
+
+
+def converted(name: str, gaussians: Gaussians) -> bytes:
+    """Convert Gaussians to another program's format, by the package gaussforge.
+
+    Args:
+        name: of the format, in ``CONVERTED``.
+        gaussians: of one subject, with RGB colours.
+
+    Returns:
+        The content of a file.
+
+    Raises:
+        InputError: gaussforge cannot convert them, such as none.
+    """
+    from gaussforge import GaussForge  # here: of an extra
+
+    if name == "spz":
+        gaussians = half_turned(gaussians)
+    answer = GaussForge().convert(ply_bytes(gaussians), "ply", CONVERTED[name])
+    if answer.get("error"):
+        expected = "formats: expected Gaussians that gaussforge converts to"
+        raise InputError(f"{expected} {name}; found {len(gaussians)}: {answer['error']}")
+    return answer["data"]
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ import torch
 from ghgs_capture.capture import Capture
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.learning import LISTING, agrees, splits_of, write_instant
+from ghgs_capture.prediction import without_tones
 from ghgs_capture.rig import spread
-from ghgs_capture.tones import without_tones
 from ghgs_capture.verbs import Adapt
 from ghgs_capture.verbs.photographs import capture_folder
 from ghgs_capture.verbs.predict import mended_by, shared_by

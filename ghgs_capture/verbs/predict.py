@@ -16,9 +16,8 @@ from ghgs_capture.capture import Capture
 from ghgs_capture.export.reports import REPORT
 from ghgs_capture.folder import CaptureFolder
 from ghgs_capture.formats.matrices import json_text
-from ghgs_capture.prediction import CapturePrediction, crop_size, predict, predict_batch
+from ghgs_capture.prediction import CapturePrediction, crop_size, predict, predict_batch, without_tones
 from ghgs_capture.rig import INSTANTS, Rig, corrected_rig, spread
-from ghgs_capture.tones import without_tones
 from ghgs_capture.verbs.photographs import capture_folder, check_cameras
 from ghgs_lit.cli import inputs
 from ghgs_lit.cli.runtime import announce, output_dir, write_config

@@ -1,18 +1,291 @@
-"""``ghgs view``: show a prediction with its photographs and cameras in the browser."""
+"""``ghgs view``: a page in the browser (the extra ``viewer``) to look around in a prediction or a PLY:
+a viser server with the Gaussians, cameras and hull, and a switch for each."""
 
+import contextlib
+import logging
 import math
+import re
+import socket
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ghgs_capture.calibration import calibrate
+from ghgs_capture.export.subject import AXES, smoothed
+from ghgs_capture.formats.matrices import read_matrices
 from ghgs_capture.verbs import predict
-from ghgs_capture.viewer.content import read_content
-from ghgs_capture.viewer.server import Viewer
 from ghgs_lit.cli.runtime import output_dir, write_config
-from ghgs_lit.errors import require
+from ghgs_lit.data.images import read_image
+from ghgs_lit.errors import InputError, choice, installed, require
+from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.geometry.rotations import quaternion_to_matrix
+from ghgs_lit.method.bounds import VisualHull
+from ghgs_lit.ply import read_ply
+from ghgs_lit.types import Batch, Cameras, Gaussians
+from ghgs_lit.visualization.pictures import to_uint8
+from ghgs_lit.visualization.turntable import center_of, pixel_size, subject_points, up_direction
 from ghgs_lit.weights.reading import SHIPPED
 
 if TYPE_CHECKING:
     from ghgs_capture.verbs import View
+
+_HULL_POINTS = 50_000
+
+
+@dataclass(frozen=True)
+class Content:
+    """Gaussians of one subject; ``batch`` has its photographs,
+    masks and cameras where they are known."""
+
+    gaussians: Gaussians
+    up: Float[Tensor, "3"]
+    batch: Batch | None = None
+
+    @property
+    def cameras(self) -> Cameras:
+        """The cameras [V] of the photographs."""
+        return self.batch.cameras[0]
+
+    @cached_property
+    def center(self) -> Float[Tensor, "3"]:
+        """The middle of the subject."""
+        return center_of(subject_points(self.gaussians), self.cameras)
+
+    @cached_property
+    def hull(self) -> np.ndarray:
+        """Points [n, 3] of the visual hull: where the rays of the subject's pixels enter it."""
+        near = VisualHull(dilation=0.0)(self.batch).near
+        points = unproject_maps(near, self.batch.cameras)[self.batch.masks]
+        return points[:: -(-max(len(points), 1) // _HULL_POINTS)].numpy()
+
+
+def read_content(path: str | Path, up: str | None) -> Content:
+    """Read what ``ghgs predict`` wrote into a directory (its formats ``ply`` and ``inputs``),
+    or a PLY.
+
+    Args:
+        path: the directory or the PLY.
+        up: the axis ``y``, ``-y`` or ``z`` that points up; None: the up of the cameras, and ``y``
+            for a PLY.
+
+    Returns:
+        The Gaussians, and of a directory the photographs with their cameras.
+
+    Raises:
+        InputError: ``path`` is neither, or a file of it is missing or wrong.
+    """
+    path = Path(path)
+    choice("up", up, (None, *AXES))
+    if path.is_file():
+        return Content(read_ply(path), torch.tensor(AXES[up or "y"]))
+    require(path.is_dir(), f"path={path}", "a directory of ghgs predict or a PLY", "neither")
+    for name, wanted in (("gaussians.ply", "ply"), ("cameras.json", "inputs")):
+        if not (path / name).exists():
+            raise InputError(f"{path / name}: expected a file of ghgs predict formats=[{wanted}]; found none")
+    batch = _read_inputs(path)
+    direction = up_direction(batch.cameras[0]) if up is None else torch.tensor(AXES[up])
+    return Content(read_ply(path / "gaussians.ply"), direction, batch)
+
+
+def _read_inputs(directory: Path) -> Batch:
+    """Photographs, masks and cameras of the format ``inputs``.
+    InputError: one is missing or wrong."""
+    stored = read_matrices(directory / "cameras.json")
+    pictures = []
+    cameras = []
+    for name, camera in stored.cameras.items():
+        file = directory / "inputs" / f"{name}.png"
+        inside = file.resolve().parent == (directory / "inputs").resolve()
+        require(inside, str(file), f"the photograph of camera {name} in this folder", "a file outside")
+        require(file.exists(), str(file), f"the photograph of camera {name}", "none")
+        pictures.append(np.asarray(read_image(file).convert("RGBA")))
+        cameras.append(calibrate(camera, stored.convention, pictures[-1].shape[:2]))
+    shapes = {picture.shape for picture in pictures}
+    require(len(shapes) == 1, str(directory / "inputs"), "photographs of one size", sorted(shapes))
+    values = torch.from_numpy(np.stack(pictures)).movedim(-1, 1).float()[None] / 255
+    intrinsics = torch.from_numpy(np.stack([camera.intrinsics for camera in cameras])).float()[None]
+    extrinsics = torch.from_numpy(np.stack([camera.extrinsics for camera in cameras])).float()[None]
+    colors = values[:, :, :3]
+    alpha = values[:, :, 3:]
+    return Batch(
+        images=torch.where(alpha > 0, colors * alpha, colors),
+        masks=alpha[:, :, 0] > 0.5,
+        alpha=alpha[:, :, 0],
+        cameras=Cameras(intrinsics, extrinsics, *pictures[0].shape[:2]),
+        views=(tuple(stored.cameras),),
+    )
+
+
+def _require_address(host: str) -> None:
+    """Refuse an address that is not this machine's: viser would wait for it silently."""
+    try:
+        family, *_ = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
+        socket.create_server((host, 0), family=family).close()
+    except (OSError, UnicodeError) as error:
+        raise InputError(f"host: expected an address of this machine; found {host!r} ({error})") from error
+
+
+def _refuse_other_addresses(connection: Any, request: Any, response: Any) -> Any:
+    """Answer 403 to a page whose origin is not the address that it connects to; None: accepted."""
+    origin = request.headers.get("Origin")
+    if response.status_code != 101 or origin is None or origin.split("://")[-1] == request.headers["Host"]:
+        return None
+    return connection.respond(403, "expected a page of this address\n")
+
+
+@contextlib.contextmanager
+def _own_pages_only(host: str) -> Iterator[None]:
+    """Make servers that start in this context refuse pages of other sites;
+    viser accepts any origin."""
+    from websockets.asyncio import server
+
+    serve = server.serve
+    names = "|".join(map(re.escape, (host, "localhost", "127.0.0.1", "[::1]")))
+    # A server open to the network has many names; the Host header has the one in use.
+    names = ".+" if host in ("0.0.0.0", "::") else names
+    origins = [None, re.compile(rf"https?://({names})(:\d+)?")]
+    server.serve = partial(serve, origins=origins, process_response=_refuse_other_addresses)
+    try:
+        yield
+    finally:
+        server.serve = serve
+
+
+class Viewer:
+    """A running page.
+
+    Args:
+        content: what it shows.
+        host: the address to listen at; ``127.0.0.1`` is seen by this machine alone.
+        port: the first one to try.
+
+    Raises:
+        InputError: viser is not installed, or this machine has no such address.
+    """
+
+    def __init__(self, content: Content, host: str = "127.0.0.1", port: int = 8080):
+        viser = installed("viser", "viewer", "ghgs view")
+        _require_address(host)
+        self.content = content
+        logging.getLogger("websockets").setLevel(logging.WARNING)  # else a line for each visitor
+        with _own_pages_only(host):
+            self.server = viser.ViserServer(host, port, label="ghgs", verbose=False)
+        self.server.scene.set_up_direction(content.up.numpy())
+        self._add_splats()
+        if content.batch is not None:
+            self._add_hull()
+            self._place_visitors()
+            self._add_cameras()
+
+    @property
+    def address(self) -> str:
+        """Where browsers find the page."""
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+
+    def stop(self) -> None:
+        """Close the page."""
+        self.server.stop()
+
+    def _add_splats(self) -> None:
+        """Add the Gaussians; those of a prediction as large as the photographs' pixels, else a larger
+        screen shows gaps."""
+        g = self.content.gaussians
+        if self.content.batch is not None:
+            g = smoothed(g, pixel_size(self.content.cameras, self.content.center))
+        root = quaternion_to_matrix(g.quaternions) * g.scales[:, None, :]
+        colors, opacities = g.colors.clamp(0, 1), g.opacities[:, None].clamp(0, 1)
+        drawn = (each.numpy() for each in (g.means, root @ root.mT, colors, opacities))
+        self._switch("Gaussians", self.server.scene.add_gaussian_splats("/gaussians", *drawn))
+
+    def _add_hull(self) -> None:
+        """Add the points of the visual hull, which are hidden at first."""
+        points = self.content.hull
+        size = float(np.ptp(points, axis=0).max(initial=0.0)) / 400
+        blue = np.array([90, 160, 255], np.uint8)
+        node = self.server.scene.add_point_cloud(
+            "/hull", points, blue, point_size=size, precision="float32", visible=False
+        )
+        self._switch("hull", node)
+
+    def _switch(self, name: str, node: Any) -> None:
+        box = self.server.gui.add_checkbox(name, node.visible)
+
+        @box.on_update
+        def _(_) -> None:
+            node.visible = box.value
+
+    def _show_frustums(self) -> None:
+        """Show the cameras but that of the visitors, whose photograph would hide the subject."""
+        for view, frustum in enumerate(self._frustums):
+            frustum.visible = self.cameras.value and view != self._at
+
+    def _add_cameras(self) -> None:
+        """Add the cameras with their photographs; a click puts the visitors there."""
+        from viser.transforms import SO3
+
+        cameras = self.content.cameras
+        batch = self.content.batch
+        self._poses = []
+        self._frustums = []
+        target = self.content.center.numpy()
+        size = np.linalg.norm(cameras.centers.numpy() - target, axis=-1).mean()
+        for view, name in enumerate(batch.views[0]):
+            k = cameras.intrinsics[view].numpy()
+            e = cameras.extrinsics[view].numpy().astype(np.float64)
+            pose = {"wxyz": SO3.from_matrix(e[:3, :3].T).wxyz, "position": -e[:3, :3].T @ e[:3, 3]}
+            fov = 2 * math.atan(cameras.height / 2 / k[1, 1])
+            alpha = batch.masks[0, view].numpy() * np.uint8(255)
+            node = self.server.scene.add_camera_frustum(
+                f"/cameras/{name}",
+                fov,
+                cameras.width / cameras.height,
+                scale=size / 12,
+                thickness=size / 400,
+                image=np.dstack([to_uint8(batch.images[0, view]), alpha]),
+                **pose,
+            )
+            node.on_click(lambda _, view=view: self.go_to(view))
+            self._frustums.append(node)
+            self._poses.append((pose, fov))
+        self.cameras = self.server.gui.add_checkbox("cameras", True)
+        self.cameras.on_update(lambda _: self._show_frustums())
+        self._at: int | None = None  # the camera that visitors were put at
+
+    def _place_visitors(self) -> None:
+        """Start visitors behind and beside the first camera:
+        its photograph would hide the subject."""
+        cameras = self.content.cameras
+        target = self.content.center.numpy()
+        up = self.content.up.numpy().astype(np.float64)
+        away = cameras.centers[0].numpy() - target
+        start = self.server.initial_camera
+        start.position = target + 1.5 * away + 0.6 * np.cross(up, away)
+        start.look_at = target
+        start.up = up
+        start.fov = 2 * math.atan(cameras.height / 2 / float(cameras.intrinsics[0, 1, 1]))
+
+    def go_to(self, view: int) -> None:
+        """Put every visitor at the camera of a photograph.
+
+        Args:
+            view: index of the photograph.
+        """
+        pose, fov = self._poses[view]
+        for client in self.server.get_clients().values():
+            with client.atomic():
+                client.camera.wxyz = pose["wxyz"]
+                client.camera.position = pose["position"]
+                client.camera.fov = fov
+        self._at = view
+        self._show_frustums()
 
 
 def run(verb: "View") -> None:

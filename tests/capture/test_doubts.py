@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from ghgs_capture import prediction as predicting
+from ghgs_capture.agreement import CORRECTION, doubt_of_cameras, doubt_of_masks
 from ghgs_capture.capture import Capture
-from ghgs_capture.doubts import CORRECTION, doubt_of_cameras, doubt_of_masks
 from ghgs_capture.prediction import predict
 from ghgs_lit.execution import Predictor
 from ghgs_lit.geometry.masks import signed_distance

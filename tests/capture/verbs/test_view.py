@@ -12,8 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ghgs_capture.export import OutputOptions, write_prediction
-from ghgs_capture.viewer.content import read_content
-from ghgs_capture.viewer.server import Viewer
+from ghgs_capture.verbs.view import Viewer, read_content
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.ply import write_ply

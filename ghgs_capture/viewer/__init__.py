@@ -1,1 +1,0 @@
-"""A page in the browser to look around in a prediction; needs the extra ``viewer``."""
