@@ -36,16 +36,20 @@ def read(capture, **options):
     return Capture.read(capture / "images", capture / "cameras.json", **options)
 
 
+def require_right(photographs):
+    """All four, with their own masks."""
+    for photograph, mask in zip(photographs, Figure().masks, strict=True):
+        np.testing.assert_array_equal(photograph.mask, mask)
+
+
 def test_photographs_and_masks_may_be_links(capture):
-    right = read(capture)
     for folder in ("images", "masks"):
         for path in (capture / folder).iterdir():
             stored = capture / "store" / f"{folder}-{path.name}"
             stored.parent.mkdir(exist_ok=True)
             path.rename(stored)
             path.symlink_to(stored)
-    for one, other in zip(right.photographs, read(capture).photographs, strict=True):
-        np.testing.assert_array_equal(one.matte, other.matte)
+    require_right(read(capture).photographs)
 
 
 def rename(capture, folder, change):
@@ -60,57 +64,66 @@ def renamed(capture, change):
     write(capture / "cameras.json", {"cameras": cameras})
 
 
-@pytest.mark.parametrize("change", [lambda n: n.replace(".png", ".PNG"), lambda n: n.replace(".", ".png.")])
-def test_names_of_masks(capture, change):
-    """``cam0.PNG`` of Windows, and COLMAP's ``cam0.png.png``."""
-    rename(capture, "masks", change)
-    assert len(read(capture).photographs) == 4
+def same(name):
+    return name
+
+
+def spelled(form):
+    return lambda name: unicodedata.normalize(form, name.replace("cam", "K\u00e4the"))
+
+
+def in_view(name):
+    return name.replace("cam", "view")
+
+
+# How photographs, masks and cameras are renamed, and options.
+RENAMED = {
+    "masks of Windows": (same, lambda n: n.replace(".png", ".PNG"), same, {}),
+    "masks of COLMAP": (same, lambda n: n.replace(".", ".png."), same, {}),
+    "CAM0.PNG": (str.upper, str.upper, same, {}),
+    "Cam0.Png": (str.title, str.title, same, {}),
+    "numbered cameras": (in_view, in_view, lambda n: n[3:], {"names": {f"view{n}": n for n in range(4)}}),
+    "letters of macOS": (spelled("NFD"), spelled("NFC"), spelled("NFC"), {}),
+}
+
+
+@pytest.mark.parametrize("name", RENAMED)
+def test_names_of_other_systems(capture, name):
+    images, masks, cameras, calibration = RENAMED[name]
+    renamed(capture, cameras)
+    rename(capture, "images", images)
+    rename(capture, "masks", masks)
+    require_right(read(capture, calibration=calibration).photographs)
+
+
+NUMBERED = "{camera}_rgb{n:06d}", "{camera}_mask{n:06d}", ["000000", "000001"]
+KINDS = "{n:04d}_img", "{n:04d}_img_fmask", ["0000_img", "0001_img"]
+ALPHA = "{camera}-{n}", "{camera}_{n}.alpha", ["0", "1"]
 
 
 @pytest.mark.parametrize(
-    ("photograph", "mask", "instants"),
+    ("place", "masks", "names"),
     [
-        ("{camera}_rgb{n:06d}", "{camera}_mask{n:06d}", ["000000", "000001"]),
-        ("{n:04d}_img", "{n:04d}_img_fmask", ["0000_img", "0001_img"]),
-        ("{camera}-{n}", "{camera}_{n}.alpha", ["0", "1"]),
+        *(("rgbs/{camera}", "mattes/{camera}", names) for names in (NUMBERED, KINDS, ALPHA)),
+        *(("rgbs/{camera}", "rgbs/{camera}", names) for names in (NUMBERED, KINDS)),
+        ("rgbs", "mattes", NUMBERED),
+        ("rgbs", "mattes", ("{camera}_img", "{camera}_fmask", ["rgbs"])),
     ],
 )
-@pytest.mark.parametrize("beside", [False, True])
-def test_names_that_repeat_camera_and_kind(capture, photograph, mask, instants, beside):
-    if beside and "mask" not in mask:
-        return
+def test_names_that_repeat_camera_and_kind(capture, place, masks, names):
+    """In folders of cameras, or all in one; masks beside photographs or in a folder of their own."""
+    photograph, mask, instants = names
     for path in sorted((capture / "images").glob("*.png")):
-        for folder, name in (("rgbs", photograph), ("rgbs" if beside else "mattes", mask)):
-            place = capture / folder / path.stem
-            place.mkdir(parents=True, exist_ok=True)
-            source = path if name == photograph else capture / "masks" / path.name
-            for n in range(2):
-                (place / f"{name.format(camera=path.stem, n=n)}.png").write_bytes(source.read_bytes())
-    masks = None if beside else capture / "mattes"
-    folder = CaptureFolder(capture / "rgbs", capture / "cameras.json", masks)
-    assert folder.instants == instants
-    for one, other in zip(folder.photographs(instants[1]), read(capture).photographs, strict=True):
-        np.testing.assert_array_equal(one.matte, other.matte)
-
-
-@pytest.mark.parametrize(
-    ("photograph", "mask", "instants"),
-    [
-        ("{camera}_rgb{n:06d}", "{camera}_mask{n:06d}", ["000000", "000001"]),
-        ("{camera}_img", "{camera}_fmask", ["rgbs"]),
-    ],
-)
-def test_names_that_begin_with_the_camera(capture, photograph, mask, instants):
-    for folder, name, source in (("rgbs", photograph, "images"), ("mattes", mask, "masks")):
-        (capture / folder).mkdir()
-        for path in (capture / source).glob("*.png"):
+        sources = ((place, photograph, path), (masks, mask, capture / "masks" / path.name))
+        for folder, pattern, source in sources:
             for n in range(len(instants)):
-                place = capture / folder / f"{name.format(camera=path.stem, n=n)}.png"
-                place.write_bytes(path.read_bytes())
-    folder = CaptureFolder(capture / "rgbs", capture / "cameras.json", capture / "mattes")
+                target = capture / f"{folder}/{pattern}.png".format(camera=path.stem, n=n)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(source.read_bytes())
+    mattes = capture / "mattes" if masks.startswith("mattes") else None
+    folder = CaptureFolder(capture / "rgbs", capture / "cameras.json", mattes)
     assert folder.instants == instants
-    for one, other in zip(folder.photographs(instants[-1]), read(capture).photographs, strict=True):
-        np.testing.assert_array_equal(one.matte, other.matte)
+    require_right(folder.photographs(instants[-1]))
 
 
 def test_a_mask_of_another_camera_is_no_mask(capture):
@@ -185,19 +198,10 @@ def test_a_turned_photograph_of_a_calibration_without_size(capture):
         exif = Image.Exif()
         exif[0x0112] = 6
         Image.fromarray(np.rot90(np.asarray(Image.open(path)))).save(path, exif=exif)
-    for photograph, mask in zip(read(capture).photographs, Figure().masks, strict=True):
-        np.testing.assert_array_equal(photograph.mask, mask)
+    require_right(read(capture).photographs)
     assert diagnose(
         CaptureFolder(capture / "images", capture / "cameras.json", masks=capture / "masks")
     ).consistent
-
-
-@pytest.mark.parametrize("change", [str.upper, str.title, lambda n: n.replace("cam", "Cam")])
-def test_names_in_another_case(capture, change):
-    """``CAM0.PNG`` of Windows is of the camera ``cam0``."""
-    for folder in ("images", "masks"):
-        rename(capture, folder, change)
-    assert [photograph.name for photograph in read(capture).photographs] == Figure().names
 
 
 def test_cameras_that_differ_by_case_alone(capture):
@@ -218,73 +222,62 @@ def test_masks_that_a_windows_program_names(capture):
     shared = {"fl_x": size["intrinsics"][0][0], "w": size["width"], "h": size["height"], "frames": frames}
     write(capture / "cameras.json", shared)
     found = Capture.read(capture / "images", capture / "cameras.json", calibration={"axes": "opencv"})
-    for photograph, mask in zip(found.photographs, Figure().masks, strict=True):
-        np.testing.assert_array_equal(photograph.mask, mask)
+    require_right(found.photographs)
     (capture / "masks" / "cam0.png").unlink()
     with pytest.raises(InputError, match=r"masks\\cam0\.PNG: expected an image; found no such file"):
         Capture.read(capture / "images", capture / "cameras.json")
 
 
-def test_numbered_cameras_have_photographs_of_other_names(capture):
-    renamed(capture, lambda name: name.removeprefix("cam"))
-    for folder in ("images", "masks"):
-        rename(capture, folder, lambda name: name.replace("cam", "view"))
-    names = {f"view{n}": n for n in range(4)}
-    assert len(read(capture, calibration={"names": names}).photographs) == 4
-
-
-def test_letters_of_macos(capture):
-    """An umlaut of two characters in names of files, of one in the calibration."""
-    renamed(capture, lambda name: name.replace("cam", "K\u00e4the"))
-    for folder, form in (("images", "NFD"), ("masks", "NFC")):
-        rename(capture, folder, lambda n, form=form: unicodedata.normalize(form, n.replace("cam", "Käthe")))
-    assert len(read(capture).photographs) == 4
-
-
-def test_a_folder_of_macos(capture):
-    """An instant, and a camera's folder, whose name has an umlaut of two characters."""
-    name = unicodedata.normalize("NFD", "K\u00e4the")
+def one_folder_down(capture, name):
     for folder in ("images", "masks"):
         (capture / folder).rename(capture / name)
         (capture / folder).mkdir()
         (capture / name).rename(capture / folder / name)
-    folder = CaptureFolder(capture / "images", capture / "cameras.json", masks=capture / "masks")
-    assert [len(folder.photographs(instant)) for instant in folder.instants] == [4]
 
 
-def test_hidden_folders_are_no_instants(capture):
-    for folder in ("images", "masks"):
-        (capture / folder).rename(capture / "001")
-        (capture / folder).mkdir()
-        (capture / "001").rename(capture / folder / "001")
+@pytest.mark.parametrize("name", ["001", unicodedata.normalize("NFD", "K\u00e4the")])
+def test_an_instant_beside_hidden_folders(capture, name):
+    """Jupyter's, and a name of macOS, whose umlaut has two characters."""
+    one_folder_down(capture, name)
     hidden = capture / "images" / ".ipynb_checkpoints"
     hidden.mkdir()
     Image.new("RGB", (8, 8)).save(hidden / "cam0-checkpoint.png")
     folder = CaptureFolder(capture / "images", capture / "cameras.json", masks=capture / "masks")
-    assert folder.instants == ["001"]
+    (instant,) = folder.instants
+    require_right(folder.photographs(instant))
 
 
-def matte(tmp_path, image):
+VALUES = np.zeros((40, 30), np.uint8)
+VALUES[10:30, 8:22] = 255
+VOID = VALUES.copy()
+VOID[12:28, 10:20] = 15  # VOC: the person is 15, the rim around it 255
+SOFT = np.where(VOID == 15, 255, np.where(VALUES == 255, 15, 0)).astype(np.uint8)
+DEEP = np.resize(np.array([0, 65535, 32768, 257, 40000, 1], np.uint16), (40, 30))
+MATTES = {
+    "void": (Image.fromarray(VOID), (VOID == 15) * 255),
+    "void of a palette": (Image.fromarray(VOID).convert("P"), (VOID == 15) * 255),
+    "a soft matte": (Image.fromarray(SOFT), SOFT),
+    "16 bits": (Image.fromarray(DEEP), np.resize([0, 255, 128, 1, 156, 0], (40, 30))),
+    "constant alpha": (Image.fromarray(VALUES).convert("RGBA"), VALUES),
+    "constant alpha of grey": (Image.fromarray(VALUES).convert("LA"), VALUES),
+}
+
+
+@pytest.mark.parametrize("name", MATTES)
+def test_mattes_of_files(tmp_path, name):
+    image, expected = MATTES[name]
     image.save(tmp_path / "mask.png")
-    return matte_of_file(tmp_path / "mask.png", Pixels(np.zeros((40, 30, 3), np.uint8), None, 0))
+    pixels = Pixels(np.zeros((40, 30, 3), np.uint8), None, 0)
+    np.testing.assert_array_equal(matte_of_file(tmp_path / "mask.png", pixels), expected)
 
 
-def test_void_is_not_the_subject(tmp_path):
-    """VOC: the person is 15, the rim around it 255;
-    a soft matte has values between, and white is more."""
-    values = np.zeros((40, 30), np.uint8)
-    values[10:30, 8:22] = 255
-    values[12:28, 10:20] = 15
-    for mode in ("L", "P"):
-        image = Image.fromarray(values)
-        image = image if mode == "L" else image.convert("P")
-        np.testing.assert_array_equal(matte(tmp_path, image), (values == 15) * 255)
-    soft = np.where(values == 255, 15, np.where(values == 15, 255, 0)).astype(np.uint8)
-    np.testing.assert_array_equal(matte(tmp_path, Image.fromarray(soft)), soft)
-
-
-@pytest.mark.parametrize("mode", ["RGBA", "LA"])
-def test_alpha_that_says_nothing_leaves_the_colour(tmp_path, mode):
-    values = np.zeros((40, 30), np.uint8)
-    values[10:30, 8:22] = 255
-    np.testing.assert_array_equal(matte(tmp_path, Image.fromarray(values).convert(mode)), values)
+@pytest.mark.parametrize("turns", [1, 3])
+def test_a_mask_of_the_stored_pixels_is_turned_as_its_photograph(tmp_path, turns):
+    """Photographs of phones are turned when they are read; their masks may be stored either way."""
+    stored = np.zeros((4, 6), np.uint8)
+    stored[0, :2] = 255
+    shown = np.rot90(stored, turns)
+    pixels = Pixels(np.zeros((*shown.shape, 3), np.uint8), None, turns)
+    for mask in (stored, np.ascontiguousarray(shown)):
+        Image.fromarray(mask).save(tmp_path / "mask.png")
+        np.testing.assert_array_equal(matte_of_file(tmp_path / "mask.png", pixels), shown)

@@ -61,20 +61,6 @@ def test_floaters_and_scales_of_nothing_stay_finite(gaussians):
     assert len(packed_and_back(gaussians.select(slice(0, 0), (0,)))) == 0
 
 
-def test_gaussians_of_pixels_side_by_side_take_few_bytes():
-    """A smooth surface: a fifth of the same Gaussians in no order."""
-    rows, columns = torch.meshgrid(torch.arange(60.0), torch.arange(60.0), indexing="ij")
-    means = torch.stack([columns * PIXEL, rows * PIXEL, (rows / 20).sin()], -1).flatten(0, 1)
-    gaussians = body(3600, 120)
-    same = {name: getattr(gaussians, name)[:1].expand(3600, -1) for name in ("quaternions", "scales")}
-    colors = torch.stack([rows, columns, rows + columns], -1).flatten(0, 1) / 120
-    gaussians = dataclasses.replace(gaussians, means=means, colors=colors, **same)
-    shuffled = gaussians.select(torch.randperm(3600, generator=torch.Generator().manual_seed(0)), (3600,))
-    opaque = [dataclasses.replace(g, opacities=torch.full((3600,), 0.9)) for g in (gaussians, shuffled)]
-    smooth, rough = (len(pack(g, PIXEL, torch.zeros(3), COARSE)) for g in opaque)
-    assert smooth < rough / 5
-
-
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
 def test_the_page_unpacks_the_same(gaussians, tmp_path):
     """Its own functions, in another program: the shader's table has the numbers of our reader."""
