@@ -81,29 +81,30 @@ def check_cameras(folder: CaptureFolder) -> None:
         InputError: they contradict each other in all of these, or the only instant cannot be read.
     """
     from ghgs_capture.camera_report import diagnose, in_parts
+    from ghgs_capture.rig import spread
 
-    names = folder.instants
-    diagnoses = {}
-    last = len(names) - 1
-    for place in sorted({round(last * i / (_CHECKED - 1)) for i in range(_CHECKED)}):
+    several = len(folder.instants) > 1
+    diagnoses = []
+    for name in spread(folder.instants, _CHECKED):
         try:
-            diagnoses[names[place]] = diagnose(folder, names[place])
+            diagnosis = diagnose(folder, name)
         except InputError:
-            if not last:
+            if not several:
                 raise
-    if not diagnoses:
-        print("cameras are not checked: none of the instants looked at can be read", flush=True)
-    for name, diagnosis in diagnoses.items():
+            continue
+        diagnoses.append(diagnosis)
         parts = in_parts(diagnosis.best.views)
         if len(parts) > 1:
             print(f"instant {name}: masks of {', '.join(parts)} have two large parts, taken for one subject")
-        if not diagnosis.consistent and last:
+        if several and not diagnosis.consistent:
             print(f"instant {name}: cameras and masks do not fit: {'; '.join(diagnosis.lines)}", flush=True)
-    sound = [diagnosis for diagnosis in diagnoses.values() if diagnosis.consistent]
-    for diagnosis in (sound or list(diagnoses.values()))[:1]:
-        if not diagnosis.consistent:
-            raise InputError(
-                "cameras: expected cameras that fit photographs and masks"
-                f" (check_cameras=false goes on anyway); found {'; '.join(diagnosis.lines)}"
-            )
-        print("\n".join(diagnosis.lines), flush=True)
+    if not diagnoses:
+        print("cameras are not checked: none of the instants looked at can be read", flush=True)
+        return
+    best = max(diagnoses, key=lambda diagnosis: diagnosis.consistent)
+    if not best.consistent:
+        raise InputError(
+            "cameras: expected cameras that fit photographs and masks"
+            f" (check_cameras=false goes on anyway); found {'; '.join(best.lines)}"
+        )
+    print("\n".join(best.lines), flush=True)

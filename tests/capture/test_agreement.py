@@ -92,7 +92,7 @@ def test_what_a_photograph_cuts_is_not_missed():
     assert not agreement.failed.any()
 
 
-def test_masks_that_fail_are_mended_and_the_others_stay():
+def test_masks_that_fail_are_mended_and_the_others_stay(monkeypatch):
     """A head that one mask lacks in half of the instants, and an object that another one has."""
     of = figure()
     instants = []
@@ -106,6 +106,14 @@ def test_masks_that_fail_are_mended_and_the_others_stay():
             masks[0][200:240, 5:35] = True
         instants.append((right, capture(of, str(number), number, masks, 6 * number - 20)))
     backgrounds = Backgrounds.of([instant for _, instant in instants])
+    rounds = []
+    mend = Backgrounds._mended
+
+    def spy(self, capture, agreement):
+        rounds.append((capture.photographs, agreement.photographs))
+        return mend(self, capture, agreement)
+
+    monkeypatch.setattr(Backgrounds, "_mended", spy)
     for number, (right, instant) in enumerate(instants):
         mended = backgrounds.applied(instant)
         wrong = {2} if number >= COUNT // 2 else set()
@@ -114,6 +122,9 @@ def test_masks_that_fail_are_mended_and_the_others_stay():
             assert (after is before) == (view not in wrong)
             if view in wrong:
                 assert (after.mask ^ right[view]).sum() < 0.4 * (before.mask ^ right[view]).sum()
+    assert len(rounds) > COUNT
+    # Each round has the hulls of its own masks, not of those before they were mended.
+    assert all(a is b for masks, hulls in rounds for a, b in zip(masks, hulls, strict=True))
 
 
 def without_half_a_head(mask, inside):
