@@ -15,11 +15,10 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from ghgs_lit.config import build, compose
-from ghgs_lit.data.dataset import DataSet
-from ghgs_lit.data.humman.dataset import HuMMan
-from ghgs_lit.data.options import required_folder
+from ghgs_lit.data.dataset import DataSet, required_folder
+from ghgs_lit.data.humman import HuMMan
 from ghgs_lit.data.reader import PHASES
-from ghgs_lit.data.zju_mocap.dataset import ZJUMoCap
+from ghgs_lit.data.zju_mocap import ZJUMoCap
 from ghgs_lit.errors import InputError
 from ghgs_people.thuman2 import THuman2
 from scripts.miniatures import humman, scans, thuman2, zju_mocap

@@ -115,8 +115,8 @@ KINDS: dict[str, dict[str | None, str]] = {
     "evaluation": {None: "ghgs_lit.config.nodes.EvaluationOptions"},
     "trainer": {"lightning": "ghgs_lit.training.trainer.TrainerOptions"},
     "data": {
-        "humman": "ghgs_lit.data.humman.dataset.HuMMan",
-        "zju_mocap": "ghgs_lit.data.zju_mocap.dataset.ZJUMoCap",
+        "humman": "ghgs_lit.data.humman.HuMMan",
+        "zju_mocap": "ghgs_lit.data.zju_mocap.ZJUMoCap",
     },
     "views": {None: "ghgs_lit.data.sampling.ViewProtocol"},
     "targets": {None: "ghgs_lit.data.sampling.TargetProtocol"},

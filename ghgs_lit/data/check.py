@@ -11,11 +11,11 @@ from rich.console import Console
 from rich.progress import track
 from torch.utils.data import Dataset
 
+from ghgs_lit.data.batches import loader_of
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.mask_checks import SEARCH, height, implausible, overlap, silhouette, twins
 from ghgs_lit.data.reader import PHASES, PhotographCache, Reader
 from ghgs_lit.data.sampling import CAMERAS, RING_VIEW, TargetProtocol
-from ghgs_lit.data.workers import loader_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.silhouettes import Silhouette
 

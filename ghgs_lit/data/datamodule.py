@@ -4,7 +4,7 @@ import dataclasses
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from lightning import LightningDataModule, Trainer
@@ -12,8 +12,14 @@ from torch.utils.data import DataLoader
 
 from ghgs_lit.config.registry import read_node
 from ghgs_lit.data.augmentation import Augmentation
-from ghgs_lit.data.batches import BatchBuilder, EvaluationBatches, StepSampler, TrainingBatches
-from ghgs_lit.data.options import LoadingOptions
+from ghgs_lit.data.batches import (
+    BatchBuilder,
+    EvaluationBatches,
+    StepSampler,
+    TrainingBatches,
+    automatic_workers,
+    loader_of,
+)
 from ghgs_lit.data.packed import Packing, folder_of, packed_reader
 from ghgs_lit.data.reader import PHASES, PhotographCache
 from ghgs_lit.data.sampling import (
@@ -24,9 +30,11 @@ from ghgs_lit.data.sampling import (
     ViewProtocol,
     evaluation_samples,
 )
-from ghgs_lit.data.workers import automatic_workers, loader_of
 from ghgs_lit.errors import InputError, choice
 from ghgs_lit.types import Batch
+
+if TYPE_CHECKING:  # which builds the module
+    from ghgs_lit.data.dataset import DataOptions
 
 log = logging.getLogger(__name__)
 
@@ -88,7 +96,7 @@ class PhotographsDataModule(LightningDataModule):
 
     def __init__(
         self,
-        dataset: LoadingOptions,
+        dataset: "DataOptions",
         views: ViewProtocol | Mapping[str, Any],
         targets: Targets,
         seed: int = 0,
@@ -216,7 +224,7 @@ class PhotographsDataModule(LightningDataModule):
         if data.packed_gb <= 0 or not reader.subjects:
             return photographs
         # Photographs that are resized in each step are packed as they are stored.
-        size = None if self.augmentation.varies_sizes or photographs.is_stored_size else photographs.size
+        size = None if self.augmentation.varies_sizes else photographs.size
         views = tuple(sorted({RING_VIEW, *self.targets.training_views}))
         there = sum(map(len, reader.subjects.values())) * len(views)
         packing = Packing(folder_of(data.folder), size, data.resampling, views, depths, writes=reads > there)

@@ -12,6 +12,7 @@ interrupted is written again, and where two processes write the same file, eithe
 import contextlib
 import functools
 import hashlib
+import itertools
 import json
 import logging
 import os
@@ -34,16 +35,14 @@ log = logging.getLogger(__name__)
 
 #: Changes with the format of the files and with every change of how photographs are
 #: decoded or resized.
-_VERSION = 1
+_VERSION = 2
 #: Files that a process keeps open.
 _OPEN_FILES = 128
 #: Largest share of the free disk that packed photographs may take.
 _SHARE_OF_DISK = 0.5
-#: Numbers of each photograph in a file: where it begins, its size, the part of it that is kept,
-#: its maps.
-_COLUMNS = ("position", "view", "start", "height", "width", "top", "bottom", "left", "right", "maps")
-_MATTE = 1
-_DEPTH = 2
+#: Arrays of a photograph of which the part that is not black is kept, and its whole ones.
+_MAPS = ("image", "mask", "matte", "inverse_depth")
+_CAMERA = ("intrinsics", "extrinsics")
 
 
 @dataclass(frozen=True)
@@ -100,10 +99,8 @@ class PackedReader(Reader):
             depth: also read the depth map; from its own file where depth maps are not packed.
         """
         pack = self.pack(name)
-        packed_view = None
-        if pack is not None and depth <= self.packing.depths:
-            packed_view = pack.view(position, view, depth)
-        return self._resized(name, position, view, depth) if packed_view is None else packed_view
+        packed = None if pack is None or depth > self.packing.depths else pack.view(position, view, depth)
+        return self._unpacked(name, position, view, depth) if packed is None else packed
 
     checked_view = read_view  # was checked before it was packed
 
@@ -111,11 +108,11 @@ class PackedReader(Reader):
         pack = self.pack(name)
         return self.reader.read_body(name) if pack is None else pack.body
 
-    def views_at(self, name: str, position: int) -> list[int]:
-        return self.reader.views_at(name, position)
-
-    def place(self, name: str, position: int, view: int) -> str:
-        return self.reader.place(name, position, view)
+    def _unpacked(self, name: str, position: int, view: int, depth: bool) -> View:
+        """A photograph as :meth:`read_view` gives it, read from its own files."""
+        stored = self.reader.checked_view(name, position, view, depth)
+        size = self.packing.size
+        return stored if size is None else resize_view(stored, *size, self.packing.resampling)
 
     def pack(self, name: str) -> "Pack | None":
         """The packed file of a subject, written if it is missing; None: there is none."""
@@ -146,55 +143,23 @@ class PackedReader(Reader):
 
     def _write(self, name: str, path: Path) -> None:
         """Write the file of a subject and remove older ones of the same settings."""
-        content = self._content(name)
+        content = {}
+        for position, view in itertools.product(self.subjects[name], self.packing.views):
+            with contextlib.suppress(InputError):  # raised when it is drawn
+                photograph = self._unpacked(name, position, view, self.packing.depths)
+                content |= _packed(position, view, photograph)
+        body = self.reader.read_body(name)
+        if body is not None:
+            content["body"] = body
         try:
             write_atomically(path, lambda temporary: temporary.write_bytes(save(content)))
             beginning = path.name.rpartition("-")[0] + "-"
-            for other in os.listdir(path.parent):
-                if other.startswith(beginning) and other != path.name and other.endswith(path.suffix):
-                    (path.parent / other).unlink(missing_ok=True)
+            for other in path.parent.iterdir():
+                if other.name.startswith(beginning) and other.suffix == path.suffix and other != path:
+                    other.unlink(missing_ok=True)
         except OSError as error:
             self._writes = False
             log.warning("%s: expected room for packed photographs; found %s", path, error.strerror)
-
-    def _content(self, name: str) -> dict[str, np.ndarray]:
-        rows = []
-        matrices = []
-        parts = [np.empty(0, np.uint8)]
-        start = 0
-        for position in self.subjects[name]:
-            for view in self.packing.views:
-                try:
-                    photograph = self._resized(name, position, view, self.packing.depths)
-                except InputError:  # said when it is drawn
-                    continue
-                row, part = _packed(photograph)
-                rows.append((position, view, start, *row))
-                matrices.append(
-                    np.concatenate((photograph.intrinsics.ravel(), photograph.extrinsics.ravel()))
-                )
-                parts.append(part)
-                start += len(part)
-        content = {
-            "pixels": np.concatenate(parts),
-            "rows": np.array(rows, np.int64).reshape(-1, len(_COLUMNS)),
-            "matrices": np.array(matrices, np.float32).reshape(-1, 25),
-        }
-        body = self.reader.read_body(name)
-        return content if body is None else content | {"body": body}
-
-    def _resized(self, name: str, position: int, view: int, depth: bool) -> View:
-        """A photograph as it is packed, read from its own files.
-
-        Args:
-            name: of the subject.
-            position: number of the camera, or position on the ring.
-            view: its number at the position.
-            depth: also read the depth map, if there is any.
-        """
-        stored = self.reader.checked_view(name, position, view, depth)
-        size = self.packing.size
-        return stored if size is None else resize_view(stored, *size, self.packing.resampling)
 
 
 class Pack:
@@ -208,11 +173,8 @@ class Pack:
     def __init__(self, path: Path) -> None:
         self.bytes = path.stat().st_size
         self._file = safe_open(path, "np")
-        rows = self._file.get_tensor("rows")
-        self._rows = {(row[0], row[1]): (i, *row[2:]) for i, row in enumerate(rows.tolist())}
-        self._matrices = self._file.get_tensor("matrices")
-        self._pixels = self._file.get_slice("pixels")
-        self.body = self._file.get_tensor("body") if "body" in self._file.keys() else None  # noqa: SIM118
+        self._names = frozenset(self._file.keys())
+        self.body = self._file.get_tensor("body") if "body" in self._names else None
 
     def view(self, position: int, view: int, depth: bool) -> View | None:
         """One photograph.
@@ -225,47 +187,34 @@ class Pack:
         Returns:
             The photograph at its packed size; None: it is not in the file.
         """
-        if (position, view) not in self._rows:
+        place = f"{position}/{view}/"
+        if place + "box" not in self._names:
             return None
-        number, start, height, width, top, bottom, left, right, maps = self._rows[position, view]
-        part = (bottom - top, right - left)
-        count = part[0] * part[1]
-        kinds = [("image", np.uint8, (3,)), ("mask", np.bool_, ())]
-        kinds += [("matte", np.uint8, ())] if maps & _MATTE else []
-        depths = maps & _DEPTH
-        pixels = self._pixels[start : start + count * (4 + bool(maps & _MATTE) + 2 * bool(depths))]
-        whole: dict[str, np.ndarray | None] = {"matte": None, "inverse_depth": None}
-        if depths and depth:
-            kinds.insert(0, ("inverse_depth", np.uint16, ()))
-        first = 2 * count if depths and not depth else 0
-        for kind, dtype, channels in kinds:
-            end = first + count * np.dtype(dtype).itemsize * (channels or (1,))[0]
-            whole[kind] = np.zeros((height, width, *channels), dtype)
-            whole[kind][top:bottom, left:right] = pixels[first:end].view(dtype).reshape(*part, *channels)
-            first = end
-        matrices = self._matrices[number]
-        return View(**whole, intrinsics=matrices[:9].reshape(3, 3), extrinsics=matrices[9:].reshape(4, 4))
+        height, width, top, bottom, left, right = self._file.get_tensor(place + "box").tolist()
+        arrays = {name: self._file.get_tensor(place + name) for name in _CAMERA}
+        for name in _MAPS:
+            arrays[name] = None
+            if place + name in self._names and (depth or name != "inverse_depth"):
+                part = self._file.get_tensor(place + name)
+                arrays[name] = np.zeros((height, width, *part.shape[2:]), part.dtype)
+                arrays[name][top:bottom, left:right] = part
+        return View(**arrays)
 
 
-def _packed(view: View) -> tuple[tuple[int, ...], np.ndarray]:
-    """Size, kept part and maps of a photograph, and its bytes: depths first,
-    where they are aligned."""
-    named = [(_DEPTH, view.inverse_depth), (0, view.image), (0, view.mask), (_MATTE, view.matte)]
-    there = [(flag, array) for flag, array in named if array is not None]
+def _packed(position: int, number: int, view: View) -> dict[str, np.ndarray]:
+    """Arrays of a photograph by their names in the file."""
+    maps = {name: array for name in _MAPS if (array := getattr(view, name)) is not None}
     shown = view.image.any(-1)
-    for _, array in there:
+    for array in maps.values():
         if array.ndim == 2:
             shown = shown | (array != 0)
-    shown[0, 0] |= not shown.any()  # a part has a pixel
-    rows = np.flatnonzero(shown.any(1))
-    columns = np.flatnonzero(shown.any(0))
-    top = int(rows[0])
-    bottom = int(rows[-1]) + 1
-    left = int(columns[0])
-    right = int(columns[-1]) + 1
-    parts = [np.ascontiguousarray(array[top:bottom, left:right]).view(np.uint8).ravel() for _, array in there]
-    maps = sum(flag for flag, _ in there)
-    return (*view.mask.shape, top, bottom, left, right, maps), np.concatenate(parts)
+    places = np.argwhere(shown)
+    top, left = places.min(0)
+    bottom, right = places.max(0) + 1
+    arrays = {name: np.ascontiguousarray(array[top:bottom, left:right]) for name, array in maps.items()}
+    arrays |= {name: np.ascontiguousarray(getattr(view, name)) for name in _CAMERA}
+    arrays["box"] = np.array([*view.mask.shape, top, bottom, left, right], np.int64)
+    return {f"{position}/{number}/{name}": array for name, array in arrays.items()}
 
 
 def _opened(path: Path) -> Pack | None:

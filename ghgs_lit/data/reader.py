@@ -5,10 +5,9 @@ A data set provides a :class:`Reader`, which finds and decodes its files. Resizi
 """
 
 import contextlib
-import logging
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,6 @@ import numpy as np
 from ghgs_lit.data.decoding import check_array, check_view
 from ghgs_lit.data.view import View, resize_view
 from ghgs_lit.errors import InputError, require
-
-log = logging.getLogger(__name__)
 
 PHASES = ("train", "val")
 
@@ -142,41 +139,6 @@ class Reader(ABC):
             raise InputError(line)
 
 
-class FrameReader(Reader):
-    """Reader whose subjects are frames of sequences;
-    ``frames[subject].folder`` is the sequence's folder."""
-
-    def __init__(self, strict: bool = True) -> None:
-        super().__init__(strict)
-        self.frames: dict[str, Any] = {}
-
-    @property
-    def sequences(self) -> set[str]:
-        """Names of the sequences that the subjects are frames of."""
-        return {self.frames[name].folder.name for name in self.subjects}
-
-    @property
-    def people(self) -> int:
-        return len(self.sequences)
-
-    def existing(self, folder: Path, names: Sequence[str], phase: str, example: str) -> list[str]:
-        """Existing sequences among names.
-
-        Args:
-            folder: of the sequences.
-            names: of sequences.
-            phase: that they are of, for messages.
-            example: name that the message shows where none of them exists, which is a problem.
-        """
-        there = [name for name in names if (folder / name).is_dir()]
-        if 0 < len(there) < len(names):
-            log.warning("%s: %d of %d sequences of %s are there", folder, len(there), len(names), phase)
-        if not there:
-            some = "such as" if names else "beside those of val, such as"
-            self.problem(f"{folder}: expected sequences {some} {example}; found none of {phase}")
-        return there
-
-
 class PhotographCache:
     """Photographs of a reader, resized and cached.
 
@@ -226,14 +188,6 @@ class PhotographCache:
             return stored if size is None else resize_view(stored, *size, self.resampling)
 
         return self._cached((name, position, view, depth, size), read)
-
-    @property
-    def is_stored_size(self) -> bool:
-        """Whether the first photograph that can be read has :attr:`size` as it is stored."""
-        for name, positions in self.reader.subjects.items():
-            with contextlib.suppress(InputError):
-                return self.reader.read_view(name, positions[0], 0, False).mask.shape == self.size
-        return False
 
     def body(self, name: str) -> np.ndarray | None:
         """Body vertices as :meth:`Reader.read_body`.

@@ -237,19 +237,6 @@ def half_centers(intrinsics: np.ndarray) -> np.ndarray:
     return intrinsics + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
 
-def opencv_view(image: np.ndarray, mask: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray) -> View:
-    """View from an OpenCV calibration, with a black background.
-
-    Args:
-        image: [h, w, 3] uint8, RGB.
-        mask: [h, w] bool, true on the subject.
-        intrinsics: [3, 3] in pixels, pixel centres at integers.
-        extrinsics: [4, 4], world to camera, metres.
-    """
-    image = np.where(mask[..., None], image, 0)
-    return View(image, mask, None, half_centers(intrinsics).astype(np.float32), extrinsics.astype(np.float32))
-
-
 def resize_view(view: View, height: int, width: int, resampling: str = "area") -> View:
     """Resize a photograph with its mask and depth map, and scale its intrinsics.
 

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from ghgs_lit.config import run_of
-from ghgs_lit.data.humman import smpl
+from ghgs_lit.data import smpl
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.weights.checkpoint import write_checkpoint
 from scripts.miniatures import humman, thuman2, zju_mocap

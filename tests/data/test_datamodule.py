@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ghgs_lit.data.datamodule import trained_batches
-from ghgs_lit.data.humman.dataset import HuMMan
+from ghgs_lit.data.humman import HuMMan
 from ghgs_lit.errors import InputError
 from ghgs_people.datasets import Scans, Synthetic
 from tests.helpers.people import TINY, render_boxes, rendered

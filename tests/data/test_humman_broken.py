@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ghgs_lit.data.humman.smpl import read_model, read_parameters
+from ghgs_lit.data.smpl import read_model, read_parameters
 from scripts.miniatures import humman
 from scripts.miniatures.smpl import stand_in
 from tests.helpers.captures import (
@@ -75,11 +75,11 @@ CASES = {
     "truncated cameras": (lambda f: truncate(f / "cameras.json"), r"cameras.json: expected the cameras"),
     "a camera missing": (
         calibrated(lambda c: c.pop("kinect_color_007")),
-        r"cameras.json: expected K of kinect_color_007; found none",
+        r"cameras.json: kinect_color_007: expected K; found none",
     ),
     "no T": (
         calibrated(lambda c: c["kinect_color_003"].pop("T")),
-        r"expected T of kinect_color_003; found none",
+        r"kinect_color_003: expected T; found none",
     ),
     "R and T swapped": (calibrated(swap), r"kinect_color_000: R: expected an array 3x3; found 3"),
     "NaN camera": (put("T", [float("nan")] * 3), r"kinect_color_003: T: expected finite numbers; found NaN"),

@@ -77,8 +77,6 @@ def test_samples_come_from_the_packed_files(root):
         patch.setattr("ghgs_lit.data.layout.read_photograph", refuse)
         with pytest.raises(AssertionError):
             batches(root, gb=0)
-        # The first photograph's size is compared with the size that is asked for.
-        patch.setattr("ghgs_lit.data.reader.PhotographCache.is_stored_size", False)
         assert all(map(equal, batches(root), expected))
     assert [path.stat().st_mtime_ns for path in files(root)] == times
 

@@ -11,15 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from ghgs_lit.data import workers
-from ghgs_lit.data.workers import automatic_workers, loader_of
+from ghgs_lit.data.batches import automatic_workers, loader_of
 from tests.helpers.people import equal, render_boxes, rendered
 
 MANY = float("inf")
 
 
 @pytest.mark.parametrize(
-    ("batches", "processes", "on_gpu", "cores", "expected"),
+    ("count", "processes", "on_gpu", "cores", "expected"),
     [
         (MANY, 1, False, 2, 0),
         (MANY, 1, False, 64, 0),
@@ -32,16 +31,16 @@ MANY = float("inf")
         (100, 1, True, 96, 8),
     ],
 )
-def test_processes_by_cores_devices_and_batches(monkeypatch, batches, processes, on_gpu, cores, expected):
+def test_processes_by_cores_devices_and_batches(monkeypatch, count, processes, on_gpu, cores, expected):
     """A GPU leaves the cores to loading, a CPU none;
     a few batches come sooner than a process starts."""
-    monkeypatch.setattr(workers.multiprocessing, "get_start_method", lambda: "fork")
-    assert automatic_workers(batches, processes, on_gpu, cores) == expected
+    monkeypatch.setattr("ghgs_lit.data.batches.multiprocessing.get_start_method", lambda: "fork")
+    assert automatic_workers(count, processes, on_gpu, cores) == expected
 
 
 def test_processes_that_import_pytorch_first_start_for_more_batches(monkeypatch):
     """As on macOS, where a start takes seconds."""
-    monkeypatch.setattr(workers.multiprocessing, "get_start_method", lambda: "spawn")
+    monkeypatch.setattr("ghgs_lit.data.batches.multiprocessing.get_start_method", lambda: "spawn")
     assert automatic_workers(100, 1, True, 96) == 0
     assert automatic_workers(1000, 1, True, 96) == 8
 

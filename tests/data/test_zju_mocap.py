@@ -15,8 +15,7 @@ from ghgs_lit.data.pickles import load_npy
 from ghgs_lit.data.reader import PhotographCache
 from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.data.view import half_centers, resize_view
-from ghgs_lit.data.zju_mocap.annotations import frame_number, read_annotations
-from ghgs_lit.data.zju_mocap.dataset import ZJUMoCap
+from ghgs_lit.data.zju_mocap import ZJUMoCap, frame_number, read_annotations
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.undistortion import undistort, undistorting_grid
 from scripts.miniatures import zju_mocap
@@ -251,7 +250,8 @@ def test_lens_coefficients_of_any_shape_are_read(root, tmp_path, shape):
     content = load_npy(root / "CoreView_386" / "annots.npy")
     content["cams"]["D"] = [np.ravel(d)[: np.prod(shape)].reshape(shape) for d in content["cams"]["D"]]
     np.save(folder / "annots.npy", content)
-    assert len(read_annotations(folder / "annots.npy").distortions[0]) == np.prod(shape)
+    cameras, _ = read_annotations(folder / "annots.npy")
+    assert len(cameras[0].distortion) == np.prod(shape)
 
 
 def test_the_new_fit_is_preferred(root, tmp_path):
@@ -352,11 +352,11 @@ def test_targets_between_cameras_that_stand_still_are_refused(root):
 def test_photographs_are_undistorted_about_their_own_pixel_centers(root):
     """Calibrations count centres from integers;
     half a pixel would bend the photograph elsewhere."""
-    annotations = read_annotations(root / "CoreView_386" / "annots.npy")
+    cameras, frames = read_annotations(root / "CoreView_386" / "annots.npy")
     bent = photographs(root, undistorted=False).view("CoreView_386_000000", 7)
-    path = root / "CoreView_386" / annotations.frames[0][7]
+    path = root / "CoreView_386" / frames[0][7]
     image = np.asarray(Image.open(path).convert("RGB"))
-    lens = half_centers(annotations.intrinsics[7]), annotations.distortions[7]
+    lens = half_centers(cameras[7].intrinsics), cameras[7].distortion
     straight, matte = undistort(image, bent.mask * np.uint8(255), undistorting_grid(*lens, *image.shape[:2]))
     view = photographs(root).view("CoreView_386_000000", 7)
     np.testing.assert_array_equal(view.mask, matte > 127)

@@ -94,9 +94,9 @@ CASES = {
     ),
     "focal length 0": (
         put("K", np.diag([0.0, 1, 1])),
-        r"K of camera 3: expected focal lengths above 0; found 0.0, 1.0",
+        r"camera 3: K: expected focal lengths above 0; found 0.0, 1.0",
     ),
-    "lens of 3 numbers": (put("D", np.zeros((3, 1))), r"D of camera 3: expected an array 4 or 5; found 3"),
+    "lens of 3 numbers": (put("D", np.zeros((3, 1))), r"camera 3: D: expected an array 4 or 5; found 3"),
     "metres": (
         annotated(metres),
         r"expected translations T in millimetres; found cameras within \d+ mm .*metres",
@@ -205,7 +205,7 @@ def test_problems_are_collected_where_that_is_asked_for(whole, tmp_path):
         shutil.copytree(whole, tmp_path / f"CoreView_{sequence}")
     put("R", 2 * np.eye(3))(tmp_path / "CoreView_387")
     reader = build_data("zju_mocap", tmp_path).dataset.reader("train", strict=False)
-    assert reader.sequences == {"CoreView_386"}
+    assert list(reader.subjects) == ["CoreView_386_000000"]
     assert [line.split(": ")[0] for line in reader.problems] == [
         str(tmp_path / "CoreView_387" / "annots.npy")
     ]

@@ -61,7 +61,7 @@ def job(cfg) -> float | str | None:
 def load_and_record(run: Run, directory: Path, stats: dict[str, Any]) -> float:
     """:func:`record_execution` after two batches."""
     if run.data.workers != "auto":
-        from ghgs_lit.data.workers import loader_of
+        from ghgs_lit.data.batches import loader_of
 
         assert list(loader_of([1, 2], run.data.workers)) == [1, 2]
     return record_execution(run, directory, stats)

@@ -1,0 +1,206 @@
+"""Frames of sequences before the static cameras of a studio."""
+
+import logging
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ghgs_lit.config.options import Options
+from ghgs_lit.data.decoding import (
+    check_array,
+    check_center,
+    check_extrinsics,
+    check_intrinsics,
+    check_name,
+    read_map,
+    read_photograph,
+)
+from ghgs_lit.data.reader import Reader
+from ghgs_lit.data.view import View, half_centers
+from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.undistortion import undistort, undistorting_grid
+
+log = logging.getLogger(__name__)
+
+
+def check_frames(options: Options) -> None:
+    """Refuse a range ``options.frames`` without frames.
+
+    Raises:
+        InputError: start is not below stop.
+    """
+    start, stop, _ = options.frames
+    options.require(start < stop, "frames", "[start, stop, step] with start < stop")
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A calibrated camera as OpenCV has it.
+
+    Attributes:
+        intrinsics: [3, 3] in pixels, with pixel centres at integers.
+        extrinsics: [4, 4], world to camera, metres.
+        distortion: k1 k2 p1 p2 (k3), which are removed from photographs; None: nothing is removed.
+    """
+
+    intrinsics: np.ndarray
+    extrinsics: np.ndarray
+    distortion: np.ndarray | None = None
+
+
+def read_camera(place: str, values: Mapping[str, Any], unit: float = 1.0) -> Camera:
+    """Check a camera of OpenCV.
+
+    Args:
+        place: of the camera, for messages.
+        values: K (3, 3), R (3, 3) and T (3), world to camera.
+        unit: of T in metres.
+
+    Raises:
+        InputError: a value is missing or bad.
+    """
+    for name in ("K", "R", "T"):
+        if not isinstance(values, Mapping) or name not in values:
+            raise InputError(f"{place}: expected {name}; found none")
+    rotation = check_array(f"{place}: R", values["R"], [(3, 3)])
+    translation = check_array(f"{place}: T", values["T"], [(3,), (3, 1), (1, 3)]).reshape(3, 1) * unit
+    extrinsics = check_extrinsics(place, np.concatenate((rotation, translation), 1))
+    return Camera(check_intrinsics(f"{place}: K", values["K"]), extrinsics)
+
+
+def spread(cameras: Sequence[Camera]) -> float:
+    """Largest distance of a camera from the first one in metres."""
+    centers = np.stack([-one.extrinsics[:3, :3].T @ one.extrinsics[:3, 3] for one in cameras])
+    return float(np.linalg.norm(centers - centers[0], axis=-1).max())
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame of a sequence.
+
+    Attributes:
+        folder: of the sequence.
+        number: of the frame, in names of files.
+        cameras: all of the sequence.
+        positions: numbers of the cameras that are read.
+        photographs: path of each camera's photograph in ``folder``.
+    """
+
+    folder: Path
+    number: int
+    cameras: Sequence[Camera]
+    positions: tuple[int, ...]
+    photographs: Sequence[PurePosixPath]
+
+
+class FrameReader(Reader):
+    """Reader whose subjects are frames, named ``<sequence>_<frame number>``; positions are cameras.
+
+    Missing sequences are left out.
+
+    Args:
+        data: options of the data set.
+        phase: ``train`` or ``val``.
+        sequences: names and wanted frames.
+        example: name of a sequence, for messages.
+        strict: raise the first problem of the data, or collect all.
+
+    Raises:
+        InputError: all sequences are missing, or one is bad.
+    """
+
+    #: File of a sequence with its cameras.
+    calibration: ClassVar[str]
+
+    def __init__(
+        self, data: Any, phase: str, sequences: Sequence[tuple[str, range]], example: str, strict: bool
+    ) -> None:
+        super().__init__(strict)
+        self.data = data
+        self.frames: dict[str, Frame] = {}
+        folder = data.folder
+        there = [sequence for sequence in sequences if (folder / sequence[0]).is_dir()]
+        if 0 < len(there) < len(sequences):
+            log.warning("%s: %d of %d sequences of %s are there", folder, len(there), len(sequences), phase)
+        if not there:
+            some = "such as" if sequences else "beside those of val, such as"
+            self.problem(f"{folder}: expected sequences {some} {example}; found none of {phase}")
+        for name, wanted in there:
+            with self.collecting():
+                found = self.frames_of(folder / name, wanted)
+                self.frames |= {check_name(f"{name}_{frame.number:06d}"): frame for frame in found}
+                if len(found) < len(wanted):
+                    log.info("%s: %d of %d frames are there", folder / name, len(found), len(wanted))
+        self.frames = dict(list(self.frames.items())[: data.limit.of(phase)])
+        self.subjects = {name: frame.positions for name, frame in self.frames.items()}
+
+    @abstractmethod
+    def frames_of(self, folder: Path, wanted: range) -> list[Frame]:
+        """The wanted frames that a sequence has.
+
+        Args:
+            folder: of the sequence.
+            wanted: numbers of frames.
+
+        Raises:
+            InputError: cameras are bad, or there is no such frame.
+        """
+
+    @abstractmethod
+    def photograph(self, frame: Frame, position: int) -> Path:
+        """File of a photograph, whether it is there or not."""
+
+    @abstractmethod
+    def masks(self, frame: Frame, position: int) -> list[Path]:
+        """Files whose union is the mask of a photograph: any value but 0 is the subject."""
+
+    def body_files(self, frame: Frame) -> Sequence[Path]:
+        """Files that a frame's body depends on; the first is its own."""
+        return ()
+
+    @property
+    def people(self) -> int:
+        return len({frame.folder for frame in self.frames.values()})
+
+    def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
+        """See :meth:`Reader.read_view`; the background is black.
+
+        Args:
+            name: of the subject.
+            position: number of the camera.
+            view: not used; there are no views between cameras.
+            depth: not used; no depth maps are read.
+        """
+        frame = self.frames[name]
+        path = self.photograph(frame, position)
+        image = read_photograph(path)
+        size = image.shape[:2]
+        mask = np.zeros(size, bool)
+        for file in self.masks(frame, position):
+            mask |= read_map(file, size) != 0
+        camera = frame.cameras[position]
+        intrinsics = half_centers(camera.intrinsics)
+        check_center(path, camera.intrinsics, *size)
+        if camera.distortion is not None:
+            grid = undistorting_grid(intrinsics, camera.distortion, *size)
+            image, matte = undistort(image, mask * np.uint8(255), grid)
+            mask = matte > 127
+        image = np.where(mask[..., None], image, 0)
+        matrices = (matrix.astype(np.float32) for matrix in (intrinsics, camera.extrinsics))
+        return View(image, mask, None, *matrices)
+
+    def sources(self, name: str) -> Iterator[Path | str]:
+        frame = self.frames[name]
+        yield f"undistorted: {frame.cameras[0].distortion is not None}"
+        yield frame.folder / self.calibration
+        for position in frame.positions:
+            yield self.photograph(frame, position)
+            yield from self.masks(frame, position)
+        yield from self.body_files(frame)
+
+    def place(self, name: str, position: int, view: int) -> str:
+        return str(self.masks(self.frames[name], position)[0])

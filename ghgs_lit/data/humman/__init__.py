@@ -1,1 +1,0 @@
-"""Reader of HuMMan-Recon v1.0 as downloaded: one performer among ten Kinects."""

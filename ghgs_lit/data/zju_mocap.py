@@ -1,0 +1,239 @@
+"""Options and reader of ZJU-MoCap.
+
+``<root>/CoreView_<id>/`` holds ``annots.npy``, the photographs of each camera, ``mask_cihp/`` and
+sometimes ``mask/`` (label maps: any value but 0 is the subject), ``new_vertices/`` and ``vertices/``
+(<frame number>.npy: 6890 x 3, metres, world with z up).
+
+``annots.npy`` is a pickled dictionary in an array without dimensions: ``cams`` with lists ``K``
+(3, 3), ``D`` (4 or 5 coefficients in any shape), ``R`` (3, 3), ``T`` (3, 1) in **millimetres**, world
+to camera; ``ims`` with a dictionary for each frame, whose ``ims`` are the paths of its photographs in
+the order of the cameras. In sequences 313 and 315 these are the original long names, whose fifth
+field is the frame number from 1.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path, PurePath, PurePosixPath
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import AfterValidator, Field, model_validator
+
+from ghgs_lit.config.options import Count, Index, Options, Size, Text
+from ghgs_lit.data.dataset import DataSet
+from ghgs_lit.data.decoding import check_array, read_array
+from ghgs_lit.data.frames import Camera, Frame, FrameReader, check_frames, read_camera, spread
+from ghgs_lit.data.pickles import load_npy
+from ghgs_lit.errors import InputError
+from ghgs_lit.parsing import find_path
+
+MILLIMETRE = 0.001
+# Metres: cameras that are closer together were not given in millimetres.
+_NEAREST = 0.1
+BODY_VERTICES = 6890
+#: Folders of vertices, of which the first existing one is read.
+_BODIES = ("new_vertices", "vertices")
+
+
+def read_annotations(path: Path) -> tuple[list[Camera], list[tuple[PurePosixPath, ...]]]:
+    """Read and check an ``annots.npy``.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        The cameras of the sequence, and for each frame the paths of their photographs.
+
+    Raises:
+        InputError: it is missing, unsafe or broken, or an entry is bad.
+    """
+    content = load_npy(path)
+    cams = _entry(path, content, "cams")
+    ims = _entry(path, content, "ims")
+    lists = {key: _entry(f"{path}: cams", cams, key) for key in ("K", "D", "R", "T")}
+    counts = {key: len(values) for key, values in lists.items()}
+    if len(set(counts.values())) != 1 or not counts["K"]:
+        raise InputError(f"{path}: expected as many K, D, R and T in cams as cameras; found {counts}")
+    cameras = []
+    for k in range(counts["K"]):
+        place = f"{path}: camera {k}"
+        values = {key: values[k] for key, values in lists.items()}
+        lens = check_array(f"{place}: D", np.ravel(values["D"]), [(4,), (5,)])
+        if np.abs(lens).max() > 10:
+            raise InputError(
+                f"{place}: D: expected lens coefficients k1 k2 p1 p2 (k3); found {lens.tolist()}"
+            )
+        cameras.append(replace(read_camera(place, values, MILLIMETRE), distortion=lens))
+    if len(cameras) > 1 and (apart := spread(cameras)) < _NEAREST:
+        found = f"cameras within {apart / MILLIMETRE:.0f} mm of one another (metres?)"
+        raise InputError(f"{path}: expected translations T in millimetres; found {found}")
+    frames = [_photographs(f"{path}: frame {f}", entry, len(cameras)) for f, entry in enumerate(ims)]
+    return cameras, frames
+
+
+def _entry(place: Path | str, content: Any, key: str) -> Any:
+    entry = content.get(key) if isinstance(content, Mapping) else None
+    if entry is None or not isinstance(entry, (Mapping, Sequence, np.ndarray)):
+        known = sorted(map(str, content)) if isinstance(content, Mapping) else type(content).__name__
+        raise InputError(f"{place}: expected an entry {key!r}; found {known}")
+    return entry
+
+
+def _photographs(place: str, entry: Any, cameras: int) -> tuple[PurePosixPath, ...]:
+    """Paths of the photographs of a frame, in the order of the cameras.
+
+    Args:
+        place: of the frame, for messages.
+        entry: of the frame in ``ims``.
+        cameras: number of cameras.
+
+    Raises:
+        InputError: paths are missing, leave the sequence, or have different frame numbers.
+    """
+    names = _entry(place, entry, "ims")
+    if len(names) != cameras:
+        raise InputError(f"{place}: expected a photograph for each of {cameras} cameras; found {len(names)}")
+    photographs = tuple(PurePosixPath(str(name).replace("\\", "/")) for name in names)
+    for name in photographs:
+        if name.is_absolute() or ".." in name.parts:
+            raise InputError(f"{place}: expected paths below the sequence; found {str(name)!r}")
+    numbers = {frame_field(name) for name in photographs}
+    if len(numbers) != 1:
+        raise InputError(f"{place}: expected one frame number for all cameras; found {sorted(numbers)[:3]}")
+    return photographs
+
+
+def frame_number(name: PurePath) -> int:
+    """Frame number in a photograph's name; files of bodies are named after it.
+
+    Args:
+        name: path of the photograph.
+
+    Raises:
+        InputError: there is none.
+    """
+    field = frame_field(name)
+    if not field.isdecimal():
+        raise InputError(
+            f"{name}: expected a frame number, or a name whose fifth field is one; found {name.name!r}"
+        )
+    return int(field)
+
+
+def frame_field(name: PurePath) -> str:
+    """Frame number as written in a name: ``000012``,
+    or ``0001`` of ``…_Camera_(1)_0001_2019-…``."""
+    fields = name.stem.split("_")
+    return fields[4] if len(fields) > 4 else name.stem
+
+
+class ZJUMoCapReader(FrameReader):
+    """Chosen frames of ZJU-MoCap; wanted numbers of frames are indices in ``annots.npy``."""
+
+    calibration = "annots.npy"
+
+    def __init__(self, data: "ZJUMoCap", phase: str, strict: bool = True) -> None:
+        sequences = []
+        for some in getattr(data.split, phase):
+            sequences += [(f"CoreView_{name}", range(*some.frames)) for name in some.sequences]
+        super().__init__(data, phase, sequences, sequences[0][0], strict)
+
+    def frames_of(self, folder: Path, wanted: range) -> list[Frame]:
+        path = folder / self.calibration
+        cameras, photographs = read_annotations(path)
+        if not self.data.undistorted:
+            cameras = [replace(camera, distortion=None) for camera in cameras]
+        count = self.data.cameras or len(cameras)
+        if count > len(cameras):
+            raise InputError(f"{path}: expected {count} cameras; found {len(cameras)}")
+        chosen = [names for index, names in enumerate(photographs) if index in wanted]
+        if not chosen:
+            raise InputError(f"{path}: expected a frame {wanted.start}; found {len(photographs)} frames")
+        positions = tuple(range(count))
+        return [Frame(folder, frame_number(folder / names[0]), cameras, positions, names) for names in chosen]
+
+    def photograph(self, frame: Frame, position: int) -> Path:
+        photograph = frame.photographs[position]
+        return _find(frame.folder, photograph, photograph.suffix)
+
+    def masks(self, frame: Frame, position: int) -> list[Path]:
+        folders = [path for name in self.data.masks if (path := frame.folder / name).is_dir()]
+        if not folders:
+            expected = f"a folder of masks, {' or '.join(self.data.masks)}"
+            raise InputError(f"{frame.folder}: expected {expected}; found none")
+        return [_find(folder, frame.photographs[position], ".png") for folder in folders]
+
+    def body_files(self, frame: Frame) -> list[Path]:
+        folders = [path for name in _BODIES if (path := frame.folder / name).is_dir()]
+        return [folder / f"{frame.number}.npy" for folder in folders[:1]]
+
+    def read_body(self, name: str) -> np.ndarray | None:
+        files = self.body_files(self.frames[name])
+        return read_array(files[0], [(BODY_VERTICES, 3)]).astype(np.float32) if files else None
+
+    def body_place(self, name: str) -> Path:
+        frame = self.frames[name]
+        files = self.body_files(frame)
+        return files[0] if files else frame.folder / _BODIES[0] / f"{frame.number}.npy"
+
+
+def _find(folder: Path, photograph: PurePosixPath, suffix: str) -> Path:
+    """File of a photograph, under its name or its frame field alone (renamed files of
+    313 and 315)."""
+    usual = photograph.with_suffix(suffix)
+    renamed = usual.with_name(frame_field(photograph) + suffix)
+    return find_path(folder, str(usual)) or find_path(folder, str(renamed)) or folder / usual
+
+
+class Frames(Options):
+    """Frames of several sequences."""
+
+    sequences: tuple[Annotated[Text | Index, AfterValidator(str)], ...] = Field(min_length=1)
+    """Ids, such as 377."""
+    frames: tuple[Index, Index, Count]
+    """[start, stop, step] of the indices in annots.npy, from 0. A shorter sequence gives the
+    frames that it has, as in the published loaders."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "Frames":
+        check_frames(self)
+        return self
+
+
+# Assumed number of cameras if all are used; some sequences have 23.
+_ALL = 21
+
+
+class FramesByPhase(Options):
+    """Frames of each phase."""
+
+    train: tuple[Frames, ...] = Field(min_length=1)
+    """Sequences and their frames."""
+    val: tuple[Frames, ...] = Field(min_length=1)
+    """Sequences and their frames."""
+
+
+class ZJUMoCap(DataSet):
+    """Downloaded ZJU-MoCap sequences below ``root``; a subject is one frame of one sequence."""
+
+    published: ClassVar[Mapping[str, int]] = {"train": 6, "val": 3}
+    static_cameras: ClassVar[bool] = True
+
+    name: Text = "zju_mocap"
+    size: Size = 512
+    split: FramesByPhase
+    """Sequences of each phase, and which of their frames."""
+    cameras: Annotated[int, Field(ge=2)] | None = 20
+    """Cameras used of each sequence, the first ones, which make up the ring;
+    null: all, a ring of 21."""
+    undistorted: bool = True
+    """Remove the lens distortion of photographs and masks (SHERF does not, most others do)."""
+    masks: tuple[Text, ...] = Field(("mask_cihp",), min_length=1)
+    """Folders of label maps; those that a sequence has are united."""
+
+    @property
+    def ring(self) -> int:
+        return self.cameras or _ALL
+
+    def reader(self, phase: str, strict: bool = True) -> ZJUMoCapReader:
+        return ZJUMoCapReader(self, phase, strict)
