@@ -120,12 +120,10 @@ class Rehearsal:
     Attributes:
         reasons: why runs would be refused.
         notes: what else they should know.
-        step: seconds of a training step; None: it was not taken.
     """
 
     reasons: Sequence[str] = ()
     notes: Sequence[str] = ()
-    step: float | None = None
 
 
 #: Tries what configurations need.
@@ -146,7 +144,7 @@ def print_plan(planned: Sequence[PlannedRun], directory: Path, rehearse: Rehears
     """
     rehearsal = rehearse([item.run for item in planned if not item.directory.done])
     measured = step_seconds(directory)
-    step = measured[0] if measured else rehearsal.step
+    step = measured[0] if measured else None
     trainers = [item.run.trainer for item in planned]
     times = [expected_seconds(trainer, step) for trainer in trainers]
     both = zip(trainers, times, strict=True)
@@ -156,10 +154,8 @@ def print_plan(planned: Sequence[PlannedRun], directory: Path, rehearse: Rehears
     basis = ["trainer.max_time"] if any(time_budget(trainer) is not None for trainer in trainers) else []
     if measured:
         basis.append(f"{measured[0]:.3g} s a step, measured in {measured[1]} finished runs")
-    elif step:
-        basis.append(f"{step:.3g} s a step, tried with the first run")
     known = "unknown" if None in left else clock(sum(left))
-    reason = "; ".join(basis) or "no trainer.max_time, and no step was measured or tried"
+    reason = "; ".join(basis) or "no trainer.max_time, and no step was measured"
     print(f"expected training time of the remaining runs, one after another: {known} ({reason})")
     place = f"{directory}/<run>" if len(planned) > 1 else planned[0].directory.path
     print(f"outputs: {place}/ with {OUTPUTS}", flush=True)

@@ -1,4 +1,4 @@
-"""A dry run says all that is missing at once, and how long a step takes."""
+"""A dry run reports all that is missing at once."""
 
 import re
 import shutil
@@ -51,7 +51,6 @@ def test_all_that_is_missing_is_said_at_once(monkeypatch, tmp_path):
     ]
     for text in expected:
         assert any(re.search(text, reason) for reason in found.reasons), (text, found.reasons)
-    assert found.step is None
 
 
 @pytest.mark.parametrize(
@@ -80,7 +79,6 @@ def test_one_thing_that_is_missing_is_the_one_that_is_said(
     found = rehearsed(f"data.root={rendered}", *overrides)
     assert len(found.reasons) == 1
     assert re.search(expected, found.reasons[0]), found.reasons
-    assert found.step is None
 
 
 def test_weights_of_another_size_are_a_note(tmp_path, rendered):
@@ -142,18 +140,14 @@ def test_files_that_a_later_step_would_read_are_named(tmp_path, rendered, lackin
     found = rehearsal.rehearse([run])
     assert len(found.reasons) == 1
     assert re.search(said.format(name=name), found.reasons[0].replace("{name}", name)), found.reasons
-    assert found.step is None
 
 
-def test_a_step_is_timed_where_nothing_is_missing(monkeypatch, capsys, tmp_path, rendered):
-    """Without a finished run the expected time was unknown; nothing is written."""
+def test_nothing_is_missing_and_nothing_is_written(monkeypatch, capsys, tmp_path, rendered):
     monkeypatch.chdir(tmp_path)
     command = ["-m", *SMALL, f"data.root={rendered}", "seed=1,2", "dry_run=true", "hydra.sweep.dir=sweep"]
     code, out, err = call(monkeypatch, capsys, "train", *command)
-    assert code == 0, err  # which may say that kernels are compiled
+    assert code == 0, err
     assert "would be refused" not in out
-    assert re.search(r"one after another: \d+:\d\d:\d\d \([\d.e-]+ s a step, tried with the first run\)", out)
-    assert not list(tmp_path.iterdir())
     alone = [*SMALL, f"data.root={rendered}", "dry_run=true", "hydra.run.dir=alone"]
     code, out, err = call(monkeypatch, capsys, "train", *alone)
     assert code == 0, err
@@ -175,6 +169,6 @@ def test_what_a_sweep_lacks_ends_its_dry_run_with_an_error(monkeypatch, capsys, 
 def test_people_that_are_not_rendered_are_not_rendered_by_a_plan(tmp_path):
     """They take minutes."""
     found = rehearsal.rehearse([run_of("train", [f"data.cache_dir={tmp_path}", "loss=depth"])])
-    assert (found.reasons, found.step) == ([], None)
+    assert found.reasons == []
     assert any("people are rendered before the first step" in note for note in found.notes)
     assert not list(tmp_path.iterdir())
