@@ -73,7 +73,7 @@ def test_the_key_covers_all_that_kernels_read(folder, monkeypatch):
                     assert node.module in names, file
     compile._digest.cache_clear()
     before, read = compile._digest(folder), Path.read_bytes
-    for file in files:  # such as activation/surface.py, whose SAME is a constant of machine code
+    for file in files:  # such as activation/__init__.py, whose SAME is a constant of machine code
         changed = lambda path, file=file: read(path) + b"#" * (path == file)  # noqa: E731
         monkeypatch.setattr(Path, "read_bytes", changed)
         compile._digest.cache_clear()

@@ -7,7 +7,7 @@ import torch
 
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.geometry.rotations import multiply_quaternions, quaternion_to_matrix
-from ghgs_lit.ops.activation.surface import surface_axes
+from ghgs_lit.ops.activation import surface_axes
 from ghgs_lit.types import Cameras, DepthMaps
 from tests.helpers.scenes import CENTER, RADII, ellipsoid, make_batch, ring
 

@@ -14,7 +14,7 @@ from ghgs_lit.geometry.masks import coverage, surface_colors, with_matte
 from ghgs_lit.geometry.projection import focal_lengths, unproject_maps, world_to_camera
 from ghgs_lit.geometry.rotations import rotate
 from ghgs_lit.method.bounds import VisualHull
-from ghgs_lit.ops.activation.surface import surface_axes
+from ghgs_lit.ops.activation import surface_axes
 from ghgs_lit.ops.photo_consistency import photo_consistency
 from ghgs_lit.refinement import Change, Refinement
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians

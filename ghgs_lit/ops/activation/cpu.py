@@ -12,8 +12,7 @@ from torch import Tensor
 
 from ghgs_lit.geometry.rotations import matrix_to_quaternion
 from ghgs_lit.ops import memory, pool, simd
-from ghgs_lit.ops.activation import SIGMOID_LIMIT, TANH_LIMIT
-from ghgs_lit.ops.activation.surface import OTHER, SAME
+from ghgs_lit.ops.activation import OTHER, SAME, SIGMOID_LIMIT, TANH_LIMIT
 from ghgs_lit.ops.compile import FLOATS, NUMBER, helper, kernel_for
 from ghgs_lit.ops.simd import EXP2_LIMIT, LANES
 

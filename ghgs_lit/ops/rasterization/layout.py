@@ -9,21 +9,9 @@ pixel's centre, the exponent of the Gaussian is ``-(p^2 + q^2) ln 2`` where ``p 
 from ghgs_lit.ops.compile import helper
 
 RECORD = 16
-# Centre: the pixel, and 0.5 minus the fraction,
-# so that small distances from it keep all their digits.
-COLUMN = 0
-ROW = 1
-REST_X = 2
-REST_Y = 3
-K_XX = 4
-K_YX = 5
-K_YY = 6
-OPACITY = 7
-CUTOFF = 8
-DEPTH = 9
-# Along a column of pixels p^2 + q^2 is smallest at dy = SLOPE_Y dx, along a row at dx = SLOPE_X dy.
-SLOPE_X = 10
-SLOPE_Y = 11
+# Centre: the pixel, and 0.5 minus the fraction (REST), so that small distances from it keep all their
+# digits. Along a column of pixels p^2 + q^2 is smallest at dy = SLOPE_Y dx, along a row at dx = SLOPE_X dy.
+COLUMN, ROW, REST_X, REST_Y, K_XX, K_YX, K_YY, OPACITY, CUTOFF, DEPTH, SLOPE_X, SLOPE_Y = range(12)
 # Colours with at most ROOM channels follow.
 COLORS = 12
 ROOM = 4
@@ -33,46 +21,24 @@ BLOCK = 4
 PIXELS = TILE * TILE
 
 # The box of tiles that a splat touches; empty if the camera does not see it.
-X0 = 0
-X1 = 1
-Y0 = 2
-Y1 = 3
+X0, X1, Y0, Y1 = range(4)
 
 # An entry is a splat in a tile, a row of integers: the bits of its depth, the splat, the slot of
 # its gradients (the slots of a splat are contiguous). After a tile is drawn, its visible splats
 # come first, front to back, with the blocks that each reaches in place of the depth.
-KEY = 0
-SPLAT = 1
-SLOT = 2
+KEY, SPLAT, SLOT = range(3)
 BLOCKS = KEY
 ENTRY = 4
 
 # Gradients of an entry, with ``h = dL / d ln(alpha)`` and sums over pixels: moments of h in
 # whitened coordinates, the gradient of the depth, then from COLOR on those of the colours.
-H = 0
-H_P = 1
-H_Q = 2
-H_PP = 3
-H_PQ = 4
-H_QQ = 5
-D_DEPTH = 6
-COLOR = 7
+H, H_P, H_Q, H_PP, H_PQ, H_QQ, D_DEPTH, COLOR = range(8)
 
 # A view: focal lengths, principal point, rotation, translation, the limits of x/z and y/z, then the
 # last column and row of pixels.
-FX = 0
-FY = 1
-CX = 2
-CY = 3
-ROTATION = 4
+FX, FY, CX, CY, ROTATION = range(5)
 TRANSLATION = 13
-X_LOW = 16
-X_HIGH = 17
-Y_LOW = 18
-Y_HIGH = 19
-RIGHT = 20
-BOTTOM = 21
-VIEW = 22
+X_LOW, X_HIGH, Y_LOW, Y_HIGH, RIGHT, BOTTOM, VIEW = range(16, 23)
 
 
 def gradient_width(channels: int) -> int:

@@ -11,7 +11,7 @@ from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.method.heads.gaussian import GaussianHead, GaussianHeadOptions
-from ghgs_lit.ops.activation.surface import surface_axes
+from ghgs_lit.ops.activation import surface_axes
 from ghgs_lit.types import DepthMaps
 from tests.helpers.plans import plan_of
 from tests.helpers.scenes import CASES, CENTER, RADII, fixture, make_batch
