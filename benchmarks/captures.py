@@ -1,8 +1,7 @@
 """What imperfect captures cost a model: built-in people, photographed in twelve ways, with the same targets.
 
-    python benchmarks/captures.py model.ckpt [model.ckpt ...] --baselines all --out captures.json
+    python benchmarks/captures.py model.ckpt
     python benchmarks/captures.py shipped --mend --people 12 --first 4
-    python benchmarks/captures.py shipped --mend --people 1 --picture docs/masks.jpg
 
 Each capture has one trouble, the last one all of them; with ``--mend`` they are others, predicted as given
 and as ``ghgs predict`` mends them by itself. Photographs are taken before a background, twice as large as
@@ -13,7 +12,6 @@ photographs and what each capture loses, whole and in the box.
 
 import argparse
 import dataclasses
-import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -22,13 +20,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
 
 from ghgs_capture.capture import Capture
 from ghgs_capture.crops import Photograph
 from ghgs_capture.prediction import predict, trained_size
 from ghgs_lit import GHGS
-from ghgs_lit.cli.evaluate import baselines_of
 from ghgs_lit.cli.inputs import build_data, build_renderer, pick_device
 from ghgs_lit.config import run_of
 from ghgs_lit.config.compose import read_option
@@ -38,15 +34,13 @@ from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.imperfections import backgrounds
 from ghgs_lit.data.sampling import even_positions, subject_rng
-from ghgs_lit.evaluation.measure import Method, ModelMethod, measure
+from ghgs_lit.evaluation.measure import ModelMethod, measure
 from ghgs_lit.execution import Predictor
-from ghgs_lit.files import write_text_atomically
 from ghgs_lit.geometry.masks import signed_distance
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.refinement import CameraRefinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch
-from ghgs_lit.visualization import pictures
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
 _RING, _VIEWS = 16, 4
@@ -252,131 +246,53 @@ def table(results: Mapping[str, dict[str, float]]) -> str:
     return "\n".join(lines)
 
 
-def methods_of(options: argparse.Namespace, run: Run, device: torch.device) -> Iterator[tuple[str, Method]]:
-    """Every checkpoint, one in memory at a time, and every baseline."""
-    renderer, rounds = build_renderer(run, device), options.refine_cameras
-    for path in options.checkpoints:
-        model = Predictor.from_checkpoint(path, device)
-        cameras = CameraRefinement(rounds, model, renderer) if rounds else None
-        yield str(path), ModelMethod(model, renderer, cameras=cameras)
-    names = "all" if options.baselines == ["all"] else options.baselines
-    yield from baselines_of(names, run, device).items()
-
-
 def measure_mending(
     options: argparse.Namespace, size: tuple[int, int], run: Run, device: torch.device
 ) -> None:
     """Print what captures lose as given, and what is left of it where ``predict`` decides."""
-    renderer, model = build_renderer(run, device), Predictor.from_checkpoint(options.checkpoints[0], device)
+    renderer, model = build_renderer(run, device), Predictor.from_checkpoint(options.checkpoint, device)
     metrics, larger = run.metrics.build().to(device), [_LARGER * side for side in size]
     data = tuple(data_of(Imperfection(), options.people, side, [], larger) for side in (list(size), larger))
-    if options.picture:
-        Image.fromarray(masks_picture(data, model, size, renderer)).save(options.picture, quality=92)
-        return
-    results, method = {}, ModelMethod(model, renderer)
+    method = ModelMethod(model, renderer)
     for name, capture in MENDED.items():
         print(name, flush=True)
-        results[name] = {
-            key: means(
-                measure(
-                    method,
-                    name,
-                    predicted(capture, data, options.first, model, size, renderer, refine),
-                    metrics,
-                    device,
-                )
-            )
-            for key, refine in (("given", 0), ("auto", "auto"))
-        }
-        shown = (f"{row[f'{t}_psnr']:.2f}" for row in results[name].values() for t in _TARGETS)
+        shown = []
+        for refine in (0, "auto"):
+            seen = predicted(capture, data, options.first, model, size, renderer, refine)
+            row = means(measure(method, name, seen, metrics, device))
+            shown += [f"{row[f'{target}_psnr']:.2f}" for target in _TARGETS]
         print(f"| {name} | {' | '.join(shown)} |", flush=True)
-    write_text_atomically(options.out, json.dumps(results, indent=1))
-
-
-def masks_picture(
-    data: tuple[PhotographsDataModule, PhotographsDataModule],
-    model: GHGS,
-    size: tuple[int, int],
-    renderer: Renderer,
-) -> np.ndarray:
-    """Two inputs, target half-way, rendering and error, with wrong masks as given and as mended.
-
-    Args:
-        data: of the first person, in the size of crops and of photographs.
-        model: predicts.
-        size: (height, width) of the crops in pixels.
-        renderer: draws predictions.
-
-    Returns:
-        Picture [h, w, 3] uint8.
-    """
-    part = slice(None), slice(size[1] // 5, -size[1] // 5)  # a standing person is narrow
-    rows = []
-    for name in ("masks grown by 4 px", "masks eroded by 4 px"):
-        for label, refine in (("as given", 0), ("mended", "auto")):
-            (batch,) = predicted(MENDED[name], data, 0, model, size, renderer, refine)
-            midway = batch.targets.of_protocol("midway")
-            target = midway.images[0, 0]
-            with torch.no_grad():
-                render = renderer(model(batch).gaussians, midway.cameras[:, :1]).image[0, 0].clamp(0, 1)
-            tiles = [
-                *map(pictures.to_uint8, (*batch.images[0, :2], target, render)),
-                pictures.error_map(render, target),
-            ]
-            texts = (
-                f"{name}, {label}",
-                "another input",
-                "target",
-                "rendering",
-                f"error x{pictures.ERROR_GAIN:g}",
-            )
-            rows.append(pictures.row([tile[part] for tile in tiles], texts))
-    return pictures.stack(rows)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("checkpoints", type=Path, nargs="+")
-    parser.add_argument("--baselines", nargs="*", default=[], help="as for ghgs evaluate, or all")
+    parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--people", type=int, default=8)
-    parser.add_argument("--size", type=int, help="side in pixels; none: the first checkpoint's")
+    parser.add_argument("--size", type=int, help="side in pixels; none: the checkpoint's")
     parser.add_argument("--refine-masks", type=int, default=0, help="pixels that masks may be off by")
     parser.add_argument("--refine-cameras", type=int, default=0, help="rounds that correct the cameras first")
     parser.add_argument("--mend", action="store_true", help="what predict mends by itself, and nothing else")
     parser.add_argument("--first", type=int, default=0, help="with --mend: people before it take no part")
-    parser.add_argument("--picture", type=Path, help="with --mend: of the first person, and no measurement")
-    parser.add_argument("--out", type=Path, default=Path("captures.json"))
     options = parser.parse_args()
     run = run_of("evaluate", ["data=synthetic", "metrics.lpips=off"])
     device = pick_device(run.device)
-    size = options.size or trained_size(read_checkpoint(options.checkpoints[0])["config"])
+    size = options.size or trained_size(read_checkpoint(options.checkpoint)["config"])
     size = image_size("size", size)
     if options.mend:
         measure_mending(options, size, run, device)
         return
-    metrics = run.metrics.build().to(device)
+    renderer, model = build_renderer(run, device), Predictor.from_checkpoint(options.checkpoint, device)
+    rounds = options.refine_cameras
+    cameras = CameraRefinement(rounds, model, renderer) if rounds else None
+    method, metrics = ModelMethod(model, renderer, cameras=cameras), run.metrics.build().to(device)
     clean = data_of(CAPTURES["clean"], options.people, list(size), _UNEVEN)
     larger = [_LARGER * side for side in size]
-    own = {name: data_of(capture, options.people, larger, _UNEVEN) for name, capture in CAPTURES.items()}
     results = {}
-    for method_name, method in methods_of(options, run, device):
-        results[method_name] = {
-            name: means(
-                measure(
-                    method,
-                    name,
-                    batches(capture, clean, own[name], size, options.refine_masks),
-                    metrics,
-                    device,
-                )
-            )
-            for name, capture in CAPTURES.items()
-        }
-        print(
-            f"{method_name}, {options.people} people, {size[0]} x {size[1]}\n{table(results[method_name])}\n",
-            flush=True,
-        )
-        write_text_atomically(options.out, json.dumps(results, indent=1))
+    for name, capture in CAPTURES.items():
+        own = data_of(capture, options.people, larger, _UNEVEN)
+        seen = batches(capture, clean, own, size, options.refine_masks)
+        results[name] = means(measure(method, name, seen, metrics, device))
+    print(f"{options.people} people, {size[0]} x {size[1]}\n{table(results)}")
 
 
 if __name__ == "__main__":

@@ -4,7 +4,8 @@ A mask that is off by a pixel paints colours of the background, different in eac
 subject's outline. A network estimates the matte from photograph and mask: a U-Net (Ronneberger et
 al., MICCAI 2015) with a rough mask beside the colours, as in Deep Image Matting (Xu et al., CVPR
 2017), and the differences of each colour from those of subject and background nearby. It was
-trained on generated people before many kinds of backgrounds (``scripts/bake_matting.py``).
+trained on generated people before many kinds of backgrounds (by ``scripts/bake_matting.py`` of commit
+46b85d02).
 """
 
 import functools
