@@ -1,6 +1,5 @@
 """Tokens of frozen ViTs on disk, and products of the encoder alone in bfloat16."""
 
-import json
 import logging
 import shutil
 from pathlib import Path
@@ -206,8 +205,7 @@ def test_a_network_that_learns_has_no_cache(tmp_path, options):
 
 
 def test_a_run_and_its_rest_read_what_is_there(tmp_path, monkeypatch):
-    """From the command line: a run that is stopped, its rest,
-    and the same run without the cache."""
+    """From the command line: a run that is stopped, and its rest."""
     monkeypatch.chdir(tmp_path)
     boxes = tmp_path / "rendered"
     render_boxes(boxes, tmp_path / "scans", train=1, val=1)
@@ -229,8 +227,3 @@ def test_a_run_and_its_rest_read_what_is_there(tmp_path, monkeypatch):
     after = {path: path.stat().st_mtime_ns for path in Path("features").rglob("*.npy")}
     assert len({path.parents[1] for path in after}) == 1
     assert after.items() >= files.items()
-    assert ghgs("train", *common, "trainer.max_steps=4", "hydra.run.dir=plain") == 0
-    psnr = []
-    for run in ("rest", "plain"):
-        psnr.append(json.loads(Path(run, "metrics.json").read_text())["rows"][0]["psnr"])
-    assert psnr[0] == pytest.approx(psnr[1], abs=0.05)
