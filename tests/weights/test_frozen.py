@@ -12,8 +12,8 @@ from ghgs_lit.execution import Predictor
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO
 from ghgs_lit.training.start import check_resume, initialize
 from ghgs_lit.weights import frozen
-from ghgs_lit.weights.checkpoint import FORMAT_VERSION, read_checkpoint
-from ghgs_lit.weights.exporting import export_weights, write_inference
+from ghgs_lit.weights.checkpoint import FORMAT_VERSION, read_checkpoint, write_inference
+from ghgs_lit.weights.published import export_weights
 from tests.helpers.models import config, load_model, make_model
 from tests.helpers.training import held
 
