@@ -42,7 +42,7 @@ class CaptureFolder:
     Args:
         images: folder of photographs named after their cameras; of such folders, one for each
             instant; or of videos named after their cameras.
-        cameras: the calibration, in one of :data:`ghgs_capture.formats.FORMATS`, or already read.
+        cameras: the calibration, in one of :data:`ghgs_capture.formats.FORMATS`.
         masks: folder of masks, laid out and named as the photographs; None: the first there is of
             ``backgrounds``, ``segment``, masks beside the photographs (``<name>_mask.png``) or
             named by the calibration, alpha.
@@ -58,7 +58,7 @@ class CaptureFolder:
     """
 
     images: str | Path
-    cameras: str | Path | CameraFile
+    cameras: str | Path
     masks: str | Path | None = None
     backgrounds: str | Path | None = None
     segment: str | None = None
@@ -82,8 +82,7 @@ class CaptureFolder:
     @functools.cached_property
     def file(self) -> CameraFile:
         """The cameras as stored."""
-        given = self.cameras
-        return given if isinstance(given, CameraFile) else read_cameras(given, self.calibration.format)
+        return read_cameras(self.cameras, self.calibration.format)
 
     @functools.cached_property
     def convention(self) -> Convention:
@@ -91,9 +90,8 @@ class CaptureFolder:
         return self.file.convention.with_options(vars(self.calibration))
 
     @functools.cached_property
-    def _listing(self) -> tuple[dict[str, dict[str, Source]], str]:
-        """``{instant: {camera: path or frame}}`` of all instants,
-        and a line about frames left over."""
+    def _all_paths(self) -> dict[str, dict[str, Source]]:
+        """``{instant: {camera: path or frame}}`` of all instants."""
         folder = self.images
         cameras = self.file.cameras
         part = self.sequence
@@ -101,17 +99,12 @@ class CaptureFolder:
         if has_videos(folder, cameras, names):
             return find_frames(folder, self.masks, cameras, names, self.convention, part.sync, part.step)
         require(part.sync is None, "sequence.sync", "null for photographs", part.sync)
-        return find_instants(folder, cameras, names), ""
-
-    @property
-    def note(self) -> str:
-        """A line about frames that are left over; empty where there are none."""
-        return self._listing[1]
+        return find_instants(folder, cameras, names)
 
     @functools.cached_property
     def paths(self) -> dict[str, dict[str, Source]]:
         """``{instant: {camera: path or frame}}`` of the instants that ``sequence`` selects."""
-        all_instants = self._listing[0]
+        all_instants = self._all_paths
         part = self.sequence
         names = list(all_instants)[part.start : part.stop : part.step]
         expected = f"a part of {len(all_instants)} instants"
@@ -122,7 +115,7 @@ class CaptureFolder:
     def missing(self) -> dict[str, dict[str, str]]:
         """``{instant: {camera: why}}`` of photographs that are missing,
         or could not be read so far."""
-        cameras = dict.fromkeys(itertools.chain.from_iterable(self._listing[0].values()))
+        cameras = dict.fromkeys(itertools.chain.from_iterable(self._all_paths.values()))
         missing = {}
         for instant, paths in self.paths.items():
             missing[instant] = {name: "there is no photograph" for name in cameras if name not in paths}

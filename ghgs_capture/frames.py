@@ -1,6 +1,7 @@
 """Frames of a folder with one video for each camera, by instant."""
 
 import os
+import warnings
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -94,8 +95,8 @@ def find_frames(
     convention: Convention,
     sync: Mapping[str, int] | str | None,
     step: int,
-) -> tuple[dict[str, dict[str, VideoFrame]], str]:
-    """The frames of each instant that all videos show.
+) -> dict[str, dict[str, VideoFrame]]:
+    """The frames of each instant that all videos show; a warning says where others are left over.
 
     Args:
         folder: of videos, each named after its camera.
@@ -110,8 +111,7 @@ def find_frames(
         step: of the instants that will be read, 1 or more; with a CSV it is not used.
 
     Returns:
-        ``{instant: {camera: frame}}``, instants named by the first camera's frame; and a line about
-        frames that are left over, or "".
+        ``{instant: {camera: frame}}``, instants named by the first camera's frame.
 
     Raises:
         InputError: videos do not fit the cameras or one another.
@@ -141,9 +141,10 @@ def find_frames(
     for instant, shown in numbers.items():
         decodable = {name: frames[name][n] for name, n in shown.items() if n in frames[name]}
         instants[f"{instant:0{_DIGITS}d}"] = decodable
-    counts = ", ".join(f"{name} {video.count}" for name, video in videos.items())
-    note = f"videos differ in length ({counts} frames): the {len(numbers)} instants that all show are used"
-    return instants, note if len({video.count for video in videos.values()}) > 1 else ""
+    counts = {name: video.count for name, video in videos.items()}
+    if len(set(counts.values())) > 1:
+        warnings.warn(f"videos differ in length: {len(numbers)} instants of frames {counts}", stacklevel=2)
+    return instants
 
 
 def _by_number(videos: Mapping[str, Video], offsets: Mapping[str, Any]) -> dict[int, dict[str, int]]:

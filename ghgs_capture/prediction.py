@@ -243,17 +243,15 @@ def crop_size(
         InputError: the model cannot take this size.
     """
     trained = image_size("size", trained_size(config))
-    patch = model.model.encoder.patch_size
     height, width = trained if size is None else image_size("size", size)
     multiple = model.side_multiple
     expected = f"sides divisible by the patch size {multiple}"
     require(height % multiple == width % multiple == 0, "size", expected, (height, width))
     is_coarse_to_fine = model.model.rounds.height is not None
     if not is_coarse_to_fine and (height > trained[0] or width > trained[1]):
-        below = ", ".join(str(n * patch) for n in range(max(trained) // patch, 0, -3)[:3])
         warnings.warn(
             f"size: {height} x {width} is larger than the {trained[0]} x {trained[1]} of the training, which"
-            f" makes results worse, not sharper; multiples of {patch} up to that fit, such as {below}",
+            " makes results worse, not sharper",
             stacklevel=3,
         )
     return height, width

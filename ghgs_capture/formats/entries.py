@@ -261,16 +261,12 @@ def _bends(key: str, value: Any) -> bool:
 
 
 def _fits(value: Any, shapes: tuple[tuple[int | None, ...], ...]) -> bool:
-    """Whether nested lists have one of several shapes; None is any length."""
+    """Whether nested lists are numbers of one of several shapes; None is any length."""
     try:
-        sizes = np.shape(value)
-    except ValueError:  # lists of different lengths
+        check_array("", value, shapes)
+    except InputError:
         return False
-    for shape in shapes:
-        same_rank = len(sizes) == len(shape)
-        if same_rank and all(side in (None, n) for side, n in zip(shape, sizes, strict=True)):
-            return True
-    return False
+    return True
 
 
 def _has_flags(value: Any) -> bool:

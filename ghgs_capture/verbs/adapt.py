@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -153,11 +152,9 @@ def adapt(run: Adapt, directory: Path, stats: dict[str, Any]) -> float | None:
     Returns:
         Mean PSNR in dB of instants that were not learned from, after training; None: it was interrupted.
     """
-    begin = time.perf_counter()
     prepare_instants(run)
     data = build_data(run)
     data.prepare_data()
-    rendered = time.perf_counter() - begin
     device = _device(run)
     method = ModelMethod(load_predictor(run.plain, run.checkpoint, device), build_renderer(run, device))
     place = directory / "before"
@@ -176,12 +173,9 @@ def adapt(run: Adapt, directory: Path, stats: dict[str, Any]) -> float | None:
     count = len(data.subjects("val"))
     print(
         f"{count} photographs of instants that were not learned from, each from the other cameras:"
-        f" {before:.2f} dB before, {after:.2f} dB after"
-        f" ({rendered:.0f} s of preparing, {stats['seconds']:.0f} s of training)",
+        f" {before:.2f} dB before, {after:.2f} dB after",
         flush=True,
     )
-    if after <= before:
-        print(f"no better: checkpoint={run.checkpoint} stays the better one for this capture", flush=True)
     announce(out)
     return after
 

@@ -96,8 +96,6 @@ def predict_photographs(run: "Predict", directory: Path) -> None:
     folder = capture_folder(run)
     output = export.output_options(run)
     directories, together = _free_places(folder, output, directory, bool(run.refine_cameras))
-    if folder.note:
-        print(folder.note, flush=True)
     if run.check_cameras:
         check_cameras(folder)
     device = inputs.pick_device(run.device)

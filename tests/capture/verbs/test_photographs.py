@@ -109,7 +109,7 @@ def test_cameras_and_masks_are_corrected_where_asked(here, predict, capsys):
 def test_what_makes_a_prediction_poor_is_said(here, predict, capsys):
     """Crops that training never showed, and inputs that do not come back."""
     cameras = Figure().write(here / "images")
-    larger = "size: 70 x 70 is larger than the 56 x 56 of the training, .* up to that fit, such as 56, 14"
+    larger = "size: 70 x 70 is larger than the 56 x 56 of the training"
     with pytest.warns(UserWarning, match=larger):
         assert predict(cameras, "images=images", "out=splat", "size=70", "refine_masks=1") == 0
     low, *_, high = sorted(report(here / "splat")["psnr_box_of_inputs"].values())
