@@ -20,10 +20,10 @@ from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.device import drawing_nothing
 from ghgs_lit.execution import predictor, step
-from ghgs_lit.execution.tape import CudaTape, Tape
+from ghgs_lit.execution.capture import CaptureBackend, CudaGraphs
 from ghgs_lit.geometry import precision
+from tests.helpers.capture_backends import OperatorBackend
 from tests.helpers.pretend_device import DEVICE, pretend_device
-from tests.helpers.tape import OperatorTape
 
 #: Kinds of a trace's events that are work of a GPU; in a rehearsal, operators.
 WORK, REHEARSED_WORK = ("kernel", "gpu_memcpy", "gpu_memset"), ("cpu_op",)
@@ -36,9 +36,9 @@ class Gpu:
     def __init__(self, device: torch.device, is_real: bool):
         self.device, self.is_real = device, is_real
 
-    def tape(self) -> Tape:
+    def backend(self) -> CaptureBackend:
         """What records: CUDA graphs; in a rehearsal a stand-in that repeats operators."""
-        return CudaTape() if self.is_real else OperatorTape(self.device.type)
+        return CudaGraphs() if self.is_real else OperatorBackend(self.device.type)
 
     def milliseconds(self, call: Callable[[], Any], repeats: int) -> float:
         """Median time of a call, by events; the host submits as fast as it can."""

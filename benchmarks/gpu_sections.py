@@ -92,7 +92,7 @@ def prediction(call: Call) -> None:
 
 def _capturing(call: Call, predictor: Predictor) -> Predictor:
     """The predictor with graphs of this device."""
-    predictor.graphs = GraphCache(tape=call.gpu.tape())
+    predictor.graphs = GraphCache(backend=call.gpu.backend())
     return predictor
 
 
@@ -122,12 +122,12 @@ class _Step:
         self.renderer, self.losses = run.renderer.build(), run.loss.build()
         self.predictor = _capturing(call, Predictor(self.model))
         self.captured_step = CapturedStep(self.predictor, self.renderer, self.losses)
-        self.captured_step.graphs = GraphCache(tape=call.gpu.tape())
+        self.captured_step.graphs = GraphCache(backend=call.gpu.backend())
         self.options = run.optimizer
         self.optimizer = self.options.optimizer(self.model)
         hold_rates(self.optimizer)
         if not call.gpu.is_real and self.options.matrix_scale is not None:  # as Muon does on CUDA
-            self.optimizer.graphs = GraphCache(limit=2, tape=call.gpu.tape())
+            self.optimizer.graphs = GraphCache(limit=2, backend=call.gpu.backend())
 
     def data(self) -> None:
         self.batch = self.host.to(self.device, non_blocking=True)

@@ -19,6 +19,7 @@ from ghgs_lit.config.options import image_size
 from ghgs_lit.errors import require
 from ghgs_lit.execution import Predictor
 from ghgs_lit.geometry.frame import Frame
+from ghgs_lit.method.model import GHGS
 from ghgs_lit.method.rounds.coarse import FILLED
 from ghgs_lit.method.rounds.gains import log_gammas
 from ghgs_lit.refinement import CameraRefinement, Refinement, Report, pixels_moved
@@ -59,7 +60,7 @@ class CapturePrediction:
 @torch.no_grad()
 def predict(
     capture: Capture,
-    model: Predictor | str | Path = SHIPPED,
+    model: Predictor | GHGS | str | Path = SHIPPED,
     size: int | tuple[int, int] | None = None,
     refine_cameras: int | Literal["auto"] = "auto",
     refine_masks: int | Literal["auto"] = "auto",
@@ -71,8 +72,8 @@ def predict(
 
     Args:
         capture: photographs of one instant with masks and cameras, in any unit of length.
-        model: a predictor in evaluation mode, or a checkpoint (kept in memory for further calls): a path,
-            or the one that comes with the package.
+        model: a predictor or its stages in evaluation mode, or a checkpoint (kept in memory for further
+            calls): a path, or the one that comes with the package.
         size: side or (height, width) of the crops that the model sees, in pixels; None: as it was
             trained (checkpoints only).
         refine_cameras: most rounds that correct the cameras until the photographs agree
@@ -92,6 +93,8 @@ def predict(
     Raises:
         InputError: the checkpoint cannot be used, or the size does not fit the model.
     """
+    if isinstance(model, GHGS):
+        model = Predictor(model)
     if not isinstance(model, Predictor):
         path = file_of(model)
         model = _model(path, path.stat().st_mtime_ns)

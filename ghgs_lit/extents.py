@@ -27,7 +27,8 @@ class Extent(NamedTuple):
         Returns:
             The extent, whose bounding box holds every touched cell.
         """
-        bottom, right = ((end - 1) // stride + 1 for end in (self.bottom, self.right))
+        bottom = (self.bottom - 1) // stride + 1
+        right = (self.right - 1) // stride + 1
         return Extent(count, self.top // stride, bottom, self.left // stride, right)
 
     def cells(self, stride: int) -> int:

@@ -14,9 +14,9 @@ from benchmarks.gpu_measure import rehearsal
 from benchmarks.gpu_replay import WRONG, judge_optimizer, judge_prediction, judge_step
 from benchmarks.gpu_sections import SECTIONS, _capturing, _Step
 from ghgs_lit.execution import Predictor
+from tests.helpers.capture_backends import OperatorBackend, SilentBackend
 from tests.helpers.models import make_model
 from tests.helpers.pretend_device import DEVICE
-from tests.helpers.tape import OperatorTape, SilentTape
 
 TINY = dataclasses.replace(DRY, side=28, batches=(1,), large_batches=(1,), large=28)
 
@@ -54,15 +54,15 @@ def test_a_section_runs_in_a_rehearsal(section, tmp_path, one_thread):
         assert all(row["ms"] > 0 and row["launches"] > 0 and len(row["longest"]) <= 40 for row in measured)
 
 
-class Lossy(OperatorTape):
+class Lossy(OperatorBackend):
     """Repeats nothing of what an operator does from its ``first`` call on, as if it were not recorded."""
 
     def __init__(self, device, operator, first):
         super().__init__(device)
         self.operator, self.first = operator, first
 
-    def record(self, call):
-        result, play = super().record(call)
+    def capture(self, call):
+        result, play = super().capture(call)
         calls = play.__self__.calls
         places = [place for place, each in enumerate(calls) if each[0].name() == self.operator]
         for place in reversed(places[self.first :]):
@@ -70,12 +70,12 @@ class Lossy(OperatorTape):
         return result, play
 
 
-TAPES = {
-    "prediction": [None, (SilentTape,), (Lossy, "aten::addmm", 0)],
-    "step": [None, (SilentTape,), (Lossy, "aten::mm", -1)],
-    "optimizer": [None, (SilentTape,), (Lossy, "aten::_foreach_lerp_.Scalar", 0)],
+BACKENDS = {
+    "prediction": [None, (SilentBackend,), (Lossy, "aten::addmm", 0)],
+    "step": [None, (SilentBackend,), (Lossy, "aten::mm", -1)],
+    "optimizer": [None, (SilentBackend,), (Lossy, "aten::_foreach_lerp_.Scalar", 0)],
 }
-PLANTED = [(kind, tape) for kind, tapes in TAPES.items() for tape in tapes]
+PLANTED = [(kind, backend) for kind, backends in BACKENDS.items() for backend in backends]
 
 
 @pytest.mark.parametrize(("kind", "planted"), PLANTED)
@@ -84,7 +84,7 @@ def test_a_wrong_replay_is_seen(kind, planted, tmp_path, one_thread, monkeypatch
     with rehearsal() as device:
         if planted is not None:
             kept, *options = planted
-            monkeypatch.setattr(device, "tape", lambda: kept(device.device.type, *options))
+            monkeypatch.setattr(device, "backend", lambda: kept(device.device.type, *options))
         rows = Rows(tmp_path / "rows.jsonl")
         call = Call(device, rows, "step", TINY, tmp_path)
         if kind == "prediction":

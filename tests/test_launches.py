@@ -22,10 +22,10 @@ from ghgs_lit.rendering.api import Renderer
 from ghgs_lit.training import Optimization
 from ghgs_lit.training.optimization import hold_rates
 from ghgs_lit.types import Batch
+from tests.helpers.capture_backends import SilentBackend
 from tests.helpers.losses import losses_of
 from tests.helpers.models import load_model, make_model
 from tests.helpers.pretend_device import DEVICE, pretend_device
-from tests.helpers.tape import SilentTape
 
 
 class Asked(NamedTuple):
@@ -115,10 +115,10 @@ def test_little_is_asked_for_around_a_step_that_is_played_back(kind, size):
     with pretend_device() as log, device.drawing_nothing():
         model = two_rounds(kind).to(DEVICE).train()
         captured = CapturedStep(Predictor(model), Renderer(), losses)
-        captured.graphs, captured.predictor.graphs = (GraphCache(tape=SilentTape()) for _ in range(2))
+        captured.graphs, captured.predictor.graphs = (GraphCache(backend=SilentBackend()) for _ in range(2))
         options = Optimization(lr=1e-3, matrix_scale=1.0)
         optimizer = options.optimizer(model)
-        optimizer.graphs = GraphCache(tape=SilentTape())
+        optimizer.graphs = GraphCache(backend=SilentBackend())
         hold_rates(optimizer)
         for _ in range(4):
             depths = 2.0 * batch.masks
@@ -145,7 +145,7 @@ def test_little_is_asked_for_around_a_prediction_that_is_played_back(size):
     batch = dataclasses.replace(ellipsoid_batch(0.15, 4, 28, size), targets=None)
     with pretend_device() as log, device.drawing_nothing():
         predictor = Predictor.from_checkpoint(map_location=DEVICE)
-        predictor.graphs = GraphCache(tape=SilentTape())
+        predictor.graphs = GraphCache(backend=SilentBackend())
         for _ in range(3):
             there = batch.to(DEVICE)
             log.clear()

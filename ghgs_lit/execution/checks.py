@@ -56,35 +56,40 @@ def refuse(findings: Sequence[Finding]) -> None:
 
 def _check_shapes(batch: Batch, patch_size: int) -> None:
     """InputError: a shape or a dtype of the batch is not what the stages work on."""
-    colored = batch.images.dim() == 5 and batch.images.shape[2] == 3
-    require(colored, "batch.images", "[B, V, 3, H, W]", tuple(batch.images.shape))
-    for name in ("images", "depths", "alpha", "log_gains"):
-        tensor = getattr(batch, name)
-        floating = tensor is None or tensor.is_floating_point()
-        require(floating, f"batch.{name}", "floating-point values", tensor is not None and tensor.dtype)
-    require(batch.masks.dtype == torch.bool, "batch.masks", "dtype torch.bool", batch.masks.dtype)
-    b, v, _, height, width = batch.images.shape
-    require(v >= 2, "batch.images", "2 views or more", v)
-    divisible = height % patch_size == width % patch_size == 0
-    expected = f"sides divisible by the patch size {patch_size} (or model.pad=multiple)"
-    require(divisible, "batch.images", expected, (height, width))
-    shapes = dict.fromkeys(("masks", "alpha", "depths"), (b, v, height, width)) | {"log_gains": (b, v, 3)}
-    for name, shape in shapes.items():
-        tensor = getattr(batch, name)
-        fits = tensor is None or tensor.shape == shape
-        require(fits, f"batch.{name}", str(shape), tensor is not None and tuple(tensor.shape))
+    images = batch.images
+    colored = images.dim() == 5 and images.shape[2] == 3
+    require(colored, "batch.images", "[B, V, 3, H, W]", tuple(images.shape))
+    b, v, _, height, width = images.shape
+    maps = (b, v, height, width)
+    fields = [("images", images, images.shape), ("alpha", batch.alpha, maps), ("depths", batch.depths, maps)]
+    for name, tensor, shape in (*fields, ("log_gains", batch.log_gains, (b, v, 3))):
+        if tensor is not None and not tensor.is_floating_point():
+            require(False, f"batch.{name}", "floating-point values", tensor.dtype)
+        if tensor is not None and tensor.shape != shape:
+            require(False, f"batch.{name}", str(shape), tuple(tensor.shape))
+    sides = f"sides divisible by the patch size {patch_size} (or model.pad=multiple)"
     cameras = batch.cameras
-    require(cameras.shape == (b, v), "batch.cameras", f"cameras of shape {(b, v)}", tuple(cameras.shape))
+    shape = tuple(cameras.intrinsics.shape[:-2])
     size = (cameras.height, cameras.width)
-    require(size == (height, width), "batch.cameras", f"the images' size {(height, width)}", size)
+    expectations = (
+        (batch.masks.dtype == torch.bool, "masks", "dtype torch.bool", batch.masks.dtype),
+        (batch.masks.shape == maps, "masks", str(maps), tuple(batch.masks.shape)),
+        (v >= 2, "images", "2 views or more", v),
+        (height % patch_size == width % patch_size == 0, "images", sides, (height, width)),
+        (shape == (b, v), "cameras", f"cameras of shape {(b, v)}", shape),
+        (size == (height, width), "cameras", f"the images' size {(height, width)}", size),
+    )
+    for fits, name, expected, found in expectations:
+        if not fits:
+            require(fits, f"batch.{name}", expected, found)
 
 
 def _findings_of_cameras(batch: Batch) -> list[Finding]:
     """Checks of cameras and masks, which are always made."""
-    findings = [
-        (f"cameras.{name}", "finite values", ~getattr(batch.cameras, name).isfinite().flatten(2).all(-1))
-        for name in ("intrinsics", "extrinsics")
-    ]
+    findings = []
+    for name in ("intrinsics", "extrinsics"):
+        matrices = getattr(batch.cameras, name)
+        findings.append((f"cameras.{name}", "finite values", ~matrices.isfinite().flatten(2).all(-1)))
     focal = batch.cameras.intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2]
     findings.append(("cameras.intrinsics", "focal lengths above 0", ~(focal > 0).all(-1)))
     findings.append(("masks", "the subject in one view at least", ~batch.masks.flatten(1).any(1)))

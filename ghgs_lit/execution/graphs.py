@@ -18,9 +18,8 @@ from weakref import WeakSet
 import torch
 from torch import Tensor
 
-from ghgs_lit.execution.repeatable import Guard
+from ghgs_lit.execution.capture import CaptureBackend, CaptureChecks, CudaGraphs
 from ghgs_lit.execution.state import ModelState
-from ghgs_lit.execution.tape import CudaTape, Tape
 from ghgs_lit.geometry.precision import rounding_state
 from ghgs_lit.rendering.capacity import Rooms, deferred
 
@@ -60,7 +59,7 @@ class GraphCache:
         limit: largest number of graphs, at least 1; the least recently used one makes room.
         eager: calls of a bucket before it is captured: what comes once is not worth it, and
             caches are filled.
-        tape: captures graphs; None: CUDA graphs.
+        backend: captures graphs; None: CUDA graphs.
         recent: number of buckets whose eager calls are remembered; None: 64 for each graph. A
             bucket that returns only after more than there are graphs would be captured in vain.
 
@@ -69,11 +68,13 @@ class GraphCache:
         reasons: why calls were not captured, each once.
     """
 
-    def __init__(self, limit: int = 8, eager: int = 1, tape: Tape | None = None, recent: int | None = None):
+    def __init__(
+        self, limit: int = 8, eager: int = 1, backend: CaptureBackend | None = None, recent: int | None = None
+    ):
         self.limit = limit
         self.eager = eager
         self.recent = recent or 64 * limit
-        self.tape = tape or CudaTape()
+        self.backend = backend or CudaGraphs()
         self.counts: Counter[str] = Counter()
         self.reasons: list[str] = []
         self._lock = threading.RLock()
@@ -83,7 +84,7 @@ class GraphCache:
 
     def __reduce__(self) -> tuple:
         """Copies capture anew."""
-        return type(self), (self.limit, self.eager, type(self.tape)(self.tape.device), self.recent)
+        return type(self), (self.limit, self.eager, type(self.backend)(self.backend.device), self.recent)
 
     def clear(self) -> None:
         """Free all graphs."""
@@ -153,7 +154,7 @@ class GraphCache:
         tensors: list[Tensor] = []
         bucket = self._bucket(inputs, key, tensors)
         devices = {tensor.device for tensor in tensors}
-        is_here = len(devices) == 1 and devices.pop().type == self.tape.device
+        is_here = len(devices) == 1 and devices.pop().type == self.backend.device
         if bucket is not None and is_here:
             with self._lock:
                 graph = self._graphs.get(bucket)
@@ -194,7 +195,7 @@ class GraphCache:
         try:
             # Streams and graphs belong to the current GPU.
             with torch.cuda.device_of(tensors[0]):
-                graph = _captured(self.tape, function, inputs, written)
+                graph = _captured(self.backend, function, inputs, written)
         except torch.OutOfMemoryError:
             is_full = True
         except Exception as error:  # a driver has many ways to fail
@@ -236,7 +237,7 @@ class GraphCache:
             key: as of :meth:`__call__`.
             tensors: gets the tensors of the inputs, in their order.
         """
-        bucket = (key, described(inputs, tensors), _surroundings(self.tape.device))
+        bucket = (key, described(inputs, tensors), _surroundings(self.backend.device))
         try:
             hash(bucket)
         except TypeError:
@@ -314,17 +315,19 @@ def _replaced(value: Any, replace: Callable[[Tensor], Tensor]) -> Any:
     return replace(value) if isinstance(value, Tensor) else value
 
 
-def _captured(tape: Tape, function: Callable[[Any], Any], inputs: Any, written: Sequence[Tensor]) -> _Graph:
+def _captured(
+    backend: CaptureBackend, function: Callable[[Any], Any], inputs: Any, written: Sequence[Tensor]
+) -> _Graph:
     """Capture ``function(inputs)``.
 
     Args:
-        tape: captures graphs.
+        backend: captures graphs.
         function: as of :meth:`GraphCache.__call__`.
         inputs: as of :meth:`GraphCache.__call__`; they are copied.
         written: as of :meth:`GraphCache.__call__`; as before in the end.
 
     Raises:
-        NotRecordable: the function reads a value of the device or copies from the host.
+        NotCapturable: the function reads a value of the device or copies from the host.
     """
     places: list[Tensor] = []
 
@@ -333,25 +336,25 @@ def _captured(tape: Tape, function: Callable[[Any], Any], inputs: Any, written: 
         return places[-1]
 
     fixed = _replaced(inputs, place)
-    guards: list[Guard] = []
+    checks: list[CaptureChecks] = []
 
-    def guarded() -> Any:
+    def checked() -> Any:
         # Casts of weights would be shared between what is captured and what is not.
         torch.clear_autocast_cache()
-        guards.append(Guard())
+        checks.append(CaptureChecks())
         # What the first call computes and keeps beside fields must be computed by the graph.
         fresh = _replaced(fixed, lambda tensor: tensor)
-        with guards[-1]:
+        with checks[-1]:
             return function(fresh)
 
     values = [tensor.clone() for tensor in written]
     try:
-        result, replay = tape.record(guarded)
+        result, replay = backend.capture(checked)
     finally:
         torch.clear_autocast_cache()  # of a capture that failed, casts are no numbers
         with torch.no_grad():
             _copy_all(written, values)
-    return _Graph(places, result, replay, list(guards[-1].kept.values()))
+    return _Graph(places, result, replay, list(checks[-1].kept.values()))
 
 
 def _replayed(graph: _Graph, tensors: list[Tensor]) -> Any:

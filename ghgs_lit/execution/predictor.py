@@ -1,18 +1,20 @@
 """Predictions of a model for batches of any world and size."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 
 from ghgs_lit.errors import choice
+from ghgs_lit.execution.capture import NotCapturable
 from ghgs_lit.execution.checks import Finding, any_bad, refuse
 from ghgs_lit.execution.graphs import GraphCache, described, with_memory
 from ghgs_lit.execution.options import ModelOptions
 from ghgs_lit.execution.preprocessing import Preprocessing, preprocess
 from ghgs_lit.execution.scene import Scene
-from ghgs_lit.execution.state import ModelState, NotCapturable, state_of
+from ghgs_lit.execution.state import ModelState, state_of
 from ghgs_lit.geometry.padding import PaddedBatch
 from ghgs_lit.geometry.precision import PRECISIONS, precision_of
 from ghgs_lit.method.model import GHGS
@@ -148,7 +150,7 @@ class Predictor:
 
     def _state(self, batch: Batch) -> ModelState | None:
         """The state of the model if its work can be captured; the device is looked at first."""
-        if batch.masks.device.type != self.graphs.tape.device or self.options.capture == "off":
+        if batch.masks.device.type != self.graphs.backend.device or self.options.capture == "off":
             return None
         try:
             return self.graphs.of_weights(state_of(self.model))
@@ -190,7 +192,7 @@ class Predictor:
 
         is_eager = state is None or self.model.training or torch.is_grad_enabled()
         if is_eager or not self.fits(batch, plan):
-            return with_memory(lambda: settled(lambda: predict(batch, plan, coarse, done)))
+            return with_memory(partial(settled, partial(predict, batch, plan, coarse, done)))
         return self.graphs.settled(
             lambda inputs: predict(*inputs[0].read(), *inputs[1:]),
             (Scene.of(batch, plan), coarse, done),

@@ -7,16 +7,13 @@ from typing import Any, NamedTuple
 from torch import nn
 from torch.nn.modules import module as torch_module
 
+from ghgs_lit.execution.capture import NotCapturable
 from ghgs_lit.runtime.watching import Wrapped
 
 _SIMPLE = (str, int, float, bool, type(None))
 #: Attributes that every module has.
 _COMMON = frozenset(vars(nn.Module())) - {"training"}
 _HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
-
-
-class NotCapturable(Exception):
-    """A model has hooks or replaced methods, which a graph would not call; the message names one."""
 
 
 class ModelState(NamedTuple):

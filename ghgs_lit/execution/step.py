@@ -115,7 +115,7 @@ class CapturedStep:
         """
         known = isinstance(self.renderer, Renderer) and isinstance(self.losses, Losses)
         known = known and not self.losses.weights.model_extra  # terms of a plug-in may do likewise
-        return known and self.predictor.options.capture == "auto" and device == self.graphs.tape.device
+        return known and self.predictor.options.capture == "auto" and device == self.graphs.backend.device
 
     def captures(self, batch: Batch, is_scaled: bool = False) -> bool:
         """Whether a training step is tried to be captured.

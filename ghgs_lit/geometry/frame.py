@@ -15,7 +15,6 @@ from torch import Tensor
 
 from ghgs_lit.geometry.constants import constant
 from ghgs_lit.geometry.masks import first_and_last
-from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.projection import (
     at_least_float32,
     homogeneous_centers,
@@ -43,10 +42,11 @@ class Frame:
     @torch.no_grad()
     def of(cls, batch: Batch) -> "Frame":
         """The frame of each element, from its masks and cameras alone."""
-        cameras = batch.cameras.to(torch.float64)
-        with exact(batch.masks.device.type):
-            origin = subject_center(batch.masks, cameras)
-            return cls(origin, _axes(cameras), _size(batch.masks, cameras, origin) / HEIGHT)
+        # Neither autocast nor rounded products change float64.
+        matrices = (batch.cameras.intrinsics.double(), batch.cameras.extrinsics.double())
+        cameras = Cameras(*matrices, batch.cameras.height, batch.cameras.width)
+        origin = subject_center(batch.masks, cameras)
+        return cls(origin, _axes(cameras), _size(batch.masks, cameras, origin) / HEIGHT)
 
     @property
     def shared(self) -> "Frame":
@@ -69,9 +69,8 @@ class Frame:
         dtype = at_least_float32(batch.images).dtype
         extrinsics = cameras.extrinsics.double()
         moved = extrinsics.clone()
-        with exact(batch.masks.device.type):
-            moved[..., :3, :3] = extrinsics[..., :3, :3] @ self.axes[:, None].mT
-            moved[..., :3, 3] = in_cameras(self.origin, extrinsics) / self.metre[:, None, None]
+        moved[..., :3, :3] = extrinsics[..., :3, :3] @ self.axes[:, None].mT
+        moved[..., :3, 3] = in_cameras(self.origin, extrinsics) / self.metre[:, None, None]
         inside = Cameras(cameras.intrinsics.to(dtype), moved.to(dtype), cameras.height, cameras.width)
         return dataclasses.replace(batch, cameras=inside)
 

@@ -197,7 +197,7 @@ class _Rounding:
         if not self.of_modules:
             return self.of_older != ("highest", False)
         products = self.of_older is not None and self.of_older[0] != "highest"
-        return products or any(value not in ("ieee", "none") for value in self.of_modules)
+        return products or not {"ieee", "none"}.issuperset(self.of_modules)
 
     @property
     def is_default(self) -> bool:

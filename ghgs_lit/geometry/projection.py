@@ -1,8 +1,6 @@
 """Projection, unprojection and bilinear sampling. Conventions: see :mod:`ghgs_lit.types`. Every
 function takes any leading dimensions and computes in float32 or wider under any autocast."""
 
-from functools import reduce
-
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
@@ -157,29 +155,22 @@ def world_to_camera(
     Returns:
         Points [..., 3], float32 or wider; their third coordinate is the depth.
     """
-    return _camera_axes(points, extrinsics).movedim(0, -1).contiguous()
+    return _affine(extrinsics[..., :3, :], points.movedim(-1, 0)).movedim(0, -1).contiguous()
 
 
-def _camera_axes(points: Tensor, extrinsics: Tensor) -> Tensor:
-    """Coordinates [3, ...] of :func:`world_to_camera`;
-    no product of matrices, as in :func:`unproject`."""
+def _affine(matrices: Tensor, points: Tensor) -> Tensor:
+    """``A x + b`` of points [c, ...] for matrices ``[A b]`` [..., r, c + 1], as [r, ...]; no product of
+    matrices, as in :func:`unproject`. On a CPU without a temporary of all products; elsewhere at once."""
+    matrices = at_least_float32(matrices)
     points = at_least_float32(points)
-    matrices = at_least_float32(extrinsics)[..., :3, :]
-    columns = _columns(matrices, points.dim() + 1)
-    return _combined(columns[:3], points.movedim(-1, 0)) + columns[3]
-
-
-def _columns(matrices: Tensor, dimensions: int) -> Tensor:
-    """Matrices [..., r, c] as [c, r, ...]; then come the dimensions that broadcasting would add."""
-    return matrices[(None,) * (dimensions - matrices.dim())].movedim((-1, -2), (0, 1))
-
-
-def _combined(columns: Tensor, factors: Tensor) -> Tensor:
-    """The sum of columns [c, r, ...] times factors [c, ...]. On a CPU without a temporary of all
-    products; elsewhere at once."""
-    if factors.device.type == "cpu":
-        return reduce(torch.add, (column * factor for column, factor in zip(columns, factors, strict=True)))
-    return (columns * factors[:, None]).sum(0)
+    columns = matrices[(None,) * (points.dim() + 1 - matrices.dim())].movedim((-1, -2), (0, 1))
+    last = len(points)
+    if points.device.type != "cpu":
+        return (columns[:last] * points[:, None]).sum(0) + columns[last]
+    total = columns[0] * points[0]
+    for number in range(1, last):
+        total = total + columns[number] * points[number]
+    return total + columns[last]
 
 
 def project(
@@ -197,11 +188,10 @@ def project(
     Returns:
         Pixels ``(u, v)`` [..., 2], which are meaningless where z <= 0, and depths z [...].
     """
-    inside = _camera_axes(points, extrinsics)
+    inside = _affine(extrinsics[..., :3, :], points.movedim(-1, 0))
     z = inside[2]
     seen = inside[:2] / torch.where(z > 0, z, torch.ones_like(z))
-    columns = _columns(at_least_float32(intrinsics)[..., :2, :], seen.dim() + 1)
-    return (_combined(columns[:2], seen) + columns[2]).movedim(0, -1).contiguous(), z
+    return _affine(intrinsics[..., :2, :], seen).movedim(0, -1).contiguous(), z
 
 
 def look_at_point(cameras: Cameras) -> Tensor:

@@ -15,8 +15,8 @@ from ghgs_lit.execution import graphs
 from ghgs_lit.execution.graphs import GraphCache
 from ghgs_lit.geometry.precision import precision_of
 from ghgs_lit.types import Batch, Cameras
+from tests.helpers.capture_backends import OperatorBackend
 from tests.helpers.pretend_device import DEVICE, pretend_device
-from tests.helpers.tape import OperatorTape
 
 HERE = "cpu"
 
@@ -28,7 +28,7 @@ def no_gradient():
 
 
 def made(**options):
-    return GraphCache(tape=OperatorTape(HERE), **options)
+    return GraphCache(backend=OperatorBackend(HERE), **options)
 
 
 def numbers(seed, *shape):
@@ -200,7 +200,7 @@ def test_what_cannot_be_played_back_stays_eager(function):
 
 def refusal(function, values):
     """Why a function is not recorded on the pretend device."""
-    cache = GraphCache(tape=OperatorTape(), eager=0)
+    cache = GraphCache(backend=OperatorBackend(), eager=0)
     with pytest.warns(UserWarning, match="not captured"):
         cache(function, values)
     return cache.reasons[-1]
@@ -209,7 +209,7 @@ def refusal(function, values):
 def test_copies_from_the_host_are_refused():
     """A recording would read memory that holds something else by then;
     a waiting copy fails on CUDA."""
-    cache = GraphCache(tape=OperatorTape())
+    cache = GraphCache(backend=OperatorBackend())
     with pretend_device():
         values = numbers(0).to(DEVICE)
         cache(lambda x: x + torch.tensor([1.0, 2.0, 3.0], device=x.device), values)
@@ -224,7 +224,7 @@ def test_copies_from_the_host_are_refused():
 
 def test_tensors_of_other_devices_are_not_recorded():
     """Recordings act on one type of device; all else is eager, and nothing is said."""
-    cache = GraphCache(tape=OperatorTape())
+    cache = GraphCache(backend=OperatorBackend())
     for _ in range(3):
         cache(work, (numbers(0), numbers(1)))
     assert cache.counts == {"eager": 3}
@@ -346,7 +346,7 @@ class Held:
 
 def test_what_comes_again_too_late_is_not_recorded():
     """Recordings would push each other out before they are played back."""
-    cache = GraphCache(limit=2, tape=OperatorTape("cpu"), recent=2)
+    cache = GraphCache(limit=2, backend=OperatorBackend("cpu"), recent=2)
     for _ in range(3):
         for size in (1, 2, 3):
             cache(torch.neg, torch.ones(size))

@@ -6,15 +6,17 @@ import dataclasses
 import pytest
 import torch
 
+import ghgs_capture
 from benchmarks.device import drawing_nothing
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
+from ghgs_lit.errors import InputError
 from ghgs_lit.execution import Predictor
 from ghgs_lit.execution.graphs import GraphCache
 from ghgs_lit.rendering.capacity import Rooms
 from ghgs_lit.runtime.watching import Watcher, watched
+from tests.helpers.capture_backends import OperatorBackend, SilentBackend
 from tests.helpers.models import ATTRIBUTES, close, make_model
 from tests.helpers.pretend_device import DEVICE, pretend_device
-from tests.helpers.tape import OperatorTape, SilentTape
 
 
 @pytest.fixture(autouse=True)
@@ -30,7 +32,7 @@ def there():
 def capturing(*overrides):
     """A predictor that captures."""
     predictor = Predictor(make_model(*overrides).eval().to(DEVICE))
-    predictor.graphs = GraphCache(limit=16, tape=OperatorTape())
+    predictor.graphs = GraphCache(limit=16, backend=OperatorBackend())
     return predictor
 
 
@@ -216,7 +218,7 @@ def test_a_copy_captures_anew():
 def test_what_is_played_back_is_not_asked_for(there):
     """The encoder, the plan and what surrounds the stages remain, and as many waits as before."""
     model, batch, asked = capturing("model=recurrent"), scene(), []
-    model.graphs.tape = SilentTape()
+    model.graphs.backend = SilentBackend()
     for _ in range(3):
         there.clear()
         model(batch)
@@ -243,3 +245,9 @@ def test_what_precedes_the_plan_keeps_names_and_gradients():
         inside, *_ = model.prepare(dataclasses.replace(batch, images=photographs))
     assert inside.images.requires_grad
     assert counts(model) == {"eager": 1, "captured": 1, "replayed": 1}
+
+
+def test_stages_alone_predict_a_capture():
+    """They get a predictor of their own; a size must be given, as they are no checkpoint."""
+    with pytest.raises(InputError, match="size: expected a size in pixels beside a model"):
+        ghgs_capture.predict(None, make_model("model=paper"))

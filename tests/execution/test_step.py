@@ -19,10 +19,10 @@ from ghgs_lit.rendering.api import Renderer
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.callbacks import Averaging
 from ghgs_lit.training.cost import Costs
+from tests.helpers.capture_backends import OperatorBackend, SilentBackend
 from tests.helpers.losses import losses_of
 from tests.helpers.models import make_model
 from tests.helpers.pretend_device import DEVICE, pretend_device
-from tests.helpers.tape import OperatorTape, SilentTape
 from tests.test_device import PretendAccelerator
 
 LOSSES = losses_of({"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 0.0, "depth": 0.2})
@@ -44,17 +44,17 @@ def training(*overrides):
     return make_model(*overrides, *two).to(DEVICE).train()
 
 
-def capturing(model, losses=LOSSES, tape=OperatorTape, capture="auto"):
+def capturing(model, losses=LOSSES, backend=OperatorBackend, capture="auto"):
     """The captured step of a model."""
     predictor = Predictor(model)
     predictor.options = predictor.options.replace(capture=capture)
-    return of_tape(CapturedStep(predictor, Renderer(), losses), tape)
+    return with_backend(CapturedStep(predictor, Renderer(), losses), backend)
 
 
-def of_tape(captured, tape):
+def with_backend(captured, backend):
     """A captured step with a stand-in for CUDA graphs."""
-    captured.predictor.graphs = GraphCache(limit=16, tape=tape())
-    captured.graphs = GraphCache(limit=32, recent=8, tape=tape())
+    captured.predictor.graphs = GraphCache(limit=16, backend=backend())
+    captured.graphs = GraphCache(limit=32, recent=8, backend=backend())
     return captured
 
 
@@ -152,7 +152,7 @@ def trained(folder, capture):
     """Weights after four steps of two batches each, and how often passes were replayed."""
     model = training("model=hull")
     module = GHGSModule(model, Renderer(), LOSSES, Optimization(lr=1e-2, warmup=0.0))
-    captured = of_tape(module.captured_step, OperatorTape)
+    captured = with_backend(module.captured_step, OperatorBackend)
     captured.predictor.options = captured.predictor.options.replace(capture=capture)
     batches = [scene(color=1 - number / 20, holes=number).to("cpu") for number in range(4)]
     trainer = L.Trainer(
@@ -190,12 +190,12 @@ def test_a_step_of_a_training_asks_for_little(there, tmp_path, monkeypatch):
     """In Lightning's loop: waits for the plan, for the room of renderings, and for the guard."""
     model, asked = training("model=hull"), Asked(there)
     module = GHGSModule(model, Renderer(), LOSSES, Optimization(lr=1e-2, matrix_scale=1.0))
-    of_tape(module.captured_step, SilentTape)
+    with_backend(module.captured_step, SilentBackend)
     configured = module.configure_optimizers
 
     def recording_too():
         answer = configured()
-        answer["optimizer"].graphs = GraphCache(tape=SilentTape())
+        answer["optimizer"].graphs = GraphCache(backend=SilentBackend())
         return answer
 
     monkeypatch.setattr(module, "configure_optimizers", recording_too)
@@ -273,7 +273,7 @@ def test_what_cannot_be_captured_is_called(monkeypatch):
     assert captured.captures(batch)
     assert not captured.captures(batch.to("cpu"))
     for parts in ((lambda *_: None, LOSSES), (Renderer(), lambda *_: None)):
-        assert not of_tape(CapturedStep(Predictor(model), *parts), OperatorTape).captures(batch)
+        assert not with_backend(CapturedStep(Predictor(model), *parts), OperatorBackend).captures(batch)
     with monkeypatch.context() as patch:
         patch.setattr(torch, "is_autocast_enabled", lambda *_: True)
         patch.setattr(torch, "get_autocast_dtype", lambda *_: torch.float16)
@@ -313,7 +313,7 @@ def test_padded_views_are_captured():
 def test_shape_buckets_are_part_of_a_checkpoint(tmp_path):
     """A run that goes on from one has the sizes of the run that wrote it."""
     module = GHGSModule(training("model=hull", "skip=fast"), Renderer(), LOSSES, Optimization(lr=1e-2))
-    captured = of_tape(module.captured_step, OperatorTape)
+    captured = with_backend(module.captured_step, OperatorBackend)
     for share in (0.16, 0.05):
         batch = ellipsoid_batch(share, 3, 56, 1)
         captured(dataclasses.replace(batch, depths=2.0 * batch.masks).to(DEVICE))

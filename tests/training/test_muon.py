@@ -10,8 +10,8 @@ from ghgs_lit.execution.graphs import GraphCache
 from ghgs_lit.training import Optimization
 from ghgs_lit.training.muon import Muon, is_matrix, orthogonalized
 from ghgs_lit.training.optimization import hold_rates, plain_rates
+from tests.helpers.capture_backends import OperatorBackend
 from tests.helpers.pretend_device import DEVICE, pretend_device
-from tests.helpers.tape import OperatorTape
 
 OPTIONS = {"lr": 0.01, "betas": (0.9, 0.98), "eps": 1e-8, "weight_decay": 0.1}
 
@@ -143,12 +143,12 @@ def test_parameters_without_gradient_stay():
     assert moved == {"square", "tall", "wide", "output", "token"}
 
 
-def stepped(tape, capturable=True, steps=5):
+def stepped(backend, capturable=True, steps=5):
     """Weights after some steps on the pretend device, whose rates follow a schedule, and counts."""
     model = Small().to(DEVICE)
     model.conv.data = model.conv.data.contiguous(memory_format=torch.channels_last)
     optimizer = Muon(model.parameters(), matrix_lr=0.02, capturable=capturable, **OPTIONS)
-    optimizer.graphs = tape and GraphCache(tape=tape)
+    optimizer.graphs = backend and GraphCache(backend=backend)
     hold_rates(optimizer)
     for seed in range(steps):
         for number, parameter in enumerate(model.parameters()):
@@ -159,7 +159,7 @@ def stepped(tape, capturable=True, steps=5):
             group["lr"].mul_(0.9)
         assert {name for name, p in model.named_parameters() if p.grad is None} == MATRICES
     weights = [parameter.detach().cpu() for parameter in model.parameters()]
-    return weights, tape and dict(optimizer.graphs.counts)
+    return weights, backend and dict(optimizer.graphs.counts)
 
 
 MATRICES = {"conv", "square", "tall", "wide"}
@@ -172,7 +172,7 @@ def test_steps_that_are_played_back_are_the_same(capturable):
     with pretend_device():
         wanted, _ = stepped(None, capturable)
         with nullcontext() if capturable else pytest.warns(UserWarning, match="not captured as a CUDA graph"):
-            found, counts = stepped(OperatorTape(), capturable)
+            found, counts = stepped(OperatorBackend(), capturable)
     for one, other in zip(wanted, found, strict=True):
         assert torch.equal(one, other)
     wanted = {"eager": 2, "captured": 1, "replayed": 2} if capturable else {"eager": 4, "refused": 1}

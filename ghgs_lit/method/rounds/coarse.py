@@ -213,12 +213,15 @@ def coarse_sizes(batch: Batch, height: int, patch_size: int) -> list[Size | None
     views, *full = photographs.masks.shape[1:]
     sizes: list[Size | None] = []
     for first in range(0, len(photographs.extents), views):
-        seen = [extent for extent in photographs.extents[first : first + views] if extent.count]
-        tallest = max((max(e.bottom - e.top, e.right - e.left) for e in seen), default=0)
-        scale = height / max(tallest, 1)
-        size = tuple(max(round(side * scale / patch_size), 1) * patch_size for side in full)
-        is_known = FILLED * max(full) <= height or tallest <= height
-        sizes.append(None if is_known or max(size) >= max(full) else size)
+        tallest = 0
+        for extent in photographs.extents[first : first + views]:
+            if extent.count:
+                tallest = max(tallest, extent.bottom - extent.top, extent.right - extent.left)
+        size = None
+        if tallest > height and FILLED * max(full) > height:
+            scale = height / tallest
+            size = tuple([max(round(side * scale / patch_size), 1) * patch_size for side in full])
+        sizes.append(None if size is None or max(size) >= max(full) else size)
     return sizes
 
 

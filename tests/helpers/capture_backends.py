@@ -12,7 +12,7 @@ from torch.utils._pytree import tree_leaves
 from tests.helpers.pretend_device import DEVICE, PretendTensor
 
 
-class OperatorTape:
+class OperatorBackend:
     """As CUDA graphs, for a type of ``device``;
     ``recorded``: number of operators of each recording."""
 
@@ -20,7 +20,7 @@ class OperatorTape:
         self.device = device
         self.recorded: list[int] = []
 
-    def record(self, call: Callable[[], Any]) -> tuple[Any, Callable[[], None]]:
+    def capture(self, call: Callable[[], Any]) -> tuple[Any, Callable[[], None]]:
         call()  # as CUDA graphs need it: once before, with the same inputs
         with _Operators() as operators:
             result = call()
@@ -28,10 +28,10 @@ class OperatorTape:
         return result, operators.play
 
 
-class SilentTape(OperatorTape):
+class SilentBackend(OperatorBackend):
     """Plays back nothing, as far as the host is concerned."""
 
-    def record(self, call: Callable[[], Any]) -> tuple[Any, Callable[[], None]]:
+    def capture(self, call: Callable[[], Any]) -> tuple[Any, Callable[[], None]]:
         return call(), lambda: None
 
 

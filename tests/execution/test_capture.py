@@ -5,9 +5,9 @@ from contextlib import contextmanager
 import pytest
 import torch
 
-from ghgs_lit.execution import tape
+from ghgs_lit.execution import capture
+from ghgs_lit.execution.capture import CudaGraphs
 from ghgs_lit.execution.graphs import GraphCache
-from ghgs_lit.execution.tape import CudaTape
 
 
 class Graphs:
@@ -72,7 +72,7 @@ class Graphs:
         self.current = stream
 
     def install(self, patch):
-        tape._side_stream.cache_clear()
+        capture._side_stream.cache_clear()
         members = {
             "Stream": self.new_stream,
             "current_stream": lambda device=None: self.current,
@@ -90,7 +90,7 @@ class Graphs:
 @pytest.fixture
 def graphs(monkeypatch):
     yield lambda *given, **options: Graphs(*given, **options).install(monkeypatch)
-    tape._side_stream.cache_clear()
+    capture._side_stream.cache_clear()
 
 
 def test_graphs_are_made_as_pytorch_documents(graphs):
@@ -98,14 +98,14 @@ def test_graphs_are_made_as_pytorch_documents(graphs):
     and in one pool as long as a graph of it is there."""
     log = []
     graphs(log)
-    cuda = CudaTape()
-    (result, play), (_, other) = (cuda.record(lambda: log.append("call") or 5) for _ in range(2))
+    cuda = CudaGraphs()
+    (result, play), (_, other) = (cuda.capture(lambda: log.append("call") or 5) for _ in range(2))
     play()
     assert result == 5
     once = ["warm", "call", "record thread_local 1", "call"]
     assert log == ["stream of 0", *once, *once, "play"]
     del play, other
-    cuda.record(lambda: log.append("call"))
+    cuda.capture(lambda: log.append("call"))
     assert log[-2] == "record thread_local 2"
 
 
@@ -116,7 +116,7 @@ def test_a_recording_that_fails_leaves_the_device_as_it_was(monkeypatch, end_fai
     log, calls, weight = [], [], torch.ones(3)
     stand_in = Graphs(log, end_fails)
     stand_in.install(monkeypatch)
-    cache = GraphCache(tape=CudaTape("cpu"))
+    cache = GraphCache(backend=CudaGraphs("cpu"))
     cleared = []
     monkeypatch.setattr(torch, "clear_autocast_cache", lambda: cleared.append(len(calls)))
 
@@ -140,4 +140,4 @@ def test_a_recording_that_fails_leaves_the_device_as_it_was(monkeypatch, end_fai
     assert calls == ["main", "side", "side", "main", "main"]
     assert cleared == [1, 2, 3]
     assert cache.counts == {"eager": 2, "refused": 1}
-    tape._side_stream.cache_clear()
+    capture._side_stream.cache_clear()
