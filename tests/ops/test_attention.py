@@ -110,22 +110,6 @@ def test_what_is_not_finite_reaches_the_same_values_as_in_pytorch(dtype, bad):
         assert found[:, :, 0].isfinite().all()
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize(("heads", "tokens"), [(5, 40), (1, 7 * QUERIES + 3)])
-def test_the_same_bits_with_any_number_of_threads(dtype, heads, tokens):
-    """Results do not depend on how heads are divided among threads."""
-    before = torch.get_num_threads()
-    args = scene(2, heads, tokens, 32, dtype)
-    found = []
-    try:
-        for threads in (1, 2, 3, 7):
-            torch.set_num_threads(threads)
-            found.append(cpu.attend_heads(*args))
-    finally:
-        torch.set_num_threads(before)
-    assert all(torch.equal(other, found[0]) for other in found[1:])
-
-
 def test_types_may_differ_and_that_of_the_values_is_taken():
     """Queries and keys in another dtype than the values are converted,
     and the result is in theirs."""

@@ -1,5 +1,5 @@
-"""How well photographs agree about a depth, against a pixel-by-pixel version on SciPy's
-interpolation."""
+"""How well photographs agree about a depth: against a pixel-by-pixel version on SciPy's interpolation, and
+kernels against plain PyTorch."""
 
 import dataclasses
 
@@ -12,9 +12,11 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.method.bounds import VisualHull
 from ghgs_lit.method.heads.depth import DepthHeadOptions
+from ghgs_lit.ops import photo_consistency as stage
 from ghgs_lit.ops.photo_consistency import TOLERANCE, photo_consistency
 from ghgs_lit.types import DepthBounds
-from tests.helpers.scenes import make_batch, ring
+from tests.helpers.kernels import DEVICE, kernels, plain_pytorch
+from tests.helpers.scenes import in_dtype, make_batch, ring
 from tests.method.heads.test_gaussian import make_head, run, shake
 
 
@@ -173,3 +175,67 @@ def test_rims_agree_as_if_they_were_not_premultiplied():
     torch.testing.assert_close(photo_consistency(mixed, bounds, 4), expected, atol=1e-5, rtol=1e-4)
     dark = photo_consistency(dataclasses.replace(mixed, alpha=None), bounds, 4)
     assert (dark - expected).abs().max() > 0.1
+
+
+LARGER = [(2, 4, 70, 98, 360.0), (1, 5, 98, 42, 360.0), (2, 2, 56, 56, 60.0), (1, 3, 56, 56, 150.0)]
+
+
+@pytest.mark.parametrize("steps", [1, 7])
+@pytest.mark.parametrize(("b", "v", "height", "width", "spread"), LARGER)
+def test_the_kernel_gives_the_agreement_of_plain_pytorch(b, v, height, width, spread, steps):
+    """Also behind cameras and outside frames; one view is empty."""
+    batch = make_batch(b, v, height, width, spread=spread)
+    batch.masks[-1, 0] = False
+    hull = VisualHull()(batch)
+    assert photo_consistency(batch, hull, steps).any()
+    for bounds in (hull, DepthBounds(-hull.far, hull.far)):
+        found = photo_consistency(batch, bounds, steps)
+        with plain_pytorch():
+            expected = photo_consistency(dataclasses.replace(batch), bounds, steps)
+        torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
+
+
+SCENES = [(2, 4, 28, 42, 360.0), (1, 5, 42, 28, 360.0), (2, 2, 28, 28, 60.0), (1, 3, 56, 56, 150.0)]
+EPS = torch.finfo(torch.float32).eps
+
+
+def bounds_of(batch):
+    hull = VisualHull()(batch)
+    return hull, DepthBounds(-hull.far, hull.far)  # also behind the cameras
+
+
+@pytest.mark.parametrize("steps", [1, 5])
+@pytest.mark.parametrize(("b", "v", "height", "width", "spread"), SCENES)
+def test_the_agreement_is_as_exact_as_plain_pytorchs(b, v, height, width, spread, steps):
+    """Behind cameras and outside frames, too; a view is empty, a pixel is not finite."""
+    batch = make_batch(b, v, height, width, spread=spread)
+    batch.masks[-1, 0] = False
+    batch.images[0, -1, :, height // 2, width // 2] = torch.nan
+    for bounds in bounds_of(batch):
+        exact = photo_consistency(in_dtype(batch, torch.float64), bounds.to(torch.float64), steps)
+        fresh = dataclasses.replace(batch).to(DEVICE)
+        with kernels() as called:
+            found = photo_consistency(fresh, bounds.to(DEVICE), steps)
+        assert called == ["swept"]
+        # Pixels are exact to roundings of the frame's size times the depth's ratio to the least
+        # in front of a camera; colours differ by up to 1 a pixel, and the agreement by 1 /
+        # TOLERANCE of that.
+        difference = (found.cpu() - exact).abs()
+        assert difference.max() < 1e-3
+        assert difference.mean() < 64 * EPS / stage.TOLERANCE
+
+
+def test_strides_change_nothing_and_no_pixel_has_no_agreement():
+    batch = make_batch(2, 3, 28, 42)
+    near, far = (bound.flatten()[batch.pixels] for bound in dataclasses.astuple(VisualHull()(batch)))
+    strided = dataclasses.replace(
+        batch, images=batch.images.transpose(3, 4).contiguous().transpose(3, 4), masks=batch.masks.clone()
+    )
+    with kernels():
+        expected = stage.consistency_of(*(x.to(DEVICE) for x in (batch, batch.pixels, near, far)), 3)
+        found = stage.consistency_of(
+            *(x.to(DEVICE) for x in (strided, batch.pixels, near.repeat_interleave(2)[::2], far)), 3
+        )
+        none = stage.consistency_of(*(x.to(DEVICE) for x in (batch, batch.pixels[:0], near[:0], far[:0])), 3)
+    assert torch.equal(found, expected)
+    assert none.shape == (0, 3)

@@ -9,6 +9,8 @@ from ghgs_lit.ops.intersections import TILE, intersections
 from ghgs_lit.rendering import RasterSettings, capacity, gsplat_backend, reference
 from ghgs_lit.rendering.capacity import deferred, settled
 from tests.helpers.gsplat import InParts, functions
+from tests.helpers.kernels import DEVICE as KERNELS
+from tests.helpers.kernels import kernels
 from tests.helpers.pretend_device import DEVICE, pretend_device
 from tests.helpers.splats import camera_ring, cloud
 
@@ -53,6 +55,20 @@ def test_splats_and_offsets_are_those_of_gsplat(size):
     assert (found.splats < radii[..., 0].numel()).all()
     assert found.has_pixels[:, :-1].all()
     assert not found.has_pixels[:, -1].any()
+
+
+@pytest.mark.parametrize("size", [(3, 200, 60, 75), (1, 1, 16, 16), (2, 90, 100, 33), (40, 3, 400, 400)])
+@pytest.mark.parametrize("capacity", [1, 300, 5000])
+def test_lists_of_kernels_are_equal(size, capacity):
+    """With room for some intersections, for all, and for more."""
+    values = splats(*size)
+    wanted = intersections(*values, *size[2:], capacity)
+    with kernels() as called:
+        found = intersections(*(value.to(KERNELS) for value in values), *size[2:], capacity)
+    assert called == ["boxed", "placed"]
+    for one, other in zip(found, wanted, strict=True):
+        assert torch.equal(one.cpu(), other)
+        assert one.dtype == other.dtype
 
 
 def test_nothing_is_asked_of_the_device():

@@ -3,7 +3,6 @@
 import dataclasses
 
 import pytest
-import torch
 
 from ghgs_lit.method.bounds import VisualHull
 from ghgs_lit.ops.ray_marching import march
@@ -39,17 +38,3 @@ def test_the_kernel_gives_the_bounds_of_plain_pytorch(monkeypatch, scene, tolera
     expected = VisualHull(tolerance=tolerance)(dataclasses.replace(batch))
     assert (found.near != expected.near).float().mean() < 1e-4
     assert (found.far != expected.far).float().mean() < 1e-4
-
-
-def test_the_number_of_threads_changes_no_bit():
-    """Tasks write apart: an order of threads must not show."""
-    batch, threads = make_batch(2, 4, 112, 112), torch.get_num_threads()
-    results = []
-    try:
-        for count in (1, 3):
-            torch.set_num_threads(count)
-            results.append(VisualHull()(batch))
-    finally:
-        torch.set_num_threads(threads)
-    assert torch.equal(results[0].near, results[1].near)
-    assert torch.equal(results[0].far, results[1].far)

@@ -1,0 +1,72 @@
+"""Tasks of a CPU's kernels write apart: an order of threads must not show."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from ghgs_lit.method.bounds import VisualHull
+from ghgs_lit.method.rounds.observation import observe
+from ghgs_lit.ops.attention import cpu as attention
+from ghgs_lit.ops.attention.cpu import QUERIES
+from ghgs_lit.ops.photo_consistency import photo_consistency
+from ghgs_lit.ops.round_memory import remembered
+from tests.helpers.scenes import make_batch
+from tests.method.heads.test_gaussian import make_head
+from tests.method.rounds.test_observation import splats
+from tests.ops import test_activation, test_attention, test_round_memory
+
+
+@torch.no_grad()
+def activated():
+    gaussians = make_head(axes="surface").activate(*test_activation.scene(2, 4, 56, 56))
+    return [getattr(gaussians, name) for name in test_activation.FIELDS]
+
+
+def attended(heads, tokens, dtype):
+    return [attention.attend_heads(*test_attention.scene(2, heads, tokens, 32, dtype))]
+
+
+def marched():
+    return list(dataclasses.astuple(VisualHull()(make_batch(2, 4, 112, 112))))
+
+
+def observed():
+    batch = make_batch(2, 4, 112, 112)
+    return [observe(splats(batch), batch)]
+
+
+def remembered_and_learned():
+    rounds, rows = test_round_memory.scene(48, 4, 5000)
+    after = remembered(rounds._layers, *rows)
+    layers = [rounds.view[0].weight, rounds.update[0].weight, rounds.memory.bias]
+    return [after, *torch.autograd.grad(after.square().sum(), layers)]
+
+
+def swept():
+    batch = make_batch(2, 4, 112, 112)
+    return [photo_consistency(batch, VisualHull()(batch), 4)]
+
+
+CALLS = {
+    "activation": activated,
+    "many heads": lambda: attended(5, 40, torch.float32),
+    "one head": lambda: attended(1, 7 * QUERIES + 3, torch.bfloat16),
+    "march": marched,
+    "memory": remembered_and_learned,
+    "observation": observed,
+    "sweep": swept,
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_the_number_of_threads_changes_no_bit(name):
+    threads, results = torch.get_num_threads(), []
+    try:
+        for count in (1, 2, 3, 7):
+            torch.set_num_threads(count)
+            results.append(CALLS[name]())
+    finally:
+        torch.set_num_threads(threads)
+    for found in results[1:]:
+        assert all(torch.equal(one, other) for one, other in zip(results[0], found, strict=True))
