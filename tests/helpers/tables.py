@@ -4,20 +4,16 @@ from pathlib import Path
 
 import yaml
 
+from ghgs_lit.config.keys import ABLATIONS
 from ghgs_lit.evaluation import tables as t
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.results import write_results
 
-SWITCHES = {
-    "full": (True, True),
-    "no_unprojection": (False, True),
-    "no_semantic": (True, False),
-    "neither": (False, False),
-}
+SWITCHES = {name: switches for switches, name in ABLATIONS.items()}
 SHIFTS = {"a": -1.0, "b": 1.0}
 
 
-def config_of(row, seed=1, data="synthetic", weights=None, **changes) -> dict:
+def config_of(row, seed=1, data="synthetic", **changes) -> dict:
     unprojection, semantic = SWITCHES[row]
     return {
         "recalibration": {
@@ -25,7 +21,7 @@ def config_of(row, seed=1, data="synthetic", weights=None, **changes) -> dict:
             "similarity": "product" if semantic else "none",
         },
         "model": {"name": "paper"},
-        "encoder": {"weights": weights},
+        "encoder": {"weights": None},
         "data": {"name": data},
         "trainer": {"max_steps": 10},
         "seed": seed,
@@ -34,43 +30,43 @@ def config_of(row, seed=1, data="synthetic", weights=None, **changes) -> dict:
 
 
 def write_run(
-    folder: Path, row, psnr, seed=1, views=(3, 4, 5), targets="release", lpips=None, weights=None,
-    shifts=SHIFTS, data="synthetic", protocol="correct", method="model", git=None, verb="train",
-    training=None, measured=None, nodes=None, **changes,
-):  # fmt: skip
+    folder: Path, row, psnr, seed=1, views=(3, 4, 5), targets="release", shifts=SHIFTS, data="synthetic",
+    protocol="correct", method="model", measured=None, metrics=None, provenance=None, **config,
+) -> Path:  # fmt: skip
     """A run whose mean PSNR at n views is ``psnr + n``; each subject differs from it by its shift.
-    ``nodes`` of its configuration are those whose names are arguments here, such as ``views``."""
-    config = config_of(row, seed, data, weights, **changes, **(nodes or {}))
-    rows = [
-        {
-            "method": method, "subject": subject, "views": n, "targets": targets, "target": "000/3",
-            "inputs": ["000/0"], "psnr": psnr + n + shift, "ssim": 0.9, "flip": 0.1,
-            **({} if lpips is None else {"lpips": lpips}),
-        }
-        for n in views
-        for subject, shift in shifts.items()
-    ]  # fmt: skip
+
+    Args:
+        folder: Of the run.
+        row: Its ablation.
+        psnr: None: the run has no results yet.
+        measured: Further configuration of `ghgs evaluate`; None: of a training.
+        metrics: Further metrics of each row of results.
+        provenance: Further provenance.
+        config: Changes of the training's configuration; ``of_`` before ``views``, ``targets`` and ``data``.
+    """
+    config = config_of(row, seed, data, **{key.removeprefix("of_"): value for key, value in config.items()})
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    if psnr is None:
+        return folder
+    rows = []
+    for n in views:
+        about = {"method": method, "views": n, "targets": targets, "target": "000/3", "inputs": ["000/0"]}
+        for subject, shift in shifts.items():
+            values = {"psnr": psnr + n + shift, "ssim": 0.9, "flip": 0.1, **(metrics or {})}
+            rows.append({**about, "subject": subject, **values})
     source = {
         "config": config,
         "seed": seed,
         "data": {"name": data, "split": "val"},
         "protocol": {"metrics": protocol},
-        "git": git,
-        "training": training,
+        **(provenance or {}),
     }
-    if verb == "evaluate":
-        source["checkpoint_config"] = config
-        source["config"] = {**config_of("neither", 99), "data": {"name": data}, **(measured or {})}
+    if measured is not None:
+        evaluation = {**config_of("neither", 99), "data": {"name": data}, **measured}
+        source |= {"checkpoint_config": config, "config": evaluation}
     source["config_hash"] = config_hash(source["config"])
-    path = write_results(folder, rows, source)
-    (folder / "config.yaml").write_text(yaml.safe_dump(config))
-    return path
-
-
-def start_run(folder: Path, ablation, seed=1, **changes) -> None:
-    """A run without results yet."""
-    folder.mkdir(parents=True)
-    (folder / "config.yaml").write_text(yaml.safe_dump(config_of(ablation, seed, **changes)))
+    return write_results(folder, rows, source)
 
 
 def tables_of(folder: Path, layout="ablation", by=(), others=(), **options):
@@ -78,12 +74,3 @@ def tables_of(folder: Path, layout="ablation", by=(), others=(), **options):
     test = t.PairedTest(**options.pop("test", {}))
     chosen = t.TableOptions(t.LAYOUTS[layout], test=test, **options)
     return t.build_tables(t.read_sweep([folder], by), others, chosen)
-
-
-def body(markdown: str):
-    """The rows of a Markdown table by their first cells, without marks of notes, and its header."""
-    lines = [
-        [c.strip() for c in line.strip("|").split("|")] for line in markdown.splitlines() if line[:1] == "|"
-    ]
-    two = lines[0][0] == "3D Unproj."
-    return {(row[0], row[1][:1]) if two else row[0]: row[2 if two else 1 :] for row in lines[2:]}, lines[0]

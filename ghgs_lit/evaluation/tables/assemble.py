@@ -2,7 +2,7 @@
 
 import itertools
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pandas as pd
@@ -10,16 +10,7 @@ import pandas as pd
 from ghgs_lit.config.keys import ABLATIONS
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.evaluation.tables.cells import fill
-from ghgs_lit.evaluation.tables.layouts import (
-    Group,
-    Layout,
-    Line,
-    Table,
-    TableOptions,
-    data_title,
-    reported_data,
-    reported_table,
-)
+from ghgs_lit.evaluation.tables.layouts import Group, Layout, Line, Table, TableOptions, data_title, paper
 from ghgs_lit.evaluation.tables.notes import write_caption, write_notes
 from ghgs_lit.evaluation.tables.records import SETTING, Planned, Sweep
 from ghgs_lit.evaluation.tables.variants import Variant
@@ -36,6 +27,11 @@ BASELINES = {
 }
 #: Titles of models that follow other methods.
 PEERS = {"gps": "After GPS-Gaussian", "pixel": "Pixel-aligned"}
+#: Kinds of measured rows from top to bottom.
+_KINDS = ("baseline", "other", "model")
+#: Columns of measurements that are no metrics.
+_FACTS = {*SETTING, "variant", "views", "trained_views", "seed", "source", "run", "git", "subject"}
+_FACTS |= {"count", "said", "trained"}
 
 
 def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOptions) -> list[Table]:
@@ -63,26 +59,28 @@ def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOpt
         ours = _selected(ours, options.subjects, "the runs")
         others = [_selected(rows, options.subjects, rows["source"].iloc[0]) for rows in others]
     if options.targets:
+        expected = f"some of {', '.join(dict.fromkeys(ours['targets']))}, on which the runs were measured"
         ours = ours[ours["targets"].isin(options.targets)]
-    if ours.empty and options.targets:
-        expected = (
-            f"some of {', '.join(dict.fromkeys(sweep.rows['targets']))}, on which the runs were measured"
-        )
-        raise InputError(f"evaluation.targets: expected {expected}; found {', '.join(options.targets)}")
+        require(len(ours), "evaluation.targets", expected, list(options.targets))
     rows = pd.concat([ours, *others], ignore_index=True)
+    known = [name for name in rows if name not in _FACTS and rows[name].notna().any()]
     for name in options.metrics or ():
-        choice("columns", name, tuple(_measured(rows)))
+        choice("columns", name, tuple(known))
     same = [name for name in SETTING if layout.columns != "data" or name != "data"]
     if layout.rows == "ablation":
-        rows = rows.assign(trained=[variant.trained for variant in rows["variant"]])
-        same = [*same, "trained"]
-    tables = [part for _, part in rows.groupby(same, sort=False) if part.index[0] < len(ours)]
-    theirs = rows.iloc[len(ours) :]
-    if len(theirs) and not any(theirs.index.isin(part.index).any() for part in tables):
-        keys = [_text(part.iloc[0], same) for part in tables]
-        where = theirs.iloc[0]
-        raise InputError(f"{where['source']}: expected results on one of {keys}; found {_text(where, same)}")
-    return [_table(part, sweep, options) for part in tables]
+        rows["trained"] = [variant.trained for variant in rows["variant"]]
+        same.append("trained")
+    parts = [part for _, part in rows.groupby(same, sort=False) if part.index[0] < len(ours)]
+    for theirs in others:
+        if not any(theirs["source"].isin(part["source"]).any() for part in parts):
+            keys = [_text(part, same) for part in parts]
+            source = theirs["source"].iloc[0]
+            raise InputError(f"{source}: expected results on one of {keys}; found {_text(theirs, same)}")
+    return [_table(part, sweep, options) for part in parts]
+
+
+def _text(rows: pd.DataFrame, names: list[str]) -> str:
+    return ", ".join(f"{name}={rows.iloc[0][name]}" for name in names)
 
 
 def _runs_of_layout(sweep: Sweep, options: TableOptions) -> Sweep:
@@ -97,9 +95,8 @@ def _runs_of_layout(sweep: Sweep, options: TableOptions) -> Sweep:
     views = options.views or layout.views
     rows = sweep.rows[sweep.rows["views"].isin(views)]
     known = ", ".join(map(str, sorted(set(sweep.rows["views"]))))
-    expected = f"some of {known}, with which the runs were measured"
-    require(len(rows), "evaluation.views", expected, list(views))
-    on_paper = reported_table(layout.reported)[0].split(" and ") if layout.reported else []
+    require(len(rows), "evaluation.views", f"some of {known}, as the runs were measured", list(views))
+    on_paper = _reported_data(layout)
     has_papers = any(data_title(name) in on_paper for name in rows["data"])
 
     def belongs(variant: Variant, data: str) -> bool:
@@ -111,18 +108,17 @@ def _runs_of_layout(sweep: Sweep, options: TableOptions) -> Sweep:
 
     rows = rows[list(map(belongs, rows["variant"], rows["data"]))]
     require(len(rows), "runs", f"runs of layout={layout.name}", "baselines or the paper's ablations only")
-    planned = [p for p in sweep.planned if belongs(p.variant, p.data)]
-    planned = [p for p in planned if p.views is None or set(p.views) & set(views)]
+    planned = [run for run in sweep.planned if belongs(run.variant, run.data)]
+    planned = [run for run in planned if run.views is None or set(run.views) & set(views)]
     return replace(sweep, rows=rows, planned=planned)
 
 
-def _selected(rows: pd.DataFrame, names: re.Pattern[str], where: str) -> pd.DataFrame:
-    """Rows of a selection of subjects.
+def _reported_data(layout: Layout) -> list[str]:
+    return paper()["tables"][layout.reported]["data"].split(" and ") if layout.reported else []
 
-    Args:
-        rows: One for each subject; means, which say no subject, stay.
-        names: Whole names of the selection match.
-        where: The rows are from, for messages.
+
+def _selected(rows: pd.DataFrame, names: re.Pattern[str], where: str) -> pd.DataFrame:
+    """Rows of the subjects whose whole names match, and means, which have no subject.
 
     Raises:
         InputError: None matches.
@@ -133,37 +129,31 @@ def _selected(rows: pd.DataFrame, names: re.Pattern[str], where: str) -> pd.Data
     return rows[is_kept]
 
 
-def _measured(rows: pd.DataFrame) -> list[str]:
-    facts = {*SETTING, "variant", "views", "trained_views", "seed", "source", "run", "git", "subject"}
-    facts |= {"count", "said", "trained"}
-    return [name for name in rows if name not in facts and rows[name].notna().any()]
-
-
-def _text(row: pd.Series, names: list[str]) -> str:
-    return ", ".join(f"{name}={row[name]}" for name in names)
-
-
 def _table(rows: pd.DataFrame, sweep: Sweep, options: TableOptions) -> Table:
     layout = options.layout
-    planned = _planned_here(rows, sweep.planned, layout)
-    reported = layout.reported if options.reported else None
+    is_ablation = layout.rows == "ablation"
+    trained = {variant.trained for variant in rows["variant"]}
+    planned = [run for run in sweep.planned if layout.columns == "data" or run.data in set(rows["data"])]
+    planned = [run for run in planned if not is_ablation or run.variant.trained in trained]
     groups = _groups(rows, planned, options)
-    models = rows[[v.kind == "model" for v in rows["variant"]]]
+    models = rows[[variant.kind == "model" for variant in rows["variant"]]]
     models = rows if models.empty else models
-    lpips = "lpips" in models and models.groupby("source")["lpips"].count().all()
-    metrics = list(options.metrics or ("psnr", "ssim", "lpips" if lpips else "flip"))
-    begun = dict.fromkeys([*rows["variant"], *(p.variant for p in planned if not p.done)])
-    lines = _measured_lines(sorted(begun, key=_place_in(sweep.order)), layout)
+    has_lpips = "lpips" in models and models.groupby("source")["lpips"].count().all()
+    metrics = list(options.metrics or ("psnr", "ssim", "lpips" if has_lpips else "flip"))
+    place = {variant: i for i, variant in enumerate(sweep.order)}
+    begun = dict.fromkeys([*rows["variant"], *(run.variant for run in planned)])
+    begun = sorted(begun, key=lambda v: (_KINDS.index(v.kind), place.get(v, len(place))))
+    stub = ("3D Unproj.", "Semantic Cons.") if is_ablation else ("Methods",)
+    lines = _ablation_lines(begun) if is_ablation else _method_lines(begun)
+    table = Table(options, rows, planned, sweep.configs, stub, groups, metrics, lines)
     figures: list[dict] = []
-    if reported:
-        names, figures = _reported(layout, reported, groups)
-        lines = [*names, *lines]
-    stub = ("3D Unproj.", "Semantic Cons.") if layout.rows == "ablation" else ("Methods",)
-    if layout.rows == "ablation" and any(line.variant.is_own for line in lines):
-        stub = ("Ablation", *stub)
-        lines = [replace(line, stub=(line.variant.ablation, *line.stub)) for line in lines]
-    on = reported_table(reported)[0] if reported else None
-    table = Table(options, rows, planned, sweep.configs, stub, groups, metrics, lines, reported_on=on)
+    if layout.reported and options.reported:
+        table.reported_on = paper()["tables"][layout.reported]["data"]
+        reported, figures = _reported(layout, groups)
+        table.lines = [*reported, *lines]
+    if is_ablation and any(variant.is_own for variant in begun):
+        table.stub = ("Ablation", *stub)
+        table.lines = [line._replace(stub=(line.variant.ablation, *line.stub)) for line in table.lines]
     table.others = len(sweep.configs.keys() - set(sweep.rows["source"]))
     fill(table, figures)
     table.caption = write_caption(table)
@@ -171,83 +161,59 @@ def _table(rows: pd.DataFrame, sweep: Sweep, options: TableOptions) -> Table:
     return table
 
 
-def _place_in(order: list[Variant]) -> Callable[[Variant], int]:
-    return lambda variant: order.index(variant) if variant in order else len(order)
-
-
-def _planned_here(rows: pd.DataFrame, planned: list[Planned], layout: Layout) -> list[Planned]:
-    models = {variant.trained for variant in rows["variant"]}
-    data = set(rows["data"])
-    planned = [p for p in planned if layout.columns == "data" or p.data in data]
-    return [p for p in planned if layout.rows != "ablation" or p.variant.trained in models]
-
-
 def _groups(rows: pd.DataFrame, planned: list[Planned], options: TableOptions) -> list[Group]:
     layout = options.layout
-    views = options.views or options.layout.views
+    views = options.views or layout.views
     if layout.columns == "views":
         name = data_title(rows["data"].iloc[0])
         return [Group(name if layout.heading == "data" else f"{n}-view", n) for n in views]
-    names = reported_data(layout.reported) if options.reported else []
-    names += [*rows["data"], *(p.data for p in planned)]
-    titles = dict.fromkeys(map(data_title, names))
+    names = _reported_data(layout) if options.reported else []
+    titles = dict.fromkeys(map(data_title, [*names, *rows["data"], *(run.data for run in planned)]))
     text = "{}, {}-view" if len(views) > 1 else "{}"
-    pairs = itertools.product(titles, views)
-    return [Group(text.format(name, n), n, name) for name, n in pairs]
+    return [Group(text.format(name, n), n, name) for name, n in itertools.product(titles, views)]
 
 
-def _reported(layout: Layout, reported: str, groups: list[Group]) -> tuple[list[Line], list[dict]]:
-    """The paper's rows, and its figures with their line and group."""
+def _reported(layout: Layout, groups: list[Group]) -> tuple[list[Line], list[dict]]:
+    """The paper's rows, and its figures with their line, group and metric."""
     lines = []
     cells = []
     switches = {name: pair for pair, name in ABLATIONS.items()}
-    for method, figures in reported_table(reported)[1].items():
-        pair = switches[method] if layout.rows == "ablation" else None
-        stub = (method,) if pair is None else _signs(pair)
-        by_group = {data_title(k) if isinstance(k, str) else k: v for k, v in figures.items()}
+    for method, figures in paper()["tables"][layout.reported]["rows"].items():
+        pair = switches.get(method)
+        by_group = {data_title(key) if isinstance(key, str) else key: row for key, row in figures.items()}
         for number, group in enumerate(groups):
             # The paper does not say with how many views its Table 1 was measured.
-            for metric, figure in by_group.get(group.data or group.views, {}).items():
+            row = by_group.get(group.data or group.views, [])
+            for metric, figure in zip(paper()["metrics"], row, strict=False):
                 cells.append({"line": len(lines), "group": number, "metric": metric, "mean": figure})
-        ablation = "" if pair is None else method
-        variant = Variant("reported", method, ablation=ablation, switches=pair)
-        lines.append(Line(variant, stub))
+        variant = Variant("reported", method, ablation="" if pair is None else method, switches=pair)
+        lines.append(Line(variant, _signs(pair) if pair else (method,)))
     return lines, cells
 
 
-def _signs(switches: tuple[bool, bool]) -> tuple[str, str]:
+def _signs(switches: tuple[bool, bool]) -> tuple[str, ...]:
     return tuple("✓" if on else "✗" for on in switches)
 
 
-def _measured_lines(begun: list[Variant], layout: Layout) -> list[Line]:
-    """Rows of all four ablations, then of a user's own; or of baselines, other methods and ours, in
-    this order."""
-    if layout.rows == "ablation":
-        first = begun[0]
-        papers = [replace(first, ablation=name, switches=pair) for pair, name in ABLATIONS.items()]
-        own = [variant for variant in begun if variant.is_own]
-        return [_ablation_line(variant) for variant in (*papers, *own)]
-    order = ("baseline", "other", "model")
-    models = [v for v in begun if v.kind == "model"]
-    return [Line(v, (_label(v, models),)) for v in sorted(begun, key=lambda v: order.index(v.kind))]
+def _ablation_lines(begun: list[Variant]) -> list[Line]:
+    """Rows of all four ablations, then of a user's own."""
+    papers = [replace(begun[0], ablation=name, switches=pair) for pair, name in ABLATIONS.items()]
+    lines = []
+    for variant in (*papers, *(variant for variant in begun if variant.is_own)):
+        unprojection, semantic = _signs(variant.switches)
+        note = " (a)" if variant.switches[1] and not variant.has_semantics else ""
+        lines.append(Line(variant, (unprojection, semantic + note)))
+    return lines
 
 
-def _ablation_line(variant: Variant) -> Line:
-    unprojection, semantic = _signs(variant.switches)
-    note = " (a)" if variant.switches[1] and not variant.has_semantics else ""
-    return Line(variant, (unprojection, semantic + note))
-
-
-def _label(variant: Variant, models: list[Variant]) -> str:
-    """Title of a row: ``Ours`` or another method's, with what distinguishes several models."""
-    if variant.kind == "baseline":
-        return BASELINES.get(variant.name, variant.name)
-    if variant.kind != "model":
-        return variant.name
-
-    def parts(v: Variant) -> list[str]:
-        return [v.model, v.encoder, v.ablation, *v.titles]
-
-    different = [len(set(values)) > 1 for values in zip(*map(parts, models), strict=True)]
-    titles = [p for p, differs in zip(parts(variant), different, strict=True) if differs and p not in PEERS]
-    return PEERS.get(variant.model, "Ours") + (f" ({', '.join(titles)})" if titles else "")
+def _method_lines(begun: list[Variant]) -> list[Line]:
+    """Rows of baselines, other methods and ours, which are called by what distinguishes them."""
+    models = [variant for variant in begun if variant.kind == "model"]
+    parts = [[v.model, v.encoder, v.ablation, *v.titles] for v in models]
+    differs = [len(set(values)) > 1 for values in zip(*parts, strict=True)]
+    names = {variant: BASELINES.get(variant.name, variant.name) for variant in begun}
+    for variant, values in zip(models, parts, strict=True):
+        titles = [value for value, shown in zip(values, differs, strict=True) if shown and value not in PEERS]
+        details = f" ({', '.join(titles)})" if titles else ""
+        names[variant] = PEERS.get(variant.model, "Ours") + details
+    return [Line(variant, (name,)) for variant, name in names.items()]

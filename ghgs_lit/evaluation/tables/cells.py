@@ -11,10 +11,10 @@ import pandas as pd
 from ghgs_lit.config.keys import OF_A_PLACE, OF_A_RUN, is_below
 from ghgs_lit.config.nodes import PairedTest
 from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.tables.differences import ABSENT, differing, differing_text, telling_apart
-from ghgs_lit.evaluation.tables.layouts import CELL, Table, arrow, data_title, decimals
+from ghgs_lit.evaluation.tables.layouts import CELL, Table, data_title, metric_of
 from ghgs_lit.evaluation.tables.records import TRAINING, person_of
 from ghgs_lit.evaluation.tables.significance import Comparison, compare, holm, pool, smallest_difference
+from ghgs_lit.evaluation.tables.variants import ABSENT, differing, differing_text
 
 
 def fill(table: Table, figures: Sequence[Mapping[str, Any]]) -> None:
@@ -29,7 +29,6 @@ def fill(table: Table, figures: Sequence[Mapping[str, Any]]) -> None:
             or configurations in a cell differ.
     """
     values = _values(table)
-    options = table.options
     _refuse_rivals(table, values)
     # Runs with the same numbers count once.
     cell_and_seed = [*CELL, "seed"]
@@ -38,39 +37,42 @@ def fill(table: Table, figures: Sequence[Mapping[str, Any]]) -> None:
     seeds = seeds.agg(mean=("value", "mean"), count=("count", "first"), run=("run", "first")).reset_index()
     means = {"mean": ("mean", "mean"), "deviation": ("mean", "std"), "seeds": ("seed", tuple)}
     cells = seeds.groupby(CELL).agg(**means, count=("count", "first"), runs=("run", " ".join))
+    columns = list(product(range(len(table.groups)), table.metrics))
+    every = [(line, *column) for line in range(len(table.lines)) for column in columns]
+    cells = cells.reindex(pd.MultiIndex.from_tuples(every, names=CELL))
     reported = pd.DataFrame(figures, columns=[*CELL, "mean"]).set_index(CELL)
-    every = pd.MultiIndex.from_product([range(len(table.lines)), *_columns(table)], names=CELL)
-    table.cells = cells.reindex(every)
-    table.cells["mean"] = table.cells["mean"].fillna(reported["mean"])
-    table.cells["lacking"] = [_lacking(table, cell) for cell in table.cells.itertuples()]
-    table.cells["best"] = False
-    for column in product(*_columns(table)):
+    table.cells = cells.assign(
+        mean=cells["mean"].fillna(reported["mean"]), best=False, marked=False, test=None
+    )
+    table.cells["lacking"] = _lacking(table)
+    for column in columns:
         _mark_best(table, column)
-    table.cells["test"] = None
-    table.cells["marked"] = False
-    if options.test.against != "none":
-        _test(table, _by_person(values, options.unit), options.test)
+    if table.options.test.against != "none":
+        _test(table, _by_person(values, table.options.unit), table.options.test)
 
 
-def _columns(table: Table) -> tuple[range, list[str]]:
-    return range(len(table.groups)), table.metrics
+def _line_of(table: Table) -> dict[Any, int]:
+    """Numbers of the measured lines by variant."""
+    return {line.variant: i for i, line in enumerate(table.lines) if line.variant.kind != "reported"}
 
 
 def _values(table: Table) -> pd.DataFrame:
     """One row for each value: ``CELL``, ``seed``, ``source``, ``run``, ``subject``, ``count``,
     ``value``."""
-    lines = {line.variant: i for i, line in enumerate(table.lines) if not line.is_reported}
-    numbers = {(g.views, g.data): i for i, g in enumerate(table.groups)}
+    lines = _line_of(table)
+    has_data = table.layout.columns == "data"
+    groups = {(group.views, group.data): i for i, group in enumerate(table.groups)}
     rows = table.rows
-    facts = ["line", "group", "seed", "source", "run", "subject"]
     about = zip(rows["views"], rows["data"], strict=True)
-    groups = [numbers.get((n, None), numbers.get((n, data_title(data)), -1)) for n, data in about]
-    rows = rows.assign(line=[lines[variant] for variant in rows["variant"]], group=groups)
+    numbers = [groups.get((views, data_title(data) if has_data else None), -1) for views, data in about]
+    rows = rows.assign(line=[lines[variant] for variant in rows["variant"]], group=numbers)
     rows = rows[rows["group"] >= 0]
     size = rows.groupby(["line", "group", "seed", "source"])["line"].transform("size")
     rows = rows.assign(count=rows.get("count", size).fillna(size), run=rows["run"].fillna(rows["source"]))
-    rows = rows.reindex(columns=[*facts, "count", *table.metrics])
-    return rows.melt([*facts, "count"], var_name="metric").dropna(subset="value")
+    facts = ["line", "group", "seed", "source", "run", "subject", "count"]
+    return (
+        rows.reindex(columns=[*facts, *table.metrics]).melt(facts, var_name="metric").dropna(subset="value")
+    )
 
 
 def _refuse_rivals(table: Table, values: pd.DataFrame) -> None:
@@ -109,50 +111,42 @@ def _differing(table: Table, sources: Sequence[str]) -> dict[str, list[str]]:
 def _rivals(
     table: Table, expected: str, sources: Sequence[str], keys: Mapping[str, Sequence[str]]
 ) -> InputError:
-    """The error that runs claim one cell.
-
-    Args:
-        table: Knows the runs' configurations.
-        expected: What was expected for the cell.
-        sources: Files of the runs.
-        keys: Keys in which their configurations differ, with the values.
-
-    Returns:
-        The error, with the keys of ``by`` that would give each a row.
-    """
-    apart = ",".join(telling_apart([table.configs.get(source, {}) for source in sources], keys))
-    rows = f"they differ in {differing_text(keys)}: by=[{apart}] gives each a row"
-    rows = rows if keys else "their configurations are equal"
-    return InputError(
-        f"runs: expected {expected}; found {' and '.join(sources)}; {rows}; runs=[...] lists those to show"
-    )
+    """The error that runs claim one cell, with the keys of ``by`` that give each a row."""
+    cure = f"they differ in {differing_text(keys)}: by=[{','.join(keys)}] gives each a row"
+    cure = cure if keys else "their configurations are equal"
+    found = " and ".join(sources)
+    return InputError(f"runs: expected {expected}; found {found}; {cure}; runs=[...] lists those to show")
 
 
-def _lacking(table: Table, cell: Any) -> tuple[int, ...]:
-    """Seeds of planned runs without results that would fill a cell."""
-    line, group, _ = cell.Index
-    group = table.groups[group]
-    seeds = set()
-    for planned in table.planned:
-        is_of_cell = planned.variant == table.lines[line].variant and not planned.done
-        is_of_cell &= planned.views is None or group.views in planned.views
-        if is_of_cell and group.data in (None, data_title(planned.data)):
-            seeds.add(planned.seed)
-    return tuple(sorted(seeds.difference(cell.seeds if isinstance(cell.seeds, tuple) else ())))
+def _lacking(table: Table) -> list[tuple[int, ...]]:
+    """Seeds of planned runs without results that would fill each cell."""
+    lines = _line_of(table)
+    planned: dict[tuple[int, int], set[int]] = {}
+    for run, (number, group) in product(table.planned, enumerate(table.groups)):
+        fits_views = run.views is None or group.views in run.views
+        if fits_views and group.data in (None, data_title(run.data)):
+            planned.setdefault((lines[run.variant], number), set()).add(run.seed)
+    lacking = []
+    for (line, group, _), seeds in table.cells["seeds"].items():
+        measured = seeds if isinstance(seeds, tuple) else ()
+        lacking.append(tuple(sorted(planned.get((line, group), set()).difference(measured))))
+    return lacking
 
 
 def _competing(table: Table, column: tuple) -> pd.Series:
+    """Means of a column by line, without baselines, some of which know the truth."""
     means = table.cells["mean"].xs(column, level=CELL[1:]).dropna()
-    return means[[table.lines[i].competes for i in means.index]]
+    return means[[table.lines[i].variant.kind in ("model", "other") for i in means.index]]
 
 
 def _mark_best(table: Table, column: tuple) -> None:
     """Mark the best means of a column, as printed. None is marked if all are equal, no direction is
     better, or the best leads by no more than the larger deviation over seeds of the best two."""
-    means = _competing(table, column).round(decimals(column[1]))
-    if means.nunique() < 2 or not arrow(column[1]):
+    metric = metric_of(column[1])
+    means = _competing(table, column).round(metric.decimals)
+    if means.nunique() < 2 or not metric.arrow:
         return
-    means = means.sort_values(ascending=arrow(column[1]) == "↓")
+    means = means.sort_values(ascending=metric.arrow == "↓")
     deviations = table.cells["deviation"].xs(column, level=CELL[1:])[means.index[:2]]
     if abs(means.iloc[0] - means.iloc[1]) <= deviations.max():  # false if there is no deviation
         return
@@ -185,35 +179,33 @@ def _test(table: Table, people: pd.DataFrame, test: PairedTest) -> None:
                 row, against = (other, one) if one == reference else (one, other)
                 cell = (row, *column) if against == reference else None
                 tested.append((cell, compare(rows[row], rows[against], test.alpha, pooled)))
-    known = [i for i, (_, comparison) in enumerate(tested) if comparison.p is not None]
+    known = [comparison.p for _, comparison in tested if comparison.p is not None]
     table.comparisons = len(known)
-    for i, p in zip(known, holm([tested[i][1].p for i in known]), strict=True):
-        cell, comparison = tested[i]
-        smallest = smallest_difference(comparison, test.alpha, len(known))
-        tested[i] = (cell, replace(comparison, corrected=p, smallest=smallest))
+    corrected = iter(holm(known))
     for cell, comparison in tested:
+        if comparison.p is not None:
+            smallest = smallest_difference(comparison, test.alpha, len(known))
+            comparison = replace(comparison, corrected=next(corrected), smallest=smallest)
         if cell is not None:
             table.cells.at[cell, "test"] = comparison
-            p = comparison.corrected
-            table.cells.at[cell, "marked"] = p is not None and p < test.alpha
+            table.cells.at[cell, "marked"] = comparison.p is not None and comparison.corrected < test.alpha
 
 
 def _reference(table: Table, means: pd.Series, metric: str, against: str) -> tuple[int | None, bool]:
-    """Reference row of a column.
+    """Number of the reference row of a column, None without any, and whether it was chosen by its
+    figures.
 
     Args:
-        table: With lines and options.
+        table: With lines.
         means: Means of the rows that compete, by number of the line.
         metric: Of the column.
         against: ``full``: the row of the whole method, where there is one;
             ``best``: the best of the column.
-
-    Returns:
-        Number of the line, None without any, and whether it was chosen by its figures.
     """
-    full = [i for i in means.index if table.lines[i].is_ours and table.lines[i].variant.ablation == "full"]
+    full = [i for i in means.index if table.lines[i].variant.ablation == "full"]
     if against == "full" and len(full) == 1:
         return full[0], False
-    if means.empty or not arrow(metric):
+    arrow = metric_of(metric).arrow
+    if means.empty or not arrow:
         return None, False
-    return (means.idxmin() if arrow(metric) == "↓" else means.idxmax()), True
+    return (means.idxmin() if arrow == "↓" else means.idxmax()), True

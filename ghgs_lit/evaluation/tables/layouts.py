@@ -1,13 +1,12 @@
 """Layouts of tables (the paper's four, the ablation at several numbers of views) and
 their parts."""
 
-import itertools
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -17,25 +16,53 @@ from ghgs_lit.evaluation.tables.records import TRAINING, Planned
 from ghgs_lit.evaluation.tables.variants import Variant
 from ghgs_lit.parsing import read_yaml
 
-DECIMALS = {"psnr": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1, "surface_mm": 1}
-DECIMALS |= {"gaussians": 0, "spill": 1, "sharpness": 2}
-DECIMALS |= {"prediction_seconds": 3, "steps": 0, "seconds": 0, "peak_gb": 1}
-HIGHER_IS_BETTER = ("psnr", "ssim")
-LOWER_IS_BETTER = ("lpips", "flip", "spill", "depth_error_mm", "surface_mm")
-LOWER_IS_BETTER += ("prediction_seconds", "seconds", "peak_gb")
-TITLES = {
-    "depth_error_mm": "Depth error (mm)",
-    "surface_mm": "Surface error (mm)",
-    "shared_neighbors": "Shared neighbours",
-    "gaussians": "Gaussians",
-    "psnr_box_40": "PSNR box at 0.40",
-    "spill": "Spill (‰)",
-    "sharpness": "Sharpness",
-    "prediction_seconds": "Prediction (s)",
-    "steps": "Training steps",
-    "seconds": "Training (s)",
-    "peak_gb": "Training memory (GB)",
+
+class Metric(NamedTuple):
+    """How a metric is printed.
+
+    Attributes:
+        title: Of its columns.
+        decimals: As in the paper.
+        arrow: ↑: higher is better; ↓: lower; empty: neither, or not known.
+    """
+
+    title: str
+    decimals: int
+    arrow: str
+
+
+METRICS = {
+    "psnr": Metric("PSNR", 2, "↑"),
+    "psnr_box_40": Metric("PSNR box at 0.40", 2, "↑"),
+    "ssim": Metric("SSIM", 4, "↑"),
+    "lpips": Metric("LPIPS", 4, "↓"),
+    "flip": Metric("FLIP", 4, "↓"),
+    "depth_error_mm": Metric("Depth error (mm)", 1, "↓"),
+    "surface_mm": Metric("Surface error (mm)", 1, "↓"),
+    "spill": Metric("Spill (‰)", 1, "↓"),
+    "sharpness": Metric("Sharpness", 2, ""),
+    "gaussians": Metric("Gaussians", 0, ""),
+    "shared_neighbors": Metric("Shared neighbours", 4, ""),
+    "prediction_seconds": Metric("Prediction (s)", 3, "↓"),
+    "steps": Metric("Training steps", 0, ""),
+    "seconds": Metric("Training (s)", 0, "↓"),
+    "peak_gb": Metric("Training memory (GB)", 1, "↓"),
 }
+
+
+def metric_of(name: str) -> Metric:
+    """How a metric is printed.
+
+    Args:
+        name: With its region, such as ``psnr_box``.
+
+    Returns:
+        Its entry of ``METRICS``, else that of the metric without its region.
+    """
+    stem, _, region = name.partition("_")
+    unknown = Metric(stem.upper(), 4, "")
+    known = METRICS.get(stem, unknown)
+    return METRICS.get(name) or known._replace(title=f"{stem.upper()} {region}".strip())
 
 
 @dataclass(frozen=True)
@@ -93,51 +120,7 @@ class TableOptions:
     subjects: re.Pattern[str] | None = None
 
 
-def _stem(metric: str) -> str:
-    """Metric without its region: ``psnr`` for ``psnr_box``."""
-    return metric if metric in DECIMALS else metric.split("_")[0]
-
-
-def decimals(metric: str) -> int:
-    """Decimals of a metric, as in the paper.
-
-    Args:
-        metric: Name, with its region.
-
-    Returns:
-        Number of decimals.
-    """
-    return DECIMALS.get(_stem(metric), 4)
-
-
-def arrow(metric: str) -> str:
-    """Which direction of a metric is better.
-
-    Args:
-        metric: Name, with its region.
-
-    Returns:
-        ↑: higher is better; ↓: lower; empty: neither, or not known.
-    """
-    stem = _stem(metric)
-    return "↑" if stem in HIGHER_IS_BETTER else "↓" if stem in LOWER_IS_BETTER else ""
-
-
-def title(metric: str) -> str:
-    """Title of a metric.
-
-    Args:
-        metric: Name, with its region, such as ``psnr_box``.
-
-    Returns:
-        Text such as ``PSNR box``.
-    """
-    stem, _, region = metric.partition("_")
-    return TITLES.get(metric) or f"{stem.upper()} {region}".strip()
-
-
-@dataclass(frozen=True)
-class Group:
+class Group(NamedTuple):
     """Columns below one heading: the metrics on ``data`` (None: the table's) with ``views``
     input views."""
 
@@ -146,28 +129,11 @@ class Group:
     data: str | None = None
 
 
-@dataclass(frozen=True)
-class Line:
+class Line(NamedTuple):
     """A row of a table: a variant and its texts in the first columns."""
 
     variant: Variant
     stub: tuple[str, ...]
-
-    @property
-    def is_ours(self) -> bool:
-        """Whether this is a trained model of ours."""
-        return self.variant.kind == "model"
-
-    @property
-    def is_reported(self) -> bool:
-        """Whether the figures are the paper's."""
-        return self.variant.kind == "reported"
-
-    @property
-    def competes(self) -> bool:
-        """Whether the row can be best and is tested;
-        baselines, some of which know the truth, do not."""
-        return self.variant.kind in ("model", "other")
 
 
 CELL = ["line", "group", "metric"]
@@ -182,7 +148,7 @@ class Table:
     Attributes:
         options: What it shows.
         rows: Measurements, as in :class:`Sweep`.
-        planned: Training runs of the table, finished or not.
+        planned: Training runs of the table that have no results yet.
         configs: Configuration of our model by ``source``.
         stub: Headings of the columns that name a row.
         groups: Groups of columns.
@@ -234,39 +200,28 @@ class Table:
         return list(names)
 
     @property
-    def ours(self) -> list[Line]:
-        """Rows of our models."""
-        return [line for line in self.lines if line.is_ours]
+    def ours(self) -> list[Variant]:
+        """Variants of our models, by row."""
+        return [line.variant for line in self.lines if line.variant.kind == "model"]
 
     @property
     def measured(self) -> pd.DataFrame:
         """Cells with a measured, not reported, number."""
-        known = self.cells[self.cells["mean"].notna()]
-        reported = [self.lines[i].is_reported for i in known.index.get_level_values("line")]
-        return known.loc[[not is_reported for is_reported in reported]]
+        return self.cells[self.cells["seeds"].notna()]
 
     @property
-    def blocks(self) -> list[list[int]]:
-        """Indices of reported rows, then of measured rows; empty blocks are left out."""
-        reported = [i for i, line in enumerate(self.lines) if line.is_reported]
-        measured = [i for i, line in enumerate(self.lines) if not line.is_reported]
-        return [block for block in (reported, measured) if block]
-
-    def block_title(self, block: list[int]) -> str:
-        """Title of a block, for tables with reported rows.
-
-        Args:
-            block: Numbers of lines, as in :attr:`blocks`.
-
-        Returns:
-            Whether they are reported or measured.
-        """
-        reported = f"as reported on {self.reported_on}, not measured here"
-        return reported if self.lines[block[0]].is_reported else "measured here"
+    def blocks(self) -> dict[str, list[int]]:
+        """Numbers of the reported lines, then of the measured ones, by title; none is empty."""
+        reported = [i for i, line in enumerate(self.lines) if line.variant.kind == "reported"]
+        measured = [i for i in range(len(self.lines)) if i not in reported]
+        titles = (f"as reported on {self.reported_on}, not measured here", "measured here")
+        blocks = dict(zip(titles, (reported, measured), strict=True))
+        return {title: block for title, block in blocks.items() if block}
 
 
 @cache
-def _content() -> dict[str, Any]:
+def paper() -> dict[str, Any]:
+    """What the paper's tables print, as in ``reported.yaml``."""
     return read_yaml(Path(__file__).parent / "reported.yaml")
 
 
@@ -279,38 +234,4 @@ def data_title(name: str) -> str:
     Returns:
         Its name in the paper, else ``name``.
     """
-    return _content()["data"].get(re.sub(r"[^a-z0-9]", "", name.lower()), name)
-
-
-def reported_source() -> str:
-    """Reference of the paper."""
-    return _content()["source"]
-
-
-def reported_table(name: str) -> tuple[str, dict[str, dict[int | str, dict[str, float]]]]:
-    """Figures of one of the paper's tables.
-
-    Args:
-        name: Such as ``table2``.
-
-    Returns:
-        Data set of the table, and its rows: method, then views or data, then metric, then figure.
-    """
-    table = _content()["tables"][name]
-    metrics = _content()["metrics"]
-    rows = {}
-    for method, groups in table["rows"].items():
-        rows[method] = {group: dict(zip(metrics, row, strict=True)) for group, row in groups.items()}
-    return table["data"], rows
-
-
-def reported_data(name: str) -> list[str]:
-    """Groups of columns of a reported table.
-
-    Args:
-        name: Such as ``table2``.
-
-    Returns:
-        Data sets or numbers of views.
-    """
-    return list(dict.fromkeys(itertools.chain.from_iterable(reported_table(name)[1].values())))
+    return paper()["data"].get(re.sub(r"[^a-z0-9]", "", name.lower()), name)

@@ -24,35 +24,31 @@ from ghgs_lit.evaluation.tables.variants import (
     with_views_of_column,
 )
 from ghgs_lit.parsing import read_yaml
-from ghgs_lit.runs.results import KEYS, METHOD, read_results, validated
+from ghgs_lit.runs.results import METHOD, read_results, validated
 from ghgs_lit.runs.run import runs_in_order
 
 SETTING = ["data", "split", "targets", "protocol"]
 """What numbers in one column must have in common."""
 TRAINING = ("steps", "seconds", "peak_gb")
 """Metrics of the training, which no subject has."""
-#: Keys of `ghgs evaluate` that change its results, beside model, data and metrics.
-_OF_EVALUATION = ("checkpoint", "refine", "refine_cameras")
 _ROW = ["method", "views", "targets", "subject"]
 
 
 @dataclass(frozen=True)
 class Planned:
-    """A training run with the cells that it fills.
+    """A training run without results yet, with the cells that it will fill.
 
     Attributes:
         variant: Row of its cells.
         data: Name of its data set.
         views: Numbers of input views of its columns; None: not known.
         seed: Of the run.
-        done: Whether it has results.
     """
 
     variant: Variant
     data: str
     views: tuple[int, ...] | None
     seed: int
-    done: bool
 
 
 @dataclass
@@ -65,7 +61,7 @@ class Sweep:
             configuration's hash), ``git`` (in words), ``subject``, and the metrics, averaged over
             the subject's targets; and ``trained_views``, the number of views of models that share a
             row because each was trained with another one.
-        planned: Training runs, finished or not.
+        planned: Training runs without results.
         configs: Configuration of our model by ``source``.
         order: Variants of our models in the order of rows.
     """
@@ -123,37 +119,33 @@ def _read_run(path: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
     trained = (source.checkpoint_config or source.config) | (source.changed_model or {})
     if source.verb == "train":  # of a version that did not write the options into the configuration
         trained = {"chosen": source.choices, **trained}
-    kept = (*_OF_EVALUATION, "data", "metrics")
-    config = trained | {key: source.config.get(key) for key in kept if key in {*source.config, *trained}}
+    of_evaluation = ("checkpoint", "refine", "refine_cameras", "data", "metrics")
+    config = trained | {key: source.config[key] for key in of_evaluation if key in source.config}
     measured = source.config.get("targets")
     if isinstance(measured, Mapping) and isinstance(trained.get("targets"), Mapping):
         of_training = {key: trained["targets"].get(key) for key in ("training_views", "per_step")}
         config["targets"] = {**measured, **of_training}
     seed = trained.get("seed", source.seed)
     require(isinstance(seed, int), f"{path}: provenance.seed", "a whole number", seed)
-    rows = pd.DataFrame(content["rows"])
-    rows = rows.drop(columns=[key for key in KEYS if key in rows and key not in _ROW])
+    rows = pd.DataFrame(content["rows"]).drop(columns=["target", "inputs", "skip"], errors="ignore")
     # In tables, ``seconds`` is the training time.
-    rows = rows.rename(columns={"seconds": "prediction_seconds"})
-    rows = rows.astype({name: float for name in rows if name not in _ROW})
-    rows = rows.groupby(_ROW, sort=False).mean().dropna(axis="columns", how="all").reset_index()
-    is_model = rows["method"] == METHOD
-    if (training := source.training) is not None:
-        peak = None if training.peak_bytes is None else training.peak_bytes / 1e9
-        for name, value in zip(TRAINING, (training.steps, training.seconds, peak), strict=True):
-            if value is not None:
-                rows.loc[is_model, name] = value
-    git = source.git and source.git.commit[:9] + " with changes" * source.git.changed
-    facts = {
-        "data": source.data.name,
-        "split": source.data.split,
-        "protocol": source.protocol.metrics,
-        "seed": seed,
-        "source": str(path),
-        "run": source.config_hash,
-        "git": git,
-    }
-    return rows.assign(**facts), config
+    rows = rows.rename(columns={"seconds": "prediction_seconds"}).set_index(_ROW).astype(float)
+    rows = rows.groupby(level=_ROW, sort=False).mean().dropna(axis="columns", how="all").reset_index()
+    training = source.training or _Training()
+    peak = training.peak_bytes and training.peak_bytes / 1e9
+    for name, value in zip(TRAINING, (training.steps, training.seconds, peak), strict=True):
+        if value is not None:
+            rows[name] = (rows["method"] == METHOD).map({True: value})
+    rows = rows.assign(
+        data=source.data.name,
+        split=source.data.split,
+        protocol=source.protocol.metrics,
+        seed=seed,
+        source=str(path),
+        run=source.config_hash,
+        git=source.git and source.git.commit[:9] + " with changes" * source.git.changed,
+    )
+    return rows, config
 
 
 def _with_variants(rows: pd.DataFrame, model: Variant | None, views: int | None) -> pd.DataFrame:
@@ -164,11 +156,11 @@ def _with_variants(rows: pd.DataFrame, model: Variant | None, views: int | None)
         model: Variant of the model's rows; None: there are none.
         views: Number of views, with which alone the model is shown; None: with all.
     """
-    is_model = rows["method"] == METHOD
-    rows = rows.assign(trained_views=float("nan") if views is None else float(views))
-    rows = rows[~is_model | (views is None) | (rows["views"] == views)]
-    variants = {name: model if name == METHOD else Variant("baseline", name) for name in rows["method"]}
-    return rows.drop(columns="method").assign(variant=[variants[name] for name in rows["method"]])
+    if views is not None:
+        rows = rows[(rows["method"] != METHOD) | (rows["views"] == views)]
+    variants = [model if name == METHOD else Variant("baseline", name) for name in rows["method"]]
+    trained_views = float("nan") if views is None else float(views)
+    return rows.drop(columns="method").assign(variant=variants, trained_views=trained_views)
 
 
 def _training_config(path: Path) -> dict[str, Any] | None:
@@ -185,13 +177,10 @@ def _training_config(path: Path) -> dict[str, Any] | None:
     return config
 
 
-def _planned(path: Path, config: Mapping[str, Any], variant: Variant, views: int | None) -> Planned:
-    measured = lookup(config, "evaluation.views")
-    measured = [measured] if isinstance(measured, int) else measured
-    columns = None if measured is None else tuple(measured)
-    done = (path.parent / "metrics.json").exists()
-    data = str(lookup(config, "data.name"))
-    return Planned(variant, data, (views,) if views else columns, config.get("seed", 0), done)
+def _planned(config: Mapping[str, Any], variant: Variant, views: int | None) -> Planned:
+    measured = lookup(config, "evaluation.views") if views is None else views
+    columns = (measured,) if isinstance(measured, int) else measured and tuple(measured)
+    return Planned(variant, str(lookup(config, "data.name")), columns, config.get("seed", 0))
 
 
 def _in_order(paths: Iterable[str], folders: Sequence[Path], variants: Mapping[str, Variant]) -> list[str]:
@@ -200,7 +189,7 @@ def _in_order(paths: Iterable[str], folders: Sequence[Path], variants: Mapping[s
 
     def place(path: str) -> tuple:
         run = Path(path).parent
-        folder = next(i for i, folder in enumerate(folders) if run.is_relative_to(folder))
+        folder = [run.is_relative_to(folder) for folder in folders].index(True)
         names = planned[run.parent]
         number = names.index(run.name) if run.name in names else len(names)
         return folder, natural(str(run.parent)), number, natural(str(variants.get(path))), natural(path)
@@ -276,7 +265,8 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
     variants = variants_of(configs, by)
     paths = _in_order({**runs, **trainings}, folders, variants)
     rows = [_with_variants(runs[p][0], variants.get(p), views.get(p)) for p in paths if p in runs]
-    planned = [_planned(Path(p), trainings[p], variants[p], views.get(p)) for p in paths if p in trainings]
+    unfinished = [p for p in paths if p in trainings and str(Path(p).with_name("metrics.json")) not in runs]
+    planned = [_planned(trainings[p], variants[p], views.get(p)) for p in unfinished]
     order = list(dict.fromkeys(variants[path] for path in paths if path in variants))
     return Sweep(pd.concat(rows).reset_index(drop=True), planned, models, order)
 

@@ -130,23 +130,8 @@ def compare(
     error = math.sqrt(over_seeds + differences.mean().var() / subjects)
     errors = abs(mean) / error if error > 0 else math.inf if mean else 0.0
     p = float(2 * stats.t.sf(errors, freedom))
-    half = needed_errors(alpha, freedom) * error
+    half = float(stats.t.isf(alpha / 2, freedom)) * error
     return Comparison(seeds, subjects, mean, mean - half, mean + half, p, error=error, freedom=freedom)
-
-
-def needed_errors(alpha: float, freedom: int, comparisons: int = 1) -> float:
-    """Standard errors by which rows must differ so that the smallest p of several comparisons
-    is significant.
-
-    Args:
-        alpha: Level of all comparisons together.
-        freedom: Degrees of freedom, at least 1.
-        comparisons: Number of comparisons, at least 1.
-
-    Returns:
-        Quantile of the t distribution, two-sided.
-    """
-    return float(stats.t.isf(alpha / 2 / comparisons, freedom))
 
 
 def smallest_difference(comparison: Comparison, alpha: float, comparisons: int) -> float:
@@ -161,13 +146,10 @@ def smallest_difference(comparison: Comparison, alpha: float, comparisons: int) 
     Returns:
         The difference, in the unit of the metric.
     """
-    needed = needed_errors(alpha, comparison.freedom, comparisons)
     freedom = comparison.freedom
-
-    def excess(errors: float) -> float:
-        return stats.nct.sf(needed, freedom, errors) - POWER
-
-    return comparison.error * brentq(excess, 0, 2 * needed + 10)
+    needed = stats.t.isf(alpha / 2 / comparisons, freedom)
+    errors = brentq(lambda errors: stats.nct.sf(needed, freedom, errors) - POWER, 0, 2 * needed + 10)
+    return float(comparison.error * errors)
 
 
 def holm(values: Sequence[float]) -> list[float]:

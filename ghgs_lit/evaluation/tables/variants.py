@@ -1,5 +1,6 @@
 """Whose row of a table a run is: its model, encoder and ablation, read from its configuration."""
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -7,11 +8,13 @@ from typing import Any
 
 from ghgs_lit.config import conf_dir
 from ghgs_lit.config.keys import (
+    EXPECTED_TO_DIFFER,
     OF_A_PLACE,
     OF_A_RUN,
     OF_TARGETS,
     OF_TRAINING,
     ablation_of,
+    flatten,
     is_below,
     is_own_ablation,
     lookup,
@@ -21,6 +24,8 @@ from ghgs_lit.errors import require
 from ghgs_lit.parsing import read_yaml
 from ghgs_lit.runs.provenance import config_hash
 
+ABSENT = "absent"
+"""Text of a value that a configuration does not have."""
 TRAINING_COUNTS = "views.training_counts"
 """Key of the numbers of input views that a model is trained with."""
 #: Titles of keys that tell rows apart without being named by the user.
@@ -243,3 +248,30 @@ def variants_of(configs: Mapping[str, Mapping[str, Any]], by: Sequence[str]) -> 
         if keys[path] not in names or not variant.is_own:
             names[keys[path]] = variant.ablation
     return {path: replace(variant, ablation=names[keys[path]]) for path, variant in variants.items()}
+
+
+def differing(
+    configs: Sequence[Mapping[str, Any]], expected: Iterable[str] = EXPECTED_TO_DIFFER
+) -> dict[str, list[str]]:
+    """Keys in which configurations differ.
+
+    Args:
+        configs: Of several runs.
+        expected: Keys that may differ, with those below them.
+
+    Returns:
+        Dotted keys with their values as text, ``ABSENT`` among them.
+    """
+    flat = [flatten(config) for config in configs]
+    texts = {}
+    for key in dict.fromkeys(itertools.chain.from_iterable(flat)):
+        values = list(dict.fromkeys(str(values.get(key, ABSENT)) for values in flat))
+        if len(values) > 1 and not is_below(key, expected):
+            texts[key] = values
+    return texts
+
+
+def differing_text(keys: Mapping[str, Sequence[str]]) -> str:
+    """The first keys and values of :func:`differing`, such as ``optimizer.lr (0.001, 0.0001)``."""
+    shown = [f"`{key}` ({', '.join(values[:4])})" for key, values in list(keys.items())[:6]]
+    return ", ".join(shown) + (f" and {len(keys) - 6} more" if len(keys) > 6 else "")

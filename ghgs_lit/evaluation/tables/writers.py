@@ -3,7 +3,6 @@ r"""Writers of tables: Markdown, terminal, CSV, and LaTeX in the paper's layout.
 LaTeX needs ``\usepackage{booktabs,multirow,adjustbox,pifont}``.
 """
 
-import itertools
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
@@ -12,7 +11,7 @@ from typing import Any
 import pandas as pd
 from tabulate import tabulate
 
-from ghgs_lit.evaluation.tables.layouts import Table, arrow, data_title, decimals, title
+from ghgs_lit.evaluation.tables.layouts import Table, data_title, metric_of
 from ghgs_lit.evaluation.tables.notes import MARK
 
 COLUMNS = (
@@ -34,10 +33,8 @@ def _cell(cell: Any, write: Write) -> str:
     missing seeds."""
     if pd.isna(cell.mean):
         return write("missing" if cell.lacking else NO_FIGURE, "", False)
-    digits = decimals(cell.Index[2])
-    tail = ""
-    if pd.notna(cell.deviation):
-        tail = f" ± {cell.deviation:.{digits}f}"
+    digits = metric_of(cell.Index[2]).decimals
+    tail = f" ± {cell.deviation:.{digits}f}" if pd.notna(cell.deviation) else ""
     if cell.marked:
         tail += MARK
     if cell.test is not None and cell.test.low is not None:
@@ -48,33 +45,10 @@ def _cell(cell: Any, write: Write) -> str:
     return write(f"{cell.mean:.{digits}f}", tail, cell.best)
 
 
-def texts(table: Table, write: Write) -> pd.DataFrame:
-    """Cells as printed.
-
-    Args:
-        table: With its cells.
-        write: Writes the number of a cell, with what follows it.
-
-    Returns:
-        A row for each line, columns by group and metric.
-    """
+def _texts(table: Table, write: Write) -> pd.DataFrame:
+    """Cells as printed: a row for each line, columns by group and metric."""
     cells = [_cell(cell, write) for cell in table.cells.itertuples()]
     return pd.Series(cells, table.cells.index).unstack(["group", "metric"])
-
-
-def heading(table: Table, group: int, metric: str) -> str:
-    """Title of a column after that of its group, if the layout has one.
-
-    Args:
-        table: With its groups.
-        group: Number of the group of columns.
-        metric: Of the column.
-
-    Returns:
-        Text such as ``4-view PSNR ↑``.
-    """
-    named = f"{table.groups[group].title} " if table.layout.heading != "none" else ""
-    return named + f"{title(metric)} {arrow(metric)}".strip()
 
 
 def to_markdown(table: Table) -> str:
@@ -86,24 +60,27 @@ def to_markdown(table: Table) -> str:
     Returns:
         Markdown.
     """
-
-    numbers = texts(table, lambda number, tail, best: _bold(number + tail.replace(MARK, rf"\{MARK}"), best))
+    numbers = _texts(table, lambda number, tail, best: _bold(number + tail.replace(MARK, rf"\{MARK}"), best))
+    names = [*table.stub, *(_heading(table, *column) for column in numbers)]
     rows = []
-    for block in table.blocks:
+    for title, block in table.blocks.items():
         if table.reported_on:
-            empty = [""] * (len(table.stub) + numbers.shape[1] - 1)
-            rows.append([f"*{table.block_title(block)}*", *empty])
+            rows.append([f"*{title}*", *[""] * (len(names) - 1)])
         rows += [[*table.lines[i].stub, *numbers.loc[i]] for i in block]
-    names = [*table.stub, *(heading(table, *column) for column in numbers)]
     align = ["center" if len(table.stub) > 1 else "left"] * len(table.stub) + ["right"] * numbers.shape[1]
-    frame = pd.DataFrame(rows, columns=pd.Index(names))
-    text = frame.to_markdown(index=False, colalign=align, disable_numparse=True)
-    notes = [rf"\{note}" if note.startswith(f"{MARK} ") else note for note in table.notes]
+    text = tabulate(rows, names, "pipe", colalign=align, disable_numparse=True)
+    notes = [rf"\{note}" if note.startswith(MARK + " ") else note for note in table.notes]
     return "\n\n".join((table.caption, text, *notes)) + "\n"
 
 
 def _bold(text: str, best: bool) -> str:
     return f"**{text}**" if best else text
+
+
+def _heading(table: Table, group: int, metric: str) -> str:
+    """Title of a column, such as ``4-view PSNR ↑``."""
+    title = f"{metric_of(metric).title} {metric_of(metric).arrow}".strip()
+    return f"{table.groups[group].title} {title}" if table.layout.heading != "none" else title
 
 
 def to_terminal(table: Table) -> str:
@@ -116,18 +93,18 @@ def to_terminal(table: Table) -> str:
     Returns:
         Plain text with caption and notes.
     """
-    numbers = texts(table, lambda number, tail, best: number + tail + BEST * best)
+    numbers = _texts(table, lambda number, tail, best: number + tail + BEST * best)
     rows = []
-    for line in itertools.chain.from_iterable(table.blocks):
-        first, *more = table.lines[line].stub
-        mark = "† " if table.lines[line].is_reported else ""
+    for i, line in enumerate(table.lines):
+        mark = "† " if line.variant.kind == "reported" else ""
         for number, group in enumerate(table.groups):
-            rows.append([mark + first, *more, group.title, *numbers.loc[line][number]])
-    names = [*table.stub, "", *(f"{title(metric)} {arrow(metric)}" for metric in table.metrics)]
+            rows.append([mark + line.stub[0], *line.stub[1:], group.title, *numbers.loc[i][number]])
+    metrics = map(metric_of, table.metrics)
+    names = [*table.stub, "", *(f"{metric.title} {metric.arrow}" for metric in metrics)]
     text = tabulate(rows, names, disable_numparse=True)
     caption = table.caption.replace("in bold", f"marked{BEST}")
-    paragraphs = (each.replace("`", "").replace("**", "") for each in (caption, *table.notes))
-    return "\n\n".join((next(paragraphs), text, *paragraphs)) + "\n"
+    text = "\n\n".join((caption, text, *table.notes)) + "\n"
+    return text.replace("`", "").replace("**", "")
 
 
 def to_csv(tables: Sequence[Table]) -> str:
@@ -141,34 +118,31 @@ def to_csv(tables: Sequence[Table]) -> str:
     """
     lines = []
     for number, table in enumerate(tables, 1):
-        lines += [_line(number, table, cell) for cell in table.cells.itertuples()]
+        lines += [{"table": number, **_line(table, cell)} for cell in table.cells.itertuples()]
     frame = pd.DataFrame(lines, columns=COLUMNS)
     frame = frame.astype(dict.fromkeys(("subjects", "test_seeds", "test_subjects"), "Int64"))
     return frame.to_csv(index=False, lineterminator="\n")
 
 
-def _line(number: int, table: Table, cell: Any) -> dict[str, Any]:
-    line = table.lines[cell.Index[0]]
-    group = table.groups[cell.Index[1]]
-    variant = line.variant
+def _line(table: Table, cell: Any) -> dict[str, Any]:
+    """Values of a cell's line by column; empty ones are left out."""
+    line, group, metric = cell.Index
+    (variant, stub), group = table.lines[line], table.groups[group]
     setting = table.rows.iloc[0]
-    reported = line.is_reported
-    about = {
-        "table": number,
-        "method": line.stub[0] if table.layout.rows == "methods" else "ours",
-        **{name: getattr(variant, name) for name in ("kind", "model", "encoder", "ablation")},
-        **dict(zip(("unprojection", "semantic"), variant.switches or (), strict=False)),
-        "extra": " ".join(f"{key}={value}" for key, value in variant.extra),
-        "data": group.data or (table.reported_on if reported else data_title(setting["data"])),
-        # Our splits, targets and protocols do not apply to the paper's figures.
-        **({} if reported else {name: setting[name] for name in ("split", "targets", "protocol")}),
-        "views": group.views,
-        "metric": cell.Index[2],
-    }
+    about = {name: getattr(variant, name) for name in ("kind", "model", "encoder", "ablation")}
+    about |= {"method": stub[0] if table.layout.rows == "methods" else "ours"}
+    about |= dict(zip(("unprojection", "semantic"), variant.switches or (), strict=False))
+    about |= {"extra": " ".join(f"{key}={value}" for key, value in variant.extra)}
+    about |= {"data": group.data or data_title(setting["data"]), "views": group.views, "metric": metric}
+    is_reported = variant.kind == "reported"
+    if is_reported:
+        about["data"] = group.data or table.reported_on
+    else:  # Our splits, targets and protocols do not apply to the paper's figures.
+        about |= {name: setting[name] for name in ("split", "targets", "protocol")}
     if pd.isna(cell.mean):
         return about
     about |= {"mean": cell.mean, "deviation": cell.deviation, "best": cell.best}
-    if not reported:
+    if not is_reported:
         about |= {"seeds": " ".join(map(str, sorted(cell.seeds))), "subjects": cell.count, "runs": cell.runs}
         about["seeds_lacking"] = " ".join(map(str, cell.lacking))
         about["selection"] = table.options.subjects and table.options.subjects.pattern
@@ -182,6 +156,17 @@ PREAMBLE = r"""% \usepackage{booktabs,multirow,adjustbox,pifont}
 \providecommand{\cmark}{\ding{51}}
 \providecommand{\xmark}{\ding{55}}
 """
+_FLOAT = r"""\begin{%(float)s}[t]
+\centering
+\small
+\begin{adjustbox}{max width=\linewidth}
+%(tabular)s
+\end{adjustbox}
+%(notes)s\caption{%(caption)s}
+\label{%(label)s}
+\end{%(float)s}
+"""
+"""Rows can be wide; the paper scales its tables to the line, too."""
 _WIDE = 7
 """Minimum number of columns of a table that spans both columns of the page."""
 _ESCAPES = {
@@ -190,7 +175,6 @@ _ESCAPES = {
     ">": r"\textgreater{}", "|": r"\textbar{}", "✓": r"\cmark{}", "✗": r"\xmark{}", "±": r"$\pm$",
     "↑": r"$\uparrow$", "↓": r"$\downarrow$", "°": r"$^\circ$", "†": r"$\dagger$",
 }  # fmt: skip
-_ARROWS = {"↑": r"($\uparrow$)", "↓": r"($\downarrow$)", "": ""}
 
 
 def escape(text: str) -> str:
@@ -202,7 +186,7 @@ def escape(text: str) -> str:
     Returns:
         The same with escaped characters.
     """
-    return "".join(_ESCAPES.get(c, c) for c in text)
+    return text.translate(str.maketrans(_ESCAPES))
 
 
 def prose(text: str) -> str:
@@ -214,14 +198,8 @@ def prose(text: str) -> str:
     Returns:
         LaTeX.
     """
-    parts = re.split(r"(`[^`]*`|\*\*[^*]+\*\*)", text)
-    marks = {"`": (r"\texttt{", 1), "*": (r"\textbf{", 2)}
-    return "".join(
-        f"{marks[p[0]][0]}{escape(p[marks[p[0]][1] : -marks[p[0]][1]])}}}"
-        if len(p) > 2 and p[0] in marks and p[0] == p[-1]
-        else escape(p)
-        for p in parts
-    )
+    text = re.sub(r"\*\*([^*]+)\*\*", r"\\textbf{\1}", escape(text))
+    return re.sub(r"`([^`]*)`", r"\\texttt{\1}", text)
 
 
 def _number(number: str, tail: str, best: bool) -> str:
@@ -229,14 +207,14 @@ def _number(number: str, tail: str, best: bool) -> str:
     return number + escape(tail).replace(MARK, "$^{*}$")
 
 
-def _column_spec(table: Table) -> str:
+def _columns(table: Table) -> str:
     """Columns such as ``ccccc`` (ablation) or ``l | c c c | c c c`` (methods; no first bar for
     data sets)."""
     if table.layout.rows == "ablation" and len(table.groups) == 1:
         return "c" * (len(table.stub) + len(table.metrics))
     stub = " ".join("c" * len(table.stub)) if len(table.stub) > 1 else "l"
-    spec = " | ".join([stub] + [" ".join("c" * len(table.metrics))] * len(table.groups))
-    return spec.replace(" |", "", 1) if table.layout.columns == "data" else spec
+    columns = " | ".join([stub] + [" ".join("c" * len(table.metrics))] * len(table.groups))
+    return columns.replace(" |", "", 1) if table.layout.columns == "data" else columns
 
 
 def _row(cells: Iterable[str]) -> str:
@@ -247,7 +225,9 @@ def _head(table: Table) -> list[str]:
     """Rows of titles, with a rule below each group of columns."""
     stub = list(map(escape, table.stub))
     width = len(table.metrics)
-    metrics = [f"{escape(title(metric))}{_ARROWS[arrow(metric)]}" for metric in table.metrics]
+    metrics = []
+    for metric in map(metric_of, table.metrics):
+        metrics.append(escape(metric.title) + (f"({escape(metric.arrow)})" if metric.arrow else ""))
     if table.layout.heading == "none":
         return [_row([*stub, *metrics * len(table.groups)])]
     names = [rf"\multirow{{2}}{{*}}{{{name}}}" for name in stub]
@@ -259,21 +239,20 @@ def _head(table: Table) -> list[str]:
 
 def _tabular(table: Table) -> str:
     """The ``tabular`` environment, with rules above blocks."""
-    numbers = texts(table, _number)
-    body = []
-    for block in table.blocks:
-        body.append(r"\midrule")
-        if len(table.blocks) > 1:
+    numbers = _texts(table, _number)
+    rows = [rf"\begin{{tabular}}{{{_columns(table)}}}", r"\toprule", *_head(table)]
+    for title, block in table.blocks.items():
+        rows.append(r"\midrule")
+        if table.reported_on:
             count = len(table.stub) + numbers.shape[1]
-            name = escape(table.block_title(block))
-            body += [rf"\multicolumn{{{count}}}{{l}}{{\emph{{{name}}}}} \\", r"\midrule"]
+            rows += [rf"\multicolumn{{{count}}}{{l}}{{\emph{{{escape(title)}}}}} \\", r"\midrule"]
         for line in block:
-            names = map(escape, table.lines[line].stub)
-            if table.lines[line].is_ours and table.layout.rows == "methods":
-                names = (rf"\textbf{{{name}}}" for name in names)
-            body.append(_row([*names, *numbers.loc[line]]))
-    begin = rf"\begin{{tabular}}{{{_column_spec(table)}}}"
-    return "\n".join([begin, r"\toprule", *_head(table), *body, r"\bottomrule", r"\end{tabular}"])
+            variant, stub = table.lines[line]
+            names = list(map(escape, stub))
+            if variant.kind == "model" and table.layout.rows == "methods":
+                names = [rf"\textbf{{{name}}}" for name in names]
+            rows.append(_row([*names, *numbers.loc[line]]))
+    return "\n".join([*rows, r"\bottomrule", r"\end{tabular}"])
 
 
 def to_latex(table: Table, label: str) -> str:
@@ -286,22 +265,12 @@ def to_latex(table: Table, label: str) -> str:
     Returns:
         LaTeX, which needs the packages of ``PREAMBLE``.
     """
-    name = "table*" if len(table.groups) * len(table.metrics) >= _WIDE else "table"
-    notes = [r"\par\smallskip", r"\parbox{\linewidth}{\footnotesize"]
-    notes += [rf"{prose(note)}\par" for note in table.notes] + ["}"]
-    return "\n".join(
-        [
-            rf"\begin{{{name}}}[t]",
-            r"\centering",
-            r"\small",
-            # Rows can be wide; the paper scales its tables to the line, too.
-            r"\begin{adjustbox}{max width=\linewidth}",
-            _tabular(table),
-            r"\end{adjustbox}",
-            *(notes if table.notes else []),
-            rf"\caption{{{prose(table.caption)}}}",
-            rf"\label{{{label}}}",
-            rf"\end{{{name}}}",
-            "",
-        ]
-    )
+    notes = "\n".join(rf"{prose(note)}\par" for note in table.notes)
+    parts = {
+        "float": "table*" if len(table.groups) * len(table.metrics) >= _WIDE else "table",
+        "tabular": _tabular(table),
+        "notes": f"\\par\\smallskip\n\\parbox{{\\linewidth}}{{\\footnotesize\n{notes}\n}}\n" if notes else "",
+        "caption": prose(table.caption),
+        "label": label,
+    }
+    return _FLOAT % parts

@@ -1,0 +1,311 @@
+"""Tables of invented runs against expected files, and runs, options and files that are refused.
+
+``written(case, suffix, folder)`` gives the text of a file of ``tests/fixtures/tables``.
+"""
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from ghgs_lit.config import run_of
+from ghgs_lit.errors import InputError
+from ghgs_lit.evaluation.tables import (
+    PREAMBLE,
+    read_others,
+    read_sweep,
+    to_csv,
+    to_latex,
+    to_markdown,
+    to_terminal,
+)
+from ghgs_lit.evaluation.tables.variants import encoder_name
+from ghgs_lit.evaluation.tables.writers import escape, prose
+from ghgs_lit.runs.provenance import config_hash
+from ghgs_lit.runs.results import read_results, summarize, write_results
+from tests.evaluation.tables.scenarios import CASES, REFUSED, RUNS, neighbors, other, views
+from tests.helpers.tables import tables_of, write_run
+
+EXPECTED = Path(__file__).parents[2] / "fixtures" / "tables"
+EXAMPLE = Path(__file__).parents[3] / "docs" / "example_others.json"
+WRITERS = {
+    ".md": lambda tables: "\n".join(map(to_markdown, tables)),
+    ".txt": lambda tables: "\n".join(map(to_terminal, tables)),
+    ".tex": lambda tables: "\n".join(to_latex(table, "table:x") for table in tables),
+    ".csv": to_csv,
+}
+
+
+def others_file(folder: Path, rows: list, **changes) -> Path:
+    content = {"format": "ghgs_lit.others", "format_version": 1, "method": "GHG", "source": "their code"}
+    path = folder / "others.json"
+    path.write_text(json.dumps({**content, "rows": rows, **changes}))
+    return path
+
+
+def built(runs: str, options: dict, folder: Path) -> list:
+    """The tables of invented runs."""
+    for number, (row, psnr, about) in enumerate(RUNS[runs]):
+        write_run(folder / "runs" / str(number), row, psnr, **about)
+    # A half-written file and a foreign one, neither of which is a run.
+    for name, text in (("half", "ablation: {name: ["), ("foreign", "a: 1")):
+        (folder / "runs" / name).mkdir()
+        (folder / "runs" / name / "config.yaml").write_text(text)
+    others = [read_others(others_file(folder, options["others"]))] if "others" in options else []
+    return tables_of(folder / "runs", **{**options, "others": others})
+
+
+def written(case: str, suffix: str, folder: Path) -> str:
+    return WRITERS[suffix](built(*CASES[case], folder)).replace(f"{folder}/", "")
+
+
+@pytest.mark.parametrize("file", sorted(EXPECTED.iterdir()), ids=lambda file: file.name)
+def test_a_table_is_the_expected_one(file, tmp_path):
+    assert written(file.stem, file.suffix, tmp_path) == file.read_text()
+
+
+def test_every_case_has_a_file():
+    assert {file.stem for file in EXPECTED.iterdir()} == set(CASES)
+
+
+@pytest.mark.parametrize(("runs", "options", "message"), REFUSED)
+def test_what_no_table_can_show_is_refused(runs, options, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        built(runs, options, tmp_path)
+
+
+def test_a_table_fits_a_terminal():
+    """Each number of views has a line of its own, also with marks and missing seeds."""
+    shown = [line for line in (EXPECTED / "rows.txt").read_text().splitlines() if line[:1] in ("✗", "✓")]
+    assert len(shown) == 4 * 3
+    assert max(map(len, shown)) <= 120
+
+
+def test_text_of_all_kinds_is_escaped():
+    """No name of a run or file can break the LaTeX."""
+    assert escape("a_b & 50% #1 {x} ^~\\ $") == (
+        r"a\_b \& 50\% \#1 \{x\} \textasciicircum{}\textasciitilde{}\textbackslash{} \$"
+    )
+    assert prose("**No** `a_b` (✗, ✓) ± 1") == r"\textbf{No} \texttt{a\_b} (\xmark{}, \cmark{}) $\pm$ 1"
+    assert prose("* differs, p < 0.05") == r"* differs, p \textless{} 0.05"
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no TeX engine")
+def test_latex_compiles(tmp_path):
+    """A TeX engine accepts every expected file, and no table is wider than the page."""
+    parts = [file.read_text() for file in sorted(EXPECTED.parent.glob("*tables/*.tex"))]
+    head = (
+        r"\documentclass[twocolumn]{article}\usepackage{booktabs,multirow,adjustbox,pifont}\begin{document}"
+    )
+    (tmp_path / "t.tex").write_text("\n".join([head, PREAMBLE, *parts, r"\end{document}"]))
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "-draftmode", "t.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout[-2000:]
+    assert "Overfull" not in done.stdout
+
+
+@pytest.mark.parametrize("planned", [["c", "a", "b"], None])
+def test_rows_stand_in_the_order_of_the_command_else_in_that_of_numbers(tmp_path, planned):
+    """Folders are called by hashes."""
+    for name, rate in (("a", 10), ("b", 9), ("c", 0.25)):
+        write_run(tmp_path / name, "full", 20.0, optimizer={"lr": rate})
+    if planned:
+        (tmp_path / "multirun.yaml").write_text(f"seed: 1\nruns: {planned}\n")
+    (table,) = tables_of(tmp_path, "table2", by=["optimizer.lr"], reported=False)
+    rates = ["0.25", "10", "9"] if planned else ["0.25", "9", "10"]
+    assert [line.stub for line in table.lines] == [(f"Ours (optimizer.lr={rate})",) for rate in rates]
+
+
+@pytest.mark.parametrize(
+    ("key", "values", "title"),
+    [
+        ("views.training", ["any", "even"], "input views in training: {}"),
+        ("targets.training_views", [[0], [2, 3]], "target views in training: {}"),
+        ("targets.per_step", [1, 2], "targets a step: {}"),
+        ("targets.view", [2, 3], "target view {}"),
+        ("targets.per_subject", [1, "all"], "targets a subject: {}"),
+    ],
+)
+@pytest.mark.parametrize("seeds", [(1, 2), (1, 1)])
+@pytest.mark.parametrize("is_training", [True, False])
+def test_other_views_and_targets_are_other_rows(tmp_path, key, values, title, seeds, is_training):
+    """They change the model, or what its protocol measures, as much as another learning rate."""
+    group, _, name = key.partition(".")
+    for number, value in enumerate(values):
+        nodes = {"views": views(4), "targets": {"name": "release", "training_views": [2], "per_step": 3}}
+        nodes["targets"] |= {"view": 3, "per_subject": 1}
+        nodes[group][name] = value
+        measured = None if is_training else {"targets": nodes["targets"]}
+        of = {f"of_{group}": node for group, node in nodes.items()}
+        write_run(tmp_path / str(number), "full", 20.0 + number, seeds[number], measured=measured, **of)
+    (table,) = tables_of(tmp_path, "table2", reported=False, metrics=("psnr",))
+    assert [line.stub for line in table.lines] == [
+        (f"Ours ({title.format(str(value).strip('[]'))})",) for value in values
+    ]
+    assert list(table.cells["mean"][:, 0, "psnr"]) == [23.0, 24.0]
+
+
+def test_results_of_an_earlier_version_are_read_by_their_choices(tmp_path):
+    """Their options stand beside the configuration, not in it; without any, the switches tell."""
+    choices = {"verb": "train", "choices": {"ablation": "mine", "model": "paper"}}
+    path = write_run(tmp_path / "0", "full", 20.0, recalibration=neighbors(1), provenance=choices)
+    path.with_name("config.yaml").unlink()
+    write_run(tmp_path / "1", "full", 21.0, recalibration=neighbors(64))
+    (table,) = tables_of(tmp_path, views=(4,), metrics=("psnr",))
+    assert [line.stub[0] for line in table.lines[3:]] == ["full", "mine"]
+    assert list(table.cells["mean"].dropna()) == [25.0, 24.0]
+
+
+def test_where_an_encoder_comes_from_makes_no_second_row(tmp_path):
+    """The results of a run name it; its configuration before training does not."""
+    path = write_run(tmp_path / "0", "full", 20.0, encoder={"weights": "vggt.safetensors"})
+    path = path.with_name("config.yaml")
+    path.write_text(path.read_text().replace("vggt.safetensors", "null"))
+    (table,) = tables_of(tmp_path, "table3", reported=False)
+    assert [line.stub for line in table.lines] == [("Ours",)]
+
+
+@pytest.mark.parametrize("name", ["vggt_nano", "vggt_small", "vggt_1b"])
+def test_encoders_of_the_package_have_their_names(name):
+    """A file holds of the nested ``vit`` what differs from the file below it."""
+    assert encoder_name(run_of("train", [f"encoder={name}"]).plain) == name
+
+
+def test_the_example_of_the_documentation_is_read(tmp_path):
+    """The documented file is valid, with subjects and with means."""
+    rows = read_others(EXAMPLE)
+    by_subject = rows.dropna(subset="subject").set_index("subject")
+    assert by_subject["psnr"]["p1000001"] == 26.85
+    assert by_subject["psnr"].mean() == pytest.approx((27.31 + 26.85) / 2)
+    (mean,) = rows[rows["subject"].isna()].to_dict("records")
+    assert (mean["views"], mean["count"]) == (5, 6)
+
+
+@pytest.mark.parametrize(
+    ("rows", "changes", "message"),
+    [
+        ([other()], {"format": "x"}, r"others\.json\.format: expected .* 'ghgs_lit\.others'; found 'x'"),
+        ([other()], {"format_version": 2}, "format_version: expected to be 1; found 2"),
+        ([other()], {"methd": "x"}, r"others\.json\.methd: expected no such key"),
+        ([other()], {"source": ""}, "source: String should have at least 1 character; found ''"),
+        ([], {}, "rows: List should have at least 1 item"),
+        ([{**other(), "vews": 3}], {}, r"rows\[0\]\.vews: expected no such key"),
+        ([other(), {"data": "x"}], {}, r"rows\[1\]\.split: expected a value; found none"),
+        ([other(views="4")], {}, r"rows\[0\]\.views: expected to be a valid integer; found '4'"),
+        ([other(views=True)], {}, r"rows\[0\]\.views: expected to be a valid integer; found True"),
+        ([other(views=0)], {}, r"rows\[0\]\.views: expected to be greater than or equal to 1; found 0"),
+        ([other(psnr="25")], {}, r"metrics\.psnr: expected to be a valid number; found '25'"),
+        ([other(psnr=float("nan"))], {}, "expected to be a finite number; found nan"),
+        ([other(subject="a"), other(subject="a")], {}, r"rows\[1\]: .* found one again"),
+        ([other(), other()], {}, r"rows\[1\]: .* found one again"),
+        ([other(subject="a"), other()], {}, "expected subjects or one mean .* found both"),
+        ([other(subject="a", subjects=3)], {}, "found both"),
+        ([5], {}, r"rows\[0\]: expected to be a valid dictionary .* found 5"),
+    ],
+)
+def test_a_wrong_file_of_another_method_is_named_with_its_key(tmp_path, rows, changes, message):
+    with pytest.raises(InputError, match=message):
+        read_others(others_file(tmp_path, rows, **changes))
+
+
+def test_a_missing_or_damaged_file_of_another_method_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.json"):
+        read_others(tmp_path / "none.json")
+    (tmp_path / "bad.json").write_text("{")
+    with pytest.raises(InputError, match="expected JSON"):
+        read_others(tmp_path / "bad.json")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("readme", "", "expected runs with a metrics.json below it; found none"),
+        ("config.yaml", "{trainer: {}, data: {}, recalibration: {}}", "1 runs without one"),
+        ("metrics.json", "{", r"metrics\.json"),
+        ("metrics.json", '{"format_version": 2}', "format_version 3; found 2 .*evaluate"),
+        ("metrics.json", '{"format_version": 99}', "format_version 3; found 99"),
+    ],
+)
+def test_missing_damaged_and_newer_results_are_refused(tmp_path, name, text, message):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_sweep([tmp_path])
+    with pytest.raises(FileNotFoundError, match="expected a directory of runs; found a file"):
+        read_sweep([tmp_path / name])
+
+
+PROVENANCE, ROW = "provenance", ("rows", 0)
+
+
+@pytest.mark.parametrize(
+    ("value", "keys", "message"),
+    [
+        (KeyError, [PROVENANCE], "provenance: expected a value; found none"),
+        ([1], [PROVENANCE], r"provenance: expected to be a valid dictionary; found \[1\]"),
+        ("x", [PROVENANCE, "config"], "provenance.config: expected to be a valid dictionary; found 'x'"),
+        (KeyError, [PROVENANCE, "config", "recalibration"], "recalibration: expected a mapping"),
+        ("one", [PROVENANCE, "config", "seed"], "provenance.seed: expected a whole number; found 'one'"),
+        (KeyError, [PROVENANCE, "data"], "provenance.data: expected a value; found none"),
+        (3, [PROVENANCE, "data", "split"], "provenance.data.split: expected to be a valid string; found 3"),
+        (None, [PROVENANCE, "protocol"], "provenance.protocol: expected to be a valid dictionary"),
+        ("dirty", [PROVENANCE, "git"], "provenance.git: expected to be a valid dictionary"),
+        (3, [PROVENANCE, "training"], "provenance.training: expected to be a valid dictionary .*found 3"),
+        (
+            "0" * 12,
+            [PROVENANCE, "config_hash"],
+            "config: expected a configuration that fits its config_hash 0",
+        ),
+        (KeyError, ["rows"], "rows: expected a value; found none"),
+        ({}, ["rows"], "rows: expected to be a valid list; found {}"),
+        ("x", ROW, r"rows\[0\]: expected to be a valid dictionary"),
+        ("high", [*ROW, "psnr"], r"rows\[0\]\.psnr: expected to be a valid number.*; found 'high'"),
+        ("four", [*ROW, "views"], r"rows\[0\]\.views: expected to be a valid integer.*; found 'four'"),
+        (KeyError, [*ROW, "subject"], r"rows\[0\]\.subject: expected a value; found none"),
+        (3, ["summary"], "summary: expected to be a valid list; found 3"),
+    ],
+)
+def test_edited_results_are_one_line(tmp_path, value, keys, message):
+    """A results file that was changed by hand is named with the key that is wrong."""
+    facts = {"training": {"steps": 1}, "git": {"commit": "a" * 40}}
+    path = write_run(tmp_path / "0", "full", 20.0, provenance=facts)
+    content = json.loads(path.read_text())
+    *parents, last = keys
+    edited = content
+    for key in parents:
+        edited = edited[key]
+    if value is KeyError:
+        del edited[last]
+    else:
+        edited[last] = value
+    if parents[1:] == ["config"]:
+        content["provenance"]["config_hash"] = config_hash(content["provenance"]["config"])
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=re.compile(rf"^[^\n]*metrics\.json[^\n]*{message}[^\n]*$")):
+        read_sweep([tmp_path])
+
+
+def test_undefined_values_are_null_and_left_out_of_means(tmp_path):
+    """nan and infinity never reach JSON or a mean, and each subject counts once."""
+    about = {"method": "model", "views": 3, "targets": "release", "target": "t", "inputs": ["a", "b"]}
+    about["depth_error_mm"] = None
+    rows = [
+        {**about, "subject": "a", "psnr": 20.0, "psnr_box": float("nan")},
+        {**about, "subject": "a", "psnr": 30.0, "psnr_box": 10.0},
+        {**about, "subject": "a", "psnr": 34.0, "psnr_box": float("nan")},
+        {**about, "subject": "b", "psnr": 40.0, "psnr_box": float("inf")},
+    ]
+    (means,) = summarize(rows[:3])
+    assert (means["psnr_box"], means["depth_error_mm"]) == (10, None)
+    (means,) = summarize(rows)
+    assert (means["psnr"], means["subjects"]) == ((28 + 40) / 2, 2)
+    content = read_results(write_results(tmp_path, rows, {"seed": 1}))
+    assert [row["psnr_box"] for row in content["rows"]] == [None, 10, None, None]
+    lines = (tmp_path / "metrics.csv").read_text().splitlines()
+    assert lines[0].startswith("method,subject,views,targets,target,inputs,depth_error_mm,psnr,psnr_box")
+    assert lines[1].startswith("model,a,3,release,t,a b,,20.0,,")
+    assert not list(tmp_path.glob(".*"))
+    with pytest.raises(InputError, match="at least one"):
+        write_results(tmp_path, [], {})
