@@ -59,11 +59,6 @@ def whole():
     return [instant(number) for number in range(COUNT)]
 
 
-def test_masks_that_are_right_are_not_touched():
-    captures = whole()
-    assert all(is_kept(capture, captures) for capture in captures)
-
-
 def test_an_object_taken_for_the_subject_is_removed():
     captures, (head, body) = whole(), parts(5)
     wrong = head | body
@@ -85,32 +80,36 @@ def test_a_part_that_is_left_out_comes_back_and_is_said(capsys):
     assert (found & ~(head | body)).sum() < 0.1 * head.sum()
 
 
-def test_outlines_that_are_off_stay():
-    """By a pixel everywhere: that is for mattes."""
-    captures, (head, body) = whole(), parts(3)
-    smaller = (head | body) & np.roll(head | body, 2, 0) & np.roll(head | body, 2, 1)
-    captures[3] = instant(3, smaller)
-    assert is_kept(captures[3], captures)
+def shaded(image):
+    """A shadow beside the subject of instant 3."""
+    there = (ROWS > 150) & (COLUMNS > 85) & (COLUMNS < 160) & ~np.logical_or(*parts(3))
+    image[there] *= 0.6
+    return image
 
 
-def test_a_shirt_of_the_walls_colour_stays():
-    """It has another pattern, or none."""
-    captures = [instant(number, shirt=(110, 110, 110)) for number in range(COUNT)]
-    assert all(is_kept(capture, captures) for capture in captures)
-    black = np.zeros((SIDE, SIDE, 3))
-    captures = [instant(number, shirt=(2, 2, 2), background=black) for number in range(COUNT)]
-    assert all(is_kept(capture, captures) for capture in captures)
+def smaller():
+    """A mask that is off by a pixel everywhere: that is for mattes."""
+    mask = np.logical_or(*parts(3))
+    return mask & np.roll(mask, 2, 0) & np.roll(mask, 2, 1)
 
 
-def test_a_shadow_is_not_the_subject():
-    def shaded(image):
-        there = (ROWS > 150) & (COLUMNS > 85) & (COLUMNS < 160) & ~np.logical_or(*parts(3))
-        image[there] *= 0.6
-        return image
+# Options of all instants, and those of instant 3 beside them.
+KEPT = {
+    "right masks": ({}, {}),
+    "outlines that are off": ({}, {"mask": smaller()}),
+    "a shirt of the wall's colour, without its pattern": ({"shirt": (110, 110, 110)}, {}),
+    "black before black": ({"shirt": (2, 2, 2), "background": np.zeros((SIDE, SIDE, 3))}, {}),
+    "a shadow": ({}, {"image": shaded}),
+}
 
-    captures = whole()
-    captures[3] = instant(3, image=shaded)
-    assert is_kept(captures[3], captures)
+
+@pytest.mark.parametrize("name", KEPT)
+def test_masks_that_are_right_are_not_touched(name):
+    options, third = KEPT[name]
+    captures = [instant(n, **options, **(third if n == 3 else {})) for n in range(COUNT)]
+    found = Backgrounds.of(captures)
+    for capture in captures if not third else captures[3:4]:
+        assert found.applied(capture).photographs[0] is capture.photographs[0]
 
 
 def test_what_never_moves_has_no_background():

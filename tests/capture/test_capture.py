@@ -1,7 +1,5 @@
 """From files to the batch of a model and back to the user's world."""
 
-import shutil
-
 import cv2
 import numpy as np
 import pytest
@@ -242,24 +240,3 @@ def test_a_bent_photograph_is_straightened(tmp_path):
         assert (one.mask ^ other.mask).sum() < 0.08 * one.mask.sum()
         crossed = np.array(Image.open(tmp_path / f"{one.name}_mask.png")) > 127
         assert (one.mask ^ other.mask).sum() < 0.5 * (one.mask ^ crossed).sum()
-
-
-def test_a_folder_for_each_instant_and_one_for_each_camera(tmp_path):
-    figure = Figure()
-    path = figure.write(tmp_path / "instants" / "000")
-    shutil.copytree(path.parent, tmp_path / "instants" / "001")
-    folder = CaptureFolder(tmp_path / "instants", path)
-    assert folder.instants == ["000", "001"]
-    for name in figure.names:
-        for kind in ("cameras", "masks"):
-            (tmp_path / kind / name).mkdir(parents=True)
-        for instant in ("000", "001"):
-            source = tmp_path / "instants" / instant
-            shutil.copy(source / f"{name}.png", tmp_path / "cameras" / name / f"{instant}.png")
-            shutil.copy(source / f"{name}_mask.png", tmp_path / "masks" / name / f"{instant}.png")
-    other = CaptureFolder(tmp_path / "cameras", path, masks=tmp_path / "masks")
-    assert other.instants == ["000", "001"]
-    for one, two in zip(folder.photographs("001"), other.photographs("001"), strict=True):
-        assert one.name == two.name
-        np.testing.assert_array_equal(one.image, two.image)
-        np.testing.assert_array_equal(one.mask, two.mask)

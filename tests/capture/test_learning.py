@@ -146,13 +146,3 @@ def test_instants_whose_masks_fail_are_left_out(tmp_path):
     assert agrees(capture)
     capture.photographs[1].matte[:, :48] = 0
     assert not agrees(capture)
-
-
-def test_no_file_is_replaced(tmp_path, capsys):
-    """The calibration, given as the place for the weights by mistake, stays as it is."""
-    images, cameras = sequence(tmp_path)
-    path = tmp_path / "cameras.json"
-    before = path.read_text()
-    assert ghgs("adapt", images, cameras, f"out={path}", f"hydra.run.dir={tmp_path / 'run'}") == 1
-    assert "out: expected a path where there is no file, or overwrite=true" in capsys.readouterr().err
-    assert path.read_text() == before
