@@ -50,10 +50,7 @@ def begin_files(directory: Path, names: Sequence[str]) -> list[str]:
         InputError: a file of another origin is in the way.
     """
     require_free(directory, names)
-    earlier = _beside(directory, names)
-    known = {"files": dict.fromkeys(names), "earlier_files": earlier}
-    write_text_atomically(directory / REPORT, json.dumps(known, indent=1))
-    return earlier
+    return _write_report(directory, dict.fromkeys(names), {})
 
 
 def end_files(directory: Path, names: Sequence[str], report: Mapping[str, Any]) -> list[Path]:
@@ -67,13 +64,9 @@ def end_files(directory: Path, names: Sequence[str], report: Mapping[str, Any]) 
     Returns:
         The paths of the files, that of the report last.
     """
-    paths = [directory / name for name in names]
-    sizes = {name: path.stat().st_size for name, path in zip(names, paths, strict=True)}
-    earlier = _beside(directory, names)
-    kept = {"earlier_files": earlier} if earlier else {}
-    text = json.dumps(plain({**report, "files": sizes, **kept}), indent=1, allow_nan=False)
-    write_text_atomically(directory / REPORT, text)
-    return [*paths, directory / REPORT]
+    sizes = {name: (directory / name).stat().st_size for name in names}
+    _write_report(directory, sizes, report)
+    return [directory / name for name in (*names, REPORT)]
 
 
 def write_file(path: Path, content: Callable[[], bytes]) -> None:
@@ -87,9 +80,14 @@ def write_file(path: Path, content: Callable[[], bytes]) -> None:
     write_atomically(path, lambda temporary: temporary.write_bytes(made))
 
 
-def _beside(directory: Path, names: Sequence[str]) -> list[str]:
+def _write_report(directory: Path, files: Mapping[str, int | None], report: Mapping[str, Any]) -> list[str]:
+    """Write the report, which also lists other files of earlier predictions, and give their names."""
     written = _written_before(directory)
-    return [name for name in written if name not in (REPORT, *names) and (directory / name).exists()]
+    earlier = [name for name in written if name not in (REPORT, *files) and (directory / name).exists()]
+    kept = {"earlier_files": earlier} if earlier else {}
+    text = json.dumps(plain({**report, "files": files, **kept}), indent=1, allow_nan=False)
+    write_text_atomically(directory / REPORT, text)
+    return earlier
 
 
 def _written_before(directory: Path) -> list[str]:
