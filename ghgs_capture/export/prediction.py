@@ -1,21 +1,25 @@
 """The files of a prediction: one entry of ``FORMATS`` for each format."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
+from PIL import Image
 
 from ghgs_capture.export.instants import mp4_bytes
-from ghgs_capture.export.maps import depth_file, input_files, png
 from ghgs_capture.export.page import page
 from ghgs_capture.export.reports import begin_files, end_files, write_file
 from ghgs_capture.export.subject import ExportedSubject, OutputOptions, exported_subject, file_names
+from ghgs_capture.formats.matrices import camera_entry, cameras_json
 from ghgs_lit.errors import InputError, choice, installed, require
 from ghgs_lit.geometry.frame import HEIGHT
+from ghgs_lit.geometry.masks import unmultiplied
 from ghgs_lit.metrics import psnr
 from ghgs_lit.metrics.regions import box_of
 from ghgs_lit.ply import ply_bytes
@@ -23,7 +27,7 @@ from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import versions
 from ghgs_lit.runtime.cores import allowed_cores
 from ghgs_lit.types import Batch, Gaussians, Prediction
-from ghgs_lit.visualization.pictures import palette, sheet
+from ghgs_lit.visualization.pictures import palette, sheet, to_uint8
 
 if TYPE_CHECKING:
     from ghgs_capture.verbs import Predict
@@ -74,6 +78,58 @@ def converted(name: str, gaussians: Gaussians) -> bytes:
         expected = "formats: expected Gaussians that gaussforge converts to"
         raise InputError(f"{expected} {name}; found {len(gaussians)}: {answer['error']}")
     return answer["data"]
+
+
+def png(picture: np.ndarray) -> bytes:
+    """Encode a picture as PNG.
+
+    Args:
+        picture: [h, w, 3], or with alpha [h, w, 4], uint8.
+
+    Returns:
+        The content of a file.
+    """
+    content = BytesIO()
+    Image.fromarray(picture).save(content, format="PNG")
+    return content.getvalue()
+
+
+def depth_file(subject: ExportedSubject) -> bytes:
+    """Depth maps as exact numbers.
+
+    Args:
+        subject: with depths of each view.
+
+    Returns:
+        The content of an NPZ with ``depth`` [V, H, W] float32 (nan: none), ``intrinsics``,
+        ``extrinsics`` and ``views``.
+    """
+    depth = torch.where(subject.depth_valid, subject.depth.float(), torch.nan).cpu().numpy()
+    cameras = {name: getattr(subject.cameras, name).cpu().numpy() for name in ("intrinsics", "extrinsics")}
+    content = BytesIO()
+    np.savez_compressed(content, depth=depth, **cameras, views=np.array(subject.views))
+    return content.getvalue()
+
+
+def input_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
+    """Photographs and cameras, as ``ghgs predict images=inputs cameras=cameras.json`` reads them.
+
+    Args:
+        subject: with its photographs.
+
+    Yields:
+        Functions that make a PNG of each view as the model saw it, with matte or mask as alpha,
+        then the JSON of the cameras.
+    """
+    for image, matte in zip(subject.images, subject.mattes, strict=True):
+        colors = to_uint8(unmultiplied(image, matte))  # PNG's colours are not premultiplied
+        alpha = (matte * 255).round().byte().cpu().numpy()[..., None]
+        yield partial(png, np.concatenate([colors, alpha], -1))
+    cameras = subject.cameras
+    entries = zip(file_names(subject.views), cameras.intrinsics, cameras.extrinsics, strict=True)
+    size = (cameras.height, cameras.width)
+    text = cameras_json({name: camera_entry(k, e, size) for name, k, e in entries})
+    yield text.encode
 
 
 @dataclass(frozen=True)

@@ -267,6 +267,30 @@ def _rotation(entries: Entries) -> np.ndarray:
     return Rotation.from_rotvec(vector.ravel()).as_matrix()
 
 
+def camera_entry(intrinsics: Any, extrinsics: Any, size: tuple[int, int]) -> dict[str, Any]:
+    """A camera of this package's JSON.
+
+    Args:
+        intrinsics: array or tensor [3, 3] in pixels.
+        extrinsics: array or tensor [4, 4], world to camera.
+        size: (height, width) of its photograph in pixels.
+
+    Returns:
+        Plain data.
+    """
+    matrices = {"intrinsics": intrinsics.tolist(), "extrinsics": extrinsics.tolist()}
+    return {**matrices, "width": size[1], "height": size[0]}
+
+
+def cameras_json(entries: Mapping[str, dict[str, Any]]) -> str:
+    """The text of this package's JSON of cameras.
+
+    Args:
+        entries: those of :func:`camera_entry`, by name.
+    """
+    return json.dumps({"cameras": entries}, indent=1)
+
+
 def json_text(cameras: Mapping[str, tuple[Calibration, tuple[int, int]]]) -> str:
     """Cameras as text that :func:`read_matrices` reads.
 
@@ -276,8 +300,6 @@ def json_text(cameras: Mapping[str, tuple[Calibration, tuple[int, int]]]) -> str
     Returns:
         The content of a file.
     """
-    from ghgs_capture.export.maps import camera_entry, cameras_json  # here: it imports PyTorch
-
     entries = {}
     for name, (camera, size) in cameras.items():
         entries[name] = camera_entry(camera.intrinsics, camera.extrinsics, size)

@@ -4,7 +4,7 @@ and where its work begins.
 The module that does the work is imported when the verb runs: ``ghgs --help`` waits for no library.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
@@ -18,6 +18,7 @@ Axis = Literal["y", "-y", "z"]
 class OfPhotographs(Verb):
     """The user's photographs and their cameras."""
 
+    reads_at_once: ClassVar[bool] = False  #: whether photographs are decoded beside the imports
     images: PathText | None = None
     """Folder of photographs or videos named after their cameras;
     of such folders: one for each instant."""
@@ -32,15 +33,11 @@ class OfPhotographs(Verb):
     segment: Text | None = None
     """rembg: masks by that package."""
 
-    def reads_at_once(self) -> bool:
-        """Whether photographs are decoded while the libraries are imported."""
-        return False
-
     def require_files(self) -> None:
         """As of every verb; photographs that are read at once are then decoded beside
         the imports."""
         super().require_files()
-        if self.reads_at_once() and self.images is not None and self.cameras is not None:
+        if self.reads_at_once and self.images is not None and self.cameras is not None:
             from ghgs_capture.verbs.photographs import begin_to_read
 
             begin_to_read(self)
@@ -52,6 +49,7 @@ class Predict(OfPhotographs, Measured):
     example = "ghgs predict images=photographs cameras=cameras.json masks=masks out=splat"
     opens = ("checkpoint",)
     reads_data = True
+    reads_at_once = True
     has_trained_data = True
 
     checkpoint: PathText | None = "shipped"
@@ -90,9 +88,6 @@ class Predict(OfPhotographs, Measured):
     sequence: SequenceOptions = SequenceOptions()
     """Which instants count, and how the videos of cameras fit together."""
 
-    def reads_at_once(self) -> bool:
-        return True
-
     def run(self) -> object:
         from ghgs_capture.verbs import predict
 
@@ -105,6 +100,7 @@ class View(Predict):
     example = "ghgs view path=runs/predict/..."
     opens = ()
     reads_data = False
+    reads_at_once = False
 
     path: PathText | None = None
     """A directory of ``ghgs predict`` (its formats ply and inputs), or a PLY;
@@ -120,9 +116,6 @@ class View(Predict):
     """The next free one is taken where it is in use."""
     seconds: Positive | None = None
     """The page is closed after so long; null: never."""
-
-    def reads_at_once(self) -> bool:
-        return False
 
     def run(self) -> object:
         from ghgs_capture.verbs import view
@@ -153,15 +146,13 @@ class Doctor(OfPhotographs):
     """Whether cameras and masks fit together, and what this machine lacks."""
 
     example = "ghgs doctor task=cameras images=photographs cameras=cameras.json masks=masks"
+    reads_at_once = True
 
     task: Literal["cameras", "machine"] = "cameras"
     """cameras: whether photographs, masks and calibration fit together, and what would fit.
     machine: what there is, and what is missing for which feature."""
     device: Device = "auto"
     """Of task=machine."""
-
-    def reads_at_once(self) -> bool:
-        return self.task == "cameras"
 
     def run(self) -> object:
         from ghgs_capture.verbs import doctor

@@ -18,9 +18,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from ghgs_capture.export.instants import mp4_bytes
-from ghgs_capture.export.maps import input_files
 from ghgs_capture.export.page import page, unpack
-from ghgs_capture.export.prediction import CONVERTED, converted, half_turned
+from ghgs_capture.export.prediction import CONVERTED, converted, half_turned, input_files
 from ghgs_lit.metrics import psnr
 from ghgs_lit.ply import ply_bytes, read_ply
 from ghgs_lit.rendering import render
