@@ -23,8 +23,8 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from ghgs_lit.config import run_of
+from ghgs_lit.diagnostics.benchmark.measure import OTHER, TOTAL, top_level, watched
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
-from ghgs_lit.diagnostics.benchmark.stages import OTHER, TOTAL, top_level, watched
 from ghgs_lit.execution import Predictor
 from ghgs_lit.losses import Losses, LossWeights
 from ghgs_lit.method.model import GHGS

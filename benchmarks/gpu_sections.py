@@ -16,7 +16,7 @@ from benchmarks.gpu_data import loader, people, training
 from benchmarks.gpu_measure import reason
 from benchmarks.gpu_replay import judge_optimizer, judge_prediction, judge_step
 from ghgs_lit.config.run import Run
-from ghgs_lit.diagnostics.benchmark.stages import TOTAL, SecondsProbe, inside, top_level, watched
+from ghgs_lit.diagnostics.benchmark.measure import TOTAL, SecondsProbe, inside, top_level, watched
 from ghgs_lit.diagnostics.machine import machine_facts
 from ghgs_lit.execution import Predictor
 from ghgs_lit.execution.graphs import GraphCache

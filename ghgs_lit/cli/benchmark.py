@@ -14,7 +14,7 @@ from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config.compose import read_options
 from ghgs_lit.config.keys import is_below
 from ghgs_lit.diagnostics.benchmark import report
-from ghgs_lit.diagnostics.benchmark.measure import record_cases, threads
+from ghgs_lit.diagnostics.benchmark.measure import record_cases
 from ghgs_lit.diagnostics.benchmark.presets import KNOBS, YARDSTICK, Case, Source, cases_of
 from ghgs_lit.diagnostics.machine import machine_facts
 from ghgs_lit.diagnostics.output import print_tables
@@ -43,9 +43,9 @@ def run(verb: "Benchmark") -> None:
     check_options(verb, overrides())
     L.seed_everything(verb.seed, workers=True, verbose=False)
     device = pick_device(verb.device)
-    with threads(verb.threads):
-        content = _presets(configured_cases(verb, device), verb, device)
-        content = {"machine": machine_facts(device), **content}
+    torch.set_num_threads(verb.threads or torch.get_num_threads())
+    content = _presets(configured_cases(verb, device), verb, device)
+    content = {"machine": machine_facts(device), **content}
     tables = report.tables_of(content["rows"])
     print_tables(tables)
     source = provenance(verb.plain, seed=verb.seed, verb="benchmark", choices=choices())

@@ -1,8 +1,9 @@
 """Measurement of cases: work, differences from the yardstick, and seconds of each stage."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,16 +11,79 @@ import pandas as pd
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 from ghgs_lit.diagnostics.benchmark.presets import Case
-from ghgs_lit.diagnostics.benchmark.stages import FlopsProbe, PeakProbe, SecondsProbe, forward
-from ghgs_lit.evaluation.measure import Estimate, measure
+from ghgs_lit.evaluation.measure import Estimate, Renderer, measure
+from ghgs_lit.execution import Predictor
+from ghgs_lit.method.model import GHGS, STAGES
+from ghgs_lit.method.rounds import NoRounds
 from ghgs_lit.metrics import ImageMetrics
 from ghgs_lit.metrics.functional import decibels, squared_error
+from ghgs_lit.ops.attention import attend
 from ghgs_lit.ply import ply_bytes
 from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
+from ghgs_lit.runtime.allocation import can_forget_peak, forget_peak, resident_bytes, return_free_memory
+from ghgs_lit.runtime.watching import Stopwatch, Watcher, inside
+from ghgs_lit.runtime.watching import watched as stages_watched
 from ghgs_lit.types import Batch, Gaussians, Prediction, Rendering
+
+ROUNDS = "rounds"
+RENDER = "render"
+TOTAL = "total"
+OTHER = "other"  #: Work outside of stages: checks, padding
+#: Modules of parts of stages, by ``<stage>.<part>``.
+PARTS = {"encoder.patch_tokens": "encoder.aggregator.patch_embed"}
+#: All timed names in the order of the data flow; those without a dot add up to ``total``.
+NAMES = (*STAGES[:1], *PARTS, *STAGES[1:], ROUNDS, RENDER, OTHER, TOTAL)
+
+
+class SecondsProbe(Stopwatch):
+    """Times of the stages and of the rest."""
+
+    def seconds(self) -> dict[str, float]:
+        """Seconds by name, in the order of :data:`NAMES`."""
+        known = super().seconds()
+        known[OTHER] = known[TOTAL] - sum(known[name] for name in top_level(known))
+        return {name: known[name] for name in NAMES if name in known}
+
+
+def top_level(names: Iterable[str]) -> list[str]:
+    """Names of whole stages, without parts, ``other`` and ``total``."""
+    return [name for name in names if "." not in name and name not in (OTHER, TOTAL)]
+
+
+def watched(model: GHGS, probe: Watcher) -> AbstractContextManager[None]:
+    """Context in which a probe watches the stages of a model and their parts.
+
+    Args:
+        model: has the stages.
+        probe: is called when they begin and end.
+    """
+    names = [*STAGES, *([] if isinstance(model.rounds, NoRounds) else [ROUNDS])]
+    return stages_watched(model, {name: name for name in names} | PARTS, probe)
+
+
+@torch.inference_mode()
+def forward(
+    predictor: Predictor, renderer: Renderer, batch: Batch, probe: Watcher | None = None
+) -> tuple[Prediction, Rendering]:
+    """Predict the Gaussians of a batch and render its targets under a probe.
+
+    Args:
+        predictor: with a model in evaluation mode.
+        renderer: draws the targets.
+        batch: with targets, which the model does not see.
+        probe: is called when stages, rendering and the whole begin and end; None: nothing is.
+    """
+    probe = probe or Watcher()
+    with watched(predictor.model, probe), inside(TOTAL, probe):
+        prediction = predictor(replace(batch, targets=None))
+        with inside(RENDER, probe):
+            rendering = renderer(prediction.gaussians, batch.targets.cameras)
+    return prediction, rendering
+
 
 ATTRIBUTES = ("means", "quaternions", "scales", "opacities", "colors")
 #: Share of the values that budgets judge differences by: where a decision lies within rounding
@@ -133,9 +197,7 @@ def amplification(case: Case, batch: Batch, result: Result) -> dict[str, float]:
     for seed in range(_ROUNDINGS):
         signs = 1 - 2 * torch.randint(2, batch.images.shape, generator=torch.Generator().manual_seed(seed))
         images = (batch.images * (1 + eps * signs.to(batch.images))).clamp(0, 1)
-        moved = forward(
-            case.predictor, case.renderer, replace(batch, images=images), SecondsProbe(images.device)
-        )
+        moved = forward(case.predictor, case.renderer, replace(batch, images=images))
         for name, value in differences(moved, result, batch.masks, MOST).items():
             largest[name] = max(largest.get(name, 1.0), value / eps)
     return largest
@@ -156,109 +218,41 @@ def conditioned(found: Result, expected: Result, batch: Batch, condition: Mappin
 
 
 WARMUP = 1  #: Rounds that do not count; the first compiles and fills caches
-
-
-@dataclass(frozen=True)
-class Times:
-    """Seconds of a stage: median and quartiles of the rounds."""
-
-    median: float
-    low: float
-    high: float
-
-    @classmethod
-    def of(cls, seconds: Sequence[float]) -> "Times":
-        """Quartiles of the seconds of rounds, at least one."""
-        low, median, high = np.quantile(seconds, (0.25, 0.5, 0.75)).tolist()
-        return cls(median, low, high)
-
-
-@dataclass
-class Work:
-    """Cost of a forward pass: FLOPs and peak bytes by stage;
-    tokens, points, Gaussians and PLY bytes."""
-
-    flops: dict[str, float]
-    peaks: dict[str, int]
-    counts: dict[str, float]
-
-    @classmethod
-    def of(cls, works: Sequence["Work"]) -> "Work":
-        """Mean over batches, with the largest peaks."""
-        flops = pd.DataFrame([work.flops for work in works])
-        peaks = pd.DataFrame([work.peaks for work in works])
-        counts = pd.DataFrame([work.counts for work in works])
-        return cls(flops.mean().to_dict(), peaks.max().to_dict(), counts.mean().to_dict())
+#: FLOPs of attention on a CPU, which PyTorch's counter lacks.
+_CPU_ATTENTION = {
+    attend.packet: lambda q, k, v, *_, **__: sdpa_flop_count(q, k, v),
+    torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: (
+        lambda q, k, v, *_, **__: sdpa_flop_count(q, k, v)
+    ),
+}
 
 
 @dataclass
 class Record:
-    """Measurements of a case; ``differences`` are the worst over batches."""
+    """Measurements of a case.
+
+    Attributes:
+        case: what was measured.
+        works: cost of each batch, from :func:`inspect`.
+        differences: from the yardstick, the worst over batches.
+        metrics: rows of errors against the truth.
+        seconds: of each round that counts, by stage.
+    """
 
     case: Case
-    work: Work
-    times: dict[str, Times] = field(default_factory=dict)
+    works: list[dict[str, float]] = field(default_factory=list)
     differences: dict[str, float] = field(default_factory=dict)
     metrics: list[Row] = field(default_factory=list)
+    seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
 
 
-def order(turn: int, count: int) -> list[int]:
-    """Order of the cases in a round; each begins one case later,
-    so that drift affects all cases alike.
-
-    Args:
-        turn: number of the round; negative ones do not count.
-        count: number of cases.
-    """
-    return [(turn + number) % count for number in range(count)]
+def flop_counter() -> FlopCounterMode:
+    """Context that counts products, convolutions and attention; not element-wise operations and the
+    rasterizer."""
+    return FlopCounterMode(display=False, custom_mapping=_CPU_ATTENTION)
 
 
-def time_cases(
-    cases: Sequence[Case], batches: Sequence[Batch], warmup: int, repeats: int, device: torch.device
-) -> list[dict[str, Times]]:
-    """Seconds of each stage of each case, in interleaved rounds.
-
-    Args:
-        cases: what is timed.
-        batches: with targets; a round of a case takes the mean over them.
-        warmup: rounds that do not count.
-        repeats: rounds that count, at least 1.
-        device: where models and batches are.
-
-    Returns:
-        For each case its times by stage.
-    """
-    seconds: list[dict[str, list[float]]] = [{} for _ in cases]
-    for turn in track(range(-warmup, repeats), "rounds"):
-        for number in order(turn, len(cases)):
-            case = cases[number]
-            probe = SecondsProbe(device)
-            for batch in batches:
-                forward(case.predictor, case.renderer, batch, probe)
-            for stage, value in probe.seconds().items() if turn >= 0 else ():
-                seconds[number].setdefault(stage, []).append(value / len(batches))
-    times = []
-    for stages in seconds:
-        times.append({stage: Times.of(values) for stage, values in stages.items()})
-    return times
-
-
-@contextmanager
-def threads(count: int | None) -> Iterator[None]:
-    """Run PyTorch with another number of threads while the context lasts.
-
-    Args:
-        count: at least 1; None: as many as now.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(count or before)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-def inspect(case: Case, batch: Batch, device: torch.device) -> tuple[Work, Prediction, Rendering]:
+def inspect(case: Case, batch: Batch, device: torch.device) -> tuple[dict[str, float], Result]:
     """Predict a batch once to count FLOPs and once to measure memory.
 
     Args:
@@ -267,23 +261,52 @@ def inspect(case: Case, batch: Batch, device: torch.device) -> tuple[Work, Predi
         device: where the model and the batch are.
 
     Returns:
-        The cost, the prediction and the render.
+        FLOPs, peak bytes beyond weights and photographs (NaN where the system has no counter), numbers
+        of tokens, points and Gaussians and bytes of the PLY; the prediction and the render.
     """
-    with FlopsProbe() as counted:
-        forward(case.predictor, case.renderer, batch, counted)
-    memory = PeakProbe(device)
-    prediction, rendering = forward(case.predictor, case.renderer, batch, memory)
-    return Work(counted.flops, memory.peaks, _counts(prediction)), prediction, rendering
-
-
-def _counts(prediction: Prediction) -> dict[str, float]:
+    with flop_counter() as counter:
+        forward(case.predictor, case.renderer, batch)
+    is_cuda = device.type == "cuda"
+    return_free_memory()
+    forget_peak()
+    if is_cuda:
+        torch.cuda.reset_peak_memory_stats(device)
+    before = torch.cuda.memory_allocated(device) if is_cuda else resident_bytes()
+    prediction, rendering = forward(case.predictor, case.renderer, batch)
+    peak = torch.cuda.max_memory_allocated(device) if is_cuda else resident_bytes("VmHWM")
     gaussians = prediction.gaussians
-    return {
+    work = {
+        "flops": counter.get_total_flops(),
+        "peak_bytes": peak - before if is_cuda or can_forget_peak() else math.nan,
         "tokens": prediction.points.tokens.shape[0],
         "points": int(prediction.points.valid.sum()),
         "gaussians": len(gaussians),
         "ply_bytes": sum(len(ply_bytes(gaussians[element])) for element in range(len(gaussians.splits))),
     }
+    return work, (prediction, rendering)
+
+
+def time_cases(
+    records: Sequence[Record], batches: Sequence[Batch], warmup: int, repeats: int, device: torch.device
+) -> None:
+    """Measure seconds of each stage of each case, in interleaved rounds; each begins with another case, so
+    that drift affects all alike.
+
+    Args:
+        records: of the cases, which get the seconds.
+        batches: with targets; a round of a case takes the mean over them.
+        warmup: rounds that do not count.
+        repeats: rounds that count, at least 1.
+        device: where models and batches are.
+    """
+    for turn in track(range(-warmup, repeats), "rounds"):
+        for number in np.roll(np.arange(len(records)), -turn):
+            record = records[number]
+            probe = SecondsProbe(device)
+            for batch in batches:
+                forward(record.case.predictor, record.case.renderer, batch, probe)
+            for stage, value in probe.seconds().items() if turn >= 0 else ():
+                record.seconds[stage].append(value / len(batches))
 
 
 def record_cases(
@@ -301,15 +324,14 @@ def record_cases(
     Returns:
         The measurements in the order of the cases.
     """
-    works: list[list[Work]] = [[] for _ in cases]
-    records = [Record(case, Work({}, {}, {})) for case in cases]
+    records = [Record(case) for case in cases]
     for batch in track(batches, "errors"):
-        for record, case_works in zip(records, works, strict=True):
-            work, *result = inspect(record.case, batch, device)
+        for record in records:
+            work, result = inspect(record.case, batch, device)
+            record.works.append(work)
             if record.case.is_yardstick:
                 yardstick = result
                 condition = amplification(record.case, batch, result)
-            case_works.append(work)
             change = differences(result, yardstick, batch.masks)
             change["rel_diff"] = conditioned(result, yardstick, batch, condition)
             for name, value in change.items():
@@ -317,13 +339,8 @@ def record_cases(
                 record.differences[name] = worst(record.differences.get(name, value), value)
             # The error against the truth, as `ghgs evaluate` measures it; its time does not count.
             prediction, rendering = result
-            depth = (prediction.depth, prediction.depth_valid)
-            estimate = Estimate(rendering.image, *depth)
+            estimate = Estimate(rendering.image, prediction.depth, prediction.depth_valid)
             measured = measure(lambda _, known=estimate: known, record.case.label, [batch], metrics, device)
-            for row in measured:
-                record.metrics.append({name: value for name, value in row.items() if name != "seconds"})
-    times = time_cases(cases, batches, WARMUP, repeats, device)
-    for record, case_works, seconds in zip(records, works, times, strict=True):
-        record.work = Work.of(case_works)
-        record.times = seconds
+            record.metrics += [{k: v for k, v in row.items() if k != "seconds"} for row in measured]
+    time_cases(records, batches, WARMUP, repeats, device)
     return records

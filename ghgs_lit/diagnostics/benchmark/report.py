@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from ghgs_lit.diagnostics.benchmark.measure import Record
-from ghgs_lit.diagnostics.benchmark.stages import TOTAL
+from ghgs_lit.diagnostics.benchmark.measure import TOTAL, Record
 from ghgs_lit.diagnostics.machine import in_words
 from ghgs_lit.diagnostics.output import Tables, document, pivoted, save_figure, texts
 from ghgs_lit.files import write_text_atomically
@@ -69,7 +69,10 @@ def rows_of(records: Sequence[Record]) -> list[Row]:
         (means,) = summarize(record.metrics)
         if record.case.is_yardstick:
             psnr_of_none = means["psnr"]
+        works = pd.DataFrame(record.works)
         total = {
+            **works.mean().to_dict(),
+            "peak_bytes": float(works.peak_bytes.max()),
             **{name: record.differences[name] for name in ("max_rel_diff", "rel_diff")},
             "psnr": means["psnr"],
             "psnr_loss_db": psnr_of_none - means["psnr"],
@@ -78,23 +81,13 @@ def rows_of(records: Sequence[Record]) -> list[Row]:
             "max_rel_diff_budget": record.case.max_rel_diff,
             "trained": record.case.is_trained,
             **{name: means[name] for name in ERRORS if name in means},
-            **record.work.counts,
             "differences": record.differences,
         }
-        for stage, times in record.times.items():
-            rows.append(
-                {
-                    "preset": record.case.label,
-                    "stage": stage,
-                    "seconds": times.median,
-                    "seconds_low": times.low,
-                    "seconds_high": times.high,
-                    "peak_bytes": record.work.peaks.get(stage),
-                    "flops": record.work.flops.get(stage),
-                    **dict.fromkeys(("max_rel_diff", "rel_diff", "psnr", "psnr_loss_db", "budget_db")),
-                    **(total if stage == TOTAL else {}),
-                }
-            )
+        for stage, seconds in record.seconds.items():
+            low, median, high = np.quantile(seconds, (0.25, 0.5, 0.75)).tolist()
+            row = {"preset": record.case.label, "stage": stage, "seconds": median}
+            row |= {"seconds_low": low, "seconds_high": high, "psnr": None}
+            rows.append(row | total if stage == TOTAL else row)
     return rows
 
 

@@ -11,29 +11,25 @@ from ghgs_lit.diagnostics.benchmark import measure
 from ghgs_lit.diagnostics.benchmark.measure import (
     ATTRIBUTES,
     MOST,
-    Times,
-    amplification,
-    conditioned,
-    differences,
-    order,
-    partners,
-    relative_difference,
-    time_cases,
-)
-from ghgs_lit.diagnostics.benchmark.presets import Case, combinations
-from ghgs_lit.diagnostics.benchmark.scene import ellipse, ellipsoid_batch
-from ghgs_lit.diagnostics.benchmark.stages import (
     NAMES,
     OTHER,
     ROUNDS,
     TOTAL,
-    FlopsProbe,
-    PeakProbe,
+    Record,
     SecondsProbe,
+    amplification,
+    conditioned,
+    differences,
+    flop_counter,
     forward,
+    partners,
+    relative_difference,
+    time_cases,
     top_level,
     watched,
 )
+from ghgs_lit.diagnostics.benchmark.presets import Case, combinations
+from ghgs_lit.diagnostics.benchmark.scene import ellipse, ellipsoid_batch
 from ghgs_lit.errors import InputError
 from ghgs_lit.execution import Predictor
 from ghgs_lit.rendering import Renderer
@@ -56,27 +52,21 @@ def case(model, name, renderer):
     return Case(name, {}, model, renderer, None, None, False)
 
 
-def test_rounds_begin_with_another_case_each():
-    """A machine that becomes slower must not make the preset that is always last look slow."""
-    rounds = [order(turn, 3) for turn in range(3)]
-    assert rounds == [[0, 1, 2], [1, 2, 0], [2, 0, 1]]
-    assert sorted(order(-1, 3)) == [0, 1, 2]
-
-
 def test_cases_are_interleaved_and_warm_up_rounds_do_not_count(model, scene, monkeypatch):
-    """Every round runs all cases once; the numbers are those of the rounds after the warm-up."""
+    """Every round runs all cases once and begins with another; the warm-up does not count."""
     seen, a, b = [], Renderer(), Renderer()
 
-    def noted(model, renderer, batch, probe):
+    def noted(model, renderer, batch, probe=None):
         seen.append("a" if renderer is a else "b")
         return forward(model, renderer, batch, probe)
 
     monkeypatch.setattr(measure, "forward", noted)
-    cases = [case(model, "a", a), case(model, "b", b)]
-    times = time_cases(cases, [scene, scene], warmup=1, repeats=2, device=CPU)
+    records = [Record(case(model, "a", a)), Record(case(model, "b", b))]
+    time_cases(records, [scene, scene], warmup=1, repeats=2, device=CPU)
     assert "".join(seen) == "bbaa" + "aabb" + "bbaa"
-    assert list(times[0]) == [name for name in NAMES if name != ROUNDS]
-    assert times[0][TOTAL].low <= times[0][TOTAL].median <= times[0][TOTAL].high
+    for record in records:
+        assert list(record.seconds) == [name for name in NAMES if name != ROUNDS]
+        assert {len(seconds) for seconds in record.seconds.values()} == {2}
 
 
 def test_stages_and_the_rest_add_up_to_the_total(model, scene):
@@ -102,12 +92,6 @@ def test_a_probe_leaves_the_model_and_its_prediction_as_they_were(model, scene):
         assert model.model.bounds.samples == bounds.samples
     assert model.model.bounds is bounds
     assert not any(m._forward_hooks or m._forward_pre_hooks for m in model.model.modules())
-
-
-def test_quartiles_of_one_round_are_its_value():
-    """One round, as for models of a minute, has no spread."""
-    assert Times.of([2.0]) == Times(2.0, 2.0, 2.0)
-    assert Times.of([1.0, 2.0, 3.0, 4.0, 5.0]) == Times(3.0, 2.0, 4.0)
 
 
 def test_relative_differences_are_always_defined():
@@ -140,7 +124,7 @@ def test_the_condition_is_what_a_rounding_of_the_photographs_changes(model, scen
     result = forward(model, Renderer(), scene, SecondsProbe(CPU))
     place = scene.images.argmax()
 
-    def moved(model, renderer, batch, probe):
+    def moved(model, renderer, batch):
         change = (batch.images.flatten()[place] / scene.images.flatten()[place]).log().item()
         prediction, rendering = result
         return dataclasses.replace(prediction, depth=prediction.depth * (1 + 64 * change)), rendering
@@ -174,44 +158,26 @@ def test_gaussians_are_compared_by_their_pixel(model, scene):
     assert [len(index) for index in partners(gaussians, nothing)] == [0, 0]
 
 
-def test_flops_of_products_and_attention():
-    """PyTorch counts no attention of a CPU itself."""
-    q = torch.rand(1, 2, 32, 16)
-    with torch.no_grad(), FlopsProbe() as probe:
-        for stage, run in {
-            "product": lambda: F.linear(torch.rand(5, 7), torch.rand(3, 7)),
-            "pytorch": lambda: F.scaled_dot_product_attention(q, q, q),
-        }.items():
-            probe.begin(stage)
-            run()
-            probe.end(stage)
-    assert probe.flops == {"product": 2 * 5 * 7 * 3, "pytorch": 4 * 2 * 32 * 32 * 16}
+@pytest.mark.parametrize(
+    ("run", "flops"),
+    [
+        (lambda: F.linear(torch.rand(5, 7), torch.rand(3, 7)), 2 * 5 * 7 * 3),
+        (lambda: F.scaled_dot_product_attention(*[torch.rand(1, 2, 32, 16)] * 3), 4 * 2 * 32 * 32 * 16),
+        (lambda: torch.ops.ghgs_lit.attend(*[torch.rand(1, 2, 8, 32)] * 3, None), 4 * 2 * 8 * 8 * 32),
+    ],
+)
+def test_flops_of_products_and_attention(run, flops):
+    """PyTorch counts no attention of a CPU itself, and none of the compiled kernel."""
+    with torch.no_grad(), flop_counter() as counter:
+        run()
+    assert counter.get_total_flops() == flops
 
 
-def test_flops_count_the_calls_of_the_compiled_kernel():
-    with FlopsProbe() as probe:
-        probe.begin("kernel")
-        torch.ops.ghgs_lit.attend(*[torch.rand(1, 2, 8, 32)] * 3, None)
-        probe.end("kernel")
-    assert probe.flops == {"kernel": 4 * 2 * 8 * 8 * 32}
-
-
-def test_memory_of_a_stage_counts_for_the_stages_around_it_alone():
-    """A peak inside one stage must not be charged to the next."""
-    probe = PeakProbe(CPU)
-    probe.begin("outer")
-    if not probe._open:
-        pytest.skip("this system has no resettable peak")
-    probe.begin("large")
-    held = torch.ones(1 << 24)  # 64 MiB
-    del held
-    probe.end("large")
-    probe.begin("small")
-    probe.end("small")
-    probe.end("outer")
-    assert probe.peaks["large"] > 60 << 20
-    assert probe.peaks["outer"] >= probe.peaks["large"]
-    assert probe.peaks["small"] < 30 << 20
+def test_memory_and_counts_of_a_case(model, scene):
+    work, (prediction, _) = measure.inspect(case(model, "a", Renderer()), scene, CPU)
+    assert work["gaussians"] == len(prediction.gaussians) > 0
+    assert work["flops"] > 0
+    assert not work["peak_bytes"] < 0
 
 
 @pytest.mark.parametrize("share", [0.05, 0.15, 0.6])

@@ -10,9 +10,8 @@ from tests.helpers.models import TINY, config, make_model
 from tests.helpers.people import render_boxes
 from tests.helpers.verbs import ghgs
 
-KEYS = {
-    "preset", "stage", "seconds", "peak_bytes", "flops", "max_rel_diff", "psnr", "psnr_loss_db", "budget_db",
-}  # fmt: skip
+KEYS = {"preset", "stage", "seconds", "seconds_low", "seconds_high", "psnr"}
+OF_TOTAL = {"peak_bytes", "flops", "max_rel_diff", "psnr_loss_db", "budget_db"}
 QUICK = ["timing.repeats=1", "threads=1", "metrics.lpips=off", "views=v3"]
 
 
@@ -62,6 +61,7 @@ def test_the_json_has_one_row_for_each_preset_and_stage(measured):
         assert (row["psnr"] is not None) == (row["stage"] == "total"), row
     whole = totals(content)
     assert list(whole) == ["none", "exact", "balanced"]
+    assert all(set(row) >= OF_TOTAL for row in whole.values())
     assert whole["none"]["max_rel_diff"] == whole["none"]["psnr_loss_db"] == 0
     assert whole["exact"]["budget_db"] is not None
     assert whole["balanced"]["tokens"] < whole["exact"]["tokens"] == 27
