@@ -2,10 +2,9 @@
 
 from pathlib import Path
 
-import numpy as np
-
 from ghgs_capture.calibration import Convention, StoredCamera
-from ghgs_capture.formats.entries import FISHEYE, PERSPECTIVE, CameraFile, coefficients, pinhole
+from ghgs_capture.formats.entries import CameraFile, Entries, pinhole
+from ghgs_capture.formats.matrices import camera_of
 from ghgs_lit.errors import InputError, installed, require
 from ghgs_lit.parsing import require_file
 
@@ -104,12 +103,9 @@ def _camera(folder: Path, name: str, image, camera) -> StoredCamera:
     model = camera.model.name
     require(model in _MODELS, origin, f"a camera model among {', '.join(_MODELS)}", model)
     values = dict(zip(_MODELS[model].split(), camera.params, strict=True))
-    fx = values.get("fx", values.get("f"))
-    fy = values.get("fy", values.get("f"))
-    intrinsics = pinhole(fx, fy, values["cx"], values["cy"])
-    fisheye = "FISHEYE" in model
-    distortion = coefficients(values, FISHEYE if fisheye else PERSPECTIVE)
-    pose = np.eye(4)
-    pose[:3] = image.cam_from_world().matrix()
-    size = (camera.height, camera.width)
-    return StoredCamera(name, origin, intrinsics, pose, size, distortion, fisheye)
+    if "f" in values:
+        values["fx"] = values["fy"] = values.pop("f")
+    lens = pinhole(*(values.pop(name) for name in ("fx", "fy", "cx", "cy")))
+    pose = image.cam_from_world().matrix()
+    fields = {"K": lens, "R": pose[:, :3], "T": pose[:, 3], "size": [camera.width, camera.height]}
+    return camera_of(name, Entries(origin, {**fields, **values, "fisheye": "FISHEYE" in model}))

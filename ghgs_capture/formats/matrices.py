@@ -171,7 +171,7 @@ def read_matrices(path: Path) -> CameraFile:
             read, others = _by_suffix(content)
         expected = "cameras with intrinsics and extrinsics (or K, R and T)"
         require(bool(read), str(file), expected, sorted(content))
-        cameras += [_camera(name, Entries(f"{file}: {name}", camera)) for name, camera in read.items()]
+        cameras += [camera_of(name, Entries(f"{file}: {name}", camera)) for name, camera in read.items()]
         for fields in (others, content if "cameras" in content else {}):
             unread += Entries(str(file), fields).unread()
     return CameraFile.of(cameras, convention, unread)
@@ -231,10 +231,16 @@ def _has_intrinsics(fields: Any) -> bool:
     return isinstance(fields, Mapping) and bool(Entries("", fields).keys("intrinsics"))
 
 
-def _camera(name: str, entries: Entries) -> StoredCamera:
+def camera_of(name: str, entries: Entries) -> StoredCamera:
     """One camera with matrices under any usual names; a rotation is a matrix or a vector.
 
-    InputError: an entry is missing or wrong."""
+    Args:
+        name: of the camera.
+        entries: of the camera; a pose maps the world to it.
+
+    Raises:
+        InputError: an entry is missing or wrong.
+    """
     pose = np.eye(4)
     if entries.keys("extrinsics"):
         extrinsics = entries.needed("extrinsics", (4, 4), (3, 4))
