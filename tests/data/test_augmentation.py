@@ -14,7 +14,7 @@ from ghgs_lit.data.imperfections import cut
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.masks import surface_colors
 from ghgs_lit.types import Batch
-from tests.helpers.people import RELEASE, V4, equal, render_boxes, rendered
+from tests.helpers.people import RELEASE, V4, equal, rendered
 
 RANDOM = V4 | {"training_counts": [3, 4, 5], "training": "uneven"}
 IMPERFECT = {
@@ -24,47 +24,40 @@ IMPERFECT = {
 EVERYTHING = IMPERFECT | {"sizes": [28, [42, 28]], "target_scale": [0.7, 2.0]}
 
 
-@pytest.fixture(scope="module")
-def root(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("rendered")
-    render_boxes(folder / "out", folder / "scans", train=3, val=1)
-    return folder / "out"
-
-
-def module(root, **changes):
+def module(boxes, **changes):
     arguments = {"views": RANDOM, "targets": RELEASE, "size": 28, "batch_size": 2, "steps_per_epoch": 6}
-    return rendered(root, **(arguments | changes))
+    return rendered(boxes, **(arguments | changes))
 
 
-def test_nothing_varies_by_default(root):
+def test_nothing_varies_by_default(boxes):
     """augmentation=none and no augmentation give the photographs as they are read, to the bit."""
     none = compose("train").augmentation
     assert Augmentation.read(none, "augmentation") == Augmentation()
-    data = module(root, augmentation=none)
+    data = module(boxes, augmentation=none)
     # for measurements alone
     builder = dataclasses.replace(data.builder("train"), target_depths=False)
     for step in range(3):
         batch = builder.batch(data.training_sampler().batch(step))
         assert equal(data.training_batch(step), batch)
-        assert equal(module(root).training_batch(step), batch)
+        assert equal(module(boxes).training_batch(step), batch)
 
 
-def test_batches_depend_on_seed_and_step_alone(root):
+def test_batches_depend_on_seed_and_step_alone(boxes):
     """Neither on loading processes nor on what was read before; steps and seeds differ."""
-    batches = list(module(root, augmentation=EVERYTHING, workers=2).train_dataloader())
+    batches = list(module(boxes, augmentation=EVERYTHING, workers=2).train_dataloader())
     assert len(batches) == 6
-    data = module(root, augmentation=EVERYTHING)
+    data = module(boxes, augmentation=EVERYTHING)
     for step in (5, 0, 3, 1, 4, 2, 5):
         assert equal(data.training_batch(step), batches[step])
     assert len({(batch.images.shape, round(batch.images.sum().item(), 3)) for batch in batches}) == 6
-    others = [module(root, augmentation=EVERYTHING, seed=1).training_batch(step) for step in range(6)]
+    others = [module(boxes, augmentation=EVERYTHING, seed=1).training_batch(step) for step in range(6)]
     assert not any(map(equal, batches, others))
 
 
-def test_imperfections_and_sizes_differ_between_seeds_steps_and_samples(root):
+def test_imperfections_and_sizes_differ_between_seeds_steps_and_samples(boxes):
     """The same photographs in another step, run or place of the batch are imperfect in
     another way."""
-    clean, varied = module(root).training_batch(0), Augmentation(**EVERYTHING)
+    clean, varied = module(boxes).training_batch(0), Augmentation(**EVERYTHING)
 
     def drawn(seed, step, indices=(6, 7)):
         return varied.imperfect(clean, seed, step, indices)
@@ -86,20 +79,20 @@ def test_imperfections_and_sizes_differ_between_seeds_steps_and_samples(root):
     assert changed[0] == changed[1] != changed[2]
 
 
-def test_sizes_of_a_class_are_drawn_once(root):
+def test_sizes_of_a_class_are_drawn_once(boxes):
     varied = {"sizes": [28, 42], "target_scale": [0.7, 1.0]}
     sizes = [
         [data._training_batches(data.training_sampler(), 6).sizes(step) for step in range(6)]
-        for data in (module(root, augmentation=varied, class_steps=steps) for steps in (1, 3))
+        for data in (module(boxes, augmentation=varied, class_steps=steps) for steps in (1, 3))
     ]
     assert sizes[1] == [sizes[0][0]] * 3 + [sizes[0][1]] * 3
     assert len(set(sizes[0])) > 2
 
 
-def test_sizes_are_drawn_for_a_step_and_cameras_follow(root):
+def test_sizes_are_drawn_for_a_step_and_cameras_follow(boxes):
     """Every size occurs, the same for all processes; targets are 0.7 to 2 times as large."""
     data = module(
-        root, target_size=[84, 84], augmentation={"sizes": [28, [42, 28]], "target_scale": [0.7, 2.0]}
+        boxes, target_size=[84, 84], augmentation={"sizes": [28, [42, 28]], "target_scale": [0.7, 2.0]}
     )
     inputs, scales = set(), []
     for step in range(12):
@@ -122,35 +115,35 @@ def test_sizes_are_drawn_for_a_step_and_cameras_follow(root):
     assert np.ptp(scales) > 0.6
 
 
-def test_drawn_sizes_keep_the_proportion_of_the_targets(root):
+def test_drawn_sizes_keep_the_proportion_of_the_targets(boxes):
     """data.target_size twice data.size: targets are twice as large as the inputs that are drawn."""
-    batch = module(root, target_size=56, augmentation={"sizes": [42]}).training_batch(0)
+    batch = module(boxes, target_size=56, augmentation={"sizes": [42]}).training_batch(0)
     assert batch.images.shape[-2:] == (42, 42)
     assert batch.targets.images.shape[-2:] == (84, 84)
 
 
-def test_targets_are_never_enlarged(root):
+def test_targets_are_never_enlarged(boxes):
     """Twice the size of the inputs is more than the photographs hold:
     they stay as large as they are read."""
-    data = module(root, target_size=42, augmentation={"target_scale": [1.0, 2.0]})
+    data = module(boxes, target_size=42, augmentation={"target_scale": [1.0, 2.0]})
     sides = {data.training_batch(step).targets.images.shape[-1] for step in range(12)}
     assert 28 <= min(sides) < 36
     assert max(sides) == 42
 
 
-def test_a_share_of_the_steps_is_imperfect(root):
+def test_a_share_of_the_steps_is_imperfect(boxes):
     """The others are as they are read, to the bit; chance=1 is every step."""
-    clean, some, every = (module(root, augmentation=a) for a in ({}, IMPERFECT | {"chance": 0.4}, IMPERFECT))
+    clean, some, every = (module(boxes, augmentation=a) for a in ({}, IMPERFECT | {"chance": 0.4}, IMPERFECT))
     steps = [(clean.training_batch(step), some.training_batch(step)) for step in range(40)]
     changed = [step for step, pair in enumerate(steps) if not equal(*pair)]
     assert 8 <= len(changed) <= 24
     assert equal(steps[changed[0]][1], every.training_batch(changed[0]))
 
 
-def test_the_last_part_of_a_run_is_exact(root):
+def test_the_last_part_of_a_run_is_exact(boxes):
     """From the step on that is named, to the bit; all before as without it."""
     clean, always, first = (
-        module(root, augmentation=a) for a in ({}, IMPERFECT, IMPERFECT | {"exact_from": 2})
+        module(boxes, augmentation=a) for a in ({}, IMPERFECT, IMPERFECT | {"exact_from": 2})
     )
     for step in range(4):
         assert equal(first.training_batch(step), (always if step < 2 else clean).training_batch(step))
@@ -180,12 +173,12 @@ def differing(a, b) -> set[str]:
         (("calibration",), {"cameras.intrinsics", "cameras.extrinsics"}),
     ],
 )
-def test_each_imperfection_changes_its_part_of_the_inputs_alone(root, names, changed):
+def test_each_imperfection_changes_its_part_of_the_inputs_alone(boxes, names, changed):
     """Targets, depths and all else stay; together they are what they are alone."""
     chosen = {name: IMPERFECT[name] for name in names}
-    clean, batch = (module(root, augmentation=a).training_batch(1) for a in ({}, chosen))
+    clean, batch = (module(boxes, augmentation=a).training_batch(1) for a in ({}, chosen))
     assert differing(clean, batch) == changed
-    together = module(root, augmentation=IMPERFECT).training_batch(1)
+    together = module(boxes, augmentation=IMPERFECT).training_batch(1)
     everything = {"images", "masks", "alpha", "cameras.intrinsics", "cameras.extrinsics"}
     assert differing(clean, together) == everything
     # A matte knows no more than the mask: nothing beside it, and all of what the mask adds.
@@ -201,11 +194,12 @@ def test_each_imperfection_changes_its_part_of_the_inputs_alone(root, names, cha
         assert one.masks.flatten(2).any(-1).all()
 
 
-def test_a_wrong_mask_shows_the_background(root):
+def test_a_wrong_mask_shows_the_background(boxes):
     """Pixels that a mask adds show what is behind them; where the mask is right nothing is new."""
     outlines = {"mask_offset": 1.5, "mask_ragged": 1.0}
     clean, black, cloudy = (
-        module(root, augmentation=a).training_batch(1) for a in ({}, outlines, outlines | {"background": 1.0})
+        module(boxes, augmentation=a).training_batch(1)
+        for a in ({}, outlines, outlines | {"background": 1.0})
     )
     assert torch.equal(black.masks, cloudy.masks)
     added = cloudy.masks & (clean.alpha == 0)
@@ -217,11 +211,11 @@ def test_a_wrong_mask_shows_the_background(root):
     assert torch.equal(cloudy.alpha, cloudy.masks.float())
 
 
-def test_refined_masks_are_those_of_a_capture(root):
+def test_refined_masks_are_those_of_a_capture(boxes):
     """refined=1 finds mattes in the photographs, by as many pixels as outlines may be off."""
     wrong = {"mask_offset": 1.5, "mask_ragged": 1.0, "background": 1.0}
     clean, given, found = (
-        module(root, augmentation=a).training_batch(1) for a in ({}, wrong, wrong | {"refined": 1.0})
+        module(boxes, augmentation=a).training_batch(1) for a in ({}, wrong, wrong | {"refined": 1.0})
     )
     errors = [(batch.alpha - clean.alpha).abs().mean() for batch in (given, found)]
     assert errors[1] < errors[0]
@@ -232,10 +226,10 @@ def test_refined_masks_are_those_of_a_capture(root):
     assert equal(found.targets, clean.targets)
 
 
-def test_tone_curves_raise_the_surface_to_a_power(root):
+def test_tone_curves_raise_the_surface_to_a_power(boxes):
     """One power for each camera; powers differ, their geometric mean is 1;
     black and mattes stay."""
-    clean, toned = (module(root, augmentation=a).training_batch(1) for a in ({}, {"gamma": 0.3}))
+    clean, toned = (module(boxes, augmentation=a).training_batch(1) for a in ({}, {"gamma": 0.3}))
     one, other = (surface_colors(batch).double() for batch in (clean, toned))
     sure = ((clean.alpha > 0.5)[:, :, None] & (one > 0.1) & (one < 0.9)).expand_as(one)
     powers = torch.where(sure, other.log() / one.log(), torch.nan).flatten(2)
@@ -248,10 +242,10 @@ def test_tone_curves_raise_the_surface_to_a_power(root):
     torch.testing.assert_close(logs.mean(1), torch.zeros(len(logs)).double(), rtol=0, atol=1e-3)
 
 
-def test_a_cut_moves_photographs_and_cameras_together(root):
+def test_a_cut_moves_photographs_and_cameras_together(boxes):
     """A point of the world shows what it showed, until it leaves the frame;
     wholes are whole in some view."""
-    clean = module(root).training_batch(1)
+    clean = module(boxes).training_batch(1)
     kinds = set()
     for seed in range(12):
         rngs = [np.random.default_rng([seed, b]) for b in range(2)]
@@ -279,9 +273,9 @@ def test_a_cut_moves_photographs_and_cameras_together(root):
     assert equal(cut(clean, 0.0, [np.random.default_rng(b) for b in range(2)]), clean)
 
 
-def test_imperfections_do_not_depend_on_batch_mates(root):
+def test_imperfections_do_not_depend_on_batch_mates(boxes):
     """Two elements together are as each alone."""
-    batch = module(root).training_batch(0)
+    batch = module(boxes).training_batch(0)
     augmentation = Augmentation(**IMPERFECT)
 
     def imperfect(one, seeds):
@@ -298,11 +292,11 @@ def test_imperfections_do_not_depend_on_batch_mates(root):
         assert torch.equal(alone.cameras.extrinsics[0], both.cameras.extrinsics[b])
 
 
-def test_validation_does_not_vary(root):
+def test_validation_does_not_vary(boxes):
     """Numbers of different runs are measured on the same photographs."""
-    clean, varied = (module(root, views=V4, augmentation=a) for a in ({}, EVERYTHING))
+    clean, varied = (module(boxes, views=V4, augmentation=a) for a in ({}, EVERYTHING))
     pairs = list(zip(clean.val_dataloader(), varied.val_dataloader(), strict=True))
-    assert [batch.subjects for batch, _ in pairs] == [("s3",)]
+    assert [batch.subjects for batch, _ in pairs] == [("s3", "s4")]
     assert all(equal(*pair) for pair in pairs)
     everyone = [list(data.evaluation_loader(split="train")) for data in (clean, varied)]
     assert sum(len(batch.subjects) for batch in everyone[0]) == 3
@@ -330,7 +324,7 @@ def test_shipped_variation_is_built():
         ({"mask_holes": 1}, "augmentation key: .*did you mean mask_hole_chance"),
     ],
 )
-def test_impossible_values_are_refused(root, values, message):
+def test_impossible_values_are_refused(boxes, values, message):
     """The message names the key."""
     with pytest.raises(InputError, match=message):
-        module(root, augmentation=values)
+        module(boxes, augmentation=values)

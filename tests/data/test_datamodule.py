@@ -11,7 +11,7 @@ from ghgs_lit.data.datamodule import trained_batches
 from ghgs_lit.data.humman import HuMMan
 from ghgs_lit.errors import InputError
 from ghgs_people.datasets import Scans, Synthetic
-from tests.helpers.people import TINY, render_boxes, rendered
+from tests.helpers.people import TINY, rendered
 
 
 def test_keys_of_the_data_set_and_of_its_batches_lie_side_by_side():
@@ -58,14 +58,6 @@ def test_a_resumed_run_knows_how_many_batches_it_has_had(step, accumulated, leng
     assert trained_batches(None, length) == 0
 
 
-@pytest.fixture(scope="module")
-def boxes(tmp_path_factory):
-    """Four people of training and two of validation."""
-    folder = tmp_path_factory.mktemp("boxes")
-    render_boxes(folder / "data", folder / "scans", train=4, val=2)
-    return folder / "data"
-
-
 def test_targets_have_their_own_size(boxes):
     """Inputs stay small where photographs are compared at twice their size."""
     data = rendered(boxes, size=14, target_size=28)
@@ -95,7 +87,7 @@ def test_evaluation_has_the_batches_that_are_asked_for(boxes):
 @pytest.mark.parametrize("rank", [0, 1])
 def test_each_process_of_several_loads_its_own_samples(boxes, rank, monkeypatch):
     """Its number and how many there are come from the trainer;
-    four subjects are passed often in an epoch."""
+    three subjects are passed often in an epoch."""
     data = rendered(boxes, batch_size=1)
     data.trainer = SimpleNamespace(world_size=2, global_rank=rank, max_steps=-1, max_epochs=None)
     data.trainer.num_devices = 2
@@ -107,4 +99,4 @@ def test_each_process_of_several_loads_its_own_samples(boxes, rank, monkeypatch)
         expected = [sample.subject for sample in drawn.batch(step, rank, 2)]
         assert list(batches[step].subjects) == expected
     monkeypatch.setattr("ghgs_lit.data.datamodule.LEAST_STEPS", 1)
-    assert len(data.train_dataloader().dataset) == 2  # of the four subjects, each process has half
+    assert len(data.train_dataloader().dataset) == 2  # of the three subjects, each process has half

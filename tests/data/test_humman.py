@@ -4,7 +4,6 @@ import json
 import pickle
 import shutil
 import sys
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,18 +14,11 @@ from scipy import sparse
 
 from ghgs_lit.data.humman import HuMMan
 from ghgs_lit.data.reader import PhotographCache
-from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.data.smpl import read_model, read_parameters
-from ghgs_lit.errors import InputError
-from scripts.miniatures import humman
 from scripts.miniatures.smpl import stand_in
 from tests.helpers.captures import (
-    blob,
     build_data,
-    centroid,
     inside,
-    make_miniature,
-    project,
     require_same_packed,
 )
 
@@ -34,36 +26,29 @@ TEST = "p000455_a000986"
 WIDTH, HEIGHT = 160, 90
 
 
-@pytest.fixture(scope="module")
-def root(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("humman") / "recon"
-    make_miniature(humman, folder, [TEST], {"train": 1, "val": 1}, WIDTH, seed=3)
-    return folder
-
-
 def photographs(root: Path, size=None, **options) -> PhotographCache:
     data = HuMMan(root=root, split={"val": [TEST]}, frames=(0, 97, 6), **options)
     return PhotographCache(data.reader("val"), size)
 
 
-def test_frames_are_multiples_of_6_and_some_lack(root):
+def test_frames_are_multiples_of_6_and_some_lack(humman_root):
     """Frames that a sequence lacks are left out; all ten cameras are positions."""
-    assert list(photographs(root).reader.subjects) == [f"{TEST}_{n:06d}" for n in (0, 6, 18)]
-    assert set(photographs(root).reader.subjects.values()) == {tuple(range(10))}
+    assert list(photographs(humman_root).reader.subjects) == [f"{TEST}_{n:06d}" for n in (0, 6, 18)]
+    assert set(photographs(humman_root).reader.subjects.values()) == {tuple(range(10))}
 
 
-def test_a_camera_that_lacks_a_frame_is_left_out(root, tmp_path):
+def test_a_camera_that_lacks_a_frame_is_left_out(humman_root, tmp_path):
     """A missing photograph removes one camera from one frame, not the frame."""
-    shutil.copytree(root / TEST, tmp_path / TEST)
+    shutil.copytree(humman_root / TEST, tmp_path / TEST)
     (tmp_path / TEST / "kinect_color" / "kinect_004" / "000006.png").unlink()
     subjects = photographs(tmp_path).reader.subjects
     assert subjects[f"{TEST}_000006"] == (0, 1, 2, 3, 5, 6, 7, 8, 9)
     assert subjects[f"{TEST}_000018"] == tuple(range(10))
 
 
-def test_named_sequences_are_for_testing_and_the_rest_for_training(root, tmp_path):
+def test_named_sequences_are_for_testing_and_the_rest_for_training(humman_root, tmp_path):
     """The official test sequences never reach training."""
-    shutil.copytree(root, tmp_path / "recon")
+    shutil.copytree(humman_root, tmp_path / "recon")
     (tmp_path / "recon" / "notes").mkdir()
     data = build_data("humman", tmp_path / "recon").dataset
     assert len(data.split.val) == len(set(data.split.val)) == 22
@@ -73,112 +58,86 @@ def test_named_sequences_are_for_testing_and_the_rest_for_training(root, tmp_pat
     assert list(range(*data.frames)) == [6 * i for i in range(17)]
 
 
-def test_the_world_is_the_first_cameras_frame_in_metres(root):
+def test_the_world_is_the_first_cameras_frame_in_metres(humman_root):
     """A wrong unit or direction of the extrinsics would move the cameras."""
-    content = json.loads((root / TEST / "cameras.json").read_text())
+    content = json.loads((humman_root / TEST / "cameras.json").read_text())
     assert len(content) == 10
-    views = [photographs(root).view(f"{TEST}_000000", k) for k in range(10)]
+    views = [photographs(humman_root).view(f"{TEST}_000000", k) for k in range(10)]
     np.testing.assert_allclose(views[0].extrinsics, np.eye(4), atol=1e-6)
     np.testing.assert_allclose(views[3].extrinsics[:3, 3], content["kinect_color_003"]["T"], rtol=1e-6)
     centers = np.stack([-v.extrinsics[:3, :3].T @ v.extrinsics[:3, 3] for v in views])
     assert 4 < np.linalg.norm(centers - centers[0], axis=-1).max() < 6
 
 
-def test_any_value_of_the_matting_is_the_performer(root):
+def test_any_value_of_the_matting_is_the_performer(humman_root):
     """Soft values of the matting count as the performer, too."""
-    path = root / TEST / "kinect_mask" / "kinect_002" / "000006.png"
+    path = humman_root / TEST / "kinect_mask" / "kinect_002" / "000006.png"
     matting = np.asarray(Image.open(path))
     assert ((matting > 0) & (matting < 128)).any()
-    np.testing.assert_array_equal(photographs(root).view(f"{TEST}_000006", 2).mask, matting > 0)
+    np.testing.assert_array_equal(photographs(humman_root).view(f"{TEST}_000006", 2).mask, matting > 0)
 
 
-def test_drawn_masks_are_read_where_there_are_any(root):
+def test_drawn_masks_are_read_where_there_are_any(humman_root):
     """The option data.masks selects another folder, which only test sequences have."""
-    view = photographs(root, masks="kinect_mask_manual").view(f"{TEST}_000006", 2)
-    assert view.mask.sum() < photographs(root).view(f"{TEST}_000006", 2).mask.sum()
-    assert not (root / "p100001_a000048" / "kinect_mask_manual").exists()
+    view = photographs(humman_root, masks="kinect_mask_manual").view(f"{TEST}_000006", 2)
+    assert view.mask.sum() < photographs(humman_root).view(f"{TEST}_000006", 2).mask.sum()
+    assert not (humman_root / "p100001_a000048" / "kinect_mask_manual").exists()
 
 
-def test_the_background_is_black(root):
-    """The studio behind the performer must not reach the model."""
-    view = photographs(root).view(f"{TEST}_000000", 1)
-    assert view.image[~view.mask].max() == 0
-    assert view.image[view.mask].max() > 60
-
-
-@pytest.mark.parametrize("share", [1, 2, 5])
-def test_intrinsics_fit_resized_photographs(root, tmp_path, share):
-    """A spot where OpenCV sees a point is where the view's camera sees it,
-    to a fiftieth of a pixel."""
-    shutil.copytree(root / TEST, tmp_path / TEST)
-    camera = json.loads((root / TEST / "cameras.json").read_text())["kinect_color_005"]
-    matrix, rotation, translation = (np.array(camera[key]) for key in "KRT")
-    point = np.array([0.03, 0.1, 2.4])
-    x, y = (matrix @ (rotation @ point + translation))[:2] / (rotation @ point + translation)[2]
-    name = Path("kinect_005") / "000000.png"
-    Image.fromarray(blob(HEIGHT, WIDTH, x, y)).save(tmp_path / TEST / "kinect_color" / name)
-    full = Image.fromarray(np.full((HEIGHT, WIDTH), 255, np.uint8))
-    full.save(tmp_path / TEST / "kinect_mask" / name)
-    size = (HEIGHT // share, WIDTH // share)
-    view = photographs(tmp_path, size=size).view(f"{TEST}_000000", 5)
-    assert view.image.shape == (*size, 3)
-    np.testing.assert_allclose(centroid(view.image), project(view, point), atol=0.02)
-
-
-def test_no_body_is_a_choice(root):
+def test_no_body_is_a_choice(humman_root):
     """Without a body a batch says so, and training without Chamfer loss is possible."""
-    assert photographs(root).body(f"{TEST}_000000") is None
-    batch = build_data("humman", root, "data.size=[36,64]", "data.workers=0").training_batch(0)
+    assert photographs(humman_root).body(f"{TEST}_000000") is None
+    batch = build_data("humman", humman_root, "data.size=[36,64]", "data.workers=0").training_batch(0)
     assert batch.body_vertices is None
     assert batch.images.shape == (1, 4, 3, 36, 64)
 
 
-def test_evaluation_takes_evenly_spaced_inputs_and_all_other_targets(root):
+def test_evaluation_takes_evenly_spaced_inputs_and_all_other_targets(humman_root):
     """The documented protocol: inputs 0 3 6 and seven targets; frames are not people."""
-    data = build_data("humman", root, "data.size=[36,64]", "data.workers=0")
+    data = build_data("humman", humman_root, "data.size=[36,64]", "data.workers=0")
     samples = list(data.evaluation_loader(views=3))
     assert len(samples) == 3
     assert samples[0].views == (("000/0", "003/0", "006/0"),)
     targets, others = samples[0].targets, (1, 2, 4, 5, 7, 8, 9)
     assert targets.names == (tuple(f"{k:03}/0" for k in others),)
-    views = [photographs(root, size=(36, 64)).view(f"{TEST}_000000", k) for k in others]
+    views = [photographs(humman_root, size=(36, 64)).view(f"{TEST}_000000", k) for k in others]
     images = (255 * targets.images[0].movedim(1, -1)).round()
     np.testing.assert_array_equal(images, [view.image for view in views])
     np.testing.assert_array_equal(targets.cameras.extrinsics[0], [view.extrinsics for view in views])
     assert data.dataset.reader("val").people == 1
 
 
-def test_parameters_have_the_published_shapes(root):
+def test_parameters_have_the_published_shapes(humman_root):
     """The miniature's SMPL parameters are those of the real files."""
-    found = read_parameters(root / TEST / "smpl_params" / "000018.npz")
+    found = read_parameters(humman_root / TEST / "smpl_params" / "000018.npz")
     assert {key: value.shape for key, value in found.items()} == {
         "betas": (10,), "body_pose": (69,), "global_orient": (3,), "transl": (3,)
     }  # fmt: skip
 
 
-def test_the_stand_in_has_the_shapes_of_smpl(root):
+def test_the_stand_in_has_the_shapes_of_smpl(humman_root):
     """The replacement of the licensed model is read as a model of SMPL's shapes."""
-    arrays = read_model(root.with_name("recon_body_models") / "smpl" / "SMPL_NEUTRAL.pkl")
+    arrays = read_model(humman_root.with_name("recon_body_models") / "smpl" / "SMPL_NEUTRAL.pkl")
     assert arrays["weights"].sum(1) == pytest.approx(1)
     assert arrays["J_regressor"].sum(1) == pytest.approx(1, abs=1e-4)
     assert set(arrays) == set(stand_in())
 
 
-def test_smpl_vertices_project_into_every_mask(root):
+def test_smpl_vertices_project_into_every_mask(humman_root):
     """Model, parameters and cameras agree about where the body is."""
     pytest.importorskip("smplx")
-    data = photographs(root, smpl_model=root.with_name("recon_body_models"))
+    data = photographs(humman_root, smpl_model=humman_root.with_name("recon_body_models"))
     for name in data.reader.subjects:
         assert data.body(name).shape == (6890, 3)
         assert min(inside(data.view(name, k), data.body(name)) for k in range(10)) > 0.97
 
 
-def test_smpl_turns_about_the_pelvis_and_then_shifts(root):
+def test_smpl_turns_about_the_pelvis_and_then_shifts(humman_root):
     """The order of rotation and translation is SMPL's."""
     pytest.importorskip("smplx")
     from ghgs_lit.data.smpl import Body
 
-    body, model = Body(root.with_name("recon_body_models")), stand_in()
+    body, model = Body(humman_root.with_name("recon_body_models")), stand_in()
     still = {
         "betas": np.zeros(10),
         "body_pose": np.zeros(69),
@@ -223,35 +182,14 @@ def test_pickles_of_the_official_release_are_read_without_chumpy(tmp_path, monke
         np.testing.assert_allclose(read[key], value)
 
 
-def test_the_same_numbers_make_the_same_miniature(root, tmp_path):
-    """A miniature is reproducible, whatever else is made."""
-    make_miniature(humman, tmp_path / "recon", [TEST], {"train": 1, "val": 0}, WIDTH, seed=3, frames=[0])
-    for name in ("kinect_color/kinect_007/000000.png", "kinect_mask/kinect_007/000000.png", "cameras.json"):
-        place = Path("p100001_a000048") / name
-        assert (tmp_path / "recon" / place).read_bytes() == (root / place).read_bytes()
-
-
-def test_targets_between_cameras_that_stand_still_are_refused(root):
-    """Views that do not exist are refused before anything is read."""
-    data = build_data("humman", root, "data.size=[36,64]", "data.workers=0", "targets=release")
-    for draw in (
-        data.training_sampler,
-        data.evaluation_loader,
-        partial(data.evaluation_loader, targets={"name": "midway"}),
-    ):
-        with pytest.raises(InputError, match=r"targets: expected cameras for data=humman.*; found"):
-            draw()
-    assert len(data.evaluation_loader(targets=CAMERAS)) > 0
-
-
-def test_packed_frames_are_the_same(root, tmp_path):
+def test_packed_frames_are_the_same(humman_root, tmp_path):
     """Photographs and bodies of a frame in one file, which depends on the body model, too."""
-    reader = photographs(root).reader
+    reader = photographs(humman_root).reader
     require_same_packed(reader, tmp_path, (36, 64))
     without = set(tmp_path.iterdir())
     assert len(without) == len(reader.subjects)
     reader._body = SimpleNamespace(
-        file=root.with_name("recon_body_models") / "smpl" / "SMPL_NEUTRAL.pkl",
+        file=humman_root.with_name("recon_body_models") / "smpl" / "SMPL_NEUTRAL.pkl",
         vertices=lambda parameters: parameters["body_pose"].reshape(-1, 3).astype(np.float32),
     )
     require_same_packed(reader, tmp_path, (36, 64))

@@ -1,4 +1,5 @@
-"""Sampling protocols and the DataModules: angles, batches, refusals."""
+"""Sampling protocols and the DataModules: angles, batches, refusals; what training draws: samples
+that resume, are fair, and follow the seed."""
 
 import numpy as np
 import pytest
@@ -15,22 +16,15 @@ from ghgs_lit.data.sampling import (
     middle,
 )
 from ghgs_lit.errors import InputError
-from tests.helpers.people import RELEASE, V4, equal, render_boxes, rendered
+from tests.helpers.people import RELEASE, V4, equal, rendered
 
 FULL = tuple(range(16))
 RANDOM = ViewProtocol()
 MIDWAY = {"name": "midway", "per_subject": "all"}
 
 
-@pytest.fixture(scope="module")
-def root(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("rendered")
-    render_boxes(folder / "out", folder / "scans")
-    return folder / "out"
-
-
-def module(root, **changes):
-    return rendered(root, **{"batch_size": 2, **changes})
+def module(boxes, **changes):
+    return rendered(boxes, **{"batch_size": 2, **changes})
 
 
 def turns(cameras) -> np.ndarray:
@@ -70,10 +64,10 @@ def test_uneven_views_need_room():
 
 
 @pytest.mark.parametrize("count", [3, 4, 5])
-def test_targets_stand_where_their_protocol_says(root, count):
+def test_targets_stand_where_their_protocol_says(boxes, count):
     """Angles of the actual cameras: 11.25 degrees beside the first input;
     equally far from two inputs."""
-    data = module(root)
+    data = module(boxes)
     for batch in data.evaluation_loader(count, TargetProtocol(name="release")):
         first, target = turns(batch.cameras)[:, 0], turns(batch.targets.cameras)[:, 0]
         np.testing.assert_allclose((target - first) % 360, 11.25, atol=1e-3)
@@ -126,9 +120,9 @@ def test_random_targets_of_evaluation_are_fixed_and_differ_between_subjects():
         assert not set(sample.targets) & set(sample.inputs)
 
 
-def test_batches_have_the_shapes_and_values_they_promise(root):
+def test_batches_have_the_shapes_and_values_they_promise(boxes):
     """Shapes, types and value ranges of a batch; every vertex of a body counts."""
-    data = module(root, targets={"name": "random", "per_step": 2}, target_size=[42, 35])
+    data = module(boxes, targets={"name": "random", "per_step": 2}, target_size=[42, 35])
     batch = data.training_batch(0)
     assert batch.images.shape == (2, 4, 3, 28, 28)
     assert batch.targets.images.shape == (2, 2, 3, 42, 35)
@@ -150,11 +144,11 @@ def test_batches_have_the_shapes_and_values_they_promise(root):
     assert torch.equal(data.training_batch(0).body_vertices[0], batch.body_vertices[0])
 
 
-def test_data_without_depth_or_body_says_none(root, tmp_path):
+def test_data_without_depth_or_body_says_none(boxes, tmp_path):
     """Missing depths, bodies or mattes (of one photograph) become None, not zeros."""
     import shutil
 
-    shutil.copytree(root / "train", tmp_path / "train")
+    shutil.copytree(boxes / "train", tmp_path / "train")
     shutil.rmtree(tmp_path / "train" / "depth")
     shutil.rmtree(tmp_path / "train" / "smpl" / "s1")
     for folder in (tmp_path / "train" / "alpha").glob("s1_*"):
@@ -163,16 +157,6 @@ def test_data_without_depth_or_body_says_none(root, tmp_path):
     assert batch.depths is None
     assert batch.alpha is None
     assert batch.body_vertices is None
-
-
-def test_training_reads_depths_where_a_loss_does(root):
-    """Decoding depth maps that nothing reads is wasted;
-    the depth error needs them in validation."""
-    data = module(root)
-    assert next(iter(data.train_dataloader())).depths is not None
-    data.trains_on_depths = False
-    assert next(iter(data.train_dataloader())).depths is None
-    assert next(iter(data.val_dataloader())).depths is not None
 
 
 class Recorder(LightningModule):
@@ -191,7 +175,7 @@ class Recorder(LightningModule):
         return torch.optim.SGD(self.parameters(), 0.1)
 
 
-def train(root, steps, checkpoint=None, folder=None, workers=0):
+def train(boxes, steps, checkpoint=None, folder=None, workers=0):
     recorder = Recorder()
     saver = ModelCheckpoint(folder, every_n_train_steps=3, save_top_k=-1, filename="{step}")
     trainer = Trainer(
@@ -204,38 +188,31 @@ def train(root, steps, checkpoint=None, folder=None, workers=0):
         num_sanity_val_steps=0,
         limit_val_batches=0,
     )
-    data = module(root, views=RANDOM, steps_per_epoch=4, workers=workers)
+    data = module(boxes, views=RANDOM, steps_per_epoch=4, workers=workers)
     trainer.fit(recorder, datamodule=data, ckpt_path=checkpoint)
     return recorder.seen
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_training_resumes_with_the_very_next_draw(root, tmp_path):
+def test_training_resumes_with_the_very_next_draw(boxes, tmp_path):
     """Stopped after 3 steps of an epoch of 4: the fourth is next, not the first again."""
-    whole = train(root, 10, folder=tmp_path / "a")
+    whole = train(boxes, 10, folder=tmp_path / "a")
     assert len(set(map(str, whole))) == 10
     for done in (3, 9):
-        rest = train(root, 10, tmp_path / "a" / f"step={done}.ckpt", tmp_path / "b")
+        rest = train(boxes, 10, tmp_path / "a" / f"step={done}.ckpt", tmp_path / "b")
         assert rest == whole[done:]
 
 
-def test_loading_processes_change_nothing(root):
-    """Batches are independent of the number of workers."""
-    alone, helped = module(root), module(root, workers=2)
-    for a, b in zip(alone.train_dataloader(), helped.train_dataloader(), strict=True):
-        assert equal(a, b)
-
-
-def test_an_epoch_and_the_evaluation_have_the_expected_length(root):
+def test_an_epoch_and_the_evaluation_have_the_expected_length(boxes):
     """Lengths follow subjects, batch size, steps_per_epoch and limit;
     evaluation repeats exactly."""
-    data = module(root)
+    data = module(boxes)
     assert len(data.train_dataloader()) == 100  # 50 passes over 3 subjects, 2 at a time
     assert [len(batch.subjects) for batch in data.val_dataloader()] == [2]
     assert [len(b.subjects) for b in data.evaluation_loader(split="train", batch_size=2)] == [2, 1]
-    assert len(module(root, steps_per_epoch=7).train_dataloader()) == 7
-    assert list(module(root, limit={"train": 2}).subjects("train")) == ["s0", "s1"]
-    again = [b for _ in range(2) for b in module(root).val_dataloader()]
+    assert len(module(boxes, steps_per_epoch=7).train_dataloader()) == 7
+    assert list(module(boxes, limit={"train": 2}).subjects("train")) == ["s0", "s1"]
+    again = [b for _ in range(2) for b in module(boxes).val_dataloader()]
     assert equal(*again)
 
 
@@ -268,13 +245,13 @@ def test_an_epoch_and_the_evaluation_have_the_expected_length(root):
         ({"workers": -1}, "data.workers: expected an integer >= 0"),
     ],
 )
-def test_impossible_values_fail_at_once(root, changes, message):
+def test_impossible_values_fail_at_once(boxes, changes, message):
     """A wrong value or key fails when the configuration is read and is named."""
     with pytest.raises(InputError, match=message):
-        module(root, **changes)
+        module(boxes, **changes)
 
 
-def test_fewer_views_than_asked(root, tmp_path):
+def test_fewer_views_than_asked(boxes, tmp_path):
     """Too few cameras are refused with the subject's name; listed positions help."""
     import shutil
 
@@ -282,7 +259,7 @@ def test_fewer_views_than_asked(root, tmp_path):
         for position in (0, 4, 9):
             for phase, name in (("train", "s0"), ("val", "s3")):
                 shutil.copytree(
-                    root / phase / kind / f"{name}_{position:03d}",
+                    boxes / phase / kind / f"{name}_{position:03d}",
                     tmp_path / phase / kind / f"{name}_{position:03d}",
                 )
     data = module(tmp_path, batch_size=1)
@@ -297,15 +274,15 @@ def test_fewer_views_than_asked(root, tmp_path):
     with pytest.raises(
         InputError, match=r"targets.per_subject: expected at most the 4 inputs, or all; found 5"
     ):
-        module(root).evaluation_loader(4, {"name": "midway", "per_subject": 5})
+        module(boxes).evaluation_loader(4, {"name": "midway", "per_subject": 5})
     listed = module(tmp_path, evaluation_positions=[[0, 4, 9]], batch_size=1)
     assert next(iter(listed.evaluation_loader(3))).views == (("000/0", "004/0", "009/0"),)
 
 
-def test_a_subject_alone_is_read_without_targets(root):
+def test_a_subject_alone_is_read_without_targets(boxes):
     """Four cameras that are all inputs leave no target: a splat needs none."""
     data = module(
-        root, targets={"name": "cameras", "view": 0, "training_views": [0], "positions": [0, 4, 8, 12]}
+        boxes, targets={"name": "cameras", "view": 0, "training_views": [0], "positions": [0, 4, 8, 12]}
     )
     with pytest.raises(InputError, match=r"targets\.positions: expected a camera that is not an input"):
         data.evaluation_loader()
@@ -319,20 +296,118 @@ def test_a_subject_alone_is_read_without_targets(root):
 
 
 @pytest.mark.parametrize("count", [0, 17])
-def test_a_number_of_views_that_a_ring_does_not_have_is_refused(root, count):
+def test_a_number_of_views_that_a_ring_does_not_have_is_refused(boxes, count):
     """0 views were measured as 4, and 17 of 16 took one position twice."""
     with pytest.raises(InputError, match=f"evaluation with {count} views: expected different positions"):
-        module(root).evaluation_loader(views=count)
+        module(boxes).evaluation_loader(views=count)
 
 
-def test_the_seed_of_the_data_reaches_training_and_random_targets(root):
+def test_the_seed_of_the_data_reaches_training_and_random_targets(boxes):
     """Two seeds differ and one repeats, as batches."""
     random = {"name": "random", "per_subject": 3}
     for draw in (
         lambda seed: [
             (b.subjects, b.views, b.targets.names)
-            for b in map(module(root, seed=seed).training_batch, range(4))
+            for b in map(module(boxes, seed=seed).training_batch, range(4))
         ],
-        lambda seed: [b.targets.names for b in module(root, seed=seed).evaluation_loader(4, random)],
+        lambda seed: [b.targets.names for b in module(boxes, seed=seed).evaluation_loader(4, random)],
     ):
         assert draw(0) == draw(0) != draw(1)
+
+
+def sampler(views=RANDOM, targets=None, **changes) -> TrainingSampler:
+    targets = targets or TargetProtocol(name="random", per_step=3)
+    arguments = {
+        "subjects": {f"s{i}": FULL for i in range(5)},
+        "ring": 16,
+        "batch_size": 2,
+        "seed": 0,
+    } | changes
+    return TrainingSampler(views=views, targets=targets, **arguments)
+
+
+def test_training_samples_depend_on_seed_step_and_index_only():
+    """A resumed run sees what an uninterrupted one sees; no global generator matters."""
+    forward = [sampler().batch(step) for step in range(40)]
+    backward = [sampler().batch(step) for step in reversed(range(40))][::-1]
+    assert forward == backward
+    assert forward != [sampler(seed=1).batch(step) for step in range(40)]
+    torch.manual_seed(5)
+    np.random.seed(5)  # noqa: NPY002  no global generator has a say
+    assert forward[7] == sampler().batch(7)
+
+
+def test_batches_of_a_class_have_one_number_of_inputs():
+    """Their subjects and cameras differ, and every number is drawn."""
+    batches = [sampler(class_steps=8).batch(step) for step in range(160)]
+    counts = [len(batch[0].inputs) for batch in batches]
+    assert all(len(set(counts[first : first + 8])) == 1 for first in range(0, 160, 8))
+    assert set(counts) == {3, 4, 5}
+    assert len({batch[0].inputs for batch in batches[:8]}) == 8
+    once = [len(sampler().batch(step)[0].inputs) for step in range(20)]
+    assert counts[::8] == once
+
+
+def test_training_samples_are_fair():
+    """Every subject once in each round, all counts, positions and views,
+    no target among the inputs."""
+    batches = [sampler().batch(step) for step in range(300)]
+    for batch in batches:
+        assert len({len(d.inputs) for d in batch}) == 1
+        for sample in batch:
+            assert len(set(sample.inputs)) == len(sample.inputs)
+            assert len(set(sample.targets)) == 3
+            assert not set(sample.targets) & set(sample.inputs)
+    names = [d.subject for batch in batches for d in batch]
+    for start in range(0, 600, 5):  # every subject once in each round
+        assert sorted(names[start : start + 5]) == ["s0", "s1", "s2", "s3", "s4"]
+    assert len({tuple(names[s : s + 5]) for s in range(0, 600, 5)}) > 30
+    counts = np.bincount([len(batch[0].inputs) for batch in batches], minlength=6)[3:]
+    assert counts.min() > 70
+    seen = np.bincount(
+        [position for batch in batches for d in batch for position, _ in d.inputs], minlength=16
+    )
+    assert seen.min() > 0.6 * seen.mean()
+    assert {view for batch in batches for d in batch for _, view in d.targets} == {0, 2, 3, 4}
+
+
+def test_processes_share_out_one_sequence():
+    """Several processes train on the samples of one, each sample once."""
+    whole = [d.subject for step in range(5) for d in sampler(batch_size=4).batch(step)]
+    ranks = [[sampler().batch(step, rank, 2) for step in range(5)] for rank in range(2)]
+    assert whole == [d.subject for step in range(5) for rank in range(2) for d in ranks[rank][step]]
+    for one, other in zip(*ranks, strict=True):
+        assert len(one[0].inputs) == len(other[0].inputs)
+
+
+def test_even_training_views_keep_their_spacing():
+    """views.training=even turns the ring but keeps the distances."""
+    even = sampler(ViewProtocol(training_counts=(5,), training="even"))
+    starts = set()
+    for step in range(60):
+        positions = [position for position, _ in even.batch(step)[0].inputs]
+        starts.add(positions[0])
+        assert sorted(np.diff([*positions, positions[0]]) % 16) == [3, 3, 3, 3, 4]
+    assert len(starts) > 10
+
+
+def test_seeds_choose_photographs_as_well_as_the_order_of_subjects():
+    """Of a single subject, whose order is no choice;
+    numbers of views and targets of evaluation, too."""
+    one = {"subjects": {"a": FULL}, "batch_size": 1}
+
+    def drawn(seed):
+        return [sampler(seed=seed, **one).batch(step)[0] for step in range(20)]
+
+    assert drawn(0) == drawn(0)
+    pairs = list(zip(drawn(0), drawn(1), strict=True))
+    assert sum(len(a.inputs) != len(b.inputs) for a, b in pairs) > 5
+    fixed = ViewProtocol(training_counts=(4,))
+    inputs = [{sampler(fixed, seed=s, **one).batch(t)[0].inputs for t in range(20)} for s in range(2)]
+    assert not inputs[0] & inputs[1]
+    names = [[d.subject for t in range(20) for d in sampler(seed=s).batch(t)] for s in range(2)]
+    assert names[0] != names[1]
+    targets = TargetProtocol(name="random", per_subject=3)
+    measured = [evaluation_samples({"a": FULL, "b": FULL}, 4, [targets], 16, seed) for seed in (0, 0, 1)]
+    assert measured[0] == measured[1]
+    assert all(a.targets != b.targets for a, b in zip(measured[0], measured[2], strict=True))

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from ghgs_lit.data.batches import automatic_workers, loader_of
-from tests.helpers.people import equal, render_boxes, rendered
+from tests.helpers.people import equal, rendered
 
 MANY = float("inf")
 
@@ -45,28 +45,21 @@ def test_processes_that_import_pytorch_first_start_for_more_batches(monkeypatch)
     assert automatic_workers(1000, 1, True, 96) == 8
 
 
-@pytest.fixture(scope="module")
-def root(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("boxes")
-    render_boxes(folder / "out", folder / "scans", train=2, val=1)
-    return folder / "out"
-
-
-def test_automatic_processes_are_said_once_and_load_the_same(root, caplog):
+def test_automatic_processes_are_said_once_and_load_the_same(boxes, caplog):
     """Evaluation with its few batches starts none and says nothing."""
     with caplog.at_level(logging.INFO):
-        data = rendered(root, workers="auto", steps_per_epoch=3)
+        data = rendered(boxes, workers="auto", steps_per_epoch=3)
         loader = data.train_dataloader()
         assert loader.num_workers == automatic_workers(MANY, 1, False)
         assert data.val_dataloader().num_workers == 0
     assert sum("data.workers=auto" in record.message for record in caplog.records) == 1
-    expected = rendered(root, workers=0, steps_per_epoch=3).train_dataloader()
+    expected = rendered(boxes, workers=0, steps_per_epoch=3).train_dataloader()
     assert all(map(equal, loader, expected))
 
 
-def test_batches_can_be_sent_to_processes_that_begin_anew(root):
+def test_batches_can_be_sent_to_processes_that_begin_anew(boxes):
     """All that a spawned process receives, as on macOS."""
-    batches = rendered(root, augmentation={"gamma": 0.1}).train_dataloader().dataset
+    batches = rendered(boxes, augmentation={"gamma": 0.1}).train_dataloader().dataset
     batches[0]
     assert equal(pickle.loads(pickle.dumps(batches))[1], batches[1])
 
@@ -101,10 +94,10 @@ def test_an_announced_end_leaves_loading_to_the_training():
     assert list(loader_of(Signalled(), 1)) == [0, 1, 2]
 
 
-def test_an_interrupt_ends_all_processes_without_their_traces(root):
+def test_an_interrupt_ends_all_processes_without_their_traces(boxes):
     """A terminal sends Ctrl-C to all of them; only the one that trains answers."""
     process = subprocess.Popen(
-        [sys.executable, "-c", _TRAINING, str(root)],
+        [sys.executable, "-c", _TRAINING, str(boxes)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

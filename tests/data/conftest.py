@@ -1,0 +1,33 @@
+"""Small data sets that the tests of a process share and never change."""
+
+from pathlib import Path
+
+import pytest
+
+from scripts.miniatures import humman, zju_mocap
+from tests.helpers.captures import make_miniature
+from tests.helpers.people import render_boxes
+
+
+@pytest.fixture(scope="session")
+def boxes(tmp_path_factory) -> Path:
+    """Rendered boxes: ``s0`` to ``s2`` for training, ``s3`` and ``s4`` for validation."""
+    folder = tmp_path_factory.mktemp("boxes")
+    render_boxes(folder / "out", folder / "scans")
+    return folder / "out"
+
+
+@pytest.fixture(scope="session")
+def zju_root(tmp_path_factory) -> Path:
+    """One sequence of each generation with two frames."""
+    folder = tmp_path_factory.mktemp("zju_mocap")
+    make_miniature(zju_mocap, folder, ["386", "313"], 112, seed=3, frames=2)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def humman_root(tmp_path_factory) -> Path:
+    """A sequence for testing and one for training, of three frames."""
+    folder = tmp_path_factory.mktemp("humman") / "recon"
+    make_miniature(humman, folder, ["p000455_a000986"], {"train": 1, "val": 1}, 160, seed=3)
+    return folder

@@ -1,0 +1,418 @@
+"""Broken sequences of ZJU-MoCap and HuMMan-Recon: each case gets one line that says where,
+what was expected and what was found.
+
+The lines are listed in ``docs/evidence/broken_files.md``.
+"""
+
+import json
+import pickle
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ghgs_lit.data.pickles import load_npy
+from ghgs_lit.data.smpl import read_model, read_parameters
+from scripts.miniatures import humman, zju_mocap
+from scripts.miniatures.smpl import stand_in
+from tests.helpers.captures import (
+    Malice,
+    blank,
+    build_data,
+    inside,
+    make_miniature,
+    refused,
+    shrink,
+    stored,
+    truncate,
+)
+
+NAMES = {"zju_mocap": "CoreView_386", "humman": "p000455_a000986"}
+ZJU_IMAGE, ZJU_MASK = "Camera_B1/000000.jpg", "mask_cihp/Camera_B1/000000.png"
+HUMMAN_IMAGE, HUMMAN_MASK = (f"kinect_{kind}/kinect_000/000000.png" for kind in ("color", "mask"))
+
+
+def annotated(change):
+    """A case that changes what is in ``annots.npy``."""
+
+    def apply(folder: Path) -> None:
+        content = load_npy(folder / "annots.npy")
+        change(content)
+        np.save(folder / "annots.npy", content)
+
+    return apply
+
+
+def put_lens(kind: str, value):
+    """A case that gives the fourth camera another K, R, T or D."""
+    return annotated(lambda content: content["cams"][kind].__setitem__(3, value))
+
+
+def swap(content: dict) -> None:
+    cams = content["cams"]
+    cams["R"], cams["T"] = cams["T"], cams["R"]
+
+
+def metres(content: dict) -> None:
+    content["cams"]["T"] = [t / 1000 for t in content["cams"]["T"]]
+
+
+def named(value: str):
+    return annotated(lambda content: content["ims"][0]["ims"].__setitem__(2, value))
+
+
+def body(value):
+    return lambda folder: np.save(folder / "new_vertices" / "0.npy", value)
+
+
+def calibrated(change):
+    """A case that changes what is in ``cameras.json``."""
+
+    def apply(folder: Path) -> None:
+        content = json.loads((folder / "cameras.json").read_text())
+        change(content)
+        (folder / "cameras.json").write_text(json.dumps(content))
+
+    return apply
+
+
+def put_kinect(key: str, value):
+    """A case that gives the fourth colour camera another K, R or T."""
+    return calibrated(lambda content: content["kinect_color_003"].__setitem__(key, value))
+
+
+def swap_kinects(content: dict) -> None:
+    for camera in content.values():
+        camera["R"], camera["T"] = camera["T"], camera["R"]
+
+
+def move(content: dict, factor: float) -> None:
+    for camera in content.values():
+        camera["T"] = [factor * t for t in camera["T"]]
+
+
+def renumber(folder: Path) -> None:
+    for path in folder.glob("kinect_*/kinect_*/000000.png"):
+        path.rename(path.with_name("000001.png"))
+
+
+ZJU_MOCAP = {
+    "no annotations": (
+        lambda f: (f / "annots.npy").unlink(),
+        r"annots.npy: expected an .npy file; found no such file",
+    ),
+    "truncated annotations": (
+        lambda f: truncate(f / "annots.npy"),
+        r"annots.npy: expected a readable pickle; found",
+    ),
+    "malicious annotations": (
+        lambda f: np.save(f / "annots.npy", {"cams": Malice()}),
+        r"annots.npy: expected a pickle of NumPy arrays and plain containers; found posix.system",
+    ),
+    "no cameras": (
+        annotated(lambda c: c.pop("cams")),
+        r"annots.npy: expected an entry 'cams'; found \['ims'\]",
+    ),
+    "R and T swapped": (annotated(swap), r"annots.npy: camera 0: R: expected an array 3x3; found 3x1"),
+    "fewer lenses": (annotated(lambda c: c["cams"]["D"].pop()), r"expected as many K, D, R and T .* 'D': 22"),
+    "NaN camera": (
+        put_lens("R", np.full((3, 3), np.nan)),
+        r"camera 3: R: expected finite numbers; found NaN or infinity",
+    ),
+    "no rotation": (
+        put_lens("R", 2 * np.eye(3)),
+        r"camera 3: expected a rotation in the first three columns; found",
+    ),
+    "mirrored camera": (
+        put_lens("R", np.diag([1.0, 1, -1])),
+        r"camera 3: expected a rotation in the first three columns",
+    ),
+    "focal length 0": (
+        put_lens("K", np.diag([0.0, 1, 1])),
+        r"camera 3: K: expected focal lengths above 0; found 0.0, 1.0",
+    ),
+    "lens of 3 numbers": (put_lens("D", np.zeros((3, 1))), r"camera 3: D: expected an array 4 or 5; found 3"),
+    "metres": (
+        annotated(metres),
+        r"expected translations T in millimetres; found cameras within \d+ mm .*metres",
+    ),
+    "a camera less in a frame": (
+        annotated(lambda c: c["ims"][0]["ims"].pop()),
+        r"frame 0: expected a photograph for each of 23 cameras; found 22",
+    ),
+    "wrong frame number": (
+        named("Camera_B3/000001.jpg"),
+        r"frame 0: expected one frame number for all cameras; found \['000000', '000001'\]",
+    ),
+    "name without a number": (
+        annotated(
+            lambda c: c["ims"].__setitem__(0, {"ims": [f"Camera_B{k}/first.jpg" for k in range(1, 24)]})
+        ),
+        r"Camera_B1/first.jpg: expected a frame number, .*; found 'first.jpg'",
+    ),
+    "path that leaves": (
+        named("../../secret/000000.jpg"),
+        r"frame 0: expected paths below the sequence; found '../../secret/000000.jpg'",
+    ),
+    "no photograph": (
+        lambda f: (f / ZJU_IMAGE).unlink(),
+        r"CoreView_386/Camera_B1/000000.jpg: expected an image; found no such file",
+    ),
+    "truncated photograph": (
+        lambda f: truncate(f / ZJU_IMAGE),
+        r"000000.jpg: expected a readable image; found",
+    ),
+    "resized photograph": (
+        lambda f: (
+            shrink(f / ZJU_IMAGE),
+            shrink(f / ZJU_MASK),
+            shrink(f / "mask" / ZJU_IMAGE.replace("jpg", "png")),
+        ),
+        r"000000.jpg: expected a photograph of the calibration's size, .*; found 32x32",
+    ),
+    "no mask": (
+        lambda f: (f / ZJU_MASK).unlink(),
+        r"mask_cihp/Camera_B1/000000.png: expected an image; found no such",
+    ),
+    "no folder of masks": (
+        lambda f: [shutil.rmtree(f / kind) for kind in ("mask", "mask_cihp")],
+        r"CoreView_386: expected a folder of masks, mask_cihp; found none",
+    ),
+    "mask of another size": (
+        lambda f: shrink(f / ZJU_MASK),
+        r"000000.png: expected the size of its photograph, 64x64; found 32x32",
+    ),
+    "empty mask": (
+        lambda f: blank(f / ZJU_MASK),
+        r"mask_cihp/Camera_B1/000000.png: expected a subject in the mask; found",
+    ),
+    "truncated mask": (lambda f: truncate(f / ZJU_MASK), r"000000.png: expected a readable image; found"),
+    "no body of a frame": (
+        lambda f: (f / "new_vertices" / "0.npy").unlink(),
+        r"new_vertices/0.npy: expected an array 6890x3; found no such file",
+    ),
+    "body of another model": (body(np.zeros((10475, 3))), r"0.npy: expected an array 6890x3; found 10475x3"),
+    "malicious body": (
+        body(np.array(Malice(), object)),
+        r"0.npy: expected an array 6890x3; found a file that cannot",
+    ),
+    "NaN body": (body(np.full((6890, 3), np.nan)), r"0.npy: expected finite numbers; found NaN or infinity"),
+    "no sequence": (shutil.rmtree, r"expected sequences such as CoreView_386; found none of train"),
+}
+
+HUMMAN = {
+    "no cameras": (
+        lambda f: (f / "cameras.json").unlink(),
+        r"cameras.json: expected the cameras .*; found no such file",
+    ),
+    "truncated cameras": (lambda f: truncate(f / "cameras.json"), r"cameras.json: expected the cameras"),
+    "a camera missing": (
+        calibrated(lambda c: c.pop("kinect_color_007")),
+        r"cameras.json: kinect_color_007: expected K; found none",
+    ),
+    "no T": (
+        calibrated(lambda c: c["kinect_color_003"].pop("T")),
+        r"kinect_color_003: expected T; found none",
+    ),
+    "R and T swapped": (calibrated(swap_kinects), r"kinect_color_000: R: expected an array 3x3; found 3"),
+    "NaN camera": (
+        put_kinect("T", [float("nan")] * 3),
+        r"kinect_color_003: T: expected finite numbers; found NaN",
+    ),
+    "no rotation": (
+        put_kinect("R", [[2, 0, 0], [0, 1, 0], [0, 0, 1]]),
+        r"kinect_color_003: expected a rotation in",
+    ),
+    "focal length below 0": (
+        put_kinect("K", [[-5, 0, 1], [0, 5, 1], [0, 0, 1]]),
+        r"expected focal lengths above 0; found -5",
+    ),
+    "text for a matrix": (
+        put_kinect("K", "none"),
+        r"kinect_color_003: K: expected an array 3x3; found text",
+    ),
+    "millimetres": (
+        calibrated(lambda c: move(c, 1000)),
+        r"expected translations T in metres; found cameras \d+ m apart",
+    ),
+    "all cameras in one place": (
+        calibrated(lambda c: move(c, 0)),
+        r"expected translations T in metres; found cameras 0 m",
+    ),
+    "no photographs": (
+        lambda f: shutil.rmtree(f / "kinect_color"),
+        r"kinect_color: expected frames such as 000000.png; found none of 17 .*multiples of 6",
+    ),
+    "wrong frame numbers": (renumber, r"kinect_color: expected frames such as 000000.png; found none of 17"),
+    "truncated photograph": (
+        lambda f: truncate(f / HUMMAN_IMAGE),
+        r"000000.png: expected a readable image; found",
+    ),
+    "resized photograph": (
+        lambda f: (shrink(f / HUMMAN_IMAGE), shrink(f / HUMMAN_MASK)),
+        r"kinect_000/000000.png: expected a photograph of the calibration's size, .*; found 36x64",
+    ),
+    "no mask": (
+        lambda f: (f / HUMMAN_MASK).unlink(),
+        r"kinect_mask/kinect_000/000000.png: expected an image; found no such",
+    ),
+    "mask of another size": (
+        lambda f: shrink(f / HUMMAN_MASK),
+        r"000000.png: expected the size of its photograph, 72x128; found 36x64",
+    ),
+    "empty mask": (
+        lambda f: blank(f / HUMMAN_MASK),
+        r"kinect_mask/kinect_000/000000.png: expected a subject in the mask; found",
+    ),
+    "no sequence": (shutil.rmtree, r"expected sequences such as p000455_a000986; found none of val"),
+}
+
+CASES = [("zju_mocap", *case) for case in ZJU_MOCAP.values()]
+CASES += [("humman", *case) for case in HUMMAN.values()]
+IDS = [f"zju_mocap {name}" for name in ZJU_MOCAP] + [f"humman {name}" for name in HUMMAN]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> dict[str, Path]:
+    """Folders of a miniature of one frame for each data set."""
+    roots = {name: tmp_path_factory.mktemp(name) / "data" for name in NAMES}
+    make_miniature(zju_mocap, roots["zju_mocap"], ["386"], 64, seed=3, frames=1)
+    arguments = [NAMES["humman"]], {"train": 0, "val": 1}, 128
+    make_miniature(humman, roots["humman"], *arguments, seed=3, frames=[0])
+    return roots
+
+
+def read_all(kind: str, root: Path) -> list:
+    """What training or evaluation reads of the frame."""
+    settings = ("train", ("data.size=64",)) if kind == "zju_mocap" else ("val", ())
+    photographs = stored(build_data(kind, root, *settings[1]), settings[0])
+    return [(name, photographs.view(name, 0), photographs.body(name)) for name in photographs.reader.subjects]
+
+
+@pytest.mark.parametrize(("kind", "size"), [("zju_mocap", (64, 64)), ("humman", (72, 128))])
+def test_the_whole_one_is_read(whole, kind, size):
+    """The intact miniature is read: the broken cases fail for their own reason."""
+    ((name, view, body),) = read_all(kind, whole[kind])
+    assert name == f"{NAMES[kind]}_000000"
+    assert view.image.shape == (*size, 3)
+    assert view.mask.any()
+    assert body is None or inside(view, body) > 0.9
+
+
+@pytest.mark.parametrize(("kind", "spoil", "line"), CASES, ids=IDS)
+def test_a_broken_one_gets_its_line(kind, spoil, line, whole, tmp_path, monkeypatch):
+    """Every defect is reported in one line that the documentation lists."""
+    folder = shutil.copytree(whole[kind] / NAMES[kind], tmp_path / "data" / NAMES[kind])
+    monkeypatch.chdir(tmp_path)
+    spoil(folder)
+    refused(line, lambda: read_all(kind, tmp_path / "data"))
+
+
+def test_problems_are_collected_where_that_is_asked_for(whole, tmp_path):
+    """task=check reports all problems, and still reads what is intact."""
+    for sequence in ("386", "387"):
+        shutil.copytree(whole["zju_mocap"] / "CoreView_386", tmp_path / f"CoreView_{sequence}")
+    put_lens("R", 2 * np.eye(3))(tmp_path / "CoreView_387")
+    reader = build_data("zju_mocap", tmp_path).dataset.reader("train", strict=False)
+    assert list(reader.subjects) == ["CoreView_386_000000"]
+    broken = tmp_path / "CoreView_387" / "annots.npy"
+    assert [line.split(": ")[0] for line in reader.problems] == [str(broken)]
+
+
+GOOD = {"betas": np.zeros(10), "body_pose": np.zeros(69), "global_orient": np.zeros(3), "transl": np.zeros(3)}
+PARAMETERS = {
+    "malicious": ({**GOOD, "betas": np.array(Malice(), object)}, "expected an .npz file of arrays; found"),
+    "without transl": ({k: v for k, v in GOOD.items() if k != "transl"}, "expected transl; found"),
+    "of SMPL-X": ({**GOOD, "body_pose": np.zeros(63)}, "body_pose: expected an array 69; found 63"),
+    "NaN": ({**GOOD, "transl": np.full(3, np.nan)}, "transl: expected finite numbers; found NaN or infinity"),
+}
+
+
+@pytest.mark.parametrize("case", PARAMETERS)
+def test_broken_parameters_get_their_line(case, tmp_path, monkeypatch):
+    """Bad SMPL parameters are named and never executed."""
+    monkeypatch.chdir(tmp_path)
+    content, line = PARAMETERS[case]
+    np.savez("000000.npz", **content)
+    refused(f"000000.npz.*{line}", lambda: read_parameters(tmp_path / "000000.npz"))
+
+
+def test_missing_and_truncated_parameters_get_their_line(tmp_path):
+    """A missing or cut-off file is named."""
+    path = tmp_path / "000000.npz"
+    refused(r"000000.npz: expected SMPL parameters; found no such file", lambda: read_parameters(path))
+    np.savez(path, **GOOD)
+    truncate(path)
+    refused(r"000000.npz: expected an .npz file of arrays; found", lambda: read_parameters(path))
+
+
+MODELS = {
+    "malicious": (
+        {**stand_in(), "f": Malice()},
+        "expected a pickle of NumPy arrays and plain containers; found posix.system",
+    ),
+    "of SMPL-X": (
+        {**stand_in(), "v_template": np.zeros((10475, 3))},
+        "v_template: expected an array 6890x3; found 10475x3",
+    ),
+    "a list": ([1, 2], "expected the arrays of an SMPL model; found list"),
+}
+
+
+@pytest.mark.parametrize("case", MODELS)
+def test_a_broken_model_gets_its_line(case, tmp_path, monkeypatch):
+    """A wrong model file is named and never executed."""
+    monkeypatch.chdir(tmp_path)
+    content, line = MODELS[case]
+    Path("SMPL_NEUTRAL.pkl").write_bytes(pickle.dumps(content))
+    refused(f"SMPL_NEUTRAL.pkl: {line}", lambda: read_model(tmp_path / "SMPL_NEUTRAL.pkl"))
+
+
+ZJU_SETTINGS = [
+    ("data.root=null", "data.root: expected the folder of the data set; found null"),
+    ("data.root=/nowhere", "/nowhere: expected the folder of the data set; found no such folder"),
+    (
+        "data.split.train=[{sequences: [386], frames: [5, 5, 1]}]",
+        r"data.split.train.frames: expected \[start, stop",
+    ),
+    ("data.split.train=[{sequences: [], frames: [0, 5, 1]}]", "split.train.sequences: expected a list"),
+    ("data.split.train=[]", "data.split.train: expected a list"),
+    (
+        "data.split.train=[{sequence: [386], frames: [0, 5, 1]}]",
+        "data.split.train key: expected one of frames, sequences; found 'sequence'",
+    ),
+    ("data.cameras=1", "data.cameras: expected an integer >= 2 or null; found 1"),
+    ("data.cameras=24", "annots.npy: expected 24 cameras; found 23"),
+    ("data.masks=[]", r"data.masks: expected a list \(each a text\); found \[\]"),
+]
+HUMMAN_SETTINGS = [
+    (
+        "data.smpl_model=/nowhere",
+        "/nowhere: expected SMPL_NEUTRAL.pkl, or a folder with smpl/SMPL_NEUTRAL.pkl",
+    ),
+    ("data.masks=mask", "data.masks: expected one of kinect_mask, kinect_mask_manual; found 'mask'"),
+    ("data.frames=[0,0,6]", r"data.frames: expected \[start, stop, step\] with start < stop; found"),
+    ("data.split.val=[]", r"data.split.val: expected a list \(each a text\); found \[\]"),
+    ("data.split.val=null", r"data.split.val: expected a list \(each a text\); found None"),
+]
+SETTINGS = [("zju_mocap", "train", *case) for case in ZJU_SETTINGS]
+SETTINGS += [("humman", "val", *case) for case in HUMMAN_SETTINGS]
+
+
+@pytest.mark.parametrize(("kind", "phase", "override", "line"), SETTINGS)
+def test_impossible_settings_are_refused(whole, kind, phase, override, line):
+    """A wrong value fails at once and names its key."""
+    refused(line, lambda: build_data(kind, whole[kind], override).dataset.reader(phase))
+
+
+def test_without_smplx_the_message_says_what_to_install(whole, monkeypatch):
+    """A missing optional package is reported with how to get it."""
+    monkeypatch.setitem(sys.modules, "smplx", None)
+    place = whole["humman"].with_name("data_body_models")
+    data = build_data("humman", whole["humman"], f"data.smpl_model={place}").dataset
+    refused(
+        r"data.smpl_model: expected the package smplx .*pip install 'ghgs-lit\[smpl\]'",
+        lambda: data.reader("val"),
+    )
