@@ -9,7 +9,6 @@ from ghgs_lit.config import run_of
 from ghgs_lit.data.reader import PhotographCache
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.protocols import check_evaluation
-from ghgs_lit.evaluation.report import table_of
 
 
 def check(root, *overrides):
@@ -58,15 +57,3 @@ def test_photographs_that_targets_lack_are_named(boxes, tmp_path):
     with pytest.raises(InputError, match=said):
         check(root)
     check(root, "targets=ghg", "evaluation.targets=[ghg]")
-
-
-def test_no_name_is_cut_on_a_narrow_terminal(monkeypatch, capsys):
-    """The rows of a summary are told by their names."""
-    monkeypatch.setenv("COLUMNS", "40")
-    about = {"views": 4, "targets": "release", "subject": "a"}
-    values = dict.fromkeys(("psnr", "psnr_box", "ssim", "flip", "depth_error_mm"), 1.0)
-    print(table_of([{"method": "nearest_view", **about, **values}]))
-    said = capsys.readouterr().out
-    assert "nearest_view" in said
-    assert all(word in said for word in ("depth", "error", "mm"))
-    assert "…" not in said

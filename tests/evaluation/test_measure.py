@@ -1,6 +1,5 @@
 """Target protocols, and the verbs from end to end on rendered boxes."""
 
-import csv
 import fnmatch
 import json
 import os
@@ -123,14 +122,6 @@ def test_what_is_said_of_a_checkpoints_model_acts_and_is_recorded(trained, tmp_p
     assert not (tmp_path / "r" / "metrics.json").exists()
 
 
-def test_an_evaluation_that_cannot_be_is_refused_before_training(boxes, tmp_path, capsys):
-    """Settings of the end must not fail after days of training."""
-    where = f"hydra.run.dir={tmp_path / 'run'}"
-    assert ghgs("train", *data_of(boxes), "evaluation.targets=[foo]", where) == 1
-    assert "evaluation.targets: expected one of cameras" in capsys.readouterr().err
-    assert not list(tmp_path.rglob("*.ckpt"))
-
-
 def test_each_target_protocol_has_the_values_of_its_own_file():
     """Only the selected protocol has overrides; the others are read from conf/targets."""
     run = run_of("evaluate", ["targets.per_subject=all", "evaluation.targets=[midway,release,ghg]"])
@@ -250,59 +241,6 @@ def test_predict_reads_the_photographs_of_one_subject(trained, tmp_path, monkeyp
     read.clear()
     assert ghgs("predict", *arguments, "targets=release") == 0
     assert read == [*inputs, ("s4", 0, 3)]
-
-
-def test_a_sweep_becomes_a_table(boxes, tmp_path):
-    """The directory of a sweep is all that a table needs, and wrong options are refused."""
-    quick = ["callbacks=none", "logger=none", "trainer.max_steps=1", "evaluation.pictures=0"]
-    code = ghgs(
-        "train", "-m", *data_of(boxes), *quick, "ablation=full,neither", "model=paper",
-        "evaluation.targets=[release]", "metrics=release", "metrics.lpips=off",
-        f"hydra.sweep.dir={tmp_path / 'sweep'}",
-    )  # fmt: skip
-    assert code == 0
-    assert ghgs("table", f"runs={tmp_path / 'sweep'}", f"hydra.run.dir={tmp_path / 'table'}") == 0
-    text = (tmp_path / "table" / "table.md").read_text()
-    assert "metrics `release`, model `paper`, encoder `vggt_nano`" in text
-    assert text.count(" - |") == 2 * 9 + 2 * 6
-    assert r"\begin{tabular}" in (tmp_path / "table" / "table.tex").read_text()
-    assert (tmp_path / "table" / "table.csv").read_text().count(",full,") == 9
-    # The paper's layout; a bad one.
-    again = ["table", f"runs=[{tmp_path / 'sweep'}]", f"hydra.run.dir={tmp_path / 'second'}"]
-    assert ghgs(*again, "layout=table2", "columns=psnr_box") == 1
-    assert ghgs(*again, "layout=table2", "columns=psnr", "test.against=best", r'test.unit="(.+)"') == 0
-    assert "RoGSplat" in (tmp_path / "second" / "table.md").read_text()
-    # One of the two subjects alone, as the run measured it.
-    runs = [path.read_text() for path in (tmp_path / "sweep").glob("*/metrics.json")]
-    (run,) = (run for run in map(json.loads, runs) if run["provenance"]["ablation"] == "neither")
-    row = run["rows"][-1]
-    assert ghgs(*again, "columns=psnr", f"subjects={row['subject'][0]}.*{row['subject'][-1]}") == 0
-    with open(tmp_path / "second" / "table.csv", newline="") as file:
-        (line,) = (cell for cell in csv.DictReader(file) if cell["ablation"] == "neither" and cell["mean"])
-    assert (float(line["mean"]), line["subjects"]) == (pytest.approx(row["psnr"]), "1")
-    for wrong in (
-        "layout=table9",
-        "evaluation.views=four",
-        "test.against=worst",
-        "test.unit=x",
-        "test.unt=1",
-        "subjects=nobody",
-    ):
-        assert ghgs(*again, wrong) == 1
-    # Jobs that share a process cannot start others.
-    assert ghgs("train", "-m", *data_of(boxes), *quick, "seed=1,2", "trainer=ddp_cpu") == 1
-
-
-def test_bad_input_of_the_verbs_is_one_line(boxes, tmp_path, capsys):
-    """Mistakes of the user give exit code 1 and their key, and no results."""
-    where = f"hydra.run.dir={tmp_path / 'run'}"
-    assert ghgs("evaluate", *data_of(boxes), where) == 1
-    assert "checkpoint: expected" in capsys.readouterr().err
-    assert ghgs("evaluate", *data_of(boxes), "checkpoint=/none.ckpt", where) == 1
-    assert ghgs("train", *data_of(boxes), "trainer.max_time=ten", where) == 1
-    assert "ten" in capsys.readouterr().err
-    assert ghgs("train", *data_of(boxes), "trainer.max_steps=-1", where) == 1
-    assert not (tmp_path / "run" / "metrics.json").exists()
 
 
 def test_two_processes_train_together_and_write_once(boxes, tmp_path):

@@ -44,15 +44,6 @@ def test_the_nearest_view_is_the_one_beside_the_target(views):
     assert torch.equal(image[:, 1], batch.images[:, 0])
 
 
-def test_the_nearest_view_is_resized_to_the_target():
-    """Targets of another size are still comparable."""
-    batch = example_batch(size=16)
-    masks = torch.zeros(2, 1, 32, 24, dtype=torch.bool)
-    large = dataclasses.replace(batch.targets, images=torch.zeros(2, 1, 3, 32, 24), masks=masks)
-    batch = dataclasses.replace(batch, targets=large)
-    assert nearest_view(batch).image.shape == (2, 1, 3, 32, 24)
-
-
 @pytest.mark.parametrize("size", [(8, 8), (4, 12), (32, 24)])
 def test_the_nearest_view_is_resized_as_photographs_are(size):
     """As Pillow does it: a smaller copy averages what a pixel covers, a larger one interpolates."""
@@ -109,15 +100,6 @@ def test_body_depth_is_the_mean_z_of_the_vertices_in_each_view():
     for v in range(3):
         _, z = project(batch.body_vertices[0], batch.cameras.intrinsics[0, v], batch.cameras.extrinsics[0, v])
         assert torch.allclose(estimate.depth[0, v], z.mean().expand(16, 16), atol=1e-5)
-
-
-def test_black_and_untrained():
-    """The two baselines without geometry have the shapes of the targets."""
-    batch = example_batch()
-    assert named("black", nothing)(batch).image.abs().max() == 0
-    estimate = named("untrained", flat_renderer)(batch)
-    assert estimate.image.shape == batch.targets.images.shape
-    assert estimate.gaussians.splits == (144, 144)
 
 
 @pytest.mark.parametrize(("name", "field"), [("body_depth", "body_vertices"), ("true_depth", "depths")])

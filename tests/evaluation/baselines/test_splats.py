@@ -1,4 +1,4 @@
-"""Splats at a depth that is not learned."""
+"""Splats at the depth of the hull, of a plane sweep or of the data, and fitted per scene."""
 
 import dataclasses
 
@@ -6,9 +6,20 @@ import pytest
 import torch
 
 from ghgs_lit.config import run_of
-from ghgs_lit.evaluation.baselines.splats import discs_at, splats_at, splatted, true_depth
+from ghgs_lit.evaluation.baselines.splats import (
+    CHANGES,
+    PerScene,
+    _shared,
+    discs_at,
+    hull_bounds,
+    hull_depth,
+    photo_depth,
+    splats_at,
+    splatted,
+    true_depth,
+)
 from ghgs_lit.geometry.masks import with_matte
-from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.geometry.projection import project, unproject_maps
 from ghgs_lit.method.heads.attributes import RawGaussians
 from ghgs_lit.metrics import psnr
 from ghgs_lit.rendering import Renderer
@@ -85,3 +96,107 @@ def test_sizes_are_of_each_views_own_focal_length(splatting):
     found, given = (splatting(one, batch.depths, batch.masks) for one in (longer, batch))
     expected = torch.where(found.image == 5, 0.5, 1.0)[:, None] * given.scales
     torch.testing.assert_close(found.scales, expected)
+
+
+def errors(views):
+    """Depths of the hull minus the true ones inside the silhouettes, in footprints of a pixel."""
+    batch = make_batch(views=views, height=160, width=160)
+    difference = (hull_depth(batch) - batch.depths)[batch.masks]
+    return difference * batch.cameras.intrinsics[0, 0, 0, 0] / batch.depths[batch.masks]
+
+
+def test_the_hull_of_a_convex_body_approaches_its_surface_with_more_views():
+    """A convex body is the intersection of its silhouette cones; few of them leave it too thick."""
+    few, many = errors(3), errors(24)
+    assert many.max() < 0  # never behind the surface
+    assert many.median() > -1.6  # masks are dilated by a pixel
+    assert few.median() < -2.4
+    assert many.abs().mean() < 0.6 * few.abs().mean()
+
+
+def test_the_hull_is_found_once_for_all_baselines_and_empty_outside_the_subject():
+    """Photo-consistency and the start of per-scene fitting search in the same hull."""
+    batch = make_batch(2, 3)
+    depth = hull_depth(batch)
+    assert batch.once(hull_bounds) is batch.once(hull_bounds)
+    assert depth.shape == batch.masks.shape
+    assert (depth[~batch.masks] == 0).all()
+
+
+def photographed(views=8, height=64, width=56):
+    cameras = ring(1, views, height, width)
+    images, masks, depths = painted_ellipsoid(cameras)
+    return Batch(images, masks, cameras, depths=depths)
+
+
+def test_colours_say_where_in_the_hull_the_surface_is():
+    """Nearer to the truth than the hull's front and than its middle,
+    on photographs that are not square."""
+    batch = photographed()
+    found, bounds = photo_depth(batch), batch.once(hull_bounds)
+
+    def error(depth):
+        return (depth - batch.depths)[batch.masks].abs().mean()
+
+    assert error(found) < 0.6 * error(hull_depth(batch))
+    assert error(found) < 0.6 * error((bounds.near + bounds.far) / 2)
+    assert (found[~batch.masks] == 0).all()
+    inside = found[batch.masks]
+    assert (inside >= bounds.near[batch.masks]).all()
+    assert (inside <= bounds.far[batch.masks]).all()
+
+
+def test_a_body_of_one_colour_stands_between_the_ends_of_its_hull():
+    """No depth is better than another: what remains is a mean, not the first or a random one."""
+    batch = photographed(views=4)
+    batch = Batch(0.5 * batch.masks[:, :, None].expand_as(batch.images), batch.masks, batch.cameras)
+    bounds = batch.once(hull_bounds)
+    share = ((photo_depth(batch) - bounds.near) / (bounds.far - bounds.near))[batch.masks]
+    assert share.median() == pytest.approx(0.5, abs=0.2)
+
+
+def test_evidence_is_shared_inside_the_subject_only():
+    """A mean over the pixels of the mask in the window, by its definition."""
+    generator = torch.Generator().manual_seed(0)
+    values = torch.rand(2, 3, 4, 9, 7, generator=generator)
+    masks = torch.rand(2, 3, 9, 7, generator=generator) > 0.4
+    found = _shared(values, masks, 2)
+    for b, v, row, column in masks.nonzero()[::11].tolist():
+        window = (b, v, slice(max(row - 2, 0), row + 3), slice(max(column - 2, 0), column + 3))
+        part = values[window[0], window[1], :, window[2], window[3]]
+        expected = part[:, masks[window]].mean(1)
+        assert torch.allclose(found[b, v, :, row, column], expected, atol=1e-5)
+
+
+def scene(views=4, size=42):
+    """Photographs of a painted ellipsoid, and its second input as the target."""
+    around = ring(1, 2 * views, size, size)
+    images, masks, _ = painted_ellipsoid(around)
+    own = Targets(images[:, 2:3], masks[:, 2:3], around[:, 2:3])
+    return Batch(images[:, ::2], masks[:, ::2], around[:, ::2], own)
+
+
+def test_the_photographs_are_fitted():
+    """The render of an input comes nearer to its photograph with steps,
+    far beyond what refinement may do."""
+    batch = scene()
+    method = PerScene(RENDERER, steps=40)
+    begin = RENDERER(method.begin(batch), batch.targets.cameras).image
+    fitted = method(batch)
+    before, after = (psnr(i[0].clamp(0, 1), batch.targets.images[0]).item() for i in (begin, fitted.image))
+    assert after > before + 8
+    assert fitted.gaussians.splits == (int(batch.masks.sum()),)
+
+
+def test_every_gaussian_begins_on_its_pixel_and_may_become_another():
+    """The start is where photographs agree; position, rotation, scale,
+    opacity and colour all change."""
+    batch = scene()
+    method = PerScene(RENDERER, steps=3)
+    begin = method.begin(batch)
+    seen = int(batch.masks[0, 0].sum())
+    _, depth = project(begin.means[:seen], batch.cameras.intrinsics[0, 0], batch.cameras.extrinsics[0, 0])
+    assert torch.allclose(depth, photo_depth(batch)[0, 0][batch.masks[0, 0]], atol=1e-5)
+    fitted = method.fitting(begin, batch)
+    for name in CHANGES:
+        assert (getattr(fitted, name) != getattr(begin, name)).float().mean() > 0.5, name
