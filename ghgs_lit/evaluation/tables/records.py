@@ -29,8 +29,8 @@ from ghgs_lit.runs.run import runs_in_order
 
 SETTING = ["data", "split", "targets", "protocol"]
 """What numbers in one column must have in common."""
-TRAINING = ("steps", "seconds", "peak_gb")
-"""Metrics of the training, which no subject has."""
+TRAINING = {"steps": ("steps", 1), "seconds": ("seconds", 1), "peak_gb": ("peak_bytes", 1e9)}
+"""Metrics of the training, which no subject has, with their keys in the provenance and units."""
 _ROW = ["method", "views", "targets", "subject"]
 
 
@@ -131,21 +131,14 @@ def _read_run(path: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
     # In tables, ``seconds`` is the training time.
     rows = rows.rename(columns={"seconds": "prediction_seconds"}).set_index(_ROW).astype(float)
     rows = rows.groupby(level=_ROW, sort=False).mean().dropna(axis="columns", how="all").reset_index()
-    training = source.training or _Training()
-    peak = training.peak_bytes and training.peak_bytes / 1e9
-    for name, value in zip(TRAINING, (training.steps, training.seconds, peak), strict=True):
+    for name, (key, unit) in TRAINING.items():
+        value = getattr(source.training, key, None)
         if value is not None:
-            rows[name] = (rows["method"] == METHOD).map({True: value})
-    rows = rows.assign(
-        data=source.data.name,
-        split=source.data.split,
-        protocol=source.protocol.metrics,
-        seed=seed,
-        source=str(path),
-        run=source.config_hash,
-        git=source.git and source.git.commit[:9] + " with changes" * source.git.changed,
-    )
-    return rows, config
+            rows[name] = (rows["method"] == METHOD).map({True: value / unit})
+    git = source.git and source.git.commit[:9] + " with changes" * source.git.changed
+    about = {"seed": seed, "source": str(path), "run": source.config_hash, "git": git}
+    about |= {"data": source.data.name, "split": source.data.split, "protocol": source.protocol.metrics}
+    return rows.assign(**about), config
 
 
 def _with_variants(rows: pd.DataFrame, model: Variant | None, views: int | None) -> pd.DataFrame:

@@ -118,38 +118,52 @@ def to_csv(tables: Sequence[Table]) -> str:
     """
     lines = []
     for number, table in enumerate(tables, 1):
-        lines += [{"table": number, **_line(table, cell)} for cell in table.cells.itertuples()]
+        for cell in table.cells.itertuples():
+            about = {"table": number, **_about_row(table, cell)}
+            lines.append(about if pd.isna(cell.mean) else about | _figures(table, cell))
     frame = pd.DataFrame(lines, columns=COLUMNS)
     frame = frame.astype(dict.fromkeys(("subjects", "test_seeds", "test_subjects"), "Int64"))
     return frame.to_csv(index=False, lineterminator="\n")
 
 
-def _line(table: Table, cell: Any) -> dict[str, Any]:
-    """Values of a cell's line by column; empty ones are left out."""
-    line, group, metric = cell.Index
-    (variant, stub), group = table.lines[line], table.groups[group]
-    setting = table.rows.iloc[0]
-    about = {name: getattr(variant, name) for name in ("kind", "model", "encoder", "ablation")}
-    about |= {"method": stub[0] if table.layout.rows == "methods" else "ours"}
-    about |= dict(zip(("unprojection", "semantic"), variant.switches or (), strict=False))
-    about |= {"extra": " ".join(f"{key}={value}" for key, value in variant.extra)}
-    about |= {"data": group.data or data_title(setting["data"]), "views": group.views, "metric": metric}
-    is_reported = variant.kind == "reported"
-    if is_reported:
-        about["data"] = group.data or table.reported_on
-    else:  # Our splits, targets and protocols do not apply to the paper's figures.
-        about |= {name: setting[name] for name in ("split", "targets", "protocol")}
-    if pd.isna(cell.mean):
-        return about
-    about |= {"mean": cell.mean, "deviation": cell.deviation, "best": cell.best}
-    if not is_reported:
-        about |= {"seeds": " ".join(map(str, sorted(cell.seeds))), "subjects": cell.count, "runs": cell.runs}
-        about["seeds_lacking"] = " ".join(map(str, cell.lacking))
-        about["selection"] = table.options.subjects and table.options.subjects.pattern
+def _about_row(table: Table, cell: Any) -> dict[str, Any]:
+    """What a cell is about, by column."""
+    variant, stub = table.lines[cell.Index[0]]
+    group = table.groups[cell.Index[1]]
+    # Our splits, targets and protocols do not apply to the paper's figures.
+    setting = {"data": table.reported_on} if variant.kind == "reported" else table.rows.iloc[0]
+    unprojection, semantic = variant.switches or (None, None)
+    return {
+        "kind": variant.kind,
+        "method": stub[0] if table.layout.rows == "methods" else "ours",
+        "model": variant.model,
+        "encoder": variant.encoder,
+        "ablation": variant.ablation,
+        "unprojection": unprojection,
+        "semantic": semantic,
+        "extra": " ".join(f"{key}={value}" for key, value in variant.extra),
+        "data": group.data or data_title(setting["data"]),
+        **{name: setting.get(name) for name in ("split", "targets", "protocol")},
+        "views": group.views,
+        "metric": cell.Index[2],
+    }
+
+
+def _figures(table: Table, cell: Any) -> dict[str, Any]:
+    """Figures of a cell, by column."""
+    figures = {"mean": cell.mean, "deviation": cell.deviation, "best": cell.best}
+    if isinstance(cell.seeds, tuple):  # measured, not reported
+        figures |= {
+            "seeds": " ".join(map(str, sorted(cell.seeds))),
+            "seeds_lacking": " ".join(map(str, cell.lacking)),
+            "subjects": cell.count,
+            "selection": table.options.subjects and table.options.subjects.pattern,
+            "runs": cell.runs,
+        }
     if cell.test is not None:
-        test = asdict(cell.test)
-        about |= {"test_p_holm": test.pop("corrected"), **{f"test_{name}": v for name, v in test.items()}}
-    return about
+        figures |= {f"test_{name}": value for name, value in asdict(cell.test).items()}
+        figures["test_p_holm"] = cell.test.corrected
+    return figures
 
 
 PREAMBLE = r"""% \usepackage{booktabs,multirow,adjustbox,pifont}
