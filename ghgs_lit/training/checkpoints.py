@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import lightning.pytorch as L
 import torch
-from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from pydantic import Field
 
@@ -75,6 +75,29 @@ def validates_now(trainer: L.Trainer) -> bool:
     return (trainer.fit_loop.total_batch_idx + 1) % every == 0
 
 
+class AfterSteps(Callback):
+    """Calls ``after_step`` after each step of the optimizer, or after its validation if one is due: a
+    restart would not repeat it. Between two parts of an accumulated step the gradients so far would
+    be lost."""
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Store the step at which the run starts."""
+        super().on_train_start(trainer, pl_module)
+        self._step = trainer.global_step
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
+        """After a part of a step."""
+        is_whole = trainer.global_step > self._step
+        self._step = trainer.global_step
+        if is_whole and not validates_now(trainer):
+            self.after_step(trainer, pl_module)
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """After the validation of a step."""
+        if not trainer.sanity_checking:
+            self.after_step(trainer, pl_module)
+
+
 #: A name in which Lightning fills in logged values, and which leaves its folder by none of them.
 FileName = Annotated[
     str,
@@ -104,7 +127,7 @@ class CheckpointOptions(Options):
         return Checkpoints(self)
 
 
-class Checkpoints(ModelCheckpoint):
+class Checkpoints(AfterSteps, ModelCheckpoint):
     """Lightning's ModelCheckpoint in ``<run>/checkpoints``;
     a file replaces the previous one of its name.
 
@@ -130,27 +153,15 @@ class Checkpoints(ModelCheckpoint):
         self.dirpath = self.dirpath or str(Path(trainer.default_root_dir) / "checkpoints")
         super().setup(trainer, pl_module, stage)
 
-    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Store the step at which the run starts."""
-        super().on_train_start(trainer, pl_module)
-        self._step = trainer.global_step
-
-    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
-        """Save after a step of the optimizer, unless a validation is due first."""
-        # Between two parts of an accumulated step the gradients so far would be lost.
-        if trainer.global_step == self._step:
-            return
-        self._step = trainer.global_step
-        # After the validation if one is due: a restart would not repeat it.
-        if self.monitor is not None or not validates_now(trainer):
-            super().on_train_batch_end(trainer, pl_module, *args)
+    def after_step(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Save if it is due."""
+        ModelCheckpoint.on_train_batch_end(self, trainer, pl_module, None, None, 0)
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Save the best checkpoint, or one that was due at the step of this validation."""
         if self.monitor is not None:
-            super().on_validation_end(trainer, pl_module)
-        elif not trainer.sanity_checking:
-            super().on_train_batch_end(trainer, pl_module, None, None, 0)
+            ModelCheckpoint.on_validation_end(self, trainer, pl_module)
+        super().on_validation_end(trainer, pl_module)
 
     def state_dict(self) -> dict[str, Any]:
         """Lightning's state with names of files in place of their paths,
@@ -178,7 +189,7 @@ def _with_paths(state: dict[str, Any], change: Callable[[str], str]) -> dict[str
 _SAME = 1.0
 
 
-class StopAtStep(Checkpoint):
+class StopAtStep(AfterSteps, Checkpoint):
     """On Ctrl-C or a signal of a batch system: finishes the step and its validation, writes
     ``last.ckpt`` and stops. The same signal again, or Ctrl-C, stops at once. Several processes stop
     after the same step. As the last ``Checkpoint``, Lightning calls it after all other callbacks,
@@ -190,14 +201,13 @@ class StopAtStep(Checkpoint):
     def __init__(self) -> None:
         self.received = 0
         self._since = 0.0
-        self._step = 0
         self._saved = 0  # the signal, once the checkpoint is written
         self._before = handlers()
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Replace Lightning's signal handlers, which save no checkpoint;
         it restores all at the end."""
-        self._step = trainer.global_step
+        super().on_train_start(trainer, pl_module)
         handle(self._note, self._before)
 
     def _note(self, number: int) -> None:
@@ -211,21 +221,7 @@ class StopAtStep(Checkpoint):
             self.received, self._since = number, time.monotonic()
             print("stopping after this step; again: at once", flush=True)
 
-    def on_train_batch_end(self, trainer: L.Trainer, *args: Any) -> None:
-        """Save after a complete step, unless a validation is due first."""
-        # Between two parts of an accumulated step the gradients so far would be lost.
-        if trainer.global_step == self._step:
-            return
-        self._step = trainer.global_step
-        if not validates_now(trainer):
-            self._save(trainer)
-
-    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Save after the validation of a step."""
-        if not trainer.sanity_checking:
-            self._save(trainer)
-
-    def _save(self, trainer: L.Trainer) -> None:
+    def after_step(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Write ``last.ckpt`` if a process has received a signal."""
         number = self.received
         if trainer.world_size > 1:
