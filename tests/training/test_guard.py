@@ -23,7 +23,7 @@ from tests.helpers.losses import losses_of
 from tests.helpers.models import config, make_model
 from tests.helpers.processes import run_prepared
 from tests.helpers.scenes import training_batch
-from tests.helpers.training import Standin, example_batch, flat_renderer
+from tests.helpers.training import Standin, example_batch, flat_renderer, trainer
 
 CONFIG = {"seed": 1}
 
@@ -40,14 +40,6 @@ def module(limit=0, depth=1.0) -> GHGSModule:
     return GHGSModule(
         Standin(), flat_renderer, losses_of({"render_l1": 1.0, "depth": depth}), options, CONFIG
     )
-
-
-def trainer(folder, steps, callbacks=(), **options) -> L.Trainer:
-    return L.Trainer(**{
-        "accelerator": "cpu", "max_steps": steps, "max_epochs": -1, "default_root_dir": folder,
-        "callbacks": list(callbacks), "logger": False, "enable_checkpointing": False,
-        "enable_progress_bar": False, "enable_model_summary": False, **options,
-    })  # fmt: skip
 
 
 def loader(*bad: int, count: int = 6) -> DataLoader:
