@@ -1,5 +1,6 @@
 """A model and a renderer that train in microseconds, and batches for them."""
 
+import dataclasses
 import math
 
 import lightning.pytorch as L
@@ -10,6 +11,7 @@ from torch.utils.data import DataLoader, Dataset
 from ghgs_lit.data.batches import StepSampler
 from ghgs_lit.data.datamodule import trained_batches
 from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.rendering import render
 from ghgs_lit.training import GHGSModule
 from ghgs_lit.training.base import BudgetedModule
 from ghgs_lit.training.checkpoints import Checkpoints
@@ -174,3 +176,10 @@ def trainer(folder, steps=12, callbacks=(), **options) -> L.Trainer:
 def loader(count=3) -> DataLoader:
     """Different batches, always the same."""
     return DataLoader([example_batch(seed=s) for s in range(count)], batch_size=None, collate_fn=lambda b: b)
+
+
+def photographed(gaussians: Gaussians, cameras: Cameras) -> tuple[Batch, Prediction]:
+    """Renders of Gaussians as photographs, and a prediction of them with these Gaussians."""
+    rendering = render(gaussians, cameras)
+    batch = Batch(rendering.image.clamp(0, 1), rendering.alpha[:, :, 0] > 0.5, cameras)
+    return batch, dataclasses.replace(Standin()(batch), gaussians=gaussians)

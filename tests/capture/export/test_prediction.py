@@ -30,10 +30,10 @@ from ghgs_lit.metrics import psnr
 from ghgs_lit.metrics.regions import box_of
 from ghgs_lit.ply import read_ply
 from ghgs_lit.rendering import Renderer, render
-from ghgs_lit.types import Batch, Cameras
+from ghgs_lit.types import Cameras
 from ghgs_lit.visualization.turntable import up_direction
 from tests.helpers.splats import body, camera_ring, cloud
-from tests.helpers.training import Standin, example_batch
+from tests.helpers.training import Standin, example_batch, photographed
 
 CONFIG = {"formats": ["ply"], "up": None, "smooth": False, "turntable": {"frames": 2, "fps": 12}}
 
@@ -192,15 +192,13 @@ def test_smooth_files_have_no_gaps_on_larger_screens(tmp_path, antialiased, size
     another shows dots."""
     gaussians, cameras = body(1500, 60), camera_ring(2, 60, 60)
     gaussians = dataclasses.replace(gaussians, scales=gaussians.scales * size, antialiased=antialiased)
-    rendering = render(gaussians, cameras)
-    batch = Batch(rendering.image.clamp(0, 1), rendering.alpha[:, :, 0] > 0.5, cameras)
-    prediction = dataclasses.replace(Standin()(batch), gaussians=gaussians)
+    batch, prediction = photographed(gaussians, cameras)
     alphas = {}
     for smooth in (False, True):
         write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions(smooth=smooth))
         large = render(read_ply(tmp_path / "gaussians.ply"), cameras.resized(240, 240)).alpha[0, :, 0]
         alphas[smooth] = torch.nn.functional.avg_pool2d(large, 4)
-    wanted = rendering.alpha[0, :, 0]
+    wanted = render(gaussians, cameras).alpha[0, :, 0]
     errors = {smooth: float((alpha - wanted).abs()[wanted > 0.5].mean()) for smooth, alpha in alphas.items()}
     assert errors[True] < 0.1
     assert antialiased or errors[False] > 3 * errors[True]
@@ -211,9 +209,7 @@ def made_for_thin_pixels(size: int = 60):
     and their photographs."""
     gaussians, cameras = body(1500, size), camera_ring(2, size, size)
     gaussians = dataclasses.replace(gaussians, low_pass=0.1, antialiased=True)
-    rendering = render(gaussians, cameras)
-    batch = Batch(rendering.image.clamp(0, 1), rendering.alpha[:, :, 0] > 0.5, cameras)
-    return batch, dataclasses.replace(Standin()(batch), gaussians=gaussians)
+    return photographed(gaussians, cameras)
 
 
 def test_other_viewers_draw_what_ours_draws(tmp_path):
@@ -262,10 +258,8 @@ def test_no_picture_of_a_turntable_cuts_the_subject(tmp_path):
     intrinsics = cameras.intrinsics.clone()
     intrinsics[..., 1, 2] -= 0.7 / 3.0 * intrinsics[..., 1, 1]
     cameras = dataclasses.replace(cameras, intrinsics=intrinsics)
-    rendering = render(gaussians, cameras)
-    batch = Batch(rendering.image.clamp(0, 1), rendering.alpha[:, :, 0] > 0.5, cameras)
+    batch, prediction = photographed(gaussians, cameras)
     assert batch.masks.any()
-    prediction = dataclasses.replace(Standin()(batch), gaussians=gaussians)
     options = OutputOptions(("turntable", "html"), frames=5)
     write_prediction(tmp_path, batch, prediction, Renderer(), options)
     for frame in range(5):

@@ -1,6 +1,5 @@
 """The page to look around in a prediction."""
 
-import dataclasses
 import json
 import shutil
 import socket
@@ -16,10 +15,9 @@ from ghgs_capture.verbs.view import Viewer, read_content
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.ply import write_ply
-from ghgs_lit.rendering import Renderer, render
-from ghgs_lit.types import Batch
+from ghgs_lit.rendering import Renderer
 from tests.helpers.splats import body, camera_ring
-from tests.helpers.training import Standin
+from tests.helpers.training import photographed
 from tests.helpers.verbs import ghgs
 
 PORT = 18180  # the next free one is taken
@@ -29,11 +27,8 @@ PORT = 18180  # the next free one is taken
 def directory(tmp_path_factory):
     """A prediction whose photographs are renders of its Gaussians."""
     path = tmp_path_factory.mktemp("prediction")
-    gaussians, cameras = body(600, 60), camera_ring(3, 50, 60)
-    rendering = render(gaussians, cameras)
-    batch = Batch(rendering.image.clamp(0, 1), rendering.alpha[:, :, 0] > 0.5, cameras)
-    prediction = dataclasses.replace(Standin()(batch), gaussians=gaussians)
-    write_prediction(path, batch, prediction, Renderer(), OutputOptions(("ply", "inputs")))
+    given = photographed(body(600, 60), camera_ring(3, 50, 60))
+    write_prediction(path, *given, Renderer(), OutputOptions(("ply", "inputs")))
     return path
 
 
