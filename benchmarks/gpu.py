@@ -48,8 +48,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.gpu_call import DRY, Call, Rows, Sizes
-from benchmarks.gpu_measure import Gpu, reason, rehearsal
+from benchmarks.gpu_measure import DRY, Call, Gpu, Rows, Sizes, reason, rehearsal
 from benchmarks.gpu_replay import WRONG
 from benchmarks.gpu_sections import SECTIONS
 

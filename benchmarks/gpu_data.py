@@ -10,7 +10,7 @@ import sys
 import time
 from pathlib import Path
 
-from benchmarks.gpu_call import Call
+from benchmarks.gpu_measure import Call
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.data.datamodule import PhotographsDataModule
 

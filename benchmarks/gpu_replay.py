@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from benchmarks.gpu_call import Call
+from benchmarks.gpu_measure import Call
 from ghgs_lit.execution import Predictor
 from ghgs_lit.execution.graphs import GraphCache
 from ghgs_lit.types import Batch

@@ -11,9 +11,8 @@ from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from benchmarks.gpu_call import Call
 from benchmarks.gpu_data import loader, people, training
-from benchmarks.gpu_measure import reason
+from benchmarks.gpu_measure import Call, reason
 from benchmarks.gpu_replay import judge_optimizer, judge_prediction, judge_step
 from ghgs_lit.config.run import Run
 from ghgs_lit.diagnostics.benchmark.measure import TOTAL, SecondsProbe, inside, top_level, watched

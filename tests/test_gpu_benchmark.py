@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from benchmarks import gpu
-from benchmarks.gpu_call import DRY, Call, Rows
-from benchmarks.gpu_measure import rehearsal
+from benchmarks.gpu_measure import DRY, Call, Rows, rehearsal
 from benchmarks.gpu_replay import WRONG, judge_optimizer, judge_prediction, judge_step
 from benchmarks.gpu_sections import SECTIONS, _capturing, _Step
 from ghgs_lit.execution import Predictor

@@ -35,6 +35,23 @@ MEASURED = {"image": _ALL, "box": _ALL, "crop": _ALL, "subject": ("psnr", "ssim"
 FURTHER = {"psnr_box_40": ("box", psnr_box_40), "spill": ("edge", spill), "sharpness": ("edge", sharpness)}
 
 
+#: What each region, and each metric that comes with it, is.
+_REGIONS = {
+    "box": {
+        "box": "the smallest upright box of the subject's mask in the target",
+        "psnr_box_40": f"psnr_box of images scaled to a mean of {BRIGHTNESS:.2f} in the mask",
+    },
+    "subject": {"subject": "the pixels of the subject's mask in the target"},
+    "crop": {"crop": "1000/1024 of the height and 500/1024 of the width, around the mask's box"},
+    "edge": {
+        "edge": f"pixels at most {EDGE} rows and columns from the outline of the subject's mask, and from "
+        f"steps of more than {DEPTH_STEP:.0%} of the true depth where known",
+        "spill": f"light farther than {BESIDE} pixels from the mask, per mille of the subject's",
+        "sharpness": f"energy of the Laplacian over the target's, {INNER} pixels inside the mask",
+    },
+}
+
+
 class LPIPS:
     """LPIPS of whole images, by torchmetrics.
 
@@ -198,18 +215,9 @@ class ImageMetrics:
             text["ssim"] = f"11x11 Gaussian window, sigma 1.5, padding {options.ssim_padding}"
         if "flip" in measured:
             text["flip"] = f"FLIP at {PIXELS_PER_DEGREE:.2f} pixels a degree"
-        if "box" in options.regions:
-            text["box"] = "the smallest upright box of the subject's mask in the target"
-            text["psnr_box_40"] = f"psnr_box of images scaled to a mean of {BRIGHTNESS:.2f} in the mask"
-        if "subject" in options.regions:
-            text["subject"] = "the pixels of the subject's mask in the target"
-        if "crop" in options.regions:
-            text["crop"] = "1000/1024 of the height and 500/1024 of the width, around the mask's box"
-        if "edge" in options.regions:
-            text["edge"] = f"pixels at most {EDGE} rows and columns from the outline of the subject's mask"
-            text["edge"] += f", and from steps of more than {DEPTH_STEP:.0%} of the true depth where known"
-            text["spill"] = f"light farther than {BESIDE} pixels from the mask, per mille of the subject's"
-            text["sharpness"] = f"energy of the Laplacian over the target's, {INNER} pixels inside the mask"
+        for region in _REGIONS:
+            if region in options.regions:
+                text |= _REGIONS[region]
         if self.lpips is not None:
             text["lpips"] = f"{NETWORK} on {'[0, 1]' if options.is_release else '[-1, 1]'}, whole image"
         if self.beside is not None:

@@ -21,8 +21,7 @@ from ghgs_lit.geometry.frame import HEIGHT, subject_center
 from ghgs_lit.geometry.masks import coverage
 from ghgs_lit.geometry.precision import exact
 from ghgs_lit.geometry.rotations import after_motions, without_common
-from ghgs_lit.refinement.outlines import QUICK, TO, Outlines
-from ghgs_lit.refinement.rays import Lens, Pose, best_points, gradients_of, rows_of
+from ghgs_lit.refinement.outlines import QUICK, TO, Lens, Outlines, Pose, best_points, gradients_of, rows_of
 from ghgs_lit.types import Batch, Cameras
 
 Lenses = Float[Tensor, "K V 3 3"]  #: Intrinsics of ``K`` instants, whose crops differ

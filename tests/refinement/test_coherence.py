@@ -9,9 +9,9 @@ import torch
 from ghgs_lit.geometry.frame import HEIGHT, Frame
 from ghgs_lit.geometry.projection import project, unproject_maps
 from ghgs_lit.geometry.rotations import after_motions, rigid, without_common
-from ghgs_lit.refinement import coherence, rays
+from ghgs_lit.refinement import coherence
 from ghgs_lit.refinement.coherence import coherent_cameras, contradiction, culprit
-from ghgs_lit.refinement.outlines import Outlines
+from ghgs_lit.refinement.outlines import Outlines, best_points, gradients_of, rows_of
 from ghgs_lit.types import Batch
 from tests.helpers.scenes import CENTER, ellipsoid, off, ring
 
@@ -173,10 +173,10 @@ def test_gradients_are_those_of_finite_differences():
     outlines = Outlines(ramps[:, None], None, None, None, (126, 126))
     points = 0.3 * torch.randn(40, 3, generator=torch.Generator().manual_seed(2))
     other = torch.arange(40) % 4
-    gradients = rays.gradients_of(outlines, lens, pose, points, other)
+    gradients = gradients_of(outlines, lens, pose, points, other)
     # a turn is about the frame's origin, not about the subject
     middle = torch.tensor([0.2, -0.1, 0.3])
-    rows = rays.rows_of(points, gradients, pose[other], middle)
+    rows = rows_of(points, gradients, pose[other], middle)
 
     def distances(step):
         rotation, shift = rigid(step[:6], HEIGHT / 2)
@@ -209,7 +209,8 @@ def test_a_step_follows_the_motion_that_took_cameras_away(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("views", "off_by", "seed"), [(3, {1: 10}, 4), (4, {1: 6}, 0), (4, {2: 10}, 4), (5, {1: 6, 3: 8}, 2)]
+    ("views", "off_by", "seed"),
+    [(3, {1: 10}, 4), (4, {1: 6}, 0), (4, {2: 10}, 4), (5, {1: 6, 3: 8}, 2), (4, {2: 2.5}, 4)],
 )
 def test_a_minority_that_explains_all_moves_alone(views, off_by, seed):
     """Cameras that agree with one another are right; of five, two may be off."""
@@ -220,7 +221,8 @@ def test_a_minority_that_explains_all_moves_alone(views, off_by, seed):
     for name in ("intrinsics", "extrinsics"):
         before, after = (getattr(cameras, name)[~free] for cameras in (wrong.cameras, found))
         assert torch.equal(before, after)
-    assert pixels_off(found, truth) < 0.7 * pixels_off(wrong.cameras, truth)
+    share = 0.8 if off_by == {2: 2.5} else 0.7
+    assert pixels_off(found, truth) < share * pixels_off(wrong.cameras, truth)
 
 
 @pytest.mark.parametrize("views", [3, 4, 5])
@@ -228,16 +230,6 @@ def test_where_all_are_off_all_move(views):
     truth = figure(views=views)
     _, free, _ = coherent_cameras(off(truth, 6.0, (1,)))
     assert free.all()
-
-
-def test_a_camera_that_is_off_by_little_moves_alone():
-    """By up to 2.5 pixels: the others, as given, agree without it, and without no other camera."""
-    truth = figure()
-    wrong = bumped(truth, {2: 2.5}, 4)
-    found, free, distances = coherent_cameras(wrong)
-    assert free[0].nonzero().tolist() == [[2]]
-    assert 5e-4 < distances < 2e-3
-    assert pixels_off(found, truth) < 0.8 * pixels_off(wrong.cameras, truth)
 
 
 def test_a_clear_culprit_is_named_and_one_of_two_is_not():
@@ -281,7 +273,7 @@ def test_a_ray_is_looked_up_in_the_other_silhouettes():
     outlines = Outlines.of(truth.alpha[0])
     lens, pose = truth.cameras.intrinsics[0], truth.cameras.extrinsics[0]
     view, pixels = outlines.view[::23], outlines.pixels[::23]
-    points, other, depth = rays.best_points(outlines, lens, pose, view, pixels)
+    points, other, depth = best_points(outlines, lens, pose, view, pixels)
     assert (other != view).all()
     index = torch.arange(4).expand(len(view), 4)
     seen = project(points[:, None].expand(-1, 4, 3), lens[index], pose[index])[0]
