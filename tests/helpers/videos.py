@@ -21,11 +21,6 @@ def numbered_frames(figure: Figure, camera: int, count: int) -> Iterator[np.ndar
         yield picture
 
 
-def mask_frames(figure: Figure, camera: int, count: int) -> list[np.ndarray]:
-    """[h, w] uint8, 0 and 255."""
-    return [figure.masks[camera] * np.uint8(255)] * count
-
-
 def number_of(image: np.ndarray) -> int:
     """The number in the corner of a frame."""
     return round(float(image[2:9, 2:9].mean()) / STEP)

@@ -84,23 +84,13 @@ def _refuse_rivals(table: Table, values: pd.DataFrame) -> None:
     means = values.groupby([*CELL, "seed", "source"], sort=False)["value"].mean().reset_index("source")
     for (line, group, _, seed), part in means.groupby(level=[*CELL, "seed"], sort=False):
         if part["value"].nunique() > 1:
-            sources = list(part["source"])
-            expected = f"one run for {_cell(table, line, group)}, seed {seed}"
-            raise _rivals(table, expected, sources, _differing(table, sources))
-    for (line, group), column in values.groupby(["line", "group"], sort=False)["source"]:
+            raise _rivals(table, (line, group), list(part["source"]), f"one run for %s, seed {seed}")
+    for cell, column in values.groupby(["line", "group"], sort=False)["source"]:
         sources = list(dict.fromkeys(column))
-        keys = _differing(table, sources)
-        # Another version of the package has other keys; copies of the data lie in other folders.
-        both = {key: shown for key, shown in keys.items() if len({*shown} - {ABSENT}) > 1}
-        both = {key: shown for key, shown in both.items() if not is_below(key, OF_A_PLACE)}
-        if both:
-            raise _rivals(table, f"one configuration for {_cell(table, line, group)}", sources, both)
-
-
-def _cell(table: Table, line: int, group: int) -> str:
-    variant = table.lines[line].variant
-    row = f"ablation={variant.ablation}" if variant.ablation else variant.name
-    return f"{row}, {table.groups[group].views} views"
+        for key, texts in _differing(table, sources).items():
+            # Another version of the package has other keys; copies of the data lie in other folders.
+            if len({*texts} - {ABSENT}) > 1 and not is_below(key, OF_A_PLACE):
+                raise _rivals(table, cell, sources, "one configuration for %s")
 
 
 def _differing(table: Table, sources: Sequence[str]) -> dict[str, list[str]]:
@@ -108,10 +98,12 @@ def _differing(table: Table, sources: Sequence[str]) -> dict[str, list[str]]:
     return differing([table.configs[source] for source in sources if source in table.configs], OF_A_RUN)
 
 
-def _rivals(
-    table: Table, expected: str, sources: Sequence[str], keys: Mapping[str, Sequence[str]]
-) -> InputError:
+def _rivals(table: Table, cell: tuple[int, int], sources: Sequence[str], expected: str) -> InputError:
     """The error that runs claim one cell, with the keys of ``by`` that give each a row."""
+    variant = table.lines[cell[0]].variant
+    row = f"ablation={variant.ablation}" if variant.ablation else variant.name
+    expected %= f"{row}, {table.groups[cell[1]].views} views"
+    keys = _differing(table, sources)
     cure = f"they differ in {differing_text(keys)}: by=[{','.join(keys)}] gives each a row"
     cure = cure if keys else "their configurations are equal"
     found = " and ".join(sources)
