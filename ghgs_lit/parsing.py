@@ -6,7 +6,6 @@ import functools
 import io
 import json
 import os
-import re
 import stat
 import unicodedata
 from collections.abc import Callable, Iterator, Sequence
@@ -280,7 +279,8 @@ def read_parsed(path: Path, expected: str, parse: Callable[[str], Any]) -> Any:
     except InputError:
         raise
     except (LookupError, ValueError, TypeError, ArithmeticError, RecursionError, *_NO_TEXT) as error:
-        found = re.sub(r'\s+in "<[^>]*>",', " in", str(error))  # where YAML's errors name no file
+        mark = getattr(error, "problem_mark", None)
+        found = f"{error.problem} in line {mark.line + 1}, column {mark.column + 1}" if mark else error
         raise InputError(f"{path}: expected {expected}; found {found}") from error
     return value
 

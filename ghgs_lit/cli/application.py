@@ -167,14 +167,13 @@ def _help(verb: str, words: list[str], folder: str | None) -> int:
     """
     from ghgs_lit.cli.help import print_group, print_verb
 
-    folders = [] if folder is None else [Path(folder)]
     groups = [word for word in words if "=" not in word]
     overrides = _for_hydra(verb, [word for word in words if "=" in word])
     cfg = compose(verb, overrides, with_hydra=True, folder=folder, is_filled=bool(groups))
     for group in groups:
-        print_group(verb, group, cfg, folders)
+        print_group(verb, group, cfg, folder)
     if not groups:
-        print_verb(verb, cfg, folders)
+        print_verb(verb, cfg, folder)
     return 0
 
 

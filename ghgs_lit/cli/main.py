@@ -21,7 +21,7 @@ def _command(argv: list[str]) -> int:
         The exit code, as of :func:`main`.
     """
     if len(argv) < 2 or argv[1] in ("-h", "--help", "help"):
-        from ghgs_lit.cli.usage import usage  # here: it loads pydantic
+        from ghgs_lit.cli.help import usage  # here: it loads pydantic
 
         print(usage())
         return 0 if len(argv) > 1 else 2

@@ -9,7 +9,7 @@ import shlex
 import sys
 import threading
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from hydra._internal.utils import get_args_parser
@@ -20,7 +20,6 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from ghgs_lit.config import compose, conf_dir
-from ghgs_lit.config.compose import plain
 from ghgs_lit.config.keys import flatten, is_below
 from ghgs_lit.config.options import UnknownKey, did_you_mean
 from ghgs_lit.config.registry import KINDS, verb_class, verbs
@@ -37,9 +36,6 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 #: :func:`ghgs_lit.cli.application.write_hydra_files` does not.
 NO_FILES_OF_HYDRA = "hydra.output_subdir=null"
 
-#: Keys that a path without a key may be meant for, the first of a verb.
-_PATHS = ("path", "runs", "checkpoint")
-
 #: Nodes of Lightning's classes, whose keys have defaults and so may be deleted.
 _LIGHTNING = ("trainer", "callbacks", "logger")
 
@@ -54,39 +50,29 @@ def one_line(error: Exception, verb: str) -> str:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         text = _missing_option(error)
     elif isinstance(error, OverrideParseException):
-        text = _unread_override(error, verb)
+        text = _unread_override(error)
     elif isinstance(error, HydraException):
         text = _composition(error, verb)
     elif isinstance(error, OSError):
         text = _system(error)
     elif isinstance(error, OmegaConfBaseException):
         text = f"{error.full_key}: expected a value that can be resolved; found {error.msg}"
-    elif isinstance(error, YAMLError):
-        text = _yaml(error)
     elif isinstance(error, UnknownKey) and any(word.startswith(f"{error.key}=") for word in sys.argv[1:]):
         text = _unknown_key(error.key, verb)
     elif isinstance(error, InputError):
         text = str(error)
     else:  # an error of Hydra that does not name the override
-        text = _no_name_of_an_option(error)
+        text = _no_name_of_an_option()
         text = text or f"{_command_line()}: expected overrides that Hydra can apply; found {error}"
     return " ".join(text.split())
 
 
-def _no_name_of_an_option(error: Exception) -> str | None:
-    """Message for the group whose option is given as a number or as null, such as ``views=4``.
-
-    Args:
-        error: of Hydra, which names neither group nor value.
-
-    Returns:
-        The message; None: it is another error.
-    """
-    kinds = {"int": r"\d[\d,]*", "NoneType": "null", "float": r"[\d.,]+"}
-    kind = str(error).rpartition("Got ")[2]
+def _no_name_of_an_option() -> str | None:
+    """Message for the first group whose option is given as a number or as null, such as ``views=4``,
+    of which Hydra's error names neither group nor value; None: there is none."""
     for word in sys.argv[1:]:
         group, _, value = word.partition("=")
-        if (conf_dir() / group).is_dir() and re.fullmatch(kinds.get(kind, "(?!)"), value):
+        if (conf_dir() / group).is_dir() and re.fullmatch(r"[\d.,]+|null", value):
             known = sorted(path.stem for path in (conf_dir() / group).glob("*.yaml"))
             hint = did_you_mean(value.partition(",")[0], known)
             return f"{group}: expected one of {', '.join(known)}; found {value}{hint}"
@@ -97,27 +83,15 @@ def _command_line() -> str:
     return " ".join(word for word in sys.argv[1:] if word != NO_FILES_OF_HYDRA)
 
 
-def _unread_override(error: OverrideParseException, verb: str) -> str:
+def _unread_override(error: OverrideParseException) -> str:
     key, sign, value = str(error.override).partition("=")
-    if not sign:
-        keys = [name for name in _PATHS if name in verb_class(verb).model_fields and os.sep in key]
-        hint = f" (did you mean {keys[0]}={key}?)" if keys else ""
-        return f"{key}: expected key=value or group=option; found no ={hint}"
-    if value.endswith(","):
-        return f"{key}: expected values without a space after the comma; found {value!r} and another word"
-    if not value or value[0] in "[{\"'":
-        return f"{error.override}: expected key=value or group=option; found {error}"
+    if not sign or not value or value[0] in "[{\"'":
+        named = error.override if sign else key
+        return f"{named}: expected key=value or group=option; found {error if sign else 'no ='}"
     quoted = shlex.quote(f'{key}="{value}"')
     return (
         f"{key}: expected quotes around such a value, two kinds because of the shell: {quoted}; found {value}"
     )
-
-
-def _yaml(error: YAMLError) -> str:
-    mark = getattr(error, "problem_mark", None)
-    problem = getattr(error, "problem", None)
-    place = f"{mark.name}, line {mark.line + 1}" if mark else "--config-dir"
-    return f"{place}: expected YAML of plain data; found {problem or error}"
 
 
 def _missing_option(error: MissingConfigException) -> str:
@@ -152,74 +126,27 @@ def _composition(error: HydraException, verb: str) -> str:
 
 
 def _unknown_key(key: str, verb: str) -> str:
-    return f"{key}: expected a key or group of this verb; found none of that name{_hint(verb, key)}"
-
-
-def _hint(verb: str, key: str) -> str:
-    """What the user may have meant by a key that does not exist, after trying it.
+    """Message for a key that does not exist, with the closest one.
 
     A word is compared with words, never with a whole dotted key, whose group would make all keys
-    of it alike. A group of another name is mended first: ``rouns.height`` is looked for in ``rounds``.
-
-    Args:
-        verb: name of the verb.
-        key: a dotted key or group that it does not have.
-
-    Returns:
-        A text that begins with a space or "; "; empty: no idea, or a key of another verb.
+    of it alike. A group of another name is mended first: ``optimzer.lrr`` is looked for in ``optimizer``.
     """
-    overrides = sys.argv[1:]
-    folders = {str(path.relative_to(conf_dir())) for path in conf_dir().rglob("*") if path.is_dir()}
-    chosen = [text for text in overrides if text.partition("=")[0] in folders and "," not in text]
-    keys = _keys(verb, chosen) or _keys(verb)
+    text = f"{key}: expected a key or group of this verb; found none of that name"
     if any(key in verb_class(name).model_fields for name in verbs()):
-        return ""  # a key of another verb
-    names = {name: name for name in (*folders, *KINDS, *(known.partition(".")[0] for known in keys))}
+        return text  # of another verb
+    groups = {str(path.relative_to(conf_dir())) for path in conf_dir().rglob("*") if path.is_dir()}
+    chosen = [word for word in sys.argv[1:] if word.partition("=")[0] in groups and "," not in word]
+    keys = _keys(verb, chosen) or _keys(verb)
+    names = dict.fromkeys((*groups, *KINDS, *(known.partition(".")[0] for known in keys)))
     group, dot, rest = key.partition(".")
-    holders: dict[str, str] = {}
-    if not dot:  # a key without its group is close, too: lr for optimizer.lr
-        leaves = {known.rpartition(".")[2]: known for known in keys if "." in known}
-        meant = leaves.get(key) or _closest(key, leaves | names)
-    else:
-        group = group if group in names else _closest(group, names) or group
-        holders = _holders(verb, chosen, group)
-        known_as = {known.removeprefix(f"{group}."): known for known in (*holders, *keys)}
-        meant = known_as.get(rest) or _closest(rest, known_as)
-    texts = [f"did you mean {meant}?" if meant not in (None, key) else ""]
-    texts += [holders[meant] if meant in holders and meant not in keys else ""]
-    text = " ".join(filter(None, texts))
-    text = f" ({text})" if text else ""
-    added = next((f"+{word}" for word in overrides if word.partition("=")[0] == key), "")
-    return f"{text}; +{key}=... adds it" if _can_add(verb, chosen, key, added) else text
-
-
-def _closest(word: str, known_as: Mapping[str, str]) -> str | None:
-    """What the closest of some words stands for; None: none is close."""
-    close = difflib.get_close_matches(word, known_as, 1)
-    return known_as[close[0]] if close else None
-
-
-def _holders(verb: str, chosen: Sequence[str], group: str) -> dict[str, str]:
-    """Keys of a group under any of its options, and under any model, which chooses groups of its own.
-
-    Args:
-        verb: name of the verb.
-        chosen: overrides that choose options of groups.
-        group: whose keys are wanted.
-
-    Returns:
-        For each dotted key who has it, such as ``model=recurrent has it``.
-    """
-    holders: dict[str, str] = {}
-    for of in (group, "model"):
-        options: dict[str, list[str]] = {}
-        for path in sorted((conf_dir() / of).glob("*.yaml")):
-            for known in _keys(verb, [*chosen, f"{of}={path.stem}"]):
-                if known.startswith(f"{group}."):
-                    options.setdefault(known, []).append(path.stem)
-        for known, names in options.items():
-            holders.setdefault(known, f"{of}={' or '.join(names)} has it")
-    return holders
+    if dot:
+        group = "".join(difflib.get_close_matches(group, names, 1)) or group
+        known_as = {known.removeprefix(f"{group}."): known for known in keys}
+    else:  # a key without its group is close, too: lr for optimizer.lr
+        rest = key
+        known_as = {known.rpartition(".")[2]: known for known in keys} | {name: name for name in names}
+    close = difflib.get_close_matches(rest, known_as, 1)
+    return f"{text} (did you mean {known_as[close[0]]}?)" if close else text
 
 
 def _keys(verb: str, overrides: Sequence[str] = ()) -> list[str]:
@@ -228,25 +155,6 @@ def _keys(verb: str, overrides: Sequence[str] = ()) -> list[str]:
         return list(flatten(OmegaConf.to_container(compose(verb, overrides), resolve=False)))
     except (HydraException, OmegaConfBaseException, InputError):
         return []
-
-
-def _can_add(verb: str, chosen: Sequence[str], key: str, override: str) -> bool:
-    """Whether the verb accepts a new key: groups know theirs, some of their values are mappings.
-
-    Args:
-        verb: name of the verb.
-        chosen: overrides that choose options of groups.
-        key: the dotted key.
-        override: adds the key, such as ``+data.rig.x=3``;
-            empty: the key was not on the command line.
-    """
-    if not override or (key.count(".") < 2 and not key.startswith("hydra.")):
-        return False
-    try:
-        cfg = compose(verb, [*chosen, override], with_hydra=key.startswith("hydra."))
-        return key.startswith("hydra.") or bool(verb_class(verb).of(plain(cfg)))
-    except (HydraException, OmegaConfBaseException, InputError):
-        return False
 
 
 def _system(error: OSError) -> str:
