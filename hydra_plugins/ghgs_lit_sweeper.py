@@ -4,6 +4,7 @@
 from typing import Any
 
 from hydra._internal.core_plugins import basic_sweeper
+from hydra.core.config_store import ConfigStore
 
 
 def rehearse(configs: list[Any]) -> Any:
@@ -30,3 +31,9 @@ class GridSweeper(basic_sweeper.BasicSweeper):
         from ghgs_lit.runs.grid import sweep  # Hydra imports its plugins for every application
 
         return sweep(self, arguments, rehearse)
+
+
+# max_batch_size: jobs that a launcher gets at once (null: all); params: comma-separated values by key,
+# as on the command line, which replaces them.
+_NODE = {"_target_": f"{__name__}.GridSweeper", "max_batch_size": None, "params": None}
+ConfigStore.instance().store(group="hydra/sweeper", name="grid", node=_NODE, provider="ghgs_lit")

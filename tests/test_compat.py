@@ -42,7 +42,7 @@ def test_every_quirk_is_a_switch_that_is_off_by_default(key, values):
     assert release_switches()[key] == values[1]
     overrides = [f"{group}.{name}={values[1]}"]
     if group in ("bounds", "depth_head"):  # depths without bounds are the release's alone
-        overrides = ["bounds=none", "depth_head.parameterization=inverse_linear"]
+        overrides = ["bounds.kind=none", "depth_head.parameterization=inverse_linear"]
     with torch.device("meta"):
         GHGS.from_config(config("model=paper", *overrides))
 

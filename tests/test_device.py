@@ -220,7 +220,7 @@ def test_predict_runs_there(tmp_path, monkeypatch):
     with pretend_device():
         code = ghgs(
             "predict", f"checkpoint={checkpoint}", "data=scans", f"data.root={tmp_path / 'data'}",
-            "data.size=42", "views=v3", "turntable.frames=1", "renderer=reference",
+            "data.size=42", "views=v3", "turntable.frames=1", "renderer.backend=reference",
             f"hydra.run.dir={tmp_path / 'run'}",
         )  # fmt: skip
     assert code == 0

@@ -225,9 +225,8 @@ def test_named_models_choose_their_parts_and_the_command_line_wins():
     """What is written on the command line must be what one gets."""
     assert config("model=hull")["bounds"]["kind"] == "hull"
     assert config("model=paper")["bounds"]["kind"] == "box"
-    assert config("model=paper", "bounds=hull")["bounds"]["kind"] == "hull"
-    assert config("model=paper", "depth_head=hull")["depth_head"]["parameterization"] == "linear"
-    assert composed("train", "model=hull", "recalibration=paper").recalibration.k == 64
+    assert config("model=paper", "bounds.kind=hull")["bounds"]["kind"] == "hull"
+    assert composed("train", "model=paper").recalibration.k == 64
     assert composed("train", "model=hull").recalibration.k == 16
 
 
@@ -280,7 +279,7 @@ def test_a_missing_stage_and_a_bad_value_name_their_key():
 @pytest.mark.parametrize(
     ("overrides", "found"),
     [
-        (["model=paper", "bounds=none"], "NoBounds with a depth head between bounds"),
+        (["model=paper", "bounds.kind=none"], "NoBounds with a depth head between bounds"),
         (["model=hull", "depth_head.parameterization=inverse_linear"], "consistency_depths"),
         (
             ["model=paper", "depth_head.parameterization=inverse_linear"],

@@ -66,7 +66,9 @@ def test_only_windows_around_the_subject_are_decoded():
     assert [count for count, *_ in decoded[1:]] == [3, 2]
 
 
-@pytest.mark.parametrize("overrides", [["model=hull"], ["unprojection=release"]], ids=operator.itemgetter(0))
+@pytest.mark.parametrize(
+    "overrides", [["model=hull"], ["unprojection.tokens=release"]], ids=operator.itemgetter(0)
+)
 @pytest.mark.parametrize("size", [(70, 70), (154, 98)])
 def test_skip_exact_gives_the_gaussians_of_skip_none(size, overrides):
     """skip=exact promises the same Gaussians,

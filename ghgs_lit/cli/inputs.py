@@ -173,7 +173,7 @@ def model_of(checkpoint: str, run: Run) -> dict[str, Any]:
     after = OmegaConf.create(before)
     if any(is_below(key, ("rounds",)) for key in given_keys()):
         _check_rounds(checkpoint, before.get("rounds"), run.plain["rounds"])
-    for key in given_keys():
+    for key in (given.removesuffix(".kind") for given in given_keys()):  # another kind has keys of its own
         if key == "ablation":
             _require_ablation(trained)
         if not is_below(key, MODEL_NODES):

@@ -18,7 +18,7 @@ from ghgs_lit.config.folder import VERSION_BASE, conf_dir
 from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.config.options import did_you_mean
 from ghgs_lit.config.outside import files_are_read
-from ghgs_lit.config.registry import verb_class, verbs
+from ghgs_lit.config.registry import KINDS, verb_class, verbs
 from ghgs_lit.config.run import Run
 from ghgs_lit.errors import InputError, require
 
@@ -114,7 +114,7 @@ def run_of(verb: str, overrides: Sequence[str] = ()) -> Run:
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:
-    """A composed configuration as plain data that nothing has checked.
+    """A composed configuration as plain data that nothing has checked, groups first.
 
     Raises:
         InputError: a value is missing.
@@ -125,7 +125,8 @@ def plain(cfg: DictConfig) -> dict[str, Any]:
         missing = sorted(OmegaConf.missing_keys(fill(cfg)))
     if missing:
         raise InputError(f"{missing[0]}: expected a value ({missing[0]}=...); found none")
-    return OmegaConf.to_container(cfg, resolve=True)
+    config = OmegaConf.to_container(cfg, resolve=True)
+    return {group: config[group] for group in KINDS if group in config} | config
 
 
 #: Groups whose files set keys of the whole configuration.

@@ -88,32 +88,9 @@ def _module_of(entry: str) -> str:
 
 _C = TypeVar("_C", bound=Callable)
 
-#: Import path of the options by group and kind; kind None: nodes of the group have no key ``kind``.
+#: Import path of the options by group and kind, groups in the order in which configurations are saved;
+#: kind None: nodes of the group have no key ``kind``.
 KINDS: dict[str, dict[str | None, str]] = {
-    "bounds": {
-        "box": "ghgs_lit.method.bounds.SubjectBox",
-        "hull": "ghgs_lit.method.bounds.VisualHull",
-        "none": "ghgs_lit.method.bounds.NoBounds",
-    },
-    "encoder": {"vggt": "ghgs_lit.method.encoder.VGGTOptions"},
-    "depth_head": {"dpt": "ghgs_lit.method.heads.depth.DepthHeadOptions"},
-    "unprojection": {"pinhole": "ghgs_lit.geometry.unprojection.Unprojection"},
-    "recalibration": {
-        "none": "ghgs_lit.method.recalibration.recalibration.NoRecalibrationOptions",
-        "semantic": "ghgs_lit.method.recalibration.RecalibrationOptions",
-    },
-    "gaussian_head": {"dpt": "ghgs_lit.method.heads.gaussian.GaussianHeadOptions"},
-    "rounds": {"recurrent": "ghgs_lit.method.rounds.RoundsOptions"},
-    "skip": {None: "ghgs_lit.method.plan.presets.SkipOptions"},
-    "model": {None: "ghgs_lit.execution.options.ModelOptions"},
-    "compat": {None: "ghgs_lit.weights.switches.CompatOptions"},
-    "renderer": {"splats": "ghgs_lit.rendering.Renderer"},
-    "loss": {"weighted": "ghgs_lit.losses.Losses"},
-    "metrics": {"images": "ghgs_lit.metrics.MetricsOptions"},
-    "optimizer": {"adamw": "ghgs_lit.training.Optimization"},
-    "calibration": {None: "ghgs_lit.config.nodes.Calibration"},
-    "evaluation": {None: "ghgs_lit.config.nodes.EvaluationOptions"},
-    "trainer": {"lightning": "ghgs_lit.training.trainer.TrainerOptions"},
     "data": {
         "humman": "ghgs_lit.data.humman.HuMMan",
         "zju_mocap": "ghgs_lit.data.zju_mocap.ZJUMoCap",
@@ -121,9 +98,21 @@ KINDS: dict[str, dict[str | None, str]] = {
     "views": {None: "ghgs_lit.data.sampling.ViewProtocol"},
     "targets": {None: "ghgs_lit.data.sampling.TargetProtocol"},
     "augmentation": {None: "ghgs_lit.data.augmentation.Augmentation"},
+    "encoder": {"vggt": "ghgs_lit.method.encoder.VGGTOptions"},
     "feature_cache": {
         "none": "ghgs_lit.training.features.NoFeatureCache",
         "disk": "ghgs_lit.training.features.DiskFeatureCache",
+    },
+    "skip": {None: "ghgs_lit.method.plan.presets.SkipOptions"},
+    "metrics": {"images": "ghgs_lit.metrics.MetricsOptions"},
+    "renderer": {"splats": "ghgs_lit.rendering.Renderer"},
+    "loss": {"weighted": "ghgs_lit.losses.Losses"},
+    "optimizer": {"adamw": "ghgs_lit.training.Optimization"},
+    "trainer": {"lightning": "ghgs_lit.training.trainer.TrainerOptions"},
+    "logger": {
+        "csv": "ghgs_lit.training.loggers.CsvOptions",
+        "tensorboard": "ghgs_lit.training.loggers.TensorBoardOptions",
+        "wandb": "ghgs_lit.training.loggers.WandbOptions",
     },
     "callbacks": {
         "checkpoints": "ghgs_lit.training.checkpoints.CheckpointOptions",
@@ -132,11 +121,23 @@ KINDS: dict[str, dict[str | None, str]] = {
         "pictures": "ghgs_lit.training.validation_pictures.PicturesOptions",
         "progress": "ghgs_lit.training.callbacks.ProgressOptions",
     },
-    "logger": {
-        "csv": "ghgs_lit.training.loggers.CsvOptions",
-        "tensorboard": "ghgs_lit.training.loggers.TensorBoardOptions",
-        "wandb": "ghgs_lit.training.loggers.WandbOptions",
+    "evaluation": {None: "ghgs_lit.config.nodes.EvaluationOptions"},
+    "calibration": {None: "ghgs_lit.config.nodes.Calibration"},
+    "bounds": {
+        "box": "ghgs_lit.method.bounds.SubjectBox",
+        "hull": "ghgs_lit.method.bounds.VisualHull",
+        "none": "ghgs_lit.method.bounds.NoBounds",
     },
+    "depth_head": {"dpt": "ghgs_lit.method.heads.depth.DepthHeadOptions"},
+    "unprojection": {"pinhole": "ghgs_lit.geometry.unprojection.Unprojection"},
+    "recalibration": {
+        "none": "ghgs_lit.method.recalibration.recalibration.NoRecalibrationOptions",
+        "semantic": "ghgs_lit.method.recalibration.RecalibrationOptions",
+    },
+    "gaussian_head": {"dpt": "ghgs_lit.method.heads.gaussian.GaussianHeadOptions"},
+    "model": {None: "ghgs_lit.execution.options.ModelOptions"},
+    "rounds": {"recurrent": "ghgs_lit.method.rounds.RoundsOptions"},
+    "compat": {None: "ghgs_lit.weights.switches.CompatOptions"},
 }
 
 #: Import path of each verb.

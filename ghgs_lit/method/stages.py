@@ -257,4 +257,4 @@ def require_bounds(bounds: Bounds, encoder: Encoder, depth_head: DepthHead, roun
     require(fits, "bounds", expected, f"{type(bounds).__name__} with {head}")
     sees = encoder.bounds_input and not bounds.is_bounded
     require(not sees, "encoder.bounds_input", "false where bounds is none", True)
-    require(rounds is None or bounds.is_bounded, "rounds", "a model with bounds", "bounds=none")
+    require(rounds is None or bounds.is_bounded, "rounds", "a model with bounds", "bounds.kind=none")

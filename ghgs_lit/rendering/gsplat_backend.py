@@ -42,7 +42,7 @@ def load() -> Any:
     if not torch.cuda.is_available():
         raise BackendUnavailable(
             "renderer.backend=gsplat: needs a CUDA device, but torch.cuda.is_available() is false "
-            f"(torch {torch.__version__}, built for CUDA {torch.version.cuda}); use renderer=cpu"
+            f"(torch {torch.__version__}, built for CUDA {torch.version.cuda}); use renderer.backend=cpu"
         )
     try:
         gsplat = importlib.import_module("gsplat")

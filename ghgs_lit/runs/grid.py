@@ -1,4 +1,4 @@
-"""Grid sweeper of ``conf/hydra/sweeper/grid.yaml``:
+"""Grid sweeper (``hydra/sweeper=grid``):
 launches those runs of a grid that are not done."""
 
 import contextlib

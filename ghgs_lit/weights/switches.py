@@ -23,14 +23,10 @@ class CompatOptions(Options):
 def release_switches() -> dict[tuple[str, ...], Any]:
     """The release's value of each switch of the model, by (group, key)."""
     node = OmegaConf.to_container(OmegaConf.load(conf_dir() / "compat" / "release.yaml"))
-    for choice in node["defaults"]:
-        ((group, option),) = ((key.removeprefix("override /"), value) for key, value in choice.items())
-        if group not in ("metrics", "renderer"):  # not parts of the model
-            node[group] = OmegaConf.to_container(OmegaConf.load(conf_dir() / group / f"{option}.yaml"))
     switches = {}
     for group, values in node.items():
-        if group not in ("defaults", "compat"):
-            switches |= {(group, key): value for key, value in values.items() if key != "defaults"}
+        if group not in ("defaults", "compat", "renderer"):  # which are no parts of the model
+            switches |= {(group, key): value for key, value in values.items()}
     return switches
 
 

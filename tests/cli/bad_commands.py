@@ -28,7 +28,7 @@ USAGE = [
     ),
     ("predict images=a cameras=b out={loop}/x", 1, "{loop}/x", "found Too many levels of symbolic"),
     ("train +bounds._target_=os.system", 1, "bounds key: expected one of", "found '_target_'"),
-    ("train --config-dir {yaml} bounds=calls", 1, "bounds key: expected one of", "found '_target_'"),
+    ("train --config-dir {yaml} encoder=calls", 1, "encoder key: expected one of", "found '_target_'"),
     ("train resume={loop}/x", 1, "{loop}/x: expected a path; found links in a loop"),
     ("train --config-name trian", 1, "--config-name", "'trian'"),
     ("train seed", 1, "seed: expected key=value or group=option; found no =\n"),

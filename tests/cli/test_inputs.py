@@ -56,7 +56,7 @@ def test_what_is_said_of_the_model_acts_on_a_checkpoint(composed, checkpoint, ve
         "skip=none",
         "recalibration.k=2",
         "recalibration.similarity=log",
-        "bounds=box",
+        "bounds.kind=box",
         "model.pad=multiple",
     ]
     model = inputs.model_of(checkpoint, composed(verb, f"checkpoint={checkpoint}", *said))
@@ -198,6 +198,6 @@ def test_a_device_or_renderer_that_is_not_there_is_refused():
     ):
         inputs.pick_device("cuda")
     assert inputs.pick_device("auto").type == "cpu"
-    renderer = run_of("evaluate", ["renderer=gsplat"])
+    renderer = run_of("evaluate", ["renderer.backend=gsplat"])
     with pytest.raises(InputError, match="needs a CUDA device"):
         inputs.build_renderer(renderer, torch.device("cpu"))

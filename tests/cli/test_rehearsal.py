@@ -65,7 +65,10 @@ def test_all_that_is_missing_is_said_at_once(monkeypatch, tmp_path):
         ),
         (["encoder.trainable=none"], r"init_from: expected a checkpoint with the encoder's weights"),
         (["evaluation.split=bench"], r"evaluation\.split: expected one of train, val; found 'bench'"),
-        (["feature_cache=disk"], r"feature_cache: expected none where encoder\.vit is no dinov2 or learns"),
+        (
+            ["feature_cache.kind=disk"],
+            r"feature_cache: expected none where encoder\.vit is no dinov2 or learns",
+        ),
         (["data.size=43"], r"data\.size: expected sides divisible by the patch size 14"),
     ],
 )
@@ -102,7 +105,7 @@ def test_the_room_for_tokens_is_said(rendered):
     frozen = ["encoder=vggt_1b", encoder, "encoder.vit={depth: 2, heads: 2}", "allow_random_encoder=true"]
     found = rehearsed(
         f"data.root={rendered}",
-        "feature_cache=disk",
+        "feature_cache.kind=disk",
         "feature_cache.folder=features",
         "data.size=28",
         *frozen,

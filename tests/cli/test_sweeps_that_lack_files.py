@@ -71,7 +71,7 @@ CASES = {
     "LPIPS": ("", "table3 metrics.lpips=require", [r"LPIPS: expected the package torchvision"]),
     "cache": (
         "",
-        "table3 feature_cache=disk feature_cache.folder=vggt.ckpt/cache",
+        "table3 feature_cache.kind=disk feature_cache.folder=vggt.ckpt/cache",
         [r"feature_cache\.folder: vggt\.ckpt/cache: expected a folder that can be written"],
     ),
 }  # fmt: skip

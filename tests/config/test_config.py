@@ -16,7 +16,7 @@ from ghgs_lit.config.registry import verbs
 from ghgs_lit.errors import InputError
 from ghgs_lit.method.model import GHGS, OPTIONS, STAGES
 from tests.cli.test_main import call
-from tests.helpers.configs import composed, verb_with
+from tests.helpers.configs import composed
 from tests.helpers.jobs import rehearse_nothing
 
 CONF = conf_dir()
@@ -56,22 +56,20 @@ def test_every_member_composes_and_its_model_is_built(group):
     """A shipped option that does not compose, or builds no model,
     would fail only for its first user."""
     for path in sorted((CONF / group).glob("*.yaml")):
-        # Depths without bounds belong to the release's model alone.
-        fitting = ["compat=release"] if (group, path.stem) == ("bounds", "none") else []
-        cfg = composed(verb_with(group), f"{group}={path.stem}", *fitting)
+        cfg = composed("train", f"{group}={path.stem}")
         nodes = {*STAGES, *OPTIONS, "rounds", "compat"}
         stages = {k: node for k, node in OmegaConf.to_container(cfg, resolve=True).items() if k in nodes}
         assert parameters_of(OmegaConf.to_yaml(stages)) > 0, path
 
 
-INSIDE_THE_MODEL = ("encoder", "depth_head", "recalibration", "gaussian_head", "model", "ablation", "compat")
+INSIDE_THE_MODEL = ("encoder", "model", "ablation", "compat")
 
 
 @pytest.mark.parametrize("group", sorted({*GROUPS} - {*INSIDE_THE_MODEL}))
 def test_every_object_outside_the_model_is_built(group, tmp_path):
     """A shipped option with a misspelt argument would fail only for its first user."""
     for path in sorted((CONF / group).glob("*.yaml")):
-        cfg = composed(verb_with(group), f"{group}={path.stem}")
+        cfg = composed("train", f"{group}={path.stem}")
         extra = {
             "data": {"views": cfg.get("views"), "targets": cfg.get("targets"), "seed": 0},
             "logger": {"save_dir": str(tmp_path)},

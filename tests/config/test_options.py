@@ -24,8 +24,9 @@ def shipped(group):
     """The nodes of a group in everything that ships, as plain data."""
     files = sorted((conf_dir() / group).glob("*.yaml"))
     configurations = [composed(verb_with(group), f"{group}={path.stem}") for path in files]
-    configurations += [composed("train", f"model={name}") for name in ("paper", "hull", "recurrent")]
-    configurations += [composed("train", *over) for over in (["compat=release"], ["experiment=shipped"])]
+    configurations += [composed("train", f"model={name}") for name in ("paper", "hull", "recurrent", "pixel")]
+    configurations += [composed("train", *over) for over in (["compat=release"], ["feature_cache.kind=disk"])]
+    configurations += [composed("train", "experiment=shipped")]
     configurations += [composed(verb) for verb in verbs()]
     nodes = []
     for cfg in configurations:

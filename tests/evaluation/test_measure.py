@@ -247,8 +247,9 @@ def test_two_processes_train_together_and_write_once(boxes, tmp_path):
     """With several processes one of them writes, and the checkpoint loads."""
     directory = tmp_path / "run"
     command = [
-        sys.executable, "-m", "ghgs_lit", "train", *data_of(boxes), "trainer=ddp_cpu", "trainer.max_steps=2",
-        "evaluation.pictures=0", "evaluation.targets=[release]", "evaluation.views=[3]",
+        sys.executable, "-m", "ghgs_lit", "train", *data_of(boxes), "trainer.devices=2",
+        "trainer.max_steps=2", "evaluation.pictures=0", "evaluation.targets=[release]",
+        "evaluation.views=[3]",
         f"hydra.run.dir={directory}",
     ]  # fmt: skip
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}

@@ -127,7 +127,7 @@ def test_the_crop_is_that_of_published_scripts(box, expected):
 
 
 def test_files_are_measured_as_written(tmp_path):
-    """``metrics=files``: PSNR and SSIM inside a window of what PNG files hold."""
+    """``metrics.protocol=files``: PSNR and SSIM inside a window of what PNG files hold."""
     image, target = (0.3 * i + 0.35 for i in _images(1, 64, 48))
     mask = torch.zeros(1, 64, 48, dtype=torch.bool)
     mask[:, 20:50, 20:31] = True

@@ -4,26 +4,13 @@ import dataclasses
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from ghgs_lit.config import VERSION_BASE, conf_dir
 from ghgs_lit.config import compose as project_compose
 from ghgs_lit.errors import InputError
 from ghgs_lit.rendering import RasterSettings, Renderer, render
 from ghgs_lit.types import Cameras, Gaussians
 from tests.helpers.splats import camera_ring, cloud
-
-NAMES = sorted(path.stem for path in (conf_dir() / "renderer").glob("*.yaml"))
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_every_config_builds_a_renderer(name):
-    """Each file of the config group builds a renderer with the backend of its name."""
-    with initialize_config_dir(str(conf_dir()), **VERSION_BASE):
-        options = dict(compose(f"renderer/{name}").renderer)
-    assert options.pop("kind") == "splats"
-    assert Renderer(**options).backend == {"release": "auto"}.get(name, name)
 
 
 @pytest.mark.parametrize(

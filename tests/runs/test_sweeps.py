@@ -165,7 +165,7 @@ def test_an_impossible_job_fails_before_any_is_launched(sweep):
     code, _, err = sweep("seed=1,-2")
     assert code == 1
     assert "seed: expected an integer >= 0" in err
-    code, _, err = sweep("seed=1,2", "trainer=ddp_cpu", "dry_run=true")
+    code, _, err = sweep("seed=1,2", "trainer.devices=2", "dry_run=true")
     assert code == 1
     assert "trainer.devices: expected 1 in a sweep, or hydra/launcher=slurm" in err
     assert not executed(sweep.directory)

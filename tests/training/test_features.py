@@ -218,7 +218,7 @@ def test_a_run_and_its_rest_read_what_is_there(tmp_path, monkeypatch):
         "evaluation.targets=[midway]", "evaluation.pictures=0", "trainer.val_check_interval=1",
         "trainer.limit_val_batches=0",
     ]  # fmt: skip
-    cache = ["feature_cache=disk", "feature_cache.folder=features"]
+    cache = ["feature_cache.kind=disk", "feature_cache.folder=features"]
     assert ghgs("train", *common, *cache, "trainer.max_steps=2", "hydra.run.dir=cached") == 0
     files = {path: path.stat().st_mtime_ns for path in Path("features").rglob("*.npy")}
     assert files

@@ -79,7 +79,7 @@ class VGGTOptions(Options):
     mask_input: bool = False
     """true: the mask is a further input channel"""
     bounds_input: bool = False
-    """true: near and far are two further input channels (not with bounds=none)"""
+    """true: near and far are two further input channels (not with bounds.kind=none)"""
     semantic: SemanticOptions | None = None
     """null: the patch tokens are the semantic features | those of a branch of blocks over single
     views, which `ghgs pretext` trains and which does not learn afterwards"""

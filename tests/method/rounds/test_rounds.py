@@ -136,7 +136,7 @@ def test_options_are_checked():
         GHGS.from_config(
             config(
                 *RECURRENT,
-                "bounds=none",
+                "bounds.kind=none",
                 "depth_head.parameterization=inverse_linear",
                 "depth_head.consistency_depths=0",
                 "encoder.bounds_input=false",
