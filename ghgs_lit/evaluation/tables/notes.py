@@ -179,7 +179,7 @@ def _about_test(table: Table) -> list[str]:
         could_show.append(f"{metric_of(metric).title} {smallest:.{metric_of(metric).decimals}f}")
     return [
         f"{MARK} differs beyond chance from {against} (p < {alpha:g} after Holm's correction over"
-        f" {table.comparisons} comparisons of {sizes}; other columns are not tested). In brackets the"
-        f" {100 * (1 - alpha):g} % interval of the difference. Differences that are found with"
+        f" {table.comparisons} comparisons of {sizes}). In brackets the {100 * (1 - alpha):g} % interval of"
+        " the difference. Tested columns, each with the difference that is found with"
         f" {100 * POWER:g} % power: {', '.join(could_show)}."
     ]

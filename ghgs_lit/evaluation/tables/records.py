@@ -102,8 +102,6 @@ class _Provenance(_Strict):
     # Of `ghgs evaluate`: how the model was trained, and what the command line changed in it.
     checkpoint_config: dict[str, Any] | None = None
     changed_model: dict[str, Any] | None = Field(None, alias="model_config")
-    verb: str | None = None
-    choices: dict[str, Any] = {}
     seed: int | None = None
     data: _Data
     protocol: _Protocol
@@ -117,8 +115,6 @@ def _read_run(path: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
     content = read_results(path)
     source = validated(_Provenance, content["provenance"], f"{path}: provenance")
     trained = (source.checkpoint_config or source.config) | (source.changed_model or {})
-    if source.verb == "train":  # of a version that did not write the options into the configuration
-        trained = {"chosen": source.choices, **trained}
     of_evaluation = ("checkpoint", "refine", "refine_cameras", "data", "metrics")
     config = trained | {key: source.config[key] for key in of_evaluation if key in source.config}
     measured = source.config.get("targets")

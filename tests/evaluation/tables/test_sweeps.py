@@ -28,6 +28,7 @@ def set_figures(path: Path) -> None:
     """Give a run figures that depend on its data, views and ablation alone, on any machine."""
     content = json.loads(path.read_text())
     source = content["provenance"]
+    source["git"] = None  # of whoever commits while this runs
     (views,) = source["config"]["views"]["training_counts"]
     rank = list(ABLATIONS.values()).index(source["ablation"])
     shift = {"zju_mocap": 0.3, "humman": 0.6, "thuman2": 0.0}[source["data"]["name"]]

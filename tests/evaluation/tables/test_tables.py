@@ -26,7 +26,7 @@ from ghgs_lit.evaluation.tables.variants import encoder_name
 from ghgs_lit.evaluation.tables.writers import escape, prose
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.results import read_results, summarize, write_results
-from tests.evaluation.tables.scenarios import CASES, REFUSED, RUNS, neighbors, other, views
+from tests.evaluation.tables.scenarios import CASES, REFUSED, RUNS, other, views
 from tests.helpers.tables import tables_of, write_run
 
 EXPECTED = Path(__file__).parents[2] / "fixtures" / "tables"
@@ -146,17 +146,6 @@ def test_other_views_and_targets_are_other_rows(tmp_path, key, values, title, se
         (f"Ours ({title.format(str(value).strip('[]'))})",) for value in values
     ]
     assert list(table.cells["mean"][:, 0, "psnr"]) == [23.0, 24.0]
-
-
-def test_results_of_an_earlier_version_are_read_by_their_choices(tmp_path):
-    """Their options stand beside the configuration, not in it; without any, the switches tell."""
-    choices = {"verb": "train", "choices": {"ablation": "mine", "model": "paper"}}
-    path = write_run(tmp_path / "0", "full", 20.0, recalibration=neighbors(1), provenance=choices)
-    path.with_name("config.yaml").unlink()
-    write_run(tmp_path / "1", "full", 21.0, recalibration=neighbors(64))
-    (table,) = tables_of(tmp_path, views=(4,), metrics=("psnr",))
-    assert [line.stub[0] for line in table.lines[3:]] == ["full", "mine"]
-    assert list(table.cells["mean"].dropna()) == [25.0, 24.0]
 
 
 def test_where_an_encoder_comes_from_makes_no_second_row(tmp_path):
