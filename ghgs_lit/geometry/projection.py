@@ -195,19 +195,23 @@ def project(
 
 
 def look_at_point(cameras: Cameras) -> Tensor:
-    """The world point nearest to all optical axes (least squares).
+    """:func:`meeting_point` [3] of the optical axes of V cameras."""
+    return meeting_point(cameras.centers.double(), cameras.extrinsics[:, 2, :3].double())
+
+
+def meeting_point(centers: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
+    """The point nearest to all rays (least squares).
 
     Args:
-        cameras: V cameras.
+        centers: points of the rays, in float64.
+        directions: of the rays, unit vectors.
 
     Returns:
-        Point [3], float64; for parallel axes,
-        the solution nearest to the mean position of the cameras.
+        Point [3]; for parallel rays, the solution nearest to the mean of the centres.
     """
-    forward = cameras.extrinsics[:, 2, :3].double()
-    centers = cameras.centers.double()
     middle = centers.mean(0)
-    away = torch.eye(3, dtype=torch.float64, device=forward.device) - forward[:, :, None] * forward[:, None]
+    identity = torch.eye(3, dtype=centers.dtype, device=centers.device)
+    away = identity - directions[:, :, None] * directions[:, None]
     right = (away @ (centers - middle)[:, :, None]).sum(0)
     return middle + (torch.linalg.pinv(away.sum(0), rtol=1e-6) @ right)[:, 0]
 

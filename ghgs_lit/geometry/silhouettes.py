@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import torch
+
+from ghgs_lit.geometry.projection import meeting_point
 
 
 @dataclass(frozen=True)
@@ -166,7 +169,6 @@ def subject_sphere(silhouettes: Sequence[Silhouette]) -> tuple[np.ndarray, float
         cells = np.array([[columns.mean(), rows.mean()]]) + 0.5 if len(rows) else np.zeros((1, 2))
         ray = s.rays(cells)[0]
         rays.append(ray / np.linalg.norm(ray))
-    # The point nearest to all rays: sum (I - r r^T) (x - c) = 0.
-    across = np.eye(3) - np.einsum("ni,nj->nij", rays, rays)
-    focus = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, centers), rcond=None)[0]
+    meeting = meeting_point(*(torch.from_numpy(np.stack(each)) for each in (centers, rays)))
+    focus = meeting.numpy()
     return focus, float(max(np.linalg.norm(s.extent(focus)) for s in silhouettes))

@@ -146,30 +146,27 @@ class GHGS(nn.Module):
             InputError: a stage is missing, an option is unknown or out of range, or stages do not
                 fit each other.
         """
-        for name in STAGES:
-            require(name in config, name, "a stage of the model", "nothing")
         config = with_known_height(config, config)
         skip = read_node(config.get("skip") or {}, "skip")
-
-        def stage(name: str, **extra: Any) -> Any:
-            with torch.device("meta") if empty else nullcontext():
-                built = build(config[name], name, **extra)
-            for attribute in getattr(stages.INTERFACES.get(name), "__annotations__", ()):
-                expected = f"a stage with the attribute {attribute}"
-                require(hasattr(built, attribute), name, expected, type(built).__name__)
-            return built
-
-        encoder = stage("encoder", tokens=skip.tokens, margin=skip.margin)
-        heads = {name: stage(name, dim_latent=encoder.dim_latent) for name in HEADS}
-        # a plug-in's may not say
+        parts: dict[str, Any] = {}
+        with torch.device("meta") if empty else nullcontext():
+            for name in STAGES:
+                require(name in config, name, "a stage of the model", "nothing")
+                extra = {"dim_latent": parts["encoder"].dim_latent} if name in HEADS else {}
+                if name == "encoder":
+                    extra = {"tokens": skip.tokens, "margin": skip.margin}
+                parts[name] = build(config[name], name, **extra)
+                for attribute in getattr(stages.INTERFACES[name], "__annotations__", ()):
+                    expected = f"a stage with the attribute {attribute}"
+                    require(hasattr(parts[name], attribute), name, expected, type(parts[name]).__name__)
+            if "rounds" in config:
+                parts["rounds"] = build(config["rounds"], "rounds", channels=parts["gaussian_head"].channels)
+        # Options of a plug-in's encoder may not name layers.
         layers = getattr(read_node(config["encoder"], "encoder"), "layers", None)
-        modules = itertools.chain.from_iterable(head.modules() for head in heads.values())
-        fused = any(isinstance(module, DPTHead) for module in modules)
-        fits = layers is None or not fused or len(layers) == LEVELS
+        model = cls(**parts, skip=skip)
+        fuses = any(isinstance(module, DPTHead) for module in model.modules())
+        fits = layers is None or not fuses or len(layers) == LEVELS
         require(fits, "encoder.layers", f"{LEVELS} layers, which the dense heads fuse", list(layers or ()))
-        rounds = stage("rounds", channels=heads["gaussian_head"].channels) if "rounds" in config else None
-        others = {name: stage(name) for name in ("bounds", "unprojection")}
-        model = cls(encoder=encoder, **heads, **others, rounds=rounds, skip=skip)
         model.config = {node: config[node] for node in (*STAGES, *OPTIONS, "compat") if node in config}
         return model
 

@@ -171,8 +171,8 @@ class GaussianHead(nn.Module):
         pixel = rows.index % (height * width)
         guide = self._guide(batch, points, depth_maps)
         parts = decode(self.decoder, tokens, guide, plan.windows, plan.together)
-        of_part = self._of_subject if plan.pixels == "subject" else self._of_all
-        raw = zip(*(of_part(part, image, pixel, rows) for part in parts), strict=True)
+        everywhere = plan.pixels == "all"
+        raw = zip(*(self._of_part(part, image, pixel, rows, everywhere) for part in parts), strict=True)
         values = [torch.cat(of_parts) for of_parts in raw]
         color = values[5] if len(values) > 5 else None
         return RawGaussians(*values[:5], color, image, pixel, rows.splits(views), rows.real)
@@ -212,39 +212,31 @@ class GaussianHead(nn.Module):
             maps.append(photo_consistency(batch, DepthBounds(depth, depth), 1))
         return photo_guide(batch, *maps)
 
-    def _of_subject(
-        self, part: Part, image: Int[Tensor, " N"], pixel: Int[Tensor, " N"], rows: Rows
+    def _of_part(
+        self, part: Part, image: Int[Tensor, " N"], pixel: Int[Tensor, " N"], rows: Rows, everywhere: bool
     ) -> Sequence[Tensor]:
-        """Descriptors and raw values (:meth:`_raw`) of the pixels in a part.
+        """Descriptors and raw values (:meth:`_raw`) of the subject's pixels in a part.
 
         Args:
             part: decoded maps of consecutive images.
             image: numbers of the images (``b * V + v``) of all pixels of the subject.
             pixel: their row-major indices.
             rows: the same pixels by image.
+            everywhere: compute values of every pixel first, one image at a time, to save memory: hidden
+                layers are wider than the maps.
         """
-        row, column, within = _in_part(part, pixel, rows)
-        chosen = part.maps.permute(0, 2, 3, 1)[image[within] - part.images.start, row, column]
-        return chosen, *self._raw(chosen)
-
-    def _of_all(
-        self, part: Part, image: Int[Tensor, " N"], pixel: Int[Tensor, " N"], rows: Rows
-    ) -> Sequence[Tensor]:
-        """:meth:`_of_subject`, but computed for every pixel of the part.
-
-        Args:
-            part: decoded maps of consecutive images.
-            image: numbers of the images (``b * V + v``) of all pixels of the subject.
-            pixel: their row-major indices.
-            rows: the same pixels by image.
-        """
-        row, column, within = _in_part(part, pixel, rows)
+        within = rows.within(part.images)
+        (top, _, _), (left, _, width) = part.window
+        row = pixel[within] // width - top
+        column = pixel[within] % width - left
+        index = (image[within] - part.images.start, row, column)
         maps = part.maps.permute(0, 2, 3, 1)
+        if not everywhere:
+            chosen = maps[index]
+            return chosen, *self._raw(chosen)
         if rows.real is not None:
-            index = (image[within] - part.images.start, row, column)
             return [values[index] for values in (maps, *self._raw(maps))]
-        # One image at a time, to save memory: hidden layers are wider than the maps.
-        of_images = zip(*(values.split(rows.counts[part.images]) for values in (row, column)), strict=True)
+        of_images = zip(*(places.split(rows.counts[part.images]) for places in (row, column)), strict=True)
         each = []
         for own, index in zip(maps, of_images, strict=True):
             each.append([values[index] for values in (own, *self._raw(own))])
@@ -257,13 +249,3 @@ class GaussianHead(nn.Module):
             headers.append(self.color_header)
         offset, scale, rotation, opacity, *color = (float32_last(header, descriptors) for header in headers)
         return offset, scale, rotation, opacity[..., 0], *color
-
-
-def _in_part(
-    part: Part, pixel: Int[Tensor, " N"], rows: Rows
-) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"], slice]:
-    """Rows and columns in a part's maps of the pixels that lie in it,
-    and the slice of these pixels."""
-    within = rows.within(part.images)
-    (top, _, _), (left, _, width) = part.window
-    return pixel[within] // width - top, pixel[within] % width - left, within

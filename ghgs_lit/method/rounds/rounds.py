@@ -108,16 +108,6 @@ def prediction_of(states: Sequence[State], keeps_drafts: bool, tokens: Tokens) -
 Activate = Callable[[RawGaussians, Batch, Points, DepthMaps], Gaussians]
 
 
-def replaced(activate: Activate, training: bool) -> Activate:
-    """``activate`` for Gaussians that the next round replaces.
-
-    Args:
-        activate: gives Gaussians from their raw attributes.
-        training: whether these are made without a gradient, which the loss would not need.
-    """
-    return torch.no_grad()(activate) if training else activate
-
-
 #: A number of rounds.
 Number = Annotated[int, Field(ge=1, le=32)]
 
@@ -231,7 +221,8 @@ class Rounds(nn.Module):
         Returns:
             As many states as there are rounds, and one more.
         """
-        draft = replaced(activate, self.training)
+        # Gaussians that the next round replaces: the loss needs no gradient of them.
+        draft = torch.no_grad()(activate) if self.training else activate
         if state.gaussians is None:
             state = state.activated(draft, batch)
         if self.options.gains and batch.log_gains is None:
@@ -303,30 +294,13 @@ class Rounds(nn.Module):
             drawn, *steep = slopes(gaussians, batch, rays.direction, _footprints(state, batch, rays))
         each = observe(gaussians, batch, drawn)
         search = self._search(state, batch, rays, size * REACH)
-        rows = (each, torch.cat((search.matches, search.place, gaussians.colors, *steep), -1), memory)
-        memory, change = self._looked(*rows, windows)
+        known = torch.cat((search.matches, search.place, gaussians.colors, *steep), -1)
+        memory = remembered(self._layers, each, known, memory)
+        memory = memory if windows is None else self.exchange(memory, windows)
+        change = float32_last(self.change, memory)
         step = bounded_tanh(change[:, 0])
         moved = torch.where(step > 0, search.up, search.down) * step
         return (moved, share * change[:, 1:]), memory
-
-    def _looked(
-        self,
-        each: Float[Tensor, "N V c"],
-        known: Float[Tensor, "N k"],
-        memory: Float[Tensor, "N h"],
-        windows: Windows | None,
-    ) -> tuple[Float[Tensor, "N h"], Float[Tensor, "N c"]]:
-        """The memory after observation and exchange, and the change computed from it.
-
-        Args:
-            each: observations of each view, the own one first.
-            known: what is known of each Gaussian beside them.
-            memory: of the rounds before.
-            windows: places of the Gaussians in maps; None: nothing is exchanged.
-        """
-        memory = remembered(self._layers, each, known, memory)
-        memory = memory if windows is None else self.exchange(memory, windows)
-        return memory, float32_last(self.change, memory)
 
     @property
     def _layers(self) -> tuple[nn.Linear, ...]:
