@@ -6,7 +6,7 @@ import dataclasses
 import lightning.pytorch as L
 import pytest
 import torch
-from lightning.pytorch.accelerators import Accelerator
+from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.strategies import SingleDeviceStrategy
 from torch.utils.data import DataLoader
 
@@ -79,37 +79,11 @@ def test_every_stage_runs_there_and_predicts_the_same(kind, skip):
     assert torch.equal(found.depth_valid, expected.depth_valid)
 
 
-class PretendAccelerator(Accelerator):
+class PretendAccelerator(CPUAccelerator):
     """What Lightning asks of an accelerator."""
 
     def setup_device(self, device):
-        pass
-
-    def teardown(self):
-        pass
-
-    def get_device_stats(self, device):
-        return {}
-
-    @staticmethod
-    def parse_devices(devices):
-        return devices
-
-    @staticmethod
-    def get_parallel_devices(devices):
-        return [DEVICE]
-
-    @staticmethod
-    def auto_device_count():
-        return 1
-
-    @staticmethod
-    def is_available():
-        return True
-
-    @staticmethod
-    def name():
-        return "pretend"
+        """Nothing, where a CPU's would refuse the device."""
 
 
 def train(folder, **place):
@@ -311,18 +285,8 @@ def test_a_planted_defect_is_caught(defect, said):
 
 def test_calls_and_waits_are_counted_by_stage(monkeypatch, capsys):
     """The counts of a prediction and of a training step that the guide of GPUs shows."""
-    small = [
-        "device.py",
-        "model=recurrent",
-        "rounds.slopes=true",
-        "--batches",
-        "1",
-        "--views",
-        "2",
-        "--size",
-        "28",
-    ]
-    monkeypatch.setattr("sys.argv", small)
+    small = "device.py model=recurrent rounds.slopes=true --batches 1 --views 2 --size 28"
+    monkeypatch.setattr("sys.argv", small.split())
     device_counts.main()
     rows = {
         line.split()[0]: line.split()[1:] for line in capsys.readouterr().out.splitlines() if line.strip()

@@ -112,27 +112,38 @@ def test_sections_that_are_named_are_one_run():
     assert runs["step_training"] == (["step", "training"], 520)
 
 
-def test_a_section_that_fails_or_hangs_stops_no_other(tmp_path, monkeypatch, capsys):
+@pytest.fixture
+def session(tmp_path, monkeypatch):
+    """Runs sections whose commands are Python code, and returns the file of findings."""
+
+    def run(plans, codes):
+        monkeypatch.setattr(gpu.Session, "command", lambda _, name: [sys.executable, "-c", codes[name]])
+        options = argparse.Namespace(dry=False, gsplat=tmp_path, work=tmp_path, overrides=[])
+        rows = Rows(tmp_path / "first.jsonl")
+        gpu.Session(options, rows, plans, 60).run()
+        return rows.read()
+
+    return run
+
+
+def test_a_section_that_fails_or_hangs_stops_no_other(session, tmp_path, monkeypatch, capsys):
     """Its last lines are reported, what it has found stays,
     and the tables come from the files alone."""
-    file = tmp_path / "first.jsonl"
     line = '{"section": "step", "row": "batch of 8", "ms": 12.5}'
+    write = f"open({str(tmp_path / 'first.jsonl')!r}, 'a').write({line + chr(10)!r})"
     codes = {
         "gsplat": "pass",
-        "step": f"open({str(file)!r}, 'a').write({line + chr(10)!r}); raise ValueError('no memory')",
-        "graphs": "import time; time.sleep(60)",
+        "step": f"{write}; raise ValueError('no memory')",
+        "kernels": "import time; time.sleep(60)",
         "paper": "pass",
     }
-    monkeypatch.setattr(gpu.Session, "command", lambda _, name: [sys.executable, "-c", codes[name]])
     plans = {
         "step": gpu.Plan(30, ("gsplat",)),
-        "graphs": gpu.Plan(1, ("gsplat",), quiet=True),
+        "kernels": gpu.Plan(1, ("gsplat",), quiet=True),
         "paper": gpu.Plan(30),
     }
-    options = argparse.Namespace(dry=False, gsplat=tmp_path, work=tmp_path, overrides=[])
-    gpu.Session(options, Rows(file), plans, 60).run()
-    ends = {row["section"]: row["status"] for row in Rows(file).read() if "status" in row}
-    assert ends == {"step": "failed", "graphs": "took too long", "paper": "done"}
+    ends = {row["section"]: row["status"] for row in session(plans, codes) if "status" in row}
+    assert ends == {"step": "failed", "kernels": "took too long", "paper": "done"}
     capsys.readouterr()
     monkeypatch.setattr(sys, "argv", ["gpu.py", "--table", str(tmp_path)])
     gpu.main()
@@ -141,19 +152,15 @@ def test_a_section_that_fails_or_hangs_stops_no_other(tmp_path, monkeypatch, cap
     assert "ValueError: no memory" in printed
 
 
-def test_a_section_whose_needs_failed_is_not_run(tmp_path, monkeypatch):
+def test_a_section_whose_needs_failed_is_not_run(session):
     """gsplat that does not compile is said once for each section,
     with the compiler's last lines."""
     code = "import sys; sys.exit('nvcc: not found')"
-    monkeypatch.setattr(gpu.Session, "command", lambda _, name: [sys.executable, "-c", code])
-    options = argparse.Namespace(dry=False, gsplat=tmp_path, work=tmp_path, overrides=[])
-    rows = Rows(tmp_path / "first.jsonl")
-    gpu.Session(options, rows, {"step": gpu.Plan(30, ("gsplat",))}, 60).run()
-    [row] = rows.read()
+    [row] = session({"step": gpu.Plan(30, ("gsplat",))}, dict.fromkeys(("gsplat", "step"), code))
     assert (row["status"], row["last_lines"]) == ("gsplat failed", ["nvcc: not found"])
 
 
-def test_a_command_that_is_ended_leaves_no_section_behind(tmp_path, monkeypatch):
+def test_a_command_that_is_ended_leaves_no_section_behind(session, monkeypatch):
     """Such as by a limit of time: a GPU is not shared with what goes on."""
     started = []
 
@@ -162,10 +169,6 @@ def test_a_command_that_is_ended_leaves_no_section_behind(tmp_path, monkeypatch)
         raise SystemExit("ended by a limit of time")
 
     monkeypatch.setattr(gpu.Background, "wait", ended)
-    monkeypatch.setattr(
-        gpu.Session, "command", lambda *_: [sys.executable, "-c", "import time; time.sleep(60)"]
-    )
-    options = argparse.Namespace(dry=False, gsplat=tmp_path, work=tmp_path, overrides=[])
     with pytest.raises(SystemExit):
-        gpu.Session(options, Rows(tmp_path / "rows.jsonl"), {"machine": gpu.Plan(30)}, 60).run()
+        session({"machine": gpu.Plan(30)}, {"machine": "import time; time.sleep(60)"})
     assert [process.poll() is not None for process in started] == [True]
