@@ -94,8 +94,12 @@ class Augmentation(Options):
     @property
     def changes_photographs(self) -> bool:
         """Whether some step sees pixels of the inputs that no other step does."""
-        limits = (self.exposure, self.white_balance, self.gamma, self.cut, self.mask_offset, self.mask_ragged)
-        return self.sizes is not None or (self.chance > 0 and any((*limits, self.mask_hole_chance)))
+        limits = (self.exposure, self.white_balance, self.gamma, self.cut, *self._of_masks)
+        return self.sizes is not None or (self.chance > 0 and any(limits))
+
+    @property
+    def _of_masks(self) -> tuple[float, float, float]:
+        return self.mask_offset, self.mask_ragged, self.mask_hole_chance
 
     @property
     def varies_sizes(self) -> bool:
@@ -127,21 +131,6 @@ class Augmentation(Options):
             ] * 2
         return drawn, tuple(max(1, round(r * side)) for r, side in zip(ratios, drawn, strict=True))
 
-    def is_exact(self, seed: int, step: int) -> bool:
-        """Whether the inputs of a training step are as they are read.
-
-        Args:
-            seed: of the run.
-            step: of training.
-        """
-        limits = (
-            *(self.exposure, self.white_balance, self.gamma, self.cut, self.calibration),
-            *(self.mask_offset, self.mask_ragged, self.mask_hole_chance),
-        )
-        is_last = self.exact_from is not None and step >= self.exact_from
-        is_perfect = is_last or not any(limits)
-        return is_perfect or np.random.default_rng([seed, _CHANCE, step]).uniform() >= self.chance
-
     def imperfect(self, batch: Batch, seed: int, step: int, indices: Sequence[int]) -> Batch:
         """The batch of a step with the imperfections of captures,
         in a share ``chance`` of the steps.
@@ -155,11 +144,14 @@ class Augmentation(Options):
         Returns:
             The same batch in exact steps; otherwise as :meth:`imperfections`.
         """
-        if self.is_exact(seed, step):
+        limits = (self.exposure, self.white_balance, self.gamma, self.cut, self.calibration, *self._of_masks)
+        is_last = self.exact_from is not None and step >= self.exact_from
+        if is_last or not any(limits):
             return batch
-        return self.imperfections(
-            batch, [np.random.default_rng([seed, _IMPERFECTIONS, step, index]) for index in indices]
-        )
+        if np.random.default_rng([seed, _CHANCE, step]).uniform() >= self.chance:
+            return batch
+        rngs = [np.random.default_rng([seed, _IMPERFECTIONS, step, index]) for index in indices]
+        return self.imperfections(batch, rngs)
 
     def imperfections(self, batch: Batch, rngs: Sequence[np.random.Generator]) -> Batch:
         """The batch with the imperfections of captures;
@@ -189,7 +181,7 @@ class Augmentation(Options):
             ]
             matrices = zip(*((one.intrinsics, one.extrinsics) for one in wrong), strict=True)
             cameras = Cameras(*map(torch.stack, matrices), cameras.height, cameras.width)
-        if self.mask_offset or self.mask_ragged or self.mask_hole_chance:
+        if any(self._of_masks):
             known = masks.to(images) if alpha is None else alpha
             segmented = [
                 self._segmented(images[b], masks[b], known[b], s[2], s[3]) for b, s in enumerate(streams)
@@ -218,7 +210,10 @@ class Augmentation(Options):
         Returns:
             Images, masks and mattes of the same shapes.
         """
-        wrong = self._masks(masks, outlines)
+        limits = (self.mask_offset, self.mask_ragged, HOLE, self.mask_hole_chance)
+        wrong = torch.from_numpy(
+            np.stack([imperfect_mask(mask, *limits, outlines) for mask in masks.numpy()])
+        )
         has_background, is_refined = behind.uniform(size=2) < (self.background, self.refined)
         if not has_background:
             # Pixels that the segmentation adds are counted as a whole.
@@ -241,7 +236,3 @@ class Augmentation(Options):
         refined = torch.where(kept, refined, wrong.to(images))
         images = torch.where(kept[:, None], subjects.movedim(-1, 1), photographs * wrong[:, None])
         return images, refined > 0.5, refined
-
-    def _masks(self, masks: Tensor, rng: np.random.Generator) -> Tensor:
-        limits = (self.mask_offset, self.mask_ragged, HOLE, self.mask_hole_chance)
-        return torch.from_numpy(np.stack([imperfect_mask(mask, *limits, rng) for mask in masks.numpy()]))

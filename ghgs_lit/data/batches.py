@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from ghgs_lit.data.augmentation import Augmentation, Size
 from ghgs_lit.data.reader import PhotographCache
-from ghgs_lit.data.sampling import Photo, SampleSpec, TrainingSampler, photo_name
+from ghgs_lit.data.sampling import Sample, TrainingSampler, photo_name
 from ghgs_lit.data.view import View
 from ghgs_lit.runtime.cores import allowed_cores, use_known_start_method
 from ghgs_lit.types import Batch, Cameras, Targets
@@ -47,58 +47,43 @@ class BatchBuilder:
     target_depths: bool = True
 
     def batch(
-        self, specs: Sequence[SampleSpec], size: Size | None = None, target_size: Size | None = None
+        self, samples: Sequence[Sample], size: Size | None = None, target_size: Size | None = None
     ) -> Batch:
         """Batch of samples with equal numbers of inputs and equal target protocols (or none).
 
         Args:
-            specs: the samples, at least one.
+            samples: the samples, at least one.
             size: (height, width) of the inputs in pixels; None: that of their photographs.
             target_size: (height, width) of the targets in pixels; None: that of their photographs.
 
         Raises:
             InputError: a file is missing or bad.
         """
-        inputs = [_views(self.inputs, s.subject, s.inputs, self.depths, size) for s in specs]
-        bodies = [self.inputs.body(s.subject) for s in specs]
+        inputs = [self.inputs.views(s.subject, s.inputs, self.depths, size) for s in samples]
+        bodies = [self.inputs.body(s.subject) for s in samples]
         known = all(body is not None for body in bodies)
         return Batch(
             images=_images(inputs),
             masks=_stacked(inputs, "mask"),
             cameras=_cameras(inputs),
-            targets=self._targets(specs, target_size) if specs[0].targets else None,
+            targets=self._targets(samples, target_size) if samples[0].targets else None,
             body_vertices=list(map(torch.from_numpy, bodies)) if known else None,
             depths=_stacked(inputs, "depth"),
             alpha=_stacked(inputs, "alpha"),
-            subjects=tuple(s.subject for s in specs),
-            views=tuple(tuple(map(photo_name, s.inputs)) for s in specs),
+            subjects=tuple(s.subject for s in samples),
+            views=tuple(tuple(map(photo_name, s.inputs)) for s in samples),
         )
 
-    def _targets(self, specs: Sequence[SampleSpec], size: Size | None) -> Targets:
-        views = [_views(self.targets, s.subject, s.targets, self.target_depths, size) for s in specs]
+    def _targets(self, samples: Sequence[Sample], size: Size | None) -> Targets:
+        views = [self.targets.views(s.subject, s.targets, self.target_depths, size) for s in samples]
         return Targets(
             images=_images(views),
             masks=_stacked(views, "mask"),
             cameras=_cameras(views),
-            names=tuple(tuple(map(photo_name, s.targets)) for s in specs),
-            protocols=specs[0].protocols,
+            names=tuple(tuple(map(photo_name, s.targets)) for s in samples),
+            protocols=samples[0].protocols,
             depths=_stacked(views, "depth"),
         )
-
-
-def _views(
-    photographs: PhotographCache, subject: str, photos: Sequence[Photo], depth: bool, size: Size | None
-) -> list[View]:
-    """Photographs of a subject.
-
-    Args:
-        photographs: where they are read.
-        subject: its name.
-        photos: (position, view) of each.
-        depth: whether depth maps are read, if there are any.
-        size: (height, width) in pixels; None: that of ``photographs``.
-    """
-    return [photographs.view(subject, *photo, depth=depth, size=size) for photo in photos]
 
 
 def _images(views: list[list[View]]) -> Tensor:
@@ -159,22 +144,22 @@ class EvaluationBatches(Dataset):
 
     Args:
         builder: reads samples.
-        specs: the samples.
+        samples: the samples.
         batch_size: largest number of samples in an item.
     """
 
-    def __init__(self, builder: BatchBuilder, specs: Sequence[SampleSpec], batch_size: int) -> None:
+    def __init__(self, builder: BatchBuilder, samples: Sequence[Sample], batch_size: int) -> None:
         self.builder = builder
-        self.specs = []
-        for _, group in groupby(specs, lambda s: s.protocols):
+        self.groups = []
+        for _, group in groupby(samples, lambda s: s.protocols):
             alike = list(group)
-            self.specs += [alike[i : i + batch_size] for i in range(0, len(alike), batch_size)]
+            self.groups += [alike[i : i + batch_size] for i in range(0, len(alike), batch_size)]
 
     def __len__(self) -> int:
-        return len(self.specs)
+        return len(self.groups)
 
     def __getitem__(self, index: int) -> Batch:
-        return self.builder.batch(self.specs[index])
+        return self.builder.batch(self.groups[index])
 
 
 class StepSampler(DistributedSampler):

@@ -24,7 +24,7 @@ from ghgs_lit.data.packed import Packing, folder_of, packed_reader
 from ghgs_lit.data.reader import PHASES, PhotographCache
 from ghgs_lit.data.sampling import (
     RING_VIEW,
-    SampleSpec,
+    Sample,
     TargetProtocol,
     TrainingSampler,
     ViewProtocol,
@@ -298,7 +298,7 @@ class PhotographsDataModule(LightningDataModule):
 
     def _evaluation_samples(
         self, subjects: Mapping[str, tuple[int, ...]], protocols: Sequence[TargetProtocol], views: int | None
-    ) -> list[SampleSpec]:
+    ) -> list[Sample]:
         """Fixed samples, one for each subject.
 
         Args:

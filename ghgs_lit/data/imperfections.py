@@ -5,7 +5,6 @@ The number of random numbers that a function draws does not depend on its limits
 """
 
 import dataclasses
-import itertools
 import math
 
 import numpy as np
@@ -225,13 +224,12 @@ def miscalibrated(
 def _corners(masks: Bool[Tensor, "V H W"]) -> Float[Tensor, "V 4 2"]:
     """Corners of the boxes around masks, in pixels; those of the photograph for an empty mask."""
     masks = torch.where(masks.any((1, 2), keepdim=True), masks, True)
-    ends = []
-    for mask, axis in itertools.product(masks, (0, 1)):
-        line = mask.any(axis).nonzero()[:, 0]
-        ends.append(torch.stack((line[0], line[-1] + 1)))
-    ends = torch.stack(ends).reshape(len(masks), 2, 2)
-    corners = itertools.product((0, 1), (0, 1))
-    return torch.stack([ends[:, [0, 1], corner] for corner in corners], 1).double()
+    corners = []
+    for mask in masks:
+        columns = mask.any(0).nonzero()[[0, -1], 0] + torch.tensor([0, 1])
+        rows = mask.any(1).nonzero()[[0, -1], 0] + torch.tensor([0, 1])
+        corners.append(torch.cartesian_prod(columns, rows))
+    return torch.stack(corners).double()
 
 
 def _of_each(matrices: Float[Tensor, "V n m"]) -> Float[Tensor, "V 4 n m"]:

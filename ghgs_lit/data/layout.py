@@ -19,11 +19,10 @@ Data without ``rendering/`` was made elsewhere and counts as complete.
 import itertools
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -61,15 +60,6 @@ class Completeness:
         return self.folder.is_dir()
 
     @property
-    def lights(self) -> str | None:
-        """``data.render.lights`` of the renders: ``studio`` or ``none``;
-        None: they were made elsewhere."""
-        path = self.folder / "settings.json"
-        settings = read_json(path) if path.exists() else {}
-        render = settings.get("render") if isinstance(settings, dict) else None
-        return None if not isinstance(render, dict) else lights_of(render)
-
-    @property
     def plan(self) -> dict[str, list[str]]:
         """Requested subjects of each phase, complete or not."""
         path = self.folder / "plan.json"
@@ -98,28 +88,6 @@ class Completeness:
             names: of the subjects.
         """
         return [name for name in names if not self.marker(phase, name).exists()] if self.rendered_here else []
-
-    def whole(self, phase: str, names: Sequence[str]) -> list[str]:
-        """Those of several subjects that are completely rendered.
-
-        Args:
-            phase: ``train`` or ``val``.
-            names: of the subjects.
-        """
-        missing = set(self.missing(phase, names))
-        return [name for name in names if name not in missing]
-
-
-def lights_of(render: Mapping[str, Any]) -> str:
-    """Lights of renders.
-
-    Args:
-        render: stored settings of the renders, which hold the lights themselves.
-
-    Returns:
-        ``studio`` or ``none``.
-    """
-    return "none" if render.get("lights") == "none" else "studio"
 
 
 _IMAGE_SUFFIXES = (".jpg", ".png", ".jpeg")
@@ -186,19 +154,6 @@ class Layout(Reader):
         integer = pixel_centers == "auto" and not self._complete.rendered_here
         self._shift = 0.5 if integer or pixel_centers == "integer" else 0.0
         self._folders: dict[str, Path] = {}
-        self.find(phase, names, limit)
-
-    def find(self, phase: str, names: Sequence[str] | None, limit: int | None = None) -> None:
-        """Fill ``subjects`` with complete ones.
-
-        Args:
-            phase: ``train`` or ``val``.
-            names: subjects to read; None: all of the phase.
-            limit: number of subjects, the first ones; None: all.
-
-        Raises:
-            InputError: as for the class.
-        """
         require_folder(self.root, "the root of a rendered data set")
         phases = [phase] if names is None else [phase, *(p for p in PHASES if p != phase)]
         stored = {p: _positions(self.root / p / "img") for p in phases}
@@ -214,8 +169,10 @@ class Layout(Reader):
         homes = {}
         for name in wanted:
             homes[name] = next((p for p in phases if name in stored[p]), phase)
-        half = self._complete.missing
-        missing = [name for name, home in homes.items() if name not in stored[home] or half(home, [name])]
+        missing = []
+        for name, home in homes.items():
+            if name not in stored[home] or self._complete.missing(home, [name]):
+                missing.append(name)
         if missing and self.strict:
             raise InputError(
                 f"{images}: expected {len(wanted)} whole subjects; found {len(wanted) - len(missing)} "
@@ -288,21 +245,18 @@ class Layout(Reader):
         image = read_photograph(self._file(name, "img", position, str(view), _IMAGE_SUFFIXES))
         size = image.shape[:2]
         mask = read_map(self._file(name, "mask", position, f"{view}.png"), size)
-        path = self._file(name, "depth", position, f"{view}.png")
         inverse = None
+        path = self._file(name, "depth", position, f"{view}.png")
         if depth and path.exists():
             inverse = read_map(path, size)
-            if inverse.dtype == np.uint8:
-                raise InputError(f"{path}: expected 16 bits of inverse depth; found 8")
-            if inverse.min() < 0 or inverse.max() > np.iinfo(np.uint16).max:
-                raise InputError(
-                    f"{path}: expected 16 bits of inverse depth; found {inverse.min()} to {inverse.max()}"
-                )
+            found = "8" if inverse.dtype == np.uint8 else f"{inverse.min()} to {inverse.max()}"
+            if inverse.dtype == np.uint8 or inverse.min() < 0 or inverse.max() > np.iinfo(np.uint16).max:
+                raise InputError(f"{path}: expected 16 bits of inverse depth; found {found}")
             inverse = inverse.astype(np.uint16)
-            seen = inverse.any() or not mask.any()
-            require(seen, str(path), "inverse depth above 0 at the subject", "0 everywhere")
-        path = self._file(name, "alpha", position, f"{view}.png")
+            is_seen = inverse.any() or not mask.any()
+            require(is_seen, str(path), "inverse depth above 0 at the subject", "0 everywhere")
         matte = None
+        path = self._file(name, "alpha", position, f"{view}.png")
         if path.exists():
             matte = read_map(path, size)
             if matte.dtype != np.uint8:

@@ -189,6 +189,16 @@ class PhotographCache:
 
         return self._cached((name, position, view, depth, size), read)
 
+    def views(
+        self,
+        name: str,
+        photos: Iterable[tuple[int, int]],
+        depth: bool = True,
+        size: tuple[int, int] | None = None,
+    ) -> list[View]:
+        """Several photographs of a subject, each by its position and view, as :meth:`view`."""
+        return [self.view(name, *photo, depth, size) for photo in photos]
+
     def body(self, name: str) -> np.ndarray | None:
         """Body vertices as :meth:`Reader.read_body`.
 

@@ -43,7 +43,7 @@ def subject_rng(seed: int, name: str) -> np.random.Generator:
 
 
 @dataclass(frozen=True)
-class SampleSpec:
+class Sample:
     """Photographs of a subject that make one sample, and the protocol of each target."""
 
     subject: str
@@ -259,7 +259,7 @@ class TrainingSampler:
                     f"draw {most} views from; found {len(positions)}"
                 )
 
-    def batch(self, step: int, rank: int = 0, world: int = 1) -> list[SampleSpec]:
+    def batch(self, step: int, rank: int = 0, world: int = 1) -> list[Sample]:
         """Samples of one process at a step, with equal numbers of inputs.
 
         Args:
@@ -282,7 +282,7 @@ class TrainingSampler:
         first = (step * world + rank) * self.batch_size
         return range(first, first + self.batch_size)
 
-    def _sample(self, step: int, index: int, count: int) -> SampleSpec:
+    def _sample(self, step: int, index: int, count: int) -> Sample:
         """A sample of the run, which takes all subjects in a new random order each epoch.
 
         Args:
@@ -297,7 +297,7 @@ class TrainingSampler:
         available = self.subjects[name]
         inputs = self.views.draw(available, count, self.ring, rng)
         targets = self.targets.draw(available, inputs, self.targets.per_step, rng)
-        return SampleSpec(name, ring_photos(inputs), targets, (self.targets.name,) * len(targets))
+        return Sample(name, ring_photos(inputs), targets, (self.targets.name,) * len(targets))
 
 
 def evaluation_samples(
@@ -307,7 +307,7 @@ def evaluation_samples(
     ring: int,
     seed: int,
     positions: Sequence[Sequence[int]] = (),
-) -> list[SampleSpec]:
+) -> list[Sample]:
     """One fixed sample for each subject, with the targets of all ``protocols`` one after another.
 
     Args:
@@ -336,5 +336,5 @@ def evaluation_samples(
         names = []
         for protocol, photos in zip(protocols, each, strict=True):
             names += [protocol.name] * len(photos)
-        specs.append(SampleSpec(name, ring_photos(inputs), tuple(itertools.chain(*each)), tuple(names)))
+        specs.append(Sample(name, ring_photos(inputs), tuple(itertools.chain(*each)), tuple(names)))
     return specs
