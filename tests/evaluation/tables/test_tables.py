@@ -148,6 +148,16 @@ def test_other_views_and_targets_are_other_rows(tmp_path, key, values, title, se
     assert list(table.cells["mean"][:, 0, "psnr"]) == [23.0, 24.0]
 
 
+def test_a_subject_counts_once_however_many_targets_it_has(tmp_path):
+    path = write_run(tmp_path, "full", 20.0, views=(4,))
+    content = json.loads(path.read_text())
+    of_a, of_b = content["rows"]
+    content["rows"] = [of_a, {**of_a, "target": "001/3", "psnr": 26.0}, of_b]
+    path.write_text(json.dumps(content))
+    (table,) = tables_of(tmp_path, metrics=("psnr",))
+    assert list(table.measured["mean"]) == [((23.0 + 26.0) / 2 + 25.0) / 2]
+
+
 def test_where_an_encoder_comes_from_makes_no_second_row(tmp_path):
     """The results of a run name it; its configuration before training does not."""
     path = write_run(tmp_path / "0", "full", 20.0, encoder={"weights": "vggt.safetensors"})
