@@ -9,6 +9,7 @@ from lightning.pytorch.callbacks import Callback, Timer
 
 from ghgs_lit.config.options import Options
 from ghgs_lit.method.model import STAGES
+from ghgs_lit.method.rounds import NoRounds
 from ghgs_lit.runtime.allocation import forget_peak, resident_bytes
 from ghgs_lit.runtime.watching import Stopwatch, watched
 
@@ -52,7 +53,9 @@ class Costs(Callback):
         if self._is_captured:
             self._watch.begin("forward")
         else:
-            self._stack.enter_context(watched(pl_module, _PLACES, self._watch))
+            has_rounds = not isinstance(getattr(pl_module.model, "rounds", None), NoRounds)
+            places = {part: place for part, place in _PLACES.items() if part != "rounds" or has_rounds}
+            self._stack.enter_context(watched(pl_module, places, self._watch))
 
     def on_before_backward(self, *args: Any) -> None:
         """The backward pass begins."""
