@@ -118,19 +118,6 @@ def test_neighbors_are_searched_once_an_element(monkeypatch):
     assert len(calls) == 2
 
 
-def test_elements_of_a_batch_do_not_mix():
-    """A result does not depend on other elements of the batch."""
-    tokens, points = scene()
-    together = make_stage()(tokens, points)
-    moved = dataclasses.replace(points, tokens=points.tokens + 100 * (tokens.image[:, None] < 3))
-    other = dataclasses.replace(
-        tokens, latent=tuple(torch.where(tokens.image[:, None] < 3, t + 1, t) for t in tokens.latent)
-    )
-    found = make_stage()(other, moved)
-    second = tokens.image >= 3
-    torch.testing.assert_close(found.latent[0][second], together.latent[0][second])
-
-
 def test_a_share_of_the_tokens_is_a_number_for_each_element():
     """A tenth of 40 and of 25 tokens; one at least. A number means the same whatever the size."""
     assert [neighbor_count(0.1, count) for count in (40, 25, 3, 0)] == [4, 2, 1, 1]
@@ -146,19 +133,6 @@ def test_a_share_of_the_tokens_is_a_number_for_each_element():
         own = tokens.image // 3 == element
         number = make_stage(k=round(0.3 * size))(tokens, points)
         assert torch.equal(share.latent[0][own], number.latent[0][own])
-
-
-def test_order_of_the_views_does_not_matter():
-    """Permuting the views only permutes the tokens."""
-    tokens, points = scene(((5, 6, 4),))
-    order = torch.tensor([2, 0, 1])
-    index = (order[:, None] * 16 + torch.arange(16)).flatten()
-    swapped = dataclasses.replace(
-        tokens, latent=tuple(t[index] for t in tokens.latent), semantic=tokens.semantic[index]
-    )
-    moved = dataclasses.replace(points, tokens=points.tokens[index], tokens_valid=points.tokens_valid[index])
-    expected, found = make_stage()(tokens, points), make_stage()(swapped, moved)
-    torch.testing.assert_close(found.latent[1], expected.latent[1][index], atol=1e-5, rtol=0)
 
 
 def test_neighborhoods():

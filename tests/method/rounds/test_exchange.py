@@ -8,7 +8,7 @@ import torch
 from scipy.signal import correlate
 
 from ghgs_lit.extents import extents
-from ghgs_lit.method.rounds.exchange import SIDE, Exchange, Windows
+from ghgs_lit.method.rounds.exchange import Exchange, Windows
 
 HEIGHT, WIDTH, KNOWN, CHANNELS = 13, 17, 6, 3
 
@@ -66,17 +66,6 @@ def test_windows_give_what_whole_images_give():
     assert np.allclose(found.detach().numpy(), expected(exchange, raw, known), rtol=0, atol=1e-12)
 
 
-def test_nothing_comes_from_farther_away_or_from_another_image():
-    raw, batch = scene(blobs())
-    known = torch.randn(len(raw.image), KNOWN, dtype=torch.float64, requires_grad=True)
-    one = int((raw.image == 2).nonzero()[4])
-    trained()(known, Windows.of(raw, batch))[one].sum().backward()
-    row, column = raw.pixel // WIDTH, raw.pixel % WIDTH
-    near = (row - row[one]).abs().maximum((column - column[one]).abs()) <= SIDE // 2
-    heard = known.grad.abs().sum(1) > 0
-    assert torch.equal(heard, near & (raw.image == raw.image[one]))
-
-
 def test_gradients_in_float64():
     masks = torch.zeros(1, HEIGHT, WIDTH, dtype=torch.bool)
     masks[0, 2:4, 5:8] = True
@@ -97,16 +86,6 @@ def test_images_without_a_subject(filled):
     found = exchange(known, windows).detach().numpy()
     assert found.shape == known.shape
     assert np.allclose(found, expected(exchange, raw, known), rtol=0, atol=1e-12)
-
-
-def test_a_batch_mate_of_another_size_changes_nothing_beyond_rounding():
-    masks = blobs()
-    raw, batch = scene(masks)
-    known, exchange = torch.randn(len(raw.image), KNOWN, dtype=torch.float64), trained()
-    together = exchange(known, Windows.of(raw, batch))
-    chosen = raw.image == 0
-    alone_raw, alone = scene(masks[:1])
-    assert torch.allclose(together[chosen], exchange(known[chosen], Windows.of(alone_raw, alone)))
 
 
 def test_untrained_it_adds_nothing():
