@@ -25,7 +25,7 @@ from ghgs_lit.method.heads.attributes import FootprintAttributes, release_attrib
 from ghgs_lit.method.heads.depth import BOUNDED, bounded_depth, inverse_linear
 from ghgs_lit.method.plan.window import Span, Window
 from ghgs_lit.method.recalibration import Neighborhood, SemanticAttention
-from ghgs_lit.ops.activation import confidence_of
+from ghgs_lit.ops.activation import confidence_of, footprint_attributes
 from ghgs_lit.ops.photo_consistency import photo_consistency
 from ghgs_lit.types import DepthBounds, DepthMaps
 from tests.helpers.scenes import make_batch, training_batch
@@ -76,7 +76,7 @@ FUNCTIONS = {
     },
     "depth inverse_linear": (inverse_linear, (values(6, low=0.2),)),
     "attributes footprint": (
-        FootprintAttributes(),
+        lambda *raws: footprint_attributes(*raws, FootprintAttributes().constants(0.05, 0.0)),
         (values(4, 3), values(4, 3), values(4, 4), values(4), values(4, low=0.01, high=0.02)),
     ),
     "attributes release": (

@@ -5,7 +5,7 @@ import torch
 
 from ghgs_lit.method.heads.attributes import FootprintAttributes
 from ghgs_lit.method.heads.depth import BOUNDED, bounded_depth, inverse_linear
-from ghgs_lit.ops.activation import bounded_sigmoid, bounded_tanh, confidence_of
+from ghgs_lit.ops.activation import bounded_sigmoid, bounded_tanh, confidence_of, footprint_attributes
 
 FAR_OUT = (-1e4, -90.0, -17.0, 17.0, 90.0, 1e4)
 
@@ -43,11 +43,16 @@ def test_a_saturated_depth_recovers(name, raw):
     assert x.abs() < 10
 
 
+def attributes(*raws, limit=0.05):
+    """Attributes of raw values and footprints, with the constants of the default options."""
+    return footprint_attributes(*raws, FootprintAttributes().constants(limit, 0.0))
+
+
 def test_offsets_go_as_far_as_their_limit():
     """Without one, as published, as far as the network says: 5 cm for a raw value of 1."""
     raws = [torch.full(shape, 40.0) for shape in ((1, 3), (1, 3), (1, 4), (1,), (1,))]
     for limit, expected in ((0.05, 0.05), (0.2, 0.2), (None, 2.0)):
-        offset = FootprintAttributes()(*raws, limit)[0]
+        offset = attributes(*raws, limit=limit)[0]
         torch.testing.assert_close(offset, torch.full((1, 3), expected), rtol=0.03, atol=0)
 
 
@@ -55,7 +60,7 @@ def test_offsets_go_as_far_as_their_limit():
 def test_saturated_attributes_keep_a_gradient(raw):
     """Offsets had none from 10 on, scales and opacities none from 20 on."""
     raws = [torch.full(shape, raw, requires_grad=True) for shape in ((1, 3), (1, 3), (1, 4), (1,))]
-    values = FootprintAttributes()(*raws, torch.full((1,), 0.004))
+    values = attributes(*raws, torch.full((1,), 0.004))
     towards_zero = 1.0 if raw > 0 else -1.0
     for name, x, value in zip(("offset", "scale", "rotation", "opacity"), raws, values, strict=True):
         assert value.isfinite().all(), name
@@ -69,7 +74,7 @@ def test_the_rotation_near_minus_identity_has_a_bounded_gradient():
     as 1 / |q|."""
     rotation = torch.tensor([[-1.0, 1e-9, 0.0, 0.0]], requires_grad=True)
     zeros = torch.zeros(1, 3)
-    quaternions = FootprintAttributes()(zeros, zeros, rotation, torch.zeros(1), torch.ones(1))[2]
+    quaternions = attributes(zeros, zeros, rotation, torch.zeros(1), torch.ones(1))[2]
     (gradient,) = torch.autograd.grad(quaternions[0, 2], rotation)
     assert gradient.abs().max() <= 10.0 + 1e-4
 

@@ -15,7 +15,6 @@ from ghgs_lit.geometry.rotations import unit
 from ghgs_lit.ops.activation import (
     Attributes,
     Constants,
-    footprint_attributes,
 )
 
 #: Offset of a Gaussian from its pixel's point along each axis, in metres, for a raw value of 1
@@ -138,28 +137,6 @@ class FootprintAttributes(Options):
         offsets = (offset_limit or 0.0, OFFSET_UNIT, self.inward)
         size = (self.scale_floor, self.scale_range, *self.scale_biases)
         return Constants(*offsets, *size, self.opacity_floor, self.opacity_bias, color_limit)
-
-    def __call__(
-        self,
-        offset: Float[Tensor, "N 3"],
-        scale: Float[Tensor, "N 3"],
-        rotation: Float[Tensor, "N 4"],
-        opacity: Float[Tensor, " N"],
-        footprint: Float[Tensor, " N"],
-        offset_limit: float | None = OFFSET_UNIT,
-    ) -> Attributes:
-        """Offsets in metres, scales in metres, quaternions and opacities.
-
-        Args:
-            offset: raw, as are all but the last two.
-            scale: raw.
-            rotation: raw.
-            opacity: raw.
-            footprint: side of a pixel at each Gaussian's depth, in metres.
-            offset_limit: of ``gaussian_head``, in metres; None: none.
-        """
-        constants = self.constants(offset_limit, 0.0)
-        return footprint_attributes(offset, scale, rotation, opacity, footprint, constants)
 
 
 def release_attributes(
