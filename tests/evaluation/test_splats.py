@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ghgs_lit.config import run_of
-from ghgs_lit.evaluation.baselines.splats import (
+from ghgs_lit.evaluation.baselines import (
     CHANGES,
     PerScene,
     _shared,
