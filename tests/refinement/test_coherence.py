@@ -90,12 +90,16 @@ def test_exact_cameras_stay():
     assert torch.equal(found.intrinsics, truth.cameras.intrinsics)
 
 
+def second_is_off(pixels):
+    """Two elements, of which the first has exact cameras."""
+    truth = figure(batch=2)
+    poses = torch.stack((truth.cameras.extrinsics[0], off(truth, pixels, (0, 5)).cameras.extrinsics[1]))
+    return dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, extrinsics=poses))
+
+
 def test_distances_tell_exact_cameras_from_others():
     """Those of the given cameras, in pixels, for each element."""
-    truth = figure(batch=2)
-    poses = torch.stack((truth.cameras.extrinsics[0], off(truth, 4.0, (0, 5)).cameras.extrinsics[1]))
-    cameras = dataclasses.replace(truth.cameras, extrinsics=poses)
-    _, _, distances = coherent_cameras(dataclasses.replace(truth, cameras=cameras))
+    _, _, distances = coherent_cameras(second_is_off(4.0))
     assert 0 <= distances[0] < 1.5e-4
     assert 3e-3 < distances[1] < 1
 
@@ -103,12 +107,10 @@ def test_distances_tell_exact_cameras_from_others():
 def test_a_quick_look_tells_exact_cameras_from_others():
     """Also ones that are off by a pixel or two, each element by itself;
     nothing without an outline."""
-    truth = figure(batch=2)
-    poses = torch.stack((truth.cameras.extrinsics[0], off(truth, 3.0, (0, 5)).cameras.extrinsics[1]))
-    cameras = dataclasses.replace(truth.cameras, extrinsics=poses)
-    exact, wrong = contradiction(dataclasses.replace(truth, cameras=cameras))[0]
+    batch = second_is_off(3.0)
+    exact, wrong = contradiction(batch)[0]
     assert exact < 2e-3 < 4e-3 < wrong
-    nothing = dataclasses.replace(truth, masks=truth.masks & False, alpha=0 * truth.alpha)
+    nothing = dataclasses.replace(batch, masks=batch.masks & False, alpha=0 * batch.alpha)
     assert not any(distances.any() for distances in contradiction(nothing))
 
 
@@ -239,13 +241,17 @@ def test_a_clear_culprit_is_named_and_one_of_two_is_not():
     assert culprit([2e-5, 0.0, 3e-5, 1e-5]) is None
 
 
+def with_zooms(truth, zooms):
+    lens = truth.cameras.intrinsics.clone()
+    lens[..., [0, 1], [0, 1]] *= zooms[:, None]
+    return dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, intrinsics=lens))
+
+
 @pytest.mark.parametrize("zoomed", [1, 3])
 def test_a_wrong_focal_length_comes_back(zoomed):
     """One lens is longer than it was: the others agree without it, and stay."""
     truth = figure()
-    lens = truth.cameras.intrinsics.clone()
-    lens[:, zoomed, [0, 1], [0, 1]] *= 1.06
-    wrong = dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, intrinsics=lens))
+    wrong = with_zooms(truth, torch.ones(4).index_fill(0, torch.tensor([zoomed]), 1.06))
     found, free, _ = coherent_cameras(wrong)
     assert free[0].nonzero().tolist() == [[zoomed]]
     assert pixels_off(found, truth) < 0.4 * pixels_off(wrong.cameras, truth)
@@ -256,9 +262,7 @@ def test_focal_lengths_that_contradict_one_another_come_nearer(monkeypatch):
     truth = figure()
     zoom = torch.tensor([1.0, 1.06, 1.0, 1.0])
     zoom = zoom / zoom.log().mean().exp()  # what all share, they do not show
-    lens = truth.cameras.intrinsics.clone()
-    lens[..., [0, 1], [0, 1]] *= zoom[:, None]
-    wrong = dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, intrinsics=lens))
+    wrong = with_zooms(truth, zoom)
     monkeypatch.setattr(coherence, "_minority", lambda *_: None)
     found, _, _ = coherent_cameras(wrong)
     left = (found.intrinsics / truth.cameras.intrinsics)[0, :, 0, 0].log()
