@@ -58,15 +58,6 @@ def test_a_resumed_run_knows_how_many_batches_it_has_had(step, accumulated, leng
     assert trained_batches(None, length) == 0
 
 
-def test_targets_have_their_own_size(boxes):
-    """Inputs stay small where photographs are compared at twice their size."""
-    data = rendered(boxes, size=14, target_size=28)
-    batch = data.training_batch(0)
-    assert batch.images.shape[-2:] == batch.masks.shape[-2:] == (14, 14)
-    assert batch.targets.images.shape[-2:] == batch.targets.masks.shape[-2:] == (28, 28)
-    assert (batch.targets.cameras.height, batch.targets.cameras.width) == (28, 28)
-
-
 def test_depths_are_read_where_something_compares_with_them(boxes):
     """Training without a term of depths reads none; evaluation measures depths all the same."""
     data = rendered(boxes)
@@ -74,14 +65,6 @@ def test_depths_are_read_where_something_compares_with_them(boxes):
     data.trains_on_depths = False
     assert data.training_batch(0).depths is None
     assert data.evaluation_batch("s4").depths is not None
-
-
-def test_evaluation_has_the_batches_that_are_asked_for(boxes):
-    """Of the data set's size unless another is given, as for measuring one subject at a time."""
-    data = rendered(boxes, batch_size=2)
-    assert [len(batch.images) for batch in data.evaluation_loader()] == [2]
-    assert [len(batch.images) for batch in data.evaluation_loader(batch_size=1)] == [1, 1]
-    assert [batch.images.shape[1] for batch in data.evaluation_loader(views=3)] == [3]
 
 
 @pytest.mark.parametrize("rank", [0, 1])

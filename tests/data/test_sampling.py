@@ -37,11 +37,10 @@ def between(a, b) -> np.ndarray:
     return np.abs((a - b + 180) % 360 - 180)
 
 
-def test_even_positions_are_the_protocols():
+@pytest.mark.parametrize(("count", "positions"), [(3, [0, 5, 10]), (4, [0, 4, 8, 12]), (5, [0, 3, 6, 9, 12])])
+def test_even_positions_are_the_protocols(count, positions):
     """The inputs of the published protocols for 3, 4 and 5 views."""
-    assert even_positions(16, 3) == [0, 5, 10]
-    assert even_positions(16, 4) == [0, 4, 8, 12]
-    assert even_positions(16, 5) == [0, 3, 6, 9, 12]
+    assert even_positions(16, count) == positions
 
 
 @pytest.mark.parametrize("count", [3, 4, 5])
@@ -91,13 +90,13 @@ def test_targets_stand_where_their_protocol_says(boxes, count):
         )
 
 
-def test_middle_wraps_around_the_ring():
+@pytest.mark.parametrize(
+    ("first", "second", "photo"),
+    [(0, 5, (2, 3)), (12, 0, (14, 0)), (10, 0, (13, 0)), (15, 0, (15, 3)), (15, 2, (0, 3))],
+)
+def test_middle_wraps_around_the_ring(first, second, photo):
     """The middle of two positions is right across the end of the ring."""
-    assert middle(0, 5, 16) == (2, 3)
-    assert middle(12, 0, 16) == (14, 0)
-    assert middle(10, 0, 16) == (13, 0)
-    assert middle(15, 0, 16) == (15, 3)
-    assert middle(15, 2, 16) == (0, 3)
+    assert middle(first, second, 16) == photo
 
 
 def test_release_beside_every_input_and_listed_positions():

@@ -43,17 +43,12 @@ def test_ranges_of_ids():
         read_split({"train": ["0000"]}, names)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 4])
-def test_few_scans_leave_somebody_to_validate(tmp_path, count):
-    """A tenth of four scans is none: training and evaluation failed on a folder that was
-    never written."""
+@pytest.mark.parametrize(
+    ("count", "fraction", "measured"), [(1, 0.1, 1), (2, 0.1, 1), (4, 0.1, 1), (4, 0.0, 0), (2, 1, 2)]
+)
+def test_few_scans_leave_somebody_to_validate(tmp_path, count, fraction, measured):
+    """A tenth of four scans is one; all can be measured, or none."""
     names = [f"s{i}" for i in range(count)]
-    drawn = split_names(tmp_path, names, None, 0.1, 0)
-    assert len(drawn["val"]) == 1
+    drawn = split_names(tmp_path, names, None, fraction, 0)
+    assert len(drawn["val"]) == measured
     assert sorted(drawn["train"] + drawn["val"]) == names
-    assert split_names(tmp_path, names, None, 0.0, 0) == {"train": names, "val": []}
-
-
-def test_all_scans_can_be_measured(tmp_path):
-    """data.val_fraction=1: nobody is trained on."""
-    assert split_names(tmp_path, ["a", "b"], None, 1, 0) == {"train": [], "val": ["a", "b"]}
