@@ -11,7 +11,7 @@ from ghgs_lit.method.bounds import SubjectBox
 from ghgs_lit.method.heads.depth import BOUNDED, DepthHeadOptions
 from ghgs_lit.method.model import GHGS
 from ghgs_lit.types import Batch, Cameras, DepthMaps, Tokens
-from ghgs_lit.weights import names
+from ghgs_lit.weights import published
 from ghgs_lit.weights.switches import release_switches
 from tests.helpers.models import config, make_model, predict
 from tests.helpers.plans import plan_of
@@ -53,7 +53,7 @@ def test_the_releases_model_has_the_releases_tensors_and_no_others(model):
     overrides = [f"model={model}", "compat=release"]
     state = GHGS.from_config(imported_config(*overrides, tiny=False), empty=True).state_dict()
     found = {
-        names.to_published(name, names.RELEASE): list(tensor.shape)
+        published.to_published(name, published.RELEASE): list(tensor.shape)
         for name, tensor in state.items()
         if not name.startswith("encoder.")
     }

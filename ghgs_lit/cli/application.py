@@ -20,7 +20,7 @@ from ghgs_lit.config import VERSION_BASE, compose, conf_dir
 from ghgs_lit.config.compose import check_ablation, plain, store_defaults
 from ghgs_lit.config.defaults import fill
 from ghgs_lit.config.options import UnknownKey
-from ghgs_lit.config.outside import check_outside_files
+from ghgs_lit.config.reading import read_as_ghgs
 from ghgs_lit.config.registry import read_nodes, verb_class
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import require_no_links, write_text_atomically
@@ -31,7 +31,7 @@ from ghgs_lit.runtime.allocation import collect_garbage_again
 from ghgs_lit.runtime.cores import children_sleep
 
 register_resolvers()  # on import, so that the processes of a launcher have them too
-check_outside_files()
+read_as_ghgs()
 
 
 def discard_unused(directory: Path, verb: str, since: float) -> None:

@@ -17,7 +17,7 @@ from ghgs_lit.config.defaults import fill, of_verb
 from ghgs_lit.config.folder import VERSION_BASE, conf_dir
 from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.config.options import did_you_mean
-from ghgs_lit.config.outside import files_are_read
+from ghgs_lit.config.reading import reading_as_ghgs
 from ghgs_lit.config.registry import KINDS, verb_class, verbs
 from ghgs_lit.config.run import Run
 from ghgs_lit.errors import InputError, require
@@ -32,7 +32,7 @@ def _application() -> Iterator[None]:
     running = GlobalHydra.instance().hydra
     GlobalHydra.instance().hydra = None
     try:
-        with files_are_read(), hydra.initialize_config_dir(str(conf_dir()), **VERSION_BASE):
+        with reading_as_ghgs(), hydra.initialize_config_dir(str(conf_dir()), **VERSION_BASE):
             yield
     finally:
         GlobalHydra.instance().hydra = running

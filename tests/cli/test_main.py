@@ -63,34 +63,6 @@ def test_help_shows_an_example_for_every_verb_and_only_built_verbs(monkeypatch, 
         assert verb_class(verb).example in out
 
 
-@pytest.mark.parametrize("argv", [(), ("paint",)])
-def test_bad_verb_is_bad_usage(monkeypatch, capsys, argv):
-    """Scripts tell bad usage by exit code 2, and the message lists the verbs."""
-    code, out, err = call(monkeypatch, capsys, *argv)
-    assert code == 2
-    assert "train" in out + err
-
-
-@pytest.mark.parametrize(
-    ("argv", "expected"),
-    [
-        (("train", "colour=red"), "colour"),
-        (("train", "optimizer.speed=9"), "speed"),
-        (("train", "encoder=vggt_huge"), "vggt_huge"),
-        (("train", "seed="), "seed"),
-        (("train", "views=[4"), "'[4'"),
-    ],
-)
-def test_configuration_errors_take_one_line_and_name_the_key(monkeypatch, capsys, argv, expected):
-    """A misspelt key must not end in a traceback or in Hydra's longer message."""
-    code, _, err = call(monkeypatch, capsys, *argv)
-    lines = [line for line in err.strip().splitlines() if line]
-    assert code == 1
-    assert len(lines) == 1
-    assert expected in lines[0]
-    assert lines[0].startswith("ghgs train: ")
-
-
 def test_an_example_of_the_help_names_the_checkpoint_where_training_writes_it(monkeypatch, capsys):
     """The example's path lacked the folder that training makes."""
     _, out, _ = call(monkeypatch, capsys, "--help")
@@ -163,13 +135,6 @@ def test_what_lightning_says_of_itself_is_not_shown():
         warnings.warn("Checkpoint directory a exists and is not empty.", stacklevel=1)
     assert shown == []
     assert not logging.getLogger("lightning.pytorch.utilities.rank_zero").isEnabledFor(logging.INFO)
-
-
-def test_cfg_is_hydras(monkeypatch, capsys):
-    """Hydra's own flags must reach it, such as that for the composed configuration."""
-    code, out, _ = call(monkeypatch, capsys, "train", "--cfg", "job", "seed=7")
-    assert code == 0
-    assert "seed: 7" in out
 
 
 def test_a_reader_that_closes_the_pipe_gets_no_traceback():

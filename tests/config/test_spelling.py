@@ -7,7 +7,7 @@ from omegaconf import OmegaConf
 from ghgs_lit.config import compose
 from ghgs_lit.config.nodes import Texts
 from ghgs_lit.config.options import Count, InputError, Options, PathText, Text
-from ghgs_lit.config.spelling import spelling_is_kept
+from ghgs_lit.config.reading import reading_as_ghgs
 
 
 class _Person(Options):
@@ -32,12 +32,12 @@ class _Person(Options):
     ],
 )
 def test_an_override_keeps_the_spelling_of_names(override, value):
-    with spelling_is_kept():
+    with reading_as_ghgs():
         assert OverridesParser.create().parse_override(override).value() == value
 
 
 def test_values_of_a_sweep_keep_theirs():
-    with spelling_is_kept():
+    with reading_as_ghgs():
         parser = OverridesParser.create()
         for override in ("k=2024_05,0426", "k=choice(2024_05,0426)"):
             swept = parser.parse_override(override).sweep_string_iterator()
@@ -49,7 +49,7 @@ def test_values_of_a_sweep_keep_theirs():
 def test_a_file_keeps_the_spelling_of_names(tmp_path):
     file = tmp_path / "a.yaml"
     file.write_text("ids: [0426, 2024_05, 12:30:45, 0x1F, 7, 1e-4, '08']")
-    with spelling_is_kept():
+    with reading_as_ghgs():
         read = list(OmegaConf.load(file).ids)
     assert read == ["0426", "2024_05", "12:30:45", "0x1F", 7, 1e-4, "08"]
     assert list(OmegaConf.create(OmegaConf.to_yaml({"ids": read})).ids) == read  # as runs save it

@@ -12,7 +12,7 @@ from ghgs_lit.cli.runtime import output_dir
 from ghgs_lit.config import VERSION_BASE, conf_dir, run_of
 from ghgs_lit.config.compose import plain
 from ghgs_lit.config.defaults import fill
-from ghgs_lit.config.outside import files_are_read
+from ghgs_lit.config.reading import reading_as_ghgs
 from ghgs_lit.config.registry import verb_class
 from ghgs_lit.config.run import Run
 from ghgs_lit.runs import job as job_module
@@ -71,7 +71,7 @@ def hydra_app(monkeypatch, *overrides: str) -> None:
     """Run ``job`` as an application over ``conf/train.yaml``."""
     monkeypatch.setattr("sys.argv", ["ghgs", *overrides])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    with files_are_read():
+    with reading_as_ghgs():
         hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name="train")(job)()
 
 

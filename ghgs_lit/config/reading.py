@@ -1,5 +1,6 @@
-"""Files of ``--config-dir`` and ``hydra.searchpath``, and what they may set in Hydra.
+"""How Hydra reads overrides and files here, and what others' files may set in it.
 
+Others' are those of ``--config-dir`` and ``hydra.searchpath``.
 Such files can come from somebody else. Their keys of the package's groups are options, which are
 checked as all options are; but the node ``hydra`` can set environment variables, call functions and
 write shell scripts, and resolvers such as ``${oc.env:...}`` read secrets. In such a file the only
@@ -15,17 +16,19 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra._internal.core_plugins import file_config_source
 from hydra._internal.sources_registry import SourcesRegistry
+from hydra.core.override_parser import overrides_parser
+from hydra.core.override_parser.overrides_visitor import HydraOverrideVisitor
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, _utils
 
 from ghgs_lit.config.defaults import of_verb, open_nodes
 from ghgs_lit.config.folder import conf_dir
 from ghgs_lit.config.keys import flatten, is_below
 from ghgs_lit.config.registry import verbs
-from ghgs_lit.config.spelling import keep_spelling, spelling_is_kept
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.parsing import check_yaml, read_parsed
 
@@ -80,25 +83,75 @@ def _parsed(text: str) -> tuple[dict[str, str | None], DictConfig]:
     return FileConfigSource._get_header_dict(text[:512]), OmegaConf.load(io.StringIO(text))
 
 
-def check_outside_files() -> None:
-    """Let all later applications of this process read files as :class:`FileConfigSource` does,
-    and keep the spelling of names."""
-    keep_spelling()
+def read_as_ghgs() -> None:
+    """Let Hydra read files as :class:`FileConfigSource` in this process from now on, and keep the spelling
+    of names."""
+    overrides_parser.HydraOverrideVisitor = SpellingVisitor
+    _utils.get_yaml_loader = yaml_loader
     SourcesRegistry.instance().types["file"] = FileConfigSource
 
 
 @contextmanager
-def files_are_read() -> Iterator[None]:
-    """Let applications of the block read files so; those of another program do not."""
+def reading_as_ghgs() -> Iterator[None]:
+    """Let applications of the block read so; those of another program do not."""
     Plugins.instance()  # registers Hydra's own
     types = SourcesRegistry.instance().types
-    before = types["file"]
+    before = types["file"], overrides_parser.HydraOverrideVisitor, _utils.get_yaml_loader
+    read_as_ghgs()
     try:
-        with spelling_is_kept():
-            check_outside_files()
-            yield
+        yield
     finally:
-        types["file"] = before
+        types["file"], overrides_parser.HydraOverrideVisitor, _utils.get_yaml_loader = before
+
+
+#: Keys of Hydra that are paths and names, whatever they spell.
+_PATHS = ("hydra.run.", "hydra.sweep.", "hydra.job.")
+#: Functions of overrides whose arguments are numbers.
+_OF_NUMBERS = ("range", "interval")
+
+_yaml_loader = _utils.get_yaml_loader
+
+
+class SpellingVisitor(HydraOverrideVisitor):
+    """Hydra's reader of overrides, which keeps whole numbers that are spelled in an unusual way as texts,
+    such as ``2024_05_17``, which Hydra reads as 20240517. Keys that are numbers take such texts, too."""
+
+    _is_path = False
+    _are_numbers = False
+
+    def visitKey(self, ctx: Any) -> Any:
+        key = super().visitKey(ctx)
+        self._is_path = key.key_or_group.startswith(_PATHS)
+        return key
+
+    def visitFunction(self, ctx: Any) -> Any:
+        self._are_numbers = ctx.getText().partition("(")[0] in _OF_NUMBERS
+        try:
+            return super().visitFunction(ctx)
+        finally:
+            self._are_numbers = False
+
+    def _createPrimitive(self, ctx: Any) -> Any:
+        value = super()._createPrimitive(ctx)
+        if self._are_numbers or not (type(value) is int or (type(value) is float and self._is_path)):
+            return value
+        return _spelled(value, ctx.getText().strip())
+
+
+def yaml_loader() -> type[yaml.SafeLoader]:
+    """OmegaConf's reader of YAML, which keeps spellings, too: ``0426`` is octal in YAML 1.1."""
+    loader = _yaml_loader()
+    loader.add_constructor("tag:yaml.org,2002:int", _construct_int)
+    return loader
+
+
+def _construct_int(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> int | str:
+    return _spelled(loader.construct_yaml_int(node), node.value)
+
+
+def _spelled(value: float, text: str) -> float | str:
+    """A number, or its text where a number is usually written otherwise."""
+    return value if str(value) == text.removeprefix("+") else text
 
 
 def check_file(file: Path, name: str, package: str, config: Any) -> None:
