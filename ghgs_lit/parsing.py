@@ -280,7 +280,10 @@ def read_parsed(path: Path, expected: str, parse: Callable[[str], Any]) -> Any:
         raise
     except (LookupError, ValueError, TypeError, ArithmeticError, RecursionError, *_NO_TEXT) as error:
         mark = getattr(error, "problem_mark", None)
-        found = f"{error.problem} in line {mark.line + 1}, column {mark.column + 1}" if mark else error
+        found = error
+        if mark is not None:
+            problem = str(error.problem).removeprefix("found ")
+            found = f"{problem} in line {mark.line + 1}, column {mark.column + 1}"
         raise InputError(f"{path}: expected {expected}; found {found}") from error
     return value
 

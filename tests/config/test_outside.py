@@ -179,7 +179,7 @@ def test_a_searched_folder_is_a_file_from_outside_too(monkeypatch, capsys, tmp_p
             "x.yaml: expected YAML; found more than 100000 values",
         ),
         ("a: " + "[" * 700 + "]" * 700, "x.yaml: expected YAML; found more than 64 levels"),
-        ("a: b\na: c", "x.yaml: expected YAML; found found duplicate key a in line 2"),
+        ("a: b\na: c", "x.yaml: expected YAML; found duplicate key a in line 3"),
         ("a: !!set {b}", "x.yaml: expected YAML; found Value 'set' is not a supported primitive type"),
         ("# Köpfe".encode("latin-1"), "x.yaml: expected YAML; found 'utf-8' codec can't decode byte"),
         ("a: b".encode("utf-16"), "x.yaml: expected YAML; found 'utf-8' codec can't decode byte"),
