@@ -33,10 +33,14 @@ def turn(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Float[Tensor, "4
     Returns:
         The unit quaternion (w, x, y, z), float64.
     """
-    from scipy.spatial.transform import Rotation  # here: most files are not turned
-
-    rotation, _ = Rotation.align_vectors(end.cpu().numpy()[None], start.cpu().numpy()[None])
-    return torch.from_numpy(rotation.as_quat(scalar_first=True))
+    start = start.double()
+    end = end.double()
+    axis = torch.linalg.cross(start, end)
+    quaternion = torch.cat([(1 + start @ end)[None], axis])
+    if quaternion.norm() < 1e-7:  # opposite: half a turn about any axis at right angles
+        other = torch.zeros_like(start).index_fill(0, start.abs().argmin(), 1)
+        quaternion = torch.cat([start.new_zeros(1), torch.linalg.cross(start, other)])
+    return torch.nn.functional.normalize(quaternion, dim=0)
 
 
 def rotate_world(
