@@ -72,10 +72,10 @@ def _check_targets(data: PhotographsDataModule, split: str, views: int, protocol
         InputError: Names the first view that is not there.
     """
     reader = data.builder(split).targets.reader
-    for batch in data.evaluation_loader(views=views, targets=protocol, split=split).dataset.specs:
-        for spec in batch:
-            for position, view in spec.targets:
-                known = position in reader.subjects[spec.subject]
-                there = reader.views_at(spec.subject, position) if known else []
-                expected = f"view {view} of subject {spec.subject} at position {position}"
+    for batch in data.evaluation_loader(views=views, targets=protocol, split=split).dataset.groups:
+        for sample in batch:
+            for position, view in sample.targets:
+                known = position in reader.subjects[sample.subject]
+                there = reader.views_at(sample.subject, position) if known else []
+                expected = f"view {view} of subject {sample.subject} at position {position}"
                 require(view in there, f"evaluation.targets={protocol.name}", expected, there)
