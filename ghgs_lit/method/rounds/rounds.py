@@ -36,26 +36,8 @@ from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Prediction, Toke
 #: Largest distance of the depths that the first round compares from the current one, as a share of
 #: the way from near to far.
 REACH = 0.25
-#: Channels of ``Search.place``: position between near and far (0 to 1), and far - near.
+#: Channels of the place of a Gaussian: position between near and far (0 to 1), and far - near.
 _PLACE = 2
-
-
-@dataclass(frozen=True)
-class Search:
-    """Depths around the current one of each Gaussian.
-
-    Attributes:
-        matches: photo-consistency at depths from ``down`` metres in front of it to ``up``
-            metres behind it.
-        place: position between near and far (0 to 1), and far - near in metres.
-        down: metres.
-        up: metres.
-    """
-
-    matches: Float[Tensor, "N s"]
-    place: Float[Tensor, "N 2"]
-    down: Float[Tensor, " N"]
-    up: Float[Tensor, " N"]
 
 
 class Rays(NamedTuple):
@@ -293,13 +275,13 @@ class Rounds(nn.Module):
         if self.options.slopes:
             drawn, *steep = slopes(gaussians, batch, rays.direction, _footprints(state, batch, rays))
         each = observe(gaussians, batch, drawn)
-        search = self._search(state, batch, rays, size * REACH)
-        known = torch.cat((search.matches, search.place, gaussians.colors, *steep), -1)
+        matches, place, down, up = self._search(state, batch, rays, size * REACH)
+        known = torch.cat((matches, place, gaussians.colors, *steep), -1)
         memory = remembered(self._layers, each, known, memory)
         memory = memory if windows is None else self.exchange(memory, windows)
         change = float32_last(self.change, memory)
         step = bounded_tanh(change[:, 0])
-        moved = torch.where(step > 0, search.up, search.down) * step
+        moved = torch.where(step > 0, up, down) * step
         return (moved, share * change[:, 1:]), memory
 
     @property
@@ -308,7 +290,9 @@ class Rounds(nn.Module):
         return self.view[0], self.view[2], self.update[0], self.update[2], self.memory
 
     @torch.no_grad()
-    def _search(self, state: State, batch: Batch, rays: Rays, reach: float | Tensor) -> Search:
+    def _search(
+        self, state: State, batch: Batch, rays: Rays, reach: float | Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Photo-consistency of depths around the current ones, within their bounds.
 
         Args:
@@ -316,6 +300,11 @@ class Rounds(nn.Module):
             batch: photographs, masks and cameras are read.
             rays: of the Gaussians' pixels.
             reach: largest distance, as a share of the way from near to far; one, or [N].
+
+        Returns:
+            Photo-consistency [N, s] at depths from ``down`` metres in front of each Gaussian to ``up`` metres
+            behind it; position between near and far (0 to 1) and far - near in
+            metres [N, 2]; down [N]; up [N].
         """
         maps = state.depth_maps
         depth, near, far = (
@@ -330,7 +319,7 @@ class Rounds(nn.Module):
         high = torch.minimum(depth + half, far)
         high = torch.maximum(high, depth)
         matches = consistency_of(batch, rays.place, low, high, self.options.depths)
-        return Search(matches, torch.stack((share, thickness), -1), depth - low, high - depth)
+        return matches, torch.stack((share, thickness), -1), depth - low, high - depth
 
 
 @torch.no_grad()
