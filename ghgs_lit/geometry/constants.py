@@ -45,8 +45,8 @@ def _made(make: Callable[..., Tensor], sizes: tuple, dtype: torch.dtype, device:
     return make(*sizes, dtype=dtype, device="cpu").to(device, non_blocking=True)
 
 
-#: Without a limit: recorded CUDA graphs read the memory of constants as long as they
-#: are played back.
+#: Without a limit: CUDA graphs read the memory of constants as long as they
+#: are replayed.
 _kept = cache(_made.__wrapped__)
 
 

@@ -256,7 +256,7 @@ class VGGTEncoder(nn.Module):
     @property
     def keeps_features(self) -> bool:
         """Whether tokens are read from disk in training,
-        which no recording of a GPU's work can hold."""
+        which no CUDA graph can hold."""
         return getattr(self.aggregator.patch_embed, "cache", None) is not None
 
     def forward(

@@ -62,7 +62,7 @@ class Windows(NamedTuple):
 @lru_cache(maxsize=64)
 @torch.inference_mode(False)  # a training step may have them in its graph
 def _on_device(numbers: tuple, device: torch.device) -> Tensor:
-    """Numbers of the host; what is recorded finds them where they are."""
+    """Numbers of the host; a captured graph finds them where they are."""
     return torch.tensor(numbers).to(device, non_blocking=True)
 
 
