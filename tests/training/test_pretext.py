@@ -235,6 +235,6 @@ def test_a_model_starts_from_it_and_leaves_it_as_it_is(pretrained, data, tmp_pat
 )
 def test_what_cannot_work_is_refused_in_one_line(data, tmp_path, capsys, overrides, message):
     """A wrong setting must be named."""
-    steps = ["trainer.max_steps=1", "logger=none"]
+    steps = ["trainer.max_steps=1", "logger=none", "callbacks=none"]
     assert ghgs("pretext", *data, *steps, *overrides, f"hydra.run.dir={tmp_path}") == 1
     assert message in capsys.readouterr().err
