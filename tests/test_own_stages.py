@@ -25,7 +25,9 @@ GROUPS = (
     "bounds", "encoder", "depth_head", "unprojection", "recalibration", "gaussian_head", "renderer", "loss"
 )  # fmt: skip
 #: What verbs need to be told again: a checkpoint brings its model.
-SAID = {"renderer": ["renderer=mine"], "loss": ["metrics=mine"]}
+SAID = {"renderer": ["renderer.kind=mine"], "loss": ["metrics=mine"]}
+#: Stages that are chosen by their kind; the others by a YAML.
+KINDS = {"bounds", "depth_head", "unprojection", "recalibration", "gaussian_head", "renderer"}
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +50,7 @@ def photographs(tmp_path_factory):
 def project(tmp_path, monkeypatch):
     """A user's folder: a Python file of stages, and a YAML for each of them."""
     shutil.copy(FILE, tmp_path / "own_stages.py")
-    for group in (*GROUPS, "metrics"):
+    for group in {*GROUPS, "metrics"} - KINDS:
         (tmp_path / "conf" / group).mkdir(parents=True)
         (tmp_path / "conf" / group / "mine.yaml").write_text("kind: mine\n")
     monkeypatch.chdir(tmp_path)
@@ -77,7 +79,7 @@ def test_each_stage_can_be_replaced_alone(project, boxes, photographs, monkeypat
     said = ["--config-dir", "conf", *SAID.get(group, [])]
     common = [*said, "views=v3", "evaluation.targets=[midway]", "evaluation.pictures=0"]
     arguments = [
-        "model=paper", "data=scans", f"data.root={boxes}", "data.size=28", f"{group}=mine",
+        "model=paper", "data=scans", f"data.root={boxes}", "data.size=28", f"{group}.kind=mine" if group in KINDS else f"{group}=mine",
         "trainer.max_steps=2", "logger=none", "callbacks=none", "hydra.run.dir=run",
     ]  # fmt: skip
     arguments += [small for small in TINY if not small.startswith(f"{group}.")]

@@ -320,7 +320,8 @@ def _input_error(cls: type[Options], key: str, values: Mapping, error: Validatio
     if first["type"] == "extra_forbidden":
         name = first["loc"][-1]
         known = list(cls.model_fields)
-        text = f"expected one of {', '.join(sorted(known))}; found {name!r}{did_you_mean(name, known)}"
+        choices = f"one of {', '.join(sorted(known))}" if known else "no keys"
+        text = f"expected {choices}; found {name!r}{did_you_mean(name, known)}"
         return UnknownKey(f"{dotted} key: {text}" if dotted else f"{name}: {text}", ".".join([*path, name]))
     if first["type"] == "missing" and first["loc"][-1] in cls.model_fields:
         return InputError(f"{dotted}: expected a value; found none")
