@@ -185,7 +185,7 @@ DRY = Sizes(
     batches=(1, 2),
     encoder="vggt_nano",
     shipped=(
-        *("data.size=28", "data.render.samples=1", "encoder.width=48", "augmentation=null"),
+        *("data.size=28", "data.render.samples=1", "encoder.width=48", "augmentation=none"),
         "rounds.height=null",  # smaller copies would keep steps from being recorded
     ),
     repeats=1,

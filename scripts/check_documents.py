@@ -122,7 +122,7 @@ SMALL = [
     (r"(?<=seed=1,2),3(,4)?", "", "two seeds"),
     (TRAIN + r".*(?:experiment=(?:demo|shipped)|data=synthetic).*)", rf"\1 {TINY}",
      "two people of 56 x 56 pixels"),
-    (TRAIN + r".*experiment=shipped.*)", r"\1 data.active.train=1 augmentation=null trainer=cpu", "small"),
+    (TRAIN + r".*experiment=shipped.*)", r"\1 data.active.train=1 augmentation=none trainer=cpu", "small"),
     (TRAIN + r".*data.root=rendered.*)", r"\1 data.size=56", "56 x 56 pixels"),
     (TRAIN + r"(?!.*vggt_nano).*experiment=(?:thuman2|zju_mocap|humman).*)", rf"\1 {CPU}", "no GPU"),
     (TRAIN + r".*experiment=zju_mocap.*)", r"\1 data.size=112", "112 x 112 pixels"),

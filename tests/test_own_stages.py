@@ -77,9 +77,10 @@ def test_each_stage_can_be_replaced_alone(project, boxes, photographs, monkeypat
     Weights of a loss are the checkpoint's, too; numbers of a metric are written like all others.
     """
     said = ["--config-dir", "conf", *SAID.get(group, [])]
+    chosen = f"{group}.kind=mine" if group in KINDS else f"{group}=mine"
     common = [*said, "views=v3", "evaluation.targets=[midway]", "evaluation.pictures=0"]
     arguments = [
-        "model=paper", "data=scans", f"data.root={boxes}", "data.size=28", f"{group}.kind=mine" if group in KINDS else f"{group}=mine",
+        "model=paper", "data=scans", f"data.root={boxes}", "data.size=28", chosen,
         "trainer.max_steps=2", "logger=none", "callbacks=none", "hydra.run.dir=run",
     ]  # fmt: skip
     arguments += [small for small in TINY if not small.startswith(f"{group}.")]

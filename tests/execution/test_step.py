@@ -336,10 +336,11 @@ def test_times_of_a_step_do_not_keep_it_from_being_captured():
         )
         costs = Costs()
         costs.on_train_start(None, module)
+        costs.on_train_batch_start(None, module)
         assert bool(model.encoder._forward_hooks) != is_free
-        for mark in (costs.on_train_batch_start, costs.on_before_backward, costs.on_after_backward):
-            mark(None, module)
-        costs.end("optimizer")
-        costs.end("step")
+        costs.on_before_backward(None, module)
+        costs.on_after_backward(None, module)
+        costs._watch.end("optimizer")
+        costs._watch.end("step")
         assert ("forward" in costs._watch.seconds()) == is_free
-        costs.teardown(None, module, "fit")
+        costs._stack.close()

@@ -7,10 +7,11 @@ import torch
 from torch import nn
 
 from ghgs_lit.execution.graphs import GraphCache
-from ghgs_lit.training import Optimization
+from ghgs_lit.training import Optimization, muon
 from ghgs_lit.training.muon import Muon, is_matrix, orthogonalized
 from ghgs_lit.training.optimization import hold_rates, plain_rates
 from tests.helpers.capture_backends import OperatorBackend
+from tests.helpers.models import load_model
 from tests.helpers.pretend_device import DEVICE, pretend_device
 
 OPTIONS = {"lr": 0.01, "betas": (0.9, 0.98), "eps": 1e-8, "weight_decay": 0.1}
@@ -36,6 +37,49 @@ def set_gradients(model, seed):
     generator = torch.Generator().manual_seed(seed)
     for parameter in model.parameters():
         parameter.grad = torch.randn(parameter.shape, generator=generator)
+
+
+@pytest.mark.parametrize("kind", ["cpu", "gpu"])
+def test_padding_and_company_change_nothing(kind, monkeypatch):
+    """Small ones of all shapes together, as on a CPU and on a GPU, and large ones; float64."""
+    if kind == "gpu":
+        monkeypatch.setattr(muon, "_power_of_two", lambda count: 128)
+    muon._packing.cache_clear()
+    generator = torch.Generator().manual_seed(5)
+    shapes = [
+        (3, 3),
+        (5, 7),
+        (7, 5),
+        (16, 16),
+        (16, 576),
+        (17, 40),
+        (128, 64),
+        (64, 1176),
+        (130, 129),
+        (129, 130),
+    ]
+    several = [torch.randn(shape, dtype=torch.float64, generator=generator) for shape in shapes]
+    for matrix, found in zip(several, orthogonalized(several), strict=True):
+        torch.testing.assert_close(found, muon._orthogonalized(matrix[None])[0], atol=1e-10, rtol=0)
+    muon._packing.cache_clear()
+
+
+def test_a_step_launches_few_kernels():
+    """Of the shipped weights: 134 matrices; PyTorch's Muon launches some 1500 for 61 of them."""
+    model = load_model()
+    with pretend_device() as log:
+        trained = [p for p in model.to(DEVICE).parameters() if p.requires_grad]
+        options = Optimization(lr=1e-3, matrix_scale=1.0)
+        optimizer = options.optimizer(model)
+        hold_rates(optimizer)
+        for _ in range(2):  # the first makes the state
+            for parameter in trained:
+                parameter.grad = torch.ones_like(parameter)
+            log.clear()
+            options.clip_gradients(model)
+            optimizer.step()
+    assert log.waits.total() == 0
+    assert 135 < log.launches <= 150
 
 
 def test_what_counts_as_a_matrix():
