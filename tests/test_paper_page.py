@@ -20,7 +20,7 @@ def test_the_page_prints_the_figures_of_the_code():
         f"{recalibration['k']} (`recalibration.k`)",
         f"{recalibration['num_heads']} heads",
         f"layers {', '.join(map(str, run['encoder']['layers']))} ",
-        f"(`bounds={run['bounds']['kind']}`, margin {100 * MARGIN:g} cm)",
+        f"(`bounds.kind={run['bounds']['kind']}`, margin {100 * MARGIN:g} cm)",
         f"`encoder.trainable={run['encoder']['trainable']}`",
         f"`recalibration.tokens={recalibration['tokens']}`",
         f"weight decay {optimizer['weight_decay']:.0e}".replace("e-0", "e-"),

@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
 import numpy as np
-from scipy import ndimage
 
 from ghgs_lit.data.view import View, area_mask
 from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, subject_sphere
@@ -89,6 +88,8 @@ def overlap(vertices: np.ndarray, view: View) -> float | None:
     Returns:
         IoU in [0, 1]; None with fewer than 500 vertices.
     """
+    from scipy import ndimage  # not where masks alone are checked
+
     if len(vertices) < _LEAST_VERTICES:
         return None
     height, width = view.mask.shape

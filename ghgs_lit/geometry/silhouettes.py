@@ -8,9 +8,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import torch
-
-from ghgs_lit.geometry.projection import meeting_point
 
 
 @dataclass(frozen=True)
@@ -162,6 +159,11 @@ def subject_sphere(silhouettes: Sequence[Silhouette]) -> tuple[np.ndarray, float
     Returns:
         Its middle [3] in the world, and an upper limit of its radius in the unit of the world.
     """
+    # Here, so that checks of paths do not wait for PyTorch.
+    import torch
+
+    from ghgs_lit.geometry.projection import meeting_point
+
     rays = []
     centers = np.stack([s.center for s in silhouettes])
     for s in silhouettes:

@@ -29,13 +29,13 @@ from ghgs_lit.geometry.rotations import quaternion_to_matrix, unit
 from ghgs_lit.geometry.unprojection import subject_tokens
 from ghgs_lit.method.bounds import VisualHull
 from ghgs_lit.method.bounds.rays import depths_in_box, ray_directions
-from ghgs_lit.method.heads.attributes import FootprintAttributes
+from ghgs_lit.method.heads.attributes import OFFSET_UNIT, FootprintAttributes
 from ghgs_lit.method.heads.depth import BOUNDED, bounded_depth
 from ghgs_lit.method.heads.dpt import DPTHead
 from ghgs_lit.method.recalibration import SemanticAttention
 from ghgs_lit.metrics.flip import flip_map
 from ghgs_lit.metrics.functional import psnr, ssim
-from ghgs_lit.ops.activation import confidence_of
+from ghgs_lit.ops.activation import confidence_of, footprint_attributes
 from ghgs_lit.ops.attention.cpu import attend_heads
 from ghgs_lit.ops.compile import processor_features
 from ghgs_lit.ops.neighbors import attend_to_neighbors, nearest_neighbors, neighbor_cosines
@@ -197,7 +197,8 @@ def _raw_attributes(family: str, g: Generator) -> Values:
 
 
 def _attributes(v: Values) -> Values:
-    rows = FootprintAttributes()(*(v[name].flatten(0, 1) for name in (*_RAW, "footprint")))
+    raw = (v[name].flatten(0, 1) for name in (*_RAW, "footprint"))
+    rows = footprint_attributes(*raw, FootprintAttributes().constants(OFFSET_UNIT, 0.0))
     return {name: value.unflatten(0, v["opacity"].shape) for name, value in zip(_RAW, rows, strict=True)}
 
 
