@@ -46,7 +46,7 @@ def content(model):
 @pytest.fixture
 def run(tmp_path):
     """The folder of two checkpoints of one model, and the model."""
-    model, files, folder = make_model(FROZEN), AtomicCheckpointIO(), tmp_path / "checkpoints"
+    model, files, folder = make_model(FROZEN), AtomicCheckpointIO(), tmp_path / "run" / "checkpoints"
     files.save_checkpoint(content(model), folder / "best.ckpt")
     with torch.no_grad():
         model.depth_head.dpt.scratch.output_conv2[-1].weight.add_(1)
