@@ -3,6 +3,7 @@
 (:class:`Hypothesis`) makes them agree."""
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -315,7 +316,7 @@ def _is_plausible(view: StoredView) -> bool:
 
 
 def _for_some(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
-    """Mistakes of one camera, and cameras (or masks, which look alike) that are exchanged."""
+    """Mistakes of one camera, and cameras or masks that are exchanged, which look alike to the hull."""
     for i, view in enumerate(views):
         for says, changed in _mistakes(view):
             mended = (*views[:i], changed, *views[i + 1 :])
@@ -328,10 +329,31 @@ def _for_some(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
     for order in orders:
         pairs = [(view, other) for view, other in zip(views, order, strict=True) if view is not other]
         names = ", ".join(f"{view.name}: {other.name}" for view, other in pairs)
-        changed = (replace(view, camera=other.camera) for view, other in zip(views, order, strict=True))
-        says = f"cameras or masks of {' and '.join(view.name for view, _ in pairs)} are exchanged"
         blames = tuple(view.name for view, _ in pairs)
-        yield Hypothesis(says, f"'calibration.names={{{names}}}'", tuple(changed), blames)
+        of_these = f"of {' and '.join(blames)} are exchanged"
+        if _fit_better(pairs):
+            changed = (replace(view, mask=other.mask) for view, other in zip(views, order, strict=True))
+            yield Hypothesis(f"the masks {of_these}", "", tuple(changed), blames)
+        else:
+            changed = (replace(view, camera=other.camera) for view, other in zip(views, order, strict=True))
+            yield Hypothesis(
+                f"the cameras {of_these}", f"'calibration.names={{{names}}}'", tuple(changed), blames
+            )
+
+
+def _fit_better(pairs: Sequence[tuple[StoredView, StoredView]]) -> bool:
+    """Whether outlines of the masks follow edges of the other photographs rather than of their own."""
+    if any(view.mask.shape != other.mask.shape for view, other in pairs):
+        return False
+    own = math.prod(_contrast(view, view.mask) for view, _ in pairs)
+    return math.prod(_contrast(view, other.mask) for view, other in pairs) > own
+
+
+def _contrast(view: StoredView, mask: np.ndarray) -> float:
+    """Mean gradient of the photograph on the outline of a mask, largest for the right mask."""
+    outline = np.hypot(*np.gradient(mask.astype(np.float64))) > 0
+    gradient = np.hypot(*np.gradient(view.pixels.image.mean(-1)))
+    return float(gradient[outline].mean()) if outline.any() else 0.0
 
 
 def _mistakes(view: StoredView) -> Iterator[tuple[str, StoredView]]:
