@@ -69,12 +69,12 @@ NOT_RUN = [
     (r"ghgs train (?!.*dry_run).*encoder=vggt_1b", PUBLISHED),
     (r"ghgs train .*hydra/launcher=slurm", "needs a cluster"),
     (r"bash scripts/slurm_drill", "needs SLURM"),
-    (r"ghgs adapt (cameras=<|data\.size=518)", "needs a capture of several instants"),
     (r"ghgs (train|evaluate|benchmark) .*split=bench", "renders forty people"),
     (r"ghgs table .*runs/ablation", "needs twelve runs"),
     (r"(GHGS_PLUGINS=\S+ )?ghgs (train|table) .*controls", "needs 21 runs"),
     (r"ghgs (train|table) .*runs/peers|ghgs evaluate .*train: 48", "needs 60 people, or runs of theirs"),
     (r"ghgs (train|export) .*runs/shipped", "renders 344 people"),
+    (r"python scripts/mutate\.py", "runs the whole suite"),
     (r"ghgs evaluate .*per_scene", "fits Gaussians to each person, for minutes"),
     (r"ghgs stress$", "takes a quarter of an hour"),
     (r"python scripts/drill\.py", "trains twelve runs, killed ten times"),
@@ -228,7 +228,7 @@ cameras = Cameras(torch.tensor([[[[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]]]), tor
 }
 # Beginnings of the commands of a document that end within seconds, and of those that they need.
 FAST = {
-    "README.md": r"ghgs \S*--help|ghgs train --help|.*dry_run=true|.*data\.source=my_scans|"
+    "README.md": r"ghgs train --help|.*dry_run=true|.*data\.source=my_scans|"
     r"ghgs prepare .*rendered|ghgs train experiment=scans .*runs/mine|"
     r"ghgs train .*trainer=gpu|ghgs predict|#python",
     "docs/rasterizer.md": r"#python",

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from ghgs_capture.verbs import Predict
 
 SHEET = "sheet.png"  #: The picture to look at
-
-
 #: Formats that the package gaussforge makes from a PLY; what it, and the suffix of files, calls each.
 CONVERTED = {"compressed_ply": "compressed.ply", "spz": "spz", "sog": "sog"}
 
@@ -249,7 +247,7 @@ def write_prediction(
         prediction: of this batch, in the world of its cameras.
         renderer: draws the turntable, and the input views for the report.
         options: formats and choices for them.
-        facts: further plain data for the report, such as the seconds of each stage.
+        facts: further plain data for the report.
 
     Returns:
         The paths, that of ``report.json`` last.

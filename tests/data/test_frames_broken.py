@@ -98,7 +98,27 @@ def renumber(folder: Path) -> None:
         path.rename(path.with_name("000001.png"))
 
 
+def of_photographs(image: str, masks: list[str], size: str, shrunk: str) -> dict:
+    """Broken photographs and masks of any sequence; the first mask is the one that is broken."""
+    name, mask = Path(image).name, masks[0]
+    resized = f"{name}: expected a photograph of the calibration's size, .*; found {shrunk}"
+    return {
+        "truncated photograph": (
+            lambda f: truncate(f / image),
+            f"{name}: expected a readable image; found",
+        ),
+        "resized photograph": (lambda f: [shrink(f / each) for each in (image, *masks)], resized),
+        "no mask": (lambda f: (f / mask).unlink(), f"{mask}: expected an image; found no such"),
+        "mask of another size": (
+            lambda f: shrink(f / mask),
+            f"000000.png: expected the size of its photograph, {size}; found {shrunk}",
+        ),
+        "empty mask": (lambda f: blank(f / mask), f"{mask}: expected a subject in the mask; found"),
+    }
+
+
 ZJU_MOCAP = {
+    **of_photographs(ZJU_IMAGE, [ZJU_MASK, ZJU_MASK.replace("_cihp", "")], "64x64", "32x32"),
     "no annotations": (
         lambda f: (f / "annots.npy").unlink(),
         r"annots.npy: expected an .npy file; found no such file",
@@ -160,33 +180,9 @@ ZJU_MOCAP = {
         lambda f: (f / ZJU_IMAGE).unlink(),
         r"CoreView_386/Camera_B1/000000.jpg: expected an image; found no such file",
     ),
-    "truncated photograph": (
-        lambda f: truncate(f / ZJU_IMAGE),
-        r"000000.jpg: expected a readable image; found",
-    ),
-    "resized photograph": (
-        lambda f: (
-            shrink(f / ZJU_IMAGE),
-            shrink(f / ZJU_MASK),
-            shrink(f / "mask" / ZJU_IMAGE.replace("jpg", "png")),
-        ),
-        r"000000.jpg: expected a photograph of the calibration's size, .*; found 32x32",
-    ),
-    "no mask": (
-        lambda f: (f / ZJU_MASK).unlink(),
-        r"mask_cihp/Camera_B1/000000.png: expected an image; found no such",
-    ),
     "no folder of masks": (
         lambda f: [shutil.rmtree(f / kind) for kind in ("mask", "mask_cihp")],
         r"CoreView_386: expected a folder of masks, mask_cihp; found none",
-    ),
-    "mask of another size": (
-        lambda f: shrink(f / ZJU_MASK),
-        r"000000.png: expected the size of its photograph, 64x64; found 32x32",
-    ),
-    "empty mask": (
-        lambda f: blank(f / ZJU_MASK),
-        r"mask_cihp/Camera_B1/000000.png: expected a subject in the mask; found",
     ),
     "truncated mask": (lambda f: truncate(f / ZJU_MASK), r"000000.png: expected a readable image; found"),
     "no body of a frame": (
@@ -203,6 +199,7 @@ ZJU_MOCAP = {
 }
 
 HUMMAN = {
+    **of_photographs(HUMMAN_IMAGE, [HUMMAN_MASK], "72x128", "36x64"),
     "no cameras": (
         lambda f: (f / "cameras.json").unlink(),
         r"cameras.json: expected the cameras .*; found no such file",
@@ -246,26 +243,6 @@ HUMMAN = {
         r"kinect_color: expected frames such as 000000.png; found none of 17 .*multiples of 6",
     ),
     "wrong frame numbers": (renumber, r"kinect_color: expected frames such as 000000.png; found none of 17"),
-    "truncated photograph": (
-        lambda f: truncate(f / HUMMAN_IMAGE),
-        r"000000.png: expected a readable image; found",
-    ),
-    "resized photograph": (
-        lambda f: (shrink(f / HUMMAN_IMAGE), shrink(f / HUMMAN_MASK)),
-        r"kinect_000/000000.png: expected a photograph of the calibration's size, .*; found 36x64",
-    ),
-    "no mask": (
-        lambda f: (f / HUMMAN_MASK).unlink(),
-        r"kinect_mask/kinect_000/000000.png: expected an image; found no such",
-    ),
-    "mask of another size": (
-        lambda f: shrink(f / HUMMAN_MASK),
-        r"000000.png: expected the size of its photograph, 72x128; found 36x64",
-    ),
-    "empty mask": (
-        lambda f: blank(f / HUMMAN_MASK),
-        r"kinect_mask/kinect_000/000000.png: expected a subject in the mask; found",
-    ),
     "no sequence": (shutil.rmtree, r"expected sequences such as p000455_a000986; found none of val"),
 }
 

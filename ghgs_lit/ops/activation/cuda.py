@@ -20,16 +20,8 @@ RANGE = tl.constexpr(activation.OTHER - activation.SAME)
 
 @triton.jit
 def unit_quaternion(w, x, y, z):
-    """Quaternions divided by their length, and the length; 0 stays 0.
-
-    The largest number is divided out first.
-
-    Args:
-        w: real part.
-        x: second part.
-        y: third part.
-        z: fourth part.
-    """
+    """Quaternions divided by their length, and the length; 0 stays 0. The largest number is divided
+    out first."""
     largest = tl.maximum(tl.maximum(tl.abs(w), tl.abs(x)), tl.maximum(tl.abs(y), tl.abs(z)))
     scale = 1 / tl.where(largest == 0, 1.0, largest)
     w = w * scale
@@ -44,18 +36,7 @@ def unit_quaternion(w, x, y, z):
 
 @triton.jit
 def product(a, b, c, d, w, x, y, z):
-    """The product of two quaternions.
-
-    Args:
-        a: real part of the first.
-        b: its second part.
-        c: its third part.
-        d: its fourth part.
-        w: real part of the second.
-        x: its second part.
-        y: its third part.
-        z: its fourth part.
-    """
+    """The product of two quaternions."""
     return (
         a * w - b * x - c * y - d * z,
         a * x + b * w + c * z - d * y,
@@ -66,17 +47,7 @@ def product(a, b, c, d, w, x, y, z):
 
 @triton.jit
 def rotated(w, a, b, c, x, y, z):
-    """The vector (x, y, z) rotated by a unit quaternion.
-
-    Args:
-        w: real part of the quaternion.
-        a: its second part.
-        b: its third part.
-        c: its fourth part.
-        x: first coordinate of the vector.
-        y: second one.
-        z: third one.
-    """
+    """The vector (x, y, z) rotated by the unit quaternion (w, a, b, c)."""
     p = 2 * (b * z - c * y)
     q = 2 * (c * x - a * z)
     r = 2 * (a * y - b * x)
