@@ -24,7 +24,6 @@ from unittest import mock
 
 import numpy as np
 import torch
-from PIL import Image
 from pydantic import Field
 from rich.console import Console
 from rich.progress import track
@@ -44,6 +43,7 @@ from ghgs_people.figures.mesh import Person
 from ghgs_people.lights import Lights
 from ghgs_people.photograph import Studio
 from ghgs_people.rig import STILL, Rig
+from ghgs_people.writing import write_body, write_view
 
 log = logging.getLogger(__name__)
 
@@ -52,8 +52,6 @@ _GUARD = 'if __name__ == "__main__":'
 RENDER_VERSION = 3
 #: Workers compute with one thread each: those of NumPy's products wait by spinning.
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-# Runs of equal bytes (Z_RLE of zlib): half the time of the default, and files are no larger.
-_PNG = {"compress_type": 3}
 #: Folders of the files of a subject, in the order in which they are moved to their place.
 _KINDS = ("mask", "alpha", "depth", "parm", "img", "smpl")
 #: Lights of all people.
@@ -215,46 +213,6 @@ def _render(job: _Job) -> None:
             write_view(job.workspace, position_name(job.name, position), number, view, settings.quality)
     if person.body_vertices is not None:
         write_body(job.workspace, job.name, person.body_vertices)
-
-
-def write_view(phase: Path, folder: str, number: int, view: View, quality: int = 98) -> None:
-    """Write one view of a subject.
-
-    The JPEG keeps the full resolution of colours. The mask has three equal channels, as the
-    authors' loader reads channel 0.
-
-    Args:
-        phase: folder of the phase, or a workspace.
-        folder: name of the subject's position, ``<id>_<position>``.
-        number: of the view at its position.
-        view: image, mask and cameras; matte and inverse depth where there are any.
-        quality: of the JPEG, 1 to 100.
-    """
-    folders = {kind: phase / kind / folder for kind in ("img", "mask", "alpha", "depth", "parm")}
-    for path in folders.values():
-        path.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(view.image).save(folders["img"] / f"{number}.jpg", quality=quality, subsampling=0)
-    mask = np.repeat(view.mask[..., None].astype(np.uint8) * 255, 3, axis=-1)
-    Image.fromarray(mask).save(folders["mask"] / f"{number}.png", **_PNG)
-    if view.matte is not None:
-        Image.fromarray(view.matte).save(folders["alpha"] / f"{number}.png", **_PNG)
-    if view.inverse_depth is not None:
-        Image.fromarray(view.inverse_depth).save(folders["depth"] / f"{number}.png", **_PNG)
-    np.save(folders["parm"] / f"{number}_intrinsic.npy", view.intrinsics.astype(np.float64))
-    np.save(folders["parm"] / f"{number}_extrinsic.npy", view.extrinsics[:3].astype(np.float64))
-
-
-def write_body(phase: Path, name: str, vertices: np.ndarray) -> None:
-    """Write the vertices of a subject's body.
-
-    Args:
-        phase: folder of the phase, or a workspace.
-        name: of the subject.
-        vertices: [n, 3], metres.
-    """
-    folder = phase / "smpl" / name
-    folder.mkdir(parents=True, exist_ok=True)
-    np.save(folder / "vertices.npy", vertices.astype(np.float32))
 
 
 def render_people(

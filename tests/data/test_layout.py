@@ -17,8 +17,8 @@ from ghgs_lit.data.view import View, encode_depth
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.types import Cameras
-from ghgs_people.jobs import write_body, write_view
 from ghgs_people.photograph import Studio
+from ghgs_people.writing import write_body, write_view
 from tests.helpers.captures import refused, truncate
 from tests.helpers.people import RIG, box_person
 

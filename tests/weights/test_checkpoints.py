@@ -1,12 +1,8 @@
-"""Checkpoints rebuild their models; files that do not fit or that changed are refused by name; and
-checkpoints for prediction alone."""
+"""Checkpoints rebuild their models; files that do not fit are refused by name."""
 
 import os
 import pickle
-import re
-import tracemalloc
 import warnings
-import zipfile
 from pathlib import Path
 
 import lightning.pytorch
@@ -18,39 +14,17 @@ from safetensors.torch import save_file
 from ghgs_lit.cli.inputs import with_trained_data
 from ghgs_lit.config import run_of
 from ghgs_lit.errors import InputError
-from ghgs_lit.geometry import precision
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.training.start import check_resume, initialize
 from ghgs_lit.weights.checkpoint import (
-    FORMAT_VERSION,
-    model_state,
-    read_checkpoint,
     read_config,
-    write_checkpoint,
-    write_inference,
 )
 from ghgs_lit.weights.frozen import SHARING
-from ghgs_lit.weights.published import export_weights
-from ghgs_lit.weights.reading import SHIPPED_FILE, open_file
+from tests.helpers.checkpoints import checkpoint, content
 from tests.helpers.models import close, config, load_model, make_model, predict
 from tests.helpers.scenes import make_batch
 from tests.helpers.training import held
-from tests.helpers.verbs import ghgs
-
-TRAINING = {"global_step": 5, "optimizer_states": [], "lr_schedulers": [], "loops": {}, "callbacks": {}}
-
-
-def content(**changes):
-    """Of a checkpoint of a training; what is None is left out."""
-    state = {f"model.{key}": value for key, value in make_model().state_dict().items()}
-    made = {"state_dict": state, "config": config(), "format_version": FORMAT_VERSION, **TRAINING, **changes}
-    return {key: value for key, value in made.items() if value is not None}
-
-
-def checkpoint(path, **changes):
-    torch.save(content(**changes), path)
-    return path
 
 
 def test_a_checkpoint_rebuilds_its_model_without_any_yaml(tmp_path):
@@ -280,110 +254,6 @@ def test_a_configuration_of_other_things_than_yaml_says_is_refused(tmp_path):
             read_config(path)
 
 
-def flip(path, near):
-    """Flip one bit of the bytes ``near``, which are in the file once."""
-    data = bytearray(path.read_bytes())
-    data[data.index(near) + 1] ^= 0x08
-    path.write_bytes(data)
-
-
-READERS = {
-    "predict and evaluate": lambda path: load_model(path),
-    "init_from": lambda path: initialize(make_model(), path),
-    "resume": lambda path: check_resume(path, held(make_model()), config()),
-    "export": lambda path: export_weights(path, None, path.with_name("release.pth")),
-    "inference": lambda path: write_inference(path, path.with_name("b.ckpt"), "float16"),
-}
-
-
-@pytest.mark.parametrize("reader", READERS)
-@pytest.mark.parametrize(
-    ("save", "where"),
-    [(AtomicCheckpointIO().save_checkpoint, "weights"), (torch.save, "configuration")],
-)
-def test_one_changed_bit_is_refused_by_every_reader(tmp_path, reader, save, where):
-    """A flipped bit would be a slightly other model in silence."""
-    path, made = tmp_path / "last.ckpt", content()
-    name = "model.gaussian_head.dpt.projections.0.weight"
-    name = name if name in made["state_dict"] else next(n for n in made["state_dict"] if "head" in n)
-    save(made, path)
-    read_checkpoint(path, whole=True)
-    near = made["state_dict"][name].numpy().tobytes()[:64]
-    flip(path, near if where == "weights" else b"neighborhood")
-    with pytest.raises(InputError, match=r"last\.ckpt: expected .* damaged"):
-        READERS[reader](path)
-
-
-def test_the_shipped_file_has_checksums(tmp_path):
-    path = tmp_path / "shipped.ckpt"
-    with zipfile.ZipFile(SHIPPED_FILE) as archive:
-        sizes = sorted(archive.infolist(), key=lambda record: record.file_size)
-        records = [*sizes[-3:], *(record for record in sizes if record.filename.endswith("data.pkl"))]
-        contents = [archive.read(record) for record in records]
-    for data in contents:
-        path.write_bytes(SHIPPED_FILE.read_bytes())
-        flip(path, data[len(data) // 2 :][:256])
-        with pytest.raises(InputError, match=r"shipped\.ckpt: expected"):
-            load_model(path)
-
-
-def packed_again(path, compression):
-    """Write the records of a PyTorch file again, as a program that repairs archives does."""
-    with zipfile.ZipFile(path) as archive:
-        records = {record.filename: archive.read(record) for record in archive.infolist()}
-    with zipfile.ZipFile(path, "w", compression) as archive:
-        for name, data in records.items():
-            archive.writestr(name, data)
-
-
-def claim(path, size):
-    """Let the last record of a PyTorch file say that it has ``size`` bytes,
-    in both of its headers."""
-    with zipfile.ZipFile(path) as archive:
-        last = archive.infolist()[-1]
-    data, name = bytearray(path.read_bytes()), last.filename.encode()
-    sizes = 2 * last.file_size.to_bytes(4, "little")
-    for place in (data.index(sizes, last.header_offset), data.index(sizes, data.rindex(name) - 46)):
-        data[place : place + 8] = 2 * size.to_bytes(4, "little")
-    path.write_bytes(data)
-
-
-FILES_OF_WEIGHTS = {**READERS, "any file of weights": open_file}
-
-
-@pytest.mark.parametrize("reader", FILES_OF_WEIGHTS)
-def test_compressed_records_are_refused_by_every_reader(tmp_path, reader):
-    """PyTorch maps records as they lie on the disk: all weights would be other numbers,
-    in silence."""
-    path = tmp_path / "a.ckpt"
-    torch.save(content(), path)
-    packed_again(path, zipfile.ZIP_STORED)
-    assert load_model(path)
-    kinds = (zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
-    for compression in kinds if reader == "any file of weights" else kinds[:1]:
-        packed_again(path, compression)
-        with pytest.raises(
-            InputError, match=r"a\.ckpt: expected .*; found a compressed or encrypted record \(a/"
-        ):
-            FILES_OF_WEIGHTS[reader](path)
-
-
-def test_a_file_that_unpacks_without_limit_is_refused_before_it_is_read(tmp_path):
-    path = tmp_path / "a.ckpt"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name in ("data.pkl", "version"):
-            archive.writestr(f"a/{name}", bytes(1 << 26))
-    tracemalloc.start()
-    with pytest.raises(InputError, match="found a compressed"):
-        read_checkpoint(path, whole=True)
-    assert tracemalloc.get_traced_memory()[1] < 1 << 24
-    tracemalloc.stop()
-    torch.save(content(), path)
-    claim(path, 1 << 30)
-    with pytest.raises(InputError, match=r"a\.ckpt: expected .*; found"):
-        read_checkpoint(path)
-
-
 def test_weights_in_double_precision_are_read_in_single(tmp_path):
     """A converter, or a run with ``trainer.precision=64-true``, writes them;
     the model computes in single."""
@@ -415,81 +285,3 @@ def test_a_missing_or_odd_version_of_lightning_is_this_one(tmp_path, version):
     torch.save(content(**version), tmp_path / "a.ckpt")
     loaded = AtomicCheckpointIO().load_checkpoint(tmp_path / "a.ckpt")
     assert loaded["pytorch-lightning_version"] == lightning.pytorch.__version__
-
-
-@pytest.fixture
-def trained(tmp_path):
-    """A checkpoint with what training adds to it."""
-    path, state = tmp_path / "a.ckpt", make_model().state_dict()
-    moments = [{name: tensor.clone() for name, tensor in state.items()} for _ in range(2)]
-    write_checkpoint(path, state, config(), optimizer_states=moments, global_step=7)
-    return path
-
-
-@pytest.mark.parametrize("dtype", ["float16", "bfloat16", "float32"])
-def test_weights_and_configuration_alone_are_written(trained, tmp_path, dtype):
-    """Every tensor is the rounded one; optimizer and progress are gone;
-    the model is built without a YAML."""
-    write_inference(trained, tmp_path / "b.ckpt", dtype)
-    before, after = read_checkpoint(trained), read_checkpoint(tmp_path / "b.ckpt")
-    assert set(after) == {"state_dict", "config", "format_version"}
-    assert after["config"] == {**before["config"], "resume": None, "init_from": None}
-    assert after["state_dict"].keys() == before["state_dict"].keys()
-    for name, tensor in before["state_dict"].items():
-        assert torch.equal(after["state_dict"][name], tensor.to(getattr(torch, dtype)))
-    share = (tmp_path / "b.ckpt").stat().st_size / trained.stat().st_size
-    assert share < (0.4 if dtype == "float32" else 0.25)
-    load_model(tmp_path / "b.ckpt")
-
-
-def test_the_verb_prints_how_far_predictions_are(trained, tmp_path, capsys):
-    arguments = [f"checkpoint={trained}", f"hydra.run.dir={tmp_path / 'r'}"]
-    assert ghgs("export", *arguments, f"inference={tmp_path / 'b.ckpt'}", "dtype=float32") == 0
-    text = capsys.readouterr().out
-    assert "against the checkpoint, on an ellipsoid: 100.0 dB between renders" in text
-    assert text.rstrip().endswith(f"wrote {tmp_path / 'b.ckpt'}")
-    arguments.append(f"inference={tmp_path / 'b.ckpt'}")
-    assert ghgs("export", *arguments) == 1
-    expected = "inference: expected a path where there is no file, or overwrite=true"
-    assert expected in capsys.readouterr().err
-    assert ghgs("export", *arguments, "overwrite=true") == 0
-    decibels = float(capsys.readouterr().out.split("ellipsoid: ")[1].split(" dB")[0])
-    assert 40 < decibels < 100  # half precision is near, and not the same
-
-
-def test_what_half_precision_cannot_hold_is_refused(tmp_path):
-    path, state = tmp_path / "a.ckpt", make_model().state_dict()
-    name = next(name for name in state if name.startswith("gaussian_head"))
-    state[name] = torch.full_like(state[name], 1e6)
-    write_checkpoint(path, state, config())
-    with pytest.raises(InputError, match=rf"a\.ckpt as float16: {name}: expected finite numbers"):
-        write_inference(path, tmp_path / "b.ckpt", "float16")
-    write_inference(path, tmp_path / "b.ckpt", "bfloat16")
-    with pytest.raises(InputError, match="expected another file than the checkpoint"):
-        write_inference(path, path, "float16")
-
-
-@pytest.mark.parametrize("has_bfloat16", [True, False])
-@pytest.mark.parametrize("stored", [torch.float16, torch.bfloat16, torch.float32])
-def test_half_precision_is_computed_where_the_processor_has_it(
-    trained, tmp_path, monkeypatch, stored, has_bfloat16
-):
-    """An encoder in float16 is slow on a CPU; a GPU keeps it, and who asks for it."""
-    monkeypatch.setattr(precision, "has_bfloat16", lambda _: has_bfloat16)
-    write_inference(trained, tmp_path / "b.ckpt", str(stored).removeprefix("torch."))
-    kept = stored == torch.bfloat16 and has_bfloat16
-    model, asked = (load_model(tmp_path / "b.ckpt", dtype=dtype) for dtype in (None, stored))
-    assert {p.dtype for p in model.encoder.parameters()} == {stored if kept else torch.float32}
-    assert {p.dtype for p in asked.encoder.parameters()} == {stored}
-    elsewhere = load_model(tmp_path / "b.ckpt", map_location="meta")
-    assert {p.dtype for p in elsewhere.encoder.parameters()} == {stored}
-    for name, tensor in model_state(read_checkpoint(tmp_path / "b.ckpt")).items():
-        assert torch.equal(model.state_dict()[name].float(), tensor.float())
-
-
-def test_the_weights_of_the_package_are_exported_by_name(tmp_path, monkeypatch, capsys):
-    """``checkpoint=shipped`` is no file's path."""
-    monkeypatch.chdir(tmp_path)
-    assert ghgs("export", "checkpoint=shipped", "inference=half.ckpt", "dtype=float16") == 0
-    assert re.search(r"^[\d.]+ MB to [\d.]+ MB$", capsys.readouterr().out, re.MULTILINE)
-    assert (tmp_path / "half.ckpt").stat().st_size < 2.5e6

@@ -11,9 +11,10 @@ from torch import Generator, Tensor, nn
 
 from ghgs_lit.config import run_of
 from ghgs_lit.diagnostics.stress.families import FAMILIES, Values, directions, sphere, uniform, vary
+from ghgs_lit.diagnostics.stress.geometry import batch_of, cameras_of
 from ghgs_lit.diagnostics.stress.measure import Stage, case_by_case
 from ghgs_lit.diagnostics.stress.stages import STAGES as PARTS
-from ghgs_lit.diagnostics.stress.stages import backend_of, batch_of, cameras_of
+from ghgs_lit.diagnostics.stress.stages import backend_of
 from ghgs_lit.execution import Predictor
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.losses import Losses
